@@ -1,0 +1,1 @@
+"""Layout-based causal inference for object navigation, in JAX."""

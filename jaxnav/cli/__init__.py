@@ -1,0 +1,1 @@
+"""Typed configuration and the train, eval, play and import commands."""

@@ -1,0 +1,1 @@
+"""One episode: reset, step and observe; batching, metrics, contract checks and adapters."""

@@ -1,0 +1,1 @@
+"""Fixed episode lists, epsilon x seed sweeps, statistics, figures and the report."""

@@ -1,0 +1,212 @@
+"""Evaluation report: rows of metrics as JSON, as a console table and as a Markdown table.
+
+A report is a plain dictionary that JSON holds exactly; SR, SPL and SAE are in percent (0-100), DTS in metres.
+"""
+
+import importlib.metadata
+import json
+import os
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Summary, paired_difference, summary
+
+#: Version of the JSON layout.
+FORMAT = 1
+
+Variant = Literal["random", "baseline", "layout", "tde", "stde"]
+Decoding = Literal["argmax", "sample"]
+Form = Literal["residual", "paper"]
+
+#: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
+_SCALES = {"sr": 100.0, "spl": 100.0, "dts": 1.0, "sae": 100.0}
+_BUCKETS = {"L>=1": 1, "L>=5": 5}
+_COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
+
+
+def build_row(
+    *,
+    variant: Variant,
+    method: str,
+    world: str,
+    split: str,
+    epsilon: float | None,
+    decoding: Decoding,
+    form: Form | None,
+    metrics: dict[str, np.ndarray],
+    best_lengths: np.ndarray,
+    strata: np.ndarray,
+    generator: np.random.Generator,
+) -> dict[str, Any]:
+    """One row: a variant's metrics over all episodes and over the buckets L* >= 1 and L* >= 5.
+
+    Every episode has L* >= 1, so the overall metrics are those of the first bucket. A bucket without episodes holds
+    `"episodes": 0` and no metrics.
+
+    Args:
+      variant: what is evaluated; with `method`, `world` and `split` it names the row.
+      method: name of the method as printed, for example `ORG`.
+      world: world of the episodes.
+      split: `train`, `val` or `test`.
+      epsilon: threshold of the sTDE, None where there is none.
+      decoding: how actions are taken from logits.
+      form: how the counterfactual logits are combined, None where there are none.
+      metrics: `sr`, `spl`, `sae` (fractions in [0, 1]) and `dts` (metres), each [S, E].
+      best_lengths: int [E], best length L* of each episode, in actions with Done, at least 1.
+      strata: int [E], stratum (room type) of each episode.
+      generator: source of the bootstrap resamples.
+
+    Raises:
+      InputError: metrics missing, of unequal or wrong shape, not finite or out of range, or an L* below 1.
+    """
+    best_lengths, strata = np.asarray(best_lengths), np.asarray(strata)
+    if set(metrics) != set(_SCALES):
+        raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_SCALES)}")
+    scaled = {name: _to_report_units(name, metrics[name]) for name in _SCALES}
+    shape = scaled["sr"].shape
+    if any(values.shape != shape for values in scaled.values()) or best_lengths.shape != shape[1:] != strata.shape:
+        raise InputError("shapes differ; give every metric as [S, E], best_lengths and strata as [E]")
+    if (best_lengths < 1).any():
+        raise InputError("best_lengths holds values below 1; drop episodes whose goal no pose can see")
+
+    buckets: dict[str, dict[str, Any]] = {}
+    for name, shortest in _BUCKETS.items():
+        kept = best_lengths >= shortest
+        buckets[name] = {"episodes": int(kept.sum())}
+        if kept.any():
+            for metric, values in scaled.items():
+                buckets[name][metric] = _plain(summary(values[:, kept], strata[kept], generator))
+    identity = {"variant": variant, "method": method, "world": world, "split": split}
+    setting = {"epsilon": epsilon, "decoding": decoding, "form": form}
+    return {**identity, **setting, "seeds": shape[0], **buckets["L>=1"], "buckets": buckets}
+
+
+def build_difference(
+    metric: str,
+    reference: tuple[str, np.ndarray],
+    compared: tuple[str, np.ndarray],
+    *,
+    epsilon: float | None,
+    decoding: Decoding,
+    strata: np.ndarray,
+    generator: np.random.Generator,
+    same_seeds: bool = False,
+) -> dict[str, Any]:
+    """Paired difference `compared - reference` of one metric over all episodes, in the report's units.
+
+    Args:
+      metric: `sr`, `spl`, `dts` or `sae`.
+      reference: (name of the variant, its results [S, E] as given to `build_row`).
+      compared: the same for the variant compared with it.
+      epsilon: threshold of the sTDE, None where there is none.
+      decoding: how actions are taken from logits, in both.
+      strata: int [E], stratum (room type) of each episode.
+      generator: source of the bootstrap resamples.
+      same_seeds: whether equal seed indexes mean the same network (see `paired_difference`).
+
+    Raises:
+      InputError: results of unequal or wrong shape, not finite or out of range.
+    """
+    (source, a), (target, b) = reference, compared
+    a, b = _to_report_units(metric, a), _to_report_units(metric, b)
+    difference = paired_difference(a, b, strata, generator, same_seeds=same_seeds)
+    identity = {"metric": metric, "from": source, "to": target, "epsilon": epsilon, "decoding": decoding}
+    return {**identity, "mean": difference.mean, "ci95": list(difference.ci95)}
+
+
+def build_report(rows: list[dict[str, Any]], differences: list[dict[str, Any]], compilations: int) -> dict[str, Any]:
+    """The report: rows, differences, number of compilations the evaluation took, versions and format."""
+    return {
+        "rows": rows,
+        "differences": differences,
+        "compilations": compilations,
+        "versions": versions(),
+        "format": FORMAT,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide the results; `jaxnav` may run uninstalled, from its source."""
+    try:
+        jaxnav = importlib.metadata.version("jaxnav")
+    except importlib.metadata.PackageNotFoundError:
+        jaxnav = "source"
+    others = {name: importlib.metadata.version(name) for name in ("jax", "flax", "numpy")}
+    return {"jaxnav": jaxnav, **others, "python": platform.python_version()}
+
+
+def write_report(path: Path, report: dict[str, Any]) -> None:
+    """Writes the report as JSON; the file is replaced at once, so a reader never sees half of one.
+
+    Raises:
+      ValueError: the report holds NaN or an infinity; nothing is written.
+    """
+    text = json.dumps(report, indent=2, allow_nan=False)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def console_table(report: dict[str, Any]) -> Table:
+    """Table for a terminal: a line per row, `mean ± std [95 % interval]`, under a header per world, split, decoding."""
+    table = Table("Variant", *(title for title, _ in _COLUMNS.values()))
+    for heading, lines in _groups(report):
+        table.add_section()
+        table.add_row(Text(heading, style="bold"))
+        for cells in lines:
+            table.add_row(*map(Text, cells))  # Text: brackets are not markup
+    return table
+
+
+def markdown_table(report: dict[str, Any]) -> str:
+    """The same table in Markdown, ending with a newline."""
+    lines = [("Variant", *(title for title, _ in _COLUMNS.values())), ("---", *("---:" for _ in _COLUMNS))]
+    for heading, group in _groups(report):
+        lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _groups(report: dict[str, Any]) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
+    """Headings in order of first appearance, each with the cells of its lines."""
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for row in report["rows"]:
+        heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
+        cells = (_label(row), *(_cell(row[metric], digits) for metric, (_, digits) in _COLUMNS.items()))
+        groups.setdefault(heading, []).append(cells)
+    yield from groups.items()
+
+
+def _label(row: dict[str, Any]) -> str:
+    names = {
+        "random": "Random",
+        "baseline": f"{row['method']} (baseline)",
+        "layout": "+ w (layout)",
+        "tde": "+ w + TDE",
+        "stde": f"+ w + sTDE (eps={row['epsilon']})",
+    }
+    return names[row["variant"]] + (", paper form" if row["form"] == "paper" else "")
+
+
+def _cell(metric: dict[str, Any], digits: int) -> str:
+    low, high = metric["ci95"]
+    return f"{metric['mean']:.{digits}f} ± {metric['std']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def _to_report_units(metric: str, values: np.ndarray) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    highest = 1.0 if _SCALES[metric] == 100.0 else np.inf
+    if not ((values >= 0) & (values <= highest) & np.isfinite(values)).all():
+        unit = "metres, at least 0" if metric == "dts" else "fractions from 0 to 1"
+        raise InputError(f"{metric} holds NaN or values out of range; give {unit}")
+    return values * _SCALES[metric]
+
+
+def _plain(result: Summary) -> dict[str, Any]:
+    return {"mean": result.mean, "std": result.std, "ci95": list(result.ci95)}

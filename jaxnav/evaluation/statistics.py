@@ -1,0 +1,139 @@
+"""Means, spreads and confidence intervals of paired per-episode results.
+
+Results are arrays [S, E]: S training seeds, each evaluated on the same E episodes. Seeds and episodes are crossed, so
+an interval resamples both: "would another training run, on other episodes of these room types, agree?"
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxnav.errors import InputError
+
+#: Percentiles that bound a two-sided 95 % interval.
+_BOUNDS = (2.5, 97.5)
+
+
+class Summary(NamedTuple):
+    """A mean with its spread, all in the unit of the values.
+
+    Attributes:
+      mean: mean over seeds and episodes.
+      std: sample standard deviation (ddof = 1) over the S seed means, the "±" of published tables; 0 for one seed.
+      ci95: (low, high) of the 95 % percentile bootstrap interval of the mean.
+    """
+
+    mean: float
+    std: float
+    ci95: tuple[float, float]
+
+
+def summary(
+    values: np.ndarray, strata: np.ndarray, generator: np.random.Generator, resamples: int = 2000
+) -> Summary:
+    """Mean of per-episode results, with a stratified, crossed bootstrap interval.
+
+    A resample draws S seeds with replacement and, within each stratum, as many episodes with replacement as it holds;
+    all seeds share the episode draw (the pigeonhole bootstrap, Owen 2007, with strata). The interval thus includes
+    the variation between training runs, between episodes of a room type, and between single outcomes; it leaves out
+    the mix of room types, which is fixed. Two limits: S seeds give only (S - 1) / S of the between-seed variance
+    (none for one seed), so few seeds that differ much give too narrow an interval; independent outcome noise enters
+    through both draws, so seeds that differ little give too wide a one.
+
+    Args:
+      values: bool, int or float [S, E], finite.
+      strata: int [E], stratum (room type) of each episode.
+      generator: source of the resamples.
+      resamples: number of bootstrap resamples, at least 1.
+
+    Raises:
+      InputError: wrong or empty shapes, NaN or infinite values, or no resample.
+    """
+    values, strata = _checked("values", values, strata, resamples)
+    episodes = _episode_weights(strata, generator, resamples)
+    means = _resampled_means(values, episodes, _seed_weights(len(values), generator, resamples))
+    return _summarise(values.mean(), _std(values), means)
+
+
+def paired_difference(
+    a: np.ndarray,
+    b: np.ndarray,
+    strata: np.ndarray,
+    generator: np.random.Generator,
+    resamples: int = 2000,
+    same_seeds: bool = False,
+) -> Summary:
+    """Mean of `b - a` on the same episodes; both arms share every episode draw, so episode difficulty cancels.
+
+    Arms trained apart have nothing in common at equal seed indexes: by default their seeds are drawn independently and
+    `std` is sqrt(std_a^2 + std_b^2). With `same_seeds`, row s of both arms comes from the same network (sTDE against
+    no de-biasing): one draw of seeds serves both and `std` is that of the S differences of seed means.
+
+    Args:
+      a: bool, int or float [S, E], finite; the reference arm.
+      b: the same shape; the arm compared with it.
+      strata: int [E], stratum (room type) of each episode.
+      generator: source of the resamples.
+      resamples: number of bootstrap resamples, at least 1.
+      same_seeds: whether equal seed indexes mean the same network.
+
+    Raises:
+      InputError: as `summary`, or shapes of `a` and `b` that differ.
+    """
+    a, strata = _checked("a", a, strata, resamples)
+    b, _ = _checked("b", b, strata, resamples)
+    if a.shape != b.shape:
+        raise InputError(f"a {a.shape} and b {b.shape} differ in shape; evaluate both arms on the same seeds and episodes")
+    if same_seeds:
+        return summary(b - a, strata, generator, resamples)
+    episodes = _episode_weights(strata, generator, resamples)
+    means_a, means_b = (
+        _resampled_means(arm, episodes, _seed_weights(len(arm), generator, resamples)) for arm in (a, b)
+    )
+    return _summarise(b.mean() - a.mean(), np.hypot(_std(a), _std(b)), means_b - means_a)
+
+
+def _checked(name: str, values: np.ndarray, strata: np.ndarray, resamples: int) -> tuple[np.ndarray, np.ndarray]:
+    values, strata = np.asarray(values, np.float64), np.asarray(strata)
+    if values.ndim != 2 or values.size == 0:
+        raise InputError(f"{name} has shape {values.shape}; give [seeds, episodes] with at least one of each")
+    if strata.shape != values.shape[1:]:
+        raise InputError(f"strata has shape {strata.shape}; give one stratum for each of {values.shape[1]} episodes")
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} holds NaN or infinite results; give every episode a finite value")
+    if resamples < 1:
+        raise InputError(f"resamples is {resamples}; give at least 1")
+    return values, strata
+
+
+def _episode_weights(strata: np.ndarray, generator: np.random.Generator, resamples: int) -> np.ndarray:
+    """Weights [resamples, E], each row the share of draws that fell on each episode; strata keep their sizes."""
+    counts = np.zeros((resamples, len(strata)))
+    for stratum in np.unique(strata):
+        members = np.flatnonzero(strata == stratum)
+        counts[:, members] = _draw_counts(len(members), generator, resamples)
+    return counts / len(strata)
+
+
+def _seed_weights(seeds: int, generator: np.random.Generator, resamples: int) -> np.ndarray:
+    return _draw_counts(seeds, generator, resamples) / seeds
+
+
+def _draw_counts(size: int, generator: np.random.Generator, resamples: int) -> np.ndarray:
+    """How often each of `size` items comes up in `size` draws with replacement: int [resamples, size]."""
+    draws = generator.integers(size, size=(resamples, size))
+    draws += np.arange(resamples)[:, None] * size  # one block of bins for each resample
+    return np.bincount(draws.ravel(), minlength=resamples * size).reshape(resamples, size)
+
+
+def _resampled_means(values: np.ndarray, episodes: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    return np.einsum("rs,rs->r", seeds, episodes @ values.T)
+
+
+def _std(values: np.ndarray) -> float:
+    return float(values.mean(axis=1).std(ddof=1)) if len(values) > 1 else 0.0
+
+
+def _summarise(mean: float, std: float, resampled: np.ndarray) -> Summary:
+    low, high = np.percentile(resampled, _BOUNDS)
+    return Summary(float(mean), float(std), (float(low), float(high)))

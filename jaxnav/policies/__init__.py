@@ -1,0 +1,1 @@
+"""The three causal pathways, the ten methods and the recurrent decision."""

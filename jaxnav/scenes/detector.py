@@ -1,0 +1,82 @@
+"""The simulated object detector: how far it sees, and errors that are frozen per pose."""
+
+import dataclasses
+import zlib
+
+import numpy as np
+
+from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
+from jaxnav.scenes.sight import TAN_HALF_FIELD_OF_VIEW
+
+MIN_RANGE, MAX_RANGE = 1.5, 5.0
+SMALLEST_APPARENT_SIZE = 0.06
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    """Error rates of the detector, each in [0, 1].
+
+    Attributes:
+      miss_near: probability of missing an object right in front.
+      miss_far: probability of missing an object at the end of its range.
+      false_alarm: probability per pose and undetected category of reporting it all the same.
+      seed: draws the errors, together with the scene's name.
+    """
+
+    miss_near: float = 0.02
+    miss_far: float = 0.3
+    false_alarm: float = 0.005
+    seed: int = 0
+
+    def detect(
+        self, name: str, seen: np.ndarray, ahead: np.ndarray, right: np.ndarray, distance: np.ndarray, size: np.ndarray
+    ) -> np.ndarray:
+        """Detections of one scene with the detector's errors.
+
+        Args:
+          name: the scene's name; its errors do not depend on the other scenes of a bank.
+          seen: bool [P, K], whether a category is detected by a detector without errors.
+          ahead, right, distance, size: float [P, K], offsets, distance and size in metres of the nearest detected object.
+
+        Returns:
+          uint8 [P, K, 4]: confidence, ahead, right and apparent size, all 0 where nothing is detected.
+        """
+        generator = np.random.default_rng([self.seed, zlib.crc32(name.encode())])
+        chance, noise, place = generator.random((3, *seen.shape), dtype=np.float32)
+        nearness = np.clip(distance / detection_range(size), 0.0, 1.0)
+        missed = chance < self.miss_near + (self.miss_far - self.miss_near) * nearness**2
+        alarm = ~seen & (chance < self.false_alarm)
+        noisy = self.miss_near > 0 or self.miss_far > 0 or self.false_alarm > 0
+        confidence = 1.0 - 0.5 * nearness + (0.2 * (noise - 0.5) if noisy else 0.0)
+        confidence = np.where(alarm, 0.3 + 0.3 * noise, confidence)
+
+        # A false alarm stands uniformly in the triangle of the view cone, with an object's usual size.
+        alarm_ahead = MAX_RANGE * np.sqrt(place)
+        alarm_right = np.clip(alarm_ahead * TAN_HALF_FIELD_OF_VIEW * (2.0 * noise - 1.0), -MAX_RANGE, MAX_RANGE)
+        ahead, right = np.where(alarm, alarm_ahead, ahead), np.where(alarm, alarm_right, right)
+        apparent = np.where(alarm, 0.3, size) / np.maximum(np.hypot(ahead, right), 0.25)
+
+        reported = (seen & ~missed) | alarm
+        channels = (
+            np.maximum(np.rint(255.0 * np.clip(confidence, 0.0, 1.0)), 1.0),
+            np.rint(AHEAD_SCALE * ahead),
+            128.0 + np.rint(RIGHT_SCALE * right),
+            np.rint(SIZE_SCALE * apparent),
+        )
+        packed = np.clip(np.stack(channels, axis=-1), 0.0, 255.0)
+        return np.where(reported[..., None], packed, 0.0).astype(np.uint8)
+
+
+#: A detector that never errs.
+PERFECT = Detector(miss_near=0.0, miss_far=0.0, false_alarm=0.0)
+
+
+def object_size(boxes: np.ndarray) -> np.ndarray:
+    """Size in metres of boxes [N, 6]: root of the product of the two largest sides, float64 [N]."""
+    sides = np.sort(boxes[:, 3:], axis=1)
+    return np.sqrt(sides[:, 1] * sides[:, 2])
+
+
+def detection_range(size: np.ndarray) -> np.ndarray:
+    """Greatest distance in metres at which objects of a size in metres are detected."""
+    return np.clip(size / SMALLEST_APPARENT_SIZE, MIN_RANGE, MAX_RANGE)

@@ -1,0 +1,66 @@
+"""The packed byte row of one pose: what an agent perceives there, in as few bytes as it takes."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+VIEW_UNKNOWN, VIEW_FREE, VIEW_BLOCKED = range(3)
+#: Bytes per metre (ahead), per metre around 128 (right) and per unit of apparent size.
+AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE = 51.0, 25.4, 127.5
+
+
+@dataclasses.dataclass(frozen=True)
+class RowLayout:
+    """Where things stand in a row of uint8; works on NumPy and JAX arrays alike.
+
+    Attributes:
+      num_categories: K.
+      view: V, cells along each side of the ego-centric view.
+    """
+
+    num_categories: int
+    view: int = 11
+
+    @property
+    def num_bytes(self) -> int:
+        """Length of a row, padded to whole 32-byte lines."""
+        return -(-(self._view_at + -(-self.view * self.view // 4)) // 32) * 32
+
+    @property
+    def _found_at(self) -> int:
+        return 4 * self.num_categories
+
+    @property
+    def _view_at(self) -> int:
+        return self._found_at + -(-self.num_categories // 8)
+
+    def pack(self, detections: np.ndarray, found: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """Pack detections uint8 [P, K, 4], found bool [P, K] and view uint8 [P, V, V] into rows [P, num_bytes]."""
+        num_poses = len(found)
+        rows = np.zeros((num_poses, self.num_bytes), np.uint8)
+        rows[:, : self._found_at] = detections.reshape(num_poses, -1)
+        rows[:, self._found_at : self._view_at] = np.packbits(found, axis=1, bitorder="little")
+        cells = np.zeros((num_poses, -(-self.view * self.view // 4) * 4), np.uint8)
+        cells[:, : self.view * self.view] = view.reshape(num_poses, -1)
+        packed = (cells.reshape(num_poses, -1, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(axis=-1, dtype=np.uint8)
+        rows[:, self._view_at : self._view_at + packed.shape[1]] = packed
+        return rows
+
+    def detections(self, rows: Any) -> Any:
+        """Detections of rows uint8 [..., num_bytes]: uint8 [..., K, 4] confidence, ahead, right, size."""
+        return rows[..., : self._found_at].reshape(*rows.shape[:-1], self.num_categories, 4)
+
+    def presence(self, rows: Any) -> Any:
+        """Which categories are detected, bool [..., K]."""
+        return rows[..., 0 : self._found_at : 4] > 0
+
+    def view_cells(self, rows: Any) -> Any:
+        """The ego-centric view, uint8 [..., V * V], row 0 nearest to the agent, column 0 leftmost."""
+        packed = rows[..., self._view_at : self._view_at + -(-self.view * self.view // 4)]
+        cells = (packed[..., None] >> np.array([0, 2, 4, 6], np.uint8)) & np.uint8(3)
+        return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]
+
+    def found_at(self, goal: Any) -> tuple[Any, Any]:
+        """Byte of the row and bit of the byte (both int32) that say whether `goal` is found."""
+        return self._found_at + goal // 8, goal % 8

@@ -1,0 +1,1 @@
+"""Checkpoints, exported parameters and the run log."""

@@ -1,0 +1,1 @@
+"""Exploration for the layout prior, rollouts, losses and the learner."""

@@ -1,0 +1,73 @@
+"""The files around the code keep their promises: the lock, the Makefile, the README and the citation."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+# An absolute path of somebody's machine; `(` keeps this line itself from matching.
+MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|root|home|Users|tmp/venv)/")
+
+
+def _locked() -> dict[str, str]:
+    """Pinned version by distribution name, as the lock spells it."""
+    return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
+
+
+def _files() -> list[Path]:
+    """Every file git tracks or would add."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    try:
+        listing = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    return [path for name in listing.split("\0") if name and (path := ROOT / name).is_file()]
+
+
+@pytest.mark.parametrize("line", PROJECT["project"]["dependencies"] + PROJECT["dependency-groups"]["dev"])
+def test_lock_pins_a_version_that_satisfies(line: str) -> None:
+    requirement = Requirement(line)
+    assert _locked()[requirement.name] in requirement.specifier
+
+
+def test_lock_names_packages_only() -> None:
+    # Nothing but `name==version`, markers and hashes: no index, no URL, no local file.
+    for line in (ROOT / "requirements.lock").read_text().splitlines():
+        assert re.fullmatch(r"[a-z0-9-]+==\S+( ; [^\\]+)? \\| +--hash=sha256:[0-9a-f]{64}( \\)?", line), line
+
+
+def test_readme_commands_are_make_targets() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    # At the start of a line (a code block) or of a code span: prose such as "to make sure" does not count.
+    commands = set(re.findall(r"(?:^|`)(?:\$ )?make ([a-z-]+)", (ROOT / "README.md").read_text(), re.MULTILINE))
+    assert {"run", "test"} <= commands <= targets
+
+
+def test_citation_carries_the_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == PROJECT["project"]["version"]
+    assert citation["license"] == PROJECT["project"]["license"]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [("see /root/notes", True), ("'/home/ann/x'", True), ("https://site.org/home/x", False), ("runs/work/x", False)],
+)
+def test_machine_path_pattern(text: str, found: bool) -> None:
+    assert bool(MACHINE_PATH.search(text)) is found
+
+
+def test_no_machine_paths() -> None:
+    for path in _files():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:  # an image or an archive
+            continue
+        if path != Path(__file__):
+            assert not MACHINE_PATH.search(text), f"{path.relative_to(ROOT)} names a path of one machine"
