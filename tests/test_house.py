@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-# An absolute path of somebody's machine; `(` keeps this line itself from matching.
+# An absolute path of somebody's machine, not a part of an address or of a relative path.
 MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|root|home|Users|tmp/venv)/")
 
 

@@ -1,7 +1,7 @@
 """One ObjectNav episode in plain Python, written from docs/environment.md alone.
 
-It shares no arithmetic with the compiled environment: lines of sight are tested object by object with the separating axis
-theorem, and the best length is found by breadth-first search over poses.
+It shares no arithmetic with the compiled environment: lines of sight are tested object by object with the separating
+axis theorem, and the best length is found by breadth-first search over poses.
 """
 
 import math
@@ -227,7 +227,7 @@ class Twin:
         }
 
     def best_length(self) -> int | None:
-        """Number of actions, Done included, of the shortest successful episode from the start; None if there is none."""
+        """Number of actions, Done included, of the shortest successful episode from the start, or None."""
         length, queue = {self.start: 1}, deque([self.start])
         while queue:
             pose = queue.popleft()

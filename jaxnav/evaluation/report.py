@@ -7,7 +7,6 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,12 +20,13 @@ from jaxnav.evaluation.statistics import Summary, paired_difference, summary
 #: Version of the JSON layout.
 FORMAT = 1
 
+Metric = Literal["sr", "spl", "dts", "sae"]
 Variant = Literal["random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
 Form = Literal["residual", "paper"]
 
 #: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
-_SCALES = {"sr": 100.0, "spl": 100.0, "dts": 1.0, "sae": 100.0}
+_SCALES: dict[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0, "sae": 100.0}
 _BUCKETS = {"L>=1": 1, "L>=5": 5}
 _COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
 
@@ -71,8 +71,10 @@ def build_row(
         raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_SCALES)}")
     scaled = {name: _to_report_units(name, metrics[name]) for name in _SCALES}
     shape = scaled["sr"].shape
-    if any(values.shape != shape for values in scaled.values()) or best_lengths.shape != shape[1:] != strata.shape:
-        raise InputError("shapes differ; give every metric as [S, E], best_lengths and strata as [E]")
+    if len(shape) != 2 or {values.shape for values in scaled.values()} != {shape}:
+        raise InputError("metrics differ in shape; give each as [seeds, episodes]")
+    if best_lengths.shape != shape[1:] or strata.shape != shape[1:]:
+        raise InputError(f"best_lengths {best_lengths.shape} and strata {strata.shape} must have shape {shape[1:]}")
     if (best_lengths < 1).any():
         raise InputError("best_lengths holds values below 1; drop episodes whose goal no pose can see")
 
@@ -89,7 +91,7 @@ def build_row(
 
 
 def build_difference(
-    metric: str,
+    metric: Metric,
     reference: tuple[str, np.ndarray],
     compared: tuple[str, np.ndarray],
     *,
@@ -157,7 +159,7 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
 def console_table(report: dict[str, Any]) -> Table:
     """Table for a terminal: a line per row, `mean ± std [95 % interval]`, under a header per world, split, decoding."""
     table = Table("Variant", *(title for title, _ in _COLUMNS.values()))
-    for heading, lines in _groups(report):
+    for heading, lines in _groups(report).items():
         table.add_section()
         table.add_row(Text(heading, style="bold"))
         for cells in lines:
@@ -168,30 +170,34 @@ def console_table(report: dict[str, Any]) -> Table:
 def markdown_table(report: dict[str, Any]) -> str:
     """The same table in Markdown, ending with a newline."""
     lines = [("Variant", *(title for title, _ in _COLUMNS.values())), ("---", *("---:" for _ in _COLUMNS))]
-    for heading, group in _groups(report):
+    for heading, group in _groups(report).items():
         lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def _groups(report: dict[str, Any]) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
-    """Headings in order of first appearance, each with the cells of its lines."""
+def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
+    """Cells of the lines under each heading, in order of first appearance."""
     groups: dict[str, list[tuple[str, ...]]] = {}
     for row in report["rows"]:
         heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
         cells = (_label(row), *(_cell(row[metric], digits) for metric, (_, digits) in _COLUMNS.items()))
         groups.setdefault(heading, []).append(cells)
-    yield from groups.items()
+    return groups
 
 
 def _label(row: dict[str, Any]) -> str:
-    names = {
-        "random": "Random",
-        "baseline": f"{row['method']} (baseline)",
-        "layout": "+ w (layout)",
-        "tde": "+ w + TDE",
-        "stde": f"+ w + sTDE (eps={row['epsilon']})",
-    }
-    return names[row["variant"]] + (", paper form" if row["form"] == "paper" else "")
+    match row["variant"]:
+        case "random":
+            label = "Random"
+        case "baseline":
+            label = f"{row['method']} (baseline)"
+        case "layout":
+            label = "+ w (layout)"
+        case "tde":
+            label = "+ w + TDE"
+        case _:
+            label = f"+ w + sTDE (eps={row['epsilon']:g})"
+    return label + (", paper form" if row["form"] == "paper" else "")
 
 
 def _cell(metric: dict[str, Any], digits: int) -> str:
@@ -199,7 +205,7 @@ def _cell(metric: dict[str, Any], digits: int) -> str:
     return f"{metric['mean']:.{digits}f} ± {metric['std']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def _to_report_units(metric: str, values: np.ndarray) -> np.ndarray:
+def _to_report_units(metric: Metric, values: np.ndarray) -> np.ndarray:
     values = np.asarray(values, np.float64)
     highest = 1.0 if _SCALES[metric] == 100.0 else np.inf
     if not ((values >= 0) & (values <= highest) & np.isfinite(values)).all():

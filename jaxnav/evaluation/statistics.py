@@ -28,17 +28,17 @@ class Summary(NamedTuple):
     ci95: tuple[float, float]
 
 
-def summary(
-    values: np.ndarray, strata: np.ndarray, generator: np.random.Generator, resamples: int = 2000
-) -> Summary:
+def summary(values: np.ndarray, strata: np.ndarray, generator: np.random.Generator, resamples: int = 2000) -> Summary:
     """Mean of per-episode results, with a stratified, crossed bootstrap interval.
 
     A resample draws S seeds with replacement and, within each stratum, as many episodes with replacement as it holds;
     all seeds share the episode draw (the pigeonhole bootstrap, Owen 2007, with strata). The interval thus includes
     the variation between training runs, between episodes of a room type, and between single outcomes; it leaves out
-    the mix of room types, which is fixed. Two limits: S seeds give only (S - 1) / S of the between-seed variance
-    (none for one seed), so few seeds that differ much give too narrow an interval; independent outcome noise enters
-    through both draws, so seeds that differ little give too wide a one.
+    the mix of room types, which is fixed.
+
+    Two limits. S seeds show only (S - 1) / S of the between-seed variance (none for one seed), and outcome noise
+    enters through both draws. Simulated with S = 3, E = 1000 and yes/no outcomes, the interval covers 97-99 % where
+    seeds differ by up to 1.4 points (standard deviation), 91 % at 2.7 points and 78 % at 8 points.
 
     Args:
       values: bool, int or float [S, E], finite.
@@ -83,7 +83,9 @@ def paired_difference(
     a, strata = _checked("a", a, strata, resamples)
     b, _ = _checked("b", b, strata, resamples)
     if a.shape != b.shape:
-        raise InputError(f"a {a.shape} and b {b.shape} differ in shape; evaluate both arms on the same seeds and episodes")
+        raise InputError(
+            f"a {a.shape} and b {b.shape} differ in shape; evaluate both arms on the same seeds and episodes"
+        )
     if same_seeds:
         return summary(b - a, strata, generator, resamples)
     episodes = _episode_weights(strata, generator, resamples)

@@ -58,7 +58,8 @@ class RowLayout:
     def view_cells(self, rows: Any) -> Any:
         """The ego-centric view, uint8 [..., V * V], row 0 nearest to the agent, column 0 leftmost."""
         packed = rows[..., self._view_at : self._view_at + -(-self.view * self.view // 4)]
-        cells = (packed[..., None] >> np.array([0, 2, 4, 6], np.uint8)) & np.uint8(3)
+        shifts = np.array([0, 2, 4, 6], np.uint8).reshape((1,) * packed.ndim + (4,))
+        cells = (packed[..., None] >> shifts) & np.uint8(3)
         return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]
 
     def found_at(self, goal: Any) -> tuple[Any, Any]:

@@ -1,0 +1,94 @@
+"""Interventions and causal effects on a policy's logits: equations 1 and 2.
+
+The causal graph has three pathways into the action: scene, goal, and the experience that scene and goal produce.
+A counterfactual keeps the factual experience and replaces the other two: `do(pathways, scene=0, goal=0)`.
+"""
+
+from typing import Any, Literal, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+Form = Literal["paper", "residual"]
+Pathways = TypeVar("Pathways", bound=Any)
+
+
+def do(pathways: Pathways, **interventions: float) -> Pathways:
+    """Sets pathways to constants and leaves the others at their factual values: the do-operator.
+
+    Args:
+      pathways: a `NamedTuple` of arrays, such as (scene, goal, experience).
+      **interventions: field name = value; every element of the field becomes that value.
+
+    Returns:
+      The same type with the named fields replaced, shapes and dtypes kept.
+
+    Raises:
+      ValueError: a name is not a field of `pathways`.
+    """
+    for name in interventions:
+        if name not in pathways._fields:
+            raise ValueError(f"do({name}=...): no such pathway; choose from {', '.join(pathways._fields)}")
+    return pathways._replace(
+        **{name: jnp.full_like(getattr(pathways, name), value) for name, value in interventions.items()}
+    )
+
+
+def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
+    """Total direct effect (eq. 1): TDE = a - a_bar.
+
+    Args:
+      logits: float [..., A], factual logits a.
+      counterfactual: float [..., A], logits a_bar under `do(scene, goal)` with the factual experience.
+
+    Returns:
+      float [..., A].
+    """
+    return logits - counterfactual
+
+
+def remove_experience(
+    logits: jax.Array, counterfactual: jax.Array, weight: jax.Array, form: Form = "residual"
+) -> jax.Array:
+    """Subtracts the share `weight` of what experience alone would do; the constant weight 1 is hard removal.
+
+    Args:
+      logits: float [..., A], factual logits a.
+      counterfactual: float [..., A], counterfactual logits a_bar.
+      weight: float32 [...], s >= 0.
+      form: `paper`: a - s a_bar (s = 1 is `tde`); `residual`: (1 + s) a - s a_bar, which keeps the temperature of a.
+        The two rank actions alike when the paper's weight is s / (1 + s).
+
+    Returns:
+      float [..., A], bit-identical to `logits` where weight is 0.
+
+    Raises:
+      ValueError: unknown form.
+    """
+    if form not in ("paper", "residual"):
+        raise ValueError(f"form={form!r}: choose 'paper' or 'residual'")
+    s = weight[..., None].astype(logits.dtype)
+    combined = (logits if form == "paper" else (1 + s) * logits) - s * counterfactual
+    return jnp.where(s == 0, logits, combined)  # 0 * a_bar may still flip the sign of a zero
+
+
+def stde(
+    logits: jax.Array,
+    counterfactual: jax.Array,
+    gap: jax.Array,
+    epsilon: jax.Array | float,
+    form: Form = "residual",
+) -> jax.Array:
+    """Soft total direct effect (eq. 2): a - ReLU(D - epsilon) a_bar.
+
+    Args:
+      logits: float [..., A], factual logits a.
+      counterfactual: float [..., A], counterfactual logits a_bar.
+      gap: float32 [...], layout gap D in [0, 1].
+      epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
+      form: how the two are combined, see `remove_experience`.
+
+    Returns:
+      float [..., A].
+    """
+    return remove_experience(logits, counterfactual, jax.nn.relu(gap - epsilon), form)

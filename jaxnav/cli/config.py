@@ -1,0 +1,120 @@
+"""The settings of a run, from dataclass defaults, a YAML overlay and the command line, in this order."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from jaxnav.errors import InputError
+from jaxnav.policies.methods import METHODS
+from jaxnav.policies.spec import Sizes
+from jaxnav.scenes.detector import Detector
+from jaxnav.training.config import Counterfactual, PPOConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldConfig:
+    """How the scenes are made and how long episodes may last.
+
+    Attributes:
+      num_train, num_val, num_test: generated scenes of each split.
+      seed: of the generator.
+      train_step_limit: actions of a training episode.
+      step_limit: actions of an evaluation episode.
+      large_step_limit: the same in living rooms.
+    """
+
+    num_train: int = 80
+    num_val: int = 20
+    num_test: int = 20
+    seed: int = 0
+    train_step_limit: int = 30
+    step_limit: int = 100
+    large_step_limit: int = 200
+
+
+@dataclasses.dataclass(frozen=True)
+class LayoutConfig:
+    """How the layout is estimated.
+
+    Attributes:
+      setting: of the estimator.
+      walks, steps: random walks and their steps that collect the prior in the training scenes.
+    """
+
+    setting: Literal["paper", "released", "calibrated"] = "calibrated"
+    walks: int = 2048
+    steps: int = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """A training run.
+
+    Attributes:
+      run_dir: where everything the run makes is kept; training goes on where it stopped.
+      method: how experience is made.
+      world: generated world, unless `scenes` is given.
+      scenes: scene file to read instead; its splits are used.
+      seeds: policies trained of each kind.
+      total_steps: environment steps of each policy.
+      seed: of all randomness in training.
+      counterfactual: how the branch that counterfactual decisions use is trained.
+      chunk: updates per compiled call; between calls the run logs, and saves every `save_every` calls.
+      save_every: calls between checkpoints.
+    """
+
+    run_dir: Path = Path("runs/rooms")
+    method: str = "org"
+    world: Literal["rooms"] = "rooms"
+    scenes: Path | None = None
+    seeds: int = 3
+    total_steps: int = 4_000_000
+    seed: int = 0
+    counterfactual: Counterfactual = "distil"
+    chunk: int = 8
+    save_every: int = 4
+    worlds: WorldConfig = WorldConfig()
+    detector: Detector = Detector()
+    layout: LayoutConfig = LayoutConfig()
+    sizes: Sizes = Sizes()
+    ppo: PPOConfig = PPOConfig()
+
+
+def check(config: RunConfig) -> RunConfig:
+    """The same config, or an `InputError` that names the first impossible setting."""
+
+    def need(holds: bool, name: str, value: object, mend: str) -> None:
+        if not holds:
+            raise InputError(f"config: {name} is {value}; {mend}")
+
+    need(config.method in METHODS, "method", repr(config.method), f"choose one of {', '.join(METHODS)}")
+    for name in ("seeds", "total_steps", "chunk", "save_every"):
+        need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
+    for group in ("worlds", "layout", "sizes", "ppo"):
+        for field in dataclasses.fields(getattr(config, group)):
+            value = getattr(getattr(config, group), field.name)
+            if isinstance(value, int) and field.name != "seed":
+                need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
+    ppo, detector = config.ppo, config.detector
+    for name in ("miss_near", "miss_far", "false_alarm"):
+        value = getattr(detector, name)
+        need(0.0 <= value <= 1.0, f"detector.{name}", value, "give a probability from 0 to 1")
+    for name in ("gamma", "gae_lambda"):
+        need(0.0 <= getattr(ppo, name) <= 1.0, f"ppo.{name}", getattr(ppo, name), "give a number from 0 to 1")
+    for name in ("learning_rate", "clip", "max_grad_norm"):
+        need(0.0 < getattr(ppo, name) < float("inf"), f"ppo.{name}", getattr(ppo, name), "give a positive number")
+    for name in ("entropy", "value", "distil"):
+        need(0.0 <= getattr(ppo, name) < float("inf"), f"ppo.{name}", getattr(ppo, name), "give 0 or more")
+    need(
+        ppo.num_envs % ppo.minibatches == 0,
+        "ppo.num_envs",
+        ppo.num_envs,
+        f"give a multiple of ppo.minibatches ({ppo.minibatches})",
+    )
+    need(
+        ppo.rollout <= config.worlds.train_step_limit,
+        "ppo.rollout",
+        ppo.rollout,
+        f"give at most worlds.train_step_limit ({config.worlds.train_step_limit})",
+    )
+    return config

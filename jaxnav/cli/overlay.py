@@ -1,0 +1,157 @@
+"""A YAML file laid over a tree of frozen config dataclasses; only what the file names changes."""
+
+import dataclasses
+import difflib
+import math
+import reprlib
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union
+
+import yaml
+
+from jaxnav.errors import InputError
+
+Config = TypeVar("Config")
+
+
+def apply_yaml(default: Config, path: str | Path) -> Config:
+    """`default` with the values of a YAML file, each checked against the annotation of its field.
+
+    Known annotations: `bool`, `int`, `float`, `str`, `Literal`, `X | None`, `tuple`, nested dataclasses. Where a float
+    is expected, whole numbers and texts such as `3e-4` (which YAML 1.1 reads as text) are taken as floats.
+
+    Args:
+      default: instance of a frozen dataclass.
+      path: the YAML file; an empty one changes nothing.
+
+    Raises:
+      InputError: the file is missing or no YAML mapping, has a key twice, an unknown key or a value of another type;
+        names file, line or dotted key, and mend.
+    """
+    path = Path(path)
+    values = _load(path)
+    return default if values is None else _overlay(default, values, path, "")
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader, which would let the last of two equal keys win; this one refuses them."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.MarkedYAMLError(problem=f"{key.value} is given twice", problem_mark=key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _load(path: Path) -> Any:
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except yaml.MarkedYAMLError as error:
+        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise InputError(f"{path}{line}: not valid YAML ({error.problem}); mend the line") from error
+    except (
+        yaml.YAMLError,
+        ValueError,
+        RecursionError,
+    ) as error:  # bytes that are no text, impossible dates, deep nests
+        raise InputError(f"{path}: not valid YAML ({error}); mend the file") from error
+
+
+def _overlay(default: Any, values: Any, path: Path, prefix: str) -> Any:
+    if not isinstance(values, dict):
+        where = f"{prefix.rstrip('.')} " if prefix else ""
+        raise InputError(f"{path}: {where}holds {_found(values)}; give a mapping of names to values")
+    annotations = typing.get_type_hints(type(default))
+    names = [field.name for field in dataclasses.fields(default)]
+    changes = {}
+    for name, value in values.items():
+        key = f"{prefix}{name}"
+        if name not in names:
+            near = difflib.get_close_matches(str(name), names, n=1)
+            mend = f"did you mean {prefix}{near[0]}?" if near else f"known here are {', '.join(names)}"
+            raise InputError(f"{path}: unknown key {key}; {mend}")
+        if dataclasses.is_dataclass(current := getattr(default, name)):
+            changes[name] = _overlay(current, value, path, f"{key}.")
+            continue
+        try:
+            changes[name] = _convert(value, annotations[name])
+        except _Mismatch as error:
+            expected = _describe(annotations[name])
+            raise InputError(f"{path}: {key} must be {expected}, but is {_found(value)}; change the value") from error
+    return dataclasses.replace(default, **changes)
+
+
+class _Mismatch(Exception):
+    """The value does not fit the annotation."""
+
+
+def _convert(value: Any, annotation: Any) -> Any:
+    """The value as the annotated type, or `_Mismatch`."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (Union, types.UnionType):
+        for argument in arguments:
+            try:
+                return _convert(value, argument)
+            except _Mismatch:
+                continue
+    elif origin is Literal:
+        # By type too, since True == 1.
+        if any(type(value) is type(option) and value == option for option in arguments):
+            return value
+    elif origin is tuple:
+        return _convert_tuple(value, arguments)
+    elif annotation is float:
+        return _convert_float(value)
+    elif annotation in (bool, int, str, types.NoneType):
+        if type(value) is annotation:
+            return value
+    else:
+        raise TypeError(f"config fields of type {annotation!r} cannot be read from YAML")
+    raise _Mismatch
+
+
+def _convert_tuple(value: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise _Mismatch
+    if arguments[1:] == (Ellipsis,):
+        arguments = arguments[:1] * len(value)
+    if len(value) != len(arguments):
+        raise _Mismatch
+    return tuple(_convert(item, argument) for item, argument in zip(value, arguments, strict=True))
+
+
+def _convert_float(value: Any) -> float:
+    if type(value) not in (int, float, str):
+        raise _Mismatch
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        raise _Mismatch from None
+    if math.isnan(number):
+        raise _Mismatch
+    return number
+
+
+def _describe(annotation: Any) -> str:
+    """The annotation in words: `float or null`, `one of 'a', 'b'`, `a list of int`."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_describe, arguments))
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, arguments))}"
+    if origin is tuple and arguments[1:] == (Ellipsis,):
+        return f"a list of {_describe(arguments[0])}"
+    if origin is tuple:
+        return f"a list [{', '.join(map(_describe, arguments))}]"
+    return "null" if annotation is types.NoneType else annotation.__name__
+
+
+def _found(value: Any) -> str:
+    return "null" if value is None else f"{reprlib.repr(value)} ({type(value).__name__})"

@@ -1,0 +1,137 @@
+"""One ObjectNav episode as pure functions: reset, step and observe are integer arithmetic and gathers.
+
+Written for a single episode; batch with `jax.vmap`. The rules are those of docs/environment.md.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.env.types import EnvParams, Observation, State, StepResult, Tables
+from jaxnav.scenes.categories import ROOM_TYPES
+from jaxnav.scenes.compile import Bank
+from jaxnav.scenes.lattice import DONE, HORIZONS, NUM_ACTIONS, NUM_HEADINGS, POSES_PER_CELL
+from jaxnav.scenes.rows import RowLayout
+
+#: Index of the layout prior that all room types outside `ROOM_TYPES` share, and the number of priors.
+OTHER_ROOM = len(ROOM_TYPES)
+NUM_PRIORS = OTHER_ROOM + 1
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectNav:
+    """The environment; hashable, holds sizes and names only.
+
+    Attributes:
+      categories: [K] names of what can be sought.
+    """
+
+    categories: tuple[str, ...]
+
+    @property
+    def layout(self) -> RowLayout:
+        """Where things stand in an observation row."""
+        return RowLayout(len(self.categories))
+
+    @property
+    def num_actions(self) -> int:
+        """Size of the action space."""
+        return NUM_ACTIONS
+
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
+        """Start an episode: scene, goal among its possible ones, cell and heading, each uniform; horizon 0.
+
+        Args:
+          key: consumed.
+          params: the bank and its limits.
+        """
+        tables = params.tables
+        bits = jax.random.bits(key, (4,), jnp.uint32)
+
+        def below(i: int, count: jax.Array) -> jax.Array:
+            # Modulo of 32 random bits: the bias is under count / 2**32.
+            return (bits[i] % count.astype(jnp.uint32)).astype(jnp.int32)
+
+        scene = below(0, jnp.asarray(tables.num_goals.shape[0], jnp.int32))
+        goal = tables.goals[scene, below(1, tables.num_goals[scene])]
+        cell = tables.first_cell[scene] + below(2, tables.num_cells[scene])
+        heading = below(3, jnp.asarray(NUM_HEADINGS, jnp.int32))
+        pose = cell * POSES_PER_CELL + heading * len(HORIZONS)
+        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose))
+        return self.observe(state, params), state
+
+    def observe(self, state: State, params: EnvParams) -> Observation:
+        """What the agent perceives in a state."""
+        return Observation(row=params.tables.rows[state.pose], goal=state.goal)
+
+    def found(self, state: State, params: EnvParams) -> jax.Array:
+        """Whether Done would succeed here, bool []."""
+        byte, bit = self.layout.found_at(state.goal)
+        return (params.tables.rows[state.pose, byte] >> bit.astype(jnp.uint8)) & jnp.uint8(1) > 0
+
+    def advance(self, state: State, action: jax.Array, params: EnvParams) -> tuple[State, jax.Array, jax.Array, jax.Array]:
+        """Take an action, without reset.
+
+        Args:
+          state: the state.
+          action: int [], 0 to 5.
+          params: the bank and its limits.
+
+        Returns:
+          The next state, reward float32 [], terminated bool [] (Done was chosen) and truncated bool [] (the step limit
+          is reached without Done).
+        """
+        done = action == DONE
+        time = state.time + 1
+        reward = jnp.where(done & self.found(state, params), params.success_reward, params.step_reward)
+        truncated = ~done & (time >= params.step_limit[state.scene])
+        pose = params.tables.successor[state.pose, action]
+        return state.replace(pose=pose, time=time), reward, done, truncated
+
+    def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
+        """Take an action; an episode that ends is followed by a new one at once (same-step auto-reset).
+
+        Args:
+          key: consumed; used only if the episode ends.
+          state: the state.
+          action: int [], 0 to 5.
+          params: the bank and its limits.
+
+        Returns:
+          observation, state, reward, terminated, truncated, info. After an ending, observation and state are those of
+          the new episode; `info` tells of the episode that the action belongs to: `final_state` and `final_observation`
+          after the action, `success` bool [] and `length` int32 [] (actions so far).
+        """
+        last, reward, terminated, truncated = self.advance(state, action, params)
+        _, fresh = self.reset(key, params)
+        ended = terminated | truncated
+        state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, last)
+        info = {
+            "final_state": last,
+            "final_observation": self.observe(last, params),
+            "success": terminated & self.found(last, params),
+            "length": last.time,
+        }
+        return self.observe(state, params), state, reward, terminated, truncated, info
+
+
+def build(bank: Bank, step_limits: dict[str, int], default_limit: int) -> tuple[ObjectNav, EnvParams]:
+    """Environment and parameters of a compiled bank.
+
+    Args:
+      bank: the scenes.
+      step_limits: step limit by room type.
+      default_limit: step limit of the other room types.
+    """
+    rooms = [ROOM_TYPES.index(room) if room in ROOM_TYPES else OTHER_ROOM for room in bank.room_types]
+    limits = [step_limits.get(room, default_limit) for room in bank.room_types]
+    params = EnvParams(
+        tables=Tables(**{name: jnp.asarray(getattr(bank, name)) for name in Tables.__dataclass_fields__}),
+        room=jnp.asarray(np.array(rooms, np.int32)),
+        step_limit=jnp.asarray(np.array(limits, np.int32)),
+        success_reward=jnp.float32(5.0),
+        step_reward=jnp.float32(-0.01),
+    )
+    return ObjectNav(bank.categories), params

@@ -1,0 +1,74 @@
+"""The words of the environment: parameters, state and observation of one episode."""
+
+from typing import Any
+
+import jax
+from flax import struct
+
+from jaxnav.scenes.compile import Bank
+from jaxnav.scenes.rows import RowLayout
+
+
+class Tables(struct.PyTreeNode):
+    """A bank of scenes on the device; see `jaxnav.scenes.compile.Bank` for the shapes."""
+
+    successor: jax.Array
+    rows: jax.Array
+    best_length: jax.Array
+    goal_distance: jax.Array
+    first_cell: jax.Array
+    num_cells: jax.Array
+    goals: jax.Array
+    num_goals: jax.Array
+
+
+class EnvParams(struct.PyTreeNode):
+    """What may differ between two runs of the same compiled environment.
+
+    Attributes:
+      tables: the bank.
+      room: int32 [S], index of each scene's room type (it picks the layout prior).
+      step_limit: int32 [S], actions after which an episode of a scene is truncated.
+      success_reward: float32 [], reward of Done where the goal is found.
+      step_reward: float32 [], reward of every other action.
+    """
+
+    tables: Tables
+    room: jax.Array
+    step_limit: jax.Array
+    success_reward: jax.Array
+    step_reward: jax.Array
+
+
+class State(struct.PyTreeNode):
+    """One episode.
+
+    Attributes:
+      pose: int32 [], global pose index.
+      scene: int32 [], scene index.
+      goal: int32 [], category that is sought.
+      time: int32 [], actions taken so far.
+    """
+
+    pose: jax.Array
+    scene: jax.Array
+    goal: jax.Array
+    time: jax.Array
+
+
+class Observation(struct.PyTreeNode):
+    """What the agent perceives.
+
+    Attributes:
+      row: uint8 [R], the packed row of the pose (see `RowLayout`).
+      goal: int32 [], category that is sought.
+    """
+
+    row: jax.Array
+    goal: jax.Array
+
+
+#: reset and step return nested pytrees; `info` holds the last observation of the episode, its success and its length.
+StepResult = tuple[Observation, State, jax.Array, jax.Array, jax.Array, dict[str, Any]]
+
+__all__ = ["Bank", "EnvParams", "Observation", "RowLayout", "State", "StepResult", "Tables"]

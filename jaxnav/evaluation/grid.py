@@ -1,0 +1,179 @@
+"""Every variant, epsilon, decoding and seed over the same fixed episodes, in one compiled call."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxnav.causal import do, remove_experience
+from jaxnav.env.types import EnvParams, State
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.policies.acting import Acting, Agent, select
+from jaxnav.policies.pathways import Memory
+from jaxnav.policies.policy import Params, bind
+from jaxnav.policies.spec import PolicySpec
+from jaxnav.scenes.lattice import DONE, MOVE_AHEAD, POSES_PER_CELL
+
+
+class Inference(struct.PyTreeNode):
+    """How one set of parameters is used; leaves [] (or [C] for a grid of C).
+
+    The weight of the counterfactual logits is `always + relu(gap - epsilon)`: sTDE has always = 0, hard TDE always = 1 and
+    epsilon = inf, and no de-biasing always = 0 and epsilon = inf.
+
+    Attributes:
+      params: int32, index of the parameters.
+      epsilon: float32.
+      always: float32.
+      residual: bool, combine in the residual form rather than in the paper's.
+      layout: bool, multiply the layout's weights in; otherwise they are ones.
+      greedy: bool, take the best action rather than sample.
+      uniform: bool, ignore the policy and act at random.
+    """
+
+    params: jax.Array
+    epsilon: jax.Array
+    always: jax.Array
+    residual: jax.Array
+    layout: jax.Array
+    greedy: jax.Array
+    uniform: jax.Array
+
+
+class Outcome(NamedTuple):
+    """How episodes went; leaves [C, E].
+
+    Attributes:
+      success: bool.
+      length: int32, actions taken, Done included.
+      moves: int32, MoveAheads chosen.
+      distance: float32, metres from the last cell to the nearest goal object's centre.
+      weight: float32, mean weight of the counterfactual logits over the episode's steps.
+    """
+
+    success: jax.Array
+    length: jax.Array
+    moves: jax.Array
+    distance: jax.Array
+    weight: jax.Array
+
+
+class _Progress(NamedTuple):
+    agent: Agent
+    running: jax.Array
+    outcome: Outcome
+
+
+def evaluate_grid(
+    grid: Inference,
+    weights: Params,
+    episodes: EpisodeList,
+    acting: Acting,
+    spec: PolicySpec,
+    params: EnvParams,
+    priors: jax.Array,
+    key: jax.Array,
+) -> tuple[Outcome, int]:
+    """Run every cell of the grid over every episode, without auto-reset.
+
+    Args:
+      grid: leaves [C].
+      weights: parameters of all policies, leaves [N, ...].
+      episodes: E of them.
+      acting: environment and layout setting.
+      spec: sizes of the policies.
+      params: the environment's.
+      priors: float32 [rooms, K, K].
+      key: of sampled actions; episode e at time t uses `fold_in(fold_in(key, e), t)` in every cell.
+
+    Returns:
+      The outcomes [C, E] and the number of compilations that it took.
+    """
+    start = State(
+        pose=jnp.asarray(episodes.pose),
+        scene=jnp.asarray(episodes.scene),
+        goal=jnp.asarray(episodes.goal),
+        time=jnp.zeros(len(episodes.pose), jnp.int32),
+    )
+
+    def run(grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array) -> Outcome:
+        def one(cell: Inference) -> Outcome:
+            own = jax.tree.map(lambda leaf: leaf[cell.params], weights)
+            return _episodes(cell, own, start, acting, spec, params, priors, key)
+
+        return jax.lax.map(one, grid)
+
+    arguments = (grid, weights, start, params, priors, key)
+    compiled = jax.jit(run).lower(*arguments).compile()
+    return jax.tree.map(np.asarray, compiled(*arguments)), 1
+
+
+def _episodes(
+    cell: Inference,
+    weights: Params,
+    start: State,
+    acting: Acting,
+    spec: PolicySpec,
+    params: EnvParams,
+    priors: jax.Array,
+    key: jax.Array,
+) -> Outcome:
+    """Run one cell over all episodes until the last one has ended."""
+    policy = bind(spec, weights)
+    count = start.pose.shape
+    keys = jax.vmap(lambda episode: jax.random.fold_in(key, episode))(jnp.arange(*count))
+    layout = acting.believe(acting.first_belief(start, params, priors), start, params, priors)
+    agent = Agent(state=start, layout=layout, memory=policy.initial_memory(count))
+    outcome = Outcome(
+        success=jnp.zeros(count, bool),
+        length=jnp.zeros(count, jnp.int32),
+        moves=jnp.zeros(count, jnp.int32),
+        distance=jnp.zeros(count),
+        weight=jnp.zeros(count),
+    )
+
+    def step(progress: _Progress) -> _Progress:
+        agent, running, outcome = progress
+        logits, hidden, weight = _logits(cell, policy, agent, acting, params)
+        now = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
+        sampled = jax.vmap(jax.random.categorical)(now, logits)
+        action = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
+        found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
+        state, _, terminated, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
+        memory = Memory(hidden=hidden, action=action)
+        following = Agent(state=state, layout=acting.believe(agent.layout, state, params, priors), memory=memory)
+        outcome = Outcome(
+            success=outcome.success | (running & found & (action == DONE)),
+            length=outcome.length + running,
+            moves=outcome.moves + (running & (action == MOVE_AHEAD)),
+            distance=outcome.distance,
+            weight=outcome.weight + jnp.where(running, weight, 0.0),
+        )
+        return _Progress(select(running, following, agent), running & ~(terminated | truncated), outcome)
+
+    begin = _Progress(agent, jnp.ones(count, bool), outcome)
+    end = jax.lax.while_loop(lambda progress: progress.running.any(), step, begin)
+    last = end.agent.state
+    return end.outcome._replace(
+        distance=params.tables.goal_distance[last.pose // POSES_PER_CELL, last.goal],
+        weight=end.outcome.weight / end.outcome.length.astype(jnp.float32),
+    )
+
+
+def _logits(
+    cell: Inference, policy: object, agent: Agent, acting: Acting, params: EnvParams
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Logits [E, A] with experience taken out, the factual recurrent state [E, H] and the weight [E]."""
+    observation, layout_weights = acting.observe(agent, params)
+    layout_weights = jnp.where(cell.layout, layout_weights, 1.0)
+    pathways = policy.pathways(observation, layout_weights)
+    factual = policy.decide(pathways, agent.memory)
+    counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
+    weight = cell.always + jax.nn.relu(agent.layout.gap - cell.epsilon)
+    residual, paper = (
+        remove_experience(factual.logits, counterfactual.logits, weight, form) for form in ("residual", "paper")
+    )
+    logits = jnp.where(cell.residual, residual, paper)
+    return jnp.where(cell.uniform, 0.0, logits), factual.hidden, weight

@@ -1,0 +1,46 @@
+"""From a packed observation row to numbers a network reads."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, VIEW_BLOCKED, VIEW_FREE, RowLayout
+
+NUM_FEATURES = 9  # per category, the goal flag included
+_REACH = 5.0  # metres; scales the offsets to about 1
+
+
+class Features(NamedTuple):
+    """What the networks see of an observation.
+
+    Attributes:
+      view: float32 [..., 2 V V], standable and not standable cells of the ego-centric view.
+      visible: float32 [..., K], 1 where a category is detected.
+      table: float32 [..., K, 9]: visible, confidence, ahead / 5 m, right / 5 m, distance / 5 m, sine and cosine of the bearing,
+        apparent size, and whether it is the goal. Only the last is non-zero for categories that are not detected.
+      goal: float32 [..., K], one-hot.
+    """
+
+    view: jax.Array
+    visible: jax.Array
+    table: jax.Array
+    goal: jax.Array
+
+
+def features(row: jax.Array, goal: jax.Array, layout: RowLayout) -> Features:
+    """Unpack rows uint8 [..., R] and goals int [...]."""
+    cells = layout.view_cells(row)
+    view = jnp.concatenate([cells == VIEW_FREE, cells == VIEW_BLOCKED], axis=-1).astype(jnp.float32)
+    confidence, ahead, right, size = jnp.moveaxis(layout.detections(row).astype(jnp.float32), -1, 0)
+    visible = (confidence > 0).astype(jnp.float32)
+    ahead = ahead / (AHEAD_SCALE * _REACH)
+    right = (right - 128.0) / (RIGHT_SCALE * _REACH)
+    distance = jnp.sqrt(ahead**2 + right**2)
+    scale = 1.0 / jnp.maximum(distance, 0.01)
+    one_hot = jax.nn.one_hot(goal, layout.num_categories, dtype=jnp.float32)
+    seen = jnp.stack(
+        [visible, confidence / 255.0, ahead, right, distance, right * scale, ahead * scale, size / SIZE_SCALE], axis=-1
+    )
+    table = jnp.concatenate([seen * visible[..., None], one_hot[..., None]], axis=-1)
+    return Features(view=view, visible=visible, table=table, goal=one_hot)

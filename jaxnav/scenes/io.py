@@ -1,0 +1,247 @@
+"""Reading and writing scene files; `docs/scene_format.md` is the contract."""
+
+import dataclasses
+import gzip
+import json
+import reprlib
+import zlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.store.files import write_atomic
+
+_SPLITS = ("train", "val", "test")
+_POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
+_REQUIRED = ("type", *_POSITION, *_SIZE)
+_COLUMNS = (*_REQUIRED, "yaw", "parent")
+_LIMIT = 1e6  # metres; a coordinate beyond it is a mistake
+_SNAP = 0.02  # metres that an origin may be off the lattice
+_WALL_DISTANCE = 3  # cells
+_BOX_DISTANCE = 0.25 + 1e-9  # metres
+
+
+def read_scenes(path: str | Path) -> list[Scene]:
+    """Reads a scene file.
+
+    Cells of `episode_starts` count as standable; `walls` are derived where the file has none (`derive_walls`). An
+    object whose x, y and z are all null is left out, and what rests on it rests on nothing.
+
+    Args:
+      path: a `*.jsonl.gz` file.
+
+    Returns:
+      The scenes in the order of the file, at least one.
+
+    Raises:
+      InputError: the file is missing, damaged or empty, or a field is missing or wrong; names file, line, scene, field
+        and mend.
+    """
+    path = Path(path)
+    scenes: list[Scene] = []
+    lines: dict[str, int] = {}
+    for line, text in enumerate(_read_lines(path), start=1):
+        record = _parse(path, line, text)
+        scene = _scene(record)
+        if scene.name in lines:
+            raise record.error("name", f"is that of line {lines[scene.name]} too; make it unique")
+        lines[scene.name] = line
+        scenes.append(scene)
+    if not scenes:
+        raise InputError(f"{path}: holds no scene; write one JSON object per line")
+    return scenes
+
+
+def write_scenes(path: str | Path, scenes: Iterable[Scene]) -> None:
+    """Writes a scene file whole or not at all; equal scenes give equal bytes.
+
+    Raises:
+      ValueError: a number is NaN or infinite.
+    """
+    lines = [json.dumps(_fields(scene), allow_nan=False, separators=(",", ":")) + "\n" for scene in scenes]
+    write_atomic(Path(path), gzip.compress("".join(lines).encode(), mtime=0))
+
+
+def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarray) -> np.ndarray:
+    """Walls of a scene without them: the cells that can be neither floor nor furniture.
+
+    Args:
+      reach: bool [nz, nx], standable cells.
+      origin: world (x, z) in metres of the centre of cell [0, 0].
+      boxes: float [N, 6], centre and full size of the objects in metres.
+
+    Returns:
+      bool [nz, nx], True where every standable cell is three or more cells away in x or in z, and every box more than
+      0.25 m (horizontally) from the cell's centre.
+    """
+    reachable = _WALL_DISTANCE - 1
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(reach, reachable), (2 * reachable + 1,) * 2)
+    x = origin[0] + CELL * np.arange(reach.shape[1])
+    z = origin[1] + CELL * np.arange(reach.shape[0])
+    dx = np.maximum(np.abs(x[:, None] - boxes[:, 0]) - boxes[:, 3] / 2, 0.0)  # [nx, N]
+    dz = np.maximum(np.abs(z[:, None] - boxes[:, 2]) - boxes[:, 5] / 2, 0.0)  # [nz, N]
+    near_box = (np.hypot(dz[:, None], dx[None]) <= _BOX_DISTANCE).any(axis=-1)
+    return ~windows.any(axis=(2, 3)) & ~near_box
+
+
+@dataclasses.dataclass(frozen=True)
+class _Record:
+    """The fields of one line, and where they stand for the messages."""
+
+    path: Path
+    line: int
+    fields: dict[str, Any]
+
+    def error(self, field: str, problem: str) -> InputError:
+        name = reprlib.repr(self.fields.get("name", "(no name)"))
+        return InputError(f"{self.path}, line {self.line}, scene {name}: {field} {problem}")
+
+    def get(self, field: str) -> Any:
+        if field not in self.fields:
+            raise self.error(field, "is missing; add it")
+        return self.fields[field]
+
+    def text(self, field: str, value: Any) -> str:
+        if not isinstance(value, str) or not value:
+            raise self.error(field, f"is {reprlib.repr(value)}; give a text")
+        return value
+
+    def number(self, field: str, value: Any) -> float:
+        if value is None:
+            raise self.error(field, "is null; give the number or leave the object out")
+        if type(value) not in (int, float) or not abs(value) <= _LIMIT:  # also refuses NaN
+            raise self.error(field, f"is {reprlib.repr(value)}; give a finite number, at most {_LIMIT:g}")
+        return float(value)
+
+    def sequence(self, field: str, value: Any, length: int | None = None) -> list[Any]:
+        if not isinstance(value, list) or length not in (None, len(value)):
+            expected = "a list" if length is None else f"a list of {length}"
+            raise self.error(field, f"is {reprlib.repr(value)}; give {expected}")
+        return value
+
+
+def _read_lines(path: Path) -> list[bytes]:
+    try:
+        with gzip.open(path) as file:
+            return file.read().splitlines()
+    except gzip.BadGzipFile as error:
+        raise InputError(f"{path}: is not gzip-compressed ({error}); compress it with gzip") from error
+    except (EOFError, zlib.error) as error:
+        raise InputError(f"{path}: is cut short or damaged ({error}); fetch or write it again") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+
+
+def _parse(path: Path, line: int, text: bytes) -> _Record:
+    try:
+        fields = json.loads(text.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}, line {line}: not JSON ({error}); write one JSON object per line") from error
+    if not isinstance(fields, dict):
+        raise InputError(f"{path}, line {line}: {reprlib.repr(fields)} is no scene; write one JSON object per line")
+    return _Record(path, line, fields)
+
+
+def _scene(record: _Record) -> Scene:
+    name, world, room_type, split = (
+        record.text(field, record.get(field)) for field in ("name", "world", "room_type", "split")
+    )
+    if split not in _SPLITS:
+        raise record.error("split", f"is {split!r}; give one of {', '.join(_SPLITS)}")
+    if record.get("cell") != CELL:
+        raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL} is known")
+    origin = _origin(record)
+    shape = record.sequence("shape", record.get("shape"), 2)
+    if not all(type(n) is int and n > 0 for n in shape):
+        raise record.error("shape", f"is {reprlib.repr(shape)}; give two positive whole numbers [nz, nx]")
+    reach = _mask(record, "reach", shape)
+    if "episode_starts" in record.fields:
+        reach |= _mask(record, "episode_starts", shape)
+    if not reach.any():
+        raise record.error("reach", "has no standable cell; mark at least one with '.'")
+    types, boxes, yaws, parents = _objects(record)
+    walls = ~_mask(record, "walls", shape) if "walls" in record.fields else derive_walls(reach, origin, boxes)
+    return Scene(name, world, room_type, split, origin, reach, walls, types, boxes, yaws, parents)
+
+
+def _origin(record: _Record) -> tuple[float, float]:
+    x, z = (record.number("origin", v) for v in record.sequence("origin", record.get("origin"), 2))
+    snapped = (round(x / CELL) * CELL, round(z / CELL) * CELL)
+    if max(abs(x - snapped[0]), abs(z - snapped[1])) > _SNAP:
+        raise record.error("origin", f"is [{x}, {z}]; both must be multiples of {CELL} (within {_SNAP})")
+    return snapped
+
+
+def _mask(record: _Record, field: str, shape: Sequence[int]) -> np.ndarray:
+    """Bool [nz, nx], True where the mask has '.'."""
+    rows = record.sequence(field, record.get(field), shape[0])
+    for i, row in enumerate(rows):
+        if not isinstance(row, str) or len(row) != shape[1] or not set(row) <= {".", "#"}:
+            raise record.error(f"{field}[{i}]", f"is {reprlib.repr(row)}; give {shape[1]} characters '.' or '#'")
+    return np.array([[character == "." for character in row] for row in rows])
+
+
+def _objects(record: _Record) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+    columns = record.sequence("columns", record.get("columns"))
+    if not all(isinstance(c, str) for c in columns) or len(set(columns)) < len(columns):
+        raise record.error("columns", f"is {reprlib.repr(columns)}; give names, each once")
+    if missing := [column for column in _REQUIRED if column not in columns]:
+        raise record.error("columns", f"lacks {', '.join(missing)}; add it")
+    rows = [
+        dict(zip(columns, record.sequence(f"objects[{i}]", values, len(columns)), strict=True))
+        for i, values in enumerate(record.sequence("objects", record.get("objects")))
+    ]
+    placed = [i for i, row in enumerate(rows) if any(row[column] is not None for column in _POSITION)]
+    new_index = {old: new for new, old in enumerate(placed)}
+    types, boxes, yaws, parents = [], [], [], []
+    for i in placed:
+        row = {"yaw": 0.0, "parent": -1} | rows[i]
+        types.append(record.text(f"objects[{i}].type", row["type"]))
+        boxes.append(_box(record, i, row))
+        yaws.append(record.number(f"objects[{i}].yaw", row["yaw"]))
+        parents.append(new_index.get(_parent(record, i, row["parent"], len(rows)), -1))
+    return (
+        tuple(types),
+        np.array(boxes, np.float64).reshape(-1, 6),
+        np.array(yaws, np.float64),
+        np.array(parents, np.int64),
+    )
+
+
+def _box(record: _Record, i: int, row: dict[str, Any]) -> list[float]:
+    box = [record.number(f"objects[{i}].{column}", row[column]) for column in (*_POSITION, *_SIZE)]
+    for column, size in zip(_SIZE, box[3:], strict=True):
+        if size < 0:
+            raise record.error(f"objects[{i}].{column}", f"is {size}; a size is at least 0")
+    return box
+
+
+def _parent(record: _Record, i: int, value: Any, count: int) -> int:
+    if type(value) is not int or not -1 <= value < count or value == i:
+        raise record.error(f"objects[{i}].parent", f"is {reprlib.repr(value)}; give the index of another object or -1")
+    return value
+
+
+def _fields(scene: Scene) -> dict[str, Any]:
+    rows = zip(scene.types, scene.boxes.tolist(), scene.yaws.tolist(), scene.parents.tolist(), strict=True)
+    return {
+        "name": scene.name,
+        "world": scene.world,
+        "room_type": scene.room_type,
+        "split": scene.split,
+        "cell": CELL,
+        "origin": list(scene.origin),
+        "shape": list(scene.reach.shape),
+        "reach": _text(scene.reach),
+        "walls": _text(~scene.walls),
+        "columns": list(_COLUMNS),
+        "objects": [[kind, *box, yaw, parent] for kind, box, yaw, parent in rows],
+    }
+
+
+def _text(mask: np.ndarray) -> list[str]:
+    return ["".join("." if free else "#" for free in row) for row in mask]

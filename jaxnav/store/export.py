@@ -1,0 +1,87 @@
+"""Exported parameters: a folder with `params.safetensors` and `policy.json`, readable with NumPy and safetensors."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+
+from jaxnav.errors import InputError
+from jaxnav.store.files import write_atomic
+
+#: Version of the layout of the two files.
+FORMAT_VERSION = 1
+
+_PARAMS, _POLICY = "params.safetensors", "policy.json"
+
+
+def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
+    """Writes parameters and what is needed to build the policy around them; replaces an earlier export.
+
+    `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, `spec` and the SHA-256 of the
+    parameters; it is written last, so an export cut short is refused by `load_params` instead of being mixed.
+
+    Args:
+      folder: made if missing.
+      params: nested dict of arrays; names are strings without `/`.
+      spec: JSON values.
+
+    Raises:
+      TypeError: a name in `params` is no string or holds `/`.
+    """
+    tensors = safetensors.numpy.save(_flatten(params))
+    policy = {"format_version": FORMAT_VERSION, "params_sha256": hashlib.sha256(tensors).hexdigest(), "spec": spec}
+    text = json.dumps(policy, indent=2) + "\n"
+    write_atomic(folder / _PARAMS, tensors)
+    write_atomic(folder / _POLICY, text.encode())
+
+
+def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The parameters, a nested dict of NumPy arrays, and the spec of an export.
+
+    Raises:
+      InputError: no export there, another format version, or files that do not belong together.
+    """
+    try:
+        policy = json.loads((folder / _POLICY).read_bytes())
+        tensors = (folder / _PARAMS).read_bytes()
+    except OSError as error:
+        raise InputError(f"{folder}: not an exported policy ({error.strerror}: {error.filename}); export it") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{folder / _POLICY}: not JSON ({error}); export the policy again") from error
+    if not isinstance(policy, dict) or not {"format_version", "params_sha256", "spec"} <= policy.keys():
+        raise InputError(f"{folder / _POLICY}: lacks format_version, params_sha256 or spec; export the policy again")
+    if policy["format_version"] != FORMAT_VERSION:
+        raise InputError(
+            f"{folder / _POLICY}: has format version {policy['format_version']!r}, this code reads version "
+            f"{FORMAT_VERSION}; export the policy again"
+        )
+    if hashlib.sha256(tensors).hexdigest() != policy["params_sha256"]:
+        raise InputError(f"{folder / _PARAMS}: does not belong to {_POLICY} or is damaged; export the policy again")
+    return _unflatten(safetensors.numpy.load(tensors)), policy["spec"]
+
+
+def _flatten(params: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+    flat = {}
+    for name, value in params.items():
+        if not isinstance(name, str) or "/" in name:
+            raise TypeError(f"parameter name {name!r} under {prefix!r} must be a string without '/'")
+        if isinstance(value, Mapping):
+            flat |= _flatten(value, f"{prefix}{name}/")
+        else:
+            flat[f"{prefix}{name}"] = np.asarray(value, order="C")
+    return flat
+
+
+def _unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    params: dict[str, Any] = {}
+    for name, value in flat.items():
+        *folders, leaf = name.split("/")
+        node = params
+        for part in folders:
+            node = node.setdefault(part, {})
+        node[leaf] = value
+    return params

@@ -1,0 +1,69 @@
+"""What can be set about learning."""
+
+import dataclasses
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Recurrent PPO.
+
+    Attributes:
+      num_envs: parallel episodes of each seed.
+      rollout: steps of every episode between two updates; at most the shortest step limit.
+      epochs: passes over a rollout.
+      minibatches: parts of a pass, split over episodes.
+      learning_rate: of Adam at the start; falls linearly to 0.
+      gamma: discount.
+      gae_lambda: of generalised advantage estimation.
+      clip: of the probability ratio.
+      entropy: weight of the entropy bonus.
+      value: weight of the value loss.
+      max_grad_norm: global norm to which gradients are clipped.
+      distil: weight of the counterfactual branch's loss where it is distilled.
+    """
+
+    num_envs: int = 512
+    rollout: int = 30
+    epochs: int = 2
+    minibatches: int = 4
+    learning_rate: float = 1e-3
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    entropy: float = 0.01
+    value: float = 0.5
+    max_grad_norm: float = 0.5
+    distil: float = 0.5
+
+    def num_updates(self, total_steps: int) -> int:
+        """Updates that `total_steps` environment steps of a seed take, rounded up."""
+        return -(-total_steps // (self.num_envs * self.rollout))
+
+    def scalars(self, total_steps: int) -> "PPOScalars":
+        """The traced part."""
+        names = [name for name in PPOScalars.__dataclass_fields__ if name != "num_updates"]
+        settings = {name: jnp.float32(getattr(self, name)) for name in names}
+        return PPOScalars(**settings, num_updates=jnp.float32(self.num_updates(total_steps)))
+
+
+class PPOScalars(struct.PyTreeNode):
+    """The settings that may change without compiling anew; float32 [] each, see `PPOConfig`."""
+
+    learning_rate: jax.Array
+    gamma: jax.Array
+    gae_lambda: jax.Array
+    clip: jax.Array
+    entropy: jax.Array
+    value: jax.Array
+    distil: jax.Array
+    num_updates: jax.Array
+
+
+#: How the branch that a counterfactual decision uses is trained: not at all (the paper's text), by zeroing both direct
+#: pathways with a fair coin (the released code), or by matching the factual policy beside the rollout.
+Counterfactual = Literal["none", "coin", "distil"]

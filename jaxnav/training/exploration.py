@@ -1,0 +1,63 @@
+"""The experience that the layout prior is made of: a random agent walks the training scenes."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
+from jaxnav.env.types import EnvParams, State
+from jaxnav.scenes.lattice import DONE, POSES_PER_CELL
+
+
+class Exploration(NamedTuple):
+    """What the random agent found.
+
+    Attributes:
+      counts: float32 [rooms, K, K], poses at which two categories were detected together, by room type; starts at
+        one off the diagonal (the all-ones Dirichlet).
+      steps: int32 [], steps taken.
+      poses: int32 [], distinct poses seen.
+    """
+
+    counts: jax.Array
+    steps: jax.Array
+    poses: jax.Array
+
+
+def explore(
+    env: ObjectNav, params: EnvParams, key: jax.Array, num_walks: int = 2048, num_steps: int = 100
+) -> Exploration:
+    """Count what is detected together along random walks without Done, each pose once (paper, section 3.3, stage i).
+
+    Args:
+      env: the environment.
+      params: of the training scenes.
+      key: consumed.
+      num_walks: parallel walks.
+      num_steps: steps of each.
+    """
+    start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
+    _, state = jax.vmap(env.reset, (0, None))(jax.random.split(start_key, num_walks), params)
+    actions = jax.random.randint(walk_key, (num_steps, num_walks), 0, DONE)
+
+    def step(carry: tuple[State, jax.Array], action: jax.Array) -> tuple[tuple[State, jax.Array], None]:
+        state, seen = carry
+        state, *_ = jax.vmap(env.advance, (0, 0, None))(state, action, params)
+        return (state, seen.at[state.pose].set(True)), None
+
+    seen = jnp.zeros(params.tables.rows.shape[0], bool).at[state.pose].set(True)
+    (_, seen), _ = jax.lax.scan(step, (state, seen), actions)
+
+    presence = (env.layout.presence(params.tables.rows) & seen[:, None]).astype(jnp.float32)
+    scene = jnp.repeat(
+        jnp.arange(len(params.room)), params.tables.num_cells * POSES_PER_CELL, total_repeat_length=len(seen)
+    )
+    room = jax.nn.one_hot(params.room[scene], NUM_PRIORS, dtype=jnp.float32)
+    together = jnp.einsum("pr,pi,pj->rij", room, presence, presence, optimize="optimal")
+    off_diagonal = 1.0 - jnp.eye(presence.shape[-1])
+    return Exploration(
+        counts=(together + 1.0) * off_diagonal[None],
+        steps=jnp.int32(num_walks * num_steps),
+        poses=seen.sum(dtype=jnp.int32),
+    )

@@ -1,0 +1,147 @@
+"""The learner: everything that changes between two updates, and chunks of updates as one compiled call."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxnav.env.types import EnvParams
+from jaxnav.policies.acting import Acting, Agent
+from jaxnav.policies.policy import Params, bind, init_params
+from jaxnav.policies.spec import PolicySpec
+from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
+from jaxnav.training.losses import advantages, ppo_loss
+from jaxnav.training.rollout import Transition, rollout
+
+_INIT, _START, _UPDATES = range(3)  # purposes of a seed's keys
+_ROLLOUT, _SHUFFLE = range(2)  # purposes of an update's keys
+
+
+class LearnerState(struct.PyTreeNode):
+    """One seed of a run.
+
+    Attributes:
+      params: of the policy.
+      optimizer: state of the optimizer.
+      agent: the parallel episodes, [B].
+      key: typed PRNG key []; update u uses `fold_in(key, u)`.
+      update: int32 [], updates done.
+    """
+
+    params: Params
+    optimizer: Any
+    agent: Agent
+    key: jax.Array
+    update: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """What stays the same during a run and is compiled in.
+
+    Attributes:
+      acting: how the episodes are acted.
+      spec: sizes of the policy.
+      config: of PPO; its scalars are traced, so only the sizes matter here.
+      counterfactual: how the counterfactual branch is trained.
+    """
+
+    acting: Acting
+    spec: PolicySpec
+    config: PPOConfig
+    counterfactual: Counterfactual
+
+    @property
+    def _optimizer(self) -> optax.GradientTransformation:
+        # An update whose gradient is not finite is skipped and counted.
+        chain = optax.chain(optax.clip_by_global_norm(self.config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+        return optax.apply_if_finite(chain, max_consecutive_errors=2**30)
+
+    def init(self, key: jax.Array, params: EnvParams, priors: jax.Array) -> LearnerState:
+        """A seed before its first update; the key is consumed."""
+        init_key, start_key, update_key = (jax.random.fold_in(key, purpose) for purpose in (_INIT, _START, _UPDATES))
+        weights = init_params(self.spec, init_key)
+        agent = self.acting.start(start_key, self.config.num_envs, bind(self.spec, weights), params, priors)
+        return LearnerState(
+            params=weights,
+            optimizer=self._optimizer.init(weights),
+            agent=agent,
+            key=update_key,
+            update=jnp.int32(0),
+        )
+
+    def train(
+        self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array, num_updates: int
+    ) -> tuple[LearnerState, dict[str, jax.Array]]:
+        """Do some updates; metrics are their float32 [] means (episode statistics over the episodes that ended)."""
+        def step(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, jax.Array]]:
+            return self.update(state, scalars, params, priors)
+
+        state, metrics = jax.lax.scan(step, state, None, length=num_updates)
+        sums = {name: value.sum() for name, value in metrics.items()}
+        episodes = jnp.maximum(sums.pop("episodes"), 1.0)
+        per_episode = {name: sums.pop(name) / episodes for name in ("success", "return", "length", "truncated")}
+        return state, per_episode | {name: value / num_updates for name, value in sums.items()} | {"episodes": episodes}
+
+    def update(
+        self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array
+    ) -> tuple[LearnerState, dict[str, jax.Array]]:
+        """Roll out once and learn from it for some epochs."""
+        key = jax.random.fold_in(state.key, state.update)
+        rollout_key, shuffle_key = (jax.random.fold_in(key, purpose) for purpose in (_ROLLOUT, _SHUFFLE))
+        config, memory = self.config, state.agent.memory
+        policy = bind(self.spec, state.params)
+        agent, transitions, following = rollout(
+            self.acting, policy, state.agent, rollout_key, config.rollout, self.counterfactual == "coin", params, priors
+        )
+        ended = transitions.terminated | transitions.truncated
+        advantage = advantages(
+            transitions.reward, transitions.value, following, ended, scalars.gamma, scalars.gae_lambda
+        )
+        rate = scalars.learning_rate * (1.0 - state.update.astype(jnp.float32) / scalars.num_updates)
+
+        def loss(weights: Params, part: tuple[Any, ...]) -> tuple[jax.Array, dict[str, jax.Array]]:
+            transitions, memory, advantage = part
+            policy = bind(self.spec, weights)
+            distil = self.counterfactual == "distil"
+            return ppo_loss(policy, transitions, memory, advantage, params, scalars, distil)
+
+        def learn(carry: tuple[Params, Any], episodes: jax.Array) -> tuple[tuple[Params, Any], dict[str, jax.Array]]:
+            weights, optimizer = carry
+            part = (
+                jax.tree.map(lambda x: x[:, episodes], transitions),
+                jax.tree.map(lambda x: x[episodes], memory),
+                advantage[:, episodes],
+            )
+            gradient, parts = jax.grad(loss, has_aux=True)(weights, part)
+            with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
+                step, optimizer = self._optimizer.update(gradient, optimizer, weights)
+            weights = jax.tree.map(lambda w, s: w - rate * s, weights, step)
+            return (weights, optimizer), parts | {"gradient_norm": optax.global_norm(gradient)}
+
+        keys = jax.random.split(shuffle_key, config.epochs)
+        order = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(keys)
+        parts = order.reshape(config.epochs * config.minibatches, -1)
+        (weights, optimizer), metrics = jax.lax.scan(learn, (state.params, state.optimizer), parts)
+        metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(transitions, ended)
+        metrics["skipped_updates"] = optimizer.total_notfinite.astype(jnp.float32)
+        state = state.replace(params=weights, optimizer=optimizer, agent=agent, update=state.update + 1)
+        return state, metrics
+
+
+def _episode_sums(transitions: Transition, ended: jax.Array) -> dict[str, jax.Array]:
+    """Sums over the episodes that ended in a rollout, float32 [] each."""
+    def total(values: jax.Array) -> jax.Array:
+        return jnp.where(ended, values.astype(jnp.float32), 0.0).sum()
+
+    # Every step but a successful Done costs the same, so the return follows from success and length.
+    return {
+        "episodes": total(ended),
+        "success": total(transitions.success),
+        "length": total(transitions.length),
+        "truncated": total(transitions.truncated),
+        "return": transitions.reward.sum(),
+    }
