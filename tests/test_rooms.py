@@ -9,7 +9,7 @@ import pytest
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.room_rules import Item, Rule, room_statistics
+from jaxnav.scenes.room_rules import room_statistics
 from jaxnav.scenes.room_shapes import inside, make_shape, wall_mask
 from jaxnav.scenes.rooms import AGENT_RADIUS, FIND_DISTANCE, free_cells, generate_rooms
 from jaxnav.scenes.scene import CELL, Scene
@@ -88,13 +88,8 @@ def test_boxes_are_in_the_room_and_do_not_overlap(rooms: list[Scene]):
         low, high = corners(scene.boxes)
         # No box overlaps a wall cell: compare with the squares around their centres.
         walls = np.asarray(scene.origin) + CELL * np.argwhere(scene.walls)[:, ::-1]
-        in_x = (low[:, None, 0] < walls[:, 0] + CELL / 2 - MILLIMETRES) & (
-            high[:, None, 0] > walls[:, 0] - CELL / 2 + MILLIMETRES
-        )
-        in_z = (low[:, None, 2] < walls[:, 1] + CELL / 2 - MILLIMETRES) & (
-            high[:, None, 2] > walls[:, 1] - CELL / 2 + MILLIMETRES
-        )
-        assert not (in_x & in_z).any(), scene.name
+        depth = np.minimum(high[:, None, ::2], walls + CELL / 2) - np.maximum(low[:, None, ::2], walls - CELL / 2)
+        assert not (depth > MILLIMETRES).all(axis=-1).any(), scene.name
         overlap = (np.minimum(high[:, None], high) - np.maximum(low[:, None], low) > MILLIMETRES).all(axis=-1)
         related = scene.parents[:, None] == np.arange(len(low))  # what lies on a sofa is inside the sofa's box
         assert not (overlap & ~related & ~related.T & ~np.eye(len(low), dtype=bool)).any(), scene.name
@@ -155,14 +150,6 @@ def test_walls_of_an_l_shape_face_inwards(high: tuple[bool, bool]):
         assert (inside(shape, points - 0.1, points + 0.1) == expected).all()
 
 
-def test_rules_are_values_that_types_can_exchange():
-    items = room_statistics()["bedroom"].items
-    swapped = dataclasses.replace(items["Bowl"], rule=items["GarbageCan"].rule)
-    assert isinstance(swapped, Item)
-    assert isinstance(swapped.rule, Rule)
-    assert (swapped.size, swapped.rule.bottom) == (items["Bowl"].size, 0.0)
-
-
 #: Per room type, measured over the 30 AI2-THOR rooms: quartiles of standable cells; target instances; distinct
 #: targets; cells of the rectangle around them that are standable.
 MEASURED = {
@@ -178,7 +165,8 @@ def test_statistics_follow_the_measured_ones(rooms: list[Scene], room_type: str)
     quartiles, instances, distinct, fill = MEASURED[room_type]
     scenes = of_type(rooms, room_type)
     cells = [scene.reach.sum() for scene in scenes]
-    np.testing.assert_allclose(np.quantile(cells, [0.25, 0.5, 0.75]), quartiles, rtol=0.3)
+    # The standard error of a quartile of 50 rooms is about 15 %.
+    np.testing.assert_allclose(np.quantile(cells, [0.25, 0.5, 0.75]), quartiles, rtol=0.35)
     targets = [[name for name in scene.types if name in ITHOR_CATEGORIES] for scene in scenes]
     assert np.mean([len(names) for names in targets]) == pytest.approx(instances, rel=0.1)
     assert np.mean([len(set(names)) for names in targets]) == pytest.approx(distinct, rel=0.1)
@@ -224,13 +212,8 @@ def lift(scenes: list[Scene], a: str, b: str) -> float:
                 shares.append((distances.min(axis=1) <= 1.5).mean())
         return float(np.mean(shares)) if shares else np.nan
 
-    return near(a) / np.nanmean(
-        [near(name) for name in ITHOR_CATEGORIES if name not in (a, b) and has(scenes, name, b)]
-    )
-
-
-def has(scenes: list[Scene], *names: str) -> bool:
-    return any(set(names) <= set(scene.types) for scene in scenes)
+    others = [name for name in ITHOR_CATEGORIES if name not in (a, b)]
+    return near(a) / float(np.nanmean([near(name) for name in others]))
 
 
 def shuffled(scene: Scene, rng: np.random.Generator) -> Scene:

@@ -79,6 +79,16 @@ class RunConfig:
     sizes: Sizes = Sizes()
     ppo: PPOConfig = PPOConfig()
 
+    @property
+    def source(self) -> str | Path:
+        """Where the scenes come from."""
+        return self.scenes or self.world
+
+    @property
+    def total_updates(self) -> int:
+        """Updates of each policy, rounded up to whole chunks."""
+        return -(-self.ppo.num_updates(self.total_steps) // self.chunk) * self.chunk
+
 
 def check(config: RunConfig) -> RunConfig:
     """The same config, or an `InputError` that names the first impossible setting."""

@@ -112,7 +112,7 @@ def put(room: Furnishing, name: str, item: Item, rng: np.random.Generator) -> bo
     rule = item.rule
     places = [place for place in rule.at if " " not in place or place.split()[1] in room.types]
     weights = np.array([rule.at[place] for place in places])
-    for k in rng.choice(len(places), len(places), replace=False, p=weights / weights.sum()) if places else ():
+    for k in np.argsort(rng.exponential(size=len(places)) / weights):  # the first is drawn by weight, then the next
         spots = draw_spots(room, whole, places[k], rule, rng)
         rests = places[k].startswith(("on ", "in "))
         middle = places[k] == "middle"

@@ -1,0 +1,157 @@
+"""The training command: prior, two arms of N seeds, checkpoints, and the policies at the end."""
+
+import dataclasses
+import json
+import sys
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from jaxnav.cli.arms import ARMS, Arm
+from jaxnav.cli.config import RunConfig, check
+from jaxnav.cli.options import parse_run
+from jaxnav.env.make import build_for, in_split, load_scenes
+from jaxnav.env.objectnav import ObjectNav
+from jaxnav.env.types import EnvParams
+from jaxnav.errors import InputError
+from jaxnav.layout import prior_from_counts
+from jaxnav.scenes.compile import Bank, compile_bank
+from jaxnav.store.checkpoint import restore, save
+from jaxnav.store.export import export_params
+from jaxnav.store.files import write_atomic
+from jaxnav.store.manifest import differences, make_manifest
+from jaxnav.store.runlog import append_row, truncate_after
+from jaxnav.training.exploration import Exploration, explore
+from jaxnav.training.learner import LearnerState
+
+CONFIG_FILE, LOG_FILE, POLICIES = "config.json", "metrics.jsonl", "policies"
+_EXPLORE = 2**31 - 1  # purpose of the prior's key; seeds use 0, 1, ...
+
+States = dict[str, LearnerState]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit code: 0, or 2 after bad input."""
+    console = Console(stderr=True, highlight=False)
+    try:
+        train(check(parse_run(sys.argv[1:] if arguments is None else arguments)), console)
+    except InputError as error:
+        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+        return 2
+    return 0
+
+
+def train(config: RunConfig, console: Console) -> None:
+    """Train all arms and seeds of a run, from its last checkpoint if it has one, and export the policies."""
+    started = time.monotonic()
+    bank = training_bank(config)
+    env, params = build_for(bank, "train", config.worlds.train_step_limit)
+    console.print(f"{len(bank.names)} training scenes, {len(bank.rows):,} poses ({len(bank.skipped)} skipped)")
+    manifest = make_manifest(settings(config) | {"scenes_crc32": zlib.crc32(bank.rows.tobytes())})
+    _claim(config.run_dir, manifest["config"])
+
+    key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
+    found = jax.jit(explore, static_argnums=(0, 3, 4))(env, params, key, config.layout.walks, config.layout.steps)
+    priors = jax.vmap(lambda counts: prior_from_counts(counts, config.layout.setting))(found.counts)
+    console.print(f"layout prior from {int(found.steps):,} random steps, {int(found.poses):,} distinct poses")
+
+    arms = {name: Arm(name, config, env, params, priors) for name in ARMS}
+    abstract = jax.eval_shape(lambda: {name: arm.init() for name, arm in arms.items()})
+    restored = restore(config.run_dir, abstract, manifest)
+    states, done = restored or ({name: arm.init() for name, arm in arms.items()}, 0)
+    truncate_after(config.run_dir / LOG_FILE, done)
+    if restored:
+        console.print(f"resumed after update {done} of {config.total_updates}")
+    states = _updates(config, arms, states, done, manifest, console)
+    for name, state in states.items():
+        _export(config, env, name, state, priors, found)
+    console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
+
+
+def training_bank(config: RunConfig) -> Bank:
+    """The compiled training scenes of a run."""
+    worlds = config.worlds
+    scenes = load_scenes(config.source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
+    return compile_bank(in_split(scenes, "train", config.source), detector=config.detector)
+
+
+def settings(config: RunConfig) -> dict[str, Any]:
+    """What makes a run the run it is: all its settings but where it is kept and how often it is saved."""
+    plain = dataclasses.asdict(config) | {"scenes": str(config.scenes) if config.scenes else None}
+    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every")}
+
+
+def _claim(run_dir: Path, config: dict[str, Any]) -> None:
+    """Make the run directory ours, or refuse if it holds another run."""
+    path = run_dir / CONFIG_FILE
+    if path.exists():
+        held = json.loads(path.read_text())
+        if different := differences(held, config):
+            raise InputError(
+                f"{run_dir}: holds another run (there != asked for): {'; '.join(different)}; "
+                "choose another --run-dir or the same settings"
+            )
+        return
+    if run_dir.exists() and any(run_dir.iterdir()):
+        raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
+    write_atomic(path, (json.dumps(config, indent=2) + "\n").encode())
+
+
+def _updates(
+    config: RunConfig, arms: dict[str, Arm], states: States, done: int, manifest: dict[str, Any], console: Console
+) -> States:
+    """Train chunk by chunk; between chunks log, show and save."""
+    per_chunk = config.chunk * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(arms)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("compiling", total=config.total_updates, completed=done)
+        while done < config.total_updates:
+            began = time.monotonic()
+            metrics = {}
+            for name, arm in arms.items():
+                states[name], metrics[name] = arm.train(states[name])
+            metrics = jax.device_get(metrics)
+            done += config.chunk
+            rate = per_chunk / (time.monotonic() - began)
+            for name, values in metrics.items():
+                for seed in range(config.seeds):
+                    own = {key: float(value[seed]) for key, value in values.items()}
+                    append_row(config.run_dir / LOG_FILE, {"step": done, "arm": name, "seed": seed} | own)
+            if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
+                save(config.run_dir, done, states, manifest)
+            rates = ", ".join(f"{name} SR {100 * values['success'].mean():.0f} %" for name, values in metrics.items())
+            line = f"update {done}/{config.total_updates}, {rate / 1000:.0f} k steps/s, {rates}"
+            progress.update(task, completed=done, description=line)
+            if not console.is_terminal and (done // config.chunk) % 4 == 0:
+                console.print(line)
+    return states
+
+
+def _export(
+    config: RunConfig, env: ObjectNav, name: str, states: LearnerState, priors: jax.Array, found: Exploration
+) -> None:
+    """Write every seed's policy with the prior it was trained with."""
+    for seed in range(config.seeds):
+        params = jax.tree.map(lambda leaf: np.asarray(leaf[seed]), states.params)  # noqa: B023
+        spec = {
+            "method": config.method,
+            "categories": list(env.categories),
+            "sizes": vars(config.sizes),
+            "layout": config.layout.setting if name == "layout" else None,
+            "prior_steps": int(found.steps),
+            "prior_poses": int(found.poses),
+        }
+        tensors = {"policy": params, "layout": {"prior": np.asarray(priors)}}
+        export_params(config.run_dir / POLICIES / f"{name}-{seed}", tensors, spec)
+
+
+def environment(config: RunConfig, bank: Bank, split: str) -> tuple[ObjectNav, EnvParams]:
+    """The environment of an evaluation split with the run's step limits."""
+    worlds = config.worlds
+    return build_for(bank, split, worlds.train_step_limit, worlds.step_limit, worlds.large_step_limit)

@@ -1,0 +1,128 @@
+"""Equations 1 and 2: interventions and (soft) total direct effects."""
+
+from typing import NamedTuple
+
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+
+from jaxnav.causal import do, remove_experience, stde, tde
+
+FORMS = ("paper", "residual")
+LOGITS = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32))
+
+
+class Pathways(NamedTuple):
+    scene: jax.Array
+    goal: jax.Array
+    experience: jax.Array
+
+
+def bits(x) -> np.ndarray:
+    return np.asarray(x, np.float32).view(np.uint32)
+
+
+def test_do_replaces_only_the_named_pathways():
+    pathways = Pathways(jnp.ones((2, 3)), jnp.ones((2, 4), jnp.bfloat16), jnp.full((2, 5), 7.0))
+    result = do(pathways, scene=0, goal=0.5)
+    assert isinstance(result, Pathways)
+    assert result.experience is pathways.experience
+    np.testing.assert_array_equal(result.scene, np.zeros((2, 3)))
+    assert result.goal.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(result.goal.astype(jnp.float32), np.full((2, 4), 0.5))
+    np.testing.assert_array_equal(pathways.scene, np.ones((2, 3)))
+
+
+def test_do_names_an_unknown_pathway():
+    with pytest.raises(ValueError, match=r"do\(sceen=.*scene, goal, experience"):
+        do(Pathways(jnp.ones(1), jnp.ones(1), jnp.ones(1)), sceen=0)
+
+
+def test_worked_arithmetic():
+    a, a_bar = jnp.array([2.0, 1.0]), jnp.array([4.0, -2.0])
+    np.testing.assert_array_equal(tde(a, a_bar), [-2.0, 3.0])
+    # s = 0.75 - 0.5 = 0.25. Paper: [2 - 1, 1 + 0.5]. Residual: [2.5 - 1, 1.25 + 0.5].
+    gap = jnp.float32(0.75)
+    np.testing.assert_array_equal(stde(a, a_bar, gap, 0.5, "paper"), [1.0, 1.5])
+    np.testing.assert_array_equal(stde(a, a_bar, gap, 0.5, "residual"), [1.5, 1.75])
+    # A weight of 1 is eq. 1 in the paper's form, and eq. 1 plus a in the other.
+    np.testing.assert_array_equal(remove_experience(a, a_bar, jnp.float32(1), "paper"), tde(a, a_bar))
+    np.testing.assert_array_equal(remove_experience(a, a_bar, jnp.float32(1), "residual"), a + tde(a, a_bar))
+
+
+def test_unknown_form():
+    with pytest.raises(ValueError, match="'papr'"):
+        remove_experience(jnp.ones(2), jnp.ones(2), jnp.float32(1), "papr")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(LOGITS, LOGITS, hnp.arrays(np.float32, 4, elements=st.floats(0, 1, width=32)))
+def test_closed_gate_is_bit_identical(form, a, a_bar, gap):
+    a[0], a_bar[0] = -0.0, -1.0  # -0 - 0 * (-1) would be +0
+    a[1], a_bar[1] = 0.0, -0.0
+    result = stde(jnp.asarray(a), jnp.asarray(a_bar), jnp.asarray(gap), 1.0, form)
+    np.testing.assert_array_equal(bits(result), bits(a))
+
+
+def test_open_gate_changes_logits():
+    """Negative control for the test above: epsilon just below the gap is not the identity."""
+    a = jnp.ones((1, 6))
+    assert not np.array_equal(stde(a, a, jnp.ones(1), 0.9), stde(a, 2 * a, jnp.ones(1), 0.9))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(LOGITS, LOGITS, st.floats(0, 1, width=32), st.floats(0, 0.9990234375, width=32))
+def test_continuous_in_epsilon(form, a, a_bar, gap, epsilon):
+    # |d result / d epsilon| <= |a| + |a_bar| <= 60, so a step of 2^-10 moves a logit by at most 0.06 (and rounding).
+    f = jax.vmap(lambda e: stde(jnp.asarray(a), jnp.asarray(a_bar), jnp.full(4, gap), e, form))
+    low, high = f(jnp.array([epsilon, epsilon + 2**-10], jnp.float32))
+    assert np.abs(low - high).max() <= 60 * 2**-10 + 1e-4
+
+
+@given(st.floats(0, 1, width=32), st.floats(0, 1, width=32))
+def test_weight_is_at_most_one_minus_epsilon(gap, epsilon):
+    # With a = 0 and a_bar = -1 the paper's form returns the weight itself.
+    weight = stde(jnp.zeros((1, 1)), -jnp.ones((1, 1)), jnp.full(1, gap), epsilon, "paper")
+    np.testing.assert_allclose(weight, max(gap - epsilon, 0), atol=1e-6)
+    assert 0 <= float(weight[0, 0]) <= 1 - epsilon + 1e-6
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(st.permutations(range(6)), st.permutations(range(6)), st.integers(-8, 8), st.integers(-8, 8))
+def test_constant_offsets_leave_the_choice(form, a, a_bar, offset, offset_bar):
+    # Small integers and s = 1/4: the arithmetic is exact, so ties stay ties.
+    a, a_bar, gap = jnp.array(a, jnp.float32), jnp.array(a_bar, jnp.float32), jnp.float32(0.75)
+    plain = stde(a, a_bar, gap, 0.5, form)
+    moved = stde(a + offset, a_bar + offset_bar, gap, 0.5, form)
+    assert plain.argmax() == moved.argmax()
+
+
+def test_forms_agree_on_the_choice_at_matching_weights():
+    # (1 + s) a - s a_bar = (1 + s) (a - s / (1 + s) a_bar).
+    a, a_bar = jax.random.normal(jax.random.key(0), (2, 50, 6))
+    s = jnp.linspace(0.01, 0.5, 50)
+    residual = remove_experience(a, a_bar, s, "residual")
+    paper = remove_experience(a, a_bar, s / (1 + s), "paper")
+    np.testing.assert_allclose(residual, (1 + s)[:, None] * paper, rtol=1e-5, atol=1e-5)
+
+
+def test_epsilon_is_traced():
+    traces = []
+
+    @jax.jit
+    def f(epsilon):
+        traces.append(1)
+        return stde(jnp.ones((3, 6)), jnp.ones((3, 6)), jnp.ones(3), epsilon)
+
+    results = [float(f(jnp.float32(e))[0, 0]) for e in (0.0, 0.5, 1.0)]
+    np.testing.assert_allclose(results, 1.0)  # (1 + s) - s
+    assert len(traces) == 1
+
+
+def test_logits_keep_their_dtype():
+    a = jnp.ones((3, 6), jnp.bfloat16)
+    assert stde(a, a, jnp.ones(3), 0.5).dtype == jnp.bfloat16
