@@ -242,8 +242,6 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """The column w[:, goal], w x g of eq. 7: float32 [K], how far each category speaks for the goal category.
-        `goal` is the goal category, int [].
-        """
+        """The column w[:, goal], w x g of eq. 7: float32 [K], how far each category speaks for `goal`, int []."""
         share = state.alpha[:, goal] / state.alpha.sum(-1)
         return share.at[goal].add(1)

@@ -19,7 +19,7 @@ Config = TypeVar("Config")
 def apply_yaml(default: Config, path: str | Path) -> Config:
     """`default` with the values of a YAML file, each checked against the annotation of its field.
 
-    Known annotations: `bool`, `int`, `float`, `str`, `Literal`, `X | None`, `tuple`, nested dataclasses. Where a float
+    Known annotations: `bool`, `int`, `float`, `str`, `Path`, `Literal`, `X | None`, `tuple`, nested dataclasses. Where a float
     is expected, whole numbers and texts such as `3e-4` (which YAML 1.1 reads as text) are taken as floats.
 
     Args:
@@ -109,6 +109,8 @@ def _convert(value: Any, annotation: Any) -> Any:
         return _convert_tuple(value, arguments)
     elif annotation is float:
         return _convert_float(value)
+    elif annotation is Path:
+        return Path(_convert(value, str))
     elif annotation in (bool, int, str, types.NoneType):
         if type(value) is annotation:
             return value
@@ -150,6 +152,8 @@ def _describe(annotation: Any) -> str:
         return f"a list of {_describe(arguments[0])}"
     if origin is tuple:
         return f"a list [{', '.join(map(_describe, arguments))}]"
+    if annotation is Path:
+        return "a path"
     return "null" if annotation is types.NoneType else annotation.__name__
 
 

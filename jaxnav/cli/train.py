@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from jaxnav.cli.arms import ARMS, Arm
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse_run
+from jaxnav.cli.overlay import apply_yaml
 from jaxnav.env.make import build_for, in_split, load_scenes
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
@@ -53,8 +54,9 @@ def train(config: RunConfig, console: Console) -> None:
     bank = training_bank(config)
     env, params = build_for(bank, "train", config.worlds.train_step_limit)
     console.print(f"{len(bank.names)} training scenes, {len(bank.rows):,} poses ({len(bank.skipped)} skipped)")
-    manifest = make_manifest(settings(config) | {"scenes_crc32": zlib.crc32(bank.rows.tobytes())})
-    _claim(config.run_dir, manifest["config"])
+    plain = settings(config)
+    _claim(config.run_dir, plain)
+    manifest = make_manifest(plain | {"scenes_crc32": zlib.crc32(bank.rows.tobytes())})
 
     key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
     found = jax.jit(explore, static_argnums=(0, 3, 4))(env, params, key, config.layout.walks, config.layout.steps)
@@ -85,6 +87,18 @@ def settings(config: RunConfig) -> dict[str, Any]:
     """What makes a run the run it is: all its settings but where it is kept and how often it is saved."""
     plain = dataclasses.asdict(config) | {"scenes": str(config.scenes) if config.scenes else None}
     return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every")}
+
+
+def load_run(run_dir: Path) -> RunConfig:
+    """Settings of an earlier run.
+
+    Raises:
+      InputError: the directory holds no run, or its config file is damaged.
+    """
+    path = run_dir / CONFIG_FILE
+    if not path.exists():
+        raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
+    return dataclasses.replace(apply_yaml(RunConfig(), path), run_dir=run_dir)
 
 
 def _claim(run_dir: Path, config: dict[str, Any]) -> None:
@@ -149,9 +163,3 @@ def _export(
         }
         tensors = {"policy": params, "layout": {"prior": np.asarray(priors)}}
         export_params(config.run_dir / POLICIES / f"{name}-{seed}", tensors, spec)
-
-
-def environment(config: RunConfig, bank: Bank, split: str) -> tuple[ObjectNav, EnvParams]:
-    """The environment of an evaluation split with the run's step limits."""
-    worlds = config.worlds
-    return build_for(bank, split, worlds.train_step_limit, worlds.step_limit, worlds.large_step_limit)

@@ -19,7 +19,9 @@ WORLDS: dict[str, Callable[..., list[Scene]]] = {"rooms": generate_rooms}
 SPLITS = ("train", "val", "test")
 
 
-def load_scenes(source: str | Path, num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0) -> list[Scene]:
+def load_scenes(
+    source: str | Path, num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0
+) -> list[Scene]:
     """All scenes of a generated world, or of a scene file.
 
     Args:

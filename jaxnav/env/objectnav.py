@@ -71,7 +71,9 @@ class ObjectNav:
         byte, bit = self.layout.found_at(state.goal)
         return (params.tables.rows[state.pose, byte] >> bit.astype(jnp.uint8)) & jnp.uint8(1) > 0
 
-    def advance(self, state: State, action: jax.Array, params: EnvParams) -> tuple[State, jax.Array, jax.Array, jax.Array]:
+    def advance(
+        self, state: State, action: jax.Array, params: EnvParams
+    ) -> tuple[State, jax.Array, jax.Array, jax.Array]:
         """Take an action, without reset.
 
         Args:

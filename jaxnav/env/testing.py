@@ -12,7 +12,9 @@ from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 
 
-def check_environment(env: ObjectNav, params: EnvParams, num_envs: int = 16, num_steps: int = 64, seed: int = 0) -> None:
+def check_environment(
+    env: ObjectNav, params: EnvParams, num_envs: int = 16, num_steps: int = 64, seed: int = 0
+) -> None:
     """Check that an environment keeps its promises.
 
     It checks: one compilation for reset and step; equal keys give equal episodes; shapes, dtypes and ranges of all outputs;
@@ -49,7 +51,9 @@ def check_environment(env: ObjectNav, params: EnvParams, num_envs: int = 16, num
         _promise(not np.any(terminated & truncated), "an episode is terminated and truncated at once")
         _promise(not np.any(info["success"] & ~terminated), "a success that is not an ending")
         ended = np.asarray(terminated | truncated)
-        _promise(np.all(np.asarray(info["final_state"].time) == np.asarray(before.time) + 1), "a step that takes no time")
+        _promise(
+            np.all(np.asarray(info["final_state"].time) == np.asarray(before.time) + 1), "a step that takes no time"
+        )
         _promise(np.all(np.asarray(state.time)[ended] == 0), "an ending that is not followed by a new episode")
         kept = jax.tree.map(lambda leaf: np.asarray(leaf)[~ended], (state, info["final_state"]))
         chex.assert_trees_all_equal(*kept)

@@ -86,7 +86,7 @@ def evaluate_grid(
       spec: sizes of the policies.
       params: the environment's.
       priors: float32 [rooms, K, K].
-      key: of sampled actions; episode e at time t uses `fold_in(fold_in(key, e), t)` in every cell.
+      key: of sampled actions; parameters p in episode e at time t use it folded with p, e and t, whatever the cell.
 
     Returns:
       The outcomes [C, E] and the number of compilations that it took.
@@ -98,7 +98,9 @@ def evaluate_grid(
         time=jnp.zeros(len(episodes.pose), jnp.int32),
     )
 
-    def run(grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array) -> Outcome:
+    def run(
+        grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array
+    ) -> Outcome:
         def one(cell: Inference) -> Outcome:
             own = jax.tree.map(lambda leaf: leaf[cell.params], weights)
             return _episodes(cell, own, start, acting, spec, params, priors, key)
@@ -123,7 +125,8 @@ def _episodes(
     """Run one cell over all episodes until the last one has ended."""
     policy = bind(spec, weights)
     count = start.pose.shape
-    keys = jax.vmap(lambda episode: jax.random.fold_in(key, episode))(jnp.arange(*count))
+    own = jax.random.fold_in(key, cell.params)
+    keys = jax.vmap(lambda episode: jax.random.fold_in(own, episode))(jnp.arange(*count))
     layout = acting.believe(acting.first_belief(start, params, priors), start, params, priors)
     agent = Agent(state=start, layout=layout, memory=policy.initial_memory(count))
     outcome = Outcome(

@@ -48,7 +48,9 @@ class Acting:
             return observation, jnp.ones((*agent.state.goal.shape, len(self.env.categories)))
         return observation, jax.vmap(LayoutEstimator.goal_weights)(agent.layout, agent.state.goal)
 
-    def believe(self, layout: LayoutState | None, state: State, params: EnvParams, priors: jax.Array) -> LayoutState | None:
+    def believe(
+        self, layout: LayoutState | None, state: State, params: EnvParams, priors: jax.Array
+    ) -> LayoutState | None:
         """Update the beliefs with what is detected in the current states; priors float32 [rooms, K, K]."""
         if self.setting is None or layout is None:
             return None

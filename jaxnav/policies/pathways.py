@@ -1,8 +1,8 @@
 """The causal graph of the paper as types: what a decision is made from, and what an intervention may replace.
 
-    S (what is seen) ---------> A
-    G (what is sought) -------> A
-    S, G --> Z (experience) --> A
+S (what is seen) ---------> A
+G (what is sought) -------> A
+S, G --> Z (experience) --> A
 """
 
 from typing import NamedTuple

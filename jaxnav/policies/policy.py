@@ -39,7 +39,9 @@ class Policy(nnx.Module):
         self.detections = CategoryMaps(spec.sizes.appearance + NUM_FEATURES, spec, rngs)
         self.sought = nnx.Embed(spec.num_categories, spec.sizes.appearance, rngs=rngs)
         self.method = METHODS[spec.method](spec, rngs)
-        fused = spec.sizes.view_outputs + self.detections.width + spec.sizes.appearance + self.method.width + NUM_ACTIONS
+        fused = (
+            spec.sizes.view_outputs + self.detections.width + spec.sizes.appearance + self.method.width + NUM_ACTIONS
+        )
         self.fuse = nnx.Linear(fused, spec.sizes.hidden, rngs=rngs)
         self.core = nnx.GRUCell(spec.sizes.hidden, spec.sizes.hidden, rngs=rngs)
         # Small first logits: the first policy is close to uniform.

@@ -198,7 +198,8 @@ def _ego_views(scene: Scene, cells: np.ndarray, view: int) -> np.ndarray:
     mask = np.zeros_like(scene.reach)
     mask[tuple(cells.T)] = True
     standable = np.pad(mask, radius)[
-        cells[:, 0, None, None, None] + radius + offsets[..., 0], cells[:, 1, None, None, None] + radius + offsets[..., 1]
+        cells[:, 0, None, None, None] + radius + offsets[..., 0],
+        cells[:, 1, None, None, None] + radius + offsets[..., 1],
     ]
     known = view_known(scene, cells, radius)[:, radius + offsets[..., 0], radius + offsets[..., 1]] & in_cone
     views = np.where(known, np.where(standable, VIEW_FREE, VIEW_BLOCKED), VIEW_UNKNOWN).astype(np.uint8)

@@ -50,7 +50,10 @@ def successors(cells: np.ndarray) -> np.ndarray:
     num_cells = len(cells)
     index = {tuple(cell): i for i, cell in enumerate(cells.tolist())}
     ahead = np.array(
-        [[index.get((z + dz, x + dx), i) for dz, dx in HEADING_STEPS.tolist()] for i, (z, x) in enumerate(cells.tolist())],
+        [
+            [index.get((z + dz, x + dx), i) for dz, dx in HEADING_STEPS.tolist()]
+            for i, (z, x) in enumerate(cells.tolist())
+        ],
     ).reshape(num_cells, NUM_HEADINGS, 1)
     cell, heading, horizon = np.indices((num_cells, NUM_HEADINGS, len(HORIZONS)))
 

@@ -77,6 +77,7 @@ class Learner:
         self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array, num_updates: int
     ) -> tuple[LearnerState, dict[str, jax.Array]]:
         """Do some updates; metrics are their float32 [] means (episode statistics over the episodes that ended)."""
+
         def step(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, jax.Array]]:
             return self.update(state, scalars, params, priors)
 
@@ -134,6 +135,7 @@ class Learner:
 
 def _episode_sums(transitions: Transition, ended: jax.Array) -> dict[str, jax.Array]:
     """Sums over the episodes that ended in a rollout, float32 [] each."""
+
     def total(values: jax.Array) -> jax.Array:
         return jnp.where(ended, values.astype(jnp.float32), 0.0).sum()
 

@@ -36,9 +36,7 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
-def replay(
-    policy: Policy, transitions: Transition, memory: Memory, params: EnvParams
-) -> tuple[Decision, Decision]:
+def replay(policy: Policy, transitions: Transition, memory: Memory, params: EnvParams) -> tuple[Decision, Decision]:
     """Decide again along a rollout.
 
     Args:
