@@ -73,7 +73,8 @@ class Box:
         self.centre = (x, y, z)
         self.half = (sx / 2, sy / 2, sz / 2)
         self.category = category
-        self.opaque = sx >= 0.3 and sz >= 0.3 and y - sy / 2 <= 0.3 and y + sy / 2 >= 0.85
+        limits = (sx - 0.3, sz - 0.3, 0.3 - (y - sy / 2), y + sy / 2 - 0.85)
+        self.opaque = min(limits) >= -1e-9
         sides = sorted((sx, sy, sz))
         self.size = math.sqrt(sides[1] * sides[2])
         self.range = min(max(self.size / 0.06, 1.5), 5.0)
@@ -179,9 +180,8 @@ class Twin:
         )
         for wall in ((iz, ix) for iz in rows for ix in columns if (iz, ix) in self.walls):
             centre = self._position(wall)
-            if not contains(goal[::2], centre, (0.125, 0.125)) and meets(
-                (x, z), end[::2], centre, (0.125 - SHRINK, 0.125 - SHRINK)
-            ):
+            exempt = any(contains(point, centre, (0.125, 0.125)) for point in (goal[::2], (x, z)))
+            if not exempt and meets((x, z), end[::2], centre, (0.125 - SHRINK, 0.125 - SHRINK)):
                 return False
         return True
 

@@ -1,4 +1,4 @@
-"""The evaluation command: fixed episodes, all variants and epsilons at once, a table, a JSON file and a row per episode."""
+"""The evaluation command: fixed episodes, all variants and epsilons at once; a table, JSON, a row per episode."""
 
 import csv
 import dataclasses
@@ -107,7 +107,7 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         jax.random.key(config.seed),
     )
     outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
-    report = _report(config, rows, outcome, episodes, policies.spec.method, str(source), compilations)
+    report = _report(config, rows, outcome, episodes, policies.spec.method, scenes[0].world, compilations)
     target = config.json or config.run / f"eval-{config.split}.json"
     write_report(target, report)
     write_atomic(target.with_suffix(".episodes.csv"), _episode_csv(rows, outcome, episodes, bank).encode())
@@ -139,14 +139,16 @@ def _report(
     outcome: Outcome,
     episodes: EpisodeList,
     method: str,
-    source: str,
+    world: str,
     compilations: int,
 ) -> dict[str, Any]:
     """The table, and the paired differences that it is read for."""
-    generator = np.random.default_rng(config.seed)
+    def generator() -> np.random.Generator:
+        # Equal resamples for every row: equal results get equal intervals.
+        return np.random.default_rng(config.seed)
+
     metrics = episode_metrics(outcome, episodes.best_length)  # [R, S, E] each
     by_row = {row: {name: values[i] for name, values in metrics.items()} for i, row in enumerate(rows)}
-    world = "file" if source.endswith(".gz") else source
     table = [
         build_row(
             variant=row.variant,
@@ -159,7 +161,7 @@ def _report(
             metrics=by_row[row],
             best_lengths=episodes.best_length,
             strata=episodes.room,
-            generator=generator,
+            generator=generator(),
         )
         for row in rows
     ]
@@ -177,7 +179,7 @@ def _report(
                 epsilon=row.epsilon,
                 decoding=row.decoding,
                 strata=episodes.room,
-                generator=generator,
+                generator=generator(),
                 same_seeds=reference == "layout",
             )
             for metric in ("sr", "spl", "dts")

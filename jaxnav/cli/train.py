@@ -19,7 +19,6 @@ from jaxnav.cli.options import parse_run
 from jaxnav.cli.overlay import apply_yaml
 from jaxnav.env.make import build_for, in_split, load_scenes
 from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.layout import prior_from_counts
 from jaxnav.scenes.compile import Bank, compile_bank

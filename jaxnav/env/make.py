@@ -60,7 +60,9 @@ def make(
     categories: tuple[str, ...] = ITHOR_CATEGORIES,
     detector: Detector | None = None,
 ) -> tuple[ObjectNav, EnvParams]:
-    """An environment and its parameters, with the step limits of the paper: 30 in training, else 100, in living rooms 200.
+    """An environment and its parameters.
+
+    The step limits are the paper's: 30 in training, else 100 and in living rooms 200.
 
     Args:
       source: a world's name (`rooms`) or the path of a scene file.

@@ -12,7 +12,7 @@ from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.policies.acting import Acting, Agent, select
 from jaxnav.policies.pathways import Memory
-from jaxnav.policies.policy import Params, bind
+from jaxnav.policies.policy import Params, Policy, bind
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.lattice import DONE, MOVE_AHEAD, POSES_PER_CELL
 
@@ -20,8 +20,8 @@ from jaxnav.scenes.lattice import DONE, MOVE_AHEAD, POSES_PER_CELL
 class Inference(struct.PyTreeNode):
     """How one set of parameters is used; leaves [] (or [C] for a grid of C).
 
-    The weight of the counterfactual logits is `always + relu(gap - epsilon)`: sTDE has always = 0, hard TDE always = 1 and
-    epsilon = inf, and no de-biasing always = 0 and epsilon = inf.
+    The weight of the counterfactual logits is `always + relu(gap - epsilon)`: sTDE has always = 0, hard TDE always = 1
+    and epsilon = inf, and no de-biasing always = 0 and epsilon = inf.
 
     Attributes:
       params: int32, index of the parameters.
@@ -126,7 +126,7 @@ def _episodes(
     policy = bind(spec, weights)
     count = start.pose.shape
     own = jax.random.fold_in(key, cell.params)
-    keys = jax.vmap(lambda episode: jax.random.fold_in(own, episode))(jnp.arange(*count))
+    keys = jax.vmap(lambda episode: jax.random.fold_in(own, episode))(jnp.arange(count[0]))
     layout = acting.believe(acting.first_belief(start, params, priors), start, params, priors)
     agent = Agent(state=start, layout=layout, memory=policy.initial_memory(count))
     outcome = Outcome(
@@ -166,7 +166,7 @@ def _episodes(
 
 
 def _logits(
-    cell: Inference, policy: object, agent: Agent, acting: Acting, params: EnvParams
+    cell: Inference, policy: Policy, agent: Agent, acting: Acting, params: EnvParams
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Logits [E, A] with experience taken out, the factual recurrent state [E, H] and the weight [E]."""
     observation, layout_weights = acting.observe(agent, params)
@@ -174,7 +174,7 @@ def _logits(
     pathways = policy.pathways(observation, layout_weights)
     factual = policy.decide(pathways, agent.memory)
     counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-    weight = cell.always + jax.nn.relu(agent.layout.gap - cell.epsilon)
+    weight = cell.always + jax.nn.relu(acting.gap(agent) - cell.epsilon)
     residual, paper = (
         remove_experience(factual.logits, counterfactual.logits, weight, form) for form in ("residual", "paper")
     )

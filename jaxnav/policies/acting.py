@@ -48,6 +48,10 @@ class Acting:
             return observation, jnp.ones((*agent.state.goal.shape, len(self.env.categories)))
         return observation, jax.vmap(LayoutEstimator.goal_weights)(agent.layout, agent.state.goal)
 
+    def gap(self, agent: Agent) -> jax.Array:
+        """The layout gaps D float32 [B]; 0 where the layout is left out."""
+        return jnp.zeros(agent.state.goal.shape) if agent.layout is None else agent.layout.gap
+
     def believe(
         self, layout: LayoutState | None, state: State, params: EnvParams, priors: jax.Array
     ) -> LayoutState | None:
@@ -55,17 +59,20 @@ class Acting:
         if self.setting is None or layout is None:
             return None
 
+        setting = self.setting
+
         def one(layout: LayoutState, state: State) -> LayoutState:
             presence = self.env.layout.presence(params.tables.rows[state.pose])
-            return LayoutEstimator(priors[params.room[state.scene]], self.setting).update(layout, presence)
+            return LayoutEstimator(priors[params.room[state.scene]], setting).update(layout, presence)
 
         return jax.vmap(one)(layout, state)
 
     def first_belief(self, state: State, params: EnvParams, priors: jax.Array) -> LayoutState | None:
         """Beliefs before anything is seen."""
-        if self.setting is None:
+        setting = self.setting
+        if setting is None:
             return None
-        return jax.vmap(lambda s: LayoutEstimator(priors[params.room[s.scene]], self.setting).init())(state)
+        return jax.vmap(lambda s: LayoutEstimator(priors[params.room[s.scene]], setting).init())(state)
 
     def start(self, key: jax.Array, num_envs: int, policy: Policy, params: EnvParams, priors: jax.Array) -> Agent:
         """Start B episodes; the key is consumed."""

@@ -17,8 +17,8 @@ class Features(NamedTuple):
     Attributes:
       view: float32 [..., 2 V V], standable and not standable cells of the ego-centric view.
       visible: float32 [..., K], 1 where a category is detected.
-      table: float32 [..., K, 9]: visible, confidence, ahead / 5 m, right / 5 m, distance / 5 m, sine and cosine of the bearing,
-        apparent size, and whether it is the goal. Only the last is non-zero for categories that are not detected.
+      table: float32 [..., K, 9]: visible, confidence, ahead / 5 m, right / 5 m, distance / 5 m, sine and cosine of the
+        bearing, apparent size, and whether it is the goal. Only the last is non-zero where nothing is detected.
       goal: float32 [..., K], one-hot.
     """
 

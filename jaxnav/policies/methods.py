@@ -29,7 +29,8 @@ class Method(Protocol):
         Args:
           features: what is seen and sought.
           appearance: float32 [K, d], one embedding per category.
-          weights: float32 [..., K], how much each category tells about the goal (eq. 7's w x g); ones leave the layout out.
+          weights: float32 [..., K], how much each category tells about the goal (eq. 7's w x g); ones leave the layout
+            out.
         """
         ...
 
@@ -43,6 +44,7 @@ class CategoryMaps(nnx.Module):
         self.width = spec.num_categories * spec.sizes.row_outputs
 
     def __call__(self, rows: jax.Array) -> jax.Array:
+        """Maps of the rows of all categories."""
         maps = nnx.relu(self.outer(nnx.relu(self.inner(rows))))
         return maps.reshape(*maps.shape[:-2], -1)
 
@@ -54,14 +56,15 @@ class NoExperience(nnx.Module):
         self.width = 0
 
     def __call__(self, features: Features, appearance: jax.Array, weights: jax.Array) -> jax.Array:
+        """Experience of no width."""
         return jnp.zeros((*weights.shape[:-1], 0), jnp.float32)
 
 
 class ORG(nnx.Module):
-    """Object relation graph (Du et al., ECCV 2020): a relation matrix between categories, conditioned on their boxes and the goal.
+    """Object relation graph (Du et al., ECCV 2020): relations between categories, given their boxes and the goal.
 
-    The table [R^T X | T | g] of K rows, X the appearance and T the boxes of the detected categories, is the experience that the
-    layout weights multiply (eq. 7), before the perceptron that reads it.
+    The table [R^T X | T | g] of K rows, X the appearance and T the boxes of the detected categories, is the experience
+    that the layout weights multiply (eq. 7), before the perceptron that reads it.
     """
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
@@ -72,6 +75,7 @@ class ORG(nnx.Module):
         self.width = self.maps.width
 
     def __call__(self, features: Features, appearance: jax.Array, weights: jax.Array) -> jax.Array:
+        """Experience from the goal-conditioned relations, each category weighted by the layout."""
         relation = jnp.swapaxes(nnx.relu(self.edges(features.table)), -1, -2)
         for kernel in self.mix[...]:
             relation = nnx.relu(relation @ kernel)

@@ -13,6 +13,7 @@ from jaxnav.scenes.rows import VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowLayout
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.sight import (
     TAN_HALF_FIELD_OF_VIEW,
+    TOLERANCE,
     cell_centres,
     line_of_sight,
     offsets_in_view,
@@ -20,7 +21,6 @@ from jaxnav.scenes.sight import (
 )
 
 SUCCESS_DISTANCE = 1.5
-TOLERANCE = 1e-9  # on distances that decide something
 
 
 class SceneTable(NamedTuple):
@@ -84,7 +84,7 @@ def compile_scene(scene: Scene, categories: tuple[str, ...], detector: Detector,
 
     clear = line_of_sight(scene, centres, targets)
     ahead, right, in_view = offsets_in_view(centres, points)
-    visible = (in_view & clear[:, None, None]).reshape(num_poses, -1)
+    visible = (in_view & clear[:, None, None]).reshape(num_poses, len(targets))
     distance = np.linalg.norm(points[None, :, [0, 2]] - centres[:, None], axis=-1)  # [C, N]
     size = object_size(scene.boxes[targets])
 
@@ -181,7 +181,7 @@ def _per_pose(values: np.ndarray) -> np.ndarray:
 
 def _per_heading(values: np.ndarray) -> np.ndarray:
     """Repeat values [C, 8, N] over horizons: [P, N]."""
-    return np.repeat(values.reshape(-1, values.shape[-1]), len(HORIZONS), axis=0)
+    return np.repeat(values.reshape(len(values) * NUM_HEADINGS, values.shape[-1]), len(HORIZONS), axis=0)
 
 
 def _ego_views(scene: Scene, cells: np.ndarray, view: int) -> np.ndarray:
@@ -197,10 +197,8 @@ def _ego_views(scene: Scene, cells: np.ndarray, view: int) -> np.ndarray:
 
     mask = np.zeros_like(scene.reach)
     mask[tuple(cells.T)] = True
-    standable = np.pad(mask, radius)[
-        cells[:, 0, None, None, None] + radius + offsets[..., 0],
-        cells[:, 1, None, None, None] + radius + offsets[..., 1],
-    ]
+    around = cells[:, None, None, None] + radius + offsets  # [C, 8, V, V, 2]
+    standable = np.pad(mask, radius)[around[..., 0], around[..., 1]]
     known = view_known(scene, cells, radius)[:, radius + offsets[..., 0], radius + offsets[..., 1]] & in_cone
     views = np.where(known, np.where(standable, VIEW_FREE, VIEW_BLOCKED), VIEW_UNKNOWN).astype(np.uint8)
-    return np.repeat(views.reshape(-1, view, view), len(HORIZONS), axis=0)
+    return np.repeat(views.reshape(len(cells) * NUM_HEADINGS, view, view), len(HORIZONS), axis=0)

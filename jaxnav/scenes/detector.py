@@ -36,7 +36,7 @@ class Detector:
         Args:
           name: the scene's name; its errors do not depend on the other scenes of a bank.
           seen: bool [P, K], whether a category is detected by a detector without errors.
-          ahead, right, distance, size: float [P, K], offsets, distance and size in metres of the nearest detected object.
+          ahead, right, distance, size: float [P, K], metres, of the nearest detected object.
 
         Returns:
           uint8 [P, K, 4]: confidence, ahead, right and apparent size, all 0 where nothing is detected.

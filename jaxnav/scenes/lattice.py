@@ -49,12 +49,8 @@ def successors(cells: np.ndarray) -> np.ndarray:
     """
     num_cells = len(cells)
     index = {tuple(cell): i for i, cell in enumerate(cells.tolist())}
-    ahead = np.array(
-        [
-            [index.get((z + dz, x + dx), i) for dz, dx in HEADING_STEPS.tolist()]
-            for i, (z, x) in enumerate(cells.tolist())
-        ],
-    ).reshape(num_cells, NUM_HEADINGS, 1)
+    steps = HEADING_STEPS.tolist()
+    ahead = [[index.get((z + dz, x + dx), i) for dz, dx in steps] for i, (z, x) in enumerate(cells.tolist())]
     cell, heading, horizon = np.indices((num_cells, NUM_HEADINGS, len(HORIZONS)))
 
     def pose(cell: np.ndarray, heading: np.ndarray, horizon: np.ndarray | int) -> np.ndarray:
@@ -62,7 +58,7 @@ def successors(cells: np.ndarray) -> np.ndarray:
 
     table = np.stack(
         [
-            pose(np.broadcast_to(ahead, cell.shape), heading, horizon),
+            pose(np.broadcast_to(np.array(ahead)[..., None], cell.shape), heading, horizon),
             pose(cell, heading - 1, horizon),
             pose(cell, heading + 1, horizon),
             pose(cell, heading, 0),

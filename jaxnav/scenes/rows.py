@@ -39,12 +39,13 @@ class RowLayout:
         """Pack detections uint8 [P, K, 4], found bool [P, K] and view uint8 [P, V, V] into rows [P, num_bytes]."""
         num_poses = len(found)
         rows = np.zeros((num_poses, self.num_bytes), np.uint8)
-        rows[:, : self._found_at] = detections.reshape(num_poses, -1)
+        rows[:, : self._found_at] = detections.reshape(num_poses, self._found_at)
         rows[:, self._found_at : self._view_at] = np.packbits(found, axis=1, bitorder="little")
-        cells = np.zeros((num_poses, -(-self.view * self.view // 4) * 4), np.uint8)
-        cells[:, : self.view * self.view] = view.reshape(num_poses, -1)
-        packed = (cells.reshape(num_poses, -1, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(axis=-1, dtype=np.uint8)
-        rows[:, self._view_at : self._view_at + packed.shape[1]] = packed
+        view_bytes = -(-self.view * self.view // 4)
+        cells = np.zeros((num_poses, 4 * view_bytes), np.uint8)
+        cells[:, : self.view * self.view] = view.reshape(num_poses, self.view * self.view)
+        packed = (cells.reshape(num_poses, view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(-1, dtype=np.uint8)
+        rows[:, self._view_at : self._view_at + view_bytes] = packed
         return rows
 
     def detections(self, rows: Any) -> Any:

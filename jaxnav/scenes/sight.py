@@ -9,6 +9,7 @@ CAMERA_HEIGHT = 1.5
 TAN_HALF_FIELD_OF_VIEW = float(np.tan(np.deg2rad(50.0)))
 SIGHT_MARGIN = 0.3  # a line of sight ends this far before the target's centre
 GRAZE = 1e-6  # touching a surface by less than this does not block
+TOLERANCE = 1e-9  # on lengths that decide something, so that rounding errors do not; always on the side of yes
 
 
 def cell_centres(scene: Scene, cells: np.ndarray) -> np.ndarray:
@@ -19,7 +20,8 @@ def cell_centres(scene: Scene, cells: np.ndarray) -> np.ndarray:
 def opaque(boxes: np.ndarray) -> np.ndarray:
     """Which boxes [N, 6] block the sight: bulky furniture that stands on the floor, bool [N]."""
     _, y, _, sx, sy, sz = boxes.T
-    return (np.minimum(sx, sz) >= 0.3) & (y - sy / 2 <= 0.3) & (y + sy / 2 >= 0.85)
+    bulky, low, high = np.minimum(sx, sz) - 0.3, 0.3 - (y - sy / 2), y + sy / 2 - 0.85
+    return np.minimum(np.minimum(bulky, low), high) >= -TOLERANCE
 
 
 def wall_boxes(scene: Scene) -> np.ndarray:
@@ -62,7 +64,7 @@ def line_of_sight(scene: Scene, centres: np.ndarray, targets: np.ndarray) -> np.
 
 
 def _meets(start: np.ndarray, line: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Whether segments start [C, 1 of 3] + t line [C, N, 3], 0 <= t <= 1, enter the open box (low, high): bool [C, N]."""
+    """Whether segments start [C, 3] + t line [C, N, 3], 0 <= t <= 1, enter the open box (low, high): bool [C, N]."""
     enter, leave = np.zeros(line.shape[:2]), np.ones(line.shape[:2])
     inside = np.ones(line.shape[:2], bool)
     for axis in range(3):
@@ -100,7 +102,7 @@ def offsets_in_view(centres: np.ndarray, points: np.ndarray) -> tuple[np.ndarray
 
 
 def view_known(scene: Scene, cells: np.ndarray, radius: int) -> np.ndarray:
-    """Which floor cells around each cell can be seen past walls and boxes of 1.5 m or more.
+    """Which floor cells around each cell can be seen past walls and opaque boxes that reach 1.5 m or more.
 
     Args:
       scene: the scene.
@@ -111,10 +113,10 @@ def view_known(scene: Scene, cells: np.ndarray, radius: int) -> np.ndarray:
       bool [C, 2 radius + 1, 2 radius + 1] over the offsets (dz, dx).
     """
     x, y, z, sx, sy, sz = scene.boxes[opaque(scene.boxes)].T
-    tall = y + sy / 2 >= CAMERA_HEIGHT
+    tall = y + sy / 2 >= CAMERA_HEIGHT - TOLERANCE
     grid = np.argwhere(np.ones_like(scene.walls))
     distance = np.abs(cell_centres(scene, grid)[:, None] - np.stack([x, z], axis=-1)[tall])
-    covered = (distance <= np.stack([sx, sz], axis=-1)[tall] / 2).all(axis=-1).any(axis=-1)
+    covered = (distance <= np.stack([sx, sz], axis=-1)[tall] / 2 + TOLERANCE).all(axis=-1).any(axis=-1)
     blocked = np.pad(scene.walls | covered.reshape(scene.walls.shape), radius)
     span = np.arange(-radius, radius + 1)
     known = np.ones((len(cells), len(span), len(span)), bool)

@@ -29,8 +29,8 @@ class PPOConfig:
 
     num_envs: int = 512
     rollout: int = 30
-    epochs: int = 2
-    minibatches: int = 4
+    epochs: int = 1
+    minibatches: int = 16
     learning_rate: float = 1e-3
     gamma: float = 0.99
     gae_lambda: float = 0.95

@@ -77,8 +77,8 @@ def ppo_loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped PPO loss over [T, B], and where `distil` holds the counterfactual branch's.
 
-    The latter teaches the branch without its direct pathways to act like the factual policy as well as experience and memory
-    allow: KL(pi || counterfactual), the target fixed.
+    The latter teaches the branch without its direct pathways to act like the factual policy as well as experience and
+    memory allow: KL(pi || counterfactual), the target fixed.
 
     Returns:
       The loss float32 [] and its parts by name.

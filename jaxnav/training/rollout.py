@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.causal import do
-from jaxnav.env.types import EnvParams, Observation
+from jaxnav.env.types import EnvParams
 from jaxnav.policies.acting import Acting, Agent, select
 from jaxnav.policies.pathways import Decision, Memory, Pathways
 from jaxnav.policies.policy import Policy
@@ -87,17 +87,17 @@ def rollout(
     """
     num_envs = agent.state.pose.shape[0]
 
-    def decide(agent: Agent, direct: jax.Array) -> tuple[Observation, jax.Array, Decision]:
+    def decide(agent: Agent, direct: jax.Array) -> tuple[jax.Array, Decision]:
         observation, weights = acting.observe(agent, params)
         pathways = zero_direct(policy.pathways(observation, weights), direct)
-        return observation, weights, policy.decide(pathways, agent.memory)
+        return weights, policy.decide(pathways, agent.memory)
 
     def step(carry: tuple[Agent, Cut], inputs: tuple[jax.Array, jax.Array]) -> tuple[tuple[Agent, Cut], Transition]:
         agent, cut = carry
         time, key = inputs
         coin_key, action_key, env_key = (jax.random.fold_in(key, purpose) for purpose in range(3))
         direct = jax.random.bernoulli(coin_key, 0.5 if coin else 1.0, (num_envs,))
-        observation, weights, decision = decide(agent, direct)
+        weights, decision = decide(agent, direct)
         action = jax.random.categorical(action_key, decision.logits)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(decision.logits), action[:, None], axis=-1)[:, 0]
 
@@ -134,8 +134,8 @@ def rollout(
 
     layout = acting.believe(cut.agent.layout, cut.agent.state, params, priors)
     direct = jnp.ones((num_envs,), bool)
-    *_, after_cut = decide(cut.agent._replace(layout=layout), direct)
-    *_, after_last = decide(agent, direct)
+    _, after_cut = decide(cut.agent._replace(layout=layout), direct)
+    _, after_last = decide(agent, direct)
     following = jnp.concatenate([transitions.value[1:], after_last.value[None]])
     at_cut = jnp.arange(length)[:, None] == cut.time[None, :]
     following = jnp.where(at_cut, after_cut.value[None, :], following)

@@ -1,0 +1,114 @@
+"""The episode command: one evaluation episode of a trained run as a picture."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+
+from jaxnav.cli.eval import load_policies
+from jaxnav.cli.train import load_run
+from jaxnav.env.make import build_for, in_split, load_scenes
+from jaxnav.env.types import State
+from jaxnav.errors import InputError
+from jaxnav.evaluation.draw import Episode, draw_episode
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.playback import play
+from jaxnav.layout import SETTINGS
+from jaxnav.policies.acting import Acting
+from jaxnav.scenes.compile import compile_bank
+from jaxnav.scenes.lattice import POSES_PER_CELL, standable_cells
+from jaxnav.scenes.sight import cell_centres
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeConfig:
+    """A picture of one episode of a training run.
+
+    Attributes:
+      run: the run directory; its first seed acts, with the best action at every step.
+      split: scenes to play in.
+      index: of the episode in the fixed list of `eval.py`.
+      out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
+      variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout weights.
+      epsilon: threshold of sTDE.
+      scenes: scene file to read instead of the run's own world or file.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    split: Literal["train", "val", "test"] = "val"
+    index: int = 0
+    out: Path | None = None
+    variant: Literal["stde", "layout", "baseline"] = "stde"
+    epsilon: float = 0.5
+    scenes: Path | None = None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit code: 0, or 2 after bad input."""
+    console = Console(stderr=True, highlight=False)
+    try:
+        config = tyro.cli(EpisodeConfig, args=arguments, prog="jaxnav episode", description="Draw one episode.")
+        target = config.out or config.run / "episode.gif"
+        if target.suffix not in (".gif", ".png"):
+            raise InputError(f"--out {target}: give a name that ends in .gif or .png")
+        episode = play_episode(config)
+        draw_episode(episode, target)
+        console.print(f"{len(episode.trace.pose)} steps; written to {target}", soft_wrap=True)
+    except InputError as error:
+        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+        return 2
+    return 0
+
+
+def play_episode(config: EpisodeConfig) -> Episode:
+    """Play the episode.
+
+    Raises:
+      InputError: no finished run, no such episode, or an impossible epsilon.
+    """
+    if not 0.0 <= config.epsilon < float("inf"):
+        raise InputError(f"--epsilon {config.epsilon}: give a number from 0 to below infinity")
+    run = load_run(config.run)
+    policies = load_policies(config.run, run.seeds)
+    worlds, source = run.worlds, config.scenes or run.source
+    scenes = load_scenes(source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
+    scenes = in_split(scenes, config.split, source)
+    bank = compile_bank(scenes, policies.categories, run.detector)
+    env, params = build_for(bank, config.split, worlds.train_step_limit, worlds.step_limit, worlds.large_step_limit)
+    episodes = episode_list(bank)
+    if not 0 <= config.index < len(episodes.goal):
+        raise InputError(f"--index {config.index}: give a number from 0 to {len(episodes.goal) - 1}")
+    index, goal = episodes.scene[config.index], episodes.goal[config.index]
+    start = State(pose=episodes.pose[config.index], scene=index, goal=goal, time=np.int32(0))
+
+    baseline = config.variant == "baseline"
+    epsilon = config.epsilon if config.variant == "stde" else float("inf")
+    trace = play(
+        jax.tree.map(lambda leaf: leaf[0 if baseline else policies.seeds], policies.params),
+        start,
+        Acting(env, policies.setting),
+        policies.spec,
+        params,
+        policies.priors,
+        epsilon=epsilon,
+        use_layout=not baseline,
+        form=SETTINGS[policies.setting].form,
+    )
+    scene = next(scene for scene in scenes if scene.name == bank.names[index])
+    cells = cell_centres(scene, standable_cells(scene.reach))
+    title = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
+    return Episode(
+        trace=trace,
+        scene=scene,
+        places=cells[trace.pose // POSES_PER_CELL - bank.first_cell[index]],
+        rows=bank.rows[trace.pose],
+        categories=policies.categories,
+        goal=int(goal),
+        best_length=int(episodes.best_length[config.index]),
+        epsilon=epsilon,
+        title=f"{policies.spec.method.upper()}{title[config.variant]}  ·  {scene.name}",  # noqa: RUF001
+    )
