@@ -10,7 +10,7 @@ from jaxnav.scenes.scene import Scene
 
 CATEGORIES = ("Book", "Chair", "Fridge")
 BOOK, CHAIR, FRIDGE = range(3)
-SMALL = (0.3, 0.3, 0.05)  # size 0.3, so detected up to 5 m; not opaque, for it is too thin
+SMALL = (0.6, 0.6, 0.05)  # size 0.6, so detected up to 5 m; not opaque, for it is too thin
 
 
 def draw(rows, *objects, walls=(), origin=(0.0, 0.0)):

@@ -18,7 +18,7 @@ from jaxnav.scenes.lattice import DONE, POSES_PER_CELL
 from jaxnav.training.losses import replay
 from jaxnav.training.rollout import rollout
 
-ENVS, LENGTH = 12, tiny.LIMITS[0]
+ENVS, LENGTH = 24, tiny.LIMITS[0]
 ENV, PARAMS = tiny.world()
 PRIORS = tiny.priors()
 ACTING = Acting(ENV, tiny.SETTING)
@@ -34,6 +34,11 @@ def act(weights, agent, key, coin, acting=ACTING):
 @functools.partial(jax.jit, static_argnums=1)
 def begin(key, acting=ACTING):
     return acting.start(key, ENVS, bind(tiny.SPEC, tiny.lively(0)), PARAMS, PRIORS)
+
+
+@jax.jit
+def decide_again(weights, transitions, memory):
+    return replay(bind(tiny.SPEC, weights), transitions, memory, PARAMS)
 
 
 class Rolled(NamedTuple):
@@ -152,8 +157,7 @@ def test_the_agent_after_the_rollout_is_that_of_the_plain_loop(coin):
 @COIN
 def test_replay_gives_the_decisions_again(coin):
     run = rolled(coin)
-    policy = bind(tiny.SPEC, run.weights)
-    decisions, _ = jax.jit(lambda t, memory: replay(policy, t, memory, PARAMS))(run.transitions, run.before.memory)
+    decisions, _ = decide_again(run.weights, run.transitions, run.before.memory)
     log_prob = np.take_along_axis(jax.nn.log_softmax(decisions.logits), run.transitions.action[..., None], axis=-1)
     np.testing.assert_allclose(log_prob[..., 0], run.transitions.log_prob, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(decisions.value, run.transitions.value, rtol=1e-4, atol=1e-5)
@@ -199,6 +203,9 @@ def test_equal_keys_give_equal_rollouts_and_others_do_not():
 
 def test_without_a_setting_no_layout_is_carried_and_its_weights_are_ones():
     acting = dataclasses.replace(ACTING, setting=None)
-    agent, transitions, _ = act(tiny.lively(0), begin(jax.random.key(0), acting), jax.random.key(1), False, acting)
+    key = jax.random.key(0)
+    agent, transitions, _ = jax.eval_shape(lambda: act(tiny.lively(0), begin(key, acting), key, False, acting))
     assert agent.layout is None
-    np.testing.assert_array_equal(transitions.weights, np.ones((LENGTH, ENVS, 3)))
+    assert transitions.weights.shape == (LENGTH, ENVS, 3)
+    weights = acting.observe(begin(key)._replace(layout=None), PARAMS)[1]
+    np.testing.assert_array_equal(weights, np.ones((ENVS, 3)))

@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from twin import DONE, Twin
+from twin import DONE, Twin, largest_component
 
 from jaxnav.env.make import build_for
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.compile import compile_bank, compile_scene
 from jaxnav.scenes.detector import PERFECT
 from jaxnav.scenes.io import read_scenes
+from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.rooms import generate_rooms
 from jaxnav.scenes.rows import RowLayout
 from jaxnav.scenes.scene import Scene
@@ -96,7 +97,7 @@ def agrees(entry, instance):
     """Whether the four bytes of a category are those of an instance, within half a quantum."""
     ahead, right, apparent = instance
     distance = math.hypot(ahead, right)
-    reach = min(max(apparent * max(distance, 0.25) / 0.06, 1.5), 5.0)
+    reach = min(max(apparent * max(distance, 0.25) / 0.12, 1.5), 5.0)
     values = (255 * (1 - 0.5 * distance / reach), 51 * ahead, 128 + 25.4 * right, min(127.5 * apparent, 255))
     return all(abs(int(byte) - value) <= 0.5 + 1e-6 for byte, value in zip(entry, values, strict=True))
 
@@ -117,11 +118,12 @@ def row_differences(row, twin):
 
 
 def roll_out(env, params, seed):
-    """Random steps, with Done likelier where it succeeds: `(before, action, ...)`, leaves [NUM_STEPS, NUM_ENVS, ...]."""
+    """Random steps, with Done likelier where it succeeds or time is up; leaves [NUM_STEPS, NUM_ENVS, ...]."""
 
     def act(key, state):
         steer, choose, step = jax.random.split(key, 3)
-        done = jax.random.bernoulli(steer, jnp.where(env.found(state, params), 0.2, 0.01))
+        last = state.time + 1 == params.step_limit[state.scene]
+        done = jax.random.bernoulli(steer, jnp.where(env.found(state, params) | last, 0.2, 0.01))
         action = jnp.where(done, DONE, jax.random.randint(choose, (), 0, DONE))
         _, after, reward, terminated, truncated, info = env.step(step, state, action, params)
         return after, (state, action, reward, terminated, truncated, info)
@@ -173,10 +175,20 @@ def test_random_steps(source, split):
                 "goal distance": abs(max(nearest - 1.0, 0.0) - twin.goal_distance()) > 1e-6,
             }
         )
-        endings[expected] += 1
+        endings[(*expected, twin.steps == limits[scene])] += 1
     assert +differences == collections.Counter()
-    # Every kind of step was taken.
-    assert set(endings) == {(-0.01, False, False), (-0.01, False, True), (-0.01, True, False), (5.0, True, False)}
+    # Every kind of step was taken, before the limit and at it (a success at the limit is rare).
+    late, early = ({ending[:3] for ending in endings if ending[3] == last} for last in (True, False))
+    assert early == {(-0.01, False, False), (-0.01, True, False), (5.0, True, False)}
+    assert late >= {(-0.01, False, True), (-0.01, True, False)}
+
+
+def test_standable_cells():
+    draws = np.random.default_rng(0)
+    for _ in range(300):  # so few cells that the largest part often is not the only one
+        reach = draws.random((4, 6)) < 0.3
+        expected = largest_component({(iz, ix) for iz, ix in np.argwhere(reach).tolist()})
+        assert {(iz, ix) for iz, ix in standable_cells(reach).tolist()} == expected
 
 
 @pytest.mark.parametrize(("source", "every"), [("coarse", 1), ("rooms", 3), ("ithor", 3)])

@@ -24,7 +24,7 @@ def test_offsets_ahead_and_right():
     scene = draw(["."] * 5, book)
     [(ahead, right, apparent)] = twin(scene, cell=(4, 0), heading=2).detections()[BOOK]
     assert (ahead, right) == pytest.approx((2.0, 0.5))
-    assert apparent == pytest.approx(0.3 / math.sqrt(4.25))
+    assert apparent == pytest.approx(0.6 / math.sqrt(4.25))
     # Heading 1, f = (0.7071, 0.7071): ahead = 1.5 x 0.7071, right = (2 + 0.5) x 0.7071 = 1.67 ahead > tan 50.
     assert detected(twin(scene, cell=(4, 0), heading=1)) == set()
     # Heading 3, f = (0.7071, -0.7071): ahead = 2.5 x 0.7071, right = (-2 + 0.5) x 0.7071.
@@ -192,9 +192,9 @@ def test_success_is_limited_to_15_m_in_the_plane(z, found):
 @pytest.mark.parametrize(
     ("sides", "reached", "missed"),
     [
-        ((0.2, 0.1, 0.18), 3.16, 3.17),  # size sqrt(0.2 x 0.18) = 0.18974, range 3.1623
-        ((0.05, 0.05, 0.01), 1.5 + 5e-10, 1.51),  # 0.05 / 0.06 < 1.5
-        ((1.0, 0.2, 1.0), 5.0, 5.01),  # 1 / 0.06 > 5
+        ((0.4, 0.2, 0.36), 3.16, 3.17),  # size sqrt(0.4 x 0.36) = 0.37947, range 3.1623
+        ((0.05, 0.05, 0.01), 1.5 + 5e-10, 1.51),  # 0.05 / 0.12 < 1.5
+        ((1.0, 0.2, 1.0), 5.0, 5.01),  # 1 / 0.12 > 5
     ],
 )
 def test_the_range_follows_from_the_size(sides, reached, missed):
@@ -202,9 +202,9 @@ def test_the_range_follows_from_the_size(sides, reached, missed):
     assert detected(single(("Book", 0, 1.5, missed, *sides))) == set()
 
 
-@pytest.mark.parametrize(("z", "apparent"), [(2.0, 0.15), (0.2, 1.2)])
+@pytest.mark.parametrize(("z", "apparent"), [(2.0, 0.3), (0.2, 2.4)])
 def test_the_apparent_size_is_bounded_near_the_camera(z, apparent):
-    # 0.3 / 2, and 0.3 / max(0.2, 0.25).
+    # 0.6 / 2, and 0.6 / max(0.2, 0.25).
     assert single(("Book", 0, 1.5, z, *SMALL)).detections()[BOOK] == [pytest.approx((z, 0.0, apparent))]
 
 
@@ -214,9 +214,9 @@ def test_the_nearest_detected_instance_wins_and_equally_near_ones_are_all_accept
     assert single(far, near).detections()[BOOK] == [pytest.approx((1.0, 0.5, 0.2 / math.sqrt(1.25)))]
     # A wardrobe at x from 0.1 to 0.6, z from 0.25 to 0.55 hides the near one.
     hidden = single(far, near, ("Wardrobe", 0.35, 1, 0.4, 0.5, 2, 0.3))
-    assert hidden.detections()[BOOK] == [pytest.approx((3.0, 0.0, 0.1))]
+    assert hidden.detections()[BOOK] == [pytest.approx((3.0, 0.0, 0.2))]
     both = single(near, ("Book", -0.5, 1.5, 1, *SMALL)).detections()[BOOK]
-    assert sorted(both) == [pytest.approx((1, -0.5, 0.3 / 1.25**0.5)), pytest.approx((1, 0.5, 0.2 / 1.25**0.5))]
+    assert sorted(both) == [pytest.approx((1, -0.5, 0.6 / 1.25**0.5)), pytest.approx((1, 0.5, 0.2 / 1.25**0.5))]
 
 
 def test_success_counts_any_instance_and_types_are_mapped_by_name():

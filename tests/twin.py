@@ -77,7 +77,7 @@ class Box:
         self.opaque = min(limits) >= -1e-9
         sides = sorted((sx, sy, sz))
         self.size = math.sqrt(sides[1] * sides[2])
-        self.range = min(max(self.size / 0.06, 1.5), 5.0)
+        self.range = min(max(self.size / 0.12, 1.5), 5.0)
 
 
 class Twin:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 import tyro
 from rich.console import Console
 
@@ -33,7 +33,7 @@ class EpisodeConfig:
       split: scenes to play in.
       index: of the episode in the fixed list of `eval.py`.
       out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
-      variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout weights.
+      variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.
       scenes: scene file to read instead of the run's own world or file.
     """
@@ -83,7 +83,7 @@ def play_episode(config: EpisodeConfig) -> Episode:
     if not 0 <= config.index < len(episodes.goal):
         raise InputError(f"--index {config.index}: give a number from 0 to {len(episodes.goal) - 1}")
     index, goal = episodes.scene[config.index], episodes.goal[config.index]
-    start = State(pose=episodes.pose[config.index], scene=index, goal=goal, time=np.int32(0))
+    start = State(pose=episodes.pose[config.index], scene=index, goal=goal, time=jnp.int32(0))
 
     baseline = config.variant == "baseline"
     epsilon = config.epsilon if config.variant == "stde" else float("inf")
@@ -110,5 +110,5 @@ def play_episode(config: EpisodeConfig) -> Episode:
         goal=int(goal),
         best_length=int(episodes.best_length[config.index]),
         epsilon=epsilon,
-        title=f"{policies.spec.method.upper()}{title[config.variant]}  ·  {scene.name}",  # noqa: RUF001
+        title=f"{policies.spec.method.upper()}{title[config.variant]}  ·  {scene.name}",
     )

@@ -25,8 +25,8 @@ def check_environment(
       AssertionError: a promise is broken.
     """
     chex.clear_trace_counter()
-    reset = jax.jit(chex.assert_max_traces(jax.vmap(env.reset, (0, None)), n=1))
-    step = jax.jit(chex.assert_max_traces(jax.vmap(env.step, (0, 0, 0, None)), n=1))
+    reset = jax.jit(jax.vmap(chex.assert_max_traces(env.reset, n=1), (0, None)))
+    step = jax.jit(jax.vmap(chex.assert_max_traces(env.step, n=1), (0, 0, 0, None)))
     key = jax.random.key(seed)
     keys = jax.random.split(key, num_envs)
     observation, state = reset(keys, params)

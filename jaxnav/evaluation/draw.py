@@ -6,30 +6,22 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PatchCollection
-from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
-from matplotlib.patches import Rectangle
 from matplotlib.path import Path as Outline
-from matplotlib.patheffects import withStroke
-from matplotlib.transforms import Affine2D, Bbox
+from matplotlib.transforms import Affine2D
 from PIL import Image
 
+from jaxnav.evaluation.plan import GOAL, INK, draw_room, view_cone
 from jaxnav.evaluation.playback import Trace
-from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import DONE, HORIZONS, NUM_HEADINGS, heading_vectors
 from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, RowLayout
-from jaxnav.scenes.scene import CELL, Scene
-from jaxnav.scenes.sight import CAMERA_HEIGHT, opaque
+from jaxnav.scenes.scene import Scene
 
-# Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies.
-AGENT, GOAL, SEEN, REMOVED = "#0072B2", "#D55E00", "#009E73", "#E69F00"
-INK, PALE, GROUND, FLOOR, WALL = "#333333", "#8a8a8a", "#f7f5f1", "#ebe5d8", "#55524d"
-HEIGHTS = LinearSegmentedColormap.from_list("height", ["#d3cab9", "#978d7d"])
+AGENT, SEEN, REMOVED, PALE = "#0072B2", "#009E73", "#E69F00", "#8a8a8a"
 ACTIONS = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")
 ARROW = Outline([(0, 1), (-0.75, -0.9), (0, -0.45), (0.75, -0.9), (0, 1)], closed=True)
-MAX_FRAMES, STEP_MS, LAST_MS, NUM_COLOURS = 60, 220, 2500, 48
+MAX_FRAMES, STEP_MS, LAST_MS, NUM_COLOURS = 60, 220, 2500, 128
 
 
 class Episode(NamedTuple):
@@ -59,7 +51,7 @@ class Episode(NamedTuple):
 
 
 def draw_episode(episode: Episode, path: Path) -> None:
-    """Write the episode as a GIF (a frame per step; at most 60) or, for any other ending of the name, its last frame."""
+    """Write the episode as a GIF, a frame per step but at most 60, or, if the name ends otherwise, its last frame."""
     figure = Figure(figsize=(9.6, 5.4), dpi=100)
     canvas = FigureCanvasAgg(figure)
     room = figure.add_axes((0.015, 0.03, 0.6, 0.85))
@@ -68,7 +60,7 @@ def draw_episode(episode: Episode, path: Path) -> None:
     figure.text(0.02, 0.945, episode.title, color=PALE, fontsize=9.5)
     figure.text(0.02, 0.9, f"Looking for {episode.categories[episode.goal]}", color=GOAL, fontsize=14, weight="bold")
     status = figure.text(0.98, 0.935, "", color=INK, fontsize=10.5, ha="right")
-    _draw_room(room, episode)
+    draw_room(room, episode.scene, episode.categories, episode.goal)
 
     last = len(episode.trace.pose) - 1
     frames = range(0, last + 1, -(-(last + 1) // MAX_FRAMES)) if path.suffix == ".gif" else []
@@ -87,7 +79,8 @@ def draw_episode(episode: Episode, path: Path) -> None:
         images[-1].save(path, optimize=True)
         return
     # One palette for all frames: what stands still stays equal from frame to frame and costs nothing.
-    palette = images[len(images) // 2].quantize(NUM_COLOURS, dither=Image.Dither.NONE)
+    richest = max(images, key=lambda image: len(image.getcolors(2**20)))
+    palette = richest.quantize(NUM_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [STEP_MS] * (len(images) - 1) + [LAST_MS]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
@@ -104,68 +97,10 @@ def _status(episode: Episode, step: int) -> str:
     return f"{text}; " + (f"found (best: {episode.best_length} steps)" if trace.success else "not found")
 
 
-def _draw_room(axes: Axes, episode: Episode) -> None:
-    """Everything that stands still."""
-    scene = episode.scene
-    colours = np.where(
-        scene.walls[..., None], to_rgb(WALL), np.where(scene.reach[..., None], to_rgb(FLOOR), to_rgb(GROUND))
-    )
-    low = np.asarray(scene.origin) - CELL / 2
-    high = low + CELL * np.array(scene.reach.shape[::-1])
-    axes.imshow(colours, origin="lower", extent=(low[0], high[0], low[1], high[1]), interpolation="nearest")
-    x, y, z, sx, sy, sz = scene.boxes.T
-    top = y + sy / 2
-    order = np.argsort(top)
-    boxes = [Rectangle((x[i] - sx[i] / 2, z[i] - sz[i] / 2), sx[i], sz[i]) for i in order]
-    shades = HEIGHTS(np.clip(top[order] / 2.0, 0, 1))
-    axes.add_collection(PatchCollection(boxes, facecolor=shades, edgecolor="white", linewidth=0.7, zorder=2))
-
-    low = np.minimum(low, np.min([x - sx / 2, z - sz / 2], axis=1)) - 0.05
-    high = np.maximum(high, np.max([x + sx / 2, z + sz / 2], axis=1)) + 0.05
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], facecolor=GROUND)
-    axes.spines[:].set_visible(False)
-    _label_objects(axes, episode)
-
-
-def _label_objects(axes: Axes, episode: Episode) -> None:
-    """A dot per object that can be sought and, for the first of its kind around, a name where it overlaps least."""
-    ids = category_ids(episode.scene.types, episode.categories)
-    objects = sorted((i for i, category in enumerate(ids) if category >= 0), key=lambda i: ids[i] != episode.goal)
-    axes.apply_aspect()
-    points = axes.transData.transform(episode.scene.boxes[:, [0, 2]])
-    taken = [Bbox.from_bounds(*(points[i] - 4), 8, 8) for i in objects]
-    named: list[tuple[int, np.ndarray]] = []
-    for i in objects:
-        sought, place = ids[i] == episode.goal, episode.scene.boxes[i, [0, 2]]
-        style = (
-            {"marker": "*", "color": GOAL, "markersize": 15, "zorder": 6} if sought else {"marker": "o", "color": INK}
-        )
-        axes.plot(*place, **{"markersize": 4, "zorder": 5, "markeredgecolor": "white", "markeredgewidth": 0.7} | style)
-        if any(ids[i] == other and np.hypot(*(place - there)) < 1.0 for other, there in named):
-            continue
-        named.append((ids[i], place))
-        colour, weight = (GOAL, "bold") if sought else (INK, "normal")
-        text = axes.text(*place, episode.categories[ids[i]], fontsize=7, color=colour, weight=weight, zorder=7)
-        text.set(verticalalignment="bottom", path_effects=[withStroke(linewidth=1.6, foreground=GROUND)])
-        width, height = text.get_window_extent().size
-        near, left, below, middle = 9, -9 - width, -8 - height, -height / 2
-        spots = [(near, middle), (left, middle), (-width / 2, 8), (-width / 2, below)]
-        spots += [(near, 3), (left, 3), (near, below), (left, below)]
-        boxes = [Bbox.from_bounds(*(points[i] + spot), width, height) for spot in spots]
-        clashes = [sum(box.overlaps(other) for other in taken) + 2 * (not _within(box, axes.bbox)) for box in boxes]
-        best = boxes[int(np.argmin(clashes))]
-        taken.append(best)
-        text.set_position(axes.transData.inverted().transform((best.x0, best.y0)))
-
-
-def _within(inner: Bbox, outer: Bbox) -> bool:
-    return outer.x0 <= inner.x0 and inner.x1 <= outer.x1 and outer.y0 <= inner.y0 and inner.y1 <= outer.y1
-
-
 def _draw_agent(axes: Axes, episode: Episode, step: int) -> list:
     """The path so far, the view cone, the agent and where it perceives objects; returns what to take away again."""
     place, heading = episode.places[step], episode.trace.pose[step] // len(HORIZONS) % NUM_HEADINGS
-    cone = axes.fill(*_view_cone(episode.scene, place, 45.0 * heading).T, color=AGENT, alpha=0.16, lw=0, zorder=3)
+    cone = axes.fill(*view_cone(episode.scene, place, 45.0 * heading).T, color=AGENT, alpha=0.16, lw=0, zorder=3)
     path = axes.plot(*episode.places[: step + 1].T, color=AGENT, lw=2, solid_joinstyle="round", zorder=4)
     start = axes.plot(*episode.places[0], "o", color="white", markeredgecolor=AGENT, markersize=6, zorder=4)
     marker = MarkerStyle(ARROW, transform=Affine2D().rotate_deg(-45.0 * heading))
@@ -179,21 +114,6 @@ def _draw_agent(axes: Axes, episode: Episode, step: int) -> list:
     colours = [GOAL if category == episode.goal else SEEN for category in seen]
     rings = axes.scatter(*(place + offsets[seen]).T, s=110, facecolor="none", edgecolor=colours, lw=1.6, zorder=6)
     return [*cone, *path, *start, *agent, rings]
-
-
-def _view_cone(scene: Scene, place: np.ndarray, yaw: float) -> np.ndarray:
-    """Outline [N, 2] of the floor in the field of view, 4 m deep, cut by walls and boxes of the camera's height."""
-    angles = np.deg2rad(yaw + np.linspace(-50.0, 50.0, 81))
-    reach = np.linspace(0.0, 4.0, 81)
-    points = place + reach[:, None] * np.stack([np.sin(angles), np.cos(angles)], axis=-1)[:, None]  # [81, 81, 2]
-    cells = np.rint((points - scene.origin) / CELL).astype(int)[..., ::-1]
-    inside = ((cells >= 0) & (cells < scene.walls.shape)).all(axis=-1)
-    blocked = inside & scene.walls[tuple(np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0))]
-    tall = scene.boxes[opaque(scene.boxes) & (scene.boxes[:, 1] + scene.boxes[:, 4] / 2 >= CAMERA_HEIGHT)]
-    for box in tall:
-        blocked |= (np.abs(points - box[[0, 2]]) < box[[3, 5]] / 2).all(axis=-1)
-    depth = np.where(blocked.any(axis=1), blocked.argmax(axis=1), len(reach) - 1)
-    return np.concatenate([place[None], points[np.arange(len(angles)), depth]])
 
 
 def _detections(episode: Episode, step: int) -> np.ndarray:
@@ -221,7 +141,7 @@ def _draw_gap(axes: Axes, episode: Episode, step: int) -> None:
         axes.axhline(epsilon, color=PALE, lw=1, ls=(0, (4, 3)))
         axes.text(1.01, epsilon, "ε", color=PALE, va="center", transform=axes.get_yaxis_transform())
         axes.fill_between(steps, epsilon, np.maximum(gap, epsilon), color=REMOVED, alpha=0.6, lw=0, step="mid")
-        axes.set_title("filled: experience taken out", loc="left", fontsize=8, color=REMOVED)
+        axes.set_title("filled: experience taken out", loc="left", fontsize=8, color=PALE)
     axes.step(steps, gap, where="mid", color=AGENT, lw=1.6)
     axes.plot(steps[-1], gap[-1], "o", color=AGENT, markersize=4.5)
     axes.set(xlim=(0.5, max(len(episode.trace.gap), 2) + 0.5), ylim=(0, 1.02), yticks=(0, 0.5, 1))
@@ -234,4 +154,4 @@ def _draw_gap(axes: Axes, episode: Episode, step: int) -> None:
 def _plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(PALE)
-    axes.tick_params(colors=INK, labelsize=8.5, color=PALE)
+    axes.tick_params(labelcolor=INK, labelsize=8.5, color=PALE)

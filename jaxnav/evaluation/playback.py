@@ -46,7 +46,7 @@ def play(
     Args:
       weights: parameters of one policy.
       start: of the episode, leaves [].
-      acting: environment and layout setting; the setting is needed, as the gap is always followed.
+      acting: environment and layout setting; without a setting the gap stays 0.
       spec: sizes of the policy.
       params: the environment's.
       priors: float32 [rooms, K, K].
@@ -63,7 +63,7 @@ def play(
         pathways = policy.pathways(observation, layout_weights)
         factual = policy.decide(pathways, agent.memory)
         counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-        logits = stde(factual.logits, counterfactual.logits, agent.layout.gap, epsilon, form)
+        logits = stde(factual.logits, counterfactual.logits, acting.gap(agent), epsilon, form)
         action = jnp.argmax(logits, axis=-1).astype(jnp.int32)
         found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
         state, _, done, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
@@ -73,9 +73,9 @@ def play(
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
     layout = acting.believe(acting.first_belief(state, params, priors), state, params, priors)
     agent = Agent(state=state, layout=layout, memory=bind(spec, weights).initial_memory((1,)))
-    steps, ended, success = [], False, False
-    while not ended:
-        pose, gap = agent.state.pose, agent.layout.gap
+    steps, ended, success = [], jnp.array([False]), jnp.array([False])
+    while not ended[0]:
+        pose, gap = agent.state.pose, acting.gap(agent)
         agent, action, ended, success = step(weights, agent)
         steps.append((pose[0], action[0], gap[0]))
     pose, action, gap = (np.asarray(column) for column in zip(*steps, strict=True))

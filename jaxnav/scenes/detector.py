@@ -9,7 +9,7 @@ from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.sight import TAN_HALF_FIELD_OF_VIEW
 
 MIN_RANGE, MAX_RANGE = 1.5, 5.0
-SMALLEST_APPARENT_SIZE = 0.06
+SMALLEST_APPARENT_SIZE = 0.12  # about 15 pixels of a 300 x 300 picture with a field of view of 100 degrees
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Detector:
       seed: draws the errors, together with the scene's name.
     """
 
-    miss_near: float = 0.02
-    miss_far: float = 0.3
+    miss_near: float = 0.05
+    miss_far: float = 0.4
     false_alarm: float = 0.005
     seed: int = 0
 

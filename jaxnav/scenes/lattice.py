@@ -58,7 +58,7 @@ def successors(cells: np.ndarray) -> np.ndarray:
 
     table = np.stack(
         [
-            pose(np.broadcast_to(np.array(ahead)[..., None], cell.shape), heading, horizon),
+            pose(np.broadcast_to(np.array(ahead).reshape(num_cells, NUM_HEADINGS, 1), cell.shape), heading, horizon),
             pose(cell, heading - 1, horizon),
             pose(cell, heading + 1, horizon),
             pose(cell, heading, 0),

@@ -122,7 +122,7 @@ def view_known(scene: Scene, cells: np.ndarray, radius: int) -> np.ndarray:
     known = np.ones((len(cells), len(span), len(span)), bool)
     for step in range(1, 2 * radius):  # half-cell steps along the longest line
         share = step / (2 * radius)
-        dz = np.floor(span * share + 0.5).astype(int)
+        dz = np.rint(span * share).astype(int)  # symmetric about 0, so that a mirrored room has a mirrored view
         seen = ~blocked[cells[:, 0, None, None] + radius + dz[:, None], cells[:, 1, None, None] + radius + dz[None, :]]
         # A sample that falls into the looked-at cell itself, or into the own one, hides nothing.
         last = (dz == span)[:, None] & (dz == span)[None, :]

@@ -83,8 +83,9 @@ class Learner:
 
         state, metrics = jax.lax.scan(step, state, None, length=num_updates)
         sums = {name: value.sum() for name, value in metrics.items()}
-        episodes = jnp.maximum(sums.pop("episodes"), 1.0)
-        per_episode = {name: sums.pop(name) / episodes for name in ("success", "return", "length", "truncated")}
+        episodes = sums.pop("episodes")
+        ended = jnp.maximum(episodes, 1.0)
+        per_episode = {name: sums.pop(name) / ended for name in ("success", "return", "length", "truncated")}
         return state, per_episode | {name: value / num_updates for name, value in sums.items()} | {"episodes": episodes}
 
     def update(
@@ -121,29 +122,31 @@ class Learner:
             with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
                 step, optimizer = self._optimizer.update(gradient, optimizer, weights)
             weights = jax.tree.map(lambda w, s: w - rate * s, weights, step)
-            return (weights, optimizer), parts | {"gradient_norm": optax.global_norm(gradient)}
+            return (weights, optimizer), parts | {"gradient_norm": optax.tree.norm(gradient)}
 
         keys = jax.random.split(shuffle_key, config.epochs)
         order = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(keys)
         parts = order.reshape(config.epochs * config.minibatches, -1)
         (weights, optimizer), metrics = jax.lax.scan(learn, (state.params, state.optimizer), parts)
-        metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(transitions, ended)
-        metrics["skipped_updates"] = optimizer.total_notfinite.astype(jnp.float32)
+        metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(transitions, ended, params)
+        skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
+        metrics["skipped_updates"] = skipped.astype(jnp.float32)
         state = state.replace(params=weights, optimizer=optimizer, agent=agent, update=state.update + 1)
         return state, metrics
 
 
-def _episode_sums(transitions: Transition, ended: jax.Array) -> dict[str, jax.Array]:
+def _episode_sums(transitions: Transition, ended: jax.Array, params: EnvParams) -> dict[str, jax.Array]:
     """Sums over the episodes that ended in a rollout, float32 [] each."""
 
     def total(values: jax.Array) -> jax.Array:
         return jnp.where(ended, values.astype(jnp.float32), 0.0).sum()
 
-    # Every step but a successful Done costs the same, so the return follows from success and length.
+    success, length = total(transitions.success), total(transitions.length)
     return {
         "episodes": total(ended),
-        "success": total(transitions.success),
-        "length": total(transitions.length),
+        "success": success,
+        "length": length,
         "truncated": total(transitions.truncated),
-        "return": transitions.reward.sum(),
+        # Every step but a successful Done costs the same, so the return follows from success and length.
+        "return": params.success_reward * success + params.step_reward * (length - success),
     }

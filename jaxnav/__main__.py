@@ -1,0 +1,31 @@
+"""The jaxnav command: `python -m jaxnav train | eval | episode`."""
+
+import difflib
+import importlib
+import sys
+
+COMMANDS = {
+    "train": "train a method with and without the layout estimator",
+    "eval": "evaluate a run: tables of variants, epsilons and seeds",
+    "episode": "draw one evaluation episode of a run",
+}
+
+HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:9} {what}\n" for name, what in COMMANDS.items())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command that the first argument names; returns its exit code, 2 for an unknown one."""
+    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in ("-h", "--help"):
+        print(HELP + "\nEach has its own --help.")
+        return 0
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        mend = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(COMMANDS)}"
+        print(f"error: unknown command {name!r}; {mend}", file=sys.stderr)
+        return 2
+    return importlib.import_module(f"jaxnav.cli.{name}").main(rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
