@@ -49,9 +49,9 @@ def test_rows_unpack_to_what_was_packed(num_categories, num_bytes):
 
 
 def test_the_bytes_of_a_detection():
-    # 2 m ahead with size 0.3 m, so range 5 m: confidence 1 - 0.5 x 0.4 = 0.8, apparent size 0.15.
+    # 2 m ahead with size 0.6 m, so range 5 m: confidence 1 - 0.5 x 0.4 = 0.8, apparent size 0.3.
     row = table_of(draw(["."], BOOK_AHEAD)).rows[0]
-    assert LAYOUT.detections(row)[BOOK].tolist() == [204, 102, 128, 19]  # 0.8 x 255, 2 x 51, 128, 0.15 x 127.5 = 19.1
+    assert LAYOUT.detections(row)[BOOK].tolist() == [204, 102, 128, 38]  # 0.8 x 255, 2 x 51, 128, 0.3 x 127.5 = 38.25
     assert not LAYOUT.detections(row)[CHAIR].any()
     # 0.9 m at a distance of 0.4 m: apparent size 2.25 x 127.5 = 286.9, more than a byte holds.
     row = table_of(draw(["."], ("Chair", 0, 1.5, 0.4, 0.9, 0.9, 0.1))).rows[0]
@@ -123,9 +123,9 @@ def test_a_mirrored_room_has_a_mirrored_view():
 
 
 def detect(detector, seen, distance, num_poses=40_000):
-    """Detections uint8 [P, 2, 4] of objects of 0.3 m (range 5 m) straight ahead."""
+    """Detections uint8 [P, 2, 4] of objects of 0.6 m (range 5 m) straight ahead."""
     shape = (num_poses, 2)
-    ahead, size = np.full(shape, float(distance)), np.full(shape, 0.3)
+    ahead, size = np.full(shape, float(distance)), np.full(shape, 0.6)
     return detector.detect("room", np.full(shape, seen), ahead, np.zeros(shape), ahead, size)
 
 

@@ -68,7 +68,7 @@ class RunConfig:
     world: Literal["rooms"] = "rooms"
     scenes: Path | None = None
     seeds: int = 3
-    total_steps: int = 4_000_000
+    total_steps: int = 2_000_000
     seed: int = 0
     counterfactual: Counterfactual = "distil"
     chunk: int = 8
