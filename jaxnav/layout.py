@@ -106,7 +106,7 @@ def _bregman_remainder(a: jax.Array, c: jax.Array, log_ratio: jax.Array) -> jax.
     b = a + c
     p, q = 1 / (a + 1), 1 / (b + 1)
     log_next = jnp.log1p(c * p)  # log((b + 1) / (a + 1))
-    half_log = (log_next - c * q) / 2
+    half_log = _excess(-c * q, -log_next) / 2
     t = c * q / a
     shift = t * c / b - (a + 1) * _excess(t, log_ratio - log_next)
     # Divergences of x^-1, x^-3 and x^-5; 1/1680 instead of 1/1260 makes the cut series best over x >= 1.

@@ -144,7 +144,9 @@ def test_an_episode_begins_with_nothing_remembered_and_no_action(org):
 def test_the_first_policy_is_close_to_uniform():
     weights = init_params(SPEC, jax.random.key(0))
     for i, row in enumerate(BANK.rows[::16]):
-        logits = decide(weights, row, i % K, WEIGHTS[0], Memory(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION)))[0].logits
+        logits = decide(weights, row, i % K, WEIGHTS[0], Memory(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION)))[
+            0
+        ].logits
         assert 0 < np.abs(logits).max() < 0.1
 
 

@@ -119,6 +119,7 @@ def test_difference_in_report_units():
         ("layout", results()["sr"]),
         ("stde", better),
         epsilon=0.5,
+        form="residual",
         decoding="argmax",
         strata=STRATA,
         generator=np.random.default_rng(0),
@@ -130,6 +131,7 @@ def test_difference_in_report_units():
         "from": "layout",
         "to": "stde",
         "epsilon": 0.5,
+        "form": "residual",
         "decoding": "argmax",
         "mean": pytest.approx(25),
     }
@@ -218,3 +220,19 @@ def test_console_table():
         ["ithor test, sample decoding", "", "", ""],
         ["VTNet (baseline)", *CELLS.split(" | ")],
     ]
+
+
+def test_difference_table_has_a_line_per_comparison():
+    entry = {"from": "layout", "to": "stde", "epsilon": 0.5, "form": "residual", "decoding": "argmax"}
+    values = [("sr", 25.0, [10.0, 40.0]), ("spl", -1.25, [-2.0, 0.5]), ("dts", -0.031, [-0.1, 0.0])]
+    report = {"differences": [{**entry, "metric": name, "mean": mean, "ci95": ci} for name, mean, ci in values]}
+    table = reports.difference_table(report)
+    cells = [str(next(iter(column.cells))) for column in table.columns]
+    expected = [
+        "+ w + sTDE (eps=0.5) - + w",
+        "argmax",
+        "+25.0 [+10.0, +40.0]",
+        "-1.2 [-2.0, +0.5]",
+        "-0.03 [-0.10, +0.00]",
+    ]
+    assert (cells, table.row_count) == (expected, 1)

@@ -106,7 +106,9 @@ def retraced(coin: bool) -> Retraced:
     for slot in range(ENVS):
         weights = tiny.goal_weights(found.layout[slot], after.state.goal[slot])
         row, goal = ROWS[after.state.pose[slot]], after.state.goal[slot]
-        values = np.append(found.value[1:, slot], tiny.decide(run.weights, row, goal, weights, found.memory[slot])[0].value)
+        values = np.append(
+            found.value[1:, slot], tiny.decide(run.weights, row, goal, weights, found.memory[slot])[0].value
+        )
         goes_on = ~(run.transitions.terminated | run.transitions.truncated)[:, slot]
         found.following[goes_on, slot] = values[goes_on]
     return found

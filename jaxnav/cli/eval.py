@@ -19,7 +19,15 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.report import Form, build_difference, build_report, build_row, console_table, write_report
+from jaxnav.evaluation.report import (
+    Form,
+    build_difference,
+    build_report,
+    build_row,
+    console_table,
+    difference_table,
+    write_report,
+)
 from jaxnav.evaluation.variants import Row, inference_grid, table_rows
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
@@ -112,6 +120,7 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     write_report(target, report)
     write_atomic(target.with_suffix(".episodes.csv"), _episode_csv(rows, outcome, episodes, bank).encode())
     out.print(console_table(report))
+    out.print(difference_table(report))
     console.print(f"{len(episodes.goal)} episodes, {compilations} compilation; written to {target}")
 
 
@@ -143,6 +152,7 @@ def _report(
     compilations: int,
 ) -> dict[str, Any]:
     """The table, and the paired differences that it is read for."""
+
     def generator() -> np.random.Generator:
         # Equal resamples for every row: equal results get equal intervals.
         return np.random.default_rng(config.seed)
@@ -177,6 +187,7 @@ def _report(
                 (reference, against[metric]),
                 (row.variant, by_row[row][metric]),
                 epsilon=row.epsilon,
+                form=row.form,
                 decoding=row.decoding,
                 strata=episodes.room,
                 generator=generator(),

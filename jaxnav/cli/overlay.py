@@ -20,7 +20,7 @@ def apply_yaml(default: Config, path: str | Path) -> Config:
     """`default` with the values of a YAML file, each checked against the annotation of its field.
 
     Known annotations: `bool`, `int`, `float`, `str`, `Path`, `Literal`, `X | None`, `tuple`, nested dataclasses.
-    Where a float is expected, whole numbers and texts such as `3e-4` (which YAML 1.1 reads as text) are taken as floats.
+    Where a float is expected, whole numbers and texts such as `3e-4` (text to YAML 1.1) are taken as floats.
 
     Args:
       default: instance of a frozen dataclass.

@@ -5,7 +5,6 @@ A report is a plain dictionary that JSON holds exactly; SR, SPL and SAE are in p
 
 import importlib.metadata
 import json
-import os
 import platform
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +15,7 @@ from rich.text import Text
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Summary, paired_difference, summary
+from jaxnav.store.files import write_atomic
 
 #: Version of the JSON layout.
 FORMAT = 1
@@ -96,6 +96,7 @@ def build_difference(
     compared: tuple[str, np.ndarray],
     *,
     epsilon: float | None,
+    form: Form | None,
     decoding: Decoding,
     strata: np.ndarray,
     generator: np.random.Generator,
@@ -108,6 +109,7 @@ def build_difference(
       reference: (name of the variant, its results [S, E] as given to `build_row`).
       compared: the same for the variant compared with it.
       epsilon: threshold of the sTDE, None where there is none.
+      form: how the compared variant combines counterfactual logits, None where there are none.
       decoding: how actions are taken from logits, in both.
       strata: int [E], stratum (room type) of each episode.
       generator: source of the bootstrap resamples.
@@ -119,8 +121,8 @@ def build_difference(
     (source, a), (target, b) = reference, compared
     a, b = _to_report_units(metric, a), _to_report_units(metric, b)
     difference = paired_difference(a, b, strata, generator, same_seeds=same_seeds)
-    identity = {"metric": metric, "from": source, "to": target, "epsilon": epsilon, "decoding": decoding}
-    return {**identity, "mean": difference.mean, "ci95": list(difference.ci95)}
+    identity = {"metric": metric, "from": source, "to": target, "epsilon": epsilon, "form": form}
+    return {**identity, "decoding": decoding, "mean": difference.mean, "ci95": list(difference.ci95)}
 
 
 def build_report(rows: list[dict[str, Any]], differences: list[dict[str, Any]], compilations: int) -> dict[str, Any]:
@@ -150,10 +152,7 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     Raises:
       ValueError: the report holds NaN or an infinity; nothing is written.
     """
-    text = json.dumps(report, indent=2, allow_nan=False)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_atomic(path, (json.dumps(report, indent=2, allow_nan=False) + "\n").encode())
 
 
 def console_table(report: dict[str, Any]) -> Table:
@@ -164,6 +163,22 @@ def console_table(report: dict[str, Any]) -> Table:
         table.add_row(Text(heading, style="bold"))
         for cells in lines:
             table.add_row(*map(Text, cells))  # Text: brackets are not markup
+    return table
+
+
+def difference_table(report: dict[str, Any]) -> Table:
+    """Table of the paired differences: a line per comparison and decoding, `mean [95 % interval]`."""
+    lines: dict[tuple[str, str], list[str]] = {}
+    for entry in report["differences"]:
+        compared = _label({**entry, "variant": entry["to"], "method": ""})
+        reference = "+ w" if entry["from"] == "layout" else entry["from"]
+        _, digits = _COLUMNS[entry["metric"]]
+        low, high = entry["ci95"]
+        cell = f"{entry['mean']:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+        lines.setdefault((f"{compared} - {reference}", entry["decoding"]), []).append(cell)
+    table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in _COLUMNS.values()))
+    for names, cells in lines.items():
+        table.add_row(*map(Text, (*names, *cells)))
     return table
 
 
