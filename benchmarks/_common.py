@@ -38,7 +38,15 @@ def timings(function: Callable, *args, repeats: int = 50) -> dict[str, float]:
         jax.block_until_ready(function(*args))
         wall.append(1e3 * (time.perf_counter() - begin))
     cpu = 1e3 * (time.process_time() - start) / repeats
-    return {"wall_min_ms": min(wall), "wall_median_ms": statistics.median(wall), "cpu_mean_ms": cpu}
+    median = statistics.median(wall)
+    return {"wall_min_ms": min(wall), "wall_median_ms": median, "wall_max_ms": max(wall), "cpu_mean_ms": cpu}
+
+
+def rates(timing: dict[str, float], steps: int) -> dict[str, float]:
+    """Steps per second of calls that take `steps` steps each, from their `timings`."""
+    slowest, fastest = timing["wall_max_ms"], timing["wall_min_ms"]
+    rate = {"median": timing["wall_median_ms"], "min": slowest, "max": fastest}
+    return {name: round(1e3 * steps / wall) for name, wall in rate.items()}
 
 
 def report(results: dict) -> None:

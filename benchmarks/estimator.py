@@ -1,10 +1,10 @@
-"""Cost of one layout-estimator step with gap for many episodes: `python -m benchmarks.estimator`."""
+"""Cost of one layout-estimator step with gap for many episodes: `python benchmarks/estimator.py`."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _common import report, timings
 
-from benchmarks._common import report, timings
 from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
 
 EPISODES, CATEGORIES, VISIBLE = 4096, 22, 0.15

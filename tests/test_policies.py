@@ -69,7 +69,7 @@ def org():
 
 
 def packed_row():
-    """Category 0 far ahead on the left, category 1 not detected though its bytes are not zero, category 2 right here."""
+    """Category 0 far ahead on the left, category 1 not detected though its bytes are not 0, category 2 right here."""
     detections = np.array([[[255, 255, 1, 51], [0, 99, 7, 200], [51, 0, 128, 255]]], np.uint8)
     view = np.zeros((1, VIEW, VIEW), np.uint8)
     view[0, 0, 0], view[0, 10, 10] = VIEW_FREE, VIEW_BLOCKED

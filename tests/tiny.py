@@ -1,4 +1,4 @@
-"""A world of two drawn rooms and policies of a few hundred parameters: what acts and learns compiles in seconds."""
+"""A world of two drawn rooms and policies of a few thousand parameters: what acts and learns compiles in seconds."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.compile import compile_bank
 from jaxnav.scenes.rows import RowLayout
 
-SIZES = Sizes(hidden=16, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4, relation_layers=2)
+SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4, relation_layers=2)
 SPEC = PolicySpec(method="org", num_categories=len(CATEGORIES), sizes=SIZES)
 SETTING = "calibrated"
 #: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
@@ -47,10 +47,13 @@ _init = jax.jit(init_params, static_argnums=0)
 
 
 def lively(seed, spec=SPEC):
-    """Random parameters whose logits are not all close to 0, as those of a fresh policy are."""
+    """Random parameters that act by what they see, unlike those of a fresh policy, which are close to indifferent."""
     params = _init(spec, jax.random.key(seed))
     kernel = jax.random.normal(jax.random.key(seed + 1000), params["actor"]["kernel"].shape)
-    return params | {"actor": params["actor"] | {"kernel": kernel}}
+    loud = {
+        name: jax.tree.map(lambda leaf: 3 * leaf, node) for name, node in params.items() if name in ("fuse", "method")
+    }
+    return params | loud | {"actor": params["actor"] | {"kernel": kernel}}
 
 
 @jax.jit

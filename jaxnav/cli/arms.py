@@ -1,10 +1,10 @@
 """The two arms of a run: the method alone, and the method with the layout estimator."""
 
-import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from jaxnav.cli.config import RunConfig
 from jaxnav.env.objectnav import ObjectNav
@@ -16,42 +16,63 @@ from jaxnav.training.learner import Learner, LearnerState
 #: The arms in the order of the tables. The first has no layout weights and no counterfactual branch.
 ARMS = ("baseline", "layout")
 
+#: The seeds of every arm.
+States = dict[str, list[LearnerState]]
+Metrics = dict[str, list[dict[str, float]]]
+
+
+class Arms:
+    """All arms and seeds of a run; each arm is compiled once, and seeds of both run side by side on the cores."""
+
+    def __init__(self, config: RunConfig, env: ObjectNav, params: EnvParams, priors: jax.Array) -> None:
+        self._learners = {
+            "baseline": _learner(config, env, setting=None, counterfactual="none"),
+            "layout": _learner(config, env, setting=config.layout.setting, counterfactual=config.counterfactual),
+        }
+        self._scalars = config.ppo.scalars(config.total_updates * config.ppo.num_envs * config.ppo.rollout)
+        self._data = (params, priors)
+        self._root = jax.random.key(config.seed)
+        self._seeds = config.seeds
+        self._chunk = config.chunk
+        self._compiled: dict[str, Any] = {}
+
+    def init(self) -> States:
+        """Every seed before its first update."""
+        starts = {name: jax.jit(learner.init) for name, learner in self._learners.items()}
+        keys = [jax.random.fold_in(self._root, seed) for seed in range(self._seeds)]
+        return {name: [start(key, *self._data) for key in keys] for name, start in starts.items()}
+
+    def train(self, states: States) -> tuple[States, Metrics]:
+        """One chunk of updates of every seed, with its metrics. The states are donated."""
+        tasks = [(name, seed) for seed in range(self._seeds) for name in ARMS]
+        with ThreadPoolExecutor(min(len(tasks), os.cpu_count() or 1)) as pool:
+            if not self._compiled:
+                compiled = pool.map(lambda name: self._compile(name, states[name][0]), ARMS)
+                self._compiled = dict(zip(ARMS, compiled, strict=True))
+            results = list(pool.map(lambda task: self._train(task[0], states[task[0]][task[1]]), tasks))
+        done: States = {name: [] for name in ARMS}
+        metrics: Metrics = {name: [] for name in ARMS}
+        for (name, _), (state, values) in zip(tasks, results, strict=True):
+            done[name].append(state)
+            metrics[name].append({key: float(value) for key, value in values.items()})
+        return done, metrics
+
+    def _compile(self, name: str, state: LearnerState) -> Any:
+        learner, num_updates = self._learners[name], self._chunk
+
+        def train(state: LearnerState, scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
+            return learner.train(state, scalars, params, priors, num_updates)
+
+        return jax.jit(train, donate_argnums=0).lower(state, self._scalars, *self._data).compile()
+
+    def _train(self, name: str, state: LearnerState) -> tuple[LearnerState, dict[str, jax.Array]]:
+        return jax.block_until_ready(self._compiled[name](state, self._scalars, *self._data))
+
 
 def policy_spec(config: RunConfig, env: ObjectNav) -> PolicySpec:
     """Sizes of a run's policies."""
     return PolicySpec(method=config.method, num_categories=len(env.categories), sizes=config.sizes)
 
 
-class Arm:
-    """N seeds of one arm, trained in one compiled call per chunk."""
-
-    def __init__(self, name: str, config: RunConfig, env: ObjectNav, params: EnvParams, priors: jax.Array) -> None:
-        layout = name == "layout"
-        self.learner = Learner(
-            acting=Acting(env, config.layout.setting if layout else None),
-            spec=policy_spec(config, env),
-            config=config.ppo,
-            counterfactual=config.counterfactual if layout else "none",
-        )
-        self._scalars = config.ppo.scalars(config.total_updates * config.ppo.num_envs * config.ppo.rollout)
-        self._keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(config.seed)))(
-            jnp.arange(config.seeds)
-        )
-        self._data = (params, priors)
-        self._chunk = config.chunk
-        self._train = jax.jit(self._train_seeds, donate_argnums=0)
-        self._init = jax.jit(self._init_seeds)
-
-    def init(self) -> LearnerState:
-        """All seeds before their first update, leaves [N, ...]."""
-        return self._init(self._keys, *self._data)
-
-    def train(self, states: LearnerState) -> tuple[LearnerState, dict[str, jax.Array]]:
-        """One chunk of updates of every seed; metrics float32 [N] each. The states are donated."""
-        return self._train(states, self._scalars, *self._data)
-
-    def _init_seeds(self, keys: jax.Array, params: EnvParams, priors: jax.Array) -> LearnerState:
-        return jax.lax.map(lambda key: self.learner.init(key, params, priors), keys)
-
-    def _train_seeds(self, states: LearnerState, scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
-        return jax.lax.map(lambda state: self.learner.train(state, scalars, params, priors, self._chunk), states)
+def _learner(config: RunConfig, env: ObjectNav, setting: str | None, counterfactual: Any) -> Learner:
+    return Learner(Acting(env, setting), policy_spec(config, env), config.ppo, counterfactual)

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxnav.cli.arms import ARMS, Arm
+from jaxnav.cli.arms import Arms, States
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse_run
 from jaxnav.cli.overlay import apply_yaml
@@ -28,12 +28,9 @@ from jaxnav.store.files import write_atomic
 from jaxnav.store.manifest import differences, make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.exploration import Exploration, explore
-from jaxnav.training.learner import LearnerState
 
 CONFIG_FILE, LOG_FILE, POLICIES = "config.json", "metrics.jsonl", "policies"
 _EXPLORE = 2**31 - 1  # purpose of the prior's key; seeds use 0, 1, ...
-
-States = dict[str, LearnerState]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,16 +59,14 @@ def train(config: RunConfig, console: Console) -> None:
     priors = jax.vmap(lambda counts: prior_from_counts(counts, config.layout.setting))(found.counts)
     console.print(f"layout prior from {int(found.steps):,} random steps, {int(found.poses):,} distinct poses")
 
-    arms = {name: Arm(name, config, env, params, priors) for name in ARMS}
-    abstract = jax.eval_shape(lambda: {name: arm.init() for name, arm in arms.items()})
-    restored = restore(config.run_dir, abstract, manifest)
-    states, done = restored or ({name: arm.init() for name, arm in arms.items()}, 0)
+    arms = Arms(config, env, params, priors)
+    restored = restore(config.run_dir, jax.eval_shape(arms.init), manifest)
+    states, done = restored or (arms.init(), 0)
     truncate_after(config.run_dir / LOG_FILE, done)
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
     states = _updates(config, arms, states, done, manifest, console)
-    for name, state in states.items():
-        _export(config, env, name, state, priors, found)
+    _export(config, env, states, priors, found)
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
 
 
@@ -117,28 +112,25 @@ def _claim(run_dir: Path, config: dict[str, Any]) -> None:
 
 
 def _updates(
-    config: RunConfig, arms: dict[str, Arm], states: States, done: int, manifest: dict[str, Any], console: Console
+    config: RunConfig, arms: Arms, states: States, done: int, manifest: dict[str, Any], console: Console
 ) -> States:
     """Train chunk by chunk; between chunks log, show and save."""
-    per_chunk = config.chunk * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(arms)
+    steps = config.chunk * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(states)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("compiling", total=config.total_updates, completed=done)
         while done < config.total_updates:
             began = time.monotonic()
-            metrics = {}
-            for name, arm in arms.items():
-                states[name], metrics[name] = arm.train(states[name])
-            metrics = jax.device_get(metrics)
+            states, metrics = arms.train(states)
             done += config.chunk
-            rate = per_chunk / (time.monotonic() - began)
-            for name, values in metrics.items():
-                for seed in range(config.seeds):
-                    own = {key: float(value[seed]) for key, value in values.items()}
-                    append_row(config.run_dir / LOG_FILE, {"step": done, "arm": name, "seed": seed} | own)
+            rate = steps / (time.monotonic() - began)
+            for name, seeds in metrics.items():
+                for seed, values in enumerate(seeds):
+                    append_row(config.run_dir / LOG_FILE, {"step": done, "arm": name, "seed": seed} | values)
             if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
                 save(config.run_dir, done, states, manifest)
-            rates = ", ".join(f"{name} SR {100 * values['success'].mean():.0f} %" for name, values in metrics.items())
+            success = {name: np.mean([values["success"] for values in seeds]) for name, seeds in metrics.items()}
+            rates = ", ".join(f"{name} SR {100 * rate:.0f} %" for name, rate in success.items())
             line = f"update {done}/{config.total_updates}, {rate / 1000:.0f} k steps/s, {rates}"
             progress.update(task, completed=done, description=line)
             if not console.is_terminal and (done // config.chunk) % 4 == 0:
@@ -146,19 +138,17 @@ def _updates(
     return states
 
 
-def _export(
-    config: RunConfig, env: ObjectNav, name: str, states: LearnerState, priors: jax.Array, found: Exploration
-) -> None:
+def _export(config: RunConfig, env: ObjectNav, states: States, priors: jax.Array, found: Exploration) -> None:
     """Write every seed's policy with the prior it was trained with."""
-    for seed in range(config.seeds):
-        params = jax.tree.map(lambda leaf: np.asarray(leaf[seed]), states.params)  # noqa: B023
+    for name, seeds in states.items():
         spec = {
             "method": config.method,
             "categories": list(env.categories),
-            "sizes": vars(config.sizes),
+            "sizes": dataclasses.asdict(config.sizes),
             "layout": config.layout.setting if name == "layout" else None,
             "prior_steps": int(found.steps),
             "prior_poses": int(found.poses),
         }
-        tensors = {"policy": params, "layout": {"prior": np.asarray(priors)}}
-        export_params(config.run_dir / POLICIES / f"{name}-{seed}", tensors, spec)
+        for seed, state in enumerate(seeds):
+            tensors = {"policy": jax.device_get(state.params), "layout": {"prior": np.asarray(priors)}}
+            export_params(config.run_dir / POLICIES / f"{name}-{seed}", tensors, spec)

@@ -149,8 +149,8 @@ def _episodes(
         following = Agent(state=state, layout=acting.believe(agent.layout, state, params, priors), memory=memory)
         outcome = Outcome(
             success=outcome.success | (running & found & (action == DONE)),
-            length=outcome.length + running,
-            moves=outcome.moves + (running & (action == MOVE_AHEAD)),
+            length=outcome.length + running.astype(jnp.int32),
+            moves=outcome.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
             distance=outcome.distance,
             weight=outcome.weight + jnp.where(running, weight, 0.0),
         )

@@ -1,0 +1,64 @@
+"""Steps per second of training with the default policy, learning included: `python benchmarks/training.py`.
+
+Both arms, one seed each, as `train.py` runs them; the rollout's share; and the memory of a compiled chunk of updates.
+"""
+
+import jax
+from _common import rates, report, timings
+
+from jaxnav.cli.arms import ARMS, Arm
+from jaxnav.cli.config import RunConfig
+from jaxnav.env.make import make
+from jaxnav.layout import prior_from_counts
+from jaxnav.policies.policy import bind
+from jaxnav.training.exploration import explore
+from jaxnav.training.rollout import rollout
+
+CHUNK, REPEATS = 2, 5
+
+
+def main() -> None:
+    config = RunConfig()
+    env, params = make(config.world)
+    counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
+    priors = jax.vmap(prior_from_counts)(counts)
+    arms = {name: arm(Arm(name, config, env, params, priors), config, params, priors) for name in ARMS}
+    report({"episodes": config.ppo.num_envs, "rollout": config.ppo.rollout, "updates_per_call": CHUNK, "arms": arms})
+
+
+def arm(arm: Arm, config: RunConfig, params, priors) -> dict:
+    learner = arm.learner
+    state = jax.jit(learner.init)(jax.random.key(0), params, priors)
+
+    @jax.jit
+    def train(state, scalars, params, priors):
+        return learner.train(state, scalars, params, priors, CHUNK)
+
+    @jax.jit
+    def act(state, params, priors):
+        policy = bind(learner.spec, state.params)
+        coin = learner.counterfactual == "coin"
+        return rollout(learner.acting, policy, state.agent, state.key, config.ppo.rollout, coin, params, priors)
+
+    def lowered(total_steps: int):
+        return train.lower(state, config.ppo.scalars(total_steps), params, priors)
+
+    compiled = lowered(config.total_steps).compile()
+    memory = compiled.memory_analysis()
+    training = timings(compiled, state, config.ppo.scalars(config.total_steps), params, priors, repeats=REPEATS)
+    acting = timings(act, state, params, priors, repeats=REPEATS)
+    steps = config.ppo.num_envs * config.ppo.rollout
+    longer = lowered(100 * config.total_steps).as_text()
+    return {
+        "steps_per_s": rates(training, CHUNK * steps),
+        "rollout_steps_per_s": rates(acting, steps),
+        "rollout_share": round(CHUNK * acting["wall_median_ms"] / training["wall_median_ms"], 3),
+        "temp_bytes": memory.temp_size_in_bytes,
+        "argument_bytes": memory.argument_size_in_bytes,
+        # Equal programs need equal memory.
+        "same_program_for_100_times_the_steps": lowered(config.total_steps).as_text() == longer,
+    }
+
+
+if __name__ == "__main__":
+    main()
