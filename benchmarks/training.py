@@ -1,33 +1,58 @@
 """Steps per second of training with the default policy, learning included: `python benchmarks/training.py`.
 
-Both arms, one seed each, as `train.py` runs them; the rollout's share; and the memory of a compiled chunk of updates.
+All seeds of both arms side by side, as `train.py` runs them; each arm alone, with the rollout's share; and the memory
+of a compiled chunk of updates.
 """
+
+import dataclasses
+import time
 
 import jax
 from _common import rates, report, timings
 
-from jaxnav.cli.arms import ARMS, Arm
+from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
 from jaxnav.layout import prior_from_counts
 from jaxnav.policies.policy import bind
 from jaxnav.training.exploration import explore
+from jaxnav.training.learner import Learner
 from jaxnav.training.rollout import rollout
 
 CHUNK, REPEATS = 2, 5
 
 
 def main() -> None:
-    config = RunConfig()
+    config = dataclasses.replace(RunConfig(), chunk=CHUNK)
     env, params = make(config.world)
     counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
     priors = jax.vmap(prior_from_counts)(counts)
-    arms = {name: arm(Arm(name, config, env, params, priors), config, params, priors) for name in ARMS}
-    report({"episodes": config.ppo.num_envs, "rollout": config.ppo.rollout, "updates_per_call": CHUNK, "arms": arms})
+    arms = Arms(config, env, params, priors)
+    steps = CHUNK * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(arms.learners)
+    report(
+        {
+            "episodes": config.ppo.num_envs,
+            "rollout": config.ppo.rollout,
+            "updates_per_call": CHUNK,
+            "seeds": config.seeds,
+            "all_arms_and_seeds_steps_per_s": side_by_side(arms, steps),
+            "arms": {name: alone(learner, config, params, priors) for name, learner in arms.learners.items()},
+        }
+    )
 
 
-def arm(arm: Arm, config: RunConfig, params, priors) -> dict:
-    learner = arm.learner
+def side_by_side(arms: Arms, steps: int) -> dict:
+    states, _ = arms.train(arms.init())
+    measured = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        states, _ = arms.train(states)
+        measured.append(round(steps / (time.perf_counter() - began)))
+    measured.sort()
+    return {"median": measured[REPEATS // 2], "min": measured[0], "max": measured[-1]}
+
+
+def alone(learner: Learner, config: RunConfig, params, priors) -> dict:
     state = jax.jit(learner.init)(jax.random.key(0), params, priors)
 
     @jax.jit

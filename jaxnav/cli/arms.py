@@ -22,10 +22,14 @@ Metrics = dict[str, list[dict[str, float]]]
 
 
 class Arms:
-    """All arms and seeds of a run; each arm is compiled once, and seeds of both run side by side on the cores."""
+    """All arms and seeds of a run; each arm is compiled once, and seeds of both run side by side on the cores.
+
+    Attributes:
+      learners: the learner of each arm.
+    """
 
     def __init__(self, config: RunConfig, env: ObjectNav, params: EnvParams, priors: jax.Array) -> None:
-        self._learners = {
+        self.learners = {
             "baseline": _learner(config, env, setting=None, counterfactual="none"),
             "layout": _learner(config, env, setting=config.layout.setting, counterfactual=config.counterfactual),
         }
@@ -38,7 +42,7 @@ class Arms:
 
     def init(self) -> States:
         """Every seed before its first update."""
-        starts = {name: jax.jit(learner.init) for name, learner in self._learners.items()}
+        starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         keys = [jax.random.fold_in(self._root, seed) for seed in range(self._seeds)]
         return {name: [start(key, *self._data) for key in keys] for name, start in starts.items()}
 
@@ -58,7 +62,7 @@ class Arms:
         return done, metrics
 
     def _compile(self, name: str, state: LearnerState) -> Any:
-        learner, num_updates = self._learners[name], self._chunk
+        learner, num_updates = self.learners[name], self._chunk
 
         def train(state: LearnerState, scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
             return learner.train(state, scalars, params, priors, num_updates)

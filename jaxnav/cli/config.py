@@ -100,6 +100,9 @@ def check(config: RunConfig) -> RunConfig:
     need(config.method in METHODS, "method", repr(config.method), f"choose one of {', '.join(METHODS)}")
     for name in ("seeds", "total_steps", "chunk", "save_every"):
         need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
+    seeds = {"seed": config.seed, "worlds.seed": config.worlds.seed, "detector.seed": config.detector.seed}
+    for name, seed in seeds.items():
+        need(0 <= seed < 2**32, name, seed, "give a whole number from 0 to 2**32 - 1")
     for group in ("worlds", "layout", "sizes", "ppo"):
         for field in dataclasses.fields(getattr(config, group)):
             value = getattr(getattr(config, group), field.name)

@@ -96,6 +96,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     """Evaluate a run: print the table and write JSON and one CSV row per episode."""
+    if not 0 <= config.seed < 2**32:
+        raise InputError(f"--seed {config.seed}: give a whole number from 0 to 2**32 - 1")
     run = load_run(config.run)
     policies = load_policies(config.run, run.seeds)
     rows = table_rows(config.epsilon, config.form or (SETTINGS[policies.setting].form,))

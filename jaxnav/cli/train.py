@@ -99,14 +99,16 @@ def _claim(run_dir: Path, config: dict[str, Any]) -> None:
     """Make the run directory ours, or refuse if it holds another run."""
     path = run_dir / CONFIG_FILE
     if path.exists():
-        held = json.loads(path.read_text())
-        if different := differences(held, config):
+        if different := differences(settings(load_run(run_dir)), config):
             raise InputError(
                 f"{run_dir}: holds another run (there != asked for): {'; '.join(different)}; "
                 "choose another --run-dir or the same settings"
             )
         return
-    if run_dir.exists() and any(run_dir.iterdir()):
+    if run_dir.exists() and not run_dir.is_dir():
+        raise InputError(f"{run_dir}: is a file; choose another --run-dir")
+    # A kill while the config is written leaves its temporary file alone in the directory.
+    if run_dir.exists() and any(not item.match(f".{CONFIG_FILE}.*.tmp") for item in run_dir.iterdir()):
         raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
     write_atomic(path, (json.dumps(config, indent=2) + "\n").encode())
 
