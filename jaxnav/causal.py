@@ -90,5 +90,8 @@ def stde(
 
     Returns:
       float [..., A].
+
+    Raises:
+      ValueError: unknown form.
     """
     return remove_experience(logits, counterfactual, jax.nn.relu(gap - epsilon), form)

@@ -27,9 +27,9 @@ CONFIG = PPOConfig(
 )
 LEARNER = Learner(acting=ACTING, spec=tiny.SPEC, config=CONFIG, counterfactual="distil")
 UPDATES = 400
-SCALARS = CONFIG.scalars(UPDATES * ENVS * LENGTH)
+SCALARS = CONFIG.scalars(UPDATES)
 METRICS = {
-    "success", "return", "length", "truncated", "episodes", "skipped_updates",
+    "success", "return", "length", "truncated", "episodes", "skipped_steps",
     "policy_loss", "value_loss", "entropy", "distil_loss", "gradient_norm",
 }  # fmt: skip
 
@@ -106,7 +106,7 @@ def test_metrics_are_finite_scalars(whole):
         assert value.shape == (), name
         assert value.dtype == jnp.float32, name
         assert np.isfinite(value), name
-    assert metrics["skipped_updates"] == 0
+    assert metrics["skipped_steps"] == 0
     assert metrics["gradient_norm"] > 0
 
 
@@ -145,12 +145,12 @@ def test_chunks_and_other_scalars_do_not_trace_again(first):
 def test_gradients_that_are_not_finite_are_skipped_and_counted(seeds, poison):
     poisoned = PARAMS.replace(success_reward=jnp.float32(poison), step_reward=jnp.float32(poison))
     states, metrics = one_update(seeds, SCALARS, poisoned, PRIORS)
-    np.testing.assert_array_equal(metrics["skipped_updates"], [8, 8])  # 4 epochs of 2 minibatches
+    np.testing.assert_array_equal(metrics["skipped_steps"], [8, 8])  # 4 epochs of 2 minibatches
     # Neither the parameters nor the moments have changed, so that learning goes on as if nothing had been.
     chex.assert_trees_all_equal(states.params, seeds.params)
     chex.assert_trees_all_equal(states.optimizer.inner_state, seeds.optimizer.inner_state)
     healed, metrics = one_update(states, SCALARS, PARAMS, PRIORS)
-    np.testing.assert_array_equal(metrics["skipped_updates"], [0, 0])
+    np.testing.assert_array_equal(metrics["skipped_steps"], [0, 0])
     chex.assert_tree_all_finite(healed.params)
     assert not np.array_equal(kernel(healed), kernel(states))
 

@@ -13,7 +13,7 @@ from jaxnav.policies.acting import Acting
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.training.learner import Learner, LearnerState
 
-#: The arms in the order of the tables. The first has no layout weights and no counterfactual branch.
+#: The arms in the order of the tables. They differ by the layout's weights alone.
 ARMS = ("baseline", "layout")
 
 #: The seeds of every arm.
@@ -30,10 +30,10 @@ class Arms:
 
     def __init__(self, config: RunConfig, env: ObjectNav, params: EnvParams, priors: jax.Array) -> None:
         self.learners = {
-            "baseline": _learner(config, env, setting=None, counterfactual="none"),
-            "layout": _learner(config, env, setting=config.layout.setting, counterfactual=config.counterfactual),
+            "baseline": _learner(config, env, setting=None),
+            "layout": _learner(config, env, setting=config.layout.setting),
         }
-        self._scalars = config.ppo.scalars(config.total_updates * config.ppo.num_envs * config.ppo.rollout)
+        self._scalars = config.ppo.scalars(config.total_updates)
         self._data = (params, priors)
         self._root = jax.random.key(config.seed)
         self._seeds = config.seeds
@@ -43,8 +43,11 @@ class Arms:
     def init(self) -> States:
         """Every seed before its first update."""
         starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
-        keys = [jax.random.fold_in(self._root, seed) for seed in range(self._seeds)]
-        return {name: [start(key, *self._data) for key in keys] for name, start in starts.items()}
+        states: States = {}
+        for index, (name, start) in enumerate(starts.items()):
+            root = jax.random.fold_in(self._root, index)
+            states[name] = [start(jax.random.fold_in(root, seed), *self._data) for seed in range(self._seeds)]
+        return states
 
     def train(self, states: States) -> tuple[States, Metrics]:
         """One chunk of updates of every seed, with its metrics. The states are donated."""
@@ -78,5 +81,5 @@ def policy_spec(config: RunConfig, env: ObjectNav) -> PolicySpec:
     return PolicySpec(method=config.method, num_categories=len(env.categories), sizes=config.sizes)
 
 
-def _learner(config: RunConfig, env: ObjectNav, setting: str | None, counterfactual: Any) -> Learner:
-    return Learner(Acting(env, setting), policy_spec(config, env), config.ppo, counterfactual)
+def _learner(config: RunConfig, env: ObjectNav, setting: str | None) -> Learner:
+    return Learner(Acting(env, setting), policy_spec(config, env), config.ppo, config.counterfactual)

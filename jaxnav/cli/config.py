@@ -56,7 +56,8 @@ class RunConfig:
       world: generated world, unless `scenes` is given.
       scenes: scene file to read instead; its splits are used.
       seeds: policies trained of each kind.
-      total_steps: environment steps of each policy.
+      total_steps: environment steps of each policy, rounded up to whole chunks. The layout's policies have seen the
+        prior's random steps (`layout.walks x layout.steps`) besides.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
       chunk: updates per compiled call; between calls the run logs, and saves every `save_every` calls.
@@ -83,6 +84,11 @@ class RunConfig:
     def source(self) -> str | Path:
         """Where the scenes come from."""
         return self.scenes or self.world
+
+    @property
+    def update_steps(self) -> int:
+        """Environment steps of one policy between two updates."""
+        return self.ppo.num_envs * self.ppo.rollout
 
     @property
     def total_updates(self) -> int:

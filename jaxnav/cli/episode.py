@@ -9,17 +9,15 @@ import jax.numpy as jnp
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.eval import load_policies
-from jaxnav.cli.train import load_run
-from jaxnav.env.make import build_for, in_split, load_scenes
+from jaxnav.cli.runs import load_policies, load_run, load_world
 from jaxnav.env.types import State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.draw import Episode, draw_episode
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
-from jaxnav.scenes.compile import compile_bank
 from jaxnav.scenes.lattice import POSES_PER_CELL, standable_cells
 from jaxnav.scenes.sight import cell_centres
 
@@ -70,37 +68,31 @@ def play_episode(config: EpisodeConfig) -> Episode:
     Raises:
       InputError: no finished run, no such episode, or an impossible epsilon.
     """
-    if not 0.0 <= config.epsilon < float("inf"):
-        raise InputError(f"--epsilon {config.epsilon}: give a number from 0 to below infinity")
     run = load_run(config.run)
-    policies = load_policies(config.run, run.seeds)
-    worlds, source = run.worlds, config.scenes or run.source
-    scenes = load_scenes(source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
-    scenes = in_split(scenes, config.split, source)
-    bank = compile_bank(scenes, policies.categories, run.detector)
-    env, params = build_for(bank, config.split, worlds.train_step_limit, worlds.step_limit, worlds.large_step_limit)
-    episodes = episode_list(bank)
+    policies = load_policies(run)
+    world = load_world(run, policies, config.split, config.scenes)
+    episodes = episode_list(world.bank)
     if not 0 <= config.index < len(episodes.goal):
         raise InputError(f"--index {config.index}: give a number from 0 to {len(episodes.goal) - 1}")
     index, goal = episodes.scene[config.index], episodes.goal[config.index]
     start = State(pose=episodes.pose[config.index], scene=index, goal=goal, time=jnp.int32(0))
-
-    baseline = config.variant == "baseline"
-    epsilon = config.epsilon if config.variant == "stde" else float("inf")
+    form = SETTINGS[policies.setting].form
+    epsilon = config.epsilon if config.variant == "stde" else None
+    cell = inference_grid([table_row(config.variant, epsilon, form, "argmax")], run.seeds)
+    cell = jax.tree.map(lambda leaf: leaf[0], cell)
     trace = play(
-        jax.tree.map(lambda leaf: leaf[0 if baseline else policies.seeds], policies.params),
+        cell,
+        jax.tree.map(lambda leaf: leaf[cell.params], policies.params),
         start,
-        Acting(env, policies.setting),
+        Acting(world.env, policies.setting),
         policies.spec,
-        params,
+        world.params,
         policies.priors,
-        epsilon=epsilon,
-        use_layout=not baseline,
-        form=SETTINGS[policies.setting].form,
     )
-    scene = next(scene for scene in scenes if scene.name == bank.names[index])
+    bank = world.bank
+    scene = next(scene for scene in world.scenes if scene.name == bank.names[index])
     cells = cell_centres(scene, standable_cells(scene.reach))
-    title = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
+    title = {"stde": f" with layout and sTDE, epsilon {config.epsilon:g}", "layout": " with layout", "baseline": ""}
     return Episode(
         trace=trace,
         scene=scene,
@@ -109,6 +101,6 @@ def play_episode(config: EpisodeConfig) -> Episode:
         categories=policies.categories,
         goal=int(goal),
         best_length=int(episodes.best_length[config.index]),
-        epsilon=epsilon,
+        epsilon=float("inf") if epsilon is None else epsilon,
         title=f"{policies.spec.method.upper()}{title[config.variant]}  ·  {scene.name}",
     )

@@ -4,17 +4,14 @@ import csv
 import dataclasses
 import io
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.arms import ARMS
-from jaxnav.cli.train import POLICIES, load_run
-from jaxnav.env.make import build_for, in_split, load_scenes
+from jaxnav.cli.runs import load_policies, load_run, load_world, settings
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
@@ -31,9 +28,7 @@ from jaxnav.evaluation.report import (
 from jaxnav.evaluation.variants import Row, inference_grid, table_rows
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
-from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.scenes.compile import Bank, compile_bank
-from jaxnav.store.export import load_params
+from jaxnav.scenes.compile import Bank
 from jaxnav.store.files import write_atomic
 
 
@@ -62,26 +57,6 @@ class EvalConfig:
     json: Path | None = None
 
 
-class Policies(NamedTuple):
-    """All policies of a run.
-
-    Attributes:
-      params: leaves [2 S, ...], baseline seeds first, then layout seeds.
-      priors: float32 [rooms, K, K].
-      spec: sizes.
-      categories: [K].
-      setting: of the layout estimator.
-      seeds: S.
-    """
-
-    params: dict[str, Any]
-    priors: jax.Array
-    spec: PolicySpec
-    categories: tuple[str, ...]
-    setting: str
-    seeds: int
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
     console, out = Console(stderr=True, highlight=False), Console(width=120, highlight=False)
@@ -96,63 +71,61 @@ def main(arguments: list[str] | None = None) -> int:
 
 def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     """Evaluate a run: print the table and write JSON and one CSV row per episode."""
+    target = _target(config)
     if not 0 <= config.seed < 2**32:
         raise InputError(f"--seed {config.seed}: give a whole number from 0 to 2**32 - 1")
     run = load_run(config.run)
-    policies = load_policies(config.run, run.seeds)
+    policies = load_policies(run)
     rows = table_rows(config.epsilon, config.form or (SETTINGS[policies.setting].form,))
-    worlds, source = run.worlds, config.scenes or run.source
-    scenes = load_scenes(source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
-    bank = compile_bank(in_split(scenes, config.split, source), policies.categories, run.detector)
-    env, params = build_for(bank, config.split, worlds.train_step_limit, worlds.step_limit, worlds.large_step_limit)
-    episodes = episode_list(bank, config.episodes, config.seed)
+    world = load_world(run, policies, config.split, config.scenes)
+    episodes = episode_list(world.bank, config.episodes, config.seed)
     outcome, compilations = evaluate_grid(
-        inference_grid(rows, policies.seeds),
+        inference_grid(rows, run.seeds),
         policies.params,
         episodes,
-        Acting(env, policies.setting),
+        Acting(world.env, policies.setting),
         policies.spec,
-        params,
+        world.params,
         policies.priors,
         jax.random.key(config.seed),
     )
-    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
-    report = _report(config, rows, outcome, episodes, policies.spec.method, scenes[0].world, compilations)
-    target = config.json or config.run / f"eval-{config.split}.json"
-    write_report(target, report)
-    write_atomic(target.with_suffix(".episodes.csv"), _episode_csv(rows, outcome, episodes, bank).encode())
+    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), run.seeds, -1), outcome)
+    table, differences = _tables(config, rows, outcome, episodes, policies.spec.method, world.scenes[0].world)
+    about = settings(run) | {
+        "steps_per_policy": run.total_updates * run.update_steps,
+        "prior_steps": policies.prior_steps,
+        "evaluation_source": str(config.scenes or run.source),
+        "evaluation_seed": config.seed,
+    }
+    report = build_report(table, differences, compilations, about)
     out.print(console_table(report))
     out.print(difference_table(report))
-    console.print(f"{len(episodes.goal)} episodes, {compilations} compilation; written to {target}")
+    try:
+        write_report(target, report)
+        write_atomic(_episodes_file(target), _episode_csv(rows, outcome, episodes, world.bank).encode())
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
+    console.print(f"{len(episodes.goal)} episodes, {compilations} compilation; written to {target}", soft_wrap=True)
 
 
-def load_policies(run_dir: Path, seeds: int) -> Policies:
-    """All exported policies of a run.
-
-    Raises:
-      InputError: training has not finished, or a file is damaged.
-    """
-    loaded = [load_params(run_dir / POLICIES / f"{arm}-{seed}") for arm in ARMS for seed in range(seeds)]
-    spec = loaded[-1][1]
-    return Policies(
-        params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tensors["policy"] for tensors, _ in loaded)),
-        priors=jnp.asarray(loaded[-1][0]["layout"]["prior"]),
-        spec=PolicySpec(spec["method"], len(spec["categories"]), Sizes(**spec["sizes"])),
-        categories=tuple(spec["categories"]),
-        setting=spec["layout"],
-        seeds=seeds,
+def _target(config: EvalConfig) -> Path:
+    """Where the table goes, refused early if nothing can be written there."""
+    name = (
+        f"eval-{config.split}" if config.scenes is None else f"eval-{config.scenes.name.split('.')[0]}-{config.split}"
     )
+    target = config.json or config.run / f"{name}.json"
+    if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
+        raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")
+    return target
 
 
-def _report(
-    config: EvalConfig,
-    rows: list[Row],
-    outcome: Outcome,
-    episodes: EpisodeList,
-    method: str,
-    world: str,
-    compilations: int,
-) -> dict[str, Any]:
+def _episodes_file(target: Path) -> Path:
+    return target.with_name(f"{target.name.removesuffix('.json')}.episodes.csv")
+
+
+def _tables(
+    config: EvalConfig, rows: list[Row], outcome: Outcome, episodes: EpisodeList, method: str, world: str
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The table, and the paired differences that it is read for."""
 
     def generator() -> np.random.Generator:
@@ -197,7 +170,7 @@ def _report(
             )
             for metric in ("sr", "spl", "dts")
         ]
-    return build_report(table, differences, compilations)
+    return table, differences
 
 
 def _episode_csv(rows: list[Row], outcome: Outcome, episodes: EpisodeList, bank: Bank) -> str:

@@ -1,11 +1,9 @@
 """The training command: prior, two arms of N seeds, checkpoints, and the policies at the end."""
 
 import dataclasses
-import json
 import sys
 import time
 import zlib
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,20 +14,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from jaxnav.cli.arms import Arms, States
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse_run
-from jaxnav.cli.overlay import apply_yaml
-from jaxnav.env.make import build_for, in_split, load_scenes
+from jaxnav.cli.runs import LOG_FILE, POLICIES, claim, settings
+from jaxnav.env.make import build_training, in_split, load_scenes
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.layout import prior_from_counts
 from jaxnav.scenes.compile import Bank, compile_bank
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.export import export_params
-from jaxnav.store.files import write_atomic
-from jaxnav.store.manifest import differences, make_manifest
+from jaxnav.store.manifest import make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.exploration import Exploration, explore
 
-CONFIG_FILE, LOG_FILE, POLICIES = "config.json", "metrics.jsonl", "policies"
 _EXPLORE = 2**31 - 1  # purpose of the prior's key; seeds use 0, 1, ...
 
 
@@ -48,11 +44,10 @@ def train(config: RunConfig, console: Console) -> None:
     """Train all arms and seeds of a run, from its last checkpoint if it has one, and export the policies."""
     started = time.monotonic()
     bank = training_bank(config)
-    env, params = build_for(bank, "train", config.worlds.train_step_limit)
+    env, params = build_training(bank, config.worlds.train_step_limit)
     console.print(f"{len(bank.names)} training scenes, {len(bank.rows):,} poses ({len(bank.skipped)} skipped)")
-    plain = settings(config)
-    _claim(config.run_dir, plain)
-    manifest = make_manifest(plain | {"scenes_crc32": zlib.crc32(bank.rows.tobytes())})
+    claim(config)
+    manifest = make_manifest(settings(config) | {"scenes_crc32": checksum(bank)})
 
     key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
     found = jax.jit(explore, static_argnums=(0, 3, 4))(env, params, key, config.layout.walks, config.layout.steps)
@@ -77,47 +72,19 @@ def training_bank(config: RunConfig) -> Bank:
     return compile_bank(in_split(scenes, "train", config.source), detector=config.detector)
 
 
-def settings(config: RunConfig) -> dict[str, Any]:
-    """What makes a run the run it is: all its settings but where it is kept and how often it is saved."""
-    plain = dataclasses.asdict(config) | {"scenes": str(config.scenes) if config.scenes else None}
-    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every")}
-
-
-def load_run(run_dir: Path) -> RunConfig:
-    """Settings of an earlier run.
-
-    Raises:
-      InputError: the directory holds no run, or its config file is damaged.
-    """
-    path = run_dir / CONFIG_FILE
-    if not path.exists():
-        raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
-    return dataclasses.replace(apply_yaml(RunConfig(), path), run_dir=run_dir)
-
-
-def _claim(run_dir: Path, config: dict[str, Any]) -> None:
-    """Make the run directory ours, or refuse if it holds another run."""
-    path = run_dir / CONFIG_FILE
-    if path.exists():
-        if different := differences(settings(load_run(run_dir)), config):
-            raise InputError(
-                f"{run_dir}: holds another run (there != asked for): {'; '.join(different)}; "
-                "choose another --run-dir or the same settings"
-            )
-        return
-    if run_dir.exists() and not run_dir.is_dir():
-        raise InputError(f"{run_dir}: is a file; choose another --run-dir")
-    # A kill while the config is written leaves its temporary file alone in the directory.
-    if run_dir.exists() and any(not item.match(f".{CONFIG_FILE}.*.tmp") for item in run_dir.iterdir()):
-        raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
-    write_atomic(path, (json.dumps(config, indent=2) + "\n").encode())
+def checksum(bank: Bank) -> int:
+    """CRC-32 of everything in a bank."""
+    crc = 0
+    for part in bank:
+        crc = zlib.crc32(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode(), crc)
+    return crc
 
 
 def _updates(
     config: RunConfig, arms: Arms, states: States, done: int, manifest: dict[str, Any], console: Console
 ) -> States:
     """Train chunk by chunk; between chunks log, show and save."""
-    steps = config.chunk * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(states)
+    steps = config.chunk * config.update_steps * config.seeds * len(states)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("compiling", total=config.total_updates, completed=done)
@@ -128,12 +95,15 @@ def _updates(
             rate = steps / (time.monotonic() - began)
             for name, seeds in metrics.items():
                 for seed, values in enumerate(seeds):
-                    append_row(config.run_dir / LOG_FILE, {"step": done, "arm": name, "seed": seed} | values)
+                    row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
+                    append_row(config.run_dir / LOG_FILE, row | values)
             if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
                 save(config.run_dir, done, states, manifest)
             success = {name: np.mean([values["success"] for values in seeds]) for name, seeds in metrics.items()}
-            rates = ", ".join(f"{name} SR {100 * rate:.0f} %" for name, rate in success.items())
-            line = f"update {done}/{config.total_updates}, {rate / 1000:.0f} k steps/s, {rates}"
+            shares = ", ".join(f"{name} SR {100 * share:.0f} %" for name, share in success.items())
+            skipped = sum(values["skipped_steps"] for seeds in metrics.values() for values in seeds)
+            warning = f", {skipped:.0f} gradient steps skipped as not finite" if skipped else ""
+            line = f"update {done}/{config.total_updates}, {rate / 1000:.0f} k steps/s, {shares}{warning}"
             progress.update(task, completed=done, description=line)
             if not console.is_terminal and (done // config.chunk) % 4 == 0:
                 console.print(line)

@@ -1,1 +1,1 @@
-"""One episode: reset, step and observe; batching, metrics, contract checks and adapters."""
+"""One episode: reset, step and observe; from worlds to environments, and a check of their contract."""

@@ -34,8 +34,8 @@ def load_scenes(
     """
     if str(source) in WORLDS:
         return WORLDS[str(source)](num_train, num_val, num_test, seed)
-    if not Path(source).exists():
-        raise InputError(f"{source}: no such scene file, and no world of that name; worlds: {', '.join(WORLDS)}")
+    if not str(source).endswith(".gz"):
+        raise InputError(f"{source}: neither a world ({', '.join(WORLDS)}) nor the name of a scene file (*.jsonl.gz)")
     return read_scenes(source)
 
 
@@ -62,7 +62,7 @@ def make(
 ) -> tuple[ObjectNav, EnvParams]:
     """An environment and its parameters.
 
-    The step limits are the paper's: 30 in training, else 100 and in living rooms 200.
+    The step limits are the paper's: 30 in the training split, else 100 and in living rooms 200.
 
     Args:
       source: a world's name (`rooms`) or the path of a scene file.
@@ -74,13 +74,14 @@ def make(
       InputError: bad source or split, or no scene with a reachable goal.
     """
     bank = compile_bank(in_split(load_scenes(source), split, source), categories, detector)
-    return build_for(bank, split)
+    return build_training(bank) if split == "train" else build_evaluation(bank)
 
 
-def build_for(
-    bank: Bank, split: str, train_step_limit: int = 30, step_limit: int = 100, large_step_limit: int = 200
-) -> tuple[ObjectNav, EnvParams]:
-    """Environment and parameters of a bank with the step limits of its split; living rooms count as large."""
-    if split == "train":
-        return build(bank, {}, train_step_limit)
+def build_training(bank: Bank, step_limit: int = 30) -> tuple[ObjectNav, EnvParams]:
+    """Environment and parameters of a bank for training: one step limit for all scenes."""
+    return build(bank, {}, step_limit)
+
+
+def build_evaluation(bank: Bank, step_limit: int = 100, large_step_limit: int = 200) -> tuple[ObjectNav, EnvParams]:
+    """Environment and parameters of a bank for evaluation: living rooms get the large step limit."""
     return build(bank, {"living_room": large_step_limit}, step_limit)

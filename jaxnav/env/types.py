@@ -5,9 +5,6 @@ from typing import Any
 import jax
 from flax import struct
 
-from jaxnav.scenes.compile import Bank
-from jaxnav.scenes.rows import RowLayout
-
 
 class Tables(struct.PyTreeNode):
     """A bank of scenes on the device; see `jaxnav.scenes.compile.Bank` for the shapes."""
@@ -60,7 +57,7 @@ class Observation(struct.PyTreeNode):
     """What the agent perceives.
 
     Attributes:
-      row: uint8 [R], the packed row of the pose (see `RowLayout`).
+      row: uint8 [R], the packed row of the pose (see `jaxnav.scenes.rows.RowLayout`).
       goal: int32 [], category that is sought.
     """
 
@@ -70,5 +67,3 @@ class Observation(struct.PyTreeNode):
 
 #: reset and step return nested pytrees; `info` holds the last observation of the episode, its success and its length.
 StepResult = tuple[Observation, State, jax.Array, jax.Array, jax.Array, dict[str, Any]]
-
-__all__ = ["Bank", "EnvParams", "Observation", "RowLayout", "State", "StepResult", "Tables"]

@@ -14,7 +14,7 @@ from jaxnav.policies.acting import Acting, Agent, select
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import Params, Policy, bind
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.lattice import DONE, MOVE_AHEAD, POSES_PER_CELL
+from jaxnav.scenes.lattice import MOVE_AHEAD, POSES_PER_CELL
 
 
 class Inference(struct.PyTreeNode):
@@ -98,9 +98,14 @@ def evaluate_grid(
         time=jnp.zeros(len(episodes.pose), jnp.int32),
     )
 
+    traces = 0
+
     def run(
         grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array
     ) -> Outcome:
+        nonlocal traces
+        traces += 1
+
         def one(cell: Inference) -> Outcome:
             own = jax.tree.map(lambda leaf: leaf[cell.params], weights)
             return _episodes(cell, own, start, acting, spec, params, priors, key)
@@ -108,8 +113,8 @@ def evaluate_grid(
         return jax.lax.map(one, grid)
 
     arguments = (grid, weights, start, params, priors, key)
-    compiled = jax.jit(run).lower(*arguments).compile()
-    return jax.tree.map(np.asarray, compiled(*arguments)), 1
+    outcome = jax.tree.map(np.asarray, jax.jit(run)(*arguments))
+    return outcome, traces
 
 
 def _episodes(
@@ -127,8 +132,7 @@ def _episodes(
     count = start.pose.shape
     own = jax.random.fold_in(key, cell.params)
     keys = jax.vmap(lambda episode: jax.random.fold_in(own, episode))(jnp.arange(count[0]))
-    layout = acting.believe(acting.first_belief(start, params, priors), start, params, priors)
-    agent = Agent(state=start, layout=layout, memory=policy.initial_memory(count))
+    agent = begin(start, policy, acting, params, priors)
     outcome = Outcome(
         success=jnp.zeros(count, bool),
         length=jnp.zeros(count, jnp.int32),
@@ -139,25 +143,17 @@ def _episodes(
 
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome = progress
-        logits, hidden, weight = _logits(cell, policy, agent, acting, params)
-        now = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
-        sampled = jax.vmap(jax.random.categorical)(now, logits)
-        action = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
-        found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
-        state, _, terminated, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
-        memory = Memory(hidden=hidden, action=action)
-        following = Agent(state=state, layout=acting.believe(agent.layout, state, params, priors), memory=memory)
-        outcome = Outcome(
-            success=outcome.success | (running & found & (action == DONE)),
-            length=outcome.length + running.astype(jnp.int32),
-            moves=outcome.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
-            distance=outcome.distance,
-            weight=outcome.weight + jnp.where(running, weight, 0.0),
+        following, taken = act(cell, policy, agent, keys, acting, params, priors)
+        outcome = outcome._replace(
+            success=outcome.success | (running & taken.success),
+            length=outcome.length + running,
+            moves=outcome.moves + (running & (taken.action == MOVE_AHEAD)),
+            weight=outcome.weight + jnp.where(running, taken.weight, 0.0),
         )
-        return _Progress(select(running, following, agent), running & ~(terminated | truncated), outcome)
+        return _Progress(select(running, following, agent), running & ~taken.ended, outcome)
 
-    begin = _Progress(agent, jnp.ones(count, bool), outcome)
-    end = jax.lax.while_loop(lambda progress: progress.running.any(), step, begin)
+    first = _Progress(agent, jnp.ones(count, bool), outcome)
+    end = jax.lax.while_loop(lambda progress: progress.running.any(), step, first)
     last = end.agent.state
     return end.outcome._replace(
         distance=params.tables.goal_distance[last.pose // POSES_PER_CELL, last.goal],
@@ -165,18 +161,64 @@ def _episodes(
     )
 
 
-def _logits(
-    cell: Inference, policy: Policy, agent: Agent, acting: Acting, params: EnvParams
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Logits [E, A] with experience taken out, the factual recurrent state [E, H] and the weight [E]."""
+class Taken(NamedTuple):
+    """One step of E episodes; leaves [E].
+
+    Attributes:
+      action: int32.
+      weight: float32, of the counterfactual logits.
+      ended: bool, with this action.
+      success: bool, ended with Done where the goal is found.
+    """
+
+    action: jax.Array
+    weight: jax.Array
+    ended: jax.Array
+    success: jax.Array
+
+
+def act(
+    cell: Inference,
+    policy: Policy,
+    agent: Agent,
+    keys: jax.Array,
+    acting: Acting,
+    params: EnvParams,
+    priors: jax.Array,
+) -> tuple[Agent, Taken]:
+    """Take one step in E episodes: decide, take experience out (eq. 2), act, and update the belief once.
+
+    The counterfactual decision shares the experience and the memory with the factual one; its own memory is dropped.
+
+    Args:
+      cell: how to infer.
+      policy: with the cell's parameters.
+      agent: the episodes, [E].
+      keys: [E], of the episodes; folded with the time for a sampled action.
+      acting: environment and layout setting.
+      params: the environment's.
+      priors: float32 [rooms, K, K].
+    """
     observation, layout_weights = acting.observe(agent, params)
-    layout_weights = jnp.where(cell.layout, layout_weights, 1.0)
-    pathways = policy.pathways(observation, layout_weights)
+    pathways = policy.pathways(observation, jnp.where(cell.layout, layout_weights, 1.0))
     factual = policy.decide(pathways, agent.memory)
     counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
     weight = cell.always + jax.nn.relu(acting.gap(agent) - cell.epsilon)
     residual, paper = (
         remove_experience(factual.logits, counterfactual.logits, weight, form) for form in ("residual", "paper")
     )
-    logits = jnp.where(cell.residual, residual, paper)
-    return jnp.where(cell.uniform, 0.0, logits), factual.hidden, weight
+    logits = jnp.where(cell.uniform, 0.0, jnp.where(cell.residual, residual, paper))
+
+    sampled = jax.vmap(jax.random.categorical)(jax.vmap(jax.random.fold_in)(keys, agent.state.time), logits)
+    action = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
+    found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
+    state, _, terminated, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
+    layout = acting.believe(agent.layout, state, params, priors)
+    following = Agent(state=state, layout=layout, memory=Memory(hidden=factual.hidden, action=action))
+    return following, Taken(action, weight, terminated | truncated, terminated & found)
+
+
+def begin(start: State, policy: Policy, acting: Acting, params: EnvParams, priors: jax.Array) -> Agent:
+    """E episodes before their first step, the first view taken in; start has leaves [E]."""
+    layout = acting.believe(acting.first_belief(start, params, priors), start, params, priors)
+    return Agent(state=start, layout=layout, memory=policy.initial_memory(start.pose.shape))

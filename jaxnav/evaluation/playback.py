@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.causal import Form, do, stde
 from jaxnav.env.types import EnvParams, State
+from jaxnav.evaluation.grid import Inference, Taken, act, begin
 from jaxnav.policies.acting import Acting, Agent
-from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec
 
@@ -31,52 +30,39 @@ class Trace(NamedTuple):
 
 
 def play(
+    cell: Inference,
     weights: Params,
     start: State,
     acting: Acting,
     spec: PolicySpec,
     params: EnvParams,
     priors: jax.Array,
-    epsilon: float = float("inf"),
-    use_layout: bool = True,
-    form: Form = "residual",
 ) -> Trace:
-    """Play one episode to its end, taking the best action at every step.
+    """Play one episode to its end, step by step.
 
     Args:
-      weights: parameters of one policy.
+      cell: how to infer, leaves []; `cell.params` is not used.
+      weights: parameters of the policy.
       start: of the episode, leaves [].
-      acting: environment and layout setting; without a setting the gap stays 0.
+      acting: environment and layout setting.
       spec: sizes of the policy.
       params: the environment's.
       priors: float32 [rooms, K, K].
-      epsilon: threshold of sTDE; infinity takes no experience out.
-      use_layout: multiply the layout's weights in; otherwise they are ones.
-      form: how sTDE combines the logits.
     """
 
     @jax.jit
-    def step(weights: Params, agent: Agent) -> tuple[Agent, jax.Array, jax.Array, jax.Array]:
-        policy = bind(spec, weights)
-        observation, layout_weights = acting.observe(agent, params)
-        layout_weights = layout_weights if use_layout else jnp.ones_like(layout_weights)
-        pathways = policy.pathways(observation, layout_weights)
-        factual = policy.decide(pathways, agent.memory)
-        counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-        logits = stde(factual.logits, counterfactual.logits, acting.gap(agent), epsilon, form)
-        action = jnp.argmax(logits, axis=-1).astype(jnp.int32)
-        found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
-        state, _, done, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
-        layout = acting.believe(agent.layout, state, params, priors)
-        return Agent(state, layout, Memory(factual.hidden, action)), action, done | truncated, done & found
+    def step(weights: Params, agent: Agent, keys: jax.Array) -> tuple[Agent, Taken]:
+        return act(cell, bind(spec, weights), agent, keys, acting, params, priors)
 
-    state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
-    layout = acting.believe(acting.first_belief(state, params, priors), state, params, priors)
-    agent = Agent(state=state, layout=layout, memory=bind(spec, weights).initial_memory((1,)))
-    steps, ended, success = [], jnp.array([False]), jnp.array([False])
-    while not ended[0]:
+    keys = jax.random.key(0)[None]
+    first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
+    agent = begin(first, bind(spec, weights), acting, params, priors)
+    steps = []
+    while True:
         pose, gap = agent.state.pose, acting.gap(agent)
-        agent, action, ended, success = step(weights, agent)
-        steps.append((pose[0], action[0], gap[0]))
+        agent, taken = step(weights, agent, keys)
+        steps.append((pose[0], taken.action[0], gap[0]))
+        if taken.ended[0]:
+            break
     pose, action, gap = (np.asarray(column) for column in zip(*steps, strict=True))
-    return Trace(pose=pose, action=action, gap=gap, success=bool(success[0]))
+    return Trace(pose=pose, action=action, gap=gap, success=bool(taken.success[0]))

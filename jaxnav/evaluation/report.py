@@ -125,9 +125,12 @@ def build_difference(
     return {**identity, "decoding": decoding, "mean": difference.mean, "ci95": list(difference.ci95)}
 
 
-def build_report(rows: list[dict[str, Any]], differences: list[dict[str, Any]], compilations: int) -> dict[str, Any]:
-    """The report: rows, differences, number of compilations the evaluation took, versions and format."""
+def build_report(
+    rows: list[dict[str, Any]], differences: list[dict[str, Any]], compilations: int, run: dict[str, Any]
+) -> dict[str, Any]:
+    """The report: rows, differences, number of compilations the evaluation took, settings, versions and format."""
     return {
+        "run": run,
         "rows": rows,
         "differences": differences,
         "compilations": compilations,
@@ -212,7 +215,7 @@ def _label(row: dict[str, Any]) -> str:
             label = "+ w + TDE"
         case _:
             label = f"+ w + sTDE (eps={row['epsilon']:g})"
-    return label + (", paper form" if row["form"] == "paper" else "")
+    return label + (", paper form" if row["variant"] == "stde" and row["form"] == "paper" else "")
 
 
 def _cell(metric: dict[str, Any], digits: int) -> str:

@@ -28,21 +28,34 @@ class Row(NamedTuple):
     decoding: Decoding
 
 
-def table_rows(epsilons: Sequence[float], forms: Sequence[Form]) -> list[Row]:
-    """Baseline, layout, hard TDE and sTDE at every epsilon and in every form, argmax then sampled, and Random.
+def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: Decoding) -> Row:
+    """One row, with nothing in it that its variant does not use.
 
     Raises:
       InputError: an epsilon outside [0, inf), or NaN.
     """
-    for epsilon in epsilons:
-        if not 0.0 <= epsilon < float("inf"):
-            raise InputError(f"--epsilon {epsilon}: give numbers from 0 to below infinity")
+    if variant == "tde":
+        return Row(variant, None, "paper", decoding)  # equation 1
+    if variant != "stde":
+        return Row(variant, None, None, decoding)
+    if epsilon is None or not 0.0 <= epsilon < float("inf"):
+        raise InputError(f"--epsilon {epsilon}: give numbers from 0 to below infinity")
+    return Row(variant, epsilon, form, decoding)
+
+
+def table_rows(epsilons: Sequence[float], forms: Sequence[Form]) -> list[Row]:
+    """Baseline, layout, hard TDE, and sTDE at every epsilon and in every form, argmax then sampled, and Random.
+
+    Raises:
+      InputError: no epsilon, or one outside [0, inf), or NaN.
+    """
+    if not epsilons:
+        raise InputError("--epsilon: give at least one number")
     rows: list[Row] = []
     for decoding in ("argmax", "sample"):
-        rows += [Row("baseline", None, None, decoding), Row("layout", None, None, decoding)]
-        rows += [Row("tde", None, form, decoding) for form in forms]
-        rows += [Row("stde", epsilon, form, decoding) for epsilon, form in itertools.product(epsilons, forms)]
-    return [*rows, Row("random", None, None, "sample")]
+        rows += [table_row(variant, None, None, decoding) for variant in ("baseline", "layout", "tde")]
+        rows += [table_row("stde", *setting, decoding) for setting in itertools.product(epsilons, forms)]
+    return [*rows, table_row("random", None, None, "sample")]
 
 
 def inference_grid(rows: Sequence[Row], num_seeds: int) -> Inference:

@@ -1,1 +1,1 @@
-"""The three causal pathways, the ten methods and the recurrent decision."""
+"""The three causal pathways, the methods that make experience, and the recurrent decision."""

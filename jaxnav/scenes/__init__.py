@@ -1,1 +1,1 @@
-"""What a scene is: procedural worlds, importers, and compilation to flat tables (NumPy, on the host)."""
+"""What a scene is: generated rooms, scene files, and compilation to flat tables (NumPy, on the host)."""

@@ -1,6 +1,6 @@
 """From scenes to flat tables over every pose, so that a step of the environment is a few gathers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
 from jaxnav.scenes.detector import Detector, detection_range, object_size
-from jaxnav.scenes.lattice import HEADING_STEPS, HORIZONS, NUM_HEADINGS, best_lengths, standable_cells, successors
+from jaxnav.scenes.lattice import HEADING_STEPS, HORIZONS, NUM_HEADINGS, POSES_PER_CELL, best_lengths, standable_cells, successors
 from jaxnav.scenes.rows import VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowLayout
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.sight import (
@@ -80,7 +80,7 @@ def compile_scene(scene: Scene, categories: tuple[str, ...], detector: Detector,
     ids = np.asarray(category_ids(scene.types, categories), np.int64)
     targets = np.flatnonzero(ids >= 0)
     points = scene.boxes[targets, :3]
-    num_poses, num_categories = len(cells) * NUM_HEADINGS * len(HORIZONS), len(categories)
+    num_poses, num_categories = len(cells) * POSES_PER_CELL, len(categories)
 
     clear = line_of_sight(scene, centres, targets)
     ahead, right, in_view = offsets_in_view(centres, points)
@@ -126,7 +126,6 @@ def compile_bank(
     scenes: Sequence[Scene],
     categories: tuple[str, ...] = ITHOR_CATEGORIES,
     detector: Detector | None = None,
-    progress: Callable[[int], None] = lambda done: None,
 ) -> Bank:
     """Compile scenes into one bank; scenes in which no goal can be reached are left out and named in `skipped`.
 
@@ -134,18 +133,16 @@ def compile_bank(
       scenes: at least one scene.
       categories: [K] what can be looked for.
       detector: error rates; None for the defaults.
-      progress: called with the number of scenes done.
 
     Raises:
       InputError: no scene is left.
     """
     layout = RowLayout(len(categories))
     kept, skipped = [], []
-    for done, scene in enumerate(scenes, start=1):
+    for scene in scenes:
         table = compile_scene(scene, categories, detector or Detector(), layout)
         possible = np.flatnonzero((table.best_length > 0).any(axis=0))
         kept.append((scene, table, possible)) if len(possible) else skipped.append(scene.name)
-        progress(done)
     if not kept:
         raise InputError(
             f"none of the {len(skipped)} scenes has a reachable goal: give scenes with objects of the categories "
@@ -157,7 +154,7 @@ def compile_bank(
     goals = np.zeros((len(kept), len(categories)), np.int32)
     for row, (_, _, possible) in zip(goals, kept, strict=True):
         row[: len(possible)] = possible
-    first_pose = first_cell * (NUM_HEADINGS * len(HORIZONS))
+    first_pose = first_cell * POSES_PER_CELL
     return Bank(
         names=tuple(scene.name for scene, _, _ in kept),
         categories=categories,
@@ -176,7 +173,7 @@ def compile_bank(
 
 def _per_pose(values: np.ndarray) -> np.ndarray:
     """Repeat values [C, N] over headings and horizons: [P, N]."""
-    return np.repeat(values, NUM_HEADINGS * len(HORIZONS), axis=0)
+    return np.repeat(values, POSES_PER_CELL, axis=0)
 
 
 def _per_heading(values: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.sight import TAN_HALF_FIELD_OF_VIEW
 
 MIN_RANGE, MAX_RANGE = 1.5, 5.0
+ALARM_SIZE = 0.3
 SMALLEST_APPARENT_SIZE = 0.12  # about 15 pixels of a 300 x 300 picture with a field of view of 100 degrees
 
 
@@ -42,7 +43,7 @@ class Detector:
           uint8 [P, K, 4]: confidence, ahead, right and apparent size, all 0 where nothing is detected.
         """
         generator = np.random.default_rng([self.seed, zlib.crc32(name.encode())])
-        chance, noise, place = generator.random((3, *seen.shape), dtype=np.float32)
+        chance, noise, place, bearing = generator.random((4, *seen.shape), dtype=np.float32)
         nearness = np.clip(distance / detection_range(size), 0.0, 1.0)
         missed = chance < self.miss_near + (self.miss_far - self.miss_near) * nearness**2
         alarm = ~seen & (chance < self.false_alarm)
@@ -50,11 +51,11 @@ class Detector:
         confidence = 1.0 - 0.5 * nearness + (0.2 * (noise - 0.5) if noisy else 0.0)
         confidence = np.where(alarm, 0.3 + 0.3 * noise, confidence)
 
-        # A false alarm stands uniformly in the triangle of the view cone, with an object's usual size.
-        alarm_ahead = MAX_RANGE * np.sqrt(place)
-        alarm_right = np.clip(alarm_ahead * TAN_HALF_FIELD_OF_VIEW * (2.0 * noise - 1.0), -MAX_RANGE, MAX_RANGE)
-        ahead, right = np.where(alarm, alarm_ahead, ahead), np.where(alarm, alarm_right, right)
-        apparent = np.where(alarm, 0.3, size) / np.maximum(np.hypot(ahead, right), 0.25)
+        # A false alarm stands uniformly in the part of the view cone where an object of its size could be detected.
+        away = detection_range(ALARM_SIZE) * np.sqrt(place)
+        angle = np.arctan(TAN_HALF_FIELD_OF_VIEW) * (2.0 * bearing - 1.0)
+        ahead, right = np.where(alarm, away * np.cos(angle), ahead), np.where(alarm, away * np.sin(angle), right)
+        apparent = np.where(alarm, ALARM_SIZE, size) / np.maximum(np.hypot(ahead, right), 0.25)
 
         reported = (seen & ~missed) | alarm
         channels = (
@@ -77,6 +78,6 @@ def object_size(boxes: np.ndarray) -> np.ndarray:
     return np.sqrt(sides[:, 1] * sides[:, 2])
 
 
-def detection_range(size: np.ndarray) -> np.ndarray:
+def detection_range(size: np.ndarray | float) -> np.ndarray:
     """Greatest distance in metres at which objects of a size in metres are detected."""
     return np.clip(size / SMALLEST_APPARENT_SIZE, MIN_RANGE, MAX_RANGE)

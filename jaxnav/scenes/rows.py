@@ -25,7 +25,7 @@ class RowLayout:
     @property
     def num_bytes(self) -> int:
         """Length of a row, padded to whole 32-byte lines."""
-        return -(-(self._view_at + -(-self.view * self.view // 4)) // 32) * 32
+        return -(-(self._view_at + self._view_bytes) // 32) * 32
 
     @property
     def _found_at(self) -> int:
@@ -35,17 +35,20 @@ class RowLayout:
     def _view_at(self) -> int:
         return self._found_at + -(-self.num_categories // 8)
 
+    @property
+    def _view_bytes(self) -> int:
+        return -(-self.view * self.view // 4)
+
     def pack(self, detections: np.ndarray, found: np.ndarray, view: np.ndarray) -> np.ndarray:
         """Pack detections uint8 [P, K, 4], found bool [P, K] and view uint8 [P, V, V] into rows [P, num_bytes]."""
         num_poses = len(found)
         rows = np.zeros((num_poses, self.num_bytes), np.uint8)
         rows[:, : self._found_at] = detections.reshape(num_poses, self._found_at)
         rows[:, self._found_at : self._view_at] = np.packbits(found, axis=1, bitorder="little")
-        view_bytes = -(-self.view * self.view // 4)
-        cells = np.zeros((num_poses, 4 * view_bytes), np.uint8)
+        cells = np.zeros((num_poses, 4 * self._view_bytes), np.uint8)
         cells[:, : self.view * self.view] = view.reshape(num_poses, self.view * self.view)
-        packed = (cells.reshape(num_poses, view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(-1, dtype=np.uint8)
-        rows[:, self._view_at : self._view_at + view_bytes] = packed
+        packed = (cells.reshape(num_poses, self._view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(-1, dtype=np.uint8)
+        rows[:, self._view_at : self._view_at + self._view_bytes] = packed
         return rows
 
     def detections(self, rows: Any) -> Any:
@@ -58,7 +61,7 @@ class RowLayout:
 
     def view_cells(self, rows: Any) -> Any:
         """The ego-centric view, uint8 [..., V * V], row 0 nearest to the agent, column 0 leftmost."""
-        packed = rows[..., self._view_at : self._view_at + -(-self.view * self.view // 4)]
+        packed = rows[..., self._view_at : self._view_at + self._view_bytes]
         shifts = np.array([0, 2, 4, 6], np.uint8).reshape((1,) * packed.ndim + (4,))
         cells = (packed[..., None] >> shifts) & np.uint8(3)
         return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]

@@ -44,11 +44,11 @@ class PPOConfig:
         """Updates that `total_steps` environment steps of a seed take, rounded up."""
         return -(-total_steps // (self.num_envs * self.rollout))
 
-    def scalars(self, total_steps: int) -> "PPOScalars":
-        """The traced part."""
+    def scalars(self, num_updates: int) -> "PPOScalars":
+        """The traced part, for a training of `num_updates` updates."""
         names = [name for name in PPOScalars.__dataclass_fields__ if name != "num_updates"]
         settings = {name: jnp.float32(getattr(self, name)) for name in names}
-        return PPOScalars(**settings, num_updates=jnp.float32(self.num_updates(total_steps)))
+        return PPOScalars(**settings, num_updates=jnp.float32(num_updates))
 
 
 class PPOScalars(struct.PyTreeNode):

@@ -76,7 +76,13 @@ class Learner:
     def train(
         self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array, num_updates: int
     ) -> tuple[LearnerState, dict[str, jax.Array]]:
-        """Do some updates; metrics are their float32 [] means (episode statistics over the episodes that ended)."""
+        """Do some updates.
+
+        Returns:
+          The state after them and float32 [] metrics: the losses' means over the updates, `success`, `return`, `length`
+          and `truncated` averaged over the `episodes` that ended, and the number of `skipped_steps` of the optimizer
+          whose gradient was not finite.
+        """
 
         def step(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, jax.Array]]:
             return self.update(state, scalars, params, priors)
@@ -86,7 +92,8 @@ class Learner:
         episodes = sums.pop("episodes")
         ended = jnp.maximum(episodes, 1.0)
         per_episode = {name: sums.pop(name) / ended for name in ("success", "return", "length", "truncated")}
-        return state, per_episode | {name: value / num_updates for name, value in sums.items()} | {"episodes": episodes}
+        counts = {"episodes": episodes, "skipped_steps": sums.pop("skipped_steps")}
+        return state, per_episode | {name: value / num_updates for name, value in sums.items()} | counts
 
     def update(
         self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array
@@ -130,7 +137,7 @@ class Learner:
         (weights, optimizer), metrics = jax.lax.scan(learn, (state.params, state.optimizer), parts)
         metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(transitions, ended, params)
         skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
-        metrics["skipped_updates"] = skipped.astype(jnp.float32)
+        metrics["skipped_steps"] = skipped.astype(jnp.float32)
         state = state.replace(params=weights, optimizer=optimizer, agent=agent, update=state.update + 1)
         return state, metrics
 

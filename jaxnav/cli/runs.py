@@ -1,0 +1,157 @@
+"""Run directories: what a run is, its settings, its policies, and the worlds they are evaluated in."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxnav.cli.arms import ARMS
+from jaxnav.cli.config import RunConfig, check
+from jaxnav.cli.overlay import apply_yaml
+from jaxnav.env.make import build_evaluation, in_split, load_scenes
+from jaxnav.env.objectnav import ObjectNav
+from jaxnav.env.types import EnvParams
+from jaxnav.errors import InputError
+from jaxnav.layout import SETTINGS
+from jaxnav.policies.methods import METHODS
+from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.scenes.compile import Bank, compile_bank
+from jaxnav.scenes.scene import Scene
+from jaxnav.store.export import load_params
+from jaxnav.store.files import write_atomic
+from jaxnav.store.manifest import differences
+
+CONFIG_FILE, LOG_FILE, POLICIES = "config.json", "metrics.jsonl", "policies"
+
+
+class Policies(NamedTuple):
+    """All policies of a run.
+
+    Attributes:
+      params: leaves [2 S, ...], baseline seeds first, then layout seeds.
+      priors: float32 [rooms, K, K].
+      spec: sizes.
+      categories: [K].
+      setting: of the layout estimator.
+      prior_steps: random steps that the priors were collected in.
+    """
+
+    params: dict[str, Any]
+    priors: jax.Array
+    spec: PolicySpec
+    categories: tuple[str, ...]
+    setting: str
+    prior_steps: int
+
+
+class World(NamedTuple):
+    """The scenes of one split, compiled.
+
+    Attributes:
+      scenes: as read or generated.
+      bank: compiled.
+      env, params: with the step limits of evaluation.
+    """
+
+    scenes: list[Scene]
+    bank: Bank
+    env: ObjectNav
+    params: EnvParams
+
+
+def settings(config: RunConfig) -> dict[str, Any]:
+    """What makes a run the run it is, as JSON: all its settings but where it is kept and how often it is saved."""
+    plain = dataclasses.asdict(config) | {"scenes": str(config.scenes) if config.scenes else None}
+    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every")}
+
+
+def claim(config: RunConfig) -> None:
+    """Make the run directory this run's, or leave it as it is.
+
+    Raises:
+      InputError: it holds another run, or something else.
+    """
+    path, run_dir = config.run_dir / CONFIG_FILE, config.run_dir
+    if path.exists():
+        if different := differences(settings(load_run(run_dir)), settings(config)):
+            raise InputError(
+                f"{run_dir}: holds another run (there != asked for): {'; '.join(different)}; "
+                "choose another --run-dir or the same settings"
+            )
+        return
+    if run_dir.exists() and not run_dir.is_dir():
+        raise InputError(f"{run_dir}: is a file; choose another --run-dir")
+    # A kill while the config is written leaves its temporary file alone in the directory.
+    if run_dir.exists() and any(not item.match(f".{CONFIG_FILE}.*.tmp") for item in run_dir.iterdir()):
+        raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
+    write_atomic(path, (json.dumps(settings(config), indent=2) + "\n").encode())
+
+
+def load_run(run_dir: Path) -> RunConfig:
+    """Settings of an earlier run.
+
+    Raises:
+      InputError: the directory holds no run, or its config file is damaged or of another version.
+    """
+    path = run_dir / CONFIG_FILE
+    if not path.exists():
+        raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
+    config = apply_yaml(RunConfig(), path)
+    try:
+        held = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON ({error}); restore the file or train in another --run-dir") from error
+    if different := differences(held or {}, settings(config)):
+        raise InputError(f"{path}: lacks settings ({'; '.join(different)}); restore the file or train the run anew")
+    return check(dataclasses.replace(config, run_dir=run_dir))
+
+
+def load_policies(run: RunConfig) -> Policies:
+    """All exported policies of a run.
+
+    Raises:
+      InputError: training has not finished, or an export is damaged.
+    """
+    folders = [run.run_dir / POLICIES / f"{arm}-{seed}" for arm in ARMS for seed in range(run.seeds)]
+    if missing := [folder for folder in folders if not folder.exists()]:
+        raise InputError(f"{missing[0]}: is missing, so training has not finished; run train.py again with this run")
+    loaded = [load_params(folder) for folder in folders]
+    tensors, spec = loaded[-1]
+    try:
+        policy_spec = PolicySpec(spec["method"], len(spec["categories"]), Sizes(**spec["sizes"]))
+        known = policy_spec.method in METHODS and spec["layout"] in SETTINGS
+        policies = Policies(
+            params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tensors["policy"] for tensors, _ in loaded)),
+            priors=jnp.asarray(tensors["layout"]["prior"]),
+            spec=policy_spec,
+            categories=tuple(spec["categories"]),
+            setting=spec["layout"],
+            prior_steps=spec["prior_steps"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{folders[-1]}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
+        ) from error
+    if not known:
+        raise InputError(
+            f"{folders[-1]}: method {policy_spec.method!r} or layout setting {spec['layout']!r} is unknown here; "
+            "use the version that trained the run"
+        )
+    return policies
+
+
+def load_world(run: RunConfig, policies: Policies, split: str, scenes: Path | None) -> World:
+    """The scenes to evaluate a run in: one split of its own world or file, or of another file.
+
+    Raises:
+      InputError: bad scene file, or no scene of the split.
+    """
+    worlds, source = run.worlds, scenes or run.source
+    everything = load_scenes(source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
+    chosen = in_split(everything, split, source)
+    bank = compile_bank(chosen, policies.categories, run.detector)
+    env, params = build_evaluation(bank, worlds.step_limit, worlds.large_step_limit)
+    return World(scenes=chosen, bank=bank, env=env, params=params)
