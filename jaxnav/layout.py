@@ -19,7 +19,7 @@ MIN_CONCENTRATION = 1e-2
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """How the estimator reads equations 4 to 6; the defaults are the `calibrated` setting.
+    """How the estimator reads equations 4 to 6; the defaults are the `calibrated` setting. Raises a ValueError out of range.
 
     Attributes:
       rows: rows that are updated: those of `visible` categories, or `all` (eq. 4 to the letter).
@@ -27,9 +27,9 @@ class Setting:
       increment: whole number from 1 to 50 added to alpha per visible category.
       own_column: a row also counts its own category; its Dirichlet then has one more entry, of concentration 1.
       gate: update only if two or more categories are visible and the set differs from the last accepted one.
-      decay: factor on the gap per estimator call at which the gate is shut.
-      passes: estimator calls per step. All but the first find nothing new, so an accepted gap is already decayed.
-      strength: sum of every prior row after rescaling; None keeps the sums of the counts.
+      decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
+      passes: estimator calls per step, 1 or more. All but the first find nothing new, so an accepted gap is already decayed.
+      strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
       uniform: share of the uniform distribution mixed into every prior row, in [0, 1].
       form: how inference combines factual and counterfactual logits, see `jaxnav.causal.stde`.
     """
@@ -45,8 +45,19 @@ class Setting:
     uniform: float = 0.05
     form: Literal["paper", "residual"] = "residual"
 
+    def __post_init__(self):
+        for name, valid, mend in (
+            ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
+            ("decay", 0 <= self.decay <= 1, "a number from 0 to 1"),
+            ("passes", self.passes >= 1 and self.passes % 1 == 0, "a whole number of 1 or more"),
+            ("strength", self.strength is None or 0 < self.strength < float("inf"), "a number above 0, or None"),
+            ("uniform", 0 <= self.uniform <= 1, "a number from 0 to 1"),
+        ):
+            if not valid:
+                raise ValueError(f"{name} is {getattr(self, name)!r}: give {mend}")
 
-#: `paper`: equations 3 to 6 to the letter. `released`: what the authors' code computes. `calibrated`: the default.
+
+#: `paper`: equations 3 to 6, with presence for the counts n. `released`: what the authors' estimator computes.
 SETTINGS = {
     "paper": Setting(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
     "released": Setting(

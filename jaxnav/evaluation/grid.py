@@ -146,8 +146,8 @@ def _episodes(
         following, taken = act(cell, policy, agent, keys, acting, params, priors)
         outcome = outcome._replace(
             success=outcome.success | (running & taken.success),
-            length=outcome.length + running,
-            moves=outcome.moves + (running & (taken.action == MOVE_AHEAD)),
+            length=outcome.length + running.astype(jnp.int32),
+            moves=outcome.moves + (running & (taken.action == MOVE_AHEAD)).astype(jnp.int32),
             weight=outcome.weight + jnp.where(running, taken.weight, 0.0),
         )
         return _Progress(select(running, following, agent), running & ~taken.ended, outcome)

@@ -36,9 +36,9 @@ def summary(values: np.ndarray, strata: np.ndarray, generator: np.random.Generat
     the variation between training runs, between episodes of a room type, and between single outcomes; it leaves out
     the mix of room types, which is fixed.
 
-    Two limits. S seeds show only (S - 1) / S of the between-seed variance (none for one seed), and outcome noise
-    enters through both draws. Simulated with S = 3, E = 1000 and yes/no outcomes, the interval covers 97-99 % where
-    seeds differ by up to 1.4 points (standard deviation), 91 % at 2.7 points and 78 % at 8 points.
+    Two limits. S seeds show only (S - 1) / S of the between-seed variance (none for one seed), so with few seeds that
+    differ widely the interval is too narrow; and outcome noise enters through both draws, so with seeds that hardly
+    differ it is a little too wide.
 
     Args:
       values: bool, int or float [S, E], finite.

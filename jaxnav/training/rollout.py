@@ -83,7 +83,8 @@ def rollout(
 
     Returns:
       The episodes after the rollout, the transitions [T, B, ...], and float32 [T, B] the value of the state after each
-      step that the return goes on with: 0 after Done, the value of the cut state at a step limit.
+      step that the return goes on with: 0 after Done, the value of the cut state at a step limit. The values of cut
+      states and of the state after the rollout are decided with both direct pathways, also with the coin.
     """
     num_envs = agent.state.pose.shape[0]
 
