@@ -1,4 +1,4 @@
-"""The jaxnav command: `python -m jaxnav train | eval | episode`."""
+"""The jaxnav command: `python -m jaxnav train | eval | episode | table`."""
 
 import difflib
 import importlib
@@ -8,6 +8,7 @@ COMMANDS = {
     "train": "train a method with and without the layout estimator",
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
     "episode": "draw one evaluation episode of a run",
+    "table": "print an evaluation as a Markdown table",
 }
 
 HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:9} {what}\n" for name, what in COMMANDS.items())

@@ -19,7 +19,7 @@ MIN_CONCENTRATION = 1e-2
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """How the estimator reads equations 4 to 6; the defaults are the `calibrated` setting. Raises a ValueError out of range.
+    """How the estimator reads equations 4 to 6; the defaults are `calibrated`. Out of range raises a ValueError.
 
     Attributes:
       rows: rows that are updated: those of `visible` categories, or `all` (eq. 4 to the letter).
@@ -28,7 +28,7 @@ class Setting:
       own_column: a row also counts its own category; its Dirichlet then has one more entry, of concentration 1.
       gate: update only if two or more categories are visible and the set differs from the last accepted one.
       decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
-      passes: estimator calls per step, 1 or more. All but the first find nothing new, so an accepted gap is already decayed.
+      passes: estimator calls per step, >= 1. All but the first find nothing new, so an accepted gap is already decayed.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
       uniform: share of the uniform distribution mixed into every prior row, in [0, 1].
       form: how inference combines factual and counterfactual logits, see `jaxnav.causal.stde`.
@@ -90,7 +90,12 @@ def prior_from_counts(counts: jax.Array, setting: str | Setting = "calibrated") 
 
     Returns:
       float32 [K, K], >= 0.01 off the diagonal and 0 on it. A row without counts is all ones before rescaling.
+
+    Raises:
+      ValueError: K is less than 2.
     """
+    if counts.shape[-1] < 2:
+        raise ValueError(f"counts has shape {counts.shape}: co-occurrence takes two or more categories")
     setting = named_setting(setting)
     others = 1 - jnp.eye(counts.shape[-1], dtype=jnp.float32)
     counts = counts.astype(jnp.float32) * others

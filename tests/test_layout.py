@@ -319,6 +319,30 @@ def test_settings_are_those_of_the_methods_table():
         assert fields.items() <= dataclasses.asdict(SETTINGS[name]).items()
 
 
+@pytest.mark.parametrize(
+    ("field", "good", "bad"),
+    [
+        ("increment", (1, 50), (0, 51, 1.5)),
+        ("decay", (0.0, 1.0), (-0.1, 1.1, float("nan"))),
+        ("passes", (1, 3), (0, 1.5)),
+        ("strength", (0.1, None), (0.0, -1.0, float("inf"))),
+        ("uniform", (0.0, 1.0), (-0.1, 1.1)),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(field, good, bad):
+    for value in good:
+        assert getattr(Setting(**{field: value}), field) == value
+    for value in bad:
+        with pytest.raises(ValueError, match=f"{field} is {value}: give a "):
+            Setting(**{field: value})
+
+
+def test_one_category_has_no_prior():
+    with pytest.raises(ValueError, match="two or more categories"):
+        prior_from_counts(jnp.ones((1, 1)))
+    np.testing.assert_allclose(prior_from_counts(jnp.ones((2, 2))), [[0, 20], [20, 0]], rtol=1e-6)
+
+
 def test_unknown_setting_names_the_nearest():
     with pytest.raises(ValueError, match="did you mean 'calibrated'"):
         LayoutEstimator(jnp.ones((K, K)), "calibratd")

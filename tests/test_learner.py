@@ -1,5 +1,7 @@
 """PPO learns; chunks, seeds side by side and poisoned rewards change nothing that they should not."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -59,14 +61,22 @@ def seeds():
 
 
 @pytest.fixture(scope="module")
-def first(seeds):
-    return one_update(seeds, SCALARS, PARAMS, PRIORS)
+def chunks(seeds):
+    """Both seeds after one update, and the first one, alone, after two; compiled side by side."""
+    with ThreadPoolExecutor() as pool:
+        one = pool.submit(one_update, seeds, SCALARS, PARAMS, PRIORS)
+        two = pool.submit(two_updates, tiny.at(seeds, 0), SCALARS, PARAMS, PRIORS)
+        return one.result(), two.result()
 
 
 @pytest.fixture(scope="module")
-def whole(seeds):
-    """The first seed after two updates in one chunk, alone."""
-    return two_updates(tiny.at(seeds, 0), SCALARS, PARAMS, PRIORS)
+def first(chunks):
+    return chunks[0]
+
+
+@pytest.fixture(scope="module")
+def whole(chunks):
+    return chunks[1]
 
 
 def assert_same(a, b):

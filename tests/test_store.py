@@ -134,18 +134,41 @@ def test_leaves_that_could_not_be_restored_are_not_saved(tmp_path, leaf):
     assert checkpoint.restore(tmp_path, ABSTRACT, MANIFEST) is None
 
 
-@pytest.mark.parametrize("lost", ["_CHECKPOINT_METADATA", "state/_METADATA"])
-def test_a_damaged_checkpoint_is_named_and_removing_it_mends(tmp_path, lost):
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "_CHECKPOINT_METADATA").unlink(), "holds no manifest"),
+        (lambda folder: (folder / "state/_METADATA").unlink(), r"is damaged \(InvalidLayoutError: .*\); remove it"),
+        (
+            lambda folder: (folder / "state/_METADATA").write_text(""),
+            r"is damaged \(JSONDecodeError: .*\); remove it",
+        ),
+    ],
+)
+def test_a_damaged_checkpoint_is_named_and_removing_it_mends(tmp_path, damage, message):
     for step in (1, 2):
         checkpoint.save(tmp_path, step, make_state(step), MANIFEST)
     folder = tmp_path / "checkpoints" / "2"
-    (folder / lost).unlink()
-    with pytest.raises(InputError, match=r"checkpoints/2: (is damaged|holds no manifest)"):
+    damage(folder)
+    with pytest.raises(InputError, match=f"checkpoints/2: {message}"):
         checkpoint.restore(tmp_path, ABSTRACT, MANIFEST)
     for file in sorted(folder.rglob("*"), reverse=True):
         file.rmdir() if file.is_dir() else file.unlink()
     folder.rmdir()
     assert checkpoint.restore(tmp_path, ABSTRACT, MANIFEST)[1] == 1
+
+
+@pytest.mark.parametrize("error", [MemoryError("full"), TypeError("a bug")])
+def test_what_is_no_damage_is_not_reported_as_such(tmp_path, monkeypatch, error):
+    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST)
+
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr("orbax.checkpoint._src.serialization.jax_array_handlers.ArrayHandler.deserialize", fail)
+    with pytest.raises(BaseException) as raised:  # noqa: PT011  (Orbax chooses the type)
+        checkpoint.restore(tmp_path, ABSTRACT, MANIFEST)
+    assert not isinstance(raised.value, InputError)
 
 
 def test_unfinished_commits_are_ignored_and_cleared(tmp_path):

@@ -8,7 +8,15 @@ import numpy as np
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
 from jaxnav.scenes.detector import Detector, detection_range, object_size
-from jaxnav.scenes.lattice import HEADING_STEPS, HORIZONS, NUM_HEADINGS, POSES_PER_CELL, best_lengths, standable_cells, successors
+from jaxnav.scenes.lattice import (
+    HEADING_STEPS,
+    HORIZONS,
+    NUM_HEADINGS,
+    POSES_PER_CELL,
+    best_lengths,
+    standable_cells,
+    successors,
+)
 from jaxnav.scenes.rows import VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowLayout
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.sight import (

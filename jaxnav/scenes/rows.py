@@ -47,8 +47,8 @@ class RowLayout:
         rows[:, self._found_at : self._view_at] = np.packbits(found, axis=1, bitorder="little")
         cells = np.zeros((num_poses, 4 * self._view_bytes), np.uint8)
         cells[:, : self.view * self.view] = view.reshape(num_poses, self.view * self.view)
-        packed = (cells.reshape(num_poses, self._view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(-1, dtype=np.uint8)
-        rows[:, self._view_at : self._view_at + self._view_bytes] = packed
+        groups = cells.reshape(num_poses, self._view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)
+        rows[:, self._view_at : self._view_at + self._view_bytes] = groups.sum(-1, dtype=np.uint8)
         return rows
 
     def detections(self, rows: Any) -> Any:

@@ -5,6 +5,7 @@ moment leaves the earlier commits whole; what it was writing is ignored and clea
 """
 
 import contextlib
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -79,11 +80,17 @@ def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str
 
 @contextlib.contextmanager
 def _damage_named(where: Path) -> Iterator[None]:
-    """Turns whatever Orbax and TensorStore raise over missing or broken files into one message with a mend."""
+    """Turns what Orbax and TensorStore raise over missing or broken files into one message with a mend."""
     try:
         yield
-    except Exception as error:
-        raise InputError(f"{where}: is damaged; remove this folder to go on from the step before it") from error
+    except (ValueError, KeyError, OSError) as error:
+        reason: BaseException = error
+        while reason.__cause__ is not None:  # Orbax wraps whatever goes wrong while it loads in a KeyError
+            reason = reason.__cause__
+        if not isinstance(reason, ValueError | KeyError | OSError):
+            raise
+        cause = textwrap.shorten(f"{type(reason).__name__}: {reason}", 300)
+        raise InputError(f"{where}: is damaged ({cause}); remove it to go on from the step before") from error
 
 
 def _folder(run_dir: Path) -> Path:

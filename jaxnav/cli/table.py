@@ -1,0 +1,46 @@
+"""The table command: an evaluation's JSON as a Markdown table."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.report import FORMAT, markdown_table
+
+
+@dataclasses.dataclass(frozen=True)
+class TableConfig:
+    """An evaluation as Markdown.
+
+    Attributes:
+      file: JSON that `eval.py` wrote.
+    """
+
+    file: Annotated[Path, tyro.conf.Positional]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit code: 0, or 2 after bad input."""
+    config = tyro.cli(TableConfig, args=arguments, prog="jaxnav table", description="Print an evaluation as Markdown.")
+    try:
+        print(markdown_table(_read(config.file)), end="")
+    except InputError as error:
+        Console(stderr=True, highlight=False).print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+        return 2
+    return 0
+
+
+def _read(path: Path) -> dict:
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: no evaluation can be read from it ({error}); give a file that eval.py wrote"
+        ) from error
+    if not isinstance(report, dict) or report.get("format") != FORMAT:
+        raise InputError(f"{path}: is no evaluation of format {FORMAT}; give a file that eval.py wrote")
+    return report
