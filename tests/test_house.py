@@ -45,7 +45,8 @@ def test_lock_names_packages_only() -> None:
 def test_readme_commands_are_make_targets() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     # At the start of a line (a code block) or of a code span: prose such as "to make sure" does not count.
-    commands = set(re.findall(r"(?:^(?: {4})?|`)(?:\$ )?make ([a-z-]+)", (ROOT / "README.md").read_text(), re.MULTILINE))
+    pattern = r"(?:^(?: {4})?|`)(?:\$ )?make ([a-z-]+)"
+    commands = set(re.findall(pattern, (ROOT / "README.md").read_text(), re.MULTILINE))
     assert {"run", "test"} <= commands <= targets
 
 
