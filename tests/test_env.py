@@ -9,7 +9,7 @@ import pytest
 from drawn import BOOK, CATEGORIES, CHAIR, SMALL, draw
 from scipy.stats import chisquare
 
-from jaxnav.env.make import build_for, make
+from jaxnav.env.make import build_evaluation, make
 from jaxnav.env.objectnav import ObjectNav, build
 from jaxnav.env.testing import check_environment
 from jaxnav.env.types import State
@@ -38,7 +38,7 @@ def test_contract_on_generated_rooms():
 def test_contract_on_real_rooms():
     if not REAL_FILE.exists():
         pytest.skip("the real rooms are not here")
-    check_environment(*build_for(compile_bank(read_scenes(REAL_FILE)[::25]), "val"))
+    check_environment(*build_evaluation(compile_bank(read_scenes(REAL_FILE)[::25])))
 
 
 class EndsTwice(ObjectNav):
@@ -165,7 +165,7 @@ def test_make_from_a_scene_file(tmp_path):
 
 
 def test_make_refuses_what_it_does_not_know(tmp_path):
-    with pytest.raises(InputError, match=r"romms: no such scene file, and no world of that name; worlds: rooms"):
+    with pytest.raises(InputError, match=r"romms: neither a world \(rooms\) nor the name of a scene file"):
         make("romms")
     path = tmp_path / "train.jsonl.gz"
     write_scenes(path, ROOMS[:1])

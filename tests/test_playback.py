@@ -31,9 +31,8 @@ ROWS = [
 
 def play_row(row, index):
     start = State(pose=EPISODES.pose[index], scene=EPISODES.scene[index], goal=EPISODES.goal[index], time=jnp.int32(0))
-    layout = row.variant != "baseline"
-    epsilon = float("inf") if row.epsilon is None else row.epsilon
-    return play(WEIGHTS[layout], start, ACTING, tiny.SPEC, PARAMS, tiny.priors(), epsilon=epsilon, use_layout=layout)
+    cell = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], 1))
+    return play(cell, WEIGHTS[int(cell.params)], start, ACTING, tiny.SPEC, PARAMS, tiny.priors())
 
 
 @pytest.fixture(scope="module")

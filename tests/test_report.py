@@ -139,12 +139,14 @@ def test_difference_in_report_units():
 
 
 def test_json_round_trip(tmp_path):
-    report = reports.build_report([row(), row(variant="stde", epsilon=0.5, form="residual")], [], compilations=2)
+    report = reports.build_report(
+        [row(), row(variant="stde", epsilon=0.5, form="residual")], [], compilations=2, run={"method": "org"}
+    )
     path = tmp_path / "report.json"
     path.write_text("old")
     reports.write_report(path, report)
     assert json.loads(path.read_text(encoding="utf-8")) == report
-    assert list(report) == ["rows", "differences", "compilations", "versions", "format"]
+    assert list(report) == ["run", "rows", "differences", "compilations", "versions", "format"]
     assert (report["compilations"], report["format"]) == (2, 1)
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
 
@@ -153,7 +155,7 @@ def test_nan_never_reaches_the_file(tmp_path):
     path = tmp_path / "report.json"
     path.write_text("old")
     with pytest.raises(ValueError, match="JSON compliant"):
-        reports.write_report(path, reports.build_report([fixed_row(sr=float("nan"))], [], 1))
+        reports.write_report(path, reports.build_report([fixed_row(sr=float("nan"))], [], 1, {}))
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
 

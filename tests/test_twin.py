@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from twin import DONE, Twin, largest_component
 
-from jaxnav.env.make import build_for
+from jaxnav.env.make import build_evaluation, build_training
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.compile import compile_bank, compile_scene
 from jaxnav.scenes.detector import PERFECT
@@ -149,7 +149,9 @@ def test_random_steps(source, split):
     twins = [twin_of(scene) for scene in scenes]
     assert [len(cells) for _, cells in twins] == bank.num_cells.tolist()
     limits = [30 if split == "train" else 200 if scene.room_type == "living_room" else 100 for scene in scenes]
-    before, action, reward, terminated, truncated, info = roll_out(*build_for(bank, split), seed=len(source))
+    before, action, reward, terminated, truncated, info = roll_out(
+        *(build_training if split == "train" else build_evaluation)(bank), seed=len(source)
+    )
     after, rows = info["final_state"], info["final_observation"].row
 
     differences, endings = collections.Counter(), collections.Counter()
