@@ -76,10 +76,6 @@ class Arms:
         return jax.block_until_ready(self._compiled[name](state, self._scalars, *self._data))
 
 
-def policy_spec(config: RunConfig, env: ObjectNav) -> PolicySpec:
-    """Sizes of a run's policies."""
-    return PolicySpec(method=config.method, num_categories=len(env.categories), sizes=config.sizes)
-
-
 def _learner(config: RunConfig, env: ObjectNav, setting: str | None) -> Learner:
-    return Learner(Acting(env, setting), policy_spec(config, env), config.ppo, config.counterfactual)
+    spec = PolicySpec(method=config.method, num_categories=len(env.categories), sizes=config.sizes)
+    return Learner(Acting(env, setting), spec, config.ppo, config.counterfactual)

@@ -11,12 +11,10 @@ from jaxnav.scenes.compile import Bank, compile_bank
 from jaxnav.scenes.detector import Detector
 from jaxnav.scenes.io import read_scenes
 from jaxnav.scenes.rooms import generate_rooms
-from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.scene import SPLITS, Scene
 
 #: The generated worlds by name; each makes scenes from (num_train, num_val, num_test, seed).
 WORLDS: dict[str, Callable[..., list[Scene]]] = {"rooms": generate_rooms}
-
-SPLITS = ("train", "val", "test")
 
 
 def load_scenes(

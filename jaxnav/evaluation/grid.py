@@ -132,7 +132,7 @@ def _episodes(
     count = start.pose.shape
     own = jax.random.fold_in(key, cell.params)
     keys = jax.vmap(lambda episode: jax.random.fold_in(own, episode))(jnp.arange(count[0]))
-    agent = begin(start, policy, acting, params, priors)
+    agent = acting.begin(start, policy, params, priors)
     outcome = Outcome(
         success=jnp.zeros(count, bool),
         length=jnp.zeros(count, jnp.int32),
@@ -216,9 +216,3 @@ def act(
     layout = acting.believe(agent.layout, state, params, priors)
     following = Agent(state=state, layout=layout, memory=Memory(hidden=factual.hidden, action=action))
     return following, Taken(action, weight, terminated | truncated, terminated & found)
-
-
-def begin(start: State, policy: Policy, acting: Acting, params: EnvParams, priors: jax.Array) -> Agent:
-    """E episodes before their first step, the first view taken in; start has leaves [E]."""
-    layout = acting.believe(acting.first_belief(start, params, priors), start, params, priors)
-    return Agent(state=start, layout=layout, memory=policy.initial_memory(start.pose.shape))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.types import EnvParams, State
-from jaxnav.evaluation.grid import Inference, Taken, act, begin
+from jaxnav.evaluation.grid import Inference, Taken, act
 from jaxnav.policies.acting import Acting, Agent
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec
@@ -56,7 +56,7 @@ def play(
 
     keys = jax.random.key(0)[None]
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
-    agent = begin(first, bind(spec, weights), acting, params, priors)
+    agent = acting.begin(first, bind(spec, weights), params, priors)
     steps = []
     while True:
         pose, gap = agent.state.pose, acting.gap(agent)

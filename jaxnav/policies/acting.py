@@ -56,10 +56,9 @@ class Acting:
         self, layout: LayoutState | None, state: State, params: EnvParams, priors: jax.Array
     ) -> LayoutState | None:
         """Update the beliefs with what is detected in the current states; priors float32 [rooms, K, K]."""
-        if self.setting is None or layout is None:
-            return None
-
         setting = self.setting
+        if setting is None or layout is None:
+            return None
 
         def one(layout: LayoutState, state: State) -> LayoutState:
             presence = self.env.layout.presence(params.tables.rows[state.pose])
@@ -75,10 +74,14 @@ class Acting:
         return jax.vmap(lambda s: LayoutEstimator(priors[params.room[s.scene]], setting).init())(state)
 
     def start(self, key: jax.Array, num_envs: int, policy: Policy, params: EnvParams, priors: jax.Array) -> Agent:
-        """Start B episodes; the key is consumed."""
+        """Start B episodes at random; the key is consumed."""
         _, state = jax.vmap(self.env.reset, (0, None))(jax.random.split(key, num_envs), params)
+        return self.begin(state, policy, params, priors)
+
+    def begin(self, state: State, policy: Policy, params: EnvParams, priors: jax.Array) -> Agent:
+        """Start B episodes in these states, leaves [B], with the first view taken in."""
         layout = self.believe(self.first_belief(state, params, priors), state, params, priors)
-        return Agent(state=state, layout=layout, memory=policy.initial_memory((num_envs,)))
+        return Agent(state=state, layout=layout, memory=policy.initial_memory(state.pose.shape))
 
 
 def select(condition: jax.Array, yes: Tree, no: Tree) -> Tree:

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.scene import CELL, SPLITS, Scene
 from jaxnav.store.files import write_atomic
 
-_SPLITS = ("train", "val", "test")
 _POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
 _REQUIRED = ("type", *_POSITION, *_SIZE)
 _COLUMNS = (*_REQUIRED, "yaw", "parent")
@@ -150,8 +149,8 @@ def _scene(record: _Record) -> Scene:
     name, world, room_type, split = (
         record.text(field, record.get(field)) for field in ("name", "world", "room_type", "split")
     )
-    if split not in _SPLITS:
-        raise record.error("split", f"is {split!r}; give one of {', '.join(_SPLITS)}")
+    if split not in SPLITS:
+        raise record.error("split", f"is {split!r}; give one of {', '.join(SPLITS)}")
     if record.get("cell") != CELL:
         raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL} is known")
     origin = _origin(record)

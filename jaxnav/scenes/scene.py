@@ -11,6 +11,9 @@ import numpy as np
 #: Lattice spacing in metres; MoveAhead goes to a neighbouring lattice point.
 CELL = 0.25
 
+#: What scenes are divided into.
+SPLITS = ("train", "val", "test")
+
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
