@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from jaxnav.scenes.io import derive_walls, read_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.sizes import UNKNOWN, typical_box
 
 REAL_FILE = Path(__file__).parents[2] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
 
@@ -210,3 +211,36 @@ def test_the_real_rooms(tmp_path):
     write_scenes(tmp_path / "copy.jsonl.gz", scenes)
     for scene, back in zip(scenes, read_scenes(tmp_path / "copy.jsonl.gz"), strict=True):
         assert_equal(scene, back)
+
+
+def test_numbers_that_are_null_become_those_typical_of_the_type(tmp_path):
+    columns = ["type", "x", "y", "z", "sx", "sy", "sz", "yaw", "parent"]
+    rows = [
+        ["Fridge", 1.0, None, 2.0, None, None, None, None, None],
+        ["Fridge", 1.0, 0.9, 2.0, 0.5, None, 0.6, 90, -1],
+        ["Gizmo", 1.0, None, 2.0, None, None, None, 0, 0],
+        ["Apple", None, None, None, None, None, None, None, -1],
+    ]
+    record = {**RECORD, "columns": columns, "objects": rows}
+    scene = read_scenes(write_records(tmp_path / "null.jsonl.gz", record))[0]
+    width, height, depth, y = typical_box("Fridge")
+    assert scene.types == ("Fridge", "Fridge", "Gizmo")  # the apple has no place
+    assert scene.boxes[0].tolist() == [1.0, y, 2.0, width, height, depth]
+    assert scene.boxes[1].tolist() == [1.0, 0.9, 2.0, 0.5, height, 0.6]
+    assert scene.boxes[2].tolist() == [1.0, UNKNOWN[3], 2.0, *UNKNOWN[:3]]
+    assert typical_box("Stool") != typical_box("Chair")  # its own size before its alias's
+    assert typical_box("couch") == typical_box("Sofa")
+
+
+def test_rooms_of_a_home_survive_the_file(tmp_path):
+    record = {
+        **RECORD,
+        "rooms": [{"type": "kitchen", "cells": [".##", "###"]}, {"type": "hall", "cells": ["###", "..#"]}],
+    }
+    path = write_records(tmp_path / "home.jsonl.gz", record)
+    scenes = read_scenes(path)
+    assert [room.type for room in scenes[0].rooms] == ["kitchen", "hall"]
+    assert np.argwhere(scenes[0].rooms[1].cells).tolist() == [[1, 0], [1, 1]]
+    write_scenes(tmp_path / "again.jsonl.gz", scenes)
+    again = read_scenes(tmp_path / "again.jsonl.gz")[0].rooms
+    assert all(np.array_equal(a.cells, b.cells) for a, b in zip(scenes[0].rooms, again, strict=True))

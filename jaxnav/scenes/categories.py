@@ -9,14 +9,38 @@ ITHOR_CATEGORIES: tuple[str, ...] = (
     "RemoteControl", "Sink", "StoveBurner", "Television", "Toaster",
 )  # fmt: skip
 
+#: What the RoboTHOR challenge looks for, and furniture that stands near it.
+ROBOTHOR_GOALS: tuple[str, ...] = (
+    "AlarmClock", "Apple", "BaseballBat", "BasketBall", "Bowl", "GarbageCan", "HousePlant", "Laptop", "Mug",
+    "SprayBottle", "Television", "Vase",
+)  # fmt: skip
+ROBOTHOR_CATEGORIES: tuple[str, ...] = (
+    *ROBOTHOR_GOALS, "ArmChair", "Bed", "Book", "Chair", "Desk", "DiningTable", "Dresser", "ShelvingUnit", "Sofa",
+    "TVStand",
+)  # fmt: skip
+
+#: The 15 classes of the Gibson setting (SemExp), of which the first six are looked for.
+GIBSON_CATEGORIES: tuple[str, ...] = (
+    "Chair", "Sofa", "HousePlant", "Bed", "Toilet", "Television", "DiningTable", "Oven", "Sink", "Fridge", "Book",
+    "Clock", "Vase", "Cup", "Bottle",
+)  # fmt: skip
+GIBSON_GOALS: tuple[str, ...] = GIBSON_CATEGORIES[:6]
+
 #: Room types of the single-room worlds, in the order of the per-type priors.
 ROOM_TYPES: tuple[str, ...] = ("kitchen", "living_room", "bedroom", "bathroom")
 
-#: Type names that other simulator versions use for a category.
-ALIASES = MappingProxyType({"Stool": "Chair"})
+#: Type names of other simulator versions and datasets, and the name that is used here.
+ALIASES = MappingProxyType({
+    "Stool": "Chair", "chair": "Chair", "stool": "Chair", "couch": "Sofa", "sofa": "Sofa", "bed": "Bed",
+    "potted plant": "HousePlant", "plant": "HousePlant", "toilet": "Toilet", "tv": "Television",
+    "tv_monitor": "Television", "television": "Television", "dining-table": "DiningTable",
+    "dining table": "DiningTable", "table": "DiningTable", "oven": "Oven", "sink": "Sink", "refrigerator": "Fridge",
+    "fridge": "Fridge", "book": "Book", "clock": "Clock", "vase": "Vase", "cup": "Cup", "bottle": "Bottle",
+    "Glassbottle": "Bottle",
+})  # fmt: skip
 
 
 def category_ids(types: tuple[str, ...], categories: tuple[str, ...]) -> tuple[int, ...]:
-    """Index of each object type in `categories`, -1 where the type is no category."""
+    """Index of each object type in `categories`, by its name or else by its alias; -1 where the type is no category."""
     index = {name: i for i, name in enumerate(categories)}
-    return tuple(index.get(ALIASES.get(name, name), -1) for name in types)
+    return tuple(index.get(name, index.get(ALIASES.get(name, name), -1)) for name in types)

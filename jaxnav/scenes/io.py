@@ -1,10 +1,8 @@
 """Reading and writing scene files; `docs/scene_format.md` is the contract."""
 
-import dataclasses
 import gzip
 import json
 import reprlib
-import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.scene import CELL, SPLITS, Scene
+from jaxnav.scenes.record import Record, parse_json, read_bytes
+from jaxnav.scenes.scene import CELL, SPLITS, Room, Scene
+from jaxnav.scenes.sizes import typical_box
 from jaxnav.store.files import write_atomic
 
 _POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
 _REQUIRED = ("type", *_POSITION, *_SIZE)
 _COLUMNS = (*_REQUIRED, "yaw", "parent")
-_LIMIT = 1e6  # metres; a coordinate beyond it is a mistake
 _SNAP = 0.02  # metres that an origin may be off the lattice
 _WALL_DISTANCE = 3  # cells
 _BOX_DISTANCE = 0.25 + 1e-9  # metres
@@ -31,7 +30,7 @@ def read_scenes(path: str | Path) -> list[Scene]:
     object whose x, y and z are all null is left out, and what rests on it rests on nothing.
 
     Args:
-      path: a `*.jsonl.gz` file.
+      path: a `*.jsonl.gz` file (or the same without gzip).
 
     Returns:
       The scenes in the order of the file, at least one.
@@ -43,7 +42,7 @@ def read_scenes(path: str | Path) -> list[Scene]:
     path = Path(path)
     scenes: list[Scene] = []
     lines: dict[str, int] = {}
-    for line, text in enumerate(_read_lines(path), start=1):
+    for line, text in enumerate(read_bytes(path).splitlines(), start=1):
         record = _parse(path, line, text)
         scene = _scene(record)
         if scene.name in lines:
@@ -87,65 +86,15 @@ def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarr
     return ~windows.any(axis=(2, 3)) & ~near_box
 
 
-@dataclasses.dataclass(frozen=True)
-class _Record:
-    """The fields of one line, and where they stand for the messages."""
-
-    path: Path
-    line: int
-    fields: dict[str, Any]
-
-    def error(self, field: str, problem: str) -> InputError:
-        name = reprlib.repr(self.fields.get("name", "(no name)"))
-        return InputError(f"{self.path}, line {self.line}, scene {name}: {field} {problem}")
-
-    def get(self, field: str) -> Any:
-        if field not in self.fields:
-            raise self.error(field, "is missing; add it")
-        return self.fields[field]
-
-    def text(self, field: str, value: Any) -> str:
-        if not isinstance(value, str) or not value:
-            raise self.error(field, f"is {reprlib.repr(value)}; give a text")
-        return value
-
-    def number(self, field: str, value: Any) -> float:
-        if value is None:
-            raise self.error(field, "is null; give the number or leave the object out")
-        if type(value) not in (int, float) or not abs(value) <= _LIMIT:  # also refuses NaN
-            raise self.error(field, f"is {reprlib.repr(value)}; give a finite number, at most {_LIMIT:g}")
-        return float(value)
-
-    def sequence(self, field: str, value: Any, length: int | None = None) -> list[Any]:
-        if not isinstance(value, list) or length not in (None, len(value)):
-            expected = "a list" if length is None else f"a list of {length}"
-            raise self.error(field, f"is {reprlib.repr(value)}; give {expected}")
-        return value
-
-
-def _read_lines(path: Path) -> list[bytes]:
-    try:
-        with gzip.open(path) as file:
-            return file.read().splitlines()
-    except gzip.BadGzipFile as error:
-        raise InputError(f"{path}: is not gzip-compressed ({error}); compress it with gzip") from error
-    except (EOFError, zlib.error) as error:
-        raise InputError(f"{path}: is cut short or damaged ({error}); fetch or write it again") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-
-
-def _parse(path: Path, line: int, text: bytes) -> _Record:
-    try:
-        fields = json.loads(text.decode())
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}, line {line}: not JSON ({error}); write one JSON object per line") from error
+def _parse(path: Path, line: int, text: bytes) -> Record:
+    where = f"{path}, line {line}"
+    fields = parse_json(where, text)
     if not isinstance(fields, dict):
-        raise InputError(f"{path}, line {line}: {reprlib.repr(fields)} is no scene; write one JSON object per line")
-    return _Record(path, line, fields)
+        raise InputError(f"{where}: {reprlib.repr(fields)} is no scene; write one JSON object per line")
+    return Record(f"{where}, scene {reprlib.repr(fields.get('name', '(no name)'))}", fields)
 
 
-def _scene(record: _Record) -> Scene:
+def _scene(record: Record) -> Scene:
     name, world, room_type, split = (
         record.text(field, record.get(field)) for field in ("name", "world", "room_type", "split")
     )
@@ -164,10 +113,20 @@ def _scene(record: _Record) -> Scene:
         raise record.error("reach", "has no standable cell; mark at least one with '.'")
     types, boxes, yaws, parents = _objects(record)
     walls = ~_mask(record, "walls", shape) if "walls" in record.fields else derive_walls(reach, origin, boxes)
-    return Scene(name, world, room_type, split, origin, reach, walls, types, boxes, yaws, parents)
+    return Scene(
+        name, world, room_type, split, origin, reach, walls, types, boxes, yaws, parents, _rooms(record, shape)
+    )
 
 
-def _origin(record: _Record) -> tuple[float, float]:
+def _rooms(record: Record, shape: Sequence[int]) -> tuple[Room, ...]:
+    rooms = []
+    for i, value in enumerate(record.sequence("rooms", record.fields.get("rooms", []))):
+        room = record.record(f"rooms[{i}]", value)
+        rooms.append(Room(room.text("type", room.get("type")), _mask(room, "cells", shape)))
+    return tuple(rooms)
+
+
+def _origin(record: Record) -> tuple[float, float]:
     x, z = (record.number("origin", v) for v in record.sequence("origin", record.get("origin"), 2))
     snapped = (round(x / CELL) * CELL, round(z / CELL) * CELL)
     if max(abs(x - snapped[0]), abs(z - snapped[1])) > _SNAP:
@@ -175,7 +134,7 @@ def _origin(record: _Record) -> tuple[float, float]:
     return snapped
 
 
-def _mask(record: _Record, field: str, shape: Sequence[int]) -> np.ndarray:
+def _mask(record: Record, field: str, shape: Sequence[int]) -> np.ndarray:
     """Bool [nz, nx], True where the mask has '.'."""
     rows = record.sequence(field, record.get(field), shape[0])
     for i, row in enumerate(rows):
@@ -184,7 +143,7 @@ def _mask(record: _Record, field: str, shape: Sequence[int]) -> np.ndarray:
     return np.array([[character == "." for character in row] for row in rows])
 
 
-def _objects(record: _Record) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+def _objects(record: Record) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
     columns = record.sequence("columns", record.get("columns"))
     if not all(isinstance(c, str) for c in columns) or len(set(columns)) < len(columns):
         raise record.error("columns", f"is {reprlib.repr(columns)}; give names, each once")
@@ -194,15 +153,15 @@ def _objects(record: _Record) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, 
         dict(zip(columns, record.sequence(f"objects[{i}]", values, len(columns)), strict=True))
         for i, values in enumerate(record.sequence("objects", record.get("objects")))
     ]
-    placed = [i for i, row in enumerate(rows) if any(row[column] is not None for column in _POSITION)]
+    placed = [i for i, row in enumerate(rows) if row["x"] is not None or row["z"] is not None]
     new_index = {old: new for new, old in enumerate(placed)}
     types, boxes, yaws, parents = [], [], [], []
     for i in placed:
-        row = {"yaw": 0.0, "parent": -1} | rows[i]
-        types.append(record.text(f"objects[{i}].type", row["type"]))
-        boxes.append(_box(record, i, row))
-        yaws.append(record.number(f"objects[{i}].yaw", row["yaw"]))
-        parents.append(new_index.get(_parent(record, i, row["parent"], len(rows)), -1))
+        row = {column: value for column, value in rows[i].items() if value is not None}
+        types.append(record.text(f"objects[{i}].type", row.get("type")))
+        boxes.append(_box(record, i, dict(zip(("sx", "sy", "sz", "y"), typical_box(types[-1]), strict=True)) | row))
+        yaws.append(record.number(f"objects[{i}].yaw", row.get("yaw", 0.0)))
+        parents.append(new_index.get(_parent(record, i, row.get("parent", -1), len(rows)), -1))
     return (
         tuple(types),
         np.array(boxes, np.float64).reshape(-1, 6),
@@ -211,21 +170,22 @@ def _objects(record: _Record) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, 
     )
 
 
-def _box(record: _Record, i: int, row: dict[str, Any]) -> list[float]:
-    box = [record.number(f"objects[{i}].{column}", row[column]) for column in (*_POSITION, *_SIZE)]
+def _box(record: Record, i: int, row: dict[str, Any]) -> list[float]:
+    box = [record.number(f"objects[{i}].{column}", row.get(column)) for column in (*_POSITION, *_SIZE)]
     for column, size in zip(_SIZE, box[3:], strict=True):
         if size < 0:
             raise record.error(f"objects[{i}].{column}", f"is {size}; a size is at least 0")
     return box
 
 
-def _parent(record: _Record, i: int, value: Any, count: int) -> int:
+def _parent(record: Record, i: int, value: Any, count: int) -> int:
     if type(value) is not int or not -1 <= value < count or value == i:
         raise record.error(f"objects[{i}].parent", f"is {reprlib.repr(value)}; give the index of another object or -1")
     return value
 
 
 def _fields(scene: Scene) -> dict[str, Any]:
+    rooms = [{"type": room.type, "cells": _text(room.cells)} for room in scene.rooms]
     rows = zip(scene.types, scene.boxes.tolist(), scene.yaws.tolist(), scene.parents.tolist(), strict=True)
     return {
         "name": scene.name,
@@ -237,6 +197,7 @@ def _fields(scene: Scene) -> dict[str, Any]:
         "shape": list(scene.reach.shape),
         "reach": _text(scene.reach),
         "walls": _text(~scene.walls),
+        **({"rooms": rooms} if rooms else {}),
         "columns": list(_COLUMNS),
         "objects": [[kind, *box, yaw, parent] for kind, box, yaw, parent in rows],
     }

@@ -5,6 +5,7 @@ looks along +z. The floor is at y = 0.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,18 @@ CELL = 0.25
 SPLITS = ("train", "val", "test")
 
 
+class Room(NamedTuple):
+    """A room of a home.
+
+    Attributes:
+      type: `kitchen`, `living_room`, `bedroom`, `bathroom`, ...
+      cells: bool [nz, nx], its floor.
+    """
+
+    type: str
+    cells: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """One room, apartment or house.
@@ -22,7 +35,7 @@ class Scene:
     Attributes:
       name: unique name of the scene.
       world: the world it comes from, for example `rooms` or `ithor`.
-      room_type: `kitchen`, `living_room`, `bedroom`, `bathroom`, ...
+      room_type: `kitchen`, `living_room`, `bedroom`, `bathroom`, or `apartment`, `house`, ...
       split: `train`, `val` or `test`.
       origin: world (x, z) in metres of the centre of cell [0, 0], a multiple of 0.25.
       reach: bool [nz, nx], True where the agent's centre can stand; row 0 has the smallest z.
@@ -31,6 +44,7 @@ class Scene:
       boxes: float64 [N, 6], centre x, y, z and full size sx, sy, sz in metres of each axis-aligned box.
       yaws: float64 [N], degrees.
       parents: int [N], index of the object that an object rests on or in, or -1.
+      rooms: of a home, where they are known.
     """
 
     name: str
@@ -44,3 +58,4 @@ class Scene:
     boxes: np.ndarray
     yaws: np.ndarray
     parents: np.ndarray
+    rooms: tuple[Room, ...] = ()
