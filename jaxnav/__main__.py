@@ -1,4 +1,4 @@
-"""The jaxnav command: `python -m jaxnav train | eval | episode | table`."""
+"""The jaxnav command: `python -m jaxnav train | eval | episode | scenes | table`."""
 
 import difflib
 import importlib
@@ -8,6 +8,7 @@ COMMANDS = {
     "train": "train a method with and without the layout estimator",
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
     "episode": "draw one evaluation episode of a run",
+    "scenes": "import scenes, show one as a picture, tell what a file of them holds",
     "table": "print an evaluation as a Markdown table",
 }
 

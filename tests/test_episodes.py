@@ -1,21 +1,19 @@
 """Evaluation episodes: the fixed list, an oracle's full marks on it, and the metrics."""
 
 import chex
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
 
-from jaxnav.env.make import build_evaluation
-from jaxnav.env.types import State
+from jaxnav.env.objectnav import build
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.oracle import oracle_actions, replay
 from jaxnav.scenes.compile import compile_bank
-from jaxnav.scenes.lattice import DONE, MOVE_AHEAD, POSES_PER_CELL
 from jaxnav.scenes.rooms import generate_rooms
+from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, Rules, Task
 
 EPISODES = episode_list(tiny.BANK, 24, seed=1)
 
@@ -23,14 +21,14 @@ EPISODES = episode_list(tiny.BANK, 24, seed=1)
 def test_episodes_are_possible_and_know_their_best_length():
     for scene, goal, pose, best in zip(*EPISODES[:4], strict=True):
         assert goal in tiny.BANK.goals[scene, : tiny.BANK.num_goals[scene]]
-        first = tiny.BANK.first_cell[scene] * POSES_PER_CELL
-        assert first <= pose < first + tiny.BANK.num_cells[scene] * POSES_PER_CELL
+        first = tiny.BANK.first_cell[scene] * tiny.POSES_PER_CELL
+        assert first <= pose < first + tiny.BANK.num_cells[scene] * tiny.POSES_PER_CELL
         assert best == tiny.BANK.best_length[pose, goal] >= 1
     assert len(set(EPISODES.pose.tolist())) > 12  # all over the rooms
 
 
 def test_episodes_are_equally_many_per_room_type_and_scene():
-    bank = compile_bank(generate_rooms(0, 6, 0, seed=1))  # two kitchens and living rooms, one of the others
+    bank = compile_bank(generate_rooms(0, 6, 0, seed=1), Task())  # two kitchens and living rooms, one of the others
     assert len(bank.names) == 6
     episodes = episode_list(bank, 42)
     assert episodes.rooms == ("bathroom", "bedroom", "kitchen", "living_room")
@@ -60,34 +58,28 @@ def test_no_episodes_are_refused():
 # The shortest way in generated rooms
 
 
-def test_an_oracle_has_full_marks():
+@pytest.mark.parametrize("rules", [Rules(), Rules(headings=12, horizons=(0.0,), success="near", success_distance=1.0)])
+def test_an_oracle_has_full_marks(rules):
     """It goes down the table of best lengths: SR 1 and SPL 1, exactly."""
-    bank = compile_bank(generate_rooms(0, 4, 0, seed=5))
-    env, params = build_evaluation(bank)
+    bank = compile_bank(generate_rooms(0, 4, 0, seed=5), Task(rules=rules))
+    env, params = build(bank, {}, 100)
     episodes = episode_list(bank, 200)
-    best = jnp.asarray(bank.best_length.astype(np.int32))
-    advance = jax.jit(jax.vmap(env.advance, (0, 0, None)))
-    time = np.zeros(len(episodes.goal), np.int32)
-    state = State(*(jnp.asarray(leaf) for leaf in (episodes.pose, episodes.scene, episodes.goal, time)))
-    running, success, length, moves = np.ones_like(time, bool), np.zeros_like(time, bool), time.copy(), time.copy()
-    while running.any():
-        here = np.asarray(best[state.pose, state.goal])
-        ahead = np.asarray(best[params.tables.successor[state.pose][:, :DONE], state.goal[:, None]])
-        action = np.where(here == 1, DONE, np.argmax(ahead == here[:, None] - 1, axis=1)).astype(np.int32)
-        length += running
-        moves += running & (action == MOVE_AHEAD)
-        success |= running & (action == DONE) & np.asarray(jax.vmap(env.found, (0, None))(state, params))
-        state, _, terminated, truncated = advance(state, jnp.asarray(action), params)
-        running &= ~np.asarray(terminated | truncated)
-    np.testing.assert_array_equal(length, episodes.best_length)
-    distance = bank.goal_distance[np.asarray(state.pose) // POSES_PER_CELL, episodes.goal]
-    metrics = episode_metrics(Outcome(success, length, moves, distance, np.zeros(200)), episodes.best_length)
+    actions = oracle_actions(bank, episodes)
+    outcome = replay(actions, episodes, env, params)
+    np.testing.assert_array_equal(outcome.length, episodes.best_length)
+    metrics = episode_metrics(outcome, episodes.best_length)
     np.testing.assert_array_equal(metrics["sr"], np.ones(200))
     np.testing.assert_array_equal(metrics["spl"], np.ones(200))
-    # Found means 1.5 m at most, of which DTS takes 1 m off.
-    assert metrics["dts"].max() <= 0.5 + 1e-6
+    # Found means 1.5 m (1 m to walk) at most, of which DTS takes 1 m off.
+    assert metrics["dts"].max() <= rules.success_distance - 1.0 + 1e-6
     assert metrics["sae"].max() <= 1
-    assert np.median(length) > 3
+    assert np.median(outcome.length) > 3
+
+    # Nothing is taken for granted: other actions fail, and a step limit stops the oracle too.
+    astray = replay(np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), episodes, env, params)
+    assert not astray.success.any()
+    stopped = replay(actions, episodes, *build(bank, {}, 3))
+    np.testing.assert_array_equal(stopped.success, episodes.best_length <= 3)
 
 
 # Metrics

@@ -12,12 +12,12 @@ import tiny
 
 from jaxnav.causal import remove_experience
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.episodes import episode_list, together
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
 from jaxnav.evaluation.variants import inference_grid, table_rows
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.scenes.lattice import DONE, MOVE_AHEAD, POSES_PER_CELL
+from jaxnav.scenes.task import DONE, MOVE_AHEAD
 
 SEEDS, LIMITS = 2, (12, 16)
 ENV, PARAMS = tiny.world()
@@ -31,7 +31,7 @@ WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) fo
 
 def run(grid, episodes=EPISODES) -> Outcome:
     acting = Acting(ENV, tiny.SETTING)
-    return evaluate_grid(grid, WEIGHTS, episodes, acting, tiny.SPEC, PARAMS, PRIORS, jax.random.key(3))[0]
+    return evaluate_grid(grid, WEIGHTS, [(episodes, PARAMS)], acting, tiny.SPEC, PRIORS, jax.random.key(3))[0]
 
 
 class Compilations(logging.Handler):
@@ -55,10 +55,9 @@ def evaluated():
             outcome, told = evaluate_grid(
                 inference_grid(ROWS, SEEDS),
                 WEIGHTS,
-                EPISODES,
+                [(EPISODES, PARAMS)],
                 Acting(ENV, tiny.SETTING),
                 tiny.SPEC,
-                PARAMS,
                 PRIORS,
                 jax.random.key(3),
             )
@@ -123,6 +122,24 @@ def test_a_cell_alone_is_the_cell_of_the_grid(outcome):
     chex.assert_trees_all_equal(tiny.at(run(cell), 0), tiny.at(outcome, row, seed))
 
 
+def test_parts_of_equal_shape_share_a_compilation_and_follow_each_other(outcome):
+    grid = inference_grid([row for row in ROWS if row.decoding == "argmax"], SEEDS)
+    halves = [
+        EPISODES._replace(**{name: getattr(EPISODES, name)[half] for name in EPISODES._fields[:5]})
+        for half in (slice(12), slice(12, 24))
+    ]
+    acting, key = Acting(ENV, tiny.SETTING), jax.random.key(3)
+    parts = [(half, PARAMS) for half in halves]
+    found, compilations = evaluate_grid(grid, WEIGHTS, parts, acting, tiny.SPEC, PRIORS, key)
+    assert compilations == 1
+    chex.assert_trees_all_equal(found, run(grid))
+    merged = together(halves)
+    assert merged.scenes == 2 * EPISODES.scenes
+    assert [merged.scenes[i] for i in merged.scene] == [EPISODES.scenes[i] for i in EPISODES.scene]
+    for name in ("goal", "pose", "best_length", "room"):
+        np.testing.assert_array_equal(getattr(merged, name), getattr(EPISODES, name))
+
+
 def test_an_episode_does_not_depend_on_the_others(outcome):
     some = np.array([0, 1, 2, 3, 20, 11])
     leaves = ("scene", "goal", "pose", "best_length", "room")
@@ -161,7 +178,7 @@ def play(seed, episode, layout, epsilon, form) -> dict[str, Any]:
         "success": action == DONE and tiny.BANK.best_length[pose, goal] == 1,
         "length": length,
         "moves": moves,
-        "distance": tiny.BANK.goal_distance[pose // POSES_PER_CELL, goal],
+        "distance": tiny.BANK.goal_distance[pose // tiny.POSES_PER_CELL, goal],
         "weight": total / length,
     }
 

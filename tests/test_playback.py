@@ -15,8 +15,9 @@ from jaxnav.evaluation.plan import view_cone
 from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.variants import Row, inference_grid
 from jaxnav.policies.acting import Acting
-from jaxnav.scenes.lattice import DONE, POSES_PER_CELL, standable_cells
+from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.sight import cell_centres
+from jaxnav.scenes.task import DONE, Rules
 
 ENV, PARAMS = tiny.world()
 ACTING = Acting(ENV, tiny.SETTING)
@@ -40,7 +41,7 @@ def outcome():
     weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *WEIGHTS)
     grid = inference_grid(ROWS, 1)
     key = jax.random.key(0)
-    return evaluate_grid(grid, weights, EPISODES, ACTING, tiny.SPEC, PARAMS, tiny.priors(), key)[0]
+    return evaluate_grid(grid, weights, [(EPISODES, PARAMS)], ACTING, tiny.SPEC, tiny.priors(), key)[0]
 
 
 @pytest.mark.parametrize("variant", range(len(ROWS)))
@@ -63,9 +64,9 @@ def test_a_picture_has_a_frame_per_step(tmp_path):
     episode = Episode(
         trace=trace,
         scene=scene,
-        places=cells[trace.pose // POSES_PER_CELL - tiny.BANK.first_cell[EPISODES.scene[0]]],
+        places=cells[trace.pose // tiny.POSES_PER_CELL - tiny.BANK.first_cell[EPISODES.scene[0]]],
         rows=tiny.BANK.rows[trace.pose],
-        categories=tiny.CATEGORIES,
+        task=tiny.BANK.task,
         goal=int(EPISODES.goal[0]),
         best_length=int(EPISODES.best_length[0]),
         epsilon=0.1,
@@ -83,7 +84,7 @@ def test_the_view_cone_ends_at_walls():
     # ends within a 0.05 m step of that; without the walls it would end at 4 m.
     walls = [(4, ix) for ix in range(4)]
     scene = tiny.draw(["...."] * 4 + ["####"] * 2, ("Book", 0.25, 0.8, 0.5, *tiny.SMALL), walls=walls)
-    outline = view_cone(scene, np.zeros(2), 0.0)
+    outline = view_cone(scene, Rules(), np.zeros(2), 0.0)
     ahead = outline[np.argmin(np.abs(outline[1:, 0])) + 1]
     assert 0.875 <= ahead[1] <= 0.926
     assert outline[:, 1].max() > 3  # past the end of the row of walls, on the left

@@ -14,7 +14,7 @@ import tiny
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.pathways import NO_ACTION, Memory
 from jaxnav.policies.policy import bind
-from jaxnav.scenes.lattice import DONE, POSES_PER_CELL
+from jaxnav.scenes.task import DONE
 from jaxnav.training.losses import replay
 from jaxnav.training.rollout import rollout
 
@@ -24,7 +24,7 @@ ENV, PARAMS = tiny.world()
 PRIORS = tiny.priors()
 ACTING = Acting(ENV, tiny.SETTING)
 ROWS, SUCCESSOR = tiny.BANK.rows, tiny.BANK.successor
-SCENE = np.repeat([0, 1], tiny.BANK.num_cells * POSES_PER_CELL)  # of each pose
+SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)  # of each pose
 
 
 @functools.partial(jax.jit, static_argnums=(3, 4))

@@ -13,84 +13,73 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from twin import DONE, Twin, largest_component
+from drawn import APARTMENTS, HOUSES, ROOMS, coarse_scene, maze_scene
+from twin import DONE, Twin
+from twin_scene import largest_component
 
-from jaxnav.env.make import build_evaluation, build_training
+from jaxnav.env.objectnav import build
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.compile import compile_bank, compile_scene
 from jaxnav.scenes.detector import PERFECT
 from jaxnav.scenes.io import read_scenes
-from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.lattice import standable_cells, successors
 from jaxnav.scenes.rooms import generate_rooms
-from jaxnav.scenes.rows import RowLayout
-from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.task import Task
 
 REAL_FILE = Path(__file__).parents[2] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
 NUM_CATEGORIES = len(ITHOR_CATEGORIES)
-NUM_ENVS, NUM_STEPS = 20, 250  # 5,000 steps of each split
+NUM_ENVS, NUM_STEPS = 20, 150  # 3,000 steps of each source and task
+LIVING_ROOM, OTHERS = 60, 30  # step limits
+TASKS = {
+    "rooms": Task(rules=ROOMS, detector=PERFECT),
+    "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT),
+    "houses": Task(rules=HOUSES, goals=ITHOR_CATEGORIES[1::2], detector=PERFECT),
+}
 
 
 @functools.cache
-def scenes_of(source, split):
-    """Two scenes of each room type, or ten coarse ones."""
+def scenes_of(source):
+    """A scene of each room type, or six drawn ones."""
     if source == "coarse":
-        return [coarse_scene(seed) for seed in range(10)]
+        return [coarse_scene(seed) for seed in range(6)]
+    if source == "maze":
+        return [maze_scene(seed) for seed in range(6)]
     if source == "rooms":
-        return [scene for scene in generate_rooms(8, 8, 0) if scene.split == split]
+        return generate_rooms(4, 0, 0)
     if not REAL_FILE.exists():
         pytest.skip("the real rooms are not here")
-    scenes = [scene for scene in read_scenes(REAL_FILE) if scene.split == split]
-    return [scene for room in ROOM_TYPES for scene in [s for s in scenes if s.room_type == room][:2]]
+    scenes = [scene for scene in read_scenes(REAL_FILE) if scene.split == "val"]
+    return [next(scene for scene in scenes if scene.room_type == room) for room in ROOM_TYPES]
 
 
-def coarse_scene(seed):
-    """Cells, walls and boxes at random, all on coarse steps, so that lengths often lie exactly on their limits."""
-    draws = np.random.default_rng(seed)
-    shape, count = (7, 8), 24
-    boxes = np.concatenate(
-        [
-            draws.integers(-2, 18, (count, 3)) / 8,
-            draws.choice([0.05, 0.09, 0.25, 0.3, 0.5], (count, 3)),
-        ],
-        axis=1,
-    )
-    tall = draws.random(count) < 0.4  # furniture on the floor, some of it just opaque
-    boxes[tall, 4] = draws.choice([0.8, 0.85, 1.2, 1.8], tall.sum())
-    boxes[tall, 1] = boxes[tall, 4] / 2 + draws.choice([0.0, 0.3, 0.35], tall.sum(), p=[0.8, 0.1, 0.1])
-    return Scene(
-        name=f"coarse-{seed}",
-        world="drawn",
-        room_type="kitchen",
-        split="train",
-        origin=(0.5, -0.25),
-        reach=draws.random(shape) < 0.6,
-        walls=draws.random(shape) < 0.1,  # some of them under standable cells
-        types=tuple(draws.choice((*ITHOR_CATEGORIES[:12], "Stool", "Vase"), count).tolist()),
-        boxes=boxes,
-        yaws=np.zeros(count),
-        parents=np.full(count, -1),
-    )
+@functools.cache
+def bank_of(source, task):
+    return compile_bank(scenes_of(source), task)
 
 
-def twin_of(scene):
-    """The twin at some start, and its standable cells in row order."""
-    rows, columns = scene.reach.shape
-    for start in itertools.product(range(rows), range(columns)):
-        try:
-            twin = Twin(scene, ITHOR_CATEGORIES, 0, start, 0, 0, 1)
-        except ValueError:  # not standable
-            continue
-        return twin, sorted(twin.standable())
-    raise AssertionError("a scene without standable cells")
+class Guide:
+    """The twin of a scene, and its poses by number."""
+
+    def __init__(self, scene, task):
+        reach = largest_component({(iz, ix) for iz, ix in np.argwhere(scene.reach).tolist()})
+        self.cells, self.rules = sorted(reach), task.rules
+        self.index = {cell: i for i, cell in enumerate(self.cells)}
+        self.twin = Twin(scene, task.categories, task.rules, 0, self.cells[0], 0, 0, 1)
+
+    def place(self, pose, goal=0, step_limit=2):
+        """Start an episode at a pose index within the scene."""
+        cell, turn = divmod(pose, self.rules.headings * len(self.rules.horizons))
+        self.twin.reset(goal, self.cells[cell], *divmod(turn, len(self.rules.horizons)), step_limit)
+        return self.twin
+
+    def pose(self):
+        place, (headings, horizons) = self.twin, (self.rules.headings, len(self.rules.horizons))
+        return (self.index[place.cell] * headings + place.heading) * horizons + place.horizon
 
 
-def place(twin, cells, pose, goal=0, step_limit=2):
-    """Start an episode of the twin at a pose index within its scene."""
-    twin.reset(goal, cells[pose // 16], pose // 2 % 8, pose % 2, step_limit)
-
-
-def index_of(twin, cells):
-    return (cells.index(twin.cell) * 8 + twin.heading) * 2 + twin.horizon
+@functools.cache
+def guides_of(source, task):
+    return [Guide(scene, task) for scene in scenes_of(source)]
 
 
 def agrees(entry, instance):
@@ -102,13 +91,21 @@ def agrees(entry, instance):
     return all(abs(int(byte) - value) <= 0.5 + 1e-6 for byte, value in zip(entry, values, strict=True))
 
 
-def row_differences(row, twin):
+def same_distance(metres, expected):
+    """Whether a distance in metres is the twin's, which is less a metre."""
+    distance = max(float(metres) - 1.0, 0.0)
+    return distance == expected or abs(distance - expected) < 1e-6
+
+
+def row_differences(row, twin, task):
     """What of an observation row differs from the twin, by name."""
-    entries = row[: 4 * NUM_CATEGORIES].reshape(NUM_CATEGORIES, 4)
-    bits = np.unpackbits(row[4 * NUM_CATEGORIES :][:3], bitorder="little")[:NUM_CATEGORIES]
-    if set(np.flatnonzero(bits).tolist()) != twin.found():
+    entries, bits, view = np.split(row, [4 * NUM_CATEGORIES, 4 * NUM_CATEGORIES + 3])
+    found = np.flatnonzero(np.unpackbits(bits, bitorder="little")[:NUM_CATEGORIES] & task.is_goal())
+    if set(found.tolist()) != {goal for goal in twin.found() if task.is_goal()[goal]}:
         yield "found"
-    for entry, instances in zip(entries, twin.detections(), strict=True):
+    if (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121].tolist() != twin.view():
+        yield "view"
+    for entry, instances in zip(entries.reshape(-1, 4), twin.detections(), strict=True):
         if bool(entry[0]) != bool(instances):
             yield "presence"
         elif instances and not any(agrees(entry, instance) for instance in instances):
@@ -140,45 +137,47 @@ def roll_out(env, params, seed):
     return jax.device_get(run(jax.random.key(seed)))
 
 
-@pytest.mark.parametrize("split", ["train", "val"])
+@pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize("source", ["rooms", "ithor"])
-def test_random_steps(source, split):
-    scenes = scenes_of(source, split)
-    bank = compile_bank(scenes, detector=PERFECT)
+def test_random_steps(source, world):
+    task, scenes = TASKS[world], scenes_of(source)
+    bank, guides = bank_of(source, task), guides_of(source, task)
     assert bank.names == tuple(scene.name for scene in scenes)
-    twins = [twin_of(scene) for scene in scenes]
-    assert [len(cells) for _, cells in twins] == bank.num_cells.tolist()
-    limits = [30 if split == "train" else 200 if scene.room_type == "living_room" else 100 for scene in scenes]
-    before, action, reward, terminated, truncated, info = roll_out(
-        *(build_training if split == "train" else build_evaluation)(bank), seed=len(source)
-    )
+    assert [len(guide.cells) for guide in guides] == bank.num_cells.tolist()
+    # Padded: there are unused cells, and the first scenes again.
+    env, params = build(bank, {"living_room": LIVING_ROOM}, OTHERS, len(bank.ahead) + 7, len(scenes) + 2)
+    assert params.room.tolist() == [0, 1, 2, 3, 0, 1]
+    before, action, reward, terminated, truncated, info = roll_out(env, params, seed=len(source))
     after, rows = info["final_state"], info["final_observation"].row
 
-    differences, endings = collections.Counter(), collections.Counter()
+    differences, endings, drawn = collections.Counter(), collections.Counter(), set()
     for env, time in itertools.product(range(NUM_ENVS), range(NUM_STEPS)):
         at = time, env
-        scene, goal = int(before.scene[at]), int(before.goal[at])
-        first_pose = int(bank.first_cell[scene]) * 16
-        twin, cells = twins[scene]
+        drawn.add(int(before.scene[at]))
+        scene, goal = int(before.scene[at]) % len(scenes), int(before.goal[at])
+        first_pose = int(bank.first_cell[scene]) * task.rules.poses_per_cell
+        guide, limit = guides[scene], LIVING_ROOM if scenes[scene].room_type == "living_room" else OTHERS
         if before.time[at] == 0:  # after an ending, the twin refuses to go on
-            place(twin, cells, int(before.pose[at]) - first_pose, goal, limits[scene])
+            twin = guide.place(int(before.pose[at]) - first_pose, goal, limit)
             differences["start"] += twin.horizon or goal not in bank.goals[scene, : bank.num_goals[scene]]
+        twin = guide.twin
         expected = twin.step(int(action[at]))
-        nearest = float(bank.goal_distance[int(after.pose[at]) // 16, goal])
-        differences.update(row_differences(rows[at], twin))
+        nearest = bank.goal_distance[after.pose[at] // task.rules.poses_per_cell, goal]
+        differences.update(row_differences(rows[at], twin, task))
         differences.update(
             {
                 "reward": reward[at] != np.float32(expected[0]),
                 "terminated": terminated[at] != expected[1],
                 "truncated": truncated[at] != expected[2],
-                "pose": after.pose[at] - first_pose != index_of(twin, cells),
+                "pose": after.pose[at] - first_pose != guide.pose(),
                 "length": info["length"][at] != twin.steps,
                 "success": info["success"][at] != (expected[0] > 0),
-                "goal distance": abs(max(nearest - 1.0, 0.0) - twin.goal_distance()) > 1e-6,
+                "goal distance": not same_distance(nearest, twin.goal_distance()),
             }
         )
-        endings[(*expected, twin.steps == limits[scene])] += 1
+        endings[(*expected, twin.steps == limit)] += 1
     assert +differences == collections.Counter()
+    assert drawn == set(range(len(scenes) + 2))
     # Every kind of step was taken, before the limit and at it (a success at the limit is rare).
     late, early = ({ending[:3] for ending in endings if ending[3] == last} for last in (True, False))
     assert early == {(-0.01, False, False), (-0.01, True, False), (5.0, True, False)}
@@ -193,37 +192,38 @@ def test_standable_cells():
         assert {(iz, ix) for iz, ix in standable_cells(reach).tolist()} == expected
 
 
-@pytest.mark.parametrize(("source", "every"), [("coarse", 1), ("rooms", 3), ("ithor", 3)])
-def test_every_pose(source, every):
-    differences, poses = collections.Counter(), 0
-    for scene in scenes_of(source, "val")[::every]:
-        table = compile_scene(scene, ITHOR_CATEGORIES, PERFECT, RowLayout(NUM_CATEGORIES))
-        twin, cells = twin_of(scene)
-        assert [tuple(cell) for cell in table.cells.tolist()] == cells
-        index = {cell: i for i, cell in enumerate(cells)}
-        for pose, (row, after) in enumerate(zip(table.rows, table.successor.tolist(), strict=True)):
-            place(twin, cells, pose)
-            differences.update(row_differences(row, twin))
+@pytest.mark.parametrize("world", TASKS)
+@pytest.mark.parametrize(("source", "every"), [("coarse", 1), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+def test_every_pose(source, every, world):
+    task, differences, poses = TASKS[world], collections.Counter(), 0
+    goals = np.flatnonzero(task.is_goal()).tolist()
+    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::every]:
+        table = compile_scene(scene, task)
+        successor = successors(table.ahead, task.rules).tolist()
+        for pose, (row, after) in enumerate(zip(table.rows, successor, strict=True)):
+            differences.update(row_differences(row, guide.place(pose), task))
             for action in range(DONE + 1):
-                place(twin, cells, pose)
-                twin.step(action)
-                differences["successor"] += after[action] != (index[twin.cell] * 8 + twin.heading) * 2 + twin.horizon
-            poses += 1
+                guide.place(pose).step(action)
+                differences["successor"] += after[action] != guide.pose()
+        for cell, goal in itertools.product(range(len(guide.cells)), goals):
+            expected = guide.place(cell * task.rules.poses_per_cell, goal).goal_distance()
+            differences["goal distance"] += not same_distance(table.goal_distance[cell, goal], expected)
+        poses += len(table.rows)
     assert +differences == collections.Counter()
-    assert poses > 3000
+    assert poses > 1000
 
 
-@pytest.mark.parametrize(("source", "every"), [("coarse", 3), ("rooms", 3), ("ithor", 3)])
-def test_best_lengths(source, every):
-    starts, differences, lengths = np.random.default_rng(0), 0, set()
-    for scene in scenes_of(source, "val")[::every]:
-        table = compile_scene(scene, ITHOR_CATEGORIES, PERFECT, RowLayout(NUM_CATEGORIES))
-        twin, cells = twin_of(scene)
-        for pose in starts.choice(len(table.rows), 4, replace=False).tolist():
-            for goal in range(NUM_CATEGORIES):
-                place(twin, cells, pose, goal)
-                length = twin.best_length() or 0
-                differences += length != table.best_length[pose, goal]
+@pytest.mark.parametrize("world", TASKS)
+@pytest.mark.parametrize(("source", "every"), [("coarse", 3), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+def test_best_lengths(source, every, world):
+    task, starts, differences, lengths = TASKS[world], np.random.default_rng(0), 0, set()
+    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::every]:
+        best_length = compile_scene(scene, task).best_length
+        assert not best_length[:, ~task.is_goal()].any()
+        for pose in starts.choice(len(best_length), 4, replace=False).tolist():
+            for goal in np.flatnonzero(task.is_goal()).tolist():
+                length = guide.place(pose, goal).best_length() or 0
+                differences += length != best_length[pose, goal]
                 lengths.add(length)
     assert differences == 0
     assert {0, 1} < lengths

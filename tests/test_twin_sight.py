@@ -7,8 +7,9 @@ import math
 import random
 
 import pytest
-from drawn import BOOK, CHAIR, FRIDGE, SMALL, detected, draw, single, twin
-from twin import LOOK_DOWN, meets
+from drawn import APARTMENTS, BOOK, CHAIR, FRIDGE, HOUSES, SMALL, detected, draw, single, twin
+from twin import LOOK_DOWN
+from twin_shapes import meets
 
 
 @pytest.mark.parametrize(("offset", "seen"), [(1.19, True), (1.2, False), (-1.19, True), (-1.2, False)])
@@ -16,6 +17,22 @@ def test_the_cone_is_50_degrees_to_every_side(offset, seen):
     # tan 50 = 1.19175, one metre ahead.
     assert (BOOK in detected(single(("Book", offset, 1.5, 1, *SMALL)))) == seen
     assert (BOOK in detected(single(("Book", 0, 1.5 + offset, 1, *SMALL)))) == seen
+
+
+@pytest.mark.parametrize(
+    ("right", "up", "seen"), [(0.82, 0, True), (-0.83, 0, False), (0, 0.61, True), (0, -0.61, True), (0, -0.63, False)]
+)
+def test_the_cone_of_apartments_and_houses(right, up, seen):
+    # tan 39.5 = 0.8243 across and tan 31.75 = 0.6188 up, one metre ahead, around cameras at 1.5 and 0.88 m.
+    for rules in (APARTMENTS, HOUSES):
+        book = ("Book", right, rules.camera + up, 1, *SMALL)
+        assert (BOOK in detected(single(book, rules=rules))) == seen
+
+
+def test_thirty_degrees_to_the_right():
+    # Heading 1 of 12, f = (1/2, sqrt 3 / 2): for v = (1, sqrt 3), ahead = 1/2 + 3/2 = 2, right = 0.
+    [(ahead, right, _)] = single(("Book", 1, 1.5, 3**0.5, *SMALL), heading=1, rules=APARTMENTS).detections()[BOOK]
+    assert (ahead, right) == pytest.approx((2.0, 0.0))
 
 
 def test_offsets_ahead_and_right():
@@ -187,6 +204,11 @@ def test_success_is_limited_to_15_m_in_the_plane(z, found):
     # 0.9 m high, the centre at z = 1.5 is 1.62 m from the camera, but 1.5 m horizontally.
     episode = single(("Book", 0, 0.9, z, *SMALL))
     assert (episode.found(), detected(episode)) == (found, {BOOK})
+
+
+@pytest.mark.parametrize(("z", "found"), [(1.0, {BOOK}), (1.01, set())])
+def test_success_in_apartments_is_limited_to_1_m(z, found):
+    assert single(("Book", 0, 1.5, z, *SMALL), rules=APARTMENTS).found() == found
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.compile import compile_bank
 from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.task import Task
 
 SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4, relation_layers=2)
 SPEC = PolicySpec(method="org", num_categories=len(CATEGORIES), sizes=SIZES)
@@ -29,7 +30,8 @@ BEDROOM = dataclasses.replace(
     name="other",
     room_type="bedroom",
 )
-BANK = compile_bank([KITCHEN, BEDROOM], CATEGORIES)
+BANK = compile_bank([KITCHEN, BEDROOM], Task(CATEGORIES))
+POSES_PER_CELL = BANK.task.rules.poses_per_cell
 
 
 def world():

@@ -28,35 +28,43 @@ class Arms:
       learners: the learner of each arm.
     """
 
-    def __init__(self, config: RunConfig, env: ObjectNav, params: EnvParams, priors: jax.Array) -> None:
+    def __init__(self, config: RunConfig, env: ObjectNav, priors: jax.Array) -> None:
         self.learners = {
             "baseline": _learner(config, env, setting=None),
             "layout": _learner(config, env, setting=config.layout.setting),
         }
         self._scalars = config.ppo.scalars(config.total_updates)
-        self._data = (params, priors)
+        self._priors = priors
         self._root = jax.random.key(config.seed)
         self._seeds = config.seeds
         self._chunk = config.chunk
         self._compiled: dict[str, Any] = {}
+        self._restarts = {name: jax.jit(learner.restart, donate_argnums=0) for name, learner in self.learners.items()}
 
-    def init(self) -> States:
+    def init(self, params: EnvParams) -> States:
         """Every seed before its first update."""
         starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         states: States = {}
         for index, (name, start) in enumerate(starts.items()):
             root = jax.random.fold_in(self._root, index)
-            states[name] = [start(jax.random.fold_in(root, seed), *self._data) for seed in range(self._seeds)]
+            states[name] = [start(jax.random.fold_in(root, seed), params, self._priors) for seed in range(self._seeds)]
         return states
 
-    def train(self, states: States) -> tuple[States, Metrics]:
+    def restart(self, states: States, params: EnvParams) -> States:
+        """Every seed with new episodes in other scenes. The states are donated."""
+        return {
+            name: [self._restarts[name](state, params, self._priors) for state in seeds]
+            for name, seeds in states.items()
+        }
+
+    def train(self, states: States, params: EnvParams) -> tuple[States, Metrics]:
         """One chunk of updates of every seed, with its metrics. The states are donated."""
         tasks = [(name, seed) for seed in range(self._seeds) for name in ARMS]
         with ThreadPoolExecutor(min(len(tasks), os.cpu_count() or 1)) as pool:
             if not self._compiled:
-                compiled = pool.map(lambda name: self._compile(name, states[name][0]), ARMS)
+                compiled = pool.map(lambda name: self._compile(name, states[name][0], params), ARMS)
                 self._compiled = dict(zip(ARMS, compiled, strict=True))
-            results = list(pool.map(lambda task: self._train(task[0], states[task[0]][task[1]]), tasks))
+            results = list(pool.map(lambda task: self._train(task[0], states[task[0]][task[1]], params), tasks))
         done: States = {name: [] for name in ARMS}
         metrics: Metrics = {name: [] for name in ARMS}
         for (name, _), (state, values) in zip(tasks, results, strict=True):
@@ -64,16 +72,16 @@ class Arms:
             metrics[name].append({key: float(value) for key, value in values.items()})
         return done, metrics
 
-    def _compile(self, name: str, state: LearnerState) -> Any:
+    def _compile(self, name: str, state: LearnerState, params: EnvParams) -> Any:
         learner, num_updates = self.learners[name], self._chunk
 
         def train(state: LearnerState, scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
             return learner.train(state, scalars, params, priors, num_updates)
 
-        return jax.jit(train, donate_argnums=0).lower(state, self._scalars, *self._data).compile()
+        return jax.jit(train, donate_argnums=0).lower(state, self._scalars, params, self._priors).compile()
 
-    def _train(self, name: str, state: LearnerState) -> tuple[LearnerState, dict[str, jax.Array]]:
-        return jax.block_until_ready(self._compiled[name](state, self._scalars, *self._data))
+    def _train(self, name: str, state: LearnerState, params: EnvParams) -> tuple[LearnerState, dict[str, jax.Array]]:
+        return jax.block_until_ready(self._compiled[name](state, self._scalars, params, self._priors))
 
 
 def _learner(config: RunConfig, env: ObjectNav, setting: str | None) -> Learner:

@@ -8,28 +8,38 @@ from jaxnav.errors import InputError
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.spec import Sizes
 from jaxnav.scenes.detector import Detector
+from jaxnav.scenes.task import Task
+from jaxnav.scenes.worlds import WORLDS
 from jaxnav.training.config import Counterfactual, PPOConfig
 
 
 @dataclasses.dataclass(frozen=True)
 class WorldConfig:
-    """How the scenes are made and how long episodes may last.
+    """Which scenes there are and how long episodes may last; what is None is as usual in the world.
 
     Attributes:
       num_train, num_val, num_test: generated scenes of each split.
       seed: of the generator.
+      shift: layout shift of the generated scenes, from 0 to 1.
+      categories: what can be detected.
+      goals: what of it can be looked for.
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
+      shard_scenes: more scenes than this are compiled to disk, in shards of so many, and streamed from there.
     """
 
-    num_train: int = 80
-    num_val: int = 20
-    num_test: int = 20
+    num_train: int | None = None
+    num_val: int | None = None
+    num_test: int | None = None
     seed: int = 0
-    train_step_limit: int = 30
-    step_limit: int = 100
-    large_step_limit: int = 200
+    shift: float = 0.0
+    categories: tuple[str, ...] | None = None
+    goals: tuple[str, ...] | None = None
+    train_step_limit: int | None = None
+    step_limit: int | None = None
+    large_step_limit: int | None = None
+    shard_scenes: int = 128
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +63,7 @@ class RunConfig:
     Attributes:
       run_dir: where everything the run makes is kept; training goes on where it stopped.
       method: how experience is made.
-      world: generated world, unless `scenes` is given.
+      world: what is asked of the agent, and the generated scenes it lives in unless `scenes` is given.
       scenes: scene file to read instead; its splits are used.
       seeds: policies trained of each kind.
       total_steps: environment steps of each policy, rounded up to whole chunks. The layout's policies have seen the
@@ -62,11 +72,12 @@ class RunConfig:
       counterfactual: how the branch that counterfactual decisions use is trained.
       chunk: updates per compiled call; between calls the run logs, and saves every `save_every` calls.
       save_every: calls between checkpoints.
+      cache: folder for compiled scenes that are streamed from disk.
     """
 
     run_dir: Path = Path("runs/rooms")
     method: str = "org"
-    world: Literal["rooms"] = "rooms"
+    world: Literal["rooms", "apartments", "houses"] = "rooms"
     scenes: Path | None = None
     seeds: int = 3
     total_steps: int = 2_000_000
@@ -74,6 +85,7 @@ class RunConfig:
     counterfactual: Counterfactual = "distil"
     chunk: int = 8
     save_every: int = 4
+    cache: Path = Path("~/.cache/jaxnav")
     worlds: WorldConfig = WorldConfig()
     detector: Detector = Detector()
     layout: LayoutConfig = LayoutConfig()
@@ -84,6 +96,21 @@ class RunConfig:
     def source(self) -> str | Path:
         """Where the scenes come from."""
         return self.scenes or self.world
+
+    @property
+    def task(self) -> Task:
+        """What is asked of the agent."""
+        own, worlds = WORLDS[self.world].task, self.worlds
+        if worlds.categories is not None:
+            own = dataclasses.replace(own, categories=worlds.categories, goals=())
+        return dataclasses.replace(
+            own, goals=own.goals if worlds.goals is None else worlds.goals, detector=self.detector
+        )
+
+    @property
+    def train_step_limit(self) -> int:
+        """Actions of a training episode."""
+        return self.worlds.train_step_limit or WORLDS[self.world].train_step_limit
 
     @property
     def update_steps(self) -> int:
@@ -131,9 +158,15 @@ def check(config: RunConfig) -> RunConfig:
         f"give a multiple of ppo.minibatches ({ppo.minibatches})",
     )
     need(
-        ppo.rollout <= config.worlds.train_step_limit,
+        ppo.rollout <= config.train_step_limit,
         "ppo.rollout",
         ppo.rollout,
-        f"give at most worlds.train_step_limit ({config.worlds.train_step_limit})",
+        f"give at most worlds.train_step_limit ({config.train_step_limit})",
     )
+    task, shift = config.task, config.worlds.shift
+    need(0.0 <= shift <= 1.0, "worlds.shift", shift, "give a number from 0 to 1")
+    need(len(task.categories) >= 2, "worlds.categories", task.categories, "give at least 2")
+    need(len(set(task.categories)) == len(task.categories), "worlds.categories", task.categories, "give each once")
+    unknown = [goal for goal in task.goals if goal not in task.categories]
+    need(not unknown, "worlds.goals", unknown, f"give some of the categories {', '.join(task.categories)}")
     return config

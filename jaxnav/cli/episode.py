@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.runs import load_policies, load_run, load_world
+from jaxnav.cli.runs import load_policies, load_run
+from jaxnav.cli.worlds import evaluation_world
 from jaxnav.env.types import State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.draw import Episode, draw_episode
@@ -18,7 +19,7 @@ from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
-from jaxnav.scenes.lattice import POSES_PER_CELL, standable_cells
+from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.sight import cell_centres
 
 
@@ -29,11 +30,12 @@ class EpisodeConfig:
     Attributes:
       run: the run directory; its first seed acts, with the best action at every step.
       split: scenes to play in.
-      index: of the episode in the fixed list of `eval.py`.
+      index: of the episode in the fixed list of `eval.py` (of the first bank, where scenes are streamed).
       out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
       variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.
       scenes: scene file to read instead of the run's own world or file.
+      shift: layout shift of generated scenes, from 0 to 1; default: the run's.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -43,6 +45,7 @@ class EpisodeConfig:
     variant: Literal["stde", "layout", "baseline"] = "stde"
     epsilon: float = 0.5
     scenes: Path | None = None
+    shift: float | None = None
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -53,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
         target = config.out or config.run / "episode.gif"
         if target.suffix not in (".gif", ".png"):
             raise InputError(f"--out {target}: give a name that ends in .gif or .png")
-        episode = play_episode(config)
+        episode = play_episode(config, console)
         draw_episode(episode, target)
         console.print(f"{len(episode.trace.pose)} steps; written to {target}", soft_wrap=True)
     except InputError as error:
@@ -62,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def play_episode(config: EpisodeConfig) -> Episode:
+def play_episode(config: EpisodeConfig, console: Console) -> Episode:
     """Play the episode.
 
     Raises:
@@ -70,8 +73,9 @@ def play_episode(config: EpisodeConfig) -> Episode:
     """
     run = load_run(config.run)
     policies = load_policies(run)
-    world = load_world(run, policies, config.split, config.scenes)
-    episodes = episode_list(world.bank)
+    world = evaluation_world(run, config.split, config.scenes, config.shift, console)
+    bank = world.banks[0]
+    episodes = episode_list(bank)
     if not 0 <= config.index < len(episodes.goal):
         raise InputError(f"--index {config.index}: give a number from 0 to {len(episodes.goal) - 1}")
     index, goal = episodes.scene[config.index], episodes.goal[config.index]
@@ -86,19 +90,19 @@ def play_episode(config: EpisodeConfig) -> Episode:
         start,
         Acting(world.env, policies.setting),
         policies.spec,
-        world.params,
+        world.params(0),
         policies.priors,
     )
-    bank = world.bank
-    scene = next(scene for scene in world.scenes if scene.name == bank.names[index])
+    scenes = (world.scenes[i] for i in range(len(world.scenes)))
+    scene = next(scene for scene in scenes if scene.name == bank.names[index])
     cells = cell_centres(scene, standable_cells(scene.reach))
     title = {"stde": f" with layout and sTDE, epsilon {config.epsilon:g}", "layout": " with layout", "baseline": ""}
     return Episode(
         trace=trace,
         scene=scene,
-        places=cells[trace.pose // POSES_PER_CELL - bank.first_cell[index]],
+        places=cells[trace.pose // bank.task.rules.poses_per_cell - bank.first_cell[index]],
         rows=bank.rows[trace.pose],
-        categories=policies.categories,
+        task=bank.task,
         goal=int(goal),
         best_length=int(episodes.best_length[config.index]),
         epsilon=float("inf") if epsilon is None else epsilon,

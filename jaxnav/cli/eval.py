@@ -11,11 +11,13 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.runs import load_policies, load_run, load_world, settings
+from jaxnav.cli.runs import load_policies, load_run, settings
+from jaxnav.cli.worlds import evaluation_world
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import EpisodeList, episode_list
+from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
 from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.oracle import oracle_actions, replay
 from jaxnav.evaluation.report import (
     Form,
     build_difference,
@@ -25,10 +27,9 @@ from jaxnav.evaluation.report import (
     difference_table,
     write_report,
 )
-from jaxnav.evaluation.variants import Row, inference_grid, table_rows
+from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
-from jaxnav.scenes.compile import Bank
 from jaxnav.store.files import write_atomic
 
 
@@ -40,6 +41,7 @@ class EvalConfig:
       run: the run directory.
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
+      shift: layout shift of generated scenes, from 0 to 1; default: the run's.
       episodes: in the fixed list, balanced over room types and scenes.
       epsilon: thresholds of sTDE; all of them in one compiled call.
       form: how sTDE combines the logits; default: the run's layout setting's.
@@ -50,6 +52,7 @@ class EvalConfig:
     run: Annotated[Path, tyro.conf.Positional]
     split: Literal["train", "val", "test"] = "val"
     scenes: Path | None = None
+    shift: float | None = None
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.5,)
     form: tuple[Form, ...] | None = None
@@ -77,24 +80,30 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     run = load_run(config.run)
     policies = load_policies(run)
     rows = table_rows(config.epsilon, config.form or (SETTINGS[policies.setting].form,))
-    world = load_world(run, policies, config.split, config.scenes)
-    episodes = episode_list(world.bank, config.episodes, config.seed)
+    world = evaluation_world(run, config.split, config.scenes, config.shift, console)
+    each = -(-config.episodes // len(world.banks))
+    lists = [episode_list(bank, each, config.seed) for bank in world.banks]
     outcome, compilations = evaluate_grid(
         inference_grid(rows, run.seeds),
         policies.params,
-        episodes,
+        ((part, world.params(i)) for i, part in enumerate(lists)),
         Acting(world.env, policies.setting),
         policies.spec,
-        world.params,
         policies.priors,
         jax.random.key(config.seed),
     )
     outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), run.seeds, -1), outcome)
+    shortest = [
+        replay(oracle_actions(world.banks[i], part), part, world.env, world.params(i)) for i, part in enumerate(lists)
+    ]
+    rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)
+    episodes = together(lists)
     table, differences = _tables(config, rows, outcome, episodes, policies.spec.method, world.scenes[0].world)
     about = settings(run) | {
         "steps_per_policy": run.total_updates * run.update_steps,
         "prior_steps": policies.prior_steps,
         "evaluation_source": str(config.scenes or run.source),
+        "evaluation_shift": run.worlds.shift if config.shift is None else config.shift,
         "evaluation_seed": config.seed,
     }
     report = build_report(table, differences, compilations, about)
@@ -102,10 +111,20 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     out.print(difference_table(report))
     try:
         write_report(target, report)
-        write_atomic(_episodes_file(target), _episode_csv(rows, outcome, episodes, world.bank).encode())
+        write_atomic(_episodes_file(target), _episode_csv(rows, outcome, episodes, world.env.categories).encode())
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
     console.print(f"{len(episodes.goal)} episodes, {compilations} compilation; written to {target}", soft_wrap=True)
+
+
+def _with_oracle(outcome: Outcome, shortest: list[Outcome]) -> Outcome:
+    """Outcomes [R, S, E] and one more row: the oracle's, which is the same for all seeds."""
+
+    def added(leaf: np.ndarray, *parts: np.ndarray) -> np.ndarray:
+        row = np.broadcast_to(np.concatenate(parts), leaf.shape[1:])
+        return np.concatenate([leaf, row[None].astype(leaf.dtype)])
+
+    return jax.tree.map(added, outcome, *shortest)
 
 
 def _target(config: EvalConfig) -> Path:
@@ -152,7 +171,7 @@ def _tables(
     ]
     differences = []
     for row in rows:
-        if row.variant in ("random", "baseline"):
+        if row.variant in ("oracle", "random", "baseline"):
             continue
         reference = "baseline" if row.variant == "layout" else "layout"
         against = by_row[Row(reference, None, None, row.decoding)]
@@ -173,7 +192,7 @@ def _tables(
     return table, differences
 
 
-def _episode_csv(rows: list[Row], outcome: Outcome, episodes: EpisodeList, bank: Bank) -> str:
+def _episode_csv(rows: list[Row], outcome: Outcome, episodes: EpisodeList, categories: tuple[str, ...]) -> str:
     """One line per row of the table, seed and episode."""
     metrics = episode_metrics(outcome, episodes.best_length)
     text = io.StringIO()
@@ -182,7 +201,7 @@ def _episode_csv(rows: list[Row], outcome: Outcome, episodes: EpisodeList, bank:
         [*Row._fields, "seed", "scene", "room", "goal", "start_pose", "best_length", "length", *metrics, "mean_weight"]
     )
     fixed = [
-        (bank.names[scene], episodes.rooms[room], bank.categories[goal], pose, best)
+        (episodes.scenes[scene], episodes.rooms[room], categories[goal], pose, best)
         for scene, room, goal, pose, best in zip(
             episodes.scene, episodes.room, episodes.goal, episodes.pose, episodes.best_length, strict=True
         )

@@ -11,15 +11,10 @@ import jax.numpy as jnp
 from jaxnav.cli.arms import ARMS
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.overlay import apply_yaml
-from jaxnav.env.make import build_evaluation, in_split, load_scenes
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.scenes.compile import Bank, compile_bank
-from jaxnav.scenes.scene import Scene
 from jaxnav.store.export import load_params
 from jaxnav.store.files import write_atomic
 from jaxnav.store.manifest import differences
@@ -47,25 +42,10 @@ class Policies(NamedTuple):
     prior_steps: int
 
 
-class World(NamedTuple):
-    """The scenes of one split, compiled.
-
-    Attributes:
-      scenes: as read or generated.
-      bank: compiled.
-      env, params: with the step limits of evaluation.
-    """
-
-    scenes: list[Scene]
-    bank: Bank
-    env: ObjectNav
-    params: EnvParams
-
-
 def settings(config: RunConfig) -> dict[str, Any]:
-    """What makes a run the run it is, as JSON: all its settings but where it is kept and how often it is saved."""
+    """What makes a run the run it is, as JSON: all its settings but where and how often things are kept."""
     plain = dataclasses.asdict(config) | {"scenes": str(config.scenes) if config.scenes else None}
-    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every")}
+    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every", "cache")}
 
 
 def claim(config: RunConfig) -> None:
@@ -141,17 +121,3 @@ def load_policies(run: RunConfig) -> Policies:
             "use the version that trained the run"
         )
     return policies
-
-
-def load_world(run: RunConfig, policies: Policies, split: str, scenes: Path | None) -> World:
-    """The scenes to evaluate a run in: one split of its own world or file, or of another file.
-
-    Raises:
-      InputError: bad scene file, or no scene of the split.
-    """
-    worlds, source = run.worlds, scenes or run.source
-    everything = load_scenes(source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
-    chosen = in_split(everything, split, source)
-    bank = compile_bank(chosen, policies.categories, run.detector)
-    env, params = build_evaluation(bank, worlds.step_limit, worlds.large_step_limit)
-    return World(scenes=chosen, bank=bank, env=env, params=params)

@@ -3,7 +3,6 @@
 import dataclasses
 import sys
 import time
-import zlib
 from typing import Any
 
 import jax
@@ -15,11 +14,10 @@ from jaxnav.cli.arms import Arms, States
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse_run
 from jaxnav.cli.runs import LOG_FILE, POLICIES, claim, settings
-from jaxnav.env.make import build_training, in_split, load_scenes
+from jaxnav.cli.worlds import CompiledWorld, Stream, training_world
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.layout import prior_from_counts
-from jaxnav.scenes.compile import Bank, compile_bank
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.export import export_params
 from jaxnav.store.manifest import make_manifest
@@ -43,54 +41,59 @@ def main(arguments: list[str] | None = None) -> int:
 def train(config: RunConfig, console: Console) -> None:
     """Train all arms and seeds of a run, from its last checkpoint if it has one, and export the policies."""
     started = time.monotonic()
-    bank = training_bank(config)
-    env, params = build_training(bank, config.worlds.train_step_limit)
-    console.print(f"{len(bank.names)} training scenes, {len(bank.rows):,} poses ({len(bank.skipped)} skipped)")
+    world = training_world(config, console)
     claim(config)
-    manifest = make_manifest(settings(config) | {"scenes_crc32": checksum(bank)})
+    manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
 
-    key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
-    found = jax.jit(explore, static_argnums=(0, 3, 4))(env, params, key, config.layout.walks, config.layout.steps)
-    priors = jax.vmap(lambda counts: prior_from_counts(counts, config.layout.setting))(found.counts)
+    found = explored(config, world)
+    # One sighting of every pair to begin with: the all-ones Dirichlet.
+    priors = jax.vmap(lambda counts: prior_from_counts(counts + 1.0, config.layout.setting))(found.counts)
     console.print(f"layout prior from {int(found.steps):,} random steps, {int(found.poses):,} distinct poses")
 
-    arms = Arms(config, env, params, priors)
-    restored = restore(config.run_dir, jax.eval_shape(arms.init), manifest)
-    states, done = restored or (arms.init(), 0)
+    arms, stream = Arms(config, world.env, priors), Stream(world, config.seed)
+    restored = restore(config.run_dir, jax.eval_shape(arms.init, stream.params(0)), manifest)
+    states, done = restored or (arms.init(stream.params(0)), 0)
     truncate_after(config.run_dir / LOG_FILE, done)
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
-    states = _updates(config, arms, states, done, manifest, console)
-    _export(config, env, states, priors, found)
+    states = _updates(config, arms, stream, states, done, manifest, console)
+    _export(config, world.env, states, priors, found)
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
 
 
-def training_bank(config: RunConfig) -> Bank:
-    """The compiled training scenes of a run."""
-    worlds = config.worlds
-    scenes = load_scenes(config.source, worlds.num_train, worlds.num_val, worlds.num_test, worlds.seed)
-    return compile_bank(in_split(scenes, "train", config.source), detector=config.detector)
-
-
-def checksum(bank: Bank) -> int:
-    """CRC-32 of everything in a bank."""
-    crc = 0
-    for part in bank:
-        crc = zlib.crc32(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode(), crc)
-    return crc
+def explored(config: RunConfig, world: CompiledWorld) -> Exploration:
+    """What random walks find in the training scenes, the walks divided among the banks."""
+    key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
+    walks = -(-config.layout.walks // len(world.banks))
+    walk = jax.jit(explore, static_argnums=(0, 3, 4))
+    found = [
+        walk(world.env, world.params(bank), jax.random.fold_in(key, bank), walks, config.layout.steps)
+        for bank in range(len(world.banks))
+    ]
+    return jax.tree.map(lambda *parts: sum(parts), *found)
 
 
 def _updates(
-    config: RunConfig, arms: Arms, states: States, done: int, manifest: dict[str, Any], console: Console
+    config: RunConfig,
+    arms: Arms,
+    stream: Stream,
+    states: States,
+    done: int,
+    manifest: dict[str, Any],
+    console: Console,
 ) -> States:
-    """Train chunk by chunk; between chunks log, show and save."""
+    """Train chunk by chunk, each in the next bank of scenes; between chunks log, show and save."""
     steps = config.chunk * config.update_steps * config.seeds * len(states)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("compiling", total=config.total_updates, completed=done)
         while done < config.total_updates:
             began = time.monotonic()
-            states, metrics = arms.train(states)
+            turn = done // config.chunk
+            params = stream.params(turn)
+            if turn and stream.bank(turn) != stream.bank(turn - 1):
+                states = arms.restart(states, params)
+            states, metrics = arms.train(states, params)
             done += config.chunk
             rate = steps / (time.monotonic() - began)
             for name, seeds in metrics.items():

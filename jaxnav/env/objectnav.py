@@ -12,8 +12,8 @@ import numpy as np
 from jaxnav.env.types import EnvParams, Observation, State, StepResult, Tables
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.compile import Bank
-from jaxnav.scenes.lattice import DONE, HORIZONS, NUM_ACTIONS, NUM_HEADINGS, POSES_PER_CELL
 from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
 #: Index of the layout prior that all room types outside `ROOM_TYPES` share, and the number of priors.
 OTHER_ROOM = len(ROOM_TYPES)
@@ -25,10 +25,15 @@ class ObjectNav:
     """The environment; hashable, holds sizes and names only.
 
     Attributes:
-      categories: [K] names of what can be sought.
+      task: what is asked of the agent.
     """
 
-    categories: tuple[str, ...]
+    task: Task
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """Names of what can be detected, [K]."""
+        return self.task.categories
 
     @property
     def layout(self) -> RowLayout:
@@ -57,14 +62,32 @@ class ObjectNav:
         scene = below(0, jnp.asarray(tables.num_goals.shape[0], jnp.int32))
         goal = tables.goals[scene, below(1, tables.num_goals[scene])]
         cell = tables.first_cell[scene] + below(2, tables.num_cells[scene])
-        heading = below(3, jnp.asarray(NUM_HEADINGS, jnp.int32))
-        pose = cell * POSES_PER_CELL + heading * len(HORIZONS)
+        rules = self.task.rules
+        heading = below(3, jnp.asarray(rules.headings, jnp.int32))
+        pose = (cell * rules.headings + heading) * len(rules.horizons)
         state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose))
         return self.observe(state, params), state
 
     def observe(self, state: State, params: EnvParams) -> Observation:
         """What the agent perceives in a state."""
         return Observation(row=params.tables.rows[state.pose], goal=state.goal)
+
+    def after(self, pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
+        """Pose int32 [] that an action int32 [] leads to."""
+        headings, horizons = self.task.rules.headings, len(self.task.rules.horizons)
+        cell, heading, horizon = pose // (headings * horizons), pose // horizons % headings, pose % horizons
+
+        def when(chosen: int) -> jax.Array:
+            return (action == chosen).astype(jnp.int32)
+
+        cell = jnp.where(action == MOVE_AHEAD, params.tables.ahead[cell, heading], cell)
+        heading = (heading + when(ROTATE_RIGHT) + (headings - 1) * when(ROTATE_LEFT)) % headings
+        horizon = jnp.clip(horizon + when(LOOK_DOWN) - when(LOOK_UP), 0, horizons - 1)
+        return (cell * headings + heading) * horizons + horizon
+
+    def cell(self, pose: jax.Array) -> jax.Array:
+        """Global cell int32 [] of a pose."""
+        return pose // self.task.rules.poses_per_cell
 
     def found(self, state: State, params: EnvParams) -> jax.Array:
         """Whether Done would succeed here, bool []."""
@@ -89,7 +112,7 @@ class ObjectNav:
         time = state.time + 1
         reward = jnp.where(done & self.found(state, params), params.success_reward, params.step_reward)
         truncated = ~done & (time >= params.step_limit[state.scene])
-        pose = params.tables.successor[state.pose, action]
+        pose = self.after(state.pose, action, params)
         return state.replace(pose=pose, time=time), reward, done, truncated
 
     def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
@@ -119,21 +142,43 @@ class ObjectNav:
         return self.observe(state, params), state, reward, terminated, truncated, info
 
 
-def build(bank: Bank, step_limits: dict[str, int], default_limit: int) -> tuple[ObjectNav, EnvParams]:
+def build(
+    bank: Bank, step_limits: dict[str, int], default_limit: int, num_cells: int = 0, num_scenes: int = 0
+) -> tuple[ObjectNav, EnvParams]:
     """Environment and parameters of a compiled bank.
 
     Args:
       bank: the scenes.
       step_limits: step limit by room type.
       default_limit: step limit of the other room types.
+      num_cells, num_scenes: sizes to pad the tables to where the bank is smaller, so that banks of equal sizes share
+        one compilation: with cells that no episode gets to, and with its own scenes again from the first.
     """
     rooms = [ROOM_TYPES.index(room) if room in ROOM_TYPES else OTHER_ROOM for room in bank.room_types]
     limits = [step_limits.get(room, default_limit) for room in bank.room_types]
+    more_cells = max(num_cells - len(bank.ahead), 0)
+    scenes = np.arange(max(num_scenes, len(bank.names))) % len(bank.names)
+
+    def padded(table: np.ndarray, per_cell: int = 1) -> jax.Array:
+        if not more_cells:
+            return jnp.asarray(table)
+        whole = np.zeros((len(table) + per_cell * more_cells, *table.shape[1:]), table.dtype)
+        whole[: len(table)] = table
+        return jnp.asarray(whole)
+
+    tables = Tables(
+        ahead=padded(bank.ahead),
+        rows=padded(bank.rows, bank.task.rules.poses_per_cell),
+        goal_distance=padded(bank.goal_distance),
+        **{
+            name: jnp.asarray(getattr(bank, name)[scenes]) for name in ("first_cell", "num_cells", "goals", "num_goals")
+        },
+    )
     params = EnvParams(
-        tables=Tables(**{name: jnp.asarray(getattr(bank, name)) for name in Tables.__dataclass_fields__}),
-        room=jnp.asarray(np.array(rooms, np.int32)),
-        step_limit=jnp.asarray(np.array(limits, np.int32)),
+        tables=tables,
+        room=jnp.asarray(np.array(rooms, np.int32)[scenes]),
+        step_limit=jnp.asarray(np.array(limits, np.int32)[scenes]),
         success_reward=jnp.float32(5.0),
         step_reward=jnp.float32(-0.01),
     )
-    return ObjectNav(bank.categories), params
+    return ObjectNav(bank.task), params

@@ -9,9 +9,8 @@ from flax import struct
 class Tables(struct.PyTreeNode):
     """A bank of scenes on the device; see `jaxnav.scenes.compile.Bank` for the shapes."""
 
-    successor: jax.Array
+    ahead: jax.Array
     rows: jax.Array
-    best_length: jax.Array
     goal_distance: jax.Array
     first_cell: jax.Array
     num_cells: jax.Array

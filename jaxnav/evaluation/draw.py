@@ -14,9 +14,9 @@ from PIL import Image
 
 from jaxnav.evaluation.plan import GOAL, INK, draw_room, view_cone
 from jaxnav.evaluation.playback import Trace
-from jaxnav.scenes.lattice import DONE, HORIZONS, NUM_HEADINGS, heading_vectors
 from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, RowLayout
 from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.task import DONE, Task
 
 AGENT, SEEN, REMOVED, PALE = "#0072B2", "#009E73", "#E69F00", "#8a8a8a"
 ACTIONS = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")
@@ -32,7 +32,7 @@ class Episode(NamedTuple):
       scene: where.
       places: float64 [T, 2], world (x, z) of the agent at each step.
       rows: uint8 [T, R], what was perceived.
-      categories: [K].
+      task: what was asked.
       goal: index of the category that is sought.
       best_length: L*.
       epsilon: threshold of sTDE; infinite where experience is kept.
@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     scene: Scene
     places: np.ndarray
     rows: np.ndarray
-    categories: tuple[str, ...]
+    task: Task
     goal: int
     best_length: int
     epsilon: float
@@ -58,9 +58,11 @@ def draw_episode(episode: Episode, path: Path) -> None:
     detected = figure.add_axes((0.76, 0.49, 0.22, 0.35))
     gap = figure.add_axes((0.68, 0.1, 0.3, 0.26))
     figure.text(0.02, 0.945, episode.title, color=PALE, fontsize=9.5)
-    figure.text(0.02, 0.9, f"Looking for {episode.categories[episode.goal]}", color=GOAL, fontsize=14, weight="bold")
+    figure.text(
+        0.02, 0.9, f"Looking for {episode.task.categories[episode.goal]}", color=GOAL, fontsize=14, weight="bold"
+    )
     status = figure.text(0.98, 0.935, "", color=INK, fontsize=10.5, ha="right")
-    draw_room(room, episode.scene, episode.categories, episode.goal)
+    draw_room(room, episode.scene, episode.task.categories, episode.goal)
 
     last = len(episode.trace.pose) - 1
     frames = range(0, last + 1, -(-(last + 1) // MAX_FRAMES)) if path.suffix == ".gif" else []
@@ -99,15 +101,17 @@ def _status(episode: Episode, step: int) -> str:
 
 def _draw_agent(axes: Axes, episode: Episode, step: int) -> list:
     """The path so far, the view cone, the agent and where it perceives objects; returns what to take away again."""
-    place, heading = episode.places[step], episode.trace.pose[step] // len(HORIZONS) % NUM_HEADINGS
-    cone = axes.fill(*view_cone(episode.scene, place, 45.0 * heading).T, color=AGENT, alpha=0.16, lw=0, zorder=3)
+    rules = episode.task.rules
+    place, heading = episode.places[step], episode.trace.pose[step] // len(rules.horizons) % rules.headings
+    yaw = 360.0 / rules.headings * heading
+    cone = axes.fill(*view_cone(episode.scene, rules, place, yaw).T, color=AGENT, alpha=0.16, lw=0, zorder=3)
     path = axes.plot(*episode.places[: step + 1].T, color=AGENT, lw=2, solid_joinstyle="round", zorder=4)
     start = axes.plot(*episode.places[0], "o", color="white", markeredgecolor=AGENT, markersize=6, zorder=4)
-    marker = MarkerStyle(ARROW, transform=Affine2D().rotate_deg(-45.0 * heading))
+    marker = MarkerStyle(ARROW, transform=Affine2D().rotate_deg(-yaw))
     agent = axes.plot(*place, marker=marker, color=AGENT, markersize=15, markeredgecolor="white", zorder=8)
 
     confidence, ahead, right, _ = _detections(episode, step).T
-    forward = heading_vectors()[heading]
+    forward = rules.directions()[heading]
     offsets = np.outer(ahead / AHEAD_SCALE, forward)
     offsets += np.outer((right - 128.0) / RIGHT_SCALE, (forward[1], -forward[0]))
     seen = np.flatnonzero(confidence)
@@ -117,7 +121,7 @@ def _draw_agent(axes: Axes, episode: Episode, step: int) -> list:
 
 
 def _detections(episode: Episode, step: int) -> np.ndarray:
-    return RowLayout(len(episode.categories)).detections(episode.rows[step]).astype(np.float64)
+    return RowLayout(len(episode.task.categories)).detections(episode.rows[step]).astype(np.float64)
 
 
 def _draw_detected(axes: Axes, episode: Episode, step: int) -> None:
@@ -126,7 +130,7 @@ def _draw_detected(axes: Axes, episode: Episode, step: int) -> None:
     confidence = _detections(episode, step)[:, 0] / 255.0
     seen = [i for i in np.argsort(-confidence)[:8] if confidence[i] > 0]
     axes.barh(range(len(seen)), confidence[seen], 0.6, color=[GOAL if i == episode.goal else SEEN for i in seen])
-    axes.set_yticks(range(len(seen)), [episode.categories[i] for i in seen])
+    axes.set_yticks(range(len(seen)), [episode.task.categories[i] for i in seen])
     axes.set(xlim=(0, 1), ylim=(7.6, -0.6), xticks=(0, 0.5, 1))
     axes.set_title("Detected now, confidence", loc="right", fontsize=10, color=INK)
     _plain(axes)

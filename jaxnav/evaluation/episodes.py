@@ -1,12 +1,12 @@
 """Fixed lists of evaluation episodes."""
 
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.compile import Bank
-from jaxnav.scenes.lattice import POSES_PER_CELL
 
 
 class EpisodeList(NamedTuple):
@@ -17,6 +17,7 @@ class EpisodeList(NamedTuple):
       best_length: int32 [E], L* >= 1.
       room: int [E], index into `rooms`; the strata of the statistics.
       rooms: names of the room types.
+      scenes: names of the scenes.
     """
 
     scene: np.ndarray
@@ -25,6 +26,7 @@ class EpisodeList(NamedTuple):
     best_length: np.ndarray
     room: np.ndarray
     rooms: tuple[str, ...]
+    scenes: tuple[str, ...]
 
 
 def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0) -> EpisodeList:
@@ -45,15 +47,37 @@ def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0) -> EpisodeList
     rooms = tuple(sorted(set(bank.room_types)))
     per_room = -(-episodes // len(rooms))
     generator = np.random.default_rng([seed, len(bank.names)])
+    poses_per_cell = bank.task.rules.poses_per_cell
     rows = []
     for room, name in enumerate(rooms):
         scenes = [i for i, room_type in enumerate(bank.room_types) if room_type == name]
         for number in range(per_room):
             scene = scenes[number % len(scenes)]
             goal = generator.choice(bank.goals[scene, : bank.num_goals[scene]])
-            first = bank.first_cell[scene] * POSES_PER_CELL
-            lengths = bank.best_length[first : first + bank.num_cells[scene] * POSES_PER_CELL, goal]
+            first = bank.first_cell[scene] * poses_per_cell
+            lengths = bank.best_length[first : first + bank.num_cells[scene] * poses_per_cell, goal]
             start = generator.choice(np.flatnonzero(lengths))
             rows.append((scene, goal, first + start, lengths[start], room))
     scene, goal, pose, best_length, room = np.array(rows, np.int32).T
-    return EpisodeList(scene=scene, goal=goal, pose=pose, best_length=best_length, room=room, rooms=rooms)
+    return EpisodeList(
+        scene=scene, goal=goal, pose=pose, best_length=best_length, room=room, rooms=rooms, scenes=bank.names
+    )
+
+
+def together(lists: Sequence[EpisodeList]) -> EpisodeList:
+    """Lists of several banks as one, for statistics and reports; its `scene` is an index into its own `scenes`."""
+    rooms = tuple(sorted({room for episodes in lists for room in episodes.rooms}))
+    first = np.cumsum([0] + [len(episodes.scenes) for episodes in lists])
+
+    def joined(arrays: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate(list(arrays)).astype(np.int32)
+
+    return EpisodeList(
+        scene=joined(episodes.scene + start for episodes, start in zip(lists, first, strict=False)),
+        goal=joined(episodes.goal for episodes in lists),
+        pose=joined(episodes.pose for episodes in lists),
+        best_length=joined(episodes.best_length for episodes in lists),
+        room=joined(np.array([rooms.index(room) for room in episodes.rooms])[episodes.room] for episodes in lists),
+        rooms=rooms,
+        scenes=tuple(name for episodes in lists for name in episodes.scenes),
+    )

@@ -1,5 +1,6 @@
 """Every variant, epsilon, decoding and seed over the same fixed episodes, in one compiled call."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jaxnav.policies.acting import Acting, Agent, select
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import Params, Policy, bind
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.lattice import MOVE_AHEAD, POSES_PER_CELL
+from jaxnav.scenes.task import MOVE_AHEAD
 
 
 class Inference(struct.PyTreeNode):
@@ -59,6 +60,17 @@ class Outcome(NamedTuple):
     distance: jax.Array
     weight: jax.Array
 
+    @classmethod
+    def start(cls, shape: tuple[int, ...]) -> "Outcome":
+        """Nothing done yet."""
+        return cls(
+            success=jnp.zeros(shape, bool),
+            length=jnp.zeros(shape, jnp.int32),
+            moves=jnp.zeros(shape, jnp.int32),
+            distance=jnp.zeros(shape),
+            weight=jnp.zeros(shape),
+        )
+
 
 class _Progress(NamedTuple):
     agent: Agent
@@ -69,10 +81,9 @@ class _Progress(NamedTuple):
 def evaluate_grid(
     grid: Inference,
     weights: Params,
-    episodes: EpisodeList,
+    parts: Iterable[tuple[EpisodeList, EnvParams]],
     acting: Acting,
     spec: PolicySpec,
-    params: EnvParams,
     priors: jax.Array,
     key: jax.Array,
 ) -> tuple[Outcome, int]:
@@ -81,25 +92,19 @@ def evaluate_grid(
     Args:
       grid: leaves [C].
       weights: parameters of all policies, leaves [N, ...].
-      episodes: E of them.
+      parts: episodes, E in all, and the parameters of the environment that they take place in, bank by bank.
       acting: environment and layout setting.
       spec: sizes of the policies.
-      params: the environment's.
       priors: float32 [rooms, K, K].
-      key: of sampled actions; parameters p in episode e at time t use it folded with p, e and t, whatever the cell.
+      key: of sampled actions; parameters p in episode e of a part use it folded with the part, p, e and the time,
+        whatever the cell.
 
     Returns:
-      The outcomes [C, E] and the number of compilations that it took.
+      The outcomes [C, E] and the number of compilations that it took: 1 if all parts are of equal shape.
     """
-    start = State(
-        pose=jnp.asarray(episodes.pose),
-        scene=jnp.asarray(episodes.scene),
-        goal=jnp.asarray(episodes.goal),
-        time=jnp.zeros(len(episodes.pose), jnp.int32),
-    )
-
     traces = 0
 
+    @jax.jit
     def run(
         grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array
     ) -> Outcome:
@@ -112,9 +117,21 @@ def evaluate_grid(
 
         return jax.lax.map(one, grid)
 
-    arguments = (grid, weights, start, params, priors, key)
-    outcome = jax.tree.map(np.asarray, jax.jit(run)(*arguments))
-    return outcome, traces
+    outcomes = []
+    for part, (episodes, params) in enumerate(parts):
+        outcome = run(grid, weights, first_states(episodes), params, priors, jax.random.fold_in(key, part))
+        outcomes.append(jax.tree.map(np.asarray, outcome))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *outcomes), traces
+
+
+def first_states(episodes: EpisodeList) -> State:
+    """The states that episodes start in, leaves [E]."""
+    return State(
+        pose=jnp.asarray(episodes.pose),
+        scene=jnp.asarray(episodes.scene),
+        goal=jnp.asarray(episodes.goal),
+        time=jnp.zeros(len(episodes.pose), jnp.int32),
+    )
 
 
 def _episodes(
@@ -133,13 +150,6 @@ def _episodes(
     own = jax.random.fold_in(key, cell.params)
     keys = jax.vmap(lambda episode: jax.random.fold_in(own, episode))(jnp.arange(count[0]))
     agent = acting.begin(start, policy, params, priors)
-    outcome = Outcome(
-        success=jnp.zeros(count, bool),
-        length=jnp.zeros(count, jnp.int32),
-        moves=jnp.zeros(count, jnp.int32),
-        distance=jnp.zeros(count),
-        weight=jnp.zeros(count),
-    )
 
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome = progress
@@ -152,11 +162,11 @@ def _episodes(
         )
         return _Progress(select(running, following, agent), running & ~taken.ended, outcome)
 
-    first = _Progress(agent, jnp.ones(count, bool), outcome)
+    first = _Progress(agent, jnp.ones(count, bool), Outcome.start(count))
     end = jax.lax.while_loop(lambda progress: progress.running.any(), step, first)
     last = end.agent.state
     return end.outcome._replace(
-        distance=params.tables.goal_distance[last.pose // POSES_PER_CELL, last.goal],
+        distance=params.tables.goal_distance[acting.env.cell(last.pose), last.goal],
         weight=end.outcome.weight / end.outcome.length.astype(jnp.float32),
     )
 

@@ -10,7 +10,8 @@ from matplotlib.transforms import Bbox
 
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.scene import CELL, Scene
-from jaxnav.scenes.sight import CAMERA_HEIGHT, opaque
+from jaxnav.scenes.sight import opaque
+from jaxnav.scenes.task import Rules
 
 # From Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies.
 GOAL = "#D55E00"
@@ -78,16 +79,16 @@ def _box(corner: np.ndarray, width: float, height: float) -> Bbox:
     return Bbox([corner, np.add(corner, (width, height))])
 
 
-def view_cone(scene: Scene, place: np.ndarray, yaw: float) -> np.ndarray:
+def view_cone(scene: Scene, rules: Rules, place: np.ndarray, yaw: float) -> np.ndarray:
     """Outline [N, 2] of the floor in the field of view, 4 m deep, cut by walls and boxes of the camera's height."""
-    angles = np.deg2rad(yaw + np.linspace(-50.0, 50.0, 81))
+    angles = np.deg2rad(yaw + rules.field_of_view[0] * np.linspace(-0.5, 0.5, 81))
     reach = np.linspace(0.0, 4.0, 81)
     points = place + reach[:, None] * np.stack([np.sin(angles), np.cos(angles)], axis=-1)[:, None]  # [81, 81, 2]
     cells = np.rint((points - scene.origin) / CELL).astype(int)[..., ::-1]
     last = np.array(scene.walls.shape) - 1
     iz, ix = np.moveaxis(np.clip(cells, 0, last), -1, 0)
     blocked = scene.walls[iz, ix] & (cells == np.stack([iz, ix], axis=-1)).all(axis=-1)
-    tall = scene.boxes[opaque(scene.boxes) & (scene.boxes[:, 1] + scene.boxes[:, 4] / 2 >= CAMERA_HEIGHT)]
+    tall = scene.boxes[opaque(scene.boxes) & (scene.boxes[:, 1] + scene.boxes[:, 4] / 2 >= rules.camera)]
     for box in tall:
         blocked |= (np.abs(points - box[[0, 2]]) < box[[3, 5]] / 2).all(axis=-1)
     depth = np.where(blocked.any(axis=1), blocked.argmax(axis=1), len(reach) - 1)

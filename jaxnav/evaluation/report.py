@@ -21,7 +21,7 @@ from jaxnav.store.files import write_atomic
 FORMAT = 1
 
 Metric = Literal["sr", "spl", "dts", "sae"]
-Variant = Literal["random", "baseline", "layout", "tde", "stde"]
+Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
 Form = Literal["residual", "paper"]
 
@@ -205,6 +205,8 @@ def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
 
 def _label(row: dict[str, Any]) -> str:
     match row["variant"]:
+        case "oracle":
+            label = "Shortest path (oracle)"
         case "random":
             label = "Random"
         case "baseline":

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 
-from jaxnav.scenes.lattice import NUM_ACTIONS
+from jaxnav.scenes.task import NUM_ACTIONS
 
 
 class Pathways(NamedTuple):

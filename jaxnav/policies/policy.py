@@ -21,8 +21,8 @@ from jaxnav.policies.features import NUM_FEATURES, features
 from jaxnav.policies.methods import METHODS, CategoryMaps
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.lattice import NUM_ACTIONS
 from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.task import NUM_ACTIONS
 
 Params = dict[str, Any]
 

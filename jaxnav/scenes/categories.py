@@ -1,6 +1,10 @@
 """What can be looked for: the ordered vocabulary of detectable object categories."""
 
+from collections import Counter
+from collections.abc import Iterable
 from types import MappingProxyType
+
+from jaxnav.scenes.scene import Scene
 
 #: The 22 AI2-THOR categories of the paper, in the index order of its released code.
 ITHOR_CATEGORIES: tuple[str, ...] = (
@@ -44,3 +48,10 @@ def category_ids(types: tuple[str, ...], categories: tuple[str, ...]) -> tuple[i
     """Index of each object type in `categories`, by its name or else by its alias; -1 where the type is no category."""
     index = {name: i for i, name in enumerate(categories)}
     return tuple(index.get(name, index.get(ALIASES.get(name, name), -1)) for name in types)
+
+
+def unknown_types(scenes: Iterable[Scene], categories: tuple[str, ...]) -> Counter[str]:
+    """Objects of the types that are no category, counted by type; they only block the sight."""
+    types = Counter(name for scene in scenes for name in scene.types)
+    known = category_ids(tuple(types), categories)
+    return Counter({name: types[name] for name, category in zip(types, known, strict=True) if category < 0})

@@ -6,7 +6,6 @@ import zlib
 import numpy as np
 
 from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
-from jaxnav.scenes.sight import TAN_HALF_FIELD_OF_VIEW
 
 MIN_RANGE, MAX_RANGE = 1.5, 5.0
 ALARM_SIZE = 0.3
@@ -30,12 +29,20 @@ class Detector:
     seed: int = 0
 
     def detect(
-        self, name: str, seen: np.ndarray, ahead: np.ndarray, right: np.ndarray, distance: np.ndarray, size: np.ndarray
+        self,
+        name: str,
+        half_view: float,
+        seen: np.ndarray,
+        ahead: np.ndarray,
+        right: np.ndarray,
+        distance: np.ndarray,
+        size: np.ndarray,
     ) -> np.ndarray:
         """Detections of one scene with the detector's errors.
 
         Args:
           name: the scene's name; its errors do not depend on the other scenes of a bank.
+          half_view: tangent of half the horizontal field of view.
           seen: bool [P, K], whether a category is detected by a detector without errors.
           ahead, right, distance, size: float [P, K], metres, of the nearest detected object.
 
@@ -53,7 +60,7 @@ class Detector:
 
         # A false alarm stands uniformly in the part of the view cone where an object of its size could be detected.
         away = detection_range(ALARM_SIZE) * np.sqrt(place)
-        angle = np.arctan(TAN_HALF_FIELD_OF_VIEW) * (2.0 * bearing - 1.0)
+        angle = np.arctan(half_view) * (2.0 * bearing - 1.0)
         ahead, right = np.where(alarm, away * np.cos(angle), ahead), np.where(alarm, away * np.sin(angle), right)
         apparent = np.where(alarm, ALARM_SIZE, size) / np.maximum(np.hypot(ahead, right), 0.25)
 

@@ -33,6 +33,20 @@ class Spots(NamedTuple):
     owners: np.ndarray
 
 
+class Placed(NamedTuple):
+    """One object (or block of objects) that was put in a room.
+
+    Attributes:
+      name: its type.
+      item: what it is and the rule that it was put by.
+      size: width, height and depth [3] of one object, metres.
+    """
+
+    name: str
+    item: Item
+    size: np.ndarray
+
+
 class Furnishing:
     """A room being furnished: axis-aligned boxes and the floor that is kept clear in front of them."""
 
@@ -45,6 +59,7 @@ class Furnishing:
         self.boxes = np.zeros((0, 2, 3))  # low and high (x, y, z) corners
         self.zones = np.zeros((0, 2, 3))
         self.zone_owners: list[int] = []
+        self.placed: list[Placed] = []
 
     def add(
         self, name: str, low: np.ndarray, high: np.ndarray, turn: int, parent: int, item: Item, middle: bool
@@ -85,27 +100,31 @@ def draw_contents(items: Mapping[str, Item], rng: np.random.Generator) -> dict[s
 
 
 def furnish(
-    shape: Shape, items: Mapping[str, Item], contents: Mapping[str, int], rng: np.random.Generator
+    room: Furnishing, items: Mapping[str, Item], contents: Mapping[str, int], rng: np.random.Generator
 ) -> Furnishing | None:
     """Furnishes a room; None if a type found no place at all (further objects of a type may be left out).
 
     Args:
-      shape: the room.
+      room: the room to furnish, which is changed.
       items: what the types are and where they are put.
       contents: number of objects by type, in the order in which they are put.
       rng: source of randomness.
     """
-    room = Furnishing(shape)
     for name, count in contents.items():
-        placed = [put(room, name, items[name], rng) for _ in range(count)]
+        item = items[name]
+        placed = [put(room, name, item, draw_size(item, rng), rng) for _ in range(count)]
         if not any(placed):
             return None
     return room
 
 
-def put(room: Furnishing, name: str, item: Item, rng: np.random.Generator) -> bool:
-    """Puts one object (or block of objects) where its rule says; False if there is no room for it."""
-    size = np.array(item.size) * np.exp(SIZE_SPREAD * rng.standard_normal())
+def draw_size(item: Item, rng: np.random.Generator) -> np.ndarray:
+    """Width, height and depth [3] of an object, metres."""
+    return np.array(item.size) * np.exp(SIZE_SPREAD * rng.standard_normal())
+
+
+def put(room: Furnishing, name: str, item: Item, size: np.ndarray, rng: np.random.Generator) -> bool:
+    """Puts one object (or block of objects) of `size` [3] where its rule says; False if there is no room for it."""
     columns, rows = item.block
     pitch = 1.2 if columns * rows > 1 else 1.0
     whole = size * (columns * pitch, 1.0, rows * pitch)
@@ -128,6 +147,7 @@ def put(room: Furnishing, name: str, item: Item, rng: np.random.Generator) -> bo
                 centre = spots.centres[best] + across * RIGHT[turn] + deep * FORWARD[turn]
                 low, high = _corners(centre[None], np.array([turn]), spots.bottoms[[best]], size)
                 room.add(name, low[0], high[0], turn, parent, item, middle)
+        room.placed.append(Placed(name, item, size))
         return True
     return False
 

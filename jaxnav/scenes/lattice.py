@@ -1,21 +1,9 @@
-"""Moves on the lattice: headings, the standable part of a scene, and shortest action counts."""
+"""Moves on the lattice: the standable part of a scene, neighbours, and shortest action counts and walks."""
 
 import numpy as np
 
-NUM_HEADINGS = 8
-HORIZONS = (0.0, 30.0)  # degrees downwards
-NUM_ACTIONS = 6
-MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTIONS)
-POSES_PER_CELL = NUM_HEADINGS * len(HORIZONS)
-
-#: (dz, dx) of MoveAhead for each heading, clockwise from +z.
-HEADING_STEPS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
-
-
-def heading_vectors() -> np.ndarray:
-    """Unit vectors (x, z) of the headings, float64 [8, 2]."""
-    angles = np.deg2rad(45.0 * np.arange(NUM_HEADINGS))
-    return np.stack([np.sin(angles), np.cos(angles)], axis=-1)
+from jaxnav.scenes.scene import CELL
+from jaxnav.scenes.task import DONE, NEIGHBOURS, NUM_ACTIONS, Rules
 
 
 def standable_cells(reach: np.ndarray) -> np.ndarray:
@@ -23,51 +11,66 @@ def standable_cells(reach: np.ndarray) -> np.ndarray:
 
     Of equally large parts it takes the one that comes first in row order.
     """
-    # Labels spread by taking the smallest label of the neighbourhood until nothing changes.
-    labels = np.where(reach, np.arange(reach.size).reshape(reach.shape), reach.size)
-    while True:
-        padded = np.pad(labels, 1, constant_values=reach.size)
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-        spread = np.where(reach, windows.min(axis=(2, 3)), reach.size)
-        if np.array_equal(spread, labels):
-            break
-        labels = spread
-    parts, counts = np.unique(labels[reach], return_counts=True)
-    if not len(parts):
-        return np.zeros((0, 2), np.int64)
-    return np.argwhere(labels == parts[np.argmax(counts)])
+    left = np.pad(reach, 1)
+    stride = left.shape[1]
+    around = (NEIGHBOURS @ (stride, 1)).tolist()
+    free, best = set(np.flatnonzero(left).tolist()), []
+    for first in np.flatnonzero(left).tolist():
+        if first not in free:
+            continue
+        free.remove(first)
+        part = [first]
+        for cell in part:
+            for step in around:
+                if cell + step in free:
+                    free.remove(cell + step)
+                    part.append(cell + step)
+        best = max(best, part, key=len)
+    return np.stack(np.divmod(np.sort(np.array(best, np.int64)), stride), axis=-1) - 1
 
 
-def successors(cells: np.ndarray) -> np.ndarray:
-    """Pose reached by every action from every pose of a scene.
+def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:
+    """Cell that MoveAhead leads to from every cell and heading, the own one where the way is barred.
 
     Args:
-      cells: int [C, 2], the standable cells (iz, ix).
+      cells: int [C, 2], the standable cells (iz, ix), at least one.
+      rules: the headings.
 
     Returns:
-      int32 [C * 16, 6]; pose `(cell * 8 + heading) * 2 + horizon`.
+      int32 [C, H].
     """
-    num_cells = len(cells)
-    index = {tuple(cell): i for i, cell in enumerate(cells.tolist())}
-    steps = HEADING_STEPS.tolist()
-    ahead = [[index.get((z + dz, x + dx), i) for dz, dx in steps] for i, (z, x) in enumerate(cells.tolist())]
-    cell, heading, horizon = np.indices((num_cells, NUM_HEADINGS, len(HORIZONS)))
+    low = cells.min(axis=0) - 1
+    index = np.full(cells.max(axis=0) - low + 2, -1)
+    index[tuple((cells - low).T)] = np.arange(len(cells))
+    ahead = index[tuple(np.moveaxis(cells[:, None] - low + rules.steps(), -1, 0))]
+    return np.where(ahead >= 0, ahead, np.arange(len(cells))[:, None]).astype(np.int32)
 
-    def pose(cell: np.ndarray, heading: np.ndarray, horizon: np.ndarray | int) -> np.ndarray:
-        return (cell * NUM_HEADINGS + heading % NUM_HEADINGS) * len(HORIZONS) + horizon
 
-    table = np.stack(
-        [
-            pose(np.broadcast_to(np.array(ahead).reshape(num_cells, NUM_HEADINGS, 1), cell.shape), heading, horizon),
-            pose(cell, heading - 1, horizon),
-            pose(cell, heading + 1, horizon),
-            pose(cell, heading, 0),
-            pose(cell, heading, 1),
-            pose(cell, heading, horizon),
-        ],
-        axis=-1,
-    )
-    return table.reshape(-1, NUM_ACTIONS).astype(np.int32)
+def successors(ahead: np.ndarray, rules: Rules) -> np.ndarray:
+    """Pose after every action from every pose.
+
+    Args:
+      ahead: int32 [C, H], see `ahead_of`.
+      rules: headings and horizons.
+
+    Returns:
+      int32 [P, 6], P = C * H * horizons.
+    """
+    last = len(rules.horizons) - 1
+    cell, heading, horizon = np.indices((len(ahead), rules.headings, last + 1), np.int32)
+
+    def pose(cell: np.ndarray, heading: np.ndarray, horizon: np.ndarray) -> np.ndarray:
+        return (cell * rules.headings + heading % rules.headings) * len(rules.horizons) + horizon
+
+    table = [
+        pose(np.broadcast_to(ahead[..., None], cell.shape), heading, horizon),
+        pose(cell, heading - 1, horizon),
+        pose(cell, heading + 1, horizon),
+        pose(cell, heading, np.maximum(horizon - 1, 0)),
+        pose(cell, heading, np.minimum(horizon + 1, last)),
+        pose(cell, heading, horizon),
+    ]
+    return np.stack(table, axis=-1).reshape(-1, NUM_ACTIONS).astype(np.int32)
 
 
 def best_lengths(successor: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -81,13 +84,43 @@ def best_lengths(successor: np.ndarray, found: np.ndarray) -> np.ndarray:
       uint16 [P, K]; 1 where the goal is found at the pose itself, 0 where it cannot be reached.
     """
     lengths = found.astype(np.uint16)
-    reached, length = found, 1
-    moves = successor[:, :DONE]
+    # The goals reached so far are the bits of a word, so that one pass over the moves serves them all.
+    bits = np.packbits(found, axis=1, bitorder="little")
+    reached = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)  # [P, words]
+    moves = np.ascontiguousarray(successor[:, :DONE].T)
+    length = 1
     while True:
-        spread = reached | reached[moves].any(axis=1)
-        new = spread & ~reached
-        if not new.any():
+        spread = reached.copy()
+        for move in moves:
+            spread |= reached[move]
+        new = np.flatnonzero((spread != reached).any(axis=1))
+        if not len(new):
             return lengths
         length += 1
-        lengths[new] = length
+        fresh = np.unpackbits((spread ^ reached)[new].view(np.uint8), axis=1, bitorder="little", count=found.shape[1])
+        pose, goal = np.nonzero(fresh)
+        lengths[new[pose], goal] = length
         reached = spread
+
+
+def walking_distances(ahead: np.ndarray, rules: Rules, start: np.ndarray) -> np.ndarray:
+    """Shortest walks over neighbouring cells, after some distance to begin with.
+
+    Args:
+      ahead: int32 [C, H], see `ahead_of`.
+      rules: the headings.
+      start: float64 [C, G], metres from each cell to a goal directly, inf where there is no direct way.
+
+    Returns:
+      float64 [C, G], the least over all cells of the walk there and the direct way from there, metres.
+    """
+    ways, first = np.unique(rules.steps(), axis=0, return_index=True)
+    costs = CELL * np.hypot(*ways.T)
+    distance = start
+    while True:
+        nearer = distance
+        for heading, cost in zip(first, costs, strict=True):
+            nearer = np.minimum(nearer, distance[ahead[:, heading]] + cost)
+        if np.array_equal(nearer, distance):
+            return distance
+        distance = nearer

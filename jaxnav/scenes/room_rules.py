@@ -65,6 +65,7 @@ class RoomStatistics:
       aspect: the longest possible side of that rectangle, relative to the other.
       l_shape: share of L-shaped rooms.
       items: what stands in the room, by type, in the order in which it is put.
+      exchange: groups of types of like size and footing that exchange their rules under a shift of the layout.
     """
 
     cells: tuple[float, float, float, float, float]
@@ -73,16 +74,44 @@ class RoomStatistics:
     aspect: float
     l_shape: float
     items: Mapping[str, Item]
+    exchange: tuple[tuple[str, ...], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class HomeStatistics:
+    """What stands in the rooms of a home.
+
+    Attributes:
+      rooms: by room type, what stands there by type, in the order in which it is put.
+      exchange: groups of types of like size and footing that exchange their rules, room included, under a shift.
+    """
+
+    rooms: Mapping[str, Mapping[str, Item]]
+    exchange: tuple[tuple[str, ...], ...]
 
 
 @functools.cache
 def room_statistics() -> dict[str, RoomStatistics]:
     """The statistics of `rooms.yaml` by room type."""
-    raw = yaml.safe_load(pathlib.Path(__file__).with_name("rooms.yaml").read_text())
     return {
-        room_type: RoomStatistics(**{**entry, "items": {name: _item(item) for name, item in entry["items"].items()}})
-        for room_type, entry in raw.items()
+        room_type: RoomStatistics(**{**entry, "items": _items(entry["items"])})
+        for room_type, entry in _read("rooms.yaml").items()
     }
+
+
+@functools.cache
+def home_statistics(world: str) -> HomeStatistics:
+    """The statistics of the world's file, `apartments.yaml` or `houses.yaml`."""
+    raw = _read(f"{world}.yaml")
+    return HomeStatistics({room_type: _items(items) for room_type, items in raw["rooms"].items()}, raw["exchange"])
+
+
+def _read(file: str) -> dict[str, Any]:
+    return yaml.safe_load(pathlib.Path(__file__).with_name(file).read_text())
+
+
+def _items(entries: dict[str, dict[str, Any]]) -> dict[str, Item]:
+    return {name: _item(entry) for name, entry in entries.items()}
 
 
 def _item(entry: dict[str, Any]) -> Item:

@@ -1,5 +1,7 @@
 """A procedural world of single rooms whose layouts follow the measured statistics of AI2-THOR."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from jaxnav.errors import InputError
@@ -8,7 +10,8 @@ from jaxnav.scenes.furnish import Furnishing, draw_contents, furnish
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.room_rules import room_statistics
 from jaxnav.scenes.room_shapes import draw_shape, wall_mask
-from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.scene import CELL, SPLITS, Scene
+from jaxnav.scenes.shift import check_scene_arguments, derangement, place_anew
 
 AGENT_RADIUS = 0.2  # metres
 OBSTACLE_HEIGHTS = (0.1, 1.7)  # boxes that reach into this range are in the agent's way, metres
@@ -20,35 +23,63 @@ ATTEMPTS = 40  # at a room of the drawn size
 TARGETS = frozenset(ITHOR_CATEGORIES)
 
 
-def generate_rooms(num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0) -> list[Scene]:
-    """Generates single rooms; a scene depends on the seed, its split and its index alone.
+def generate_rooms(
+    num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0, shift: float = 0.0
+) -> list[Scene]:
+    """Generates single rooms; a scene depends on the seed, its split, its index and the shift alone.
 
     Args:
       num_train: number of training scenes, at least 0; room types take turns.
       num_val: number of validation scenes.
       num_test: number of test scenes.
       seed: at least 0.
+      shift: probability in [0, 1] that an object is placed by the rule of another type.
 
     Returns:
       The scenes, split by split, named like `train-kitchen-003`.
 
     Raises:
-      InputError: a count or the seed is negative, or there is no scene at all.
+      InputError: a count or the seed is negative, the shift is not in [0, 1], or there is no scene at all.
     """
-    counts = {"train": num_train, "val": num_val, "test": num_test}
-    for name, number in {**{f"num_{split}": count for split, count in counts.items()}, "seed": seed}.items():
-        if number < 0:
-            raise InputError(f"generate_rooms: {name} is {number}; give a number of at least 0")
+    counts = dict(zip(SPLITS, (num_train, num_val, num_test), strict=True))
+    for split, count in counts.items():
+        if count < 0:
+            raise InputError(f"generate_rooms: num_{split} is {count}; give a number of at least 0")
+        check_scene_arguments("generate_rooms", split, count, seed, shift)
     if not sum(counts.values()):
         raise InputError("generate_rooms: num_train, num_val and num_test are all 0; ask for at least one scene")
-    return [
-        generate_room(ROOM_TYPES[i % len(ROOM_TYPES)], split, i, np.random.default_rng((seed, k, i)))
-        for k, (split, count) in enumerate(counts.items())
-        for i in range(count)
-    ]
+    return [generate_room_at(split, i, seed, shift) for split, count in counts.items() for i in range(count)]
 
 
-def generate_room(room_type: str, split: str, index: int, rng: np.random.Generator) -> Scene:
+def generate_room_at(split: str, index: int, seed: int, shift: float = 0.0) -> Scene:
+    """The scene of `generate_rooms` with the given split and index, from 0; room types take turns.
+
+    Raises:
+      InputError: unknown split, negative index or seed, or a shift that is not in [0, 1].
+    """
+    check_scene_arguments("generate_room_at", split, index, seed, shift)
+    room_type = ROOM_TYPES[index % len(ROOM_TYPES)]
+    key = (seed, SPLITS.index(split), index)
+    rng, shift_rng = np.random.default_rng(key), np.random.default_rng((*key, 1))
+    while True:
+        drawn: DrawnRoom | None = _draw_room(room_type, rng)
+        if shift:
+            drawn = _shifted(room_type, drawn, shift, shift_rng)
+        if drawn:
+            walls, reach = wall_mask(drawn.furniture.shape), drawn.reach
+            return make_scene(
+                f"{split}-{room_type}-{index:03d}", "rooms", room_type, split, walls, reach, drawn.furniture
+            )
+
+
+class DrawnRoom(NamedTuple):
+    """A furnished room and its standable cells, bool [nz, nx]."""
+
+    furniture: Furnishing
+    reach: np.ndarray
+
+
+def _draw_room(room_type: str, rng: np.random.Generator) -> DrawnRoom:
     """Draws rooms of the given type until one can be walked through and everything in it can be found."""
     statistics = room_statistics()[room_type]
     while True:
@@ -59,19 +90,44 @@ def generate_room(room_type: str, split: str, index: int, rng: np.random.Generat
         for _ in range(ATTEMPTS):
             notched = rng.random() < statistics.l_shape
             shape = draw_shape(size, statistics.fill, statistics.margin, statistics.aspect, notched, rng)
-            room = furnish(shape, statistics.items, contents, rng)
+            room = furnish(Furnishing(shape), statistics.items, contents, rng)
             if room is None:
                 size *= 1.05
                 continue
-            walls = wall_mask(shape)
-            free = free_cells(walls, room.boxes)
-            reach = np.zeros_like(free)
-            reach[tuple(standable_cells(free).T)] = True
+            reach, whole = _standable(room)
             ratio = reach.sum() / cells
-            whole = reach.sum() >= CONNECTED_SHARE * free.sum()
             if abs(ratio - 1.0) < CELLS_TOLERANCE and whole and _everything_found(reach, room):
-                return _scene(f"{split}-{room_type}-{index:03d}", room_type, split, walls, reach, room)
+                return DrawnRoom(room, reach)
             size *= np.clip(ratio, 0.7, 1.4) ** -0.7
+
+
+def _shifted(room_type: str, drawn: DrawnRoom, shift: float, rng: np.random.Generator) -> DrawnRoom | None:
+    """The same room with the same objects placed anew; None if it could not be walked through."""
+    statistics = room_statistics()[room_type]
+    bare = [Furnishing(drawn.furniture.shape)]
+    partners = derangement(statistics.exchange)
+    for _ in range(ATTEMPTS):
+        rooms = place_anew(bare, [statistics.items], [drawn.furniture], partners, shift, rng)
+        if rooms:
+            reach, whole = _standable(rooms[0])
+            alike = abs(reach.sum() / drawn.reach.sum() - 1.0) < CELLS_TOLERANCE
+            if alike and whole and _everything_found(reach, rooms[0]):
+                return DrawnRoom(rooms[0], reach)
+    return None
+
+
+def _standable(room: Furnishing) -> tuple[np.ndarray, bool]:
+    """The standable cells, bool [nz, nx], and whether they are nearly all that is free."""
+    free = free_cells(wall_mask(room.shape), room.boxes)
+    reach = connected(free)
+    return reach, bool(reach.sum() >= CONNECTED_SHARE * free.sum())
+
+
+def connected(free: np.ndarray) -> np.ndarray:
+    """The largest connected part of the free cells, bool [nz, nx]."""
+    reach = np.zeros_like(free)
+    reach[tuple(standable_cells(free).T)] = True
+    return reach
 
 
 def free_cells(walls: np.ndarray, boxes: np.ndarray) -> np.ndarray:
@@ -84,9 +140,19 @@ def free_cells(walls: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     Returns:
       bool [nz, nx].
     """
+    return clear_of_boxes(clear_of_walls(walls), boxes)
+
+
+def clear_of_walls(walls: np.ndarray) -> np.ndarray:
+    """Cells that are far enough from every wall, bool [nz, nx]; outside there are walls."""
     # Cell centres are 0.125 m from a neighbouring wall, 0.177 m from a diagonal one and 0.375 m from the next.
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(walls, 1, constant_values=True), (3, 3))
-    free = np.logical_not(windows.any(axis=(2, 3)))
+    return np.logical_not(windows.any(axis=(2, 3)))
+
+
+def clear_of_boxes(free: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Those of the cells `free` [nz, nx] that are far enough from every box as well."""
+    free = free.copy()
     iz, ix = np.nonzero(free)
     centres = CELL * (np.stack([ix, iz], axis=-1) - 0.5)
     low_height, high_height = OBSTACLE_HEIGHTS
@@ -104,23 +170,25 @@ def _everything_found(reach: np.ndarray, room: Furnishing) -> bool:
     return bool((distances.min(axis=1, initial=np.inf) <= FIND_DISTANCE).all())
 
 
-def _scene(name: str, room_type: str, split: str, walls: np.ndarray, reach: np.ndarray, room: Furnishing) -> Scene:
+def make_scene(
+    name: str, world: str, room_type: str, split: str, walls: np.ndarray, reach: np.ndarray, furniture: Furnishing
+) -> Scene:
     """The scene of a furnished room, with the world's origin at a cell in its middle."""
     nz, nx = walls.shape
     origin = (-CELL * (nx // 2), -CELL * (nz // 2))
-    low, high = room.boxes[:, 0], room.boxes[:, 1]
+    low, high = furniture.boxes[:, 0], furniture.boxes[:, 1]
     shift = (origin[0] + CELL / 2, 0.0, origin[1] + CELL / 2)
     boxes = np.round(np.concatenate([(low + high) / 2 + shift, high - low], axis=1), 3)
     return Scene(
         name=name,
-        world="rooms",
+        world=world,
         room_type=room_type,
         split=split,
         origin=origin,
         reach=reach,
         walls=walls,
-        types=tuple(room.types),
+        types=tuple(furniture.types),
         boxes=boxes,
-        yaws=90.0 * np.array(room.turns),
-        parents=np.array(room.parents),
+        yaws=90.0 * np.array(furniture.turns),
+        parents=np.array(furniture.parents),
     )

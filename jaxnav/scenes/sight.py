@@ -1,12 +1,12 @@
 """Lines of sight: which boxes and walls hide what, and what lies in the camera's view."""
 
+import functools
+
 import numpy as np
 
-from jaxnav.scenes.lattice import HORIZONS, heading_vectors
 from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.task import Rules
 
-CAMERA_HEIGHT = 1.5
-TAN_HALF_FIELD_OF_VIEW = float(np.tan(np.deg2rad(50.0)))
 SIGHT_MARGIN = 0.3  # a line of sight ends this far before the target's centre
 GRAZE = 1e-6  # touching a surface by less than this does not block
 TOLERANCE = 1e-9  # on lengths that decide something, so that rounding errors do not; always on the side of yes
@@ -24,108 +24,169 @@ def opaque(boxes: np.ndarray) -> np.ndarray:
     return np.minimum(np.minimum(bulky, low), high) >= -TOLERANCE
 
 
-def wall_boxes(scene: Scene) -> np.ndarray:
-    """Wall cells as boxes without floor or ceiling, float64 [W, 6]."""
-    centres = cell_centres(scene, np.argwhere(scene.walls))
-    boxes = np.full((len(centres), 6), CELL)
-    boxes[:, [0, 2]] = centres
-    boxes[:, [1, 4]] = 0.0, np.inf
-    return boxes
+def rectangles(mask: np.ndarray) -> np.ndarray:
+    """Disjoint rectangles that cover a mask [nz, nx]: z0, x0, z1, x1 of each, the latter two excluded, int [R, 4]."""
+    open_runs: dict[tuple[int, int], int] = {}
+    found = []
+    for z, row in enumerate(np.diff(np.pad(mask, ((0, 1), (1, 1))).astype(np.int8), axis=1)):
+        runs = list(zip(np.flatnonzero(row == 1).tolist(), np.flatnonzero(row == -1).tolist(), strict=True))
+        found += [(z0, x0, z, x1) for (x0, x1), z0 in open_runs.items() if (x0, x1) not in runs]
+        open_runs = {run: open_runs.get(run, z) for run in runs}
+    return np.array(found, int).reshape(-1, 4)
 
 
-def line_of_sight(scene: Scene, centres: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Whether the camera above each cell has a clear line to each target object.
+def clear_of_walls(scene: Scene, start: np.ndarray, end: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Whether segments from `start` to `end` [M, 2], world (x, z), meet no wall cell; bool [M].
 
-    Args:
-      scene: the scene whose walls and opaque boxes hide things.
-      centres: float64 [C, 2], world (x, z) of the cells.
-      targets: int [N], indices of the target objects.
-
-    Returns:
-      bool [C, N].
+    Wall cells that contain `start` or `target` [M, 2] do not count.
     """
-    camera = np.insert(centres, 1, CAMERA_HEIGHT, axis=1)
-    points = scene.boxes[targets, :3]
-    line = points - camera[:, None]
-    length = np.linalg.norm(line, axis=-1, keepdims=True)
-    line = line * np.maximum(1.0 - SIGHT_MARGIN / np.maximum(length, SIGHT_MARGIN), 0.0)
-
-    furniture = np.flatnonzero(opaque(scene.boxes))
-    blockers = np.concatenate([scene.boxes[furniture], wall_boxes(scene)])
-    owners = np.concatenate([furniture, np.full(len(blockers) - len(furniture), -1)])
-    clear = np.ones(line.shape[:2], bool)
-    for box, owner in zip(blockers, owners, strict=True):
-        half = box[3:] / 2
-        exempt_target = (np.abs(points - box[:3]) <= half + GRAZE).all(axis=-1) | (targets == owner)
-        exempt_camera = (np.abs(centres - box[[0, 2]]) <= half[[0, 2]] + GRAZE).all(axis=-1)
-        hit = _meets(camera, line, box[:3] - half + GRAZE, box[:3] + half - GRAZE)
-        clear &= ~hit | exempt_target[None, :] | exempt_camera[:, None]
+    clear = np.ones(len(start), bool)
+    exempt = np.concatenate([_walls_at(scene, start), _walls_at(scene, target)], axis=1)
+    special = (exempt >= 0).any(axis=1)
+    groups = [(~special, [])]
+    if special.any():
+        sets, member = np.unique(np.sort(exempt[special], axis=1), axis=0, return_inverse=True)
+        rows = np.flatnonzero(special)
+        groups += [(rows[member.ravel() == i], cells[cells >= 0]) for i, cells in enumerate(sets)]
+    corner = np.asarray(scene.origin) - CELL / 2
+    for rows, cells in groups:
+        walls = scene.walls.copy()
+        walls.flat[cells] = False
+        boxes = corner + CELL * rectangles(walls)[:, [[1, 0], [3, 2]]]  # [R, 2, (x, z)]
+        clear[rows] = ~_blocked(start[rows], end[rows], boxes)
     return clear
 
 
+def _walls_at(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Flat indices of the wall cells that contain points [M, 2], up to four each, -1 for none: int [M, 4]."""
+    place = (points - scene.origin) / CELL
+    reach = GRAZE / CELL
+    columns, rows = np.moveaxis(np.rint([place - reach, place + reach]).astype(int), -1, 0)  # [2, M] each
+    iz, ix = np.stack([rows[[0, 0, 1, 1]], columns[[0, 1, 0, 1]]]).swapaxes(1, 2)
+    nz, nx = scene.walls.shape
+    within = (iz >= 0) & (iz < nz) & (ix >= 0) & (ix < nx)
+    flat = np.where(within, iz * nx + ix, 0)
+    return np.where(within & scene.walls.flat[flat], flat, -1)
+
+
+def _blocked(start: np.ndarray, end: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Whether segments [M, D] enter any of the boxes [R, 2, D], each shrunk by the graze: bool [M]."""
+    line = end - start
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    blocked = np.zeros(len(start), bool)
+    for near, far in zip(boxes[:, 0] + GRAZE, boxes[:, 1] - GRAZE, strict=True):
+        maybe = np.flatnonzero(~blocked & (low < far).all(axis=1) & (high > near).all(axis=1))
+        blocked[maybe] = _meets(start[maybe], line[maybe], near, far)
+    return blocked
+
+
 def _meets(start: np.ndarray, line: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Whether segments start [C, 3] + t line [C, N, 3], 0 <= t <= 1, enter the open box (low, high): bool [C, N]."""
-    enter, leave = np.zeros(line.shape[:2]), np.ones(line.shape[:2])
-    inside = np.ones(line.shape[:2], bool)
-    for axis in range(3):
-        a, d = start[:, None, axis], line[..., axis]
-        moving = d != 0.0
-        slope = np.where(moving, d, 1.0)
-        t0, t1 = (low[axis] - a) / slope, (high[axis] - a) / slope
-        enter = np.where(moving, np.maximum(enter, np.minimum(t0, t1)), enter)
-        leave = np.where(moving, np.minimum(leave, np.maximum(t0, t1)), leave)
-        inside &= moving | ((low[axis] < a) & (a < high[axis]))
+    """Whether segments start + t line [M, D], 0 <= t <= 1, enter the open box (low, high) [D]: bool [M]."""
+    moving = line != 0.0
+    slope = np.where(moving, line, 1.0)
+    t0, t1 = (low - start) / slope, (high - start) / slope
+    enter = np.where(moving, np.minimum(t0, t1), 0.0).max(axis=1, initial=0.0)
+    leave = np.where(moving, np.maximum(t0, t1), 1.0).min(axis=1, initial=1.0)
+    inside = (moving | ((low < start) & (start < high))).all(axis=1)
     return inside & (enter < leave)
 
 
-def offsets_in_view(centres: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where points lie relative to the headings, and whether they are in the camera's view.
+def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Whether cameras have a clear line to target objects.
 
     Args:
-      centres: float64 [C, 2], world (x, z) of the cells.
-      points: float64 [N, 3].
+      scene: the scene whose walls and opaque boxes hide things.
+      rules: the camera's height.
+      cameras: float64 [M, 2], world (x, z).
+      targets: int [M], indices of the target objects.
 
     Returns:
-      ahead, right: float64 [C, 8, N] metres; in_view: bool [C, 8, 2, N] over cells, headings and horizons.
+      bool [M].
     """
-    vectors = heading_vectors()
-    v = points[None, :, [0, 2]] - centres[:, None]  # [C, N, 2]
-    ahead = np.einsum("cnd,hd->chn", v, vectors)
-    right = np.einsum("cnd,hd->chn", v, np.stack([vectors[:, 1], -vectors[:, 0]], axis=-1))
-    up = points[:, 1] - CAMERA_HEIGHT
-    pitch = np.deg2rad(HORIZONS)[:, None]
-    depth = ahead[:, :, None] * np.cos(pitch) - up * np.sin(pitch)
-    rise = ahead[:, :, None] * np.sin(pitch) + up * np.cos(pitch)
-    limit = TAN_HALF_FIELD_OF_VIEW * depth
-    in_view = (depth > 0) & (np.abs(right)[:, :, None] <= limit) & (np.abs(rise) <= limit)
+    camera = np.insert(cameras, 1, rules.camera, axis=1)
+    points = scene.boxes[targets, :3]
+    line = points - camera
+    length = np.linalg.norm(line, axis=-1, keepdims=True)
+    end = camera + line * np.maximum(1.0 - SIGHT_MARGIN / np.maximum(length, SIGHT_MARGIN), 0.0)
+    clear = clear_of_walls(scene, cameras, end[:, [0, 2]], points[:, [0, 2]])
+    for owner in np.flatnonzero(opaque(scene.boxes)):
+        centre, half = scene.boxes[owner, :3], scene.boxes[owner, 3:] / 2
+        low, high = centre - half, centre + half
+        near = np.flatnonzero(
+            clear
+            & (np.minimum(cameras, end[:, [0, 2]]) < high[[0, 2]]).all(axis=1)
+            & (np.maximum(cameras, end[:, [0, 2]]) > low[[0, 2]]).all(axis=1)
+        )
+        exempt = (np.abs(points[near] - centre) <= half + GRAZE).all(axis=1) | (targets[near] == owner)
+        exempt |= (np.abs(cameras[near] - centre[[0, 2]]) <= half[[0, 2]] + GRAZE).all(axis=1)
+        near = near[~exempt]
+        clear[near] = ~_meets(camera[near], end[near] - camera[near], low + GRAZE, high - GRAZE)
+    return clear
+
+
+def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where points lie relative to the headings of cameras, and whether they are in the view.
+
+    Args:
+      rules: headings, horizons and the camera.
+      cameras: float64 [M, 2], world (x, z).
+      points: float64 [M, 3].
+
+    Returns:
+      ahead, right: float64 [M, H] metres; in_view: bool [M, H, horizons].
+    """
+    directions = rules.directions()
+    v = points[:, [0, 2]] - cameras
+    ahead = v @ directions.T
+    right = v @ np.stack([directions[:, 1], -directions[:, 0]])
+    up = (points[:, 1] - rules.camera)[:, None, None]
+    pitch = np.deg2rad(rules.horizons)
+    depth = ahead[..., None] * np.cos(pitch) - up * np.sin(pitch)
+    rise = ahead[..., None] * np.sin(pitch) + up * np.cos(pitch)
+    across, high = rules.half_view
+    in_view = (depth > 0) & (np.abs(right)[..., None] <= across * depth) & (np.abs(rise) <= high * depth)
     return ahead, right, in_view
 
 
-def view_known(scene: Scene, cells: np.ndarray, radius: int) -> np.ndarray:
-    """Which floor cells around each cell can be seen past walls and opaque boxes that reach 1.5 m or more.
+def view_known(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Which floor cells around each cell can be seen past walls and opaque boxes as high as the camera.
 
     Args:
       scene: the scene.
+      rules: the camera's height.
       cells: int [C, 2], the cells (iz, ix) to look from.
-      radius: how many cells to look to every side.
+      offsets: int [O, 2], the cells (dz, dx) to look at.
 
     Returns:
-      bool [C, 2 radius + 1, 2 radius + 1] over the offsets (dz, dx).
+      bool [C, O].
     """
     x, y, z, sx, sy, sz = scene.boxes[opaque(scene.boxes)].T
-    tall = y + sy / 2 >= CAMERA_HEIGHT - TOLERANCE
+    tall = y + sy / 2 >= rules.camera - TOLERANCE
     grid = np.argwhere(np.ones_like(scene.walls))
     distance = np.abs(cell_centres(scene, grid)[:, None] - np.stack([x, z], axis=-1)[tall])
     covered = (distance <= np.stack([sx, sz], axis=-1)[tall] / 2 + TOLERANCE).all(axis=-1).any(axis=-1)
-    blocked = np.pad(scene.walls | covered.reshape(scene.walls.shape), radius)
-    span = np.arange(-radius, radius + 1)
-    known = np.ones((len(cells), len(span), len(span)), bool)
-    for step in range(1, 2 * radius):  # half-cell steps along the longest line
-        share = step / (2 * radius)
-        dz = np.rint(span * share).astype(int)  # symmetric about 0, so that a mirrored room has a mirrored view
-        seen = ~blocked[cells[:, 0, None, None] + radius + dz[:, None], cells[:, 1, None, None] + radius + dz[None, :]]
-        # A sample that falls into the looked-at cell itself, or into the own one, hides nothing.
-        last = (dz == span)[:, None] & (dz == span)[None, :]
-        first = (dz == 0)[:, None] & (dz == 0)[None, :]
-        known &= seen | last | first
-    return known
+    radius = int(np.abs(offsets).max())
+    clear = ~np.pad(scene.walls | covered.reshape(scene.walls.shape), radius)
+    # On the flattened lattice a displacement is one shift, whatever the cell.
+    stride, flat = clear.shape[1], clear.ravel()
+    margin = radius * (stride + 1)
+    length = flat.size - 2 * margin
+    at = (cells + radius) @ (stride, 1) - margin
+    known = np.ones((len(offsets), len(cells)), bool)
+    seen = np.empty(length, bool)
+    for row, offset in zip(known, offsets.tolist(), strict=True):
+        seen[:] = True
+        for dz, dx in _between(*offset, radius):
+            shift = margin + dz * stride + dx
+            seen &= flat[shift : shift + length]
+        row[:] = seen[at]
+    return known.T
+
+
+@functools.lru_cache(maxsize=4096)
+def _between(dz: int, dx: int, radius: int) -> list[tuple[int, int]]:
+    """The cells that a look from (0, 0) to (dz, dx) passes through, its ends left out."""
+    share = np.arange(1, 2 * radius) / (2 * radius)  # half-cell steps along the longest line
+    # Rounding is symmetric about 0, so that a mirrored room has a mirrored view.
+    passed = set(zip(np.rint(dz * share).astype(int).tolist(), np.rint(dx * share).astype(int).tolist(), strict=True))
+    return sorted(passed - {(0, 0), (dz, dx)})

@@ -7,15 +7,14 @@ import jax.numpy as jnp
 
 from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
 from jaxnav.env.types import EnvParams, State
-from jaxnav.scenes.lattice import DONE, POSES_PER_CELL
+from jaxnav.scenes.task import DONE
 
 
 class Exploration(NamedTuple):
     """What the random agent found.
 
     Attributes:
-      counts: float32 [rooms, K, K], poses at which two categories were detected together, by room type; starts at
-        one off the diagonal (the all-ones Dirichlet).
+      counts: float32 [rooms, K, K], poses at which two categories were detected together, by room type.
       steps: int32 [], steps taken.
       poses: int32 [], distinct poses seen.
     """
@@ -51,13 +50,14 @@ def explore(
 
     presence = (env.layout.presence(params.tables.rows) & seen[:, None]).astype(jnp.float32)
     scene = jnp.repeat(
-        jnp.arange(len(params.room)), params.tables.num_cells * POSES_PER_CELL, total_repeat_length=len(seen)
+        jnp.arange(len(params.room)),
+        params.tables.num_cells * env.task.rules.poses_per_cell,
+        total_repeat_length=len(seen),
     )
     room = jax.nn.one_hot(params.room[scene], NUM_PRIORS, dtype=jnp.float32)
     together = jnp.einsum("pr,pi,pj->rij", room, presence, presence, optimize="optimal")
-    off_diagonal = 1.0 - jnp.eye(presence.shape[-1])
     return Exploration(
-        counts=(together + 1.0) * off_diagonal[None],
+        counts=together,
         steps=jnp.int32(num_walks * num_steps),
         poses=seen.sum(dtype=jnp.int32),
     )

@@ -17,7 +17,7 @@ from jaxnav.training.losses import advantages, ppo_loss
 from jaxnav.training.rollout import Transition, rollout
 
 _INIT, _START, _UPDATES = range(3)  # purposes of a seed's keys
-_ROLLOUT, _SHUFFLE = range(2)  # purposes of an update's keys
+_ROLLOUT, _SHUFFLE, _RESTART = range(3)  # purposes of an update's keys
 
 
 class LearnerState(struct.PyTreeNode):
@@ -72,6 +72,12 @@ class Learner:
             key=update_key,
             update=jnp.int32(0),
         )
+
+    def restart(self, state: LearnerState, params: EnvParams, priors: jax.Array) -> LearnerState:
+        """The same seed with new episodes, for scenes other than before."""
+        key = jax.random.fold_in(jax.random.fold_in(state.key, state.update), _RESTART)
+        policy = bind(self.spec, state.params)
+        return state.replace(agent=self.acting.start(key, self.config.num_envs, policy, params, priors))
 
     def train(
         self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array, num_updates: int

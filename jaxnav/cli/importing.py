@@ -1,0 +1,131 @@
+"""The import of scenes: from users' files, in the formats that there are, to a scene file."""
+
+import dataclasses
+import fnmatch
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import category_ids, unknown_types
+from jaxnav.scenes.importers.ai2thor import read_ai2thor
+from jaxnav.scenes.importers.controller import read_controller
+from jaxnav.scenes.importers.habitat import read_habitat
+from jaxnav.scenes.importers.procthor import read_procthor
+from jaxnav.scenes.importers.scene_data import read_scene_data
+from jaxnav.scenes.io import read_scenes, write_scenes
+from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.worlds import WORLDS
+
+Split = Literal["train", "val", "test"]
+Imported = Iterator[Scene | InputError]
+
+#: World whose vocabulary scenes of a format are checked against.
+USUAL_WORLDS = {
+    "procthor": "houses",
+    "ai2thor": "rooms",
+    "scene-data": "rooms",
+    "habitat": "houses",
+    "scenes": "rooms",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportConfig:
+    """Import scenes to a scene file.
+
+    Attributes:
+      format: `procthor`: houses as JSON or JSON lines; `ai2thor`: metadata of the controller with reachable positions,
+        a file or a folder of files; `scene-data`: the offline folders of SAVN, ORG and L-sTDE; `habitat`: an ObjectNav
+        split or one of its files; `scenes`: a scene file, to divide it into splits.
+      source: what to read; with `--from-controller` names of scenes with commas between them.
+      out: scene file to write (`*.jsonl.gz`).
+      split: of the scenes that none of the following patterns fits.
+      val, test: patterns of scene names, such as `FloorPlan_Train11_*`, that make up these splits.
+      world: world whose vocabulary the types are compared with; default: that which the format usually stands for.
+      categories: vocabulary to compare with instead.
+      assets: asset database of ProcTHOR (JSON), for types and sizes.
+      maps: semantic floor maps for Habitat episodes (`*_info.pbz2`).
+      from_controller: read from an installed `ai2thor` simulator instead of from files.
+    """
+
+    format: Annotated[Literal["procthor", "ai2thor", "scene-data", "habitat", "scenes"], tyro.conf.Positional]
+    source: Annotated[str, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional]
+    split: Split = "train"
+    val: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    world: Literal["rooms", "apartments", "houses"] | None = None
+    categories: tuple[str, ...] | None = None
+    assets: Path | None = None
+    maps: Path | None = None
+    from_controller: bool = False
+
+
+def import_scenes(config: ImportConfig, console: Console) -> None:
+    """Import, write the scene file, and tell what was refused and which types are unknown.
+
+    Raises:
+      InputError: nothing could be imported, or the file cannot be written.
+    """
+    if not config.out.name.endswith(".jsonl.gz"):
+        raise InputError(f"{config.out}: give a name that ends in .jsonl.gz")
+    categories = config.categories or WORLDS[config.world or USUAL_WORLDS[config.format]].task.categories
+    kept: dict[str, Scene] = {}
+    refused = 0
+    for scene in _read(config):
+        if isinstance(scene, Scene):
+            scene = _checked(scene, kept, categories, config.source)
+        if isinstance(scene, Scene):
+            kept[scene.name] = _with_split(scene, config)
+        else:
+            refused += 1
+            console.print(f"refused: {scene}", style="yellow", markup=False, soft_wrap=True)
+    if not kept:
+        raise InputError(f"{config.source}: none of its {refused} scenes can be used; mend what is said of them above")
+    try:
+        write_scenes(config.out, kept.values())
+    except OSError as error:
+        raise InputError(f"{config.out}: cannot be written ({error.strerror}); give another name") from error
+    unknown = unknown_types(kept.values(), categories)
+    for name, count in unknown.most_common():
+        console.print(f"unknown type, only blocks the sight: {name} x {count}", markup=False, soft_wrap=True)
+    console.print(f"{len(kept)} scenes imported, {refused} refused; written to {config.out}", soft_wrap=True)
+
+
+def _read(config: ImportConfig) -> Imported:
+    path, split = Path(config.source), config.split
+    if config.from_controller:
+        if config.format != "ai2thor":
+            raise InputError(
+                f"--from-controller: reads from ai2thor, not from {config.format}; give the format ai2thor"
+            )
+        return read_controller(config.source.split(","), split)
+    readers: dict[str, Callable[[], Imported]] = {
+        "procthor": lambda: read_procthor(path, split, config.assets),
+        "ai2thor": lambda: read_ai2thor(path, split),
+        "scene-data": lambda: read_scene_data(path, split),
+        "habitat": lambda: read_habitat(path, split, config.maps),
+        "scenes": lambda: iter(read_scenes(path)),
+    }
+    return readers[config.format]()
+
+
+def _checked(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> Scene | InputError:
+    if scene.name in kept:
+        return InputError(f"{source}, scene {scene.name!r}: name is that of an earlier scene; import them to two files")
+    if max(category_ids(scene.types, categories), default=-1) < 0:
+        return InputError(
+            f"{source}, scene {scene.name!r}: objects are of no known type; known are {', '.join(categories)} "
+            "(see --world and --categories)"
+        )
+    return scene
+
+
+def _with_split(scene: Scene, config: ImportConfig) -> Scene:
+    patterns: tuple[tuple[Split, tuple[str, ...]], ...] = (("val", config.val), ("test", config.test))
+    fits = [split for split, names in patterns if any(fnmatch.fnmatchcase(scene.name, name) for name in names)]
+    return dataclasses.replace(scene, split=fits[0] if fits else config.split)

@@ -1,0 +1,129 @@
+"""Pickles of others, read without running them: dicts, lists, texts, numbers and arrays of numbers."""
+
+import bz2
+import pickle
+import re
+import reprlib
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import numpy as np
+
+from jaxnav.errors import InputError
+
+_LIMIT = 2**32  # bytes of a file when decompressed
+
+
+class PickledArray:
+    """Stands for a NumPy array, whose own way of unpickling trusts what it reads.
+
+    Attributes:
+      values: the array, of booleans, integers or floats.
+    """
+
+    values = np.zeros(0)
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, dtype, fortran, data = state
+        self.values = _array(data, dtype, shape, "F" if fortran else "C")
+
+
+def read_pickle(path: Path) -> Any:
+    """What a pickle compressed by bz2 holds, with `PickledArray` for arrays; a part may be any of these or be missing.
+
+    Raises:
+      InputError: the file is missing, damaged or too large, or asks for anything but arrays of numbers.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    with file, bz2.open(file) as stream:
+        try:
+            return _Reader(path, stream).load()
+        except InputError:
+            raise
+        except Exception as error:  # on damaged bytes, bz2 and the unpickler raise errors of almost any type
+            problem = f"is cut short, damaged or no bz2 pickle ({type(error).__name__})"
+            raise InputError(f"{path}: {problem}; fetch or write it again") from error
+
+
+class _Reader(pickle._Unpickler):  # the one in Python: to that in C, ten bytes can be a request for 64 GiB
+    """An unpickler that looks up nothing but what arrays of numbers are made of."""
+
+    dispatch = pickle._Unpickler.dispatch.copy()
+    dispatch[pickle.BYTEARRAY8[0]] = dispatch[pickle.BINBYTES8[0]]  # for the former allocates before it reads
+
+    def __init__(self, path: Path, stream: IO[bytes]):
+        super().__init__(_Limited(path, stream))
+        self._path = path
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Bound methods and a text, since a pickle could change the attributes of a class or a function."""
+        known = {
+            "numpy.ndarray": "ndarray",
+            "numpy.dtype": self._dtype,
+            "numpy.multiarray._reconstruct": self._reconstruct,
+            "numpy.multiarray.scalar": self._scalar,
+            "numpy.numeric._frombuffer": self._from_buffer,
+        }
+        found = known.get(re.sub(r"^numpy\._?core\.", "numpy.", module) + "." + name)
+        if found is None:
+            asked = reprlib.repr(f"{module}.{name}")
+            raise InputError(
+                f"{self._path}: asks for {asked}, which could run code; give NumPy arrays of numbers alone"
+            )
+        return found
+
+    def _dtype(self, code: str, *_: object) -> "_Dtype":
+        return _Dtype(code)
+
+    def _reconstruct(self, *_: object) -> PickledArray:
+        return PickledArray()
+
+    def _scalar(self, dtype: "_Dtype", data: bytes) -> float | int | bool:
+        return _array(data, dtype, (), "C").item()
+
+    def _from_buffer(
+        self, data: bytes, dtype: "_Dtype", shape: tuple[int, ...], order: Literal["C", "F"], *_: object
+    ) -> PickledArray:
+        array = PickledArray()
+        array.values = _array(data, dtype, shape, order)
+        return array
+
+
+class _Dtype:
+    """Stands for `numpy.dtype`; numbers only."""
+
+    def __init__(self, code: str):
+        if not re.fullmatch("[biuf][1248]", code):
+            raise ValueError(code)
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: Any) -> None:
+        self.dtype = self.dtype.newbyteorder(state[1])
+
+
+def _array(data: bytes, dtype: _Dtype, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
+    return np.frombuffer(data, dtype.dtype).reshape(shape, order=order)
+
+
+class _Limited:
+    """A stream that gives `_LIMIT` bytes at most."""
+
+    def __init__(self, path: Path, stream: IO[bytes]):
+        self._path, self._stream, self._left = path, stream, _LIMIT
+
+    def read(self, size: int) -> bytes:
+        self._take(size)
+        return self._stream.read(size)
+
+    def readline(self) -> bytes:
+        line = self._stream.readline(self._left + 1)
+        self._take(len(line))
+        return line
+
+    def _take(self, size: int) -> None:
+        self._left -= size
+        if self._left < 0:
+            raise InputError(f"{self._path}: holds more than {_LIMIT} bytes; split it")

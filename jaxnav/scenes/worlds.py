@@ -1,0 +1,187 @@
+"""The worlds of the paper, generated scene by scene, and scenes as sequences that know what they are."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import GIBSON_CATEGORIES, GIBSON_GOALS, ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS
+from jaxnav.scenes.homes import generate_apartment, generate_house
+from jaxnav.scenes.io import read_scenes
+from jaxnav.scenes.record import read_bytes
+from jaxnav.scenes.rooms import generate_room_at
+from jaxnav.scenes.scene import SPLITS, Scene
+from jaxnav.scenes.task import Rules, Task
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """What the scenes of a world have in common.
+
+    Attributes:
+      generate: a scene from (split, index, seed, shift).
+      counts: usual number of scenes of each split.
+      task: what is asked there.
+      train_step_limit: actions of a training episode.
+      step_limit: actions of an evaluation episode.
+      large_step_limit: the same in living rooms.
+    """
+
+    generate: Callable[[str, int, int, float], Scene]
+    counts: dict[str, int]
+    task: Task
+    train_step_limit: int
+    step_limit: int
+    large_step_limit: int
+
+
+#: AI2-THOR, RoboTHOR and Gibson in the paper.
+WORLDS = {
+    "rooms": World(
+        generate=generate_room_at,
+        counts={"train": 80, "val": 20, "test": 20},
+        task=Task(),
+        train_step_limit=30,
+        step_limit=100,
+        large_step_limit=200,
+    ),
+    "apartments": World(
+        generate=generate_apartment,
+        counts={"train": 60, "val": 15, "test": 15},
+        task=Task(
+            ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS, Rules(headings=12, field_of_view=(79.0, 63.5), success_distance=1.0)
+        ),
+        train_step_limit=100,
+        step_limit=500,
+        large_step_limit=500,
+    ),
+    "houses": World(
+        generate=generate_house,
+        counts={"train": 25, "val": 5, "test": 5},
+        task=Task(
+            GIBSON_CATEGORIES,
+            GIBSON_GOALS,
+            Rules(
+                headings=12,
+                horizons=(0.0,),
+                field_of_view=(79.0, 63.5),
+                camera=0.88,
+                success="near",
+                success_distance=1.0,
+            ),
+        ),
+        train_step_limit=100,
+        step_limit=500,
+        large_step_limit=500,
+    ),
+}
+
+
+class Scenes(Protocol):
+    """The scenes of one split, in order; a scene is made when it is asked for."""
+
+    @property
+    def identity(self) -> str:
+        """Text that differs wherever the scenes differ."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Scene: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratedScenes:
+    """Scenes of a generated world.
+
+    Attributes:
+      world: its name, a key of `WORLDS`.
+      split: `train`, `val` or `test`.
+      count: number of scenes.
+      seed: of the generator, at least 0.
+      shift: share of objects that are put where those of another category belong, from 0 to 1.
+    """
+
+    world: str
+    split: str
+    count: int
+    seed: int = 0
+    shift: float = 0.0
+
+    @property
+    def identity(self) -> str:
+        """The arguments of the generator."""
+        return repr(self)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Scene:
+        if not 0 <= index < self.count:
+            raise IndexError(index)
+        return WORLDS[self.world].generate(self.split, index, self.seed, self.shift)
+
+
+@dataclasses.dataclass(frozen=True)
+class FileScenes:
+    """Scenes of one split of a scene file.
+
+    Attributes:
+      scenes: as read.
+      identity: split and checksum of the file.
+    """
+
+    scenes: tuple[Scene, ...]
+    identity: str
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> Scene:
+        return self.scenes[index]
+
+
+def generated(world: str, split: str, count: int | None = None, seed: int = 0, shift: float = 0.0) -> GeneratedScenes:
+    """The scenes of one split of a generated world.
+
+    Args:
+      world: a key of `WORLDS`.
+      split: `train`, `val` or `test`.
+      count: number of scenes; None for the world's usual one.
+      seed: of the generator.
+      shift: layout shift, from 0 (the training distribution) to 1.
+
+    Raises:
+      InputError: an unknown name, or an impossible number.
+    """
+    if world not in WORLDS:
+        raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}")
+    _check_split(split)
+    count = WORLDS[world].counts[split] if count is None else count
+    if count < 1:
+        raise InputError(f"world {world!r}: {count} scenes of split {split!r}; ask for at least one")
+    if seed < 0 or not 0.0 <= shift <= 1.0:
+        raise InputError(f"world {world!r}: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
+    return GeneratedScenes(world, split, count, seed, shift)
+
+
+def from_file(path: str | Path, split: str) -> FileScenes:
+    """The scenes of one split of a scene file.
+
+    Raises:
+      InputError: unknown split, no readable scene file, or it holds no scene of the split.
+    """
+    _check_split(split)
+    scenes = read_scenes(path)
+    chosen = tuple(scene for scene in scenes if scene.split == split)
+    if not chosen:
+        held = sorted({scene.split for scene in scenes})
+        raise InputError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(held)}")
+    return FileScenes(chosen, f"{split} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}")
+
+
+def _check_split(split: str) -> None:
+    if split not in SPLITS:
+        raise InputError(f"split {split!r}: choose one of {', '.join(SPLITS)}")
