@@ -16,7 +16,7 @@ def run_dir(tmp_path_factory):
     return finished_run(tmp_path_factory)[1]
 
 
-ROWS = 2 * (2 + 1 + 2) + 1  # of each decoding baseline, layout, TDE and sTDE at two epsilons; Random
+ROWS = 2 * (2 + 1 + 2) + 2  # of each decoding baseline, layout, TDE and sTDE at two epsilons; Random; the oracle
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +25,11 @@ def evaluated(run_dir, tmp_path_factory):
     target = tmp_path_factory.mktemp("eval") / "new" / "table.json"
     assert evaluate(run_dir, "--episodes", 18, "--epsilon", 0, 0.5, "--json", target) == 0
     return target
+
+
+def _episodes(report):
+    with report.with_suffix(".episodes.csv").open() as file:
+        return list(csv.DictReader(file))
 
 
 def test_the_report_holds_all_rows_and_differences(evaluated):
@@ -44,13 +49,15 @@ def test_the_report_holds_all_rows_and_differences(evaluated):
     settings = [(row["variant"], row["epsilon"], row["decoding"], row["form"]) for row in report["rows"]]
     assert len(set(settings)) == ROWS
     assert ("stde", 0.5, "argmax", "residual") in settings
+    oracle = next(row for row in report["rows"] if row["variant"] == "oracle")
+    short = np.array([float(r["best_length"]) for r in _episodes(evaluated) if r["variant"] == "oracle"]) <= 12
+    assert oracle["sr"]["mean"] == oracle["spl"]["mean"] >= 100 * short.mean()  # all but those beyond the step limit
     # Layout against baseline, the others against layout: four rows of each decoding, three metrics.
     assert len(report["differences"]) == 2 * 4 * 3
 
 
 def test_the_episodes_are_written_row_by_row(evaluated):
-    with evaluated.with_suffix(".episodes.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = _episodes(evaluated)
     assert len(rows) == ROWS * SEEDS * 20
     report = json.loads(evaluated.read_text())
     for row in report["rows"]:
@@ -118,7 +125,7 @@ def test_damaged_files_are_named(tmp_path, run_dir, capsys):
     scenes = tmp_path / "scenes.jsonl.gz"
     scenes.write_bytes(b"not compressed")
     assert evaluate(run_dir, "--scenes", scenes) == 2
-    assert f"{scenes}: is not gzip-compressed" in refusal(capsys)
+    assert f"{scenes}, line 1: not JSON" in refusal(capsys)
     text = (run_dir / "config.json").read_text()
     (tmp_path / "config.json").write_text(text[: len(text) // 2])
     assert evaluate(tmp_path) == 2

@@ -120,7 +120,7 @@ WHOLE = gzip.compress(b'{"name": "a"}\n' * 9, mtime=0)
     ("data", "problem"),
     [
         (None, "cannot be read (No such file or directory)"),
-        (b"not compressed", "is not gzip-compressed"),
+        (b"not compressed", "line 1: not JSON"),
         (WHOLE[:-9], "is cut short or damaged"),
         (gzip.compress(b"{]\n"), "line 1: not JSON"),
         (WHOLE, "line 1, scene 'a': world is missing; add it"),

@@ -1,4 +1,4 @@
-"""From scenes to tables: rows, ego-centric view, detector, best lengths, standable cells and banks."""
+"""From scenes to tables: rows, ego-centric view, standable cells, best lengths and banks."""
 
 import dataclasses
 from collections import deque
@@ -6,23 +6,23 @@ from collections import deque
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drawn import BOOK, CATEGORIES, CHAIR, SMALL, draw
-from scipy.stats import binomtest, kstest
+from drawn import APARTMENTS, BOOK, CATEGORIES, CHAIR, FRIDGE, HOUSES, ROOMS, SMALL, draw
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.compile import compile_bank, compile_scene
-from jaxnav.scenes.detector import PERFECT, Detector, detection_range
-from jaxnav.scenes.lattice import best_lengths, standable_cells, successors
-from jaxnav.scenes.rooms import generate_rooms
+from jaxnav.scenes.detector import PERFECT
+from jaxnav.scenes.lattice import ahead_of, best_lengths, standable_cells, successors
 from jaxnav.scenes.rows import RowLayout
 from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.sight import rectangles
+from jaxnav.scenes.task import Task
 
 LAYOUT = RowLayout(len(CATEGORIES))
 BOOK_AHEAD = ("Book", 0, 1.5, 2, *SMALL)
 
 
-def table_of(scene, detector=PERFECT):
-    return compile_scene(scene, CATEGORIES, detector, LAYOUT)
+def table_of(scene, rules=ROOMS):
+    return compile_scene(scene, Task(CATEGORIES, rules=rules, detector=PERFECT))
 
 
 # Rows
@@ -61,11 +61,11 @@ def test_the_bytes_of_a_detection():
 # The ego-centric view
 
 
-def view_of(scene, cell, heading):
+def view_of(scene, cell, heading, rules=ROOMS):
     """The view as a picture, the far edge first."""
-    table = table_of(scene)
-    place = table.cells.tolist().index(list(cell))
-    cells = LAYOUT.view_cells(table.rows[(place * 8 + heading) * 2]).reshape(11, 11)
+    place = standable_cells(scene.reach).tolist().index(list(cell))
+    pose = place * rules.poses_per_cell + heading * len(rules.horizons)
+    cells = LAYOUT.view_cells(table_of(scene, rules).rows[pose]).reshape(11, 11)
     return ["".join("?.#"[value] for value in row) for row in cells[::-1]]
 
 
@@ -106,85 +106,22 @@ def test_view_along_a_diagonal():
     assert picture[:4] == ["?????.?????", "????...????", "???#....???", "??...#...??"]
 
 
-def test_a_mirrored_room_has_a_mirrored_view():
+@pytest.mark.parametrize("rules", [ROOMS, APARTMENTS, HOUSES])
+def test_a_mirrored_room_has_a_mirrored_view(rules):
+    # With 12 headings, many offsets are halves: the cell 1 ahead at 30 degrees lies half a cell to the right.
     draws = np.random.default_rng(0)
     for _ in range(5):
         reach, walls = draws.random((9, 9)) < 0.8, draws.random((9, 9)) < 0.1
         reach &= ~walls
         scene = dataclasses.replace(draw(["." * 9] * 9), reach=reach, walls=walls)
         mirrored = dataclasses.replace(scene, reach=reach[:, ::-1], walls=walls[:, ::-1])
+        turned = dataclasses.replace(scene, reach=reach[::-1, ::-1], walls=walls[::-1, ::-1])
         iz, ix = draws.permutation(standable_cells(reach))[0]
-        for heading in range(8):
-            picture = view_of(scene, (iz, ix), heading)
-            assert view_of(mirrored, (iz, 8 - ix), -heading % 8) == [row[::-1] for row in picture]
-
-
-# The detector
-
-
-def detect(detector, seen, distance, num_poses=40_000):
-    """Detections uint8 [P, 2, 4] of objects of 0.6 m (range 5 m) straight ahead."""
-    shape = (num_poses, 2)
-    ahead, size = np.full(shape, float(distance)), np.full(shape, 0.6)
-    return detector.detect("room", np.full(shape, seen), ahead, np.zeros(shape), ahead, size)
-
-
-@pytest.mark.parametrize(("distance", "rate"), [(0.0, 0.1), (2.5, 0.2), (5.0, 0.5)])
-def test_misses_grow_with_the_square_of_the_distance(distance, rate):
-    # 0.1 + 0.4 (2.5 / 5)^2 = 0.2.
-    entries = detect(Detector(miss_near=0.1, miss_far=0.5, false_alarm=0.5), True, distance)
-    missed = entries[..., 0] == 0
-    assert binomtest(int(missed.sum()), missed.size, rate).pvalue > 1e-3
-    assert binomtest(int(missed.sum()), missed.size, rate + 0.02).pvalue < 1e-3  # the test can tell
-    assert not entries[missed].any()
-    # Confidence 1 - 0.5 d / 5 m, plus or minus 0.1; the place is not noisy.
-    confidence = entries[~missed][:, 0] / 255
-    expected = 1.0 - 0.1 * distance
-    assert confidence.min() >= expected - 0.1 - 1 / 255
-    assert confidence.max() <= min(expected + 0.1, 1.0) + 1 / 255
-    assert (entries[~missed][:, 1:3] == [round(51 * distance), 128]).all()
-
-
-def test_false_alarms_fill_the_view_cone():
-    entries = detect(Detector(false_alarm=0.1), False, 1.0)
-    alarms = entries[entries[..., 0] > 0]
-    assert binomtest(len(alarms), entries[..., 0].size, 0.1).pvalue > 1e-3
-    confidence, ahead, right = alarms[:, 0] / 255, alarms[:, 1] / 51, (alarms[:, 2] - 128.0) / 25.4
-    assert kstest(confidence, "uniform", (0.3, 0.3)).pvalue > 1e-6  # quantised, hence not 1e-3
-    assert (np.abs(right) <= np.tan(np.deg2rad(50)) * ahead + 0.05).all()  # a quantum is 0.02 m and 0.04 m
-    # The range of 0.3 m is 0.3 / 0.12 = 2.5 m, the greatest offset to a side 2.5 sin 50 = 1.92 m.
-    distance = np.hypot(ahead, right)
-    assert (max(distance), max(np.abs(right))) == pytest.approx((2.5, 1.92), abs=0.05)
-    # Uniform in a sector: a quarter of the area lies within half the radius, and half of it to the right.
-    assert binomtest(int((distance < 1.25).sum()), len(alarms), 0.25).pvalue > 1e-3
-    assert binomtest(int((right > 0).sum()), int((right != 0).sum()), 0.5).pvalue > 1e-3
-    # The confidence says nothing of the place: 8,000 independent pairs have correlations of 0.011 or so.
-    for offset in (np.arctan2(right, ahead), distance):
-        assert abs(np.corrcoef(confidence, offset)[0, 1]) < 0.05
-    # An object of that apparent size at that distance could be detected (a quantum of either is worth 0.1 m).
-    size = alarms[:, 3] / 127.5 * np.maximum(distance, 0.25)
-    assert (distance <= detection_range(size) + 0.12).all()
-    assert not entries[entries[..., 0] == 0].any()
-
-
-def test_errors_are_frozen_and_belong_to_the_scene():
-    scenes = generate_rooms(3, 0, 0)
-    together, again, alone = compile_bank(scenes), compile_bank(scenes), compile_bank(scenes[1:2])
-    np.testing.assert_array_equal(together.rows, again.rows)
-    first = together.first_cell[1] * 16
-    np.testing.assert_array_equal(together.rows[first : first + len(alone.rows)], alone.rows)
-    other_seed, other_name = Detector(seed=1), dataclasses.replace(scenes[1], name="other")
-    assert (compile_bank(scenes[1:2], detector=other_seed).rows != alone.rows).any()
-    assert (compile_bank([other_name]).rows != alone.rows).any()
-
-
-def test_success_is_never_noisy():
-    scenes, layout = generate_rooms(2, 0, 0), RowLayout(22)
-    blind, perfect = (compile_bank(scenes, detector=d) for d in (Detector(miss_near=1.0, miss_far=1.0), PERFECT))
-    np.testing.assert_array_equal(blind.best_length, perfect.best_length)
-    byte, _ = layout.found_at(np.arange(22))
-    np.testing.assert_array_equal(blind.rows[:, byte], perfect.rows[:, byte])
-    assert layout.presence(blind.rows).sum() < 0.1 * layout.presence(perfect.rows).sum()
+        for heading in range(rules.headings):
+            picture = view_of(scene, (iz, ix), heading, rules)
+            flipped = view_of(mirrored, (iz, 8 - ix), -heading % rules.headings, rules)
+            assert flipped == [row[::-1] for row in picture]
+            assert view_of(turned, (8 - iz, 8 - ix), (heading + rules.headings // 2) % rules.headings, rules) == picture
 
 
 # Moves
@@ -201,9 +138,10 @@ def test_standable_cells_are_the_largest_part_and_the_first_of_equal_ones():
     assert cells("##") == []
 
 
-def test_best_lengths_are_those_of_a_breadth_first_search():
+@pytest.mark.parametrize("rules", [ROOMS, HOUSES])
+def test_best_lengths_are_those_of_a_breadth_first_search(rules):
     draws = np.random.default_rng(0)
-    successor = successors(standable_cells(draws.random((9, 9)) < 0.55))
+    successor = successors(ahead_of(standable_cells(draws.random((9, 9)) < 0.55), rules), rules)
     found = draws.random((len(successor), 3)) < [0.002, 0.02, 0.0]
     lengths = best_lengths(successor, found)
 
@@ -226,6 +164,18 @@ def test_best_lengths_are_those_of_a_breadth_first_search():
     np.testing.assert_array_equal(lengths == 1, found)
 
 
+@pytest.mark.parametrize("density", [0.0, 0.2, 0.5, 0.8, 1.0])
+def test_rectangles_cover_a_mask_once(density):
+    draws = np.random.default_rng(0)
+    for _ in range(20):
+        mask = draws.random(draws.integers(1, 9, 2)) < density
+        cover = np.zeros(mask.shape, int)
+        for z0, x0, z1, x1 in rectangles(mask):
+            cover[z0:z1, x0:x1] += 1
+        np.testing.assert_array_equal(cover, mask)
+    assert rectangles(np.ones((3, 5), bool)).tolist() == [[0, 0, 3, 5]]
+
+
 # Banks
 
 
@@ -242,12 +192,25 @@ def test_scenes_without_a_reachable_goal_are_left_out_by_name():
         named("not sought", draw(["...."], ("Vase", 0, 1.5, 1, *SMALL))),
     ]
     near = named("near", draw(["..", ".."], ("Book", 0, 1.5, 1, *SMALL)))
-    bank = compile_bank([hopeless[0], good, *hopeless[1:], near], CATEGORIES)
-    assert bank.names == ("good", "near")
+    task = Task(CATEGORIES)
+    bank = compile_bank([hopeless[0], good, *hopeless[1:], near], task)
+    assert (bank.task, bank.names) == (task, ("good", "near"))
     assert bank.skipped == ("empty", "nowhere", "too far", "not sought")
     # In the good room the book is 2 m away, so only the chair is a goal.
     assert [bank.goals[i, :n].tolist() for i, n in enumerate(bank.num_goals)] == [[CHAIR], [BOOK]]
     assert (bank.first_cell.tolist(), bank.num_cells.tolist()) == ([0, 4], [4, 4])
     assert bank.successor[:64].max() < 64 <= bank.successor[64:].min()
     with pytest.raises(InputError, match=r"none of the 4 scenes has a reachable goal.*Book, Chair, Fridge"):
-        compile_bank(hopeless, CATEGORIES)
+        compile_bank(hopeless, task)
+
+
+@pytest.mark.parametrize("rules", [ROOMS, HOUSES])
+def test_only_goals_of_the_task_are_looked_for(rules):
+    scene = draw(["."], ("Book", 0, 1.0, 0.5, *SMALL), ("Chair", 0, 1.0, 0.6, *SMALL), ("Fridge", 5, 1, 0, 1, 2, 1))
+    task = Task(CATEGORIES, ("Chair", "Fridge"), rules, PERFECT)
+    bank = compile_bank([scene], task)
+    assert bank.goals[0, : bank.num_goals[0]].tolist() == [CHAIR]
+    assert not bank.best_length[:, [BOOK, FRIDGE]].any()
+    assert LAYOUT.presence(bank.rows)[0].tolist() == [True, True, False]  # but books are detected
+    with pytest.raises(InputError, match=r"categories Fridge near"):
+        compile_bank([scene], dataclasses.replace(task, goals=("Fridge",)))

@@ -1,30 +1,32 @@
 """One episode: its contract, how it starts and ends, and how environments are made."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drawn import BOOK, CATEGORIES, CHAIR, SMALL, draw
+from drawn import APARTMENTS, BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, draw
 from scipy.stats import chisquare
 
-from jaxnav.env.make import build_evaluation, make
-from jaxnav.env.objectnav import ObjectNav, build
+from jaxnav.env.make import make
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, build
 from jaxnav.env.testing import check_environment
 from jaxnav.env.types import State
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.compile import compile_bank
 from jaxnav.scenes.io import read_scenes, write_scenes
-from jaxnav.scenes.lattice import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD
 from jaxnav.scenes.rooms import generate_rooms
+from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, Task
+from jaxnav.scenes.worlds import WORLDS, generated
 
 REAL_FILE = Path(__file__).parents[2] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
-ROOMS = generate_rooms(4, 4, 0)  # one of each type
-BANK = compile_bank(ROOMS[:4])
+SCENES = generate_rooms(4, 4, 0)  # one of each type
+BANK = compile_bank(SCENES[:4], Task())
 # One cell: the book is found at headings 7, 0 and 1, the chair from behind.
-ONE_CELL = compile_bank([draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Chair", 0, 1.5, -1, *SMALL))], CATEGORIES)
+ONE_CELL = compile_bank([draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Chair", 0, 1.5, -1, *SMALL))], Task(CATEGORIES))
 
 
 def in_one_cell(goal=BOOK, heading=0, time=0):
@@ -38,7 +40,7 @@ def test_contract_on_generated_rooms():
 def test_contract_on_real_rooms():
     if not REAL_FILE.exists():
         pytest.skip("the real rooms are not here")
-    check_environment(*build_evaluation(compile_bank(read_scenes(REAL_FILE)[::25])))
+    check_environment(*build(compile_bank(read_scenes(REAL_FILE)[::25], Task()), {}, 100))
 
 
 class EndsTwice(ObjectNav):
@@ -85,7 +87,7 @@ def test_contract_refuses_broken_environments(broken, promise):
     env, params = build(BANK, {}, 5)
     check_environment(env, params, num_steps=1)
     with pytest.raises(AssertionError, match=promise):
-        check_environment(broken(env.categories), params)
+        check_environment(broken(env.task), params)
 
 
 @pytest.mark.parametrize(
@@ -127,16 +129,16 @@ def test_an_ending_does_not_leak_the_next_episode():
     np.testing.assert_array_equal(observation.goal, after.goal)
 
 
-def test_starts_are_uniform():
+@pytest.mark.parametrize("rules", [ROOMS, HOUSES])
+def test_starts_are_uniform(rules):
     # A scene of 4 cells with one goal, and one of 1 cell with two goals.
     wide = draw(["..", ".."], ("Book", 0, 1.5, 1, *SMALL))
-    narrow = draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Fridge", 1, 0.9, 1, 0.3, 1.2, 0.3))
-    bank = compile_bank([wide, narrow], CATEGORIES)
+    narrow = draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Fridge", 1, 0.9, 0.5, 0.3, 1.2, 0.3))
+    bank = compile_bank([wide, narrow], Task(CATEGORIES, rules=rules))
     env, params = build(bank, {}, 10)
     _, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 40_000), params)
     pose, scene, goal = np.asarray(state.pose), np.asarray(state.scene), np.asarray(state.goal)
     assert not np.asarray(state.time).any()
-    assert not (pose % 2).any()  # level
 
     def uniform(values, choices):
         counts = np.bincount(np.searchsorted(choices, values), minlength=len(choices))
@@ -146,32 +148,84 @@ def test_starts_are_uniform():
     assert uniform(scene, [0, 1])
     assert (goal[scene == 0] == BOOK).all()
     assert uniform(goal[scene == 1], [0, 2])
-    assert uniform(pose[scene == 0], np.arange(0, 64, 2))  # cell and heading
-    assert uniform(pose[scene == 1], np.arange(64, 80, 2))
+    starts = np.arange(0, 5 * rules.poses_per_cell, len(rules.horizons))  # cell and heading; level
+    assert uniform(pose[scene == 0], starts[: 4 * rules.headings])
+    assert uniform(pose[scene == 1], starts[4 * rules.headings :])
     assert not uniform(np.append(scene, np.zeros(1000, int)), [0, 1])  # the test can tell
 
 
-def test_make_from_a_scene_file(tmp_path):
+def test_padded_tables_hold_the_same_episodes():
+    cells, cell_poses = len(BANK.ahead), BANK.task.rules.poses_per_cell
+    env, params = build(BANK, {"kitchen": 7}, 9)
+    padded_env, padded = build(BANK, {"kitchen": 7}, 9, cells + 10, 6)
+    assert padded_env == env
+    # 4 scenes, and the first two again.
+    assert (params.step_limit.tolist(), padded.step_limit.tolist()) == ([7, 9, 9, 9], [7, 9, 9, 9, 7, 9])
+    assert (params.room.tolist(), padded.room.tolist()) == ([0, 1, 2, 3], [0, 1, 2, 3, 0, 1])
+    tables, longer = vars(params.tables), vars(padded.tables)
+    for name in ("first_cell", "num_cells", "goals", "num_goals"):
+        np.testing.assert_array_equal(longer[name], np.asarray(tables[name])[[0, 1, 2, 3, 0, 1]])
+    for name, added in (("ahead", 10), ("goal_distance", 10), ("rows", 10 * cell_poses)):
+        np.testing.assert_array_equal(longer[name][:-added], tables[name])
+        assert not np.asarray(longer[name][-added:]).any()
+    small = build(BANK, {}, 9, cells - 1, 2)[1]
+    assert (len(small.tables.ahead), len(small.room)) == (cells, 4)
+
+
+@pytest.mark.parametrize(
+    ("world", "categories", "goals", "rules", "limits"),
+    [
+        ("rooms", 22, 22, ROOMS, (30, [100, 200, 100, 100])),
+        ("apartments", 22, 12, APARTMENTS, (100, [500])),
+        ("houses", 15, 6, HOUSES, (100, [500])),
+    ],
+)
+def test_the_worlds_are_those_of_the_page(tmp_path, world, categories, goals, rules, limits):
+    task = WORLDS[world].task
+    assert (len(task.categories), task.is_goal().sum(), task.rules) == (categories, goals, rules)
+    # A book and a television, both of which every world knows, in each room type and in a home.
+    room = draw(["."], ("Book", 0, 1.0, 0.5, *SMALL), ("Television", 0, 1.0, 0.5, *SMALL))
+    types = ROOM_TYPES if world == "rooms" else ("apartment",)
+    path = tmp_path / "scenes.jsonl.gz"
+    write_scenes(path, [named_room(room, split, kind) for split in ("train", "val") for kind in types])
+    for split, expected in zip(("train", "val"), ([limits[0]] * len(types), limits[1]), strict=True):
+        env, params = make(world, split, path)
+        assert env.task == task
+        assert params.step_limit.tolist() == expected
+        assert params.room.tolist() == ([0, 1, 2, 3] if world == "rooms" else [OTHER_ROOM])
+
+
+def named_room(room, split, room_type):
+    return dataclasses.replace(room, name=f"{split}-{room_type}", split=split, room_type=room_type)
+
+
+def test_make_generates_a_world():
+    env, params = make("houses", "val", seed=3)
+    check_environment(env, params, num_envs=4, num_steps=16)
+    scenes = generated("houses", "val", seed=3)
+    bank = compile_bank([scenes[i] for i in range(len(scenes))], WORLDS["houses"].task)
+    np.testing.assert_array_equal(params.tables.rows, bank.rows)
+
+
+def test_make_from_a_scene_file_with_a_task_of_ones_own(tmp_path):
     path = tmp_path / "rooms.jsonl.gz"
-    write_scenes(path, ROOMS)
-    types = tuple(scene.room_type for scene in ROOMS[4:])
+    write_scenes(path, SCENES)
+    types = tuple(scene.room_type for scene in SCENES[4:])
     assert types == ROOM_TYPES
-    env, params = make(path, "val")
-    assert params.step_limit.tolist() == [200 if room == "living_room" else 100 for room in types]
-    assert params.room.tolist() == [0, 1, 2, 3]
-    assert (env.num_actions, len(env.categories)) == (6, 22)
-    assert make(path)[1].step_limit.tolist() == [30] * 4
-    assert make(path, categories=("Television", "Sink"))[0].categories == ("Television", "Sink")
+    task = Task(("Television", "Sink"), rules=HOUSES)
+    env, params = make("rooms", "val", path, task)
+    assert (env.task, env.categories, env.num_actions) == (task, ("Television", "Sink"), 6)
+    assert params.tables.ahead.shape[1] == 12
 
 
 def test_make_refuses_what_it_does_not_know(tmp_path):
-    with pytest.raises(InputError, match=r"romms: neither a world \(rooms\) nor the name of a scene file"):
+    with pytest.raises(InputError, match=r"world 'romms': choose one of rooms, apartments, houses"):
         make("romms")
     path = tmp_path / "train.jsonl.gz"
-    write_scenes(path, ROOMS[:1])
+    write_scenes(path, SCENES[:1])
     with pytest.raises(InputError, match=r"split 'valid': choose one of train, val, test"):
-        make(path, "valid")
+        make("rooms", "valid", path)
     with pytest.raises(InputError, match=r"train\.jsonl\.gz: holds no scene of split 'test'; it holds train"):
-        make(path, "test")
+        make("rooms", "test", path)
     with pytest.raises(InputError, match="reachable goal"):
-        make(path, categories=("Unicorn",))
+        make("rooms", "train", path, Task(("Unicorn",)))

@@ -19,7 +19,7 @@ from jaxnav.causal import do
 from jaxnav.env.types import Observation
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.policies.policy import SELDOM, bind, init_params
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.lattice import NUM_ACTIONS
 from jaxnav.store.export import export_params
@@ -100,13 +100,14 @@ def test_an_episode_begins_with_nothing_remembered_and_no_action(org):
     assert NO_ACTION == NUM_ACTIONS  # one past the actions: its one-hot vector is zero
 
 
-def test_the_first_policy_is_close_to_uniform():
+def test_the_first_policy_is_close_to_uniform_but_seldom_done():
     weights = init_params(SPEC, jax.random.key(0))
     for i, row in enumerate(BANK.rows[::16]):
         logits = decide(weights, row, i % K, WEIGHTS[0], Memory(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION)))[
             0
         ].logits
-        assert 0 < np.abs(logits).max() < 0.1
+        assert 0 < np.abs(np.asarray(logits) - [0, 0, 0, 0, 0, SELDOM]).max() < 0.1
+    assert 1 / 70 < np.exp(SELDOM) / (5 + np.exp(SELDOM)) < 1 / 50
 
 
 # Interventions

@@ -4,6 +4,7 @@ The byte row is taken apart here by the words of docs/environment.md, without `R
 """
 
 import collections
+import dataclasses
 import functools
 import itertools
 import math
@@ -25,9 +26,10 @@ from jaxnav.scenes.io import read_scenes
 from jaxnav.scenes.lattice import standable_cells, successors
 from jaxnav.scenes.rooms import generate_rooms
 from jaxnav.scenes.task import Task
+from jaxnav.scenes.worlds import WORLDS, generated
 
-REAL_FILE = Path(__file__).parents[2] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
-NUM_CATEGORIES = len(ITHOR_CATEGORIES)
+SHARED = Path(__file__).parents[2] / "shared" / "scenes"
+REAL_FILE, APARTMENT_FILE = SHARED / "ithor_train_val.jsonl.gz", SHARED / "robothor_train.jsonl.gz"
 NUM_ENVS, NUM_STEPS = 20, 150  # 3,000 steps of each source and task
 LIVING_ROOM, OTHERS = 60, 30  # step limits
 TASKS = {
@@ -50,11 +52,6 @@ def scenes_of(source):
         pytest.skip("the real rooms are not here")
     scenes = [scene for scene in read_scenes(REAL_FILE) if scene.split == "val"]
     return [next(scene for scene in scenes if scene.room_type == room) for room in ROOM_TYPES]
-
-
-@functools.cache
-def bank_of(source, task):
-    return compile_bank(scenes_of(source), task)
 
 
 class Guide:
@@ -99,9 +96,10 @@ def same_distance(metres, expected):
 
 def row_differences(row, twin, task):
     """What of an observation row differs from the twin, by name."""
-    entries, bits, view = np.split(row, [4 * NUM_CATEGORIES, 4 * NUM_CATEGORIES + 3])
-    found = np.flatnonzero(np.unpackbits(bits, bitorder="little")[:NUM_CATEGORIES] & task.is_goal())
-    if set(found.tolist()) != {goal for goal in twin.found() if task.is_goal()[goal]}:
+    count, goals = len(task.categories), set(np.flatnonzero(task.is_goal()).tolist())
+    entries, bits, view = np.split(row, [4 * count, 4 * count + math.ceil(count / 8)])
+    found = np.flatnonzero(np.unpackbits(bits, bitorder="little", count=count))
+    if goals & set(found.tolist()) != goals & twin.found():
         yield "found"
     if (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121].tolist() != twin.view():
         yield "view"
@@ -137,11 +135,12 @@ def roll_out(env, params, seed):
     return jax.device_get(run(jax.random.key(seed)))
 
 
-@pytest.mark.parametrize("world", TASKS)
-@pytest.mark.parametrize("source", ["rooms", "ithor"])
+@pytest.mark.parametrize(
+    ("source", "world"), [("rooms", "rooms"), ("ithor", "rooms"), ("rooms", "apartments"), ("rooms", "houses")]
+)
 def test_random_steps(source, world):
     task, scenes = TASKS[world], scenes_of(source)
-    bank, guides = bank_of(source, task), guides_of(source, task)
+    bank, guides = compile_bank(scenes, task), guides_of(source, task)
     assert bank.names == tuple(scene.name for scene in scenes)
     assert [len(guide.cells) for guide in guides] == bank.num_cells.tolist()
     # Padded: there are unused cells, and the first scenes again.
@@ -192,25 +191,42 @@ def test_standable_cells():
         assert {(iz, ix) for iz, ix in standable_cells(reach).tolist()} == expected
 
 
+def differences_of(scene, guide, task, every=1):
+    """What of the poses of a scene (every so many of them) differs from the twin, by name."""
+    table, differences = compile_scene(scene, task), collections.Counter()
+    successor = successors(table.ahead, task.rules)
+    assert len(successor) == len(table.rows) == len(guide.cells) * task.rules.poses_per_cell
+    for pose in range(0, len(successor), every):
+        differences.update(row_differences(table.rows[pose], guide.place(pose), task))
+        for action in range(DONE + 1):
+            guide.place(pose).step(action)
+            differences["successor"] += successor[pose, action] != guide.pose()
+    for cell, goal in itertools.product(range(len(guide.cells)), np.flatnonzero(task.is_goal()).tolist()):
+        expected = guide.place(cell * task.rules.poses_per_cell, goal).goal_distance()
+        differences["goal distance"] += not same_distance(table.goal_distance[cell, goal], expected)
+    return +differences
+
+
 @pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize(("source", "every"), [("coarse", 1), ("maze", 2), ("rooms", 3), ("ithor", 3)])
 def test_every_pose(source, every, world):
-    task, differences, poses = TASKS[world], collections.Counter(), 0
-    goals = np.flatnonzero(task.is_goal()).tolist()
+    task = TASKS[world]
     for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::every]:
-        table = compile_scene(scene, task)
-        successor = successors(table.ahead, task.rules).tolist()
-        for pose, (row, after) in enumerate(zip(table.rows, successor, strict=True)):
-            differences.update(row_differences(row, guide.place(pose), task))
-            for action in range(DONE + 1):
-                guide.place(pose).step(action)
-                differences["successor"] += after[action] != guide.pose()
-        for cell, goal in itertools.product(range(len(guide.cells)), goals):
-            expected = guide.place(cell * task.rules.poses_per_cell, goal).goal_distance()
-            differences["goal distance"] += not same_distance(table.goal_distance[cell, goal], expected)
-        poses += len(table.rows)
-    assert +differences == collections.Counter()
-    assert poses > 1000
+        assert differences_of(scene, guide, task) == collections.Counter()
+
+
+@pytest.mark.parametrize("world", ["apartments", "houses"])
+def test_generated_homes(world):
+    task, scene = dataclasses.replace(WORLDS[world].task, detector=PERFECT), generated(world, "val")[0]
+    assert differences_of(scene, Guide(scene, task), task, every=13) == collections.Counter()
+
+
+@pytest.mark.parametrize("world", ["apartments", "houses"])
+def test_real_apartments(world):
+    if not APARTMENT_FILE.exists():
+        pytest.skip("the real apartments are not here")
+    task, scene = dataclasses.replace(WORLDS[world].task, detector=PERFECT), read_scenes(APARTMENT_FILE)[0]
+    assert differences_of(scene, Guide(scene, task), task, every=7) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", TASKS)

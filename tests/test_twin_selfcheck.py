@@ -164,8 +164,8 @@ def test_walks_go_round_thin_walls():
     # The footprint begins at z = 0.75 and ends at x = 0.25.
     book = (0, 1, 1, *CHEST)
     assert walk_to_the_book(["...."] * 4, *book) == pytest.approx(0.75)
-    # Behind the wall cells [2, 0] to [2, 2] the way is [1, 1], [1, 2], [2, 3], [3, 2]: three diagonal steps and one, and
-    # 0.25 m straight. The line from [2, 3] to (0.25, 0.75) would pass [2, 2].
+    # Behind the wall cells [2, 0] to [2, 2] the way is [1, 1], [1, 2], [2, 3], [3, 2]: three diagonal steps and one,
+    # and 0.25 m straight. The line from [2, 3] to (0.25, 0.75) would pass [2, 2].
     rows, walls = ["....", "....", "###.", "...."], [(2, 0), (2, 1), (2, 2)]
     assert walk_to_the_book(rows, *book, walls=walls) == pytest.approx(3 * 0.25 * 2**0.5 + 0.25 + 0.25)
     assert walk_to_the_book(["....", "....", "####", "...."], *book, walls=[*walls, (2, 3)]) == math.inf

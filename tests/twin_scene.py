@@ -82,7 +82,7 @@ class TwinScene:
     """A scene under some rules; keeps what was found out about it."""
 
     def __init__(self, scene: Scene, categories: tuple[str, ...], rules: Rules):
-        self.categories, self.rules = categories, rules
+        self.rules = rules
         self.origin = (float(scene.origin[0]), float(scene.origin[1]))
         self.lattice = {(iz, ix) for iz in range(scene.reach.shape[0]) for ix in range(scene.reach.shape[1])}
         self.walls = {cell for cell in self.lattice if scene.walls[cell]}
@@ -91,9 +91,15 @@ class TwinScene:
         for name, values in zip(scene.types, scene.boxes, strict=True):
             name = name if name in categories else ALIASES.get(name, name)
             self.boxes.append(Box(values, categories.index(name) if name in categories else None))
+        tall = [box for box in self.boxes if box.opaque and box.top >= self.rules.camera - 1e-9]
+        #: Cells that hide the floor behind them: walls, and those under what is as high as the camera.
+        self.hiding = self.walls | {
+            cell
+            for cell in self.lattice
+            if any(contains(self.position(cell), box.centre[::2], box.half[::2], 1e-9) for box in tall)
+        }
         self._detectable: dict[Cell, list[tuple[Box, float]]] = {}
         self._walks: dict[int, dict[Cell, float]] = {}
-        self._hides: dict[Cell, bool] = {}
 
     def position(self, cell: Cell) -> tuple[float, float]:
         return self.origin[0] + 0.25 * cell[1], self.origin[1] + 0.25 * cell[0]
@@ -185,17 +191,9 @@ class TwinScene:
         iz, ix = cell
         view = []
         for look in looks(self.rules, heading):
-            if look is None or any(self._hides_floor((iz + dz, ix + dx)) for dz, dx in look[1]):
+            if look is None or any((iz + dz, ix + dx) in self.hiding for dz, dx in look[1]):
                 view.append(UNKNOWN)
             else:
                 there = iz + look[0][0], ix + look[0][1]
                 view.append(STANDABLE if there in self.standable else NOT_STANDABLE)
         return view
-
-    def _hides_floor(self, cell: Cell) -> bool:
-        """Whether a cell hides the floor behind it: walls, and what is as high as the camera."""
-        if cell not in self._hides:
-            tall = [box for box in self.boxes if box.opaque and box.top >= self.rules.camera - 1e-9]
-            over = any(contains(self.position(cell), box.centre[::2], box.half[::2], 1e-9) for box in tall)
-            self._hides[cell] = cell in self.walls or (cell in self.lattice and over)
-        return self._hides[cell]

@@ -26,6 +26,7 @@ class WorldConfig:
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
+      shaping: reward in training for every metre nearer to the goal.
       shard_scenes: more scenes than this are compiled to disk, in shards of so many, and streamed from there.
     """
 
@@ -39,6 +40,7 @@ class WorldConfig:
     train_step_limit: int | None = None
     step_limit: int | None = None
     large_step_limit: int | None = None
+    shaping: float | None = None
     shard_scenes: int = 128
 
 

@@ -83,12 +83,13 @@ def _compiled(
     config: RunConfig, scenes: Scenes, step_limits: dict[str, int], step_limit: int, console: Console
 ) -> CompiledWorld:
     task, shard_scenes = config.task, config.worlds.shard_scenes
+    env = ObjectNav(task, WORLDS[config.world].shaping if config.worlds.shaping is None else config.worlds.shaping)
     if len(scenes) <= shard_scenes:
         bank = compile_bank((scenes[i] for i in range(len(scenes))), task)
         without = f" ({len(bank.skipped)} scenes without a goal left out)" if bank.skipped else ""
         console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{without}")
         about = len(bank.ahead), len(bank.names), f"{checksum(bank):08x}"
-        return CompiledWorld(scenes, ObjectNav(task), (bank,), step_limits, step_limit, *about)
+        return CompiledWorld(scenes, env, (bank,), step_limits, step_limit, *about)
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(f"compiling {len(scenes):,} scenes")
 
@@ -101,7 +102,7 @@ def _compiled(
         f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size / 1e9:.2f} GB in {shards.folder}", soft_wrap=True
     )
     about = shards.num_cells, shards.num_scenes, shards.folder.name
-    return CompiledWorld(scenes, ObjectNav(task), shards, step_limits, step_limit, *about)
+    return CompiledWorld(scenes, env, shards, step_limits, step_limit, *about)
 
 
 def checksum(bank: Bank) -> int:

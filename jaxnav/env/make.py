@@ -38,5 +38,5 @@ def make(
     chosen = generated(world, split, None, seed, shift) if scenes is None else from_file(scenes, split)
     bank = compile_bank((chosen[i] for i in range(len(chosen))), task or own.task)
     if split == "train":
-        return build(bank, {}, own.train_step_limit)
+        return build(bank, {}, own.train_step_limit, shaping=own.shaping)
     return build(bank, {"living_room": own.large_step_limit}, own.step_limit)

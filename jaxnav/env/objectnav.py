@@ -26,9 +26,12 @@ class ObjectNav:
 
     Attributes:
       task: what is asked of the agent.
+      shaping: reward for every metre that an action brings the agent nearer to its goal (by `goal_distance`), in
+        training.
     """
 
     task: Task
+    shaping: float = 0.0
 
     @property
     def categories(self) -> tuple[str, ...]:
@@ -113,6 +116,10 @@ class ObjectNav:
         reward = jnp.where(done & self.found(state, params), params.success_reward, params.step_reward)
         truncated = ~done & (time >= params.step_limit[state.scene])
         pose = self.after(state.pose, action, params)
+        if self.shaping:
+            distance = params.tables.goal_distance
+            before, after = distance[self.cell(state.pose), state.goal], distance[self.cell(pose), state.goal]
+            reward += self.shaping * (before - after)
         return state.replace(pose=pose, time=time), reward, done, truncated
 
     def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
@@ -143,7 +150,12 @@ class ObjectNav:
 
 
 def build(
-    bank: Bank, step_limits: dict[str, int], default_limit: int, num_cells: int = 0, num_scenes: int = 0
+    bank: Bank,
+    step_limits: dict[str, int],
+    default_limit: int,
+    num_cells: int = 0,
+    num_scenes: int = 0,
+    shaping: float = 0.0,
 ) -> tuple[ObjectNav, EnvParams]:
     """Environment and parameters of a compiled bank.
 
@@ -153,6 +165,7 @@ def build(
       default_limit: step limit of the other room types.
       num_cells, num_scenes: sizes to pad the tables to where the bank is smaller, so that banks of equal sizes share
         one compilation: with cells that no episode gets to, and with its own scenes again from the first.
+      shaping: see `ObjectNav`.
     """
     rooms = [ROOM_TYPES.index(room) if room in ROOM_TYPES else OTHER_ROOM for room in bank.room_types]
     limits = [step_limits.get(room, default_limit) for room in bank.room_types]
@@ -181,4 +194,4 @@ def build(
         success_reward=jnp.float32(5.0),
         step_reward=jnp.float32(-0.01),
     )
-    return ObjectNav(bank.task), params
+    return ObjectNav(bank.task, shaping), params

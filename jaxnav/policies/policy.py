@@ -22,9 +22,12 @@ from jaxnav.policies.methods import METHODS, CategoryMaps
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.rows import RowLayout
-from jaxnav.scenes.task import NUM_ACTIONS
+from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 Params = dict[str, Any]
+
+#: First logit of Done: chosen once in 60 steps, for an agent that gives up at once never learns what it might find.
+SELDOM = -2.5
 
 
 class Policy(nnx.Module):
@@ -44,9 +47,9 @@ class Policy(nnx.Module):
         )
         self.fuse = nnx.Linear(fused, spec.sizes.hidden, rngs=rngs)
         self.core = nnx.GRUCell(spec.sizes.hidden, spec.sizes.hidden, rngs=rngs)
-        # Small first logits: the first policy is close to uniform.
+        # Small first logits: the first policy is close to uniform but for Done.
         small = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        self.actor = nnx.Linear(spec.sizes.hidden, NUM_ACTIONS, kernel_init=small, rngs=rngs)
+        self.actor = nnx.Linear(spec.sizes.hidden, NUM_ACTIONS, kernel_init=small, bias_init=_seldom_done, rngs=rngs)
         self.critic = nnx.Linear(spec.sizes.hidden, 1, rngs=rngs)
 
     def pathways(self, observation: Observation, weights: jax.Array) -> Pathways:
@@ -77,6 +80,11 @@ class Policy(nnx.Module):
     def initial_memory(self, batch: tuple[int, ...] = ()) -> Memory:
         """Memory at the start of an episode."""
         return Memory(hidden=jnp.zeros((*batch, self.hidden)), action=jnp.full(batch, NO_ACTION, jnp.int32))
+
+
+def _seldom_done(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+    del key
+    return jnp.zeros(shape, dtype).at[DONE].set(SELDOM)
 
 
 def init_params(spec: PolicySpec, key: jax.Array) -> Params:

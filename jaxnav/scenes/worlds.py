@@ -27,6 +27,7 @@ class World:
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
+      shaping: reward in training for every metre nearer to the goal; what is far away is hardly ever found by chance.
     """
 
     generate: Callable[[str, int, int, float], Scene]
@@ -35,6 +36,7 @@ class World:
     train_step_limit: int
     step_limit: int
     large_step_limit: int
+    shaping: float
 
 
 #: AI2-THOR, RoboTHOR and Gibson in the paper.
@@ -46,6 +48,7 @@ WORLDS = {
         train_step_limit=30,
         step_limit=100,
         large_step_limit=200,
+        shaping=0.0,
     ),
     "apartments": World(
         generate=generate_apartment,
@@ -56,6 +59,7 @@ WORLDS = {
         train_step_limit=100,
         step_limit=500,
         large_step_limit=500,
+        shaping=1.0,
     ),
     "houses": World(
         generate=generate_house,
@@ -75,6 +79,7 @@ WORLDS = {
         train_step_limit=100,
         step_limit=500,
         large_step_limit=500,
+        shaping=1.0,
     ),
 }
 

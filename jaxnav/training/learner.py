@@ -86,8 +86,8 @@ class Learner:
 
         Returns:
           The state after them and float32 [] metrics: the losses' means over the updates, `success`, `return`, `length`
-          and `truncated` averaged over the `episodes` that ended, and the number of `skipped_steps` of the optimizer
-          whose gradient was not finite.
+          (without shaping) and `truncated` averaged over the `episodes` that ended, and the number of `skipped_steps`
+          of the optimizer whose gradient was not finite.
         """
 
         def step(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, jax.Array]]:
@@ -160,6 +160,6 @@ def _episode_sums(transitions: Transition, ended: jax.Array, params: EnvParams) 
         "success": success,
         "length": length,
         "truncated": total(transitions.truncated),
-        # Every step but a successful Done costs the same, so the return follows from success and length.
+        # Every step but a successful Done costs the same, so the return (without shaping) follows from both.
         "return": params.success_reward * success + params.step_reward * (length - success),
     }
