@@ -61,9 +61,7 @@ def test_as_scipy_has_it(counts, priors):
     counts, priors = np.array(counts), np.array(priors)
     gaps, likeness = layout_gap(counts, priors), layout_similarity(counts, priors)
     for scene, prior, gap, like in zip(counts, priors, gaps, likeness, strict=True):
-        rows = [
-            (np.delete(scene[i], i), np.delete(prior[i], i)) for i in range(K) if np.delete(scene[i], i).sum() > 0
-        ]
+        rows = [(np.delete(scene[i], i), np.delete(prior[i], i)) for i in range(K) if np.delete(scene[i], i).sum() > 0]
         if not rows:
             assert np.isnan(gap)
             continue

@@ -19,10 +19,10 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from rich.console import Console
 
-from jaxnav.cli.telling import Source, scene_size
+from jaxnav.cli.telling import Source
 from jaxnav.errors import InputError
 from jaxnav.evaluation.draw import AGENT, ARROW, SEEN
-from jaxnav.evaluation.plan import GOAL, HEIGHTS, INK, PALE, TALL, WALL, draw_room, extent, view_cone
+from jaxnav.evaluation.plan import GOAL, HEIGHTS, INK, PALE, TALL, WALL, draw_room, extent, scene_size, view_cone
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.compile import compile_scene
 from jaxnav.scenes.detector import PERFECT
@@ -101,8 +101,10 @@ def choose(config: ShowConfig) -> Scene:
         raise InputError("--scene, --index: both are given; give the scene's name or its number")
     if config.scene is None:
         index = config.index or 0
+        if index < 0:
+            raise InputError(f"--index {index}: give 0 or more")
         scenes = config.scenes(index + 1)
-        if not 0 <= index < len(scenes):
+        if index >= len(scenes):
             raise InputError(f"--index {index}: {config.file} holds {len(scenes)} scenes; give 0 to {len(scenes) - 1}")
         return scenes[index]
     scenes = config.scenes()
@@ -212,7 +214,7 @@ def _draw_view(axes: Axes, scene: Scene, rules: Rules, view: View) -> list[Artis
 
 def _draw_scale(axes: Axes) -> None:
     """A bar of one metre below the plan."""
-    left, down = axes.get_xlim()[0], -0.15 * axes.get_figure(root=True).dpi / axes.bbox.height
+    left, down = axes.get_xlim()[0], -0.15 * axes.figure.dpi / axes.bbox.height
     at = {"transform": axes.get_xaxis_transform(), "clip_on": False, "color": INK}
     axes.plot([left, left + 1.0], [down, down], lw=2, solid_capstyle="butt", **at)
     axes.text(left + 1.0, down, "  1 m", fontsize=8.5, va="center", **at)

@@ -64,14 +64,20 @@ def draw_room(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int |
         labels.among(room.type.replace("_", " "), np.asarray(scene.origin) + CELL * np.stack([ix, iz], axis=-1))
 
 
-def extent(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest (x, z) in metres of the lattice and of everything that stands on or beside it."""
-    low = np.asarray(scene.origin) - CELL / 2
-    high = low + CELL * np.array(scene.reach.shape[::-1])
+def extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest (x, z) in metres, float64 [2] each, of the objects and of cells bool [nz, nx], else of all."""
+    iz, ix = np.nonzero(np.ones_like(scene.reach) if cells is None else cells)
+    points = np.asarray(scene.origin) + CELL * np.stack([ix, iz], axis=-1)
     centre, half = scene.boxes[:, [0, 2]], scene.boxes[:, [3, 5]] / 2
-    return np.minimum(low, (centre - half).min(axis=0, initial=np.inf)), np.maximum(
-        high, (centre + half).max(axis=0, initial=-np.inf)
-    )
+    low = np.minimum(points.min(axis=0) - CELL / 2, (centre - half).min(axis=0, initial=np.inf))
+    high = np.maximum(points.max(axis=0) + CELL / 2, (centre + half).max(axis=0, initial=-np.inf))
+    return low, high
+
+
+def scene_size(scene: Scene) -> np.ndarray:
+    """Width and depth in metres of the rectangle around the objects and the cells that are no wall, float64 [2]."""
+    low, high = extent(scene, scene.reach | ~scene.walls)
+    return high - low
 
 
 def _floor(scene: Scene) -> np.ndarray:
@@ -92,7 +98,7 @@ class _Labels:
     def __init__(self, axes: Axes, dots: np.ndarray, walls: np.ndarray) -> None:
         """Take dots at [N, 2] and walls [M, (low, high), 2] into account, both world (x, z)."""
         self._axes = axes
-        self._point = axes.get_figure(root=True).dpi / 72  # pixels
+        self._point = axes.figure.dpi / 72  # pixels
         centres, walls = (axes.transData.transform(part.reshape(-1, 2)) for part in (dots, walls))
         around = centres[:, None] + 3 * self._point * np.array([[-1, -1], [1, 1]])
         self._taken = np.concatenate([around, walls.reshape(-1, 2, 2)])  # pixels, [N, (low, high), (x, y)]
@@ -101,7 +107,7 @@ class _Labels:
     def beside(self, name: str, place: np.ndarray, colour: str) -> None:
         """Write a name right beside a dot, if need be a little farther off."""
         text = self._text(name, colour, fontsize=7)
-        width, height = size = text.get_window_extent().size
+        width, height = size = np.array(text.get_window_extent().size)
         dot = self._axes.transData.transform(place)
         spots = []
         for gap in self._point * np.array([5, 9, 14]):
@@ -115,7 +121,7 @@ class _Labels:
         """Write the name of an area, centred on one of its places [N, 2], in its middle if possible."""
         text = self._text(name, WALL, fontsize=9, style="italic", parse_math=False)
         places = places[np.argsort(np.linalg.norm(places - places.mean(axis=0), axis=1), kind="stable")]
-        size = text.get_window_extent().size
+        size = np.array(text.get_window_extent().size)
         self._put(text, self._axes.transData.transform(places) - size / 2, size)
 
     def _text(self, name: str, colour: str, **font) -> Text:
@@ -132,7 +138,8 @@ class _Labels:
         inside = np.minimum(boxes[:, 1], frame.max) - np.maximum(boxes[:, 0], frame.min)
         covered += 2 * (np.prod(size) - np.prod(np.maximum(inside, 0.0), axis=-1))
         best = int(np.argmin(np.round(covered)))
-        text.set_position(self._axes.transData.inverted().transform(corners[best]))
+        x, y = self._axes.transData.inverted().transform(corners[best])
+        text.set_position((x, y))
         self._taken = np.concatenate([self._taken, boxes[best : best + 1]])
         self._badness = np.append(self._badness, 1.0)
 

@@ -88,7 +88,7 @@ def layout_similarity(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
 
 def _present(counts: np.ndarray) -> np.ndarray:
     """Categories that a scene shows together with others, bool [..., K]."""
-    return expected(counts).any(axis=-1)
+    return expected(counts).sum(axis=-1) > 0
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:

@@ -121,12 +121,13 @@ def compile_scene(scene: Scene, task: Task) -> SceneTable:
     else:
         goal_distance = _walks(scene, rules, centres, ahead, targets, kinds, task.is_goal())
         found = np.repeat(goal_distance <= rules.success_distance + TOLERANCE, rules.poses_per_cell, axis=0)
+    found &= task.is_goal()
     return SceneTable(
         name=scene.name,
         room_type=scene.room_type,
         ahead=ahead,
         rows=layout.pack(detections, found, _ego_views(scene, rules, cells, layout.view)),
-        best_length=best_lengths(successors(ahead, rules), found & task.is_goal()),
+        best_length=best_lengths(successors(ahead, rules), found),
         goal_distance=goal_distance.astype(np.float32),
     )
 

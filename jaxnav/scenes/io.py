@@ -78,12 +78,15 @@ def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarr
     """
     reachable = _WALL_DISTANCE - 1
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(reach, reachable), (2 * reachable + 1,) * 2)
+    walls = ~windows.any(axis=(2, 3))
     x = origin[0] + CELL * np.arange(reach.shape[1])
     z = origin[1] + CELL * np.arange(reach.shape[0])
-    dx = np.maximum(np.abs(x[:, None] - boxes[:, 0]) - boxes[:, 3] / 2, 0.0)  # [nx, N]
-    dz = np.maximum(np.abs(z[:, None] - boxes[:, 2]) - boxes[:, 5] / 2, 0.0)  # [nz, N]
-    near_box = (np.hypot(dz[:, None], dx[None]) <= _BOX_DISTANCE).any(axis=-1)
-    return ~windows.any(axis=(2, 3)) & ~near_box
+    for box in boxes:
+        dx = np.maximum(np.abs(x - box[0]) - box[3] / 2, 0.0)
+        dz = np.maximum(np.abs(z - box[2]) - box[5] / 2, 0.0)
+        near = np.ix_(dz <= _BOX_DISTANCE, dx <= _BOX_DISTANCE)
+        walls[near] &= np.hypot(dz[near[0]], dx[near[1]]) > _BOX_DISTANCE
+    return walls
 
 
 def _parse(path: Path, line: int, text: bytes) -> Record:

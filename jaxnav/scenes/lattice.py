@@ -33,14 +33,14 @@ def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:
     """Cell that MoveAhead leads to from every cell and heading, the own one where the way is barred.
 
     Args:
-      cells: int [C, 2], the standable cells (iz, ix), at least one.
+      cells: int [C, 2], the standable cells (iz, ix).
       rules: the headings.
 
     Returns:
       int32 [C, H].
     """
-    low = cells.min(axis=0) - 1
-    index = np.full(cells.max(axis=0) - low + 2, -1)
+    low = cells.min(axis=0, initial=0) - 1
+    index = np.full(cells.max(axis=0, initial=0) - low + 2, -1)
     index[tuple((cells - low).T)] = np.arange(len(cells))
     ahead = index[tuple(np.moveaxis(cells[:, None] - low + rules.steps(), -1, 0))]
     return np.where(ahead >= 0, ahead, np.arange(len(cells))[:, None]).astype(np.int32)

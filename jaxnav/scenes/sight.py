@@ -186,7 +186,8 @@ def view_known(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarra
 @functools.lru_cache(maxsize=4096)
 def _between(dz: int, dx: int, radius: int) -> list[tuple[int, int]]:
     """The cells that a look from (0, 0) to (dz, dx) passes through, its ends left out."""
-    share = np.arange(1, 2 * radius) / (2 * radius)  # half-cell steps along the longest line
+    steps = np.arange(1, 2 * radius)  # half-cell steps along the longest line
     # Rounding is symmetric about 0, so that a mirrored room has a mirrored view.
-    passed = set(zip(np.rint(dz * share).astype(int).tolist(), np.rint(dx * share).astype(int).tolist(), strict=True))
+    z, x = (np.rint(d * steps / (2 * radius)).astype(int).tolist() for d in (dz, dx))
+    passed = set(zip(z, x, strict=True))
     return sorted(passed - {(0, 0), (dz, dx)})
