@@ -81,7 +81,7 @@ def test_a_picture_has_a_frame_per_step(tmp_path):
 
 def test_the_view_cone_ends_at_walls():
     # From (0, 0) along +z with a row of wall cells at z = 1 m (their near faces at 0.875 m): straight ahead the outline
-    # ends within a 0.05 m step of that; without the walls it would end at 4 m.
+    # ends within a 0.05 m step of that; without the walls it would end at 5 m.
     walls = [(4, ix) for ix in range(4)]
     scene = tiny.draw(["...."] * 4 + ["####"] * 2, ("Book", 0.25, 0.8, 0.5, *tiny.SMALL), walls=walls)
     outline = view_cone(scene, Rules(), np.zeros(2), 0.0)
