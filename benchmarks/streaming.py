@@ -12,15 +12,13 @@ import sys
 import time
 from pathlib import Path
 
-import jax
 from _common import report
 from rich.console import Console
 
 from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig, WorldConfig
-from jaxnav.cli.train import explored
-from jaxnav.cli.worlds import Stream, training_world
-from jaxnav.layout import prior_from_counts
+from jaxnav.cli.train import explored, layout_priors
+from jaxnav.cli.worlds import bank_order, read_ahead, training_world
 
 TURNS, CHUNK = 7, 8
 
@@ -38,19 +36,18 @@ def main() -> None:
     began = time.perf_counter()
     found = explored(config, world)
     exploring = time.perf_counter() - began
-    priors = jax.vmap(lambda counts: prior_from_counts(counts + 1.0))(found.counts)
-    stream, arms = Stream(world, 0), Arms(config, world.env, priors)
-    still = stream.params(0)
+    arms = Arms(config, world.env, layout_priors(found.counts, config.layout.setting))
+    still, coming = world.params(0), read_ahead(world, bank_order(world, config.seed, TURNS))
     memory, streamed = arms.init(still), arms.init(still)
     memory, _ = arms.train(memory, still)  # compiles
     streamed = arms.restart(streamed, still)
     seconds = {"in_memory": [], "streamed": []}
-    for turn in range(1, TURNS + 1):
+    for _ in range(TURNS):
         began = time.perf_counter()
         memory, _ = arms.train(memory, still)
         seconds["in_memory"].append(time.perf_counter() - began)
         began = time.perf_counter()
-        params = stream.params(turn)
+        params = next(coming)
         streamed, _ = arms.train(arms.restart(streamed, params), params)
         seconds["streamed"].append(time.perf_counter() - began)
     steps = CHUNK * config.update_steps * len(arms.learners)

@@ -12,8 +12,9 @@ from _common import rates, report, timings
 
 from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig
+from jaxnav.cli.train import layout_priors
 from jaxnav.env.make import make
-from jaxnav.layout import prior_from_counts
+from jaxnav.env.types import EnvParams
 from jaxnav.policies.policy import bind
 from jaxnav.training.exploration import explore
 from jaxnav.training.learner import Learner
@@ -26,8 +27,8 @@ def main() -> None:
     config = dataclasses.replace(RunConfig(), chunk=CHUNK)
     env, params = make(config.world)
     counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
-    priors = jax.vmap(prior_from_counts)(counts)
-    arms = Arms(config, env, params, priors)
+    priors = layout_priors(counts, config.layout.setting)
+    arms = Arms(config, env, priors)
     steps = CHUNK * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(arms.learners)
     report(
         {
@@ -35,18 +36,18 @@ def main() -> None:
             "rollout": config.ppo.rollout,
             "updates_per_call": CHUNK,
             "seeds": config.seeds,
-            "all_arms_and_seeds_steps_per_s": side_by_side(arms, steps),
+            "all_arms_and_seeds_steps_per_s": side_by_side(arms, params, steps),
             "arms": {name: alone(learner, config, params, priors) for name, learner in arms.learners.items()},
         }
     )
 
 
-def side_by_side(arms: Arms, steps: int) -> dict:
-    states, _ = arms.train(arms.init())
+def side_by_side(arms: Arms, params: EnvParams, steps: int) -> dict:
+    states, _ = arms.train(arms.init(params), params)
     measured = []
     for _ in range(REPEATS):
         began = time.perf_counter()
-        states, _ = arms.train(states)
+        states, _ = arms.train(states, params)
         measured.append(round(steps / (time.perf_counter() - began)))
     measured.sort()
     return {"median": measured[REPEATS // 2], "min": measured[0], "max": measured[-1]}

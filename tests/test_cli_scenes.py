@@ -94,8 +94,37 @@ def test_what_cannot_be_imported_leaves_nothing(tmp_path, monkeypatch, capsys, a
 
 
 def test_a_simulator_that_is_not_there_is_named(tmp_path, capsys):
-    assert run("procthor", "FloorPlan1", tmp_path / "o.jsonl.gz", "--from-controller") == 2
-    assert "reads from ai2thor, not from procthor" in refusal(capsys)
+    assert run("ai2thor", "FloorPlan1", tmp_path / "o.jsonl.gz", "--from-controller") == 2
+    assert "pip install ai2thor" in refusal(capsys)
+
+
+@pytest.mark.parametrize(
+    ("form", "option", "problem"),
+    [
+        ("procthor", ["--from-controller"], "--from-controller: is for the format ai2thor, not for procthor"),
+        ("ai2thor", ["--maps", "a.pbz2"], "--maps: is for the format habitat, not for ai2thor"),
+        ("habitat", ["--assets", "a.json"], "--assets: is for the format procthor, not for habitat"),
+        ("ai2thor", ["--val", "FloorPlan9?"], "pattern 'FloorPlan9?': fits no scene"),
+    ],
+)
+def test_options_without_effect_are_refused(tmp_path, capsys, form, option, problem):
+    (tmp_path / "room.json").write_text(json.dumps(METADATA))
+    assert run(form, tmp_path / "room.json", tmp_path / "o.jsonl.gz", *option) == 2
+    assert problem in refusal(capsys)
+
+
+def test_bad_lines_of_a_scene_file_leave_the_others(tmp_path, capsys):
+    (tmp_path / "room.json").write_text(json.dumps(METADATA))
+    good, mixed = tmp_path / "good.jsonl.gz", tmp_path / "mixed.jsonl.gz"
+    assert run("ai2thor", tmp_path / "room.json", good) == 0
+    line = gzip.decompress(good.read_bytes())
+    mixed.write_bytes(line + line.replace(b'"train"', b'"trial"') + b"{]\n" + line)
+    assert run("scenes", mixed, tmp_path / "o.jsonl.gz") == 0
+    told = capsys.readouterr().err
+    assert "1 scenes imported, 3 refused" in told
+    assert "line 2" in told
+    assert "line 3: not JSON" in told
+    assert "name is that of line 1 too" in told
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -3,15 +3,24 @@
 import dataclasses
 import io
 import json
+import time
 
+import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import tiny
 from commands import CONFIG, evaluate, train
 from rich.console import Console
 
+from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig, WorldConfig
-from jaxnav.cli.worlds import Stream, evaluation_world, training_world
+from jaxnav.cli.worlds import bank_order, evaluation_world, read_ahead, training_world
+from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.scenes.categories import ROOM_TYPES
+from jaxnav.store.runlog import read_rows
+from jaxnav.training.config import PPOConfig
 
 OPTIONS = ("--worlds.num-train", 9, "--worlds.shard-scenes", 3, "--total-steps", 1024)
 
@@ -53,29 +62,63 @@ def test_all_banks_have_one_shape_on_the_device(world):
 
 
 def test_every_pass_meets_every_bank_in_an_order_of_its_own(world):
-    stream, other = Stream(world, seed=1), Stream(world, seed=2)
-    passes = [tuple(stream.bank(turn) for turn in range(start, start + 3)) for start in range(0, 30, 3)]
-    assert all(sorted(order) == [0, 1, 2] for order in passes)
+    order, other = bank_order(world, 1, 30), bank_order(world, 2, 30)
+    passes = [tuple(order[start : start + 3]) for start in range(0, 30, 3)]
+    assert all(sorted(one) == [0, 1, 2] for one in passes)
     assert len(set(passes)) > 2
-    assert passes != [tuple(other.bank(turn) for turn in range(start, start + 3)) for start in range(0, 30, 3)]
-    for turn in (0, 1, 2, 7):
-        assert np.array_equal(stream.params(turn).tables.num_cells, world.params(stream.bank(turn)).tables.num_cells)
+    assert order != other
+    assert bank_order(world, 1, 7) == order[:7]
 
 
-def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache, tmp_path):
+def test_banks_are_read_one_ahead(world, monkeypatch):
+    asked, params = [], type(world).params
+    monkeypatch.setattr(type(world), "params", lambda self, bank: asked.append(bank) or params(self, bank))
+    order = [2, 0, 0, 1]
+    given = read_ahead(world, order)
+    for turn, bank in enumerate(order):
+        chex.assert_trees_all_equal(next(given), params(world, bank))
+        time.sleep(0.2)  # the thread that reads
+        assert asked == [[2, 0], [2, 0], [2, 0, 1], [2, 0, 1]][turn]
+    assert list(given) == list(read_ahead(world, [])) == []
+
+
+def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
+    """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
+    config = RunConfig(ppo=PPOConfig(num_envs=32, rollout=4, minibatches=2), seeds=1, sizes=tiny.SIZES)
+    arms = Arms(config, world.env, jnp.ones((NUM_PRIORS, 22, 22)))
+    before = arms.init(world.params(0))
+    kept = jax.tree.map(np.array, before["layout"][0].replace(key=None))
+    after = arms.restart(before, world.params(1))["layout"][0]
+    chex.assert_trees_all_equal(
+        (after.params, after.optimizer, after.update), (kept.params, kept.optimizer, kept.update)
+    )
+    assert not np.array_equal(after.agent.state.pose, kept.agent.state.pose)
+    assert not np.asarray(after.agent.state.time).any()
+    assert (np.asarray(after.agent.state.scene) < len(world.banks[1].names)).all()
+
+
+@pytest.mark.slow
+def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache, tmp_path, monkeypatch, capsys):
     """8 updates in chunks of 2 go through four turns of three shards; the second half comes after a stop."""
-    rows = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["step"] == 8
-    half = tmp_path / "half"
-    assert train(config_file, half, *OPTIONS, "--cache", cache) == 0
-    for step in half.glob("checkpoints/*"):
-        if step.name.isdigit() and int(step.name) > 4:
-            for file in sorted(step.rglob("*"), reverse=True):
-                file.rmdir() if file.is_dir() else file.unlink()
-            step.rmdir()
-    resumed = train(config_file, half, *OPTIONS, "--cache", cache)
-    assert resumed == 0
-    assert (half / "metrics.jsonl").read_bytes() == (finished / "metrics.jsonl").read_bytes()
+    stopped, calls, whole = tmp_path / "stopped", [], Arms.train
+
+    def train_twice(self, states, params):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return whole(self, states, params)
+
+    monkeypatch.setattr(Arms, "train", train_twice)
+    with pytest.raises(KeyboardInterrupt):
+        train(config_file, stopped, *OPTIONS, "--cache", cache)
+    assert [row["step"] for row in read_rows(stopped / "metrics.jsonl")] == [2, 2, 4, 4]
+    capsys.readouterr()
+    assert train(config_file, stopped, *OPTIONS, "--cache", cache) == 0
+    assert "resumed after update 4 of 8" in capsys.readouterr().err
+    assert len(calls) == 5  # two, the one that stopped, and two more
+    assert read_rows(finished / "metrics.jsonl")[-1]["step"] == 8
+    for name in ("metrics.jsonl", "policies/layout-0/params.safetensors", "policies/baseline-0/params.safetensors"):
+        assert (stopped / name).read_bytes() == (finished / name).read_bytes()
 
 
 def test_streamed_evaluation_is_one_compilation_and_knows_all_scenes(finished, tmp_path):
@@ -84,11 +127,7 @@ def test_streamed_evaluation_is_one_compilation_and_knows_all_scenes(finished, t
     report = json.loads(target.read_text())
     assert report["compilations"] == 1
     scenes = {line.split(",")[5] for line in target.with_name("train.episodes.csv").read_text().splitlines()[1:]}
-    assert scenes == {f"train-{room}-{i:03d}" for i, room in enumerate(4 * list(ROOMS))} & scenes
-    assert len(scenes) == 9
-
-
-ROOMS = ("kitchen", "living_room", "bedroom", "bathroom")
+    assert scenes == {f"train-{room}-{i:03d}" for i, room in enumerate((2 * ROOM_TYPES + ROOM_TYPES)[:9])}
 
 
 def test_shards_hold_what_memory_would(world, cache):

@@ -8,9 +8,9 @@ import tiny
 from jaxnav.env.objectnav import build
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.grid import Outcome
+from jaxnav.evaluation.grid import Outcome, first_states
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.oracle import oracle_actions, replay
+from jaxnav.evaluation.oracle import oracle_actions, oracle_outcome, replay
 from jaxnav.scenes.compile import compile_bank
 from jaxnav.scenes.rooms import generate_rooms
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, Rules, Task
@@ -65,7 +65,7 @@ def test_an_oracle_has_full_marks(rules):
     env, params = build(bank, {}, 100)
     episodes = episode_list(bank, 200)
     actions = oracle_actions(bank, episodes)
-    outcome = replay(actions, episodes, env, params)
+    outcome = oracle_outcome([bank], [episodes], [params], env)
     np.testing.assert_array_equal(outcome.length, episodes.best_length)
     metrics = episode_metrics(outcome, episodes.best_length)
     np.testing.assert_array_equal(metrics["sr"], np.ones(200))
@@ -76,9 +76,9 @@ def test_an_oracle_has_full_marks(rules):
     assert np.median(outcome.length) > 3
 
     # Nothing is taken for granted: other actions fail, and a step limit stops the oracle too.
-    astray = replay(np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), episodes, env, params)
+    astray = replay(np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), first_states(episodes), params, env)
     assert not astray.success.any()
-    stopped = replay(actions, episodes, *build(bank, {}, 3))
+    stopped = replay(actions, first_states(episodes), build(bank, {}, 3)[1], env)
     np.testing.assert_array_equal(stopped.success, episodes.best_length <= 3)
 
 

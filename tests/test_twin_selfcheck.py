@@ -171,12 +171,15 @@ def test_walks_go_round_thin_walls():
     assert walk_to_the_book(["....", "....", "####", "...."], *book, walls=[*walls, (2, 3)]) == math.inf
 
 
-def test_walls_at_the_ends_of_the_straight_part_do_not_count():
-    # The footprint begins at z = 0.5, in the wall cell [2, 0] from 0.375 to 0.625, or on the edge of [2, 0] and [3, 0].
-    assert walk_to_the_book([".", "#", "#"], 0, 1, 0.75, *CHEST, walls=[(2, 0)]) == pytest.approx(0.5)
-    assert walk_to_the_book([".", "#", "#"], 0, 1, 0.75, *CHEST, walls=[(1, 0), (2, 0)]) == math.inf
-    assert walk_to_the_book([".", "#", "#"], 0, 1, 0.75, *CHEST, walls=[(0, 0)]) == pytest.approx(0.5)
-    assert walk_to_the_book([".", "#", "#", "#"], 0, 1, 0.875, *CHEST, walls=[(2, 0), (3, 0)]) == pytest.approx(0.625)
+def test_walls_of_the_start_and_of_the_object_do_not_count():
+    # A footprint from z = 0.4 to 0.6 in the wall cell [2, 0] from 0.375 to 0.625 that holds its centre: 0.4 m.
+    rows, thin = [".", "#", "#"], (0, 1, 0.5, 0.5, 0.5, 0.2)
+    assert walk_to_the_book(rows, *thin, walls=[(2, 0)]) == pytest.approx(0.4)
+    assert walk_to_the_book(rows, *thin, walls=[(1, 0), (2, 0)]) == math.inf
+    assert walk_to_the_book(rows, *thin, walls=[(0, 0)]) == pytest.approx(0.4)
+    # A chest from 0.5 to 1.0 m that only reaches into that wall cell stands behind the wall.
+    assert walk_to_the_book(rows, 0, 1, 0.75, *CHEST, walls=[(2, 0)]) == math.inf
+    assert walk_to_the_book([*rows, "#"], 0, 1, 0.75, *CHEST, walls=[(3, 0)]) == pytest.approx(0.5)
 
 
 def test_measures_of_walks():

@@ -55,7 +55,7 @@ def lively(seed, spec=SPEC):
     loud = {
         name: jax.tree.map(lambda leaf: 3 * leaf, node) for name, node in params.items() if name in ("fuse", "method")
     }
-    return params | loud | {"actor": params["actor"] | {"kernel": kernel}}
+    return params | loud | {"actor": params["actor"] | {"kernel": kernel, "bias": jnp.zeros(6)}}
 
 
 @jax.jit

@@ -183,7 +183,7 @@ class TwinScene:
             here = self.position(cell)
             end = box.nearest(*here)
             length = math.dist(here, end)
-            if length <= 1 + 1e-9 and not self._walled(here, end, end):
+            if length <= 1 + 1e-9 and not self._walled(here, end, box.centre[::2]):
                 yield length, cell
 
     def view(self, cell: Cell, heading: int) -> list[int]:

@@ -22,7 +22,7 @@ class WorldConfig:
       seed: of the generator.
       shift: layout shift of the generated scenes, from 0 to 1.
       categories: what can be detected.
-      goals: what of it can be looked for.
+      goals: what of it can be looked for; None with categories of one's own: all of them.
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
@@ -72,7 +72,8 @@ class RunConfig:
         prior's random steps (`layout.walks x layout.steps`) besides.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
-      chunk: updates per compiled call; between calls the run logs, and saves every `save_every` calls.
+      chunk: updates per compiled call; between calls the run logs, saves (every `save_every` calls) and, where scenes
+        are streamed, goes on to the next shard with new episodes.
       save_every: calls between checkpoints.
       cache: folder for compiled scenes that are streamed from disk.
     """
@@ -167,6 +168,8 @@ def check(config: RunConfig) -> RunConfig:
     )
     task, shift = config.task, config.worlds.shift
     need(0.0 <= shift <= 1.0, "worlds.shift", shift, "give a number from 0 to 1")
+    shaping = config.worlds.shaping
+    need(shaping is None or 0.0 <= shaping < float("inf"), "worlds.shaping", shaping, "give 0 or more")
     need(len(task.categories) >= 2, "worlds.categories", task.categories, "give at least 2")
     need(len(set(task.categories)) == len(task.categories), "worlds.categories", task.categories, "give each once")
     unknown = [goal for goal in task.goals if goal not in task.categories]

@@ -30,7 +30,7 @@ class EpisodeConfig:
     Attributes:
       run: the run directory; its first seed acts, with the best action at every step.
       split: scenes to play in.
-      index: of the episode in the fixed list of `eval.py` (of the first bank, where scenes are streamed).
+      index: of the episode in the list that `eval.py` fixes by default (of the first shard, where scenes are streamed).
       out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
       variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.

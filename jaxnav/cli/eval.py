@@ -11,13 +11,14 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from jaxnav.cli.config import RunConfig
 from jaxnav.cli.runs import load_policies, load_run, settings
-from jaxnav.cli.worlds import evaluation_world
+from jaxnav.cli.worlds import evaluation_world, read_ahead
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.oracle import oracle_actions, replay
+from jaxnav.evaluation.oracle import oracle_outcome
 from jaxnav.evaluation.report import (
     Form,
     build_difference,
@@ -42,7 +43,8 @@ class EvalConfig:
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
       shift: layout shift of generated scenes, from 0 to 1; default: the run's.
-      episodes: in the fixed list, balanced over room types and scenes.
+      episodes: in the fixed list, balanced over room types and scenes; where scenes are streamed equally many in every
+        shard, and balanced there.
       epsilon: thresholds of sTDE; all of them in one compiled call.
       form: how sTDE combines the logits; default: the run's layout setting's.
       seed: of the episode list, the sampled actions and the bootstrap.
@@ -81,21 +83,20 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     policies = load_policies(run)
     rows = table_rows(config.epsilon, config.form or (SETTINGS[policies.setting].form,))
     world = evaluation_world(run, config.split, config.scenes, config.shift, console)
+    everything = range(len(world.banks))
     each = -(-config.episodes // len(world.banks))
-    lists = [episode_list(bank, each, config.seed) for bank in world.banks]
+    lists = [episode_list(bank, each, config.seed, part) for part, bank in enumerate(world.banks)]
     outcome, compilations = evaluate_grid(
         inference_grid(rows, run.seeds),
         policies.params,
-        ((part, world.params(i)) for i, part in enumerate(lists)),
+        zip(lists, read_ahead(world, everything), strict=True),
         Acting(world.env, policies.setting),
         policies.spec,
         policies.priors,
         jax.random.key(config.seed),
     )
     outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), run.seeds, -1), outcome)
-    shortest = [
-        replay(oracle_actions(world.banks[i], part), part, world.env, world.params(i)) for i, part in enumerate(lists)
-    ]
+    shortest = oracle_outcome(world.banks, lists, read_ahead(world, everything), world.env)
     rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)
     episodes = together(lists)
     table, differences = _tables(config, rows, outcome, episodes, policies.spec.method, world.scenes[0].world)
@@ -103,7 +104,7 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         "steps_per_policy": run.total_updates * run.update_steps,
         "prior_steps": policies.prior_steps,
         "evaluation_source": str(config.scenes or run.source),
-        "evaluation_shift": run.worlds.shift if config.shift is None else config.shift,
+        "evaluation_shift": None if config.scenes or run.scenes else _shift(config, run),
         "evaluation_seed": config.seed,
     }
     report = build_report(table, differences, compilations, about)
@@ -117,21 +118,23 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     console.print(f"{len(episodes.goal)} episodes, {compilations} compilation; written to {target}", soft_wrap=True)
 
 
-def _with_oracle(outcome: Outcome, shortest: list[Outcome]) -> Outcome:
-    """Outcomes [R, S, E] and one more row: the oracle's, which is the same for all seeds."""
+def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
+    """Outcomes [R, S, E] and one more row: the oracle's [E], which is the same for all seeds."""
 
-    def added(leaf: np.ndarray, *parts: np.ndarray) -> np.ndarray:
-        row = np.broadcast_to(np.concatenate(parts), leaf.shape[1:])
-        return np.concatenate([leaf, row[None].astype(leaf.dtype)])
+    def added(leaf: np.ndarray, own: np.ndarray) -> np.ndarray:
+        return np.concatenate([leaf, np.broadcast_to(own, leaf.shape[1:])[None].astype(leaf.dtype)])
 
-    return jax.tree.map(added, outcome, *shortest)
+    return jax.tree.map(added, outcome, shortest)
+
+
+def _shift(config: EvalConfig, run: RunConfig) -> float:
+    return run.worlds.shift if config.shift is None else config.shift
 
 
 def _target(config: EvalConfig) -> Path:
     """Where the table goes, refused early if nothing can be written there."""
-    name = (
-        f"eval-{config.split}" if config.scenes is None else f"eval-{config.scenes.name.split('.')[0]}-{config.split}"
-    )
+    source = "" if config.scenes is None else f"{config.scenes.name.split('.')[0]}-"
+    name = f"eval-{source}{config.split}" + ("" if config.shift is None else f"-shift{config.shift:g}")
     target = config.json or config.run / f"{name}.json"
     if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
         raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")

@@ -2,6 +2,8 @@
 
 import dataclasses
 import fnmatch
+import reprlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,21 +18,24 @@ from jaxnav.scenes.importers.controller import read_controller
 from jaxnav.scenes.importers.habitat import read_habitat
 from jaxnav.scenes.importers.procthor import read_procthor
 from jaxnav.scenes.importers.scene_data import read_scene_data
-from jaxnav.scenes.io import read_scenes, write_scenes
+from jaxnav.scenes.io import iterate_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
 
 Split = Literal["train", "val", "test"]
 Imported = Iterator[Scene | InputError]
 
-#: World whose vocabulary scenes of a format are checked against.
+#: World whose vocabulary scenes are compared with, by the world that they come from; `rooms` for others.
 USUAL_WORLDS = {
+    "robothor": "apartments",
+    "apartments": "apartments",
     "procthor": "houses",
-    "ai2thor": "rooms",
-    "scene-data": "rooms",
     "habitat": "houses",
-    "scenes": "rooms",
+    "gibson": "houses",
+    "houses": "houses",
 }
+#: Options that only one format has.
+OWN_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +50,7 @@ class ImportConfig:
       out: scene file to write (`*.jsonl.gz`).
       split: of the scenes that none of the following patterns fits.
       val, test: patterns of scene names, such as `FloorPlan_Train11_*`, that make up these splits.
-      world: world whose vocabulary the types are compared with; default: that which the format usually stands for.
+      world: world whose vocabulary the types are compared with; default: that which the scenes stand for.
       categories: vocabulary to compare with instead.
       assets: asset database of ProcTHOR (JSON), for types and sizes.
       maps: semantic floor maps for Habitat episodes (`*_info.pbz2`).
@@ -73,24 +78,34 @@ def import_scenes(config: ImportConfig, console: Console) -> None:
     """
     if not config.out.name.endswith(".jsonl.gz"):
         raise InputError(f"{config.out}: give a name that ends in .jsonl.gz")
-    categories = config.categories or WORLDS[config.world or USUAL_WORLDS[config.format]].task.categories
+    for option, owner in OWN_OPTIONS.items():
+        if getattr(config, option) and config.format != owner:
+            name = option.replace("_", "-")
+            raise InputError(f"--{name}: is for the format {owner}, not for {config.format}; leave it out")
     kept: dict[str, Scene] = {}
+    unknown: Counter[str] = Counter()
     refused = 0
     for scene in _read(config):
-        if isinstance(scene, Scene):
-            scene = _checked(scene, kept, categories, config.source)
-        if isinstance(scene, Scene):
-            kept[scene.name] = _with_split(scene, config)
-        else:
+        try:
+            if isinstance(scene, InputError):
+                raise scene
+            categories = _vocabulary(scene, config)
+            _check(scene, kept, categories, config.source)
+        except InputError as error:
             refused += 1
-            console.print(f"refused: {scene}", style="yellow", markup=False, soft_wrap=True)
+            console.print(f"refused: {error}", style="yellow", markup=False, soft_wrap=True)
+        else:
+            kept[scene.name] = _with_split(scene, config)
+            unknown += unknown_types([scene], categories)
     if not kept:
         raise InputError(f"{config.source}: none of its {refused} scenes can be used; mend what is said of them above")
+    for pattern in (*config.val, *config.test):
+        if not fnmatch.filter(kept, pattern):
+            raise InputError(f"pattern {pattern!r}: fits no scene; there are {reprlib.repr(sorted(kept))}")
     try:
         write_scenes(config.out, kept.values())
     except OSError as error:
         raise InputError(f"{config.out}: cannot be written ({error.strerror}); give another name") from error
-    unknown = unknown_types(kept.values(), categories)
     for name, count in unknown.most_common():
         console.print(f"unknown type, only blocks the sight: {name} x {count}", markup=False, soft_wrap=True)
     console.print(f"{len(kept)} scenes imported, {refused} refused; written to {config.out}", soft_wrap=True)
@@ -99,30 +114,30 @@ def import_scenes(config: ImportConfig, console: Console) -> None:
 def _read(config: ImportConfig) -> Imported:
     path, split = Path(config.source), config.split
     if config.from_controller:
-        if config.format != "ai2thor":
-            raise InputError(
-                f"--from-controller: reads from ai2thor, not from {config.format}; give the format ai2thor"
-            )
         return read_controller(config.source.split(","), split)
     readers: dict[str, Callable[[], Imported]] = {
         "procthor": lambda: read_procthor(path, split, config.assets),
         "ai2thor": lambda: read_ai2thor(path, split),
         "scene-data": lambda: read_scene_data(path, split),
         "habitat": lambda: read_habitat(path, split, config.maps),
-        "scenes": lambda: iter(read_scenes(path)),
+        "scenes": lambda: iterate_scenes(path),
     }
     return readers[config.format]()
 
 
-def _checked(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> Scene | InputError:
+def _vocabulary(scene: Scene, config: ImportConfig) -> tuple[str, ...]:
+    world = config.world or USUAL_WORLDS.get(scene.world, "rooms")
+    return config.categories or WORLDS[world].task.categories
+
+
+def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> None:
+    where = f"{source}, scene {scene.name!r}"
     if scene.name in kept:
-        return InputError(f"{source}, scene {scene.name!r}: name is that of an earlier scene; import them to two files")
+        raise InputError(f"{where}: name is that of an earlier scene; import them to two files")
     if max(category_ids(scene.types, categories), default=-1) < 0:
-        return InputError(
-            f"{source}, scene {scene.name!r}: objects are of no known type; known are {', '.join(categories)} "
-            "(see --world and --categories)"
+        raise InputError(
+            f"{where}: objects are of no known type; known are {', '.join(categories)} (see --world and --categories)"
         )
-    return scene
 
 
 def _with_split(scene: Scene, config: ImportConfig) -> Scene:

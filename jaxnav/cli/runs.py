@@ -29,7 +29,6 @@ class Policies(NamedTuple):
       params: leaves [2 S, ...], baseline seeds first, then layout seeds.
       priors: float32 [rooms, K, K].
       spec: sizes.
-      categories: [K].
       setting: of the layout estimator.
       prior_steps: random steps that the priors were collected in.
     """
@@ -37,14 +36,14 @@ class Policies(NamedTuple):
     params: dict[str, Any]
     priors: jax.Array
     spec: PolicySpec
-    categories: tuple[str, ...]
     setting: str
     prior_steps: int
 
 
 def settings(config: RunConfig) -> dict[str, Any]:
     """What makes a run the run it is, as JSON: all its settings but where and how often things are kept."""
-    plain = dataclasses.asdict(config) | {"scenes": str(config.scenes) if config.scenes else None}
+    plain = dataclasses.asdict(config)
+    plain = json.loads(json.dumps(plain, default=str))  # as it is read again: tuples are lists
     return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every", "cache")}
 
 
@@ -103,11 +102,11 @@ def load_policies(run: RunConfig) -> Policies:
     try:
         policy_spec = PolicySpec(spec["method"], len(spec["categories"]), Sizes(**spec["sizes"]))
         known = policy_spec.method in METHODS and spec["layout"] in SETTINGS
+        task = spec["task"]
         policies = Policies(
             params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tensors["policy"] for tensors, _ in loaded)),
             priors=jnp.asarray(tensors["layout"]["prior"]),
             spec=policy_spec,
-            categories=tuple(spec["categories"]),
             setting=spec["layout"],
             prior_steps=spec["prior_steps"],
         )
@@ -115,6 +114,11 @@ def load_policies(run: RunConfig) -> Policies:
         raise InputError(
             f"{folders[-1]}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
         ) from error
+    if different := differences(task, json.loads(json.dumps(dataclasses.asdict(run.task)))):
+        raise InputError(
+            f"{folders[-1]}: was trained for another task than its run says (there != here): {'; '.join(different)}; "
+            "use the version that trained the run"
+        )
     if not known:
         raise InputError(
             f"{folders[-1]}: method {policy_spec.method!r} or layout setting {spec['layout']!r} is unknown here; "

@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -14,7 +15,7 @@ from jaxnav.cli.arms import Arms, States
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse_run
 from jaxnav.cli.runs import LOG_FILE, POLICIES, claim, settings
-from jaxnav.cli.worlds import CompiledWorld, Stream, training_world
+from jaxnav.cli.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.layout import prior_from_counts
@@ -46,17 +47,22 @@ def train(config: RunConfig, console: Console) -> None:
     manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
 
     found = explored(config, world)
-    # One sighting of every pair to begin with: the all-ones Dirichlet.
-    priors = jax.vmap(lambda counts: prior_from_counts(counts + 1.0, config.layout.setting))(found.counts)
+    priors = layout_priors(found.counts, config.layout.setting)
     console.print(f"layout prior from {int(found.steps):,} random steps, {int(found.poses):,} distinct poses")
 
-    arms, stream = Arms(config, world.env, priors), Stream(world, config.seed)
-    restored = restore(config.run_dir, jax.eval_shape(arms.init, stream.params(0)), manifest)
-    states, done = restored or (arms.init(stream.params(0)), 0)
+    arms = Arms(config, world.env, priors)
+    order = bank_order(world, config.seed, config.total_updates // config.chunk)
+    if len(world.banks) > 1:
+        console.print(
+            f"one shard after the other: {len(order)} turns in {len(set(order))} of {len(world.banks)} shards"
+        )
+    first = world.params(order[0])
+    restored = restore(config.run_dir, jax.eval_shape(arms.init, first), manifest)
+    states, done = restored or (arms.init(first), 0)
     truncate_after(config.run_dir / LOG_FILE, done)
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
-    states = _updates(config, arms, stream, states, done, manifest, console)
+    states = _updates(config, arms, world, order, states, done, manifest, console)
     _export(config, world.env, states, priors, found)
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
 
@@ -67,16 +73,28 @@ def explored(config: RunConfig, world: CompiledWorld) -> Exploration:
     walks = -(-config.layout.walks // len(world.banks))
     walk = jax.jit(explore, static_argnums=(0, 3, 4))
     found = [
-        walk(world.env, world.params(bank), jax.random.fold_in(key, bank), walks, config.layout.steps)
-        for bank in range(len(world.banks))
+        walk(world.env, params, jax.random.fold_in(key, bank), walks, config.layout.steps)
+        for bank, params in enumerate(read_ahead(world, range(len(world.banks))))
     ]
     return jax.tree.map(lambda *parts: sum(parts), *found)
+
+
+def layout_priors(counts: jax.Array, setting: str) -> jax.Array:
+    """The layout prior of each room type, float32 [rooms, K, K], from what exploration counted.
+
+    Every pair starts with one sighting (the all-ones Dirichlet). A room type that training has no scene of gets the
+    prior of all its scenes together.
+    """
+    met = counts.any(axis=(1, 2), keepdims=True)
+    counts = jnp.where(met, counts, counts.sum(axis=0, keepdims=True))
+    return jax.vmap(lambda own: prior_from_counts(own + 1.0, setting))(counts)
 
 
 def _updates(
     config: RunConfig,
     arms: Arms,
-    stream: Stream,
+    world: CompiledWorld,
+    order: list[int],
     states: States,
     done: int,
     manifest: dict[str, Any],
@@ -87,15 +105,14 @@ def _updates(
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("compiling", total=config.total_updates, completed=done)
-        while done < config.total_updates:
-            began = time.monotonic()
-            turn = done // config.chunk
-            params = stream.params(turn)
-            if turn and stream.bank(turn) != stream.bank(turn - 1):
+        left = range(done // config.chunk, len(order))
+        began = time.monotonic()
+        for turn, params in zip(left, read_ahead(world, [order[turn] for turn in left]), strict=True):
+            if turn and order[turn] != order[turn - 1]:
                 states = arms.restart(states, params)
             states, metrics = arms.train(states, params)
             done += config.chunk
-            rate = steps / (time.monotonic() - began)
+            rate, began = steps / (time.monotonic() - began), time.monotonic()
             for name, seeds in metrics.items():
                 for seed, values in enumerate(seeds):
                     row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
@@ -119,6 +136,7 @@ def _export(config: RunConfig, env: ObjectNav, states: States, priors: jax.Array
         spec = {
             "method": config.method,
             "categories": list(env.categories),
+            "task": dataclasses.asdict(env.task),
             "sizes": dataclasses.asdict(config.sizes),
             "layout": config.layout.setting if name == "layout" else None,
             "prior_steps": int(found.steps),

@@ -1,9 +1,8 @@
 """The scenes of a run: compiled in memory, or as shards on disk where there are many."""
 
 import dataclasses
-import zlib
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,10 @@ from rich.progress import Progress
 from jaxnav.cli.config import RunConfig
 from jaxnav.env.objectnav import ObjectNav, build
 from jaxnav.env.types import EnvParams
+from jaxnav.errors import InputError
 from jaxnav.scenes.categories import unknown_types
-from jaxnav.scenes.compile import Bank, compile_bank
-from jaxnav.scenes.shards import compile_shards
+from jaxnav.scenes.compile import Bank, checksum, compile_bank
+from jaxnav.scenes.shards import Shards, compile_shards
 from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
 
 
@@ -35,7 +35,7 @@ class CompiledWorld:
 
     scenes: Scenes
     env: ObjectNav
-    banks: Sequence[Bank]
+    banks: Sequence[Bank] | Shards
     step_limits: dict[str, int]
     step_limit: int
     num_cells: int
@@ -61,9 +61,14 @@ def evaluation_world(
     Raises:
       InputError: bad scene file, no scene of the split, or a bad shift.
     """
-    world, shift = WORLDS[config.world], config.worlds.shift if shift is None else shift
+    world = WORLDS[config.world]
+    if shift is not None and (scenes or config.scenes):
+        raise InputError(
+            f"--shift {shift}: only generated scenes can be shifted; leave it out or evaluate without --scenes"
+        )
     limits = {"living_room": config.worlds.large_step_limit or world.large_step_limit}
     limit = config.worlds.step_limit or world.step_limit
+    shift = config.worlds.shift if shift is None else shift
     chosen = _scenes(config, split, scenes or config.scenes, shift, console)
     return _compiled(config, chosen, limits, limit, console)
 
@@ -86,8 +91,7 @@ def _compiled(
     env = ObjectNav(task, WORLDS[config.world].shaping if config.worlds.shaping is None else config.worlds.shaping)
     if len(scenes) <= shard_scenes:
         bank = compile_bank((scenes[i] for i in range(len(scenes))), task)
-        without = f" ({len(bank.skipped)} scenes without a goal left out)" if bank.skipped else ""
-        console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{without}")
+        console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{_left_out(bank.skipped)}")
         about = len(bank.ahead), len(bank.names), f"{checksum(bank):08x}"
         return CompiledWorld(scenes, env, (bank,), step_limits, step_limit, *about)
     with Progress(console=console, disable=not console.is_terminal) as progress:
@@ -96,45 +100,44 @@ def _compiled(
         def report(done: int, total: int) -> None:
             progress.update(bar, completed=done, total=total)
 
-        shards = compile_shards(scenes, task, shard_scenes, config.cache.expanduser(), report)
-    size = sum(file.stat().st_size for file in shards.folder.rglob("*.npy"))
+        try:
+            shards = compile_shards(scenes, task, shard_scenes, config.cache.expanduser(), report)
+        except OSError as error:
+            raise InputError(f"--cache {config.cache}: {error.strerror}; give another folder, or make room") from error
+    if config.chunk * config.ppo.rollout < config.train_step_limit:
+        raise InputError(
+            f"config: chunk is {config.chunk}; where scenes are streamed it must last for a whole episode: give at "
+            f"least {-(-config.train_step_limit // config.ppo.rollout)}"
+        )
+    size = sum(file.stat().st_size for file in shards.folder.rglob("*.npy")) / 1e9
     console.print(
-        f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size / 1e9:.2f} GB in {shards.folder}", soft_wrap=True
+        f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size:.2f} GB in {shards.folder}"
+        f"{_left_out(shards.skipped)}",
+        soft_wrap=True,
     )
-    about = shards.num_cells, shards.num_scenes, shards.folder.name
+    about = shards.num_cells, shards.num_scenes, f"{shards.checksum:08x}"
     return CompiledWorld(scenes, env, shards, step_limits, step_limit, *about)
 
 
-def checksum(bank: Bank) -> int:
-    """CRC-32 of everything in a bank."""
-    crc = 0
-    for part in bank:
-        crc = zlib.crc32(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode(), crc)
-    return crc
+def _left_out(skipped: Sequence[str]) -> str:
+    return f" ({len(skipped)} scenes without a goal left out)" if skipped else ""
 
 
-class Stream:
-    """Bank after bank on the device, the next one read while one is used.
+def bank_order(world: CompiledWorld, seed: int, turns: int) -> list[int]:
+    """Which bank is trained in at each turn: pass after pass over all of them, each in an order of its own."""
+    count = len(world.banks)
+    passes = [np.random.default_rng([seed, i]).permutation(count).tolist() for i in range(-(-turns // count))]
+    return [bank for order in passes for bank in order][:turns]
 
-    Every pass over the banks is in an order of its own, which the seed decides.
-    """
 
-    def __init__(self, world: CompiledWorld, seed: int) -> None:
-        self._world = world
-        self._seed = seed
-        self._pool = ThreadPoolExecutor(1)
-        self._loaded: dict[int, Future[EnvParams]] = {}
-
-    def bank(self, turn: int) -> int:
-        """Index of the bank of a turn (0, 1, ...)."""
-        count = len(self._world.banks)
-        return int(np.random.default_rng([self._seed, turn // count]).permutation(count)[turn % count])
-
-    def params(self, turn: int) -> EnvParams:
-        """The environment's parameters at a turn; those of the next one are fetched in the background."""
-        wanted = {self.bank(turn), self.bank(turn + 1)}
-        self._loaded = {index: future for index, future in self._loaded.items() if index in wanted}
-        for index in (self.bank(turn), self.bank(turn + 1)):
-            if index not in self._loaded:
-                self._loaded[index] = self._pool.submit(self._world.params, index)
-        return self._loaded[self.bank(turn)].result()
+def read_ahead(world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
+    """The environment's parameters with one bank after the other, the next one read while one is used."""
+    if not order:
+        return
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(world.params, order[0])
+        for i, bank in enumerate(order):
+            params = coming.result()
+            if i + 1 < len(order) and order[i + 1] != bank:
+                coming = pool.submit(world.params, order[i + 1])
+            yield params

@@ -29,7 +29,7 @@ class EpisodeList(NamedTuple):
     scenes: tuple[str, ...]
 
 
-def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0) -> EpisodeList:
+def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0, part: int = 0) -> EpisodeList:
     """Draw the episodes of a bank by the paper's rule: equally many per room type, balanced over its scenes.
 
     In each scene the goal is uniform over its possible categories, the start uniform over all poses that can reach it.
@@ -38,6 +38,7 @@ def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0) -> EpisodeList
       bank: the scenes.
       episodes: E, rounded up to a multiple of the number of room types.
       seed: of the draw.
+      part: number of the bank among those that are evaluated together; each has draws of its own.
 
     Raises:
       InputError: fewer than one episode.
@@ -46,7 +47,7 @@ def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0) -> EpisodeList
         raise InputError(f"--episodes {episodes}: give at least 1")
     rooms = tuple(sorted(set(bank.room_types)))
     per_room = -(-episodes // len(rooms))
-    generator = np.random.default_rng([seed, len(bank.names)])
+    generator = np.random.default_rng([seed, len(bank.names), part])
     poses_per_cell = bank.task.rules.poses_per_cell
     rows = []
     for room, name in enumerate(rooms):

@@ -1,5 +1,8 @@
 """The shortest-path oracle: it knows the way, walks it in the environment, and so checks environment and metrics."""
 
+import functools
+from collections.abc import Iterable, Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,8 +28,30 @@ def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
     return np.array(actions, np.int32)
 
 
-def replay(actions: np.ndarray, episodes: EpisodeList, env: ObjectNav, params: EnvParams) -> Outcome:
-    """What the environment makes of fixed actions int32 [T, E]; leaves [E]."""
+def oracle_outcome(
+    banks: Iterable[Bank], lists: Sequence[EpisodeList], params: Iterable[EnvParams], env: ObjectNav
+) -> Outcome:
+    """What the environment makes of the oracle's actions, leaves [E] over the episodes of all banks.
+
+    Args:
+      banks: of scenes.
+      lists: episodes in each.
+      params: the environment's, bank by bank.
+      env: the environment.
+    """
+    actions = [oracle_actions(bank, episodes) for bank, episodes in zip(banks, lists, strict=True)]
+    longest = max(map(len, actions))
+    padded = [np.pad(steps, ((0, longest - len(steps)), (0, 0)), constant_values=DONE) for steps in actions]
+    outcomes = [
+        replay(jnp.asarray(steps), first_states(episodes), own, env)
+        for steps, episodes, own in zip(padded, lists, params, strict=True)
+    ]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *outcomes)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) -> Outcome:
+    """What the environment makes of fixed actions int32 [T, E] from states [E]; leaves [E]."""
 
     def step(carry: tuple[State, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
         state, running, outcome = carry
@@ -39,10 +64,6 @@ def replay(actions: np.ndarray, episodes: EpisodeList, env: ObjectNav, params: E
         )
         return (state, running & ~terminated & ~truncated, outcome), None
 
-    @jax.jit
-    def run(actions: jax.Array, state: State, params: EnvParams) -> Outcome:
-        first = (state, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))
-        (state, _, outcome), _ = jax.lax.scan(step, first, actions)
-        return outcome._replace(distance=params.tables.goal_distance[env.cell(state.pose), state.goal])
-
-    return jax.tree.map(np.asarray, run(jnp.asarray(actions), first_states(episodes), params))
+    first = (state, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))
+    (state, _, outcome), _ = jax.lax.scan(step, first, actions)
+    return outcome._replace(distance=params.tables.goal_distance[env.cell(state.pose), state.goal])

@@ -1,5 +1,6 @@
 """From scenes to flat tables over every pose, so that a step of the environment is a few gathers."""
 
+import zlib
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -171,6 +172,14 @@ def join(tables: Sequence[SceneTable], task: Task) -> Bank:
     )
 
 
+def checksum(bank: Bank) -> int:
+    """CRC-32 of everything in a bank."""
+    crc = 0
+    for part in bank:
+        crc = zlib.crc32(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode(), crc)
+    return crc
+
+
 def _walks(
     scene: Scene,
     rules: Rules,
@@ -190,7 +199,7 @@ def _walks(
     straight = np.linalg.norm(nearest - centres[:, None], axis=-1)
     cell, target = np.nonzero((straight <= rules.success_distance + TOLERANCE) & is_goal[kinds])
     end = nearest[cell, target]
-    clear = clear_of_walls(scene, centres[cell], end, end)
+    clear = clear_of_walls(scene, centres[cell], end, boxes[target][:, [0, 2]])
     cell, target = cell[clear], target[clear]
     direct = np.full((len(centres), len(is_goal)), np.inf)
     np.minimum.at(direct, (cell, kinds[target]), straight[cell, target])

@@ -7,7 +7,7 @@ import numpy as np
 from jaxnav.scenes.furnish import FORWARD, RIGHT
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.room_shapes import Shape
-from jaxnav.scenes.rooms import clear_of_walls
+from jaxnav.scenes.rooms import away_from_walls
 from jaxnav.scenes.scene import CELL
 
 APARTMENT = (17, 37)  # cells of floor within its outer walls, (nz, nx)
@@ -108,7 +108,7 @@ def apartment_plan(rng: np.random.Generator) -> FloorPlan:
         walls[1:-1, 1:-1] = False
         for wall in partitions:
             walls[wall.cells] = True
-        free = clear_of_walls(walls)
+        free = away_from_walls(walls)
         low, high = APARTMENT_CELLS
         if low <= free.sum() <= high and len(standable_cells(free)) == free.sum():
             return FloorPlan(walls, (Rectangle(1, 1, nz + 1, nx + 1),), ("apartment",), partitions=partitions)

@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.scenes.categories import GIBSON_GOALS, ROBOTHOR_GOALS
+from jaxnav.scenes.compile import compile_scene
 from jaxnav.scenes.floor_plans import FloorPlan, apartment_plan, house_plan, room_shape
 from jaxnav.scenes.furnish import Furnishing, draw_contents, furnish
 from jaxnav.scenes.room_rules import HomeStatistics, Item, Rule, home_statistics
-from jaxnav.scenes.rooms import CONNECTED_SHARE, clear_of_boxes, clear_of_walls, connected, make_scene
+from jaxnav.scenes.rooms import CONNECTED_SHARE, away_from_boxes, away_from_walls, connected, make_scene
 from jaxnav.scenes.scene import CELL, SPLITS, Room, Scene
 from jaxnav.scenes.shift import check_scene_arguments, derangement, place_anew, settle
+from jaxnav.scenes.task import APARTMENTS
 
 FURNISHINGS = 5  # of each apartment
 APARTMENT_CELLS = (155, 340)  # standable cells of an apartment
@@ -52,7 +54,9 @@ _HOUSE_FINDING = Finding(GIBSON_GOALS, 0.6, to_footprint=True)
 
 
 def generate_apartment(split: str, index: int, seed: int, shift: float = 0.0) -> Scene:
-    """One furnishing of an apartment with all twelve goals; `index // 5` is the wall layout, shared by five scenes.
+    """One furnishing of an apartment with all twelve goals, each of which can be found.
+
+    `index // 5` is the wall layout, shared by five scenes.
 
     Args:
       split: `train`, `val` or `test`.
@@ -73,14 +77,24 @@ def generate_apartment(split: str, index: int, seed: int, shift: float = 0.0) ->
     rng, shift_rng = (np.random.default_rng((*key, index, stream)) for stream in (_APARTMENT, _APARTMENT + _SHIFT))
     low, high = APARTMENT_CELLS
     home = Home(plan, home_statistics("apartments"), _APARTMENT_FINDING)
+    name = f"{split}-apartment-{layout:02d}-{furnishing}"
+
+    def made(rooms: list[Furnishing] | None) -> Scene | None:
+        """The scene of the furnished rooms, if every goal in it can be seen from near enough."""
+        if not rooms:
+            return None
+        scene = home.scene(name, "apartments", "apartment", split, rooms)
+        lengths = compile_scene(scene, APARTMENTS).best_length[:, APARTMENTS.is_goal()]
+        return scene if lengths.max(axis=0).all() else None
+
     while True:
         rooms = home.furnished(rng)
-        if rooms and low <= home.reach(rooms).sum() <= high:
-            rooms = home.shifted(rooms, shift, shift_rng) if shift else rooms
-            if rooms:
-                return home.scene(
-                    f"{split}-apartment-{layout:02d}-{furnishing}", "apartments", "apartment", split, rooms
-                )
+        if rooms and low <= home.reach(rooms).sum() <= high and (scene := made(rooms)):
+            if not shift:
+                return scene
+            for _ in range(ATTEMPTS):
+                if scene := made(home.shifted(rooms, shift, shift_rng)):
+                    return scene
 
 
 def generate_house(split: str, index: int, seed: int, shift: float = 0.0) -> Scene:
@@ -118,7 +132,7 @@ class Home:
 
     def __init__(self, plan: FloorPlan, statistics: HomeStatistics, finding: Finding):
         self.plan, self.statistics, self.finding = plan, statistics, finding
-        self.clear = clear_of_walls(plan.walls)
+        self.clear = away_from_walls(plan.walls)
         self.rules = [statistics.rooms[room_type] for room_type in plan.types]
         self.bare = [self._bare(k) for k in range(len(plan.rooms))]
 
@@ -145,7 +159,7 @@ class Home:
 
     def sound(self, k: int, room: Furnishing) -> bool:
         """Whether one can walk from every door of room `k` through nearly all of it, and can find its goals."""
-        free = clear_of_boxes(self.clear[self.plan.rooms[k].around.cells], _furniture(room))
+        free = away_from_boxes(self.clear[self.plan.rooms[k].around.cells], _furniture(room))
         reach = connected(free)
         doors = free.copy()
         doors[1:-1, 1:-1] = False
@@ -159,7 +173,7 @@ class Home:
 
     def reach(self, rooms: list[Furnishing]) -> np.ndarray:
         """The standable cells of the furnished home, bool [nz, nx]."""
-        return connected(clear_of_boxes(self.clear, self._merged(rooms).boxes))
+        return connected(away_from_boxes(self.clear, self._merged(rooms).boxes))
 
     def floors(self) -> tuple[Room, ...]:
         """The rooms of the scene."""

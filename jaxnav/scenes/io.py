@@ -3,7 +3,7 @@
 import gzip
 import json
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +41,33 @@ def read_scenes(path: str | Path) -> list[Scene]:
     """
     path = Path(path)
     scenes: list[Scene] = []
-    lines: dict[str, int] = {}
-    for line, text in enumerate(read_bytes(path).splitlines(), start=1):
-        record = _parse(path, line, text)
-        scene = _scene(record)
-        if scene.name in lines:
-            raise record.error("name", f"is that of line {lines[scene.name]} too; make it unique")
-        lines[scene.name] = line
+    for scene in iterate_scenes(path):
+        if isinstance(scene, InputError):
+            raise scene
         scenes.append(scene)
     if not scenes:
         raise InputError(f"{path}: holds no scene; write one JSON object per line")
     return scenes
+
+
+def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
+    """The scenes of a file line by line, or why one cannot be used; see `read_scenes`.
+
+    Raises:
+      InputError: the file is missing or damaged.
+    """
+    lines: dict[str, int] = {}
+    for line, text in enumerate(read_bytes(path).splitlines(), start=1):
+        try:
+            record = _parse(path, line, text)
+            scene = _scene(record)
+            if scene.name in lines:
+                raise record.error("name", f"is that of line {lines[scene.name]} too; make it unique")
+        except InputError as error:
+            yield error
+        else:
+            lines[scene.name] = line
+            yield scene
 
 
 def write_scenes(path: str | Path, scenes: Iterable[Scene]) -> None:
@@ -78,7 +94,7 @@ def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarr
     """
     reachable = _WALL_DISTANCE - 1
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(reach, reachable), (2 * reachable + 1,) * 2)
-    walls = ~windows.any(axis=(2, 3))
+    walls = np.logical_not(windows.any(axis=(2, 3)))
     x = origin[0] + CELL * np.arange(reach.shape[1])
     z = origin[1] + CELL * np.arange(reach.shape[0])
     for box in boxes:

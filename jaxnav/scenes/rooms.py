@@ -140,17 +140,17 @@ def free_cells(walls: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     Returns:
       bool [nz, nx].
     """
-    return clear_of_boxes(clear_of_walls(walls), boxes)
+    return away_from_boxes(away_from_walls(walls), boxes)
 
 
-def clear_of_walls(walls: np.ndarray) -> np.ndarray:
+def away_from_walls(walls: np.ndarray) -> np.ndarray:
     """Cells that are far enough from every wall, bool [nz, nx]; outside there are walls."""
     # Cell centres are 0.125 m from a neighbouring wall, 0.177 m from a diagonal one and 0.375 m from the next.
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(walls, 1, constant_values=True), (3, 3))
     return np.logical_not(windows.any(axis=(2, 3)))
 
 
-def clear_of_boxes(free: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def away_from_boxes(free: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Those of the cells `free` [nz, nx] that are far enough from every box as well."""
     free = free.copy()
     iz, ix = np.nonzero(free)

@@ -10,7 +10,8 @@ import shutil
 import signal
 import threading
 import uuid
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.compile import Bank, compile_scene, join
+from jaxnav.scenes.compile import Bank, checksum, compile_scene, join
 from jaxnav.scenes.task import Task
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ class Shards:
       num_cells: the most cells of any shard.
       num_scenes: the most scenes of any shard.
       skipped: names of scenes without any possible goal, which are in no shard.
+      checksum: CRC-32 of all that the shards hold.
     """
 
     folder: Path
@@ -51,9 +53,13 @@ class Shards:
     num_cells: int
     num_scenes: int
     skipped: tuple[str, ...]
+    checksum: int
 
     def __len__(self) -> int:
         return len(self.paths)
+
+    def __iter__(self) -> Iterator[Bank]:
+        return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Bank:
         """One shard.
@@ -124,6 +130,7 @@ def compile_shards(
         num_cells=max(text["cells"] for _, text in usable),
         num_scenes=max(counts),
         skipped=tuple(name for text in texts for name in text["skipped"]),
+        checksum=zlib.crc32(repr([text["checksum"] for _, text in usable]).encode()),
     )
 
 
@@ -149,7 +156,8 @@ class _Work:
         arrays = {}
         if any(table.best_length.any() for table in tables):
             bank = join(tables, self.task)
-            texts = {field: getattr(bank, field) for field in _TEXTS} | {"cells": len(bank.ahead)}
+            texts = {field: getattr(bank, field) for field in _TEXTS}
+            texts |= {"cells": len(bank.ahead), "checksum": checksum(bank)}
             arrays = {field: getattr(bank, field) for field in _ARRAYS}
         _write(self.paths[number], texts, arrays)
 

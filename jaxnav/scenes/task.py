@@ -5,7 +5,13 @@ from typing import Literal
 
 import numpy as np
 
-from jaxnav.scenes.categories import ITHOR_CATEGORIES
+from jaxnav.scenes.categories import (
+    GIBSON_CATEGORIES,
+    GIBSON_GOALS,
+    ITHOR_CATEGORIES,
+    ROBOTHOR_CATEGORIES,
+    ROBOTHOR_GOALS,
+)
 from jaxnav.scenes.detector import Detector
 
 NUM_ACTIONS = 6
@@ -76,3 +82,15 @@ class Task:
     def is_goal(self) -> np.ndarray:
         """Which categories can be looked for, bool [K]."""
         return np.array([not self.goals or name in self.goals for name in self.categories])
+
+
+#: What is asked in AI2-THOR rooms, in RoboTHOR apartments and in Gibson houses.
+ROOMS = Task()
+APARTMENTS = Task(
+    ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS, Rules(headings=12, field_of_view=(79.0, 63.5), success_distance=1.0)
+)
+HOUSES = Task(
+    GIBSON_CATEGORIES,
+    GIBSON_GOALS,
+    Rules(headings=12, horizons=(0.0,), field_of_view=(79.0, 63.5), camera=0.88, success="near", success_distance=1.0),
+)

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Protocol
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.categories import GIBSON_CATEGORIES, GIBSON_GOALS, ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS
 from jaxnav.scenes.homes import generate_apartment, generate_house
 from jaxnav.scenes.io import read_scenes
 from jaxnav.scenes.record import read_bytes
 from jaxnav.scenes.rooms import generate_room_at
 from jaxnav.scenes.scene import SPLITS, Scene
-from jaxnav.scenes.task import Rules, Task
+from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +43,7 @@ WORLDS = {
     "rooms": World(
         generate=generate_room_at,
         counts={"train": 80, "val": 20, "test": 20},
-        task=Task(),
+        task=ROOMS,
         train_step_limit=30,
         step_limit=100,
         large_step_limit=200,
@@ -53,9 +52,7 @@ WORLDS = {
     "apartments": World(
         generate=generate_apartment,
         counts={"train": 60, "val": 15, "test": 15},
-        task=Task(
-            ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS, Rules(headings=12, field_of_view=(79.0, 63.5), success_distance=1.0)
-        ),
+        task=APARTMENTS,
         train_step_limit=100,
         step_limit=500,
         large_step_limit=500,
@@ -64,18 +61,7 @@ WORLDS = {
     "houses": World(
         generate=generate_house,
         counts={"train": 25, "val": 5, "test": 5},
-        task=Task(
-            GIBSON_CATEGORIES,
-            GIBSON_GOALS,
-            Rules(
-                headings=12,
-                horizons=(0.0,),
-                field_of_view=(79.0, 63.5),
-                camera=0.88,
-                success="near",
-                success_distance=1.0,
-            ),
-        ),
+        task=HOUSES,
         train_step_limit=100,
         step_limit=500,
         large_step_limit=500,
