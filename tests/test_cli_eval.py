@@ -130,3 +130,29 @@ def test_damaged_files_are_named(tmp_path, run_dir, capsys):
     (tmp_path / "config.json").write_text(text[: len(text) // 2])
     assert evaluate(tmp_path) == 2
     assert f"{tmp_path}/config.json" in refusal(capsys)
+
+
+def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(run_dir, run)
+    assert evaluate(run, "--episodes", 4, "--shift", 1) == 0
+    report = json.loads((run / "eval-val-shift1.json").read_text())
+    assert report["run"]["evaluation_shift"] == 1.0
+    assert report["run"]["worlds"]["shift"] == 0.0
+    assert not (run / "eval-val.json").exists()
+    capsys.readouterr()
+    assert evaluate(run, "--shift", 1.5) == 2
+    assert "give a seed of at least 0, a shift from 0 to 1" in refusal(capsys)
+    (tmp_path / "a.jsonl.gz").write_bytes(b"")
+    assert evaluate(run, "--shift", 0.5, "--scenes", tmp_path / "a.jsonl.gz") == 2
+    assert "--shift 0.5: only generated scenes can be shifted" in refusal(capsys)
+
+
+def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(run_dir, run)
+    config = json.loads((run / "config.json").read_text())
+    config["detector"]["false_alarm"] = 0.25
+    (run / "config.json").write_text(json.dumps(config))
+    assert evaluate(run) == 2
+    assert "was trained for another task than its run says" in refusal(capsys)

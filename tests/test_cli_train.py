@@ -1,13 +1,16 @@
 """The train command end to end, and all that it refuses."""
 
+import csv
 import gzip
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import POLICIES, SEEDS, contents, finished_run, refusal, train
+from commands import POLICIES, SEEDS, contents, evaluate, finished_run, refusal, train
 
 from jaxnav.cli import train as train_command
+from jaxnav.cli.train import layout_priors
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.store.export import load_params
 from jaxnav.store.runlog import read_rows
@@ -93,13 +96,26 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("seed: 4294967296", "seed is 4294967296; give a whole number from 0"),
         ("worlds: {seed: -1}", "worlds.seed is -1; give a whole number from 0"),
         ("detector: {seed: -1}", "detector.seed is -1; give a whole number from 0"),
+        ("worlds: {shift: 1.5}", "worlds.shift is 1.5; give a number from 0 to 1"),
+        ("worlds: {shaping: .inf}", "worlds.shaping is inf; give 0 or more"),
+        ("worlds: {categories: [Chair]}", "worlds.categories is ('Chair',); give at least 2"),
+        (
+            "worlds: {categories: [Chair, Sink, Chair]}",
+            "worlds.categories is ('Chair', 'Sink', 'Chair'); give each once",
+        ),
+        ("worlds: {goals: [Chair, Unicorn]}", "worlds.goals is ['Unicorn']; give some of the categories AlarmClock,"),
+        ("{world: houses, scenes: none.jsonl.gz}", "none.jsonl.gz: cannot be read"),
+        (
+            "{world: houses, worlds: {num_train: 9, shard_scenes: 8}, chunk: 1}",
+            "chunk is 1; where scenes are streamed it",
+        ),
         ("seeds: 1\nseeds: 2", "line 2: not valid YAML (seeds is given twice)"),
     ],
 )
 def test_bad_settings_are_refused_before_anything_is_made(tmp_path, capsys, line, problem):
     file = tmp_path / "bad.yaml"
     file.write_text(line)
-    assert train(file, tmp_path / "run") == 2
+    assert train(file, tmp_path / "run", "--cache", tmp_path / "cache") == 2
     assert problem in refusal(capsys)
     assert not (tmp_path / "run").exists()
 
@@ -153,3 +169,26 @@ def test_a_damaged_config_is_named(tmp_path, run_dir, config_file, capsys):
     (tmp_path / "config.json").write_text(text[: len(text) // 2])
     assert train(config_file, tmp_path) == 2
     assert f"{tmp_path}/config.json" in refusal(capsys)
+
+
+def test_a_vocabulary_of_ones_own_is_trained_resumed_and_evaluated(tmp_path, config_file, capsys):
+    """Three categories, two of them goals, in a run that is then found finished and evaluated."""
+    run_dir = tmp_path / "own"
+    options = ("--seeds", 1, "--total-steps", 256, "--worlds.categories", "Chair", "Sink", "LightSwitch",
+               "--worlds.goals", "Sink", "LightSwitch")  # fmt: skip
+    assert train(config_file, run_dir, *options) == 0
+    assert train(config_file, run_dir, *options) == 0
+    assert "resumed after update 2 of 2" in capsys.readouterr().err
+    task = load_params(run_dir / "policies" / "layout-0")[1]["task"]
+    assert (task["categories"], task["goals"]) == (["Chair", "Sink", "LightSwitch"], ["Sink", "LightSwitch"])
+    assert evaluate(run_dir, "--episodes", 8) == 0
+    with (run_dir / "eval-val.episodes.csv").open() as file:
+        assert {row["goal"] for row in csv.DictReader(file)} == {"Sink", "LightSwitch"}
+
+
+def test_room_types_without_training_scenes_get_the_prior_of_all_together():
+    counts = np.zeros((3, 2, 2), np.float32)
+    counts[0], counts[2] = [[5, 3], [3, 4]], [[2, 1], [1, 2]]
+    # By the letter of the paper the prior is the counts and one: 3 + 1, 3 + 1 + 1, 1 + 1.
+    priors = layout_priors(jnp.asarray(counts), "paper")
+    np.testing.assert_array_equal(priors[:, 0, 1], [4, 5, 2])

@@ -154,6 +154,28 @@ def test_starts_are_uniform(rules):
     assert not uniform(np.append(scene, np.zeros(1000, int)), [0, 1])  # the test can tell
 
 
+@pytest.mark.parametrize(("rules", "ahead"), [(ROOMS, 1.0), (HOUSES, 0.75)])
+def test_shaping_rewards_metres_nearer_to_the_goal(rules, ahead):
+    # A corridor of 8 cells along z; the book's centre is at z = 2.75, its footprint from 2.5 m on (sight: 2.75 - z to
+    # the centre, walk: 2.5 - z to the footprint). Each MoveAhead is 0.25 m, whatever is measured.
+    corridor = draw(["."] * 8, ("Book", 0, 1.0, 2.75, 0.5, 0.5, 0.5))
+    bank = compile_bank([corridor], Task(CATEGORIES, rules=rules))
+    plain, params = build(bank, {}, 100)
+    shaped, _ = build(bank, {}, 100, shaping=2.0)
+    per_cell = rules.poses_per_cell
+    back = rules.headings // 2 * len(rules.horizons)
+    start = State(pose=jnp.int32(3 * per_cell), scene=jnp.int32(0), goal=jnp.int32(BOOK), time=jnp.int32(0))
+    turned = start.replace(pose=start.pose + back)
+    assert plain.advance(start, jnp.int32(MOVE_AHEAD), params)[1] == jnp.float32(-0.01)
+    for state, action, metres in [(start, MOVE_AHEAD, 0.25), (turned, MOVE_AHEAD, -0.25), (start, LOOK_UP, 0.0)]:
+        reward = shaped.advance(state, jnp.int32(action), params)[1]
+        np.testing.assert_allclose(reward, -0.01 + 2.0 * metres, atol=1e-6)
+    done = start.replace(pose=jnp.int32(7 * per_cell))
+    np.testing.assert_allclose(bank.goal_distance[7, BOOK], ahead)  # z = 1.75
+    assert shaped.advance(done, jnp.int32(DONE), params)[1] == 5.0
+    assert make("rooms")[0].shaping == 0.0
+
+
 def test_padded_tables_hold_the_same_episodes():
     cells, cell_poses = len(BANK.ahead), BANK.task.rules.poses_per_cell
     env, params = build(BANK, {"kitchen": 7}, 9)
