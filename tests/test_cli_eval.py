@@ -9,6 +9,8 @@ import pytest
 from commands import SEEDS, contents, evaluate, finished_run, refusal
 
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
+from jaxnav.scenes.io import write_scenes
+from jaxnav.scenes.worlds import generated
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +145,25 @@ def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys
     capsys.readouterr()
     assert evaluate(run, "--shift", 1.5) == 2
     assert "give a seed of at least 0, a shift from 0 to 1" in refusal(capsys)
-    (tmp_path / "a.jsonl.gz").write_bytes(b"")
-    assert evaluate(run, "--shift", 0.5, "--scenes", tmp_path / "a.jsonl.gz") == 2
-    assert "--shift 0.5: only generated scenes can be shifted" in refusal(capsys)
+
+
+def test_a_shift_relabels_a_scene_file(run_dir, tmp_path, capsys):
+    run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
+    shutil.copytree(run_dir, run)
+    config = json.loads((run / "config.json").read_text())
+    config["worlds"]["shift"] = 0.5  # of the run's own scenes; a file is taken as it is
+    (run / "config.json").write_text(json.dumps(config))
+    write_scenes(file, (generated("rooms", "val")[i] for i in range(2)))
+    told = {}
+    for shift, options in ((0.0, ()), (1.0, ("--shift", 1))):
+        target = tmp_path / f"{shift}.json"
+        assert evaluate(run, "--episodes", 40, "--scenes", file, "--json", target, *options) == 0
+        assert json.loads(target.read_text())["run"]["evaluation_shift"] == shift
+        told[shift] = [(row["scene"], row["goal"], row["start_pose"], row["best_length"]) for row in _episodes(target)]
+    assert told[0.0] != told[1.0]
+    capsys.readouterr()
+    assert evaluate(run, "--shift", 1.5, "--scenes", file) == 2
+    assert "relabelling: seed 0, shift 1.5; give" in refusal(capsys)
 
 
 def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):

@@ -104,6 +104,8 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, capsys):
         ("procthor", ["--from-controller"], "--from-controller: is for the format ai2thor, not for procthor"),
         ("ai2thor", ["--maps", "a.pbz2"], "--maps: is for the format habitat, not for ai2thor"),
         ("habitat", ["--assets", "a.json"], "--assets: is for the format procthor, not for habitat"),
+        ("ai2thor", ["--base", "a.jsonl.gz"], "--base: is for the format replacements, not for ai2thor"),
+        ("replacements", [], "--base: is missing; replacements need the scene file"),
         ("ai2thor", ["--val", "FloorPlan9?"], "pattern 'FloorPlan9?': fits no scene"),
     ],
 )

@@ -139,6 +139,13 @@ def test_scenes_in_which_nothing_is_seen_together_have_no_gap(tmp_path_factory, 
     assert row(rows[start:], "kitchen") == ["0"]
 
 
+def test_a_shift_exchanges_labels_in_a_file(file, capsys):
+    own, shifted = (stats(capsys, file, *options) for options in ((), ("--shift", "1")))
+    # Two books and a chair: who is in half of the scenes, how many, how high.
+    assert row(own, "Book")[:3] == row(shifted, "Chair")[:3] == ["50%", "2.00", "0.90 m"]
+    assert row(own, "Chair")[:3] == row(shifted, "Book")[:3] == ["50%", "1.00", "0.50 m"]
+
+
 def test_what_is_refused(tmp_path, tmp_path_factory, file, capsys):
     _, run_dir = commands.finished_run(tmp_path_factory)
     for arguments, words in (

@@ -20,7 +20,7 @@ class WorldConfig:
     Attributes:
       num_train, num_val, num_test: generated scenes of each split.
       seed: of the generator.
-      shift: layout shift of the generated scenes, from 0 to 1.
+      shift: layout shift of the scenes, from 0 to 1; those of a file are relabelled.
       categories: what can be detected.
       goals: what of it can be looked for; None with categories of one's own: all of them.
       train_step_limit: actions of a training episode.

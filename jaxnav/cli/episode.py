@@ -35,7 +35,7 @@ class EpisodeConfig:
       variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.
       scenes: scene file to read instead of the run's own world or file.
-      shift: layout shift of generated scenes, from 0 to 1; default: the run's.
+      shift: layout shift of the scenes, from 0 to 1; default: the run's.
     """
 
     run: Annotated[Path, tyro.conf.Positional]

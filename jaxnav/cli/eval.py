@@ -11,9 +11,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.config import RunConfig
 from jaxnav.cli.runs import load_policies, load_run, settings
-from jaxnav.cli.worlds import evaluation_world, read_ahead
+from jaxnav.cli.worlds import evaluation_shift, evaluation_world, read_ahead
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
@@ -42,7 +41,8 @@ class EvalConfig:
       run: the run directory.
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
-      shift: layout shift of generated scenes, from 0 to 1; default: the run's.
+      shift: from 0 to 1: layout shift of generated scenes, in a file the share of the categories that exchange their
+        labels; default: the run's, and 0 with `--scenes`.
       episodes: in the fixed list, balanced over room types and scenes; where scenes are streamed equally many in every
         shard, and balanced there.
       epsilon: thresholds of sTDE; all of them in one compiled call.
@@ -104,7 +104,7 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         "steps_per_policy": run.total_updates * run.update_steps,
         "prior_steps": policies.prior_steps,
         "evaluation_source": str(config.scenes or run.source),
-        "evaluation_shift": None if config.scenes or run.scenes else _shift(config, run),
+        "evaluation_shift": evaluation_shift(run, config.scenes, config.shift),
         "evaluation_seed": config.seed,
     }
     report = build_report(table, differences, compilations, about)
@@ -125,10 +125,6 @@ def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
         return np.concatenate([leaf, np.broadcast_to(own, leaf.shape[1:])[None].astype(leaf.dtype)])
 
     return jax.tree.map(added, outcome, shortest)
-
-
-def _shift(config: EvalConfig, run: RunConfig) -> float:
-    return run.worlds.shift if config.shift is None else config.shift
 
 
 def _target(config: EvalConfig) -> Path:

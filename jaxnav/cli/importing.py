@@ -17,6 +17,7 @@ from jaxnav.scenes.importers.ai2thor import read_ai2thor
 from jaxnav.scenes.importers.controller import read_controller
 from jaxnav.scenes.importers.habitat import read_habitat
 from jaxnav.scenes.importers.procthor import read_procthor
+from jaxnav.scenes.importers.replacements import read_replacements
 from jaxnav.scenes.importers.scene_data import read_scene_data
 from jaxnav.scenes.io import iterate_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
@@ -35,7 +36,7 @@ USUAL_WORLDS = {
     "houses": "houses",
 }
 #: Options that only one format has.
-OWN_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor"}
+OWN_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor", "base": "replacements"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +46,8 @@ class ImportConfig:
     Attributes:
       format: `procthor`: houses as JSON or JSON lines; `ai2thor`: metadata of the controller with reachable positions,
         a file or a folder of files; `scene-data`: the offline folders of SAVN, ORG and L-sTDE; `habitat`: an ObjectNav
-        split or one of its files; `scenes`: a scene file, to divide it into splits.
+        split or one of its files; `replacements`: places of movable objects in the rooms of `--base`; `scenes`: a scene
+        file, to divide it into splits.
       source: what to read; with `--from-controller` names of scenes with commas between them.
       out: scene file to write (`*.jsonl.gz`).
       split: of the scenes that none of the following patterns fits.
@@ -55,9 +57,12 @@ class ImportConfig:
       assets: asset database of ProcTHOR (JSON), for types and sizes.
       maps: semantic floor maps for Habitat episodes (`*_info.pbz2`).
       from_controller: read from an installed `ai2thor` simulator instead of from files.
+      base: scene file with the rooms that re-placements are of.
     """
 
-    format: Annotated[Literal["procthor", "ai2thor", "scene-data", "habitat", "scenes"], tyro.conf.Positional]
+    format: Annotated[
+        Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"], tyro.conf.Positional
+    ]
     source: Annotated[str, tyro.conf.Positional]
     out: Annotated[Path, tyro.conf.Positional]
     split: Split = "train"
@@ -68,6 +73,7 @@ class ImportConfig:
     assets: Path | None = None
     maps: Path | None = None
     from_controller: bool = False
+    base: Path | None = None
 
 
 def import_scenes(config: ImportConfig, console: Console) -> None:
@@ -115,6 +121,10 @@ def _read(config: ImportConfig) -> Imported:
     path, split = Path(config.source), config.split
     if config.from_controller:
         return read_controller(config.source.split(","), split)
+    if config.format == "replacements":
+        if config.base is None:
+            raise InputError("--base: is missing; replacements need the scene file of their rooms")
+        return read_replacements(path, config.base)
     readers: dict[str, Callable[[], Imported]] = {
         "procthor": lambda: read_procthor(path, split, config.assets),
         "ai2thor": lambda: read_ai2thor(path, split),

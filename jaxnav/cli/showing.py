@@ -103,11 +103,11 @@ def choose(config: ShowConfig) -> Scene:
         index = config.index or 0
         if index < 0:
             raise InputError(f"--index {index}: give 0 or more")
-        scenes = config.scenes(index + 1)
+        scenes = config.scenes(config.task, index + 1)
         if index >= len(scenes):
             raise InputError(f"--index {index}: {config.file} holds {len(scenes)} scenes; give 0 to {len(scenes) - 1}")
         return scenes[index]
-    scenes = config.scenes()
+    scenes = config.scenes(config.task)
     named = {scene.name: scene for scene in (scenes[i] for i in range(len(scenes)))}
     if config.scene not in named:
         near = difflib.get_close_matches(config.scene, named, n=3)

@@ -19,11 +19,10 @@ from jaxnav.evaluation.plan import scene_size
 from jaxnav.evaluation.similarity import layout_gap, layout_similarity, seen_together
 from jaxnav.scenes.categories import ROOM_TYPES, category_ids, unknown_types
 from jaxnav.scenes.compile import compile_scene
-from jaxnav.scenes.io import read_scenes
 from jaxnav.scenes.rows import RowLayout
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, FileScenes, Scenes, from_file, generated
+from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
 
 _PAIRS = 15
 
@@ -35,8 +34,8 @@ class Source:
     Attributes:
       file: scene file, or the name of a generated world: `rooms`, `apartments` or `houses`.
       split: of the scenes; default: all of a file, `val` of a generated world.
-      seed: of a generated world.
-      shift: layout shift of a generated world, from 0 to 1.
+      seed: of a generated world, and of the shift.
+      shift: from 0 to 1: layout shift of a generated world, in a file the share of the categories that exchange labels.
       world: world whose categories and rules count; default: the generated one, and `rooms` for a file.
     """
 
@@ -51,10 +50,11 @@ class Source:
         """Categories and rules."""
         return WORLDS[self.world or (self.file if self.file in WORLDS else "rooms")].task
 
-    def scenes(self, count: int | None = None) -> Scenes:
+    def scenes(self, task: Task, count: int | None = None) -> Scenes:
         """The scenes.
 
         Args:
+          task: whose categories a shift exchanges in a file.
           count: how many of a generated world; None for as many as usual.
 
         Raises:
@@ -62,9 +62,7 @@ class Source:
         """
         if self.file in WORLDS:
             return generated(self.file, self.split or "val", count, self.seed, self.shift)
-        if self.split is None:
-            return FileScenes(tuple(read_scenes(self.file)), self.file)
-        return from_file(self.file, self.split)
+        return from_file(self.file, self.split, self.shift, self.seed, task.categories)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +109,7 @@ def tell_statistics(config: StatsConfig, console: Console) -> None:
         raise InputError("--world, --run: both are given, but the run has a world; leave --world out")
     run = load_run(config.run) if config.run else None
     task, policies = (run.task, load_policies(run)) if run else (config.task, None)
-    scenes = config.scenes()
+    scenes = config.scenes(task)
     every = (scenes[i] for i in range(len(scenes)))
     progress = Console(stderr=True)
     bar = track(every, "compiling", len(scenes), console=progress, transient=True, disable=not progress.is_terminal)

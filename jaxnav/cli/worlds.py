@@ -62,21 +62,23 @@ def evaluation_world(
       InputError: bad scene file, no scene of the split, or a bad shift.
     """
     world = WORLDS[config.world]
-    if shift is not None and (scenes or config.scenes):
-        raise InputError(
-            f"--shift {shift}: only generated scenes can be shifted; leave it out or evaluate without --scenes"
-        )
     limits = {"living_room": config.worlds.large_step_limit or world.large_step_limit}
     limit = config.worlds.step_limit or world.step_limit
-    shift = config.worlds.shift if shift is None else shift
-    chosen = _scenes(config, split, scenes or config.scenes, shift, console)
+    chosen = _scenes(config, split, scenes or config.scenes, evaluation_shift(config, scenes, shift), console)
     return _compiled(config, chosen, limits, limit, console)
+
+
+def evaluation_shift(config: RunConfig, scenes: Path | None, shift: float | None) -> float:
+    """The shift that is asked for, else the run's own; another file is taken as it is."""
+    if shift is not None:
+        return shift
+    return 0.0 if scenes else config.worlds.shift
 
 
 def _scenes(config: RunConfig, split: str, path: Path | None, shift: float, console: Console) -> Scenes:
     if path is None:
         return generated(config.world, split, getattr(config.worlds, f"num_{split}"), config.worlds.seed, shift)
-    scenes = from_file(path, split)
+    scenes = from_file(path, split, shift, config.worlds.seed, config.task.categories)
     if counts := unknown_types(scenes.scenes, config.task.categories):
         types = ", ".join(f"{name} x {count}" for name, count in counts.most_common(5))
         rest = f" and {len(counts) - 5} more" if len(counts) > 5 else ""

@@ -26,8 +26,8 @@ def make(
       split: `train`, `val` or `test`; training episodes are shorter.
       scenes: path of a scene file to read instead.
       task: what is asked instead of the world's own.
-      seed: of the generated scenes.
-      shift: layout shift of the generated scenes, from 0 to 1.
+      seed: of the generated scenes, or of the relabelling of those of a file.
+      shift: layout shift from 0 to 1; on the scenes of a file by relabelling.
 
     Raises:
       InputError: bad world, split or scene file, or no scene with a reachable goal.
@@ -35,8 +35,12 @@ def make(
     if world not in WORLDS:
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}; a scene file goes to `scenes`")
     own = WORLDS[world]
-    chosen = generated(world, split, None, seed, shift) if scenes is None else from_file(scenes, split)
-    bank = compile_bank((chosen[i] for i in range(len(chosen))), task or own.task)
+    task = task or own.task
+    if scenes is None:
+        chosen = generated(world, split, None, seed, shift)
+    else:
+        chosen = from_file(scenes, split, shift, seed, task.categories)
+    bank = compile_bank((chosen[i] for i in range(len(chosen))), task)
     if split == "train":
         return build(bank, {}, own.train_step_limit, shaping=own.shaping)
     return build(bank, {"living_room": own.large_step_limit}, own.step_limit)

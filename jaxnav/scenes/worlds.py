@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Protocol
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.scenes.homes import generate_apartment, generate_house
 from jaxnav.scenes.io import read_scenes
 from jaxnav.scenes.record import read_bytes
+from jaxnav.scenes.relabel import relabel
 from jaxnav.scenes.rooms import generate_room_at
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
@@ -117,11 +119,11 @@ class GeneratedScenes:
 
 @dataclasses.dataclass(frozen=True)
 class FileScenes:
-    """Scenes of one split of a scene file.
+    """Scenes of a scene file.
 
     Attributes:
-      scenes: as read.
-      identity: split and checksum of the file.
+      scenes: as read, or relabelled.
+      identity: split and checksum of the file, and how it is relabelled.
     """
 
     scenes: tuple[Scene, ...]
@@ -158,19 +160,36 @@ def generated(world: str, split: str, count: int | None = None, seed: int = 0, s
     return GeneratedScenes(world, split, count, seed, shift)
 
 
-def from_file(path: str | Path, split: str) -> FileScenes:
+def from_file(
+    path: str | Path,
+    split: str | None,
+    shift: float = 0.0,
+    seed: int = 0,
+    categories: tuple[str, ...] = ITHOR_CATEGORIES,
+) -> FileScenes:
     """The scenes of one split of a scene file.
 
+    Args:
+      path: the scene file.
+      split: `train`, `val` or `test`; None for all scenes.
+      shift: share of the categories present in a scene that exchange their labels, from 0 to 1; see `relabel`.
+      seed: of the relabelling.
+      categories: the vocabulary that is relabelled.
+
     Raises:
-      InputError: unknown split, no readable scene file, or it holds no scene of the split.
+      InputError: unknown split, no readable scene file, it holds no scene of the split, or an impossible number.
     """
-    _check_split(split)
+    if split is not None:
+        _check_split(split)
     scenes = read_scenes(path)
-    chosen = tuple(scene for scene in scenes if scene.split == split)
+    chosen = [scene for scene in scenes if split in (None, scene.split)]
     if not chosen:
         held = sorted({scene.split for scene in scenes})
         raise InputError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(held)}")
-    return FileScenes(chosen, f"{split} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}")
+    identity = f"{split or 'all'} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}"
+    if shift:
+        identity += f", relabelled: {shift=}, {seed=}, {categories=}"
+    return FileScenes(tuple(relabel(scene, categories, shift, seed) for scene in chosen), identity)
 
 
 def _check_split(split: str) -> None:
