@@ -1,4 +1,4 @@
-"""The jaxnav command: `python -m jaxnav train | eval | episode | scenes | table`."""
+"""The jaxnav command: `python -m jaxnav train | eval | episode | instrument | scenes | table`."""
 
 import difflib
 import importlib
@@ -8,11 +8,12 @@ COMMANDS = {
     "train": "train a method with and without the layout estimator",
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
     "episode": "draw one evaluation episode of a run",
+    "instrument": "prove that the layout shift leaves the difficulty and costs the baseline",
     "scenes": "import scenes, show one as a picture, tell what a file of them holds",
     "table": "print an evaluation as a Markdown table",
 }
 
-HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:9} {what}\n" for name, what in COMMANDS.items())
+HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {what}\n" for name, what in COMMANDS.items())
 
 
 def main(arguments: list[str] | None = None) -> int:
