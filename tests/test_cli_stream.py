@@ -121,6 +121,7 @@ def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache
         assert (stopped / name).read_bytes() == (finished / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_streamed_evaluation_is_one_compilation_and_knows_all_scenes(finished, tmp_path):
     target = tmp_path / "train.json"
     assert evaluate(finished, "--split", "train", "--episodes", 24, "--json", target) == 0

@@ -171,6 +171,7 @@ def test_a_damaged_config_is_named(tmp_path, run_dir, config_file, capsys):
     assert f"{tmp_path}/config.json" in refusal(capsys)
 
 
+@pytest.mark.slow
 def test_a_vocabulary_of_ones_own_is_trained_resumed_and_evaluated(tmp_path, config_file, capsys):
     """Three categories, two of them goals, in a run that is then found finished and evaluated."""
     run_dir = tmp_path / "own"
