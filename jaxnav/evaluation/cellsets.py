@@ -43,9 +43,7 @@ def body(rules: Rules) -> Body:
     """How it moves and sees under the rules (docs/environment.md)."""
     view = RowLayout(0).view
     ahead, right = np.arange(view).repeat(view), np.tile(np.arange(view) - view // 2, view)
-    forward = rules.directions()[:, None, ::-1]  # [H, 1, (z, x)]
-    rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
-    offsets = np.rint(forward * ahead[:, None] + rightward * right[:, None]).astype(int)  # [H, V V, 2]
+    offsets = rules.view_offsets(view).reshape(rules.headings, -1, 2)
     flat = offsets @ (SIDE, 1)
     near = (np.abs(right) <= rules.half_view[0] * ahead) & (CELL * np.hypot(*np.moveaxis(offsets, -1, 0)) <= MIN_RANGE)
     return Body(

@@ -210,11 +210,7 @@ def _walks(
 def _ego_views(scene: Scene, rules: Rules, cells: np.ndarray, view: int) -> np.ndarray:
     """Ego-centric views uint8 [P, V, V]: unknown, standable or not."""
     steps, side = np.arange(view), np.arange(view) - view // 2
-    forward = rules.directions()[:, ::-1]  # [H, (z, x)]
-    rightward = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
-    offsets = np.rint(
-        forward[:, None, None] * steps[:, None, None] + rightward[:, None, None] * side[:, None] + 0.0
-    ).astype(int)  # [H, V, V, 2]
+    offsets = rules.view_offsets(view)
     in_cone = np.abs(side) <= rules.half_view[0] * steps[:, None]  # [V, V]; the own cell is in it
     looked_at, which = np.unique(offsets[:, in_cone].reshape(-1, 2), axis=0, return_inverse=True)
 

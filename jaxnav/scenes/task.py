@@ -58,6 +58,13 @@ class Rules:
         angles = np.deg2rad(360.0 / self.headings * np.arange(self.headings))
         return np.round(np.stack([np.sin(angles), np.cos(angles)], axis=-1), 12)
 
+    def view_offsets(self, view: int) -> np.ndarray:
+        """(dz, dx) from the agent of the cells of the ego-centric view, `view` V cells a side: int [H, V, V, 2]."""
+        ahead, side = np.arange(view), np.arange(view) - view // 2
+        forward = self.directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
+        rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
+        return np.rint(forward * ahead[:, None, None] + rightward * side[:, None]).astype(int)
+
     def steps(self) -> np.ndarray:
         """(dz, dx) of MoveAhead for each heading, to the neighbouring cell in the nearest direction: int [H, 2]."""
         return NEIGHBOURS[np.rint(8 / self.headings * np.arange(self.headings)).astype(int) % 8]
