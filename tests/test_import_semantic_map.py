@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES
-from jaxnav.scenes.importers.semantic_map import connected_parts, floor_map, read_maps, scene_of_map
-from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.importers.semantic_map import floor_map, read_maps, scene_of_map
+from jaxnav.scenes.lattice import connected_parts, standable_cells
 from jaxnav.scenes.scene import Scene
 
 CHAIR, BED = (1 + GIBSON_CATEGORIES.index(name) for name in ("Chair", "Bed"))

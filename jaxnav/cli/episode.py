@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import tyro
 from rich.console import Console
 
+from jaxnav.cli.command import exit_code
 from jaxnav.cli.runs import load_policies, load_run
 from jaxnav.cli.worlds import evaluation_world
 from jaxnav.env.types import State
@@ -50,19 +51,18 @@ class EpisodeConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
-    console = Console(stderr=True, highlight=False)
-    try:
-        config = tyro.cli(EpisodeConfig, args=arguments, prog="jaxnav episode", description="Draw one episode.")
-        target = config.out or config.run / "episode.gif"
-        if target.suffix not in (".gif", ".png"):
-            raise InputError(f"--out {target}: give a name that ends in .gif or .png")
-        episode = play_episode(config, console)
-        draw_episode(episode, target)
-        console.print(f"{len(episode.trace.pose)} steps; written to {target}", soft_wrap=True)
-    except InputError as error:
-        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        return 2
-    return 0
+    config = tyro.cli(EpisodeConfig, args=arguments, prog="jaxnav episode", description="Draw one episode.")
+    return exit_code(lambda console: draw(config, console))
+
+
+def draw(config: EpisodeConfig, console: Console) -> None:
+    """Play the episode and write its picture."""
+    target = config.out or config.run / "episode.gif"
+    if target.suffix not in (".gif", ".png"):
+        raise InputError(f"--out {target}: give a name that ends in .gif or .png")
+    episode = play_episode(config, console)
+    draw_episode(episode, target)
+    console.print(f"{len(episode.trace.pose)} steps; written to {target}", soft_wrap=True)
 
 
 def play_episode(config: EpisodeConfig, console: Console) -> Episode:

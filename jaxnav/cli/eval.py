@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from jaxnav.cli.command import exit_code, result_console
 from jaxnav.cli.runs import load_policies, load_run, settings
 from jaxnav.cli.worlds import evaluation_shift, evaluation_world, read_ahead
 from jaxnav.errors import InputError
@@ -64,14 +65,8 @@ class EvalConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
-    console, out = Console(stderr=True, highlight=False), Console(width=120, highlight=False)
-    try:
-        config = tyro.cli(EvalConfig, args=arguments, prog="eval.py", description="Evaluate a training run.")
-        evaluate(config, console, out)
-    except InputError as error:
-        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        return 2
-    return 0
+    config = tyro.cli(EvalConfig, args=arguments, prog="eval.py", description="Evaluate a training run.")
+    return exit_code(lambda console: evaluate(config, console, result_console()))
 
 
 def evaluate(config: EvalConfig, console: Console, out: Console) -> None:

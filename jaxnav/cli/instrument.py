@@ -9,6 +9,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from jaxnav.cli.command import exit_code, result_console
 from jaxnav.cli.config import RunConfig
 from jaxnav.cli.runs import Policies, load_policies, load_run, settings
 from jaxnav.cli.worlds import CompiledWorld, evaluation_world, read_ahead
@@ -50,14 +51,8 @@ class InstrumentConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, also where the proof fails, or 2 after bad input."""
-    console, out = Console(stderr=True, highlight=False), Console(width=120, highlight=False)
-    try:
-        config = tyro.cli(InstrumentConfig, args=arguments, prog="eval.py instrument", description="Prove the dial.")
-        prove(config, console, out)
-    except InputError as error:
-        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        return 2
-    return 0
+    config = tyro.cli(InstrumentConfig, args=arguments, prog="eval.py instrument", description="Prove the dial.")
+    return exit_code(lambda console: prove(config, console, result_console()))
 
 
 def prove(config: InstrumentConfig, console: Console, out: Console) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
+from jaxnav.cli.command import exit_code
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import FORMAT, markdown_table
 
@@ -26,12 +26,7 @@ class TableConfig:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
     config = tyro.cli(TableConfig, args=arguments, prog="jaxnav table", description="Print an evaluation as Markdown.")
-    try:
-        print(markdown_table(_read(config.file)), end="")
-    except InputError as error:
-        Console(stderr=True, highlight=False).print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        return 2
-    return 0
+    return exit_code(lambda _: print(markdown_table(_read(config.file)), end=""))
 
 
 def _read(path: Path) -> dict:

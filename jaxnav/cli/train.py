@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from jaxnav.cli.arms import Arms, States
+from jaxnav.cli.command import exit_code
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse_run
 from jaxnav.cli.runs import LOG_FILE, POLICIES, claim, settings
 from jaxnav.cli.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.env.objectnav import ObjectNav
-from jaxnav.errors import InputError
 from jaxnav.layout import prior_from_counts
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.export import export_params
@@ -30,13 +30,8 @@ _EXPLORE = 2**31 - 1  # purpose of the prior's key; seeds use 0, 1, ...
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
-    console = Console(stderr=True, highlight=False)
-    try:
-        train(check(parse_run(sys.argv[1:] if arguments is None else arguments)), console)
-    except InputError as error:
-        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        return 2
-    return 0
+    given = sys.argv[1:] if arguments is None else arguments
+    return exit_code(lambda console: train(check(parse_run(given)), console))
 
 
 def train(config: RunConfig, console: Console) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxnav.scenes.scene import CELL
-from jaxnav.scenes.task import DONE, NEIGHBOURS, NUM_ACTIONS, Rules
+from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
 
 
 def standable_cells(reach: np.ndarray) -> np.ndarray:
@@ -11,22 +11,30 @@ def standable_cells(reach: np.ndarray) -> np.ndarray:
 
     Of equally large parts it takes the one that comes first in row order.
     """
-    left = np.pad(reach, 1)
-    stride = left.shape[1]
-    around = (NEIGHBOURS @ (stride, 1)).tolist()
-    free, best = set(np.flatnonzero(left).tolist()), []
-    for first in np.flatnonzero(left).tolist():
-        if first not in free:
-            continue
-        free.remove(first)
-        part = [first]
-        for cell in part:
-            for step in around:
-                if cell + step in free:
-                    free.remove(cell + step)
-                    part.append(cell + step)
-        best = max(best, part, key=len)
-    return np.stack(np.divmod(np.sort(np.array(best, np.int64)), stride), axis=-1) - 1
+    return max(connected_parts(reach), key=len, default=np.zeros((0, 2), np.int64))
+
+
+def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
+    """Parts of a mask [n, m] whose cells touch, be it at corners: int [P, 2] each, parts and cells in row order."""
+    cells = np.argwhere(mask)
+    if not len(cells):
+        return []
+    index = np.full(np.add(mask.shape, 2), -1)
+    index[1:-1, 1:-1][mask] = np.arange(len(cells))
+    beside = cells[:, None] + 1 + [(0, 1), (1, -1), (1, 0), (1, 1)]  # [P, 4, 2]; the other four are these reversed
+    other = index[beside[..., 0], beside[..., 1]]
+    a, b = np.nonzero(other >= 0)[0], other[other >= 0]
+    label = np.arange(len(cells))
+    while True:  # neighbours are joined under the smaller label until all of them agree
+        joined, low = label.copy(), np.minimum(label[a], label[b])
+        np.minimum.at(joined, label[a], low)
+        np.minimum.at(joined, label[b], low)
+        joined = joined[joined]
+        if np.array_equal(joined, label):
+            break
+        label = joined
+    counts = np.unique(label, return_counts=True)[1]
+    return np.split(cells[np.argsort(label, kind="stable")], np.cumsum(counts)[:-1])
 
 
 def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:

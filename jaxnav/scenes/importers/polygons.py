@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxnav.scenes.importers.assemble import SNAP
+from jaxnav.scenes.lattice import connected_parts
 from jaxnav.scenes.scene import CELL
 from jaxnav.scenes.sight import TOLERANCE
 
@@ -88,15 +89,10 @@ def nearer(boxes: np.ndarray, x: np.ndarray, z: np.ndarray, distance: float) -> 
 
 def connected_part(free: np.ndarray, start: np.ndarray) -> np.ndarray:
     """The part of `free`, bool [nz, nx], that straight and diagonal steps connect with its cell `start` (iz, ix)."""
-    left = np.pad(free, 1).ravel()  # still to be reached
-    width = free.shape[1] + 2
-    steps = np.add.outer((-width, 0, width), (-1, 0, 1)).ravel()
-    frontier = np.array([(start[0] + 1) * width + start[1] + 1])
-    while len(frontier):
-        left[frontier] = False
-        around = (frontier[:, None] + steps).ravel()
-        frontier = np.unique(around[left[around]])
-    return free & ~left.reshape(-1, width)[1:-1, 1:-1]
+    part = next(part for part in connected_parts(free) if (part == start).all(axis=1).any())
+    mask = np.zeros_like(free)
+    mask[tuple(part.T)] = True
+    return mask
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

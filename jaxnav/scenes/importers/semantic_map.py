@@ -16,6 +16,7 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES
 from jaxnav.scenes.importers.assemble import Thing, scene_of_cells
 from jaxnav.scenes.importers.pickled_arrays import PickledArray, read_pickle
+from jaxnav.scenes.lattice import connected_parts
 from jaxnav.scenes.record import Record
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.sizes import typical_box
@@ -105,29 +106,6 @@ def scene_of_map(record: Record, name: str, split: str, floor: FloorMap) -> Scen
         raise record.error("sem_map", "has no object in layers 1 and up; leave the floor out")
     scene = scene_of_cells(name, "gibson", "house", split, cells, things)
     return dataclasses.replace(scene, walls=scene.walls | _thin_walls(floor, scene))
-
-
-def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
-    """Parts of a mask [n, m] whose pixels touch, be it at corners: int [P, 2] each, in row order."""
-    pixels = np.argwhere(mask)
-    if not len(pixels):
-        return []
-    index = np.full(np.add(mask.shape, 2), -1)
-    index[1:-1, 1:-1][mask] = np.arange(len(pixels))
-    beside = pixels[:, None] + 1 + [(0, 1), (1, -1), (1, 0), (1, 1)]  # [P, 4, 2]; the other four are these reversed
-    other = index[beside[..., 0], beside[..., 1]]
-    a, b = np.nonzero(other >= 0)[0], other[other >= 0]
-    label = np.arange(len(pixels))
-    while True:  # neighbours are joined under the smaller label until all of them agree
-        joined, low = label.copy(), np.minimum(label[a], label[b])
-        np.minimum.at(joined, label[a], low)
-        np.minimum.at(joined, label[b], low)
-        joined = joined[joined]
-        if np.array_equal(joined, label):
-            break
-        label = joined
-    counts = np.unique(label, return_counts=True)[1]
-    return np.split(pixels[np.argsort(label, kind="stable")], np.cumsum(counts)[:-1])
 
 
 def _standable(floor: FloorMap) -> np.ndarray:
