@@ -17,8 +17,10 @@ from rich.console import Console
 
 from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig, WorldConfig
-from jaxnav.cli.train import explored, layout_priors
+from jaxnav.cli.train import explored
 from jaxnav.cli.worlds import bank_order, read_ahead, training_world
+from jaxnav.layout import SETTINGS
+from jaxnav.training.calibration import layout_priors
 
 TURNS, CHUNK = 7, 8
 
@@ -36,7 +38,8 @@ def main() -> None:
     began = time.perf_counter()
     found = explored(config, world)
     exploring = time.perf_counter() - began
-    arms = Arms(config, world.env, layout_priors(found.counts, config.layout.setting))
+    setting = SETTINGS[config.layout.setting]
+    arms = Arms(config, world.env, setting, layout_priors(found.counts, setting))
     still, coming = world.params(0), read_ahead(world, bank_order(world, config.seed, TURNS))
     memory, streamed = arms.init(still), arms.init(still)
     memory, _ = arms.train(memory, still)  # compiles

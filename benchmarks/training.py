@@ -12,10 +12,11 @@ from _common import rates, report, timings
 
 from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig
-from jaxnav.cli.train import layout_priors
 from jaxnav.env.make import make
 from jaxnav.env.types import EnvParams
+from jaxnav.layout import SETTINGS
 from jaxnav.policies.policy import bind
+from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
 from jaxnav.training.learner import Learner
 from jaxnav.training.rollout import rollout
@@ -27,8 +28,9 @@ def main() -> None:
     config = dataclasses.replace(RunConfig(), chunk=CHUNK)
     env, params = make(config.world)
     counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
-    priors = layout_priors(counts, config.layout.setting)
-    arms = Arms(config, env, priors)
+    setting = SETTINGS[config.layout.setting]
+    priors = layout_priors(counts, setting)
+    arms = Arms(config, env, setting, priors)
     steps = CHUNK * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(arms.learners)
     report(
         {

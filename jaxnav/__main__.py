@@ -1,4 +1,4 @@
-"""The jaxnav command: `python -m jaxnav train | eval | episode | instrument | scenes | table`."""
+"""The jaxnav command: `python -m jaxnav train | eval | episode | instrument | study | scenes | table`."""
 
 import difflib
 import importlib
@@ -9,6 +9,7 @@ COMMANDS = {
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
     "episode": "draw one evaluation episode of a run",
     "instrument": "prove that the layout shift leaves the difficulty and costs the baseline",
+    "study": "put the claims of the paper to the test: runs, results, figures, a document",
     "scenes": "import scenes, show one as a picture, tell what a file of them holds",
     "table": "print an evaluation as a Markdown table",
 }

@@ -13,12 +13,12 @@ Form = Literal["paper", "residual"]
 Pathways = TypeVar("Pathways", bound=Any)
 
 
-def do(pathways: Pathways, **interventions: float) -> Pathways:
-    """Sets pathways to constants and leaves the others at their factual values: the do-operator.
+def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
+    """Sets pathways to given values and leaves the others at their factual values: the do-operator.
 
     Args:
       pathways: a `NamedTuple` of arrays, such as (scene, goal, experience).
-      **interventions: field name = value; every element of the field becomes that value.
+      **interventions: field name = value, a number or an array that is broadcast to the field.
 
     Returns:
       The same type with the named fields replaced, shapes and dtypes kept.

@@ -1,8 +1,9 @@
 """The layout estimator: a Dirichlet belief about which categories are seen together, equations 3 to 6.
 
 Row i of `alpha` [K, K] parametrises a Dirichlet over the categories j != i seen together with category i. The belief
-starts at the prior alpha*, gains counts as the episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5)
-and the expected co-occurrence w (eq. 6). There are no learned parameters. Functions take one episode; callers `vmap`.
+starts at the prior alpha*, gains counts as the episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5, or
+`evidence_gap`) and the expected co-occurrence w (eq. 6). There are no learned parameters. Functions take one episode;
+callers `vmap`.
 """
 
 import dataclasses
@@ -16,6 +17,9 @@ from flax import struct
 #: Smallest concentration of a category that can be seen; below it a first sighting has an unbounded divergence.
 MIN_CONCENTRATION = 1e-2
 
+#: Over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
+Reduction = Literal["mean_visible", "mean", "sum"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
@@ -27,6 +31,9 @@ class Setting:
       increment: whole number from 1 to 50 added to alpha per visible category.
       own_column: a row also counts its own category; its Dirichlet then has one more entry, of concentration 1.
       gate: update only if two or more categories are visible and the set differs from the last accepted one.
+      gap: what D measures: `novelty`, how much the last view changed the belief (eq. 5), or `evidence`, how badly all
+        that was seen so far fits the prior (`evidence_gap`; `reduction`, `decay` and `passes` then have no effect), or
+        `clock`, 1 when the gate opens: what the sum over all rows in `released` comes to, for tanh is saturated there.
       decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
       passes: estimator calls per step, >= 1. All but the first find nothing new, so an accepted gap is already decayed.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
@@ -35,10 +42,11 @@ class Setting:
     """
 
     rows: Literal["visible", "all"] = "visible"
-    reduction: Literal["mean_visible", "mean", "sum"] = "mean_visible"
+    reduction: Reduction = "mean_visible"
     increment: int = 1
     own_column: bool = False
     gate: bool = True
+    gap: Literal["novelty", "evidence", "clock"] = "novelty"
     decay: float = 0.8
     passes: int = 1
     strength: float | None = 20.0
@@ -58,12 +66,14 @@ class Setting:
 
 
 #: `paper`: equations 3 to 6, with presence for the counts n. `released`: what the authors' estimator computes.
+#: `evidence`: `calibrated` with another gap; priors and weights w are the same.
 SETTINGS = {
     "paper": Setting(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
     "released": Setting(
         rows="all", reduction="sum", increment=5, own_column=True, passes=2, strength=None, uniform=0.0
     ),
     "calibrated": Setting(),
+    "evidence": Setting(gap="evidence"),
 }
 
 
@@ -184,6 +194,36 @@ def presence_kl(prior: jax.Array, counts: jax.Array, increment: int) -> jax.Arra
     return jnp.maximum(g - a_0 * _excess(n / a_0, log_0) - _bregman_remainder(a_0, n, log_0), 0)
 
 
+def evidence_gap(prior: jax.Array, alpha: jax.Array) -> jax.Array:
+    """Gap D by the evidence of an episode: how far what was seen together falls short of agreeing with the prior.
+
+    With the expected shares p_i = alpha*_i / a_i before and q_i = alpha_i / (a_i + n_i) after n_i sightings, row i
+    agrees by p_i . q_i, the probability that one draw of each is alike. For layouts drawn from the prior that has mean
+    p_i . p_i and variance n_i v_i / ((a_i + n_i) (a_i + 1)), where v_i is the variance of p_ij, j drawn from p_i. So
+
+      z = sum_i (p_i . p_i - p_i . q_i) / sum_i sqrt(n_i v_i / ((a_i + n_i) (a_i + 1))),
+
+    the denominator being the standard deviation if rows are fully correlated, its upper bound, and D = erf(z / sqrt 2)
+    or 0 where z < 0: 2 P - 1, P the probability (normal approximation) that the prior's own layouts agree better.
+
+    Args:
+      prior: float32 [K, K], alpha*, 0 on the diagonal.
+      alpha: float32 [K, K], the belief, >= alpha*; the diagonal is ignored.
+
+    Returns:
+      float32 [], in [0, 1] (1 only by rounding); 0 where nothing was gained, below 0.01 where prior rows are uniform.
+    """
+    seen = (alpha - prior) * (1 - jnp.eye(len(prior), dtype=jnp.float32))
+    a, n = prior.sum(-1), seen.sum(-1)
+    p = prior / a[:, None]
+    shortfall = (p * p).sum(-1, keepdims=True) - p
+    excess = (seen * shortfall).sum(-1) / (a + n)
+    deviation = jnp.sqrt(n * (p * shortfall**2).sum(-1) / ((a + n) * (a + 1)))
+    # Where rows are uniform both are 0 up to rounding (1e-7), which the bound keeps out of the ratio.
+    z = excess.sum() / jnp.maximum(deviation.sum(), 1e-5)
+    return jnp.maximum(jax.lax.erf(z * 0.5**0.5), 0)
+
+
 class LayoutState(struct.PyTreeNode):
     """The belief within one episode.
 
@@ -222,7 +262,7 @@ class LayoutEstimator(struct.PyTreeNode):
         """Takes in the categories visible at one step (eqs. 3-5).
 
         `state` is the belief before the step, `presence` bool or real [K], nonzero where a category is visible. Returns
-        the belief after the step; its gap is the divergence of the one from the other.
+        the belief after the step; its gap is the divergence of the one from the other, or of the belief from the prior.
         """
         setting = named_setting(self.setting)
         seen = presence.astype(bool)
@@ -236,18 +276,20 @@ class LayoutEstimator(struct.PyTreeNode):
         else:
             kl_prior, counts = alpha, counts * (1 - diagonal)
         accept = (seen.sum() >= 2) & (seen != state.last).any() if setting.gate else jnp.bool_(True)
+        posterior = jnp.where(accept, alpha + counts, alpha)  # eq. 4
+        last = jnp.where(accept, seen, state.last)
+        if setting.gap == "evidence":
+            return LayoutState(alpha=posterior, last=last, gap=evidence_gap(self.prior, posterior))
 
         kl = presence_kl(kl_prior, counts, setting.increment)  # [K]
         if setting.reduction == "mean_visible":
             mean_kl = (kl * visible).sum() / jnp.maximum(visible.sum(), 1)
         else:
             mean_kl = kl.mean() if setting.reduction == "mean" else kl.sum()
-        new_gap = jnp.tanh(mean_kl) * setting.decay ** (setting.passes - 1)  # eq. 5
-        return LayoutState(
-            alpha=jnp.where(accept, alpha + counts, alpha),  # eq. 4
-            last=jnp.where(accept, seen, state.last),
-            gap=jnp.where(accept, new_gap, state.gap * setting.decay**setting.passes),
-        )
+        fresh = jnp.float32(1.0) if setting.gap == "clock" else jnp.tanh(mean_kl)
+        new_gap = fresh * setting.decay ** (setting.passes - 1)  # eq. 5
+        gap = jnp.where(accept, new_gap, state.gap * setting.decay**setting.passes)
+        return LayoutState(alpha=posterior, last=last, gap=gap)
 
     @staticmethod
     def expectation(state: LayoutState) -> jax.Array:

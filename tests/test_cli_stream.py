@@ -18,6 +18,7 @@ from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig, WorldConfig
 from jaxnav.cli.worlds import bank_order, evaluation_world, read_ahead, training_world
 from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.layout import Setting
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.store.runlog import read_rows
 from jaxnav.training.config import PPOConfig
@@ -85,7 +86,7 @@ def test_banks_are_read_one_ahead(world, monkeypatch):
 def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
     config = RunConfig(ppo=PPOConfig(num_envs=32, rollout=4, minibatches=2), seeds=1, sizes=tiny.SIZES)
-    arms = Arms(config, world.env, jnp.ones((NUM_PRIORS, 22, 22)))
+    arms = Arms(config, world.env, Setting(), jnp.ones((NUM_PRIORS, 22, 22)))
     before = arms.init(world.params(0))
     kept = jax.tree.map(np.array, before["layout"][0].replace(key=None))
     after = arms.restart(before, world.params(1))["layout"][0]

@@ -1,6 +1,7 @@
 """The train command end to end, and all that it refuses."""
 
 import csv
+import dataclasses
 import gzip
 import math
 
@@ -10,10 +11,11 @@ import pytest
 from commands import POLICIES, SEEDS, contents, evaluate, finished_run, refusal, train
 
 from jaxnav.cli import train as train_command
-from jaxnav.cli.train import layout_priors
+from jaxnav.layout import SETTINGS, Setting
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.store.export import load_params
 from jaxnav.store.runlog import read_rows
+from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, layout_priors
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,16 @@ def test_policies_say_how_they_are_used(run_dir):
         assert spec["method"] == "org"
         assert spec["categories"] == list(ITHOR_CATEGORIES)
         assert spec["sizes"]["hidden"] == 16
-        assert spec["layout"] == ("calibrated" if name.startswith("layout") else None)
+        if name.startswith("layout"):
+            setting = Setting(**spec["layout"])
+            assert setting == dataclasses.replace(
+                SETTINGS["calibrated"], strength=setting.strength, reduction=setting.reduction
+            )
+            assert setting.strength in STRENGTHS
+            assert setting.reduction in REDUCTIONS
+        else:
+            assert spec["layout"] is None
+        assert tensors["layout"]["counts"].shape == (5, 22, 22)
         assert spec["prior_steps"] == 64 * 20
         assert 0 < spec["prior_poses"] <= 64 * 21
         assert tensors["layout"]["prior"].shape == (5, 22, 22)

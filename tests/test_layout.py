@@ -1,4 +1,4 @@
-"""Equations 3 to 6: the belief, its expectation, the gap, and the three settings."""
+"""Equations 3 to 6: the belief, its expectation, the gap, and the named settings."""
 
 import dataclasses
 
@@ -200,10 +200,12 @@ def test_settings_are_those_of_the_methods_table():
     calibrated = {"rows": "visible", "reduction": "mean_visible", "increment": 1, "own_column": False, "gate": True}
     calibrated |= {"decay": 0.8, "passes": 1, "strength": 20.0, "uniform": 0.05, "form": "residual"}
     expected = {
-        "paper": common | paper,
-        "released": common | released | {"decay": 0.8, "passes": 2},
-        "calibrated": calibrated,
+        "paper": common | paper | {"gap": "novelty"},
+        "released": common | released | {"gap": "novelty", "decay": 0.8, "passes": 2},
+        "calibrated": calibrated | {"gap": "novelty"},
+        "evidence": calibrated | {"gap": "evidence"},
     }
+    assert expected.keys() == SETTINGS.keys()
     for name, fields in expected.items():
         assert fields.items() <= dataclasses.asdict(SETTINGS[name]).items()
 

@@ -198,7 +198,8 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
 
 
 def test_the_coin_zeroes_both_direct_pathways_and_nothing_else():
-    pathways = Pathways(scene=jnp.ones((2, 3)), goal=jnp.full((2, 4), 2.0), experience=jnp.full((2, 5), 3.0))
+    fields = {"scene": (3, 1.0), "goal": (4, 2.0), "experience": (5, 3.0), "gate": (1, 4.0)}
+    pathways = Pathways(**{name: jnp.full((2, width), value) for name, (width, value) in fields.items()})
     kept, zeroed = (tiny.at(zero_direct(pathways, jnp.array([True, False])), i) for i in range(2))
     chex.assert_trees_all_equal(kept, tiny.at(pathways, 0))
-    chex.assert_trees_all_equal(zeroed, Pathways(jnp.zeros(3), jnp.zeros(4), jnp.full(5, 3.0)))
+    chex.assert_trees_all_equal(zeroed, Pathways(jnp.zeros(3), jnp.zeros(4), jnp.full(5, 3.0), jnp.full(1, 4.0)))

@@ -9,9 +9,10 @@ import pytest
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.relabel import relabel
 from jaxnav.scenes.room_rules import room_statistics
 from jaxnav.scenes.room_shapes import inside, make_shape, wall_mask
-from jaxnav.scenes.rooms import AGENT_RADIUS, FIND_DISTANCE, free_cells, generate_rooms
+from jaxnav.scenes.rooms import AGENT_RADIUS, FIND_DISTANCE, free_cells, generate_room_at, generate_rooms
 from jaxnav.scenes.scene import CELL, Scene
 
 MILLIMETRES = 2e-3  # boxes are rounded to 1 mm
@@ -44,6 +45,15 @@ def test_a_scene_depends_on_seed_split_and_index_alone():
     assert all(a.boxes.shape != b.boxes.shape or (a.boxes != b.boxes).any() for a, b in zip(few, other, strict=False))
     # The same index in another split is another room.
     assert few[0].boxes.shape != few[4].boxes.shape or (few[0].boxes != few[4].boxes).any()
+
+
+def test_a_shifted_room_is_relabelled_with_its_own_seed():
+    for i in range(4):
+        twin, shifted = (generate_room_at("val", i, 7, shift) for shift in (0.0, 0.5))
+        assert_same(shifted, relabel(twin, ITHOR_CATEGORIES, 0.5, 7))
+    # Seed 8 chooses others among these objects.
+    kitchen = generate_room_at("val", 0, 7)
+    assert relabel(kitchen, ITHOR_CATEGORIES, 0.5, 7).types != relabel(kitchen, ITHOR_CATEGORIES, 0.5, 8).types
 
 
 def test_splits_are_balanced_and_names_unique():

@@ -6,15 +6,13 @@ from typing import Any
 
 import jax
 
-from jaxnav.cli.config import RunConfig
+from jaxnav.cli.config import ARMS, RunConfig
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
+from jaxnav.layout import Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.training.learner import Learner, LearnerState
-
-#: The arms in the order of the tables. They differ by the layout's weights alone.
-ARMS = ("baseline", "layout")
 
 #: The seeds of every arm.
 States = dict[str, list[LearnerState]]
@@ -28,11 +26,9 @@ class Arms:
       learners: the learner of each arm.
     """
 
-    def __init__(self, config: RunConfig, env: ObjectNav, priors: jax.Array) -> None:
-        self.learners = {
-            "baseline": _learner(config, env, setting=None),
-            "layout": _learner(config, env, setting=config.layout.setting),
-        }
+    def __init__(self, config: RunConfig, env: ObjectNav, setting: Setting, priors: jax.Array) -> None:
+        settings = {"baseline": None, "layout": setting}
+        self.learners = {name: _learner(config, env, settings[name]) for name in config.arms}
         self._scalars = config.ppo.scalars(config.total_updates)
         self._priors = priors
         self._root = jax.random.key(config.seed)
@@ -45,8 +41,8 @@ class Arms:
         """Every seed before its first update."""
         starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         states: States = {}
-        for index, (name, start) in enumerate(starts.items()):
-            root = jax.random.fold_in(self._root, index)
+        for name, start in starts.items():
+            root = jax.random.fold_in(self._root, ARMS.index(name))
             states[name] = [start(jax.random.fold_in(root, seed), params, self._priors) for seed in range(self._seeds)]
         return states
 
@@ -59,14 +55,14 @@ class Arms:
 
     def train(self, states: States, params: EnvParams) -> tuple[States, Metrics]:
         """One chunk of updates of every seed, with its metrics. The states are donated."""
-        tasks = [(name, seed) for seed in range(self._seeds) for name in ARMS]
+        tasks = [(name, seed) for seed in range(self._seeds) for name in self.learners]
         with ThreadPoolExecutor(min(len(tasks), os.cpu_count() or 1)) as pool:
             if not self._compiled:
-                compiled = pool.map(lambda name: self._compile(name, states[name][0], params), ARMS)
-                self._compiled = dict(zip(ARMS, compiled, strict=True))
+                compiled = pool.map(lambda name: self._compile(name, states[name][0], params), self.learners)
+                self._compiled = dict(zip(self.learners, compiled, strict=True))
             results = list(pool.map(lambda task: self._train(task[0], states[task[0]][task[1]], params), tasks))
-        done: States = {name: [] for name in ARMS}
-        metrics: Metrics = {name: [] for name in ARMS}
+        done: States = {name: [] for name in self.learners}
+        metrics: Metrics = {name: [] for name in self.learners}
         for (name, _), (state, values) in zip(tasks, results, strict=True):
             done[name].append(state)
             metrics[name].append({key: float(value) for key, value in values.items()})
@@ -84,6 +80,6 @@ class Arms:
         return jax.block_until_ready(self._compiled[name](state, self._scalars, params, self._priors))
 
 
-def _learner(config: RunConfig, env: ObjectNav, setting: str | None) -> Learner:
-    spec = PolicySpec(method=config.method, num_categories=len(env.categories), sizes=config.sizes)
+def _learner(config: RunConfig, env: ObjectNav, setting: Setting | None) -> Learner:
+    spec = PolicySpec(config.method, len(env.categories), config.sizes, config.direct, config.done_gate)
     return Learner(Acting(env, setting), spec, config.ppo, config.counterfactual)

@@ -5,12 +5,16 @@ from pathlib import Path
 from typing import Literal
 
 from jaxnav.errors import InputError
+from jaxnav.layout import Reduction
 from jaxnav.policies.methods import METHODS
-from jaxnav.policies.spec import Sizes
+from jaxnav.policies.spec import Direct, Sizes
 from jaxnav.scenes.detector import Detector
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.training.config import Counterfactual, PPOConfig
+
+#: Policies without and with the layout estimator, in the order of the tables; they differ by its weights alone.
+ARMS = ("baseline", "layout")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +24,7 @@ class WorldConfig:
     Attributes:
       num_train, num_val, num_test: generated scenes of each split.
       seed: of the generator.
-      shift: layout shift of the scenes, from 0 to 1; those of a file are relabelled.
+      shift: layout shift of the scenes, from 0 to 1; single rooms and files are relabelled.
       categories: what can be detected.
       goals: what of it can be looked for; None with categories of one's own: all of them.
       train_step_limit: actions of a training episode.
@@ -50,10 +54,14 @@ class LayoutConfig:
 
     Attributes:
       setting: of the estimator.
+      strength, reduction: of the prior's rows, and over rows in the gap; None: whatever makes the gap run as in the
+        paper in the training scenes. Of no use to `paper` and `released`.
       walks, steps: random walks and their steps that collect the prior in the training scenes.
     """
 
     setting: Literal["paper", "released", "calibrated"] = "calibrated"
+    strength: float | None = None
+    reduction: Reduction | None = None
     walks: int = 2048
     steps: int = 100
 
@@ -67,11 +75,14 @@ class RunConfig:
       method: how experience is made.
       world: what is asked of the agent, and the generated scenes it lives in unless `scenes` is given.
       scenes: scene file to read instead; its splits are used.
+      arms: kinds of policies that are trained.
       seeds: policies trained of each kind.
       total_steps: environment steps of each policy, rounded up to whole chunks. The layout's policies have seen the
         prior's random steps (`layout.walks x layout.steps`) besides.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
+      direct: which detections the direct pathway of the goal sees.
+      done_gate: multiply the logit of Done by 0.58 times the confidence that the goal is in sight.
       chunk: updates per compiled call; between calls the run logs, saves (every `save_every` calls) and, where scenes
         are streamed, goes on to the next shard with new episodes.
       save_every: calls between checkpoints.
@@ -82,10 +93,13 @@ class RunConfig:
     method: str = "org"
     world: Literal["rooms", "apartments", "houses"] = "rooms"
     scenes: Path | None = None
+    arms: tuple[Literal["baseline", "layout"], ...] = ARMS
     seeds: int = 3
     total_steps: int = 2_000_000
     seed: int = 0
     counterfactual: Counterfactual = "distil"
+    direct: Direct = "all"
+    done_gate: bool = False
     chunk: int = 8
     save_every: int = 4
     cache: Path = Path("~/.cache/jaxnav")
@@ -144,6 +158,9 @@ def check(config: RunConfig) -> RunConfig:
             value = getattr(getattr(config, group), field.name)
             if isinstance(value, int) and field.name != "seed":
                 need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
+    arms, strength = config.arms, config.layout.strength
+    need(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
+    need(strength is None or 0.0 < strength < float("inf"), "layout.strength", strength, "give a positive number")
     ppo, detector = config.ppo, config.detector
     for name in ("miss_near", "miss_far", "false_alarm"):
         value = getattr(detector, name)

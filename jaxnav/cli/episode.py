@@ -18,7 +18,6 @@ from jaxnav.evaluation.draw import Episode, draw_episode
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.sight import cell_centres
@@ -80,7 +79,7 @@ def play_episode(config: EpisodeConfig, console: Console) -> Episode:
         raise InputError(f"--index {config.index}: give a number from 0 to {len(episodes.goal) - 1}")
     index, goal = episodes.scene[config.index], episodes.goal[config.index]
     start = State(pose=episodes.pose[config.index], scene=index, goal=goal, time=jnp.int32(0))
-    form = SETTINGS[policies.setting].form
+    form = policies.setting.form
     epsilon = config.epsilon if config.variant == "stde" else None
     cell = inference_grid([table_row(config.variant, epsilon, form, "argmax")], run.seeds)
     cell = jax.tree.map(lambda leaf: leaf[0], cell)

@@ -29,7 +29,6 @@ from jaxnav.evaluation.report import (
     write_report,
 )
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
-from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
 from jaxnav.store.files import write_atomic
 
@@ -42,7 +41,7 @@ class EvalConfig:
       run: the run directory.
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
-      shift: from 0 to 1: layout shift of generated scenes, in a file the share of the categories that exchange their
+      shift: layout shift, from 0 to 1; in single rooms and in a file the share of the categories that exchange their
         labels; default: the run's, and 0 with `--scenes`.
       episodes: in the fixed list, balanced over room types and scenes; where scenes are streamed equally many in every
         shard, and balanced there.
@@ -76,7 +75,7 @@ def evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         raise InputError(f"--seed {config.seed}: give a whole number from 0 to 2**32 - 1")
     run = load_run(config.run)
     policies = load_policies(run)
-    rows = table_rows(config.epsilon, config.form or (SETTINGS[policies.setting].form,))
+    rows = table_rows(config.epsilon, config.form or (policies.setting.form,))
     world = evaluation_world(run, config.split, config.scenes, config.shift, console)
     everything = range(len(world.banks))
     each = -(-config.episodes // len(world.banks))

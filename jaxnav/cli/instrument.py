@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -12,6 +12,7 @@ from rich.console import Console
 from jaxnav.cli.command import exit_code, result_console
 from jaxnav.cli.config import RunConfig
 from jaxnav.cli.runs import Policies, load_policies, load_run, settings
+from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
 from jaxnav.cli.worlds import CompiledWorld, evaluation_world, read_ahead
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
@@ -51,31 +52,38 @@ class InstrumentConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, also where the proof fails, or 2 after bad input."""
-    config = tyro.cli(InstrumentConfig, args=arguments, prog="eval.py instrument", description="Prove the dial.")
+    if "--config" in (arguments or []):
+        return exit_code(lambda console: prove(main_run(parse_study(arguments), console), console, result_console()))
+    what = "Prove the dial with a finished run, or `--config FILE` with the main run of a study, trained if need be."
+    config = tyro.cli(InstrumentConfig, args=arguments, prog="eval.py instrument", description=what)
     return exit_code(lambda console: prove(config, console, result_console()))
+
+
+def main_run(config: StudyConfig, console: Console) -> InstrumentConfig:
+    """What is asked of the instrument in a study, with its main run, trained unless it is finished."""
+    run = training(config, "main")
+    ensure(run, console)
+    return of_study(config, run)
+
+
+def of_study(config: StudyConfig, run: RunConfig) -> InstrumentConfig:
+    """What is asked of the instrument with one of the study's runs."""
+    return InstrumentConfig(run.run_dir, config.shifts, config.split, config.episodes, seed=config.seed)
 
 
 def prove(config: InstrumentConfig, console: Console, out: Console) -> None:
     """Measure at every shift, print the table and what it shows, and write JSON."""
-    shifts = sorted(set(config.shift))
-    if len(shifts) < 2:
+    if len(set(config.shift)) < 2:
         raise InputError(f"--shift {' '.join(map(str, config.shift))}: give at least two different shifts")
     if not 0 <= config.seed < 2**32:
         raise InputError(f"--seed {config.seed}: give a whole number from 0 to 2**32 - 1")
     run = load_run(config.run)
-    policies = load_policies(run)
     if config.scenes_per_split is not None:
         if run.scenes:
             raise InputError(f"--scenes-per-split: {config.run} is a run on scenes of a file; leave it out")
         worlds = dataclasses.replace(run.worlds, **{f"num_{config.split}": config.scenes_per_split})
         run = dataclasses.replace(run, worlds=worlds)
-    totals = []
-    for shift in shifts:
-        console.print(f"shift {shift:g}:")
-        totals.append(measure(config, run, policies, evaluation_world(run, config.split, None, shift, console)))
-    table = compare(shifts, totals, config.seed)
-    about = settings(run) | {"evaluation_split": config.split, "evaluation_seed": config.seed}
-    report = {"run": about, **table, "versions": versions(), "format": FORMAT}
+    report = instrument_report(config, run, console)
     out.print(console_table(report))
     for line in verdicts(report):
         out.print(line, markup=False)
@@ -85,6 +93,21 @@ def prove(config: InstrumentConfig, console: Console, out: Console) -> None:
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror})") from error
     console.print(f"written to {target}", soft_wrap=True)
+
+
+def instrument_report(config: InstrumentConfig, run: RunConfig, console: Console) -> dict[str, Any]:
+    """The instrument's table for a finished run, and what it shows."""
+    policies, totals = load_policies(run), []
+    for shift in sorted(set(config.shift)):
+        console.print(f"shift {shift:g}:")
+        totals.append(measure(config, run, policies, evaluation_world(run, config.split, None, shift, console)))
+    about = settings(run) | {"evaluation_split": config.split, "evaluation_seed": config.seed}
+    return {
+        "run": about,
+        **compare(sorted(set(config.shift)), totals, config.seed),
+        "versions": versions(),
+        "format": FORMAT,
+    }
 
 
 def measure(config: InstrumentConfig, run: RunConfig, policies: Policies, world: CompiledWorld) -> Totals:

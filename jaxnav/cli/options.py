@@ -2,15 +2,17 @@
 
 import argparse
 from pathlib import Path
+from typing import TypeVar
 
 import tyro
 
-from jaxnav.cli.config import RunConfig
 from jaxnav.cli.overlay import apply_yaml
 
+Config = TypeVar("Config")
 
-def parse_run(arguments: list[str]) -> RunConfig:
-    """Settings of a training run: defaults, then the file of `--config`, then the other options.
+
+def parse(default: Config, arguments: list[str] | None, prog: str, description: str) -> Config:
+    """Settings of a command: `default`, then the file of `--config`, then the other options.
 
     Raises:
       InputError: bad config file.
@@ -19,12 +21,10 @@ def parse_run(arguments: list[str]) -> RunConfig:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--config", type=Path)
     known, rest = first.parse_known_args(arguments)
-    default = apply_yaml(RunConfig(), known.config) if known.config else RunConfig()
     return tyro.cli(
-        RunConfig,
-        default=default,
+        type(default),
+        default=apply_yaml(default, known.config) if known.config else default,
         args=rest,
-        prog="train.py",
-        description="Train a method with and without the layout estimator. "
-        "`--config FILE` lays a YAML file over the defaults; the other options override it.",
+        prog=prog,
+        description=f"{description} `--config FILE` lays a YAML file over the defaults; the other options override it.",
     )

@@ -2,17 +2,17 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxnav.cli.arms import ARMS
-from jaxnav.cli.config import RunConfig, check
+from jaxnav.cli.config import ARMS, RunConfig, check
 from jaxnav.cli.overlay import apply_yaml
 from jaxnav.errors import InputError
-from jaxnav.layout import SETTINGS
+from jaxnav.layout import Setting
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.store.export import load_params
@@ -28,15 +28,17 @@ class Policies(NamedTuple):
     Attributes:
       params: leaves [2 S, ...], baseline seeds first, then layout seeds.
       priors: float32 [rooms, K, K].
+      counts: float32 [rooms, K, K], that the priors were made of.
       spec: sizes.
-      setting: of the layout estimator.
+      setting: of the layout estimator, as calibrated.
       prior_steps: random steps that the priors were collected in.
     """
 
     params: dict[str, Any]
     priors: jax.Array
+    counts: jax.Array
     spec: PolicySpec
-    setting: str
+    setting: Setting
     prior_steps: int
 
 
@@ -88,26 +90,30 @@ def load_run(run_dir: Path) -> RunConfig:
     return check(dataclasses.replace(config, run_dir=run_dir))
 
 
-def load_policies(run: RunConfig) -> Policies:
-    """All exported policies of a run.
+def load_policies(run: RunConfig, arms: Sequence[str] = ARMS) -> Policies:
+    """The exported policies of a run, of all arms or some; the last must be `layout`.
 
     Raises:
-      InputError: training has not finished, or an export is damaged.
+      InputError: training has not finished, or left an arm out, or an export is damaged.
     """
-    folders = [run.run_dir / POLICIES / f"{arm}-{seed}" for arm in ARMS for seed in range(run.seeds)]
+    if absent := [arm for arm in arms if arm not in run.arms]:
+        raise InputError(f"{run.run_dir}: was trained without the arm {absent[0]!r}; train one with all --arms")
+    folders = [run.run_dir / POLICIES / f"{arm}-{seed}" for arm in arms for seed in range(run.seeds)]
     if missing := [folder for folder in folders if not folder.exists()]:
         raise InputError(f"{missing[0]}: is missing, so training has not finished; run train.py again with this run")
     loaded = [load_params(folder) for folder in folders]
     tensors, spec = loaded[-1]
     try:
-        policy_spec = PolicySpec(spec["method"], len(spec["categories"]), Sizes(**spec["sizes"]))
-        known = policy_spec.method in METHODS and spec["layout"] in SETTINGS
+        policy_spec = PolicySpec(
+            spec["method"], len(spec["categories"]), Sizes(**spec["sizes"]), spec["direct"], spec["done_gate"]
+        )
         task = spec["task"]
         policies = Policies(
             params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tensors["policy"] for tensors, _ in loaded)),
             priors=jnp.asarray(tensors["layout"]["prior"]),
+            counts=jnp.asarray(tensors["layout"]["counts"]),
             spec=policy_spec,
-            setting=spec["layout"],
+            setting=Setting(**spec["layout"]),
             prior_steps=spec["prior_steps"],
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -119,9 +125,8 @@ def load_policies(run: RunConfig) -> Policies:
             f"{folders[-1]}: was trained for another task than its run says (there != here): {'; '.join(different)}; "
             "use the version that trained the run"
         )
-    if not known:
+    if policy_spec.method not in METHODS:
         raise InputError(
-            f"{folders[-1]}: method {policy_spec.method!r} or layout setting {spec['layout']!r} is unknown here; "
-            "use the version that trained the run"
+            f"{folders[-1]}: method {policy_spec.method!r} is unknown here; use the version that trained the run"
         )
     return policies

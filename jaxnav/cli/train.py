@@ -1,12 +1,10 @@
 """The training command: prior, two arms of N seeds, checkpoints, and the policies at the end."""
 
 import dataclasses
-import sys
 import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -14,24 +12,25 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from jaxnav.cli.arms import Arms, States
 from jaxnav.cli.command import exit_code
 from jaxnav.cli.config import RunConfig, check
-from jaxnav.cli.options import parse_run
+from jaxnav.cli.options import parse
 from jaxnav.cli.runs import LOG_FILE, POLICIES, claim, settings
 from jaxnav.cli.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.env.objectnav import ObjectNav
-from jaxnav.layout import prior_from_counts
+from jaxnav.layout import SETTINGS, Setting
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.export import export_params
 from jaxnav.store.manifest import make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
+from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout_priors
 from jaxnav.training.exploration import Exploration, explore
 
-_EXPLORE = 2**31 - 1  # purpose of the prior's key; seeds use 0, 1, ...
+_EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
-    given = sys.argv[1:] if arguments is None else arguments
-    return exit_code(lambda console: train(check(parse_run(given)), console))
+    what = "Train a method with and without the layout estimator."
+    return exit_code(lambda console: train(check(parse(RunConfig(), arguments, "train.py", what)), console))
 
 
 def train(config: RunConfig, console: Console) -> None:
@@ -42,10 +41,11 @@ def train(config: RunConfig, console: Console) -> None:
     manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
 
     found = explored(config, world)
-    priors = layout_priors(found.counts, config.layout.setting)
     console.print(f"layout prior from {int(found.steps):,} random steps, {int(found.poses):,} distinct poses")
+    setting = calibrated(config, world, found, console)
+    priors = layout_priors(found.counts, setting)
 
-    arms = Arms(config, world.env, priors)
+    arms = Arms(config, world.env, setting, priors)
     order = bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
         console.print(
@@ -58,7 +58,7 @@ def train(config: RunConfig, console: Console) -> None:
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
     states = _updates(config, arms, world, order, states, done, manifest, console)
-    _export(config, world.env, states, priors, found)
+    _export(config, world.env, states, setting, priors, found)
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
 
 
@@ -74,15 +74,20 @@ def explored(config: RunConfig, world: CompiledWorld) -> Exploration:
     return jax.tree.map(lambda *parts: sum(parts), *found)
 
 
-def layout_priors(counts: jax.Array, setting: str) -> jax.Array:
-    """The layout prior of each room type, float32 [rooms, K, K], from what exploration counted.
-
-    Every pair starts with one sighting (the all-ones Dirichlet). A room type that training has no scene of gets the
-    prior of all its scenes together.
-    """
-    met = counts.any(axis=(1, 2), keepdims=True)
-    counts = jnp.where(met, counts, counts.sum(axis=0, keepdims=True))
-    return jax.vmap(lambda own: prior_from_counts(own + 1.0, setting))(counts)
+def calibrated(config: RunConfig, world: CompiledWorld, found: Exploration, console: Console) -> Setting:
+    """The estimator's setting, what it leaves open chosen in the training scenes (of the first bank)."""
+    setting, layout = SETTINGS[config.layout.setting], config.layout
+    if setting.strength is None:
+        return setting  # rows keep the sums of the counts
+    key = jax.random.fold_in(jax.random.key(config.seed), _CALIBRATE)
+    strengths = STRENGTHS if layout.strength is None else (layout.strength,)
+    reductions = REDUCTIONS if layout.reduction is None else (layout.reduction,)
+    chosen = calibrate(world.env, world.params(0), found.counts, setting, key, strengths, reductions)
+    console.print(
+        f"layout estimator: prior rows of {chosen.setting.strength:g}, reduction {chosen.setting.reduction}; "
+        f"gap {chosen.early:.2f} in the first views, {chosen.late:.2f} after twenty steps"
+    )
+    return chosen.setting
 
 
 def _updates(
@@ -125,7 +130,9 @@ def _updates(
     return states
 
 
-def _export(config: RunConfig, env: ObjectNav, states: States, priors: jax.Array, found: Exploration) -> None:
+def _export(
+    config: RunConfig, env: ObjectNav, states: States, setting: Setting, priors: jax.Array, found: Exploration
+) -> None:
     """Write every seed's policy with the prior it was trained with."""
     for name, seeds in states.items():
         spec = {
@@ -133,10 +140,15 @@ def _export(config: RunConfig, env: ObjectNav, states: States, priors: jax.Array
             "categories": list(env.categories),
             "task": dataclasses.asdict(env.task),
             "sizes": dataclasses.asdict(config.sizes),
-            "layout": config.layout.setting if name == "layout" else None,
+            "direct": config.direct,
+            "done_gate": config.done_gate,
+            "layout": dataclasses.asdict(setting) if name == "layout" else None,
             "prior_steps": int(found.steps),
             "prior_poses": int(found.poses),
         }
         for seed, state in enumerate(seeds):
-            tensors = {"policy": jax.device_get(state.params), "layout": {"prior": np.asarray(priors)}}
+            tensors = {
+                "policy": jax.device_get(state.params),
+                "layout": {"prior": np.asarray(priors), "counts": np.asarray(found.counts)},
+            }
             export_params(config.run_dir / POLICIES / f"{name}-{seed}", tensors, spec)

@@ -6,41 +6,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from jaxnav.causal import do, remove_experience
+from jaxnav.causal import remove_experience
 from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.inference import Inference, counterfactual_logits
 from jaxnav.policies.acting import Acting, Agent, select
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import Params, Policy, bind
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import MOVE_AHEAD
-
-
-class Inference(struct.PyTreeNode):
-    """How one set of parameters is used; leaves [] (or [C] for a grid of C).
-
-    The weight of the counterfactual logits is `always + relu(gap - epsilon)`: sTDE has always = 0, hard TDE always = 1
-    and epsilon = inf, and no de-biasing always = 0 and epsilon = inf.
-
-    Attributes:
-      params: int32, index of the parameters.
-      epsilon: float32.
-      always: float32.
-      residual: bool, combine in the residual form rather than in the paper's.
-      layout: bool, multiply the layout's weights in; otherwise they are ones.
-      greedy: bool, take the best action rather than sample.
-      uniform: bool, ignore the policy and act at random.
-    """
-
-    params: jax.Array
-    epsilon: jax.Array
-    always: jax.Array
-    residual: jax.Array
-    layout: jax.Array
-    greedy: jax.Array
-    uniform: jax.Array
 
 
 class Outcome(NamedTuple):
@@ -212,14 +187,17 @@ def act(
     observation, layout_weights = acting.observe(agent, params)
     pathways = policy.pathways(observation, jnp.where(cell.layout, layout_weights, 1.0))
     factual = policy.decide(pathways, agent.memory)
-    counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
+    keys = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
+    counterfactual = counterfactual_logits(cell, policy, pathways, agent.memory, keys)
     weight = cell.always + jax.nn.relu(acting.gap(agent) - cell.epsilon)
+    others = jax.random.permutation(jax.random.key(0), len(weight))
+    weight = jnp.where(cell.shuffled, weight[others], weight)
     residual, paper = (
-        remove_experience(factual.logits, counterfactual.logits, weight, form) for form in ("residual", "paper")
+        remove_experience(factual.logits, counterfactual, weight, form) for form in ("residual", "paper")
     )
     logits = jnp.where(cell.uniform, 0.0, jnp.where(cell.residual, residual, paper))
 
-    sampled = jax.vmap(jax.random.categorical)(jax.vmap(jax.random.fold_in)(keys, agent.state.time), logits)
+    sampled = jax.vmap(jax.random.categorical)(keys, logits)
     action = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
     found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
     state, _, terminated, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.types import EnvParams, State
-from jaxnav.evaluation.grid import Inference, Taken, act
+from jaxnav.evaluation.grid import Taken, act
+from jaxnav.evaluation.inference import Inference
 from jaxnav.policies.acting import Acting, Agent
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec

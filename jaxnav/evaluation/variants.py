@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.errors import InputError
-from jaxnav.evaluation.grid import Inference
+from jaxnav.evaluation.inference import Branch, Inference
 from jaxnav.evaluation.report import Decoding, Form, Variant
 
 
@@ -74,4 +74,7 @@ def _cell(row: Row, seed: int, num_seeds: int) -> Inference:
         layout=jnp.bool_(layout),
         greedy=jnp.bool_(row.decoding == "argmax"),
         uniform=jnp.bool_(row.variant == "random"),
+        noise=jnp.float32(0.0),
+        shuffled=jnp.bool_(False),
+        branch=jnp.int32(Branch.COUNTERFACTUAL),
     )

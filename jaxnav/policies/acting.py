@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, Observation, State
-from jaxnav.layout import LayoutEstimator, LayoutState
+from jaxnav.layout import LayoutEstimator, LayoutState, Setting
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import Policy
 
@@ -39,7 +39,7 @@ class Acting:
     """
 
     env: ObjectNav
-    setting: str | None
+    setting: str | Setting | None
 
     def observe(self, agent: Agent, params: EnvParams) -> tuple[Observation, jax.Array]:
         """What the episodes perceive, and the layout's weights float32 [B, K] for their goals."""

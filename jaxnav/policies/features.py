@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, VIEW_BLOCKED, VIEW_FREE, RowLayout
 
 NUM_FEATURES = 9  # per category, the goal flag included
+CONFIDENCE = 1  # which of them is the detection's confidence, 0 to 1
 _REACH = 5.0  # metres; scales the offsets to about 1
 
 

@@ -19,11 +19,13 @@ class Pathways(NamedTuple):
       scene: float32 [..., S], the direct pathway S -> A: what lies around.
       goal: float32 [..., G], the direct pathway G -> A: detections and what is sought, without experience.
       experience: float32 [..., Z], the mediator Z: what the method makes of scene and goal by experience.
+      gate: float32 [..., 1], factor on the logit of Done; no pathway, so interventions leave it as it is.
     """
 
     scene: jax.Array
     goal: jax.Array
     experience: jax.Array
+    gate: jax.Array
 
 
 class Memory(NamedTuple):

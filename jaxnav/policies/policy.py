@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxnav.env.types import Observation
-from jaxnav.policies.features import NUM_FEATURES, features
+from jaxnav.policies.features import CONFIDENCE, NUM_FEATURES, features
 from jaxnav.policies.methods import METHODS, CategoryMaps
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
 from jaxnav.policies.spec import PolicySpec
@@ -28,6 +28,7 @@ Params = dict[str, Any]
 
 #: First logit of Done: chosen once in 60 steps, for an agent that gives up at once never learns what it might find.
 SELDOM = -2.5
+DONE_GATE = 0.58  # times the confidence of the goal's detection
 
 
 class Policy(nnx.Module):
@@ -36,7 +37,7 @@ class Policy(nnx.Module):
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         layout = RowLayout(spec.num_categories)
         self.layout = layout
-        self.hidden = spec.sizes.hidden
+        self.hidden, self.direct, self.done_gate = spec.sizes.hidden, spec.direct, spec.done_gate
         self.appearance = nnx.Embed(spec.num_categories, spec.sizes.appearance, rngs=rngs)
         self.view = nnx.Linear(2 * layout.view**2, spec.sizes.view_outputs, rngs=rngs)
         self.detections = CategoryMaps(spec.sizes.appearance + NUM_FEATURES, spec, rngs)
@@ -63,19 +64,27 @@ class Policy(nnx.Module):
         appearance = self.appearance.embedding[...]
         looks = seen.visible[..., None] * jnp.broadcast_to(appearance, (*seen.visible.shape, appearance.shape[-1]))
         rows = jnp.concatenate([looks, seen.table], axis=-1)
+        if self.direct != "all":
+            rows = rows * (seen.goal if self.direct == "goal" else jnp.zeros_like(seen.goal))[..., None]
         goal = jnp.concatenate([self.detections(rows), seen.goal @ self.sought.embedding[...]], axis=-1)
+        confidence = (seen.table[..., CONFIDENCE] * seen.goal).sum(axis=-1, keepdims=True)
         return Pathways(
             scene=nnx.relu(self.view(seen.view)),
             goal=goal,
             experience=self.method(seen, appearance, jax.lax.stop_gradient(weights)),
+            gate=DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence),
         )
 
     def decide(self, pathways: Pathways, memory: Memory) -> Decision:
         """Action logits and value from the pathways and the memory."""
         previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
-        fused = nnx.relu(self.fuse(jnp.concatenate([*pathways, previous], axis=-1)))
+        scene, goal, experience, gate = pathways
+        fused = nnx.relu(self.fuse(jnp.concatenate([scene, goal, experience, previous], axis=-1)))
         hidden, _ = self.core(memory.hidden, fused)
-        return Decision(logits=self.actor(hidden), value=self.critic(hidden)[..., 0], hidden=hidden)
+        logits = self.actor(hidden)
+        if self.done_gate:
+            logits = jnp.concatenate([logits[..., :DONE], gate * logits[..., DONE:]], axis=-1)
+        return Decision(logits=logits, value=self.critic(hidden)[..., 0], hidden=hidden)
 
     def initial_memory(self, batch: tuple[int, ...] = ()) -> Memory:
         """Memory at the start of an episode."""

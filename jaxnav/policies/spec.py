@@ -1,6 +1,10 @@
 """The sizes of a policy: all that is needed, beside its parameters, to build it again."""
 
 import dataclasses
+from typing import Literal
+
+#: Which detections the direct pathway G -> A sees: of all categories, of the goal's alone, or none.
+Direct = Literal["all", "goal", "none"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,8 +36,13 @@ class PolicySpec:
       method: name of the method, a key of `METHODS`; how experience is made.
       num_categories: K.
       sizes: widths.
+      direct: which detections the direct pathway sees; the number of parameters does not depend on it.
+      done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
+        not (released code of HOZ and L-sTDE).
     """
 
     method: str = "org"
     num_categories: int = 22
     sizes: Sizes = Sizes()
+    direct: Direct = "all"
+    done_gate: bool = False

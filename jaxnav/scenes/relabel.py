@@ -1,4 +1,4 @@
-"""The dial on scenes of a file: categories exchange their labels, and nothing moves."""
+"""The dial of single rooms and of scene files: categories of like size exchange their labels, and nothing moves."""
 
 import dataclasses
 import zlib
@@ -11,17 +11,18 @@ from jaxnav.scenes.scene import Scene
 
 
 def relabel(scene: Scene, categories: tuple[str, ...], shift: float, seed: int) -> Scene:
-    """Exchanges the labels of a share of the categories present: all objects of one become objects of another.
+    """Exchanges the labels of categories of like size: all objects of one become objects of another.
 
-    Of C categories present the first n of a random order are exchanged, each becomes the next of them and the last the
-    first; n is `shift` C, rounded, and at least 2. Boxes stay, and with them what hides what, how far an object is
-    detected, and how far from any start there is something to find.
+    The categories present, ordered by the mean volume of their boxes, fall into pairs of neighbours; if their number is
+    odd, the three largest are one group. In a random order of these groups, the first `shift` of them, rounded, and at
+    least one, exchange: each category of a group becomes the next larger one, and the largest the smallest. Boxes stay,
+    and with them what hides what, how far an object is detected, and how far from any start there is something to find.
 
     Args:
       scene: any.
       categories: [K] the vocabulary; objects of other types keep them.
-      shift: share of the categories present, from 0 to 1.
-      seed: at least 0; with the scene's name it fixes the order.
+      shift: share of the groups, from 0 to 1.
+      seed: at least 0; with the scene's name it fixes the order of the groups.
 
     Returns:
       The relabelled scene; `scene` itself where `shift` is 0 or fewer than two categories are present.
@@ -32,11 +33,26 @@ def relabel(scene: Scene, categories: tuple[str, ...], shift: float, seed: int) 
     if seed < 0 or not 0.0 <= shift <= 1.0:  # NaN is refused, too
         raise InputError(f"relabelling: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
     ids = category_ids(scene.types, categories)
-    present = sorted(set(ids) - {-1})
-    if shift == 0 or len(present) < 2:
+    groups = _like_sized(np.array(ids), scene.boxes[:, 3:].prod(axis=1))
+    if shift == 0 or not groups:
         return scene
-    order = np.random.default_rng([seed, zlib.crc32(scene.name.encode())]).permutation(present)
-    cycle = order[: max(2, round(shift * len(present)))].tolist()
-    becomes = dict(zip(cycle, cycle[1:] + cycle[:1], strict=True))
+    order = np.random.default_rng([seed, zlib.crc32(scene.name.encode())]).permutation(len(groups))
+    exchanging = [groups[g] for g in order[: max(1, round(shift * len(groups)))]]
+    becomes = {k: new for group in exchanging for k, new in zip(group, group[1:] + group[:1], strict=True)}
     types = (categories[becomes[k]] if k in becomes else name for name, k in zip(scene.types, ids, strict=True))
     return dataclasses.replace(scene, types=tuple(types))
+
+
+def _like_sized(ids: np.ndarray, volumes: np.ndarray) -> list[list[int]]:
+    """The categories present, two by two from the smallest; the last three together if their number is odd.
+
+    Args:
+      ids: int [N] category of each object, -1 for none.
+      volumes: float [N] of the objects' boxes.
+    """
+    present = sorted(set(ids.tolist()) - {-1})
+    ordered = sorted(present, key=lambda k: volumes[ids == k].mean())  # ties in the order of the vocabulary
+    groups = [ordered[i : i + 2] for i in range(0, len(ordered) - 1, 2)]
+    if groups and len(ordered) % 2:
+        groups[-1].append(ordered[-1])
+    return groups

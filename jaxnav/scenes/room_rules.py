@@ -65,7 +65,6 @@ class RoomStatistics:
       aspect: the longest possible side of that rectangle, relative to the other.
       l_shape: share of L-shaped rooms.
       items: what stands in the room, by type, in the order in which it is put.
-      exchange: groups of types of like size and footing that exchange their rules under a shift of the layout.
     """
 
     cells: tuple[float, float, float, float, float]
@@ -74,7 +73,6 @@ class RoomStatistics:
     aspect: float
     l_shape: float
     items: Mapping[str, Item]
-    exchange: tuple[tuple[str, ...], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,10 +8,11 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.furnish import Furnishing, draw_contents, furnish
 from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.relabel import relabel
 from jaxnav.scenes.room_rules import room_statistics
 from jaxnav.scenes.room_shapes import draw_shape, wall_mask
 from jaxnav.scenes.scene import CELL, SPLITS, Scene
-from jaxnav.scenes.shift import check_scene_arguments, derangement, place_anew
+from jaxnav.scenes.shift import check_scene_arguments
 
 AGENT_RADIUS = 0.2  # metres
 OBSTACLE_HEIGHTS = (0.1, 1.7)  # boxes that reach into this range are in the agent's way, metres
@@ -33,7 +34,7 @@ def generate_rooms(
       num_val: number of validation scenes.
       num_test: number of test scenes.
       seed: at least 0.
-      shift: probability in [0, 1] that an object is placed by the rule of another type.
+      shift: share of the categories in a room that exchange their labels, from 0 to 1; see `relabel`.
 
     Returns:
       The scenes, split by split, named like `train-kitchen-003`.
@@ -59,17 +60,10 @@ def generate_room_at(split: str, index: int, seed: int, shift: float = 0.0) -> S
     """
     check_scene_arguments("generate_room_at", split, index, seed, shift)
     room_type = ROOM_TYPES[index % len(ROOM_TYPES)]
-    key = (seed, SPLITS.index(split), index)
-    rng, shift_rng = np.random.default_rng(key), np.random.default_rng((*key, 1))
-    while True:
-        drawn: DrawnRoom | None = _draw_room(room_type, rng)
-        if shift:
-            drawn = _shifted(room_type, drawn, shift, shift_rng)
-        if drawn:
-            walls, reach = wall_mask(drawn.furniture.shape), drawn.reach
-            return make_scene(
-                f"{split}-{room_type}-{index:03d}", "rooms", room_type, split, walls, reach, drawn.furniture
-            )
+    drawn = _draw_room(room_type, np.random.default_rng((seed, SPLITS.index(split), index)))
+    walls, furniture = wall_mask(drawn.furniture.shape), drawn.furniture
+    scene = make_scene(f"{split}-{room_type}-{index:03d}", "rooms", room_type, split, walls, drawn.reach, furniture)
+    return relabel(scene, ITHOR_CATEGORIES, shift, seed)
 
 
 class DrawnRoom(NamedTuple):
@@ -99,21 +93,6 @@ def _draw_room(room_type: str, rng: np.random.Generator) -> DrawnRoom:
             if abs(ratio - 1.0) < CELLS_TOLERANCE and whole and _everything_found(reach, room):
                 return DrawnRoom(room, reach)
             size *= np.clip(ratio, 0.7, 1.4) ** -0.7
-
-
-def _shifted(room_type: str, drawn: DrawnRoom, shift: float, rng: np.random.Generator) -> DrawnRoom | None:
-    """The same room with the same objects placed anew; None if it could not be walked through."""
-    statistics = room_statistics()[room_type]
-    bare = [Furnishing(drawn.furniture.shape)]
-    partners = derangement(statistics.exchange)
-    for _ in range(ATTEMPTS):
-        rooms = place_anew(bare, [statistics.items], [drawn.furniture], partners, shift, rng)
-        if rooms:
-            reach, whole = _standable(rooms[0])
-            alike = abs(reach.sum() / drawn.reach.sum() - 1.0) < CELLS_TOLERANCE
-            if alike and whole and _everything_found(reach, rooms[0]):
-                return DrawnRoom(rooms[0], reach)
-    return None
 
 
 def _standable(room: Furnishing) -> tuple[np.ndarray, bool]:

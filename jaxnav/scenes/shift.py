@@ -1,4 +1,4 @@
-"""The dial of layout shift: with some probability an object is placed by the rule of another type.
+"""The dial of homes: with some probability an object is placed by the rule of another type.
 
 Types of like size and footing exchange their rules by a fixed derangement: each takes the rule of the next of its
 group, the last that of the first. A scene is first furnished by the types' own rules; then the very same objects are

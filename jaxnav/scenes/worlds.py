@@ -94,7 +94,8 @@ class GeneratedScenes:
       split: `train`, `val` or `test`.
       count: number of scenes.
       seed: of the generator, at least 0.
-      shift: share of objects that are put where those of another category belong, from 0 to 1.
+      shift: from 0 to 1: in `rooms` the share of the categories that exchange labels, see `relabel`; in homes the
+        probability that an object is put where those of another type belong.
     """
 
     world: str

@@ -1,0 +1,61 @@
+"""The study command: train every run, put the paper's claims to the test, and write results, figures and a document."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rich.console import Console
+
+from jaxnav.cli.command import exit_code
+from jaxnav.cli.conditions import Condition, gaps, table
+from jaxnav.cli.instrument import instrument_report, of_study
+from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
+from jaxnav.evaluation.report import FORMAT, versions, write_report
+from jaxnav.evaluation.study import draw, write_document
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit code: 0, or 2 after bad input."""
+    return exit_code(lambda console: study(parse_study(arguments), console))
+
+
+def study(config: StudyConfig, console: Console) -> None:
+    """Run whatever of the study is missing, then draw its figures and write its document."""
+    names = list(dict.fromkeys(("main", *config.trainings, *(("real",) if config.real else ()))))
+    runs = {name: training(config, name) for name in names}
+    for run in runs.values():
+        ensure(run, console)
+    folder = config.results / config.split
+    about = {"study": plain(config), "versions": versions(), "format": FORMAT}
+
+    def part(name: str, make: Callable[[], dict[str, Any]]) -> None:
+        path = folder / f"{name}.json"
+        if path.exists() and json.loads(path.read_text())["study"] == about["study"]:
+            return
+        console.print(f"{path}")
+        write_report(path, about | make())
+
+    others = {name: run for name, run in runs.items() if name not in ("main", "real")}
+    for name, beside in (("main", others), ("real", {})):
+        if name not in runs:
+            continue
+        run = runs[name]
+        part(f"instrument-{name}", partial(instrument_report, of_study(config, run), run, console))
+        for shift in config.shifts:
+            part(f"{name}-shift{shift:g}", partial(table, Condition(run, beside, shift), config, console))
+        part(f"gap-{name}", partial(gaps, run, config, console))
+    draw(folder, config.document.parent / "images" / "study")
+    write_document(config.results, config.document)
+    console.print(f"written to {config.document}")
+
+
+def plain(config: StudyConfig) -> dict[str, Any]:
+    """What makes the study the study it is, as JSON: not where its files are."""
+    settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    for name in ("results", "document", "runs"):
+        settings.pop(name)
+    for name in ("run_dir", "save_every", "cache"):
+        settings["base"].pop(name)
+    return settings

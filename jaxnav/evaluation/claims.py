@@ -1,0 +1,120 @@
+"""The paper's claims as effects with intervals, and whether they hold: from the study's results alone."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+#: Results by the name of their part, see `jaxnav.cli.study`.
+Results = Mapping[str, dict[str, Any]]
+
+
+class Claim(NamedTuple):
+    """One claim put to the test.
+
+    Attributes:
+      text: the claim, as an effect above 0.
+      unit: of the effect.
+      mean, low, high: the effect and its 95 % interval.
+      least: the least effect that would matter.
+    """
+
+    text: str
+    unit: str
+    mean: float
+    low: float
+    high: float
+    least: float
+
+    @property
+    def verdict(self) -> str:
+        """`holds` if the interval lies above 0; if not, `does not hold` if it lies below what would matter."""
+        if self.low > 0:
+            return "holds"
+        return "does not hold" if self.high < self.least else "cannot be told here"
+
+
+def pick(part: Mapping[str, Any], **wanted: Any) -> dict[str, Any]:
+    """The row of a part's table with these entries; sampled actions and the main run's own gap unless named."""
+    wanted = {"training": "main", "gap": "novelty", "decoding": "sample", "control": None, **wanted}
+    return next(row for row in part["rows"] if all(row[key] == value for key, value in wanted.items()))
+
+
+def claims(results: Results, world: str = "main") -> list[Claim]:
+    """What the paper claims of one world, `main` or `real`, sampled actions."""
+    parts = [results[f"{world}-shift{shift:g}"] for shift in _shifts(results)]
+    first, last = parts[0], parts[-1]
+    at = f"at shift {last['shift']:g}"
+    paper = {"variant": "stde", "epsilon": 0.5, "form": "residual"}
+    full = {"variant": "stde", "epsilon": 0.0, "form": "paper"}
+    mismatch = {"gap": "evidence", "variant": "stde", "epsilon": 0.0, "form": "paper"}
+
+    def gain(name: str, part: Mapping[str, Any], **wanted: Any) -> Claim:
+        return _claim(name, "SR points", pick(part, **wanted)["difference"]["sr"], least=2.0)
+
+    loss = results[f"instrument-{world}"]["discriminating"][-1]
+    course, steps = results[f"gap-{world}"], (0, 20)
+    lines = {line["setting"]: line for line in course["auc"][-1]["lines"]}
+    own = next(panel for panel in course["panels"] if panel["setting"] == "calibrated")["lines"]
+    updated, frozen = (
+        next(line for line in own if line["shift"] == first["shift"] and line["belief"] == belief)
+        for belief in ("updated", "frozen")
+    )
+    hard = pick(first, variant="tde")["difference"]["sr"]
+    rows = [
+        _claim(f"The baseline loses from shift {first['shift']:g} to {last['shift']:g}", "SR points", loss, least=2.0),
+        gain("The layout's weights help where the layout is as trained", first, variant="layout"),
+        gain(f"The layout's weights help {at}", last, variant="layout"),
+        gain(f"sTDE (epsilon 0.5) gains on the weights {at}", last, **paper),
+        gain(f"sTDE (paper's form, epsilon 0) gains on the weights {at}", last, **full),
+        gain(f"sTDE with the `evidence` gap (paper's form, epsilon 0) gains on the weights {at}", last, **mismatch),
+        _difference("The gain of sTDE (epsilon 0.5) grows with the shift", *(_gain(p, paper) for p in (last, first))),
+        _claim("Hard TDE loses to the weights where the layout is as trained", "SR points", _negated(hard), least=2.0),
+        _claim("Success follows the layout's similarity (Fig. 4)", "r", first["similarity"]["pearson"], least=0.1),
+        _claim(
+            "Gains over the baseline are larger where similarity is low (Fig. 5)",
+            "points per -0.1",
+            _negated(last["gains"]["stde"]["slope"]),
+            least=1.0,
+        ),
+        _line("The gap falls below 0.5 by step 20 (Fig. 6b)", updated, steps[1], lambda gap: 0.5 - gap),
+        _line("Without updates it stays above 0.5 (Fig. 6b)", frozen, steps[1], lambda gap: gap - 0.5),
+    ]
+    rows += [
+        _line(f"Eq. 5's gap tells shift {last['shift']:g} from none at step {step}", lines["calibrated"], step, _above)
+        for step in steps
+    ]
+    return [*rows, _line("The `evidence` gap does at step 20", lines["evidence"], steps[1], _above)]
+
+
+def _shifts(results: Results) -> list[float]:
+    return next(iter(results.values()))["study"]["shifts"]
+
+
+def _gain(part: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+    return pick(part, **wanted)["difference"]["sr"]
+
+
+def _claim(text: str, unit: str, effect: Mapping[str, Any], least: float) -> Claim:
+    return Claim(text, unit, effect["mean"], effect["ci95"][0], effect["ci95"][1], least)
+
+
+def _negated(effect: Mapping[str, Any]) -> dict[str, Any]:
+    low, high = effect["ci95"]
+    return {"mean": -effect["mean"], "ci95": [-high, -low]}
+
+
+def _difference(text: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Claim:
+    """a - b, their intervals taken for those of independent normal variables."""
+    half = math.hypot(*((effect["ci95"][1] - effect["ci95"][0]) / 2 for effect in (a, b)))
+    mean = a["mean"] - b["mean"]
+    return Claim(text, "SR points", mean, mean - half, mean + half, 2.0)
+
+
+def _above(auc: float) -> float:
+    return auc - 0.5
+
+
+def _line(text: str, line: Mapping[str, Sequence[float]], step: int, effect: Callable[[float], float]) -> Claim:
+    at = min(step, len(line["mean"]) - 1)
+    low, high = sorted(effect(line[name][at]) for name in ("low", "high"))
+    return Claim(text, "AUC - 0.5" if effect is _above else "D", effect(line["mean"][at]), low, high, 0.05)

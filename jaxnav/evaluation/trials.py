@@ -1,0 +1,109 @@
+"""The trials of the study: every way of using the policies at inference that its tables compare."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.evaluation.grid import Outcome
+from jaxnav.evaluation.inference import Branch, Inference
+from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.report import Decoding, Form
+from jaxnav.evaluation.statistics import paired_difference, summary
+from jaxnav.evaluation.variants import inference_grid, table_row
+
+#: What is changed about sTDE to learn what it owes its effect to: the weight is its own mean at every step, or that of
+#: another episode; what is taken out is nothing but temperature, or noise; the intervention is random instead of zero.
+#: The first needs the mean weight, which is known only after the others.
+Control = Literal["constant", "shuffled", "zeros", "noise", "random"]
+CONTROLS: tuple[Control, ...] = ("constant", "shuffled", "zeros", "noise", "random")
+METRICS = ("sr", "spl", "dts")
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One row of a table of the study.
+
+    Attributes:
+      variant: `baseline`, `layout`, `tde` or `stde`.
+      decoding: of actions.
+      epsilon, form: of sTDE.
+      control: what is changed about it.
+      weight: the constant weight of `constant`.
+    """
+
+    variant: Literal["baseline", "layout", "tde", "stde", "random"]
+    decoding: Decoding
+    epsilon: float | None = None
+    form: Form | None = None
+    control: Control | None = None
+    weight: float = 0.0
+
+    def cells(self, num_seeds: int) -> Inference:
+        """The cells of the grid, leaves [S]; parameters are stacked as by `inference_grid`."""
+        cells = inference_grid([table_row(self.variant, self.epsilon, self.form, self.decoding)], num_seeds)
+        match self.control:
+            case "constant":
+                changes = {"always": jnp.float32(self.weight), "epsilon": jnp.float32(jnp.inf)}
+            case "shuffled":
+                changes = {"shuffled": jnp.bool_(True)}
+            case "zeros":
+                changes = {"branch": jnp.int32(Branch.ZEROS)}
+            case "noise":
+                changes = {"branch": jnp.int32(Branch.NOISE)}
+            case "random":
+                changes = {"noise": jnp.float32(1.0)}
+            case None:
+                changes = {}
+        return cells.replace(**{name: jnp.broadcast_to(value, (num_seeds,)) for name, value in changes.items()})
+
+
+def trial_grid(trials: Sequence[Trial], num_seeds: int) -> Inference:
+    """The cells of all trials, leaves [T S]."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(trial.cells(num_seeds) for trial in trials))
+
+
+class Results:
+    """Outcomes [T, S, E] of trials that share their policies and episodes, and what they say."""
+
+    def __init__(self, trials: Sequence[Trial], outcome: Outcome, best_length: np.ndarray, strata: np.ndarray) -> None:
+        self.trials = list(trials)
+        self.metrics = episode_metrics(outcome, best_length)
+        self.weight = np.asarray(outcome.weight, np.float64)
+        self.length = np.asarray(outcome.length)
+        self.strata = strata
+
+    def success(self, trial: Trial) -> np.ndarray:
+        """Success of a trial, float64 [S, E]."""
+        return self.metrics["sr"][self.trials.index(trial)]
+
+    def mean_weight(self, trial: Trial) -> float:
+        """Mean over steps of the weight of what is taken out."""
+        i = self.trials.index(trial)
+        return float((self.weight[i] * self.length[i]).sum() / self.length[i].sum())
+
+    def rows(self, seed: int) -> list[dict[str, Any]]:
+        """A row of JSON per trial: metrics, and their difference to the layout's weights (theirs: to the baseline).
+
+        SR and SPL are in percent, DTS in metres; intervals as in `jaxnav.evaluation.statistics`. Trials without the row
+        that they would be compared with have no difference.
+        """
+        return [self._row(i, trial, seed) for i, trial in enumerate(self.trials)]
+
+    def _row(self, i: int, trial: Trial, seed: int) -> dict[str, Any]:
+        scale = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
+        against = Trial("baseline" if trial.variant == "layout" else "layout", trial.decoding)
+        row: dict[str, Any] = dataclasses.asdict(trial) | {"weight": self.mean_weight(trial)}
+        for metric in METRICS:
+            own = scale[metric] * self.metrics[metric]
+            # Equal resamples for every row: equal results get equal intervals.
+            row[metric] = summary(own[i], self.strata, np.random.default_rng(seed))._asdict()
+            row[metric]["seeds"] = own[i].mean(axis=1).tolist()
+            if trial.variant not in ("baseline", "random") and against in self.trials:
+                other, same = own[self.trials.index(against)], trial.variant != "layout"
+                difference = paired_difference(other, own[i], self.strata, np.random.default_rng(seed), same_seeds=same)
+                row.setdefault("difference", {"to": against.variant})[metric] = difference._asdict()
+        return row

@@ -1,0 +1,110 @@
+"""The estimator's prior strength and reduction, chosen on random walks in the training scenes."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.env.objectnav import ObjectNav
+from jaxnav.env.types import EnvParams, State
+from jaxnav.layout import LayoutEstimator, LayoutState, Reduction, Setting, prior_from_counts
+from jaxnav.scenes.task import DONE
+
+#: What a gap should be like in the training layouts, after Fig. 6b: large in the first three views that the belief
+#: takes in, well under the paper's threshold of 0.5 twenty steps later.
+EARLY, LATE, LATE_STEP = 0.75, 0.25, 20
+EARLY_VIEWS = 3
+STRENGTHS = (5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0)
+REDUCTIONS: tuple[Reduction, ...] = ("mean_visible", "sum")
+
+
+def layout_priors(counts: jax.Array, setting: str | Setting) -> jax.Array:
+    """The layout prior of each room type, float32 [rooms, K, K], from what exploration counted.
+
+    Every pair starts with one sighting (the all-ones Dirichlet). A room type that training has no scene of gets the
+    prior of all its scenes together.
+    """
+    met = counts.any(axis=(1, 2), keepdims=True)
+    counts = jnp.where(met, counts, counts.sum(axis=0, keepdims=True))
+    return jax.vmap(lambda own: prior_from_counts(own + 1.0, setting))(counts)
+
+
+class Calibration(NamedTuple):
+    """The setting that was chosen, and how its gap runs.
+
+    Attributes:
+      setting: with the chosen strength and reduction.
+      early: median gap of the first three views taken in.
+      late: median gap at step 20.
+    """
+
+    setting: Setting
+    early: float
+    late: float
+
+
+def calibrate(
+    env: ObjectNav,
+    params: EnvParams,
+    counts: jax.Array,
+    setting: Setting,
+    key: jax.Array,
+    strengths: Sequence[float] = STRENGTHS,
+    reductions: Sequence[Reduction] = REDUCTIONS,
+    num_walks: int = 256,
+) -> Calibration:
+    """Choose strength and reduction so that the gap runs as in the paper's Fig. 6b where the layout is as trained.
+
+    Of all pairs the one with the least |early - 0.75| + |late - 0.25| is taken, early and late being medians over the
+    same random walks without Done.
+
+    Args:
+      env: the environment.
+      params: of the training scenes.
+      counts: float32 [rooms, K, K], from `explore`.
+      setting: the estimator's other choices.
+      key: consumed.
+      strengths, reductions: to choose from.
+      num_walks: parallel walks.
+    """
+    start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
+    actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
+
+    def gaps(setting: Setting, priors: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+        """Mean gap of the early views (NaN without any) and gap of the late step, [num_walks]."""
+        _, state = jax.vmap(env.reset, (0, None))(jax.random.split(start_key, num_walks), params)
+
+        def estimators(state: State) -> LayoutEstimator:
+            return LayoutEstimator(priors[params.room[state.scene]], setting)
+
+        def see(state: State, layout: LayoutState) -> tuple[LayoutState, tuple[jax.Array, jax.Array]]:
+            presence = env.layout.presence(params.tables.rows[state.pose])
+            new = jax.vmap(LayoutEstimator.update)(estimators(state), layout, presence)
+            return new, (new.gap, (new.alpha != layout.alpha).any(axis=(1, 2)))
+
+        def step(carry: tuple[State, LayoutState], action: jax.Array) -> tuple:
+            state, *_ = jax.vmap(env.advance, (0, 0, None))(carry[0], action, params)
+            layout, seen = see(state, carry[1])
+            return (state, layout), seen
+
+        layout, first = see(state, jax.vmap(LayoutEstimator.init)(estimators(state)))
+        _, later = jax.lax.scan(step, (state, layout), actions)
+        gap, taken = (jnp.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
+        early = taken & (jnp.cumsum(taken, axis=0) <= EARLY_VIEWS)
+        return jnp.where(early, gap, 0.0).sum(axis=0) / early.astype(jnp.float32).sum(axis=0), gap[-1]
+
+    choices = [dataclasses.replace(setting, strength=strength) for strength in strengths]
+    priors = jnp.stack([layout_priors(counts, chosen) for chosen in choices])
+    found = []
+    for reduction in reductions:
+        own = dataclasses.replace(setting, reduction=reduction)  # the strength only enters by the priors
+        early, late = jax.jit(jax.vmap(partial(gaps, own), (0, None)))(priors, params)
+        found += [
+            Calibration(dataclasses.replace(own, strength=chosen.strength), float(np.nanmedian(e)), float(np.median(f)))
+            for chosen, e, f in zip(choices, np.asarray(early), np.asarray(late), strict=True)
+        ]
+    return min(found, key=lambda one: abs(one.early - EARLY) + abs(one.late - LATE))
