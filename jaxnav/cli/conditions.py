@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,19 +17,20 @@ from jaxnav.cli.worlds import CompiledWorld, evaluation_world
 from jaxnav.errors import InputError
 from jaxnav.evaluation.association import gain_by_similarity, success_by_similarity
 from jaxnav.evaluation.episodes import EpisodeList, episode_list
-from jaxnav.evaluation.grid import evaluate_grid
+from jaxnav.evaluation.grid import Evaluator, Outcome
 from jaxnav.evaluation.report import Decoding, Form
 from jaxnav.evaluation.similarity import scene_counts
 from jaxnav.evaluation.tracking import FROZEN, UPDATED, Course, auc_by_step, gap_traces, mean_by_step
-from jaxnav.evaluation.trials import CONTROLS, Results, Trial, trial_grid
+from jaxnav.evaluation.trials import CONTROLS, Results, Trial, mean_weight, trial_grid
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
+from jaxnav.policies.spec import PolicySpec
 from jaxnav.training.calibration import layout_priors
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 FORMS: tuple[Form, ...] = ("residual", "paper")
-#: The two uses of sTDE that controls are run for: the paper's threshold, and all there is to take out.
-REFERENCES: tuple[tuple[float, Form], ...] = ((0.5, "residual"), (0.0, "paper"))
+#: The uses of sTDE that all is run for: the paper's threshold, and no threshold, in the paper's form.
+USES: tuple[tuple[float, Form], ...] = ((0.5, "residual"), (0.0, "paper"))
 
 
 class Condition(NamedTuple):
@@ -46,36 +47,77 @@ class Condition(NamedTuple):
     shift: float
 
 
-def table(condition: Condition, config: StudyConfig, console: Console) -> dict[str, Any]:
-    """Every trial of every run at one shift, and success against similarity."""
-    run = condition.run
-    world = evaluation_world(run, config.split, None, condition.shift, console)
-    episodes = _episodes(world, config)
-    policies, rows = load_policies(run), []
+class Bench:
+    """Evaluates trials in blocks of one size, so that all that is alike is compiled once."""
 
-    def add(name: str, policies: Policies, gap: str, trials: Sequence[Trial]) -> Results:
-        setting = gap_settings(policies.setting)[gap]
-        results = _evaluate(world, episodes, policies, setting, trials, run.seeds, config.seed)
-        for row in results.rows(config.seed):
-            new = row["variant"] == "stde" or gap == "novelty"  # without sTDE the gap is of no effect
-            rows.extend([{"training": name, "gap": gap, **row}] if new else [])
+    BLOCK = 2
+
+    def __init__(self, config: StudyConfig) -> None:
+        self.config = config
+        self._evaluators: dict[tuple[Acting, PolicySpec], Evaluator] = {}
+
+    def outcomes(
+        self, world: CompiledWorld, episodes: EpisodeList, policies: Policies, gap: str, trials: Iterable[Trial]
+    ) -> dict[Trial, Outcome]:
+        """The outcomes of each trial, leaves [S, E]."""
+        trials, seeds = list(dict.fromkeys(trials)), self.config.base.seeds
+        acting = Acting(world.env, gap_settings(policies.setting)[gap])
+        evaluator = self._evaluators.setdefault((acting, policies.spec), Evaluator(acting, policies.spec))
+        found: dict[Trial, Outcome] = {}
+        for first in range(0, len(trials), self.BLOCK):
+            block = trials[first : first + self.BLOCK]
+            filled = block + block[-1:] * (self.BLOCK - len(block))
+            outcome = evaluator(
+                trial_grid(filled, seeds),
+                policies.params,
+                [(episodes, world.params(0))],
+                policies.priors,
+                jax.random.key(self.config.seed),
+            )
+            for i, trial in enumerate(block):
+                found[trial] = jax.tree.map(lambda leaf, i=i: leaf[i * seeds : (i + 1) * seeds], outcome)
+        return found
+
+
+def table(condition: Condition, bench: Bench, console: Console) -> dict[str, Any]:
+    """Every trial of every run at one shift, and success against similarity."""
+    run, config = condition.run, bench.config
+    world = evaluation_world(run, config.split, None, condition.shift, console)
+    episodes, policies = _episodes(world, config), load_policies(run)
+    rows: list[dict[str, Any]] = []
+    similarity: dict[str, Any] = {}
+
+    def add(name: str, gap: str, outcomes: Mapping[Trial, Outcome]) -> Results:
+        results = Results(outcomes, episodes.best_length, episodes.room)
+        # Without sTDE the gap is of no effect.
+        own = (row for row in results.rows(config.seed) if row["variant"] == "stde" or gap == "novelty")
+        rows.extend({"training": name, "gap": gap, **row} for row in own)
         return results
 
-    epsilons = sorted({0.0, 0.5, 1.0, *(config.epsilon if config.split == "val" else (chosen(config)[0],))})
-    own = add("main", policies, "novelty", [*_plain(), *_sweep(epsilons), *_controls()])
-    add("main", policies, "novelty", [*_plain(), *_constants(own)])
-    evidence = add("main", policies, "evidence", [*_plain(), *_sweep(epsilons), *_controls()])
-    add("main", policies, "evidence", [*_plain(), *_constants(evidence)])
-    add("main", policies, "clock", [*_plain(), *_sweep((0.0, 0.5))])
+    plain = bench.outcomes(world, episodes, policies, "novelty", _plain(DECODINGS))
+    epsilons = config.epsilon if config.split == "val" else chosen(config)
+    for gap in ("novelty", "evidence", "clock"):
+        trials = [Trial("stde", decoding, *use) for use in USES for decoding in DECODINGS]
+        if gap == "novelty":
+            trials += [Trial("stde", "argmax", epsilon, form) for form in FORMS for epsilon in epsilons]
+        if gap != "clock":
+            trials += [Trial("stde", "argmax", *use, control) for use in USES for control in CONTROLS[1:]]
+        found = bench.outcomes(world, episodes, policies, gap, trials)
+        if gap != "clock":
+            weights = {use: mean_weight(found[Trial("stde", "argmax", *use)]) for use in USES}
+            constants = [Trial("stde", "argmax", *use, "constant", weight) for use, weight in weights.items()]
+            found |= bench.outcomes(world, episodes, policies, gap, constants)
+        results = add("main", gap, plain | found)
+        if gap == "novelty":
+            similarity = _similarity(world, episodes, policies, results, config)
     for name, other in condition.others.items():
-        loaded = load_policies(other, other.arms)
-        if "baseline" not in other.arms:
+        loaded, both = load_policies(other, other.arms), "baseline" in other.arms
+        if not both:
             loaded = loaded._replace(params=jax.tree.map(lambda x: jnp.concatenate([x, x]), loaded.params))
-        add(name, loaded, "novelty", [*_plain("baseline" in other.arms), *_sweep((0.0, 0.5))])
-    # Rows that came more than once, for others to be compared with, are the same to the bit.
-    rows = list({json.dumps(row): row for row in rows}.values())
+        trials = [*_plain(("argmax",), both), *(Trial("stde", "argmax", *use) for use in USES)]
+        add(name, "novelty", bench.outcomes(world, episodes, loaded, "novelty", trials))
     about = {"shift": condition.shift, "world": world.scenes[0].world, "scenes": len(episodes.scenes)}
-    return about | {"episodes": len(episodes.goal), "rows": rows} | _similarity(world, episodes, policies, own, config)
+    return about | {"episodes": len(episodes.goal), "rows": rows} | similarity
 
 
 def gap_settings(setting: Setting) -> dict[str, Setting]:
@@ -90,8 +132,8 @@ def gap_settings(setting: Setting) -> dict[str, Setting]:
     }
 
 
-def chosen(config: StudyConfig) -> tuple[float, str]:
-    """Epsilon and form of the greatest SR on `val` at the first shift, sampled actions, eq. 5's gap.
+def chosen(config: StudyConfig) -> tuple[float, ...]:
+    """Epsilon of the greatest SR on `val` at the first shift, eq. 5's gap, residual form.
 
     Raises:
       InputError: the study has not been done on `val`.
@@ -99,71 +141,21 @@ def chosen(config: StudyConfig) -> tuple[float, str]:
     path = config.results / "val" / f"main-shift{config.shifts[0]:g}.json"
     if not path.exists():
         raise InputError(f"{path}: is missing; run the study with --split val first, epsilon is chosen there")
-    rows = [row for row in json.loads(path.read_text())["rows"] if _is_sweep(row)]
-    best = max(rows, key=lambda row: row["sr"]["mean"])
-    return best["epsilon"], best["form"]
+    wanted = {"training": "main", "gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
+    wanted["form"] = "residual"
+    rows = [row for row in json.loads(path.read_text())["rows"] if all(row[key] == wanted[key] for key in wanted)]
+    return (max(rows, key=lambda row: row["sr"]["mean"])["epsilon"],)
 
 
-def _is_sweep(row: dict[str, Any]) -> bool:
-    wanted = {"training": "main", "gap": "novelty", "variant": "stde", "decoding": "sample", "control": None}
-    return all(row[key] == value for key, value in wanted.items())
-
-
-def _plain(baseline: bool = True) -> Iterator[Trial]:
-    for decoding in DECODINGS:
-        if baseline:
-            yield Trial("baseline", decoding)
-        yield from (Trial("layout", decoding), Trial("tde", decoding))
-
-
-def _sweep(epsilons: Sequence[float]) -> Iterator[Trial]:
-    for decoding in DECODINGS:
-        for form in FORMS:
-            yield from (Trial("stde", decoding, epsilon, form) for epsilon in epsilons)
-
-
-def _controls() -> Iterator[Trial]:
-    for decoding in DECODINGS:
-        for epsilon, form in REFERENCES:
-            yield from (
-                Trial("stde", decoding, epsilon, form, control) for control in CONTROLS if control != "constant"
-            )
-
-
-def _constants(results: Results) -> Iterator[Trial]:
-    for decoding in DECODINGS:
-        for epsilon, form in REFERENCES:
-            weight = results.mean_weight(Trial("stde", decoding, epsilon, form))
-            yield Trial("stde", decoding, epsilon, form, "constant", weight)
+def _plain(decodings: Sequence[Decoding], baseline: bool = True) -> list[Trial]:
+    variants = ("baseline", "layout", "tde") if baseline else ("layout", "tde")
+    return [Trial(variant, decoding) for variant in variants for decoding in decodings]
 
 
 def _episodes(world: CompiledWorld, config: StudyConfig) -> EpisodeList:
     if len(world.banks) > 1:
         raise InputError("study: takes as many scenes of a split as fit into one shard; give more --shard-scenes")
     return episode_list(world.banks[0], config.episodes, config.seed)
-
-
-def _evaluate(
-    world: CompiledWorld,
-    episodes: EpisodeList,
-    policies: Policies,
-    setting: Setting,
-    trials: Sequence[Trial],
-    num_seeds: int,
-    seed: int,
-) -> Results:
-    trials = list(dict.fromkeys(trials))
-    outcome, _ = evaluate_grid(
-        trial_grid(trials, num_seeds),
-        policies.params,
-        [(episodes, world.params(0))],
-        Acting(world.env, setting),
-        policies.spec,
-        policies.priors,
-        jax.random.key(seed),
-    )
-    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(trials), num_seeds, -1), outcome)
-    return Results(trials, outcome, episodes.best_length, episodes.room)
 
 
 def _similarity(
@@ -173,10 +165,10 @@ def _similarity(
     bank = world.banks[0]
     room = np.asarray(world.params(0).room)[: len(bank.names)]
     about = episodes, scene_counts(bank), np.asarray(policies.counts, np.float64)[room]
-    baseline = results.success(Trial("baseline", "sample"))
+    baseline = results.success(Trial("baseline", "argmax"))
     found = success_by_similarity(baseline, *about, np.random.default_rng(config.seed))
     gains = {}
-    for name, trial in {"layout": Trial("layout", "sample"), "stde": Trial("stde", "sample", *REFERENCES[0])}.items():
+    for name, trial in {"layout": Trial("layout", "argmax"), "stde": Trial("stde", "argmax", *USES[0])}.items():
         gain = gain_by_similarity(baseline, results.success(trial), *about, np.random.default_rng(config.seed))
         gains[name] = _lists(gain) | {"categories": [world.env.categories[k] for k in gain.category]}
     return {"similarity": _lists(found), "gains": gains}

@@ -9,11 +9,12 @@ from typing import Any
 from rich.console import Console
 
 from jaxnav.cli.command import exit_code
-from jaxnav.cli.conditions import Condition, gaps, table
+from jaxnav.cli.conditions import Bench, Condition, gaps, table
 from jaxnav.cli.instrument import instrument_report, of_study
 from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
-from jaxnav.evaluation.report import FORMAT, versions, write_report
+from jaxnav.evaluation.report import FORMAT, versions
 from jaxnav.evaluation.study import draw, write_document
+from jaxnav.store.files import write_atomic
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -35,8 +36,9 @@ def study(config: StudyConfig, console: Console) -> None:
         if path.exists() and json.loads(path.read_text())["study"] == about["study"]:
             return
         console.print(f"{path}")
-        write_report(path, about | make())
+        write_atomic(path, (json.dumps(rounded(about | make()), allow_nan=False) + "\n").encode())
 
+    bench = Bench(config)
     others = {name: run for name, run in runs.items() if name not in ("main", "real")}
     for name, beside in (("main", others), ("real", {})):
         if name not in runs:
@@ -44,7 +46,7 @@ def study(config: StudyConfig, console: Console) -> None:
         run = runs[name]
         part(f"instrument-{name}", partial(instrument_report, of_study(config, run), run, console))
         for shift in config.shifts:
-            part(f"{name}-shift{shift:g}", partial(table, Condition(run, beside, shift), config, console))
+            part(f"{name}-shift{shift:g}", partial(table, Condition(run, beside, shift), bench, console))
         part(f"gap-{name}", partial(gaps, run, config, console))
     draw(folder, config.document.parent / "images" / "study")
     write_document(config.results, config.document)
@@ -54,8 +56,17 @@ def study(config: StudyConfig, console: Console) -> None:
 def plain(config: StudyConfig) -> dict[str, Any]:
     """What makes the study the study it is, as JSON: not where its files are."""
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-    for name in ("results", "document", "runs"):
+    for name in ("results", "document", "runs", "split"):
         settings.pop(name)
     for name in ("run_dir", "save_every", "cache"):
         settings["base"].pop(name)
     return settings
+
+
+def rounded(value: Any) -> Any:
+    """JSON with numbers of six digits: what is behind them is no result."""
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

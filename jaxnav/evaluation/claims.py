@@ -34,13 +34,13 @@ class Claim(NamedTuple):
 
 
 def pick(part: Mapping[str, Any], **wanted: Any) -> dict[str, Any]:
-    """The row of a part's table with these entries; sampled actions and the main run's own gap unless named."""
-    wanted = {"training": "main", "gap": "novelty", "decoding": "sample", "control": None, **wanted}
+    """The row of a part's table with these entries; best actions and the main run's own gap unless named."""
+    wanted = {"training": "main", "gap": "novelty", "decoding": "argmax", "control": None, **wanted}
     return next(row for row in part["rows"] if all(row[key] == value for key, value in wanted.items()))
 
 
 def claims(results: Results, world: str = "main") -> list[Claim]:
-    """What the paper claims of one world, `main` or `real`, sampled actions."""
+    """What the paper claims of one world, `main` or `real`, best actions."""
     parts = [results[f"{world}-shift{shift:g}"] for shift in _shifts(results)]
     first, last = parts[0], parts[-1]
     at = f"at shift {last['shift']:g}"

@@ -243,5 +243,7 @@ def _legend(figure: Figure, keys: list[Line2D]) -> None:
 
 
 def _interval(own: dict[str, Any], form: str) -> str:
+    if own["mean"] is None:
+        return "undefined"
     low, high = own["ci95"]
     return f"{own['mean']:{form}} [{low:{form}}, {high:{form}}]".replace("-", "\N{MINUS SIGN}")

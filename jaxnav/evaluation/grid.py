@@ -51,6 +51,11 @@ class _Progress(NamedTuple):
     agent: Agent
     running: jax.Array
     outcome: Outcome
+    keys: jax.Array
+
+
+#: The episodes are carried on in so many parts as still run: all of them, half, and so on.
+_SHARES = (2, 4, 16)
 
 
 def evaluate_grid(
@@ -77,26 +82,48 @@ def evaluate_grid(
     Returns:
       The outcomes [C, E] and the number of compilations that it took: 1 if all parts are of equal shape.
     """
-    traces = 0
+    evaluator = Evaluator(acting, spec)
+    return evaluator(grid, weights, parts, priors, key), evaluator.compilations
 
-    @jax.jit
-    def run(
-        grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array
+
+class Evaluator:
+    """Evaluates grids one after the other; those of equal shape share a compilation. Arguments as `evaluate_grid`.
+
+    Attributes:
+      compilations: so far.
+    """
+
+    def __init__(self, acting: Acting, spec: PolicySpec) -> None:
+        self.compilations = 0
+        self._acting, self._spec = acting, spec
+        self._compiled = jax.jit(self._run)
+
+    def __call__(
+        self,
+        grid: Inference,
+        weights: Params,
+        parts: Iterable[tuple[EpisodeList, EnvParams]],
+        priors: jax.Array,
+        key: jax.Array,
     ) -> Outcome:
-        nonlocal traces
-        traces += 1
+        """The outcomes [C, E]."""
+        outcomes = []
+        for part, (episodes, params) in enumerate(parts):
+            own = jax.random.fold_in(key, part)
+            outcome = self._compiled(grid, weights, first_states(episodes), params, priors, own)
+            outcomes.append(jax.tree.map(np.asarray, outcome))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *outcomes)
+
+    def _run(
+        self, grid: Inference, weights: Params, start: State, params: EnvParams, priors: jax.Array, key: jax.Array
+    ) -> Outcome:
+        self.compilations += 1  # traced once per shape
 
         def one(cell: Inference) -> Outcome:
             own = jax.tree.map(lambda leaf: leaf[cell.params], weights)
-            return _episodes(cell, own, start, acting, spec, params, priors, key)
+            return _episodes(cell, own, start, self._acting, self._spec, params, priors, key)
 
         return jax.lax.map(one, grid)
-
-    outcomes = []
-    for part, (episodes, params) in enumerate(parts):
-        outcome = run(grid, weights, first_states(episodes), params, priors, jax.random.fold_in(key, part))
-        outcomes.append(jax.tree.map(np.asarray, outcome))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *outcomes), traces
 
 
 def first_states(episodes: EpisodeList) -> State:
@@ -119,7 +146,10 @@ def _episodes(
     priors: jax.Array,
     key: jax.Array,
 ) -> Outcome:
-    """Run one cell over all episodes until the last one has ended."""
+    """Run one cell over all episodes until the last one has ended.
+
+    Few are long: when no more than half of the episodes still run, only these are carried on, and so on.
+    """
     policy = bind(spec, weights)
     count = start.pose.shape
     own = jax.random.fold_in(key, cell.params)
@@ -127,7 +157,7 @@ def _episodes(
     agent = acting.begin(start, policy, params, priors)
 
     def step(progress: _Progress) -> _Progress:
-        agent, running, outcome = progress
+        agent, running, outcome, keys = progress
         following, taken = act(cell, policy, agent, keys, acting, params, priors)
         outcome = outcome._replace(
             success=outcome.success | (running & taken.success),
@@ -135,14 +165,20 @@ def _episodes(
             moves=outcome.moves + (running & (taken.action == MOVE_AHEAD)).astype(jnp.int32),
             weight=outcome.weight + jnp.where(running, taken.weight, 0.0),
         )
-        return _Progress(select(running, following, agent), running & ~taken.ended, outcome)
+        return _Progress(select(running, following, agent), running & ~taken.ended, outcome, keys)
 
-    first = _Progress(agent, jnp.ones(count, bool), Outcome.start(count))
-    end = jax.lax.while_loop(lambda progress: progress.running.any(), step, first)
-    last = end.agent.state
-    return end.outcome._replace(
+    progress = _Progress(agent, jnp.ones(count, bool), Outcome.start(count), keys)
+    episodes, ended = jnp.arange(count[0]), (progress.outcome, start)
+    for most in (*(count[0] // share for share in _SHARES), 0):
+        progress = jax.lax.while_loop(lambda own, most=most: own.running.sum() > most, step, progress)
+        now = progress.outcome, progress.agent.state
+        ended = jax.tree.map(lambda whole, own, at=episodes: whole.at[at].set(own), ended, now)
+        left = jnp.argsort(~progress.running)[:most]  # those that run first
+        episodes, progress = episodes[left], jax.tree.map(lambda leaf, left=left: leaf[left], progress)
+    outcome, last = ended
+    return outcome._replace(
         distance=params.tables.goal_distance[acting.env.cell(last.pose), last.goal],
-        weight=end.outcome.weight / end.outcome.length.astype(jnp.float32),
+        weight=outcome.weight / outcome.length.astype(jnp.float32),
     )
 
 

@@ -1,7 +1,7 @@
 """The trials of the study: every way of using the policies at inference that its tables compare."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -20,7 +20,7 @@ from jaxnav.evaluation.variants import inference_grid, table_row
 #: The first needs the mean weight, which is known only after the others.
 Control = Literal["constant", "shuffled", "zeros", "noise", "random"]
 CONTROLS: tuple[Control, ...] = ("constant", "shuffled", "zeros", "noise", "random")
-METRICS = ("sr", "spl", "dts")
+METRICS = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Trial:
       weight: the constant weight of `constant`.
     """
 
-    variant: Literal["baseline", "layout", "tde", "stde", "random"]
+    variant: Literal["baseline", "layout", "tde", "stde"]
     decoding: Decoding
     epsilon: float | None = None
     form: Form | None = None
@@ -66,24 +66,26 @@ def trial_grid(trials: Sequence[Trial], num_seeds: int) -> Inference:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(trial.cells(num_seeds) for trial in trials))
 
 
-class Results:
-    """Outcomes [T, S, E] of trials that share their policies and episodes, and what they say."""
+def mean_weight(outcome: Outcome) -> float:
+    """Mean over all steps of the weight of what is taken out."""
+    length = np.asarray(outcome.length, np.float64)
+    return float((np.asarray(outcome.weight, np.float64) * length).sum() / length.sum())
 
-    def __init__(self, trials: Sequence[Trial], outcome: Outcome, best_length: np.ndarray, strata: np.ndarray) -> None:
-        self.trials = list(trials)
-        self.metrics = episode_metrics(outcome, best_length)
-        self.weight = np.asarray(outcome.weight, np.float64)
-        self.length = np.asarray(outcome.length)
-        self.strata = strata
+
+class Results:
+    """What trials on the same episodes say.
+
+    Attributes:
+      outcomes: of each trial, leaves [S, E].
+    """
+
+    def __init__(self, outcomes: Mapping[Trial, Outcome], best_length: np.ndarray, strata: np.ndarray) -> None:
+        self.outcomes, self._strata = outcomes, strata
+        self._metrics = {trial: episode_metrics(outcome, best_length) for trial, outcome in outcomes.items()}
 
     def success(self, trial: Trial) -> np.ndarray:
         """Success of a trial, float64 [S, E]."""
-        return self.metrics["sr"][self.trials.index(trial)]
-
-    def mean_weight(self, trial: Trial) -> float:
-        """Mean over steps of the weight of what is taken out."""
-        i = self.trials.index(trial)
-        return float((self.weight[i] * self.length[i]).sum() / self.length[i].sum())
+        return self._metrics[trial]["sr"]
 
     def rows(self, seed: int) -> list[dict[str, Any]]:
         """A row of JSON per trial: metrics, and their difference to the layout's weights (theirs: to the baseline).
@@ -91,19 +93,18 @@ class Results:
         SR and SPL are in percent, DTS in metres; intervals as in `jaxnav.evaluation.statistics`. Trials without the row
         that they would be compared with have no difference.
         """
-        return [self._row(i, trial, seed) for i, trial in enumerate(self.trials)]
+        return [self._row(trial, seed) for trial in self.outcomes]
 
-    def _row(self, i: int, trial: Trial, seed: int) -> dict[str, Any]:
-        scale = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
+    def _row(self, trial: Trial, seed: int) -> dict[str, Any]:
         against = Trial("baseline" if trial.variant == "layout" else "layout", trial.decoding)
-        row: dict[str, Any] = dataclasses.asdict(trial) | {"weight": self.mean_weight(trial)}
-        for metric in METRICS:
-            own = scale[metric] * self.metrics[metric]
+        row: dict[str, Any] = dataclasses.asdict(trial) | {"mean_weight": mean_weight(self.outcomes[trial])}
+        for metric, scale in METRICS.items():
+            own = scale * self._metrics[trial][metric]
             # Equal resamples for every row: equal results get equal intervals.
-            row[metric] = summary(own[i], self.strata, np.random.default_rng(seed))._asdict()
-            row[metric]["seeds"] = own[i].mean(axis=1).tolist()
-            if trial.variant not in ("baseline", "random") and against in self.trials:
-                other, same = own[self.trials.index(against)], trial.variant != "layout"
-                difference = paired_difference(other, own[i], self.strata, np.random.default_rng(seed), same_seeds=same)
+            row[metric] = summary(own, self._strata, np.random.default_rng(seed))._asdict()
+            row[metric]["seeds"] = own.mean(axis=1).tolist()
+            if trial.variant != "baseline" and against in self.outcomes:
+                other, same = scale * self._metrics[against][metric], trial.variant != "layout"
+                difference = paired_difference(other, own, self._strata, np.random.default_rng(seed), same_seeds=same)
                 row.setdefault("difference", {"to": against.variant})[metric] = difference._asdict()
         return row

@@ -1,0 +1,216 @@
+"""sTDE and its controls, step by step: what is taken out, with which weight, and which actions follow."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+from scipy.stats import kstest
+
+from jaxnav.causal import do
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.grid import act, first_states
+from jaxnav.evaluation.inference import Branch, counterfactual_logits
+from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.pathways import Decision, Memory, Pathways
+from jaxnav.policies.policy import bind
+from jaxnav.scenes.task import NUM_ACTIONS
+
+EPISODES = 48
+ENV, PARAMS = tiny.world()
+PRIORS = 0.05 * tiny.priors()  # a belief that gives way at once: large gaps
+ACTING = Acting(ENV, tiny.SETTING)
+START = first_states(episode_list(tiny.BANK, EPISODES, seed=1))
+
+
+def cell(variant="stde", epsilon=0.0, form="paper", decoding="argmax", **changes):
+    """One cell of the grid, changed."""
+    one = tiny.at(inference_grid([table_row(variant, epsilon, form, decoding)], 1), 0)
+    return one.replace(**{name: jnp.asarray(value, getattr(one, name).dtype) for name, value in changes.items()})
+
+
+LAYOUT = cell("layout")
+NO_BRANCH = {"branch": Branch.ZEROS}
+EPISODE_KEYS = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(3), jnp.arange(EPISODES))
+
+
+@jax.jit
+def begin(weights):
+    """The episodes after their first view."""
+    return ACTING.begin(START, bind(tiny.SPEC, weights), PARAMS, PRIORS)
+
+
+@jax.jit
+def take(own, weights, agent, keys):
+    """One step."""
+    return act(own, bind(tiny.SPEC, weights), agent, keys, ACTING, PARAMS, PRIORS)
+
+
+@jax.jit
+def both(own, weights, agent, keys):
+    """The logits that are taken out, and those of the counterfactual decision."""
+    policy = bind(tiny.SPEC, weights)
+    observation, layout = ACTING.observe(agent, PARAMS)
+    pathways = policy.pathways(observation, layout)
+    zeroed = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
+    return counterfactual_logits(own, policy, pathways, agent.memory, keys), zeroed.logits
+
+
+WEIGHTS = tiny.lively(6)
+
+
+@pytest.fixture(scope="module")
+def agent():
+    """The episodes after three steps of + w: the memory is alive and gaps differ."""
+    agent = begin(WEIGHTS)
+    for _ in range(3):
+        agent, _ = take(LAYOUT, WEIGHTS, agent, EPISODE_KEYS)
+    assert len(np.unique(agent.layout.gap)) > 3
+    return agent
+
+
+def step(agent, keys=EPISODE_KEYS, **options):
+    """What one step takes, and the weights that it takes it with."""
+    _, taken = take(cell(**options), WEIGHTS, agent, keys)
+    return np.asarray(taken.action), np.asarray(taken.weight)
+
+
+# What is taken out
+
+
+def test_stde_takes_out_the_decision_without_direct_pathways(agent):
+    found, expected = both(cell(), WEIGHTS, agent, EPISODE_KEYS)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_zeros_are_zeros(agent):
+    assert not both(cell(**NO_BRANCH), WEIGHTS, agent, EPISODE_KEYS)[0].any()
+
+
+def test_noise_is_normal_with_the_spread_of_the_counterfactual_logits(agent):
+    found, counterfactual = both(cell(branch=Branch.NOISE), WEIGHTS, agent, EPISODE_KEYS)
+    standard = np.asarray(found) / np.std(counterfactual, axis=1, keepdims=True)
+    # 48 episodes of 6 actions: 288 independent draws.
+    assert kstest(standard.ravel(), "norm").pvalue > 0.01
+    assert abs(np.corrcoef(np.asarray(found).ravel(), np.asarray(counterfactual).ravel())[0, 1]) < 0.2
+
+
+class Open:
+    """A policy whose logits are its pathways: two numbers of scene, two of goal, one of experience."""
+
+    def decide(self, pathways, memory):
+        logits = jnp.concatenate(pathways[:3], axis=-1)
+        return Decision(logits=logits, value=logits[:, 0], hidden=memory.hidden)
+
+
+@pytest.mark.parametrize("highest", [0.25, 2.0])
+def test_a_random_intervention_sets_scene_and_goal_alone(highest):
+    count = 500
+    pathways = Pathways(*(jnp.full((count, width), 9.0) for width in (2, 2, 1)), gate=jnp.ones((count, 1)))
+    memory = Memory(hidden=jnp.zeros((count, 1)), action=jnp.zeros(count, jnp.int32))
+    keys = jax.random.split(jax.random.key(0), count)
+    found = np.asarray(counterfactual_logits(cell(noise=highest), Open(), pathways, memory, keys))
+    np.testing.assert_array_equal(found[:, 4], 9.0)
+    # Columns of scene and goal are uniform and owe nothing to each other.
+    for column in found[:, :4].T:
+        assert kstest(column / highest, "uniform").pvalue > 0.01
+    assert np.abs(np.corrcoef(found[:, :4].T) - np.eye(4)).max() < 0.15
+    np.testing.assert_array_equal(counterfactual_logits(cell(), Open(), pathways, memory, keys)[:, :4], 0.0)
+
+
+@pytest.mark.parametrize("changes", [{"branch": Branch.NOISE}, {"noise": 1.0}], ids=["noise", "random"])
+def test_what_is_drawn_follows_the_key(agent, changes):
+    first, again = (both(cell(**changes), WEIGHTS, agent, EPISODE_KEYS)[0] for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    # Another key in one episode: other logits there and nowhere else.
+    others = EPISODE_KEYS.at[7].set(jax.random.key(99))
+    changed = (both(cell(**changes), WEIGHTS, agent, others)[0] != first).any(axis=1)
+    assert np.flatnonzero(changed).tolist() == [7]
+
+
+# Which actions follow
+
+
+@pytest.mark.parametrize("form", ["paper", "residual"])
+@pytest.mark.parametrize("weight", [0.3, 2.0])
+def test_zeros_leave_the_best_action_as_it_is(agent, form, weight):
+    plain, _ = step(agent, variant="layout")
+    own = {"form": form, "epsilon": 0.0, "always": weight}
+    zeros, weights = step(agent, **own, **NO_BRANCH)
+    assert (weights >= np.float32(weight)).all()
+    np.testing.assert_array_equal(zeros, plain)
+    # What the policy's own counterfactual, noise or a random intervention would change.
+    for changes in ({}, {"branch": Branch.NOISE}, {"noise": 1.0}):
+        assert (step(agent, **own | {"always": 2.0}, **changes)[0] != plain).any()
+
+
+def test_zeros_are_no_control_of_the_papers_form(agent):
+    """a - s 0 = a whatever the weight, sampled actions too; in the residual form the policy is sharper: (1 + s) a."""
+    plain, _ = step(agent, variant="layout", decoding="sample")
+    own = {"decoding": "sample", "always": 2.0, **NO_BRANCH}
+    np.testing.assert_array_equal(step(agent, form="paper", **own)[0], plain)
+    assert (step(agent, form="residual", **own)[0] != plain).any()
+
+
+CONTROLS = {
+    "none": {},
+    "shuffled": {"shuffled": True},
+    "zeros": NO_BRANCH,
+    "noise": {"branch": Branch.NOISE},
+    "random": {"noise": 1.0},
+}
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("form", ["paper", "residual"])
+@pytest.mark.parametrize("decoding", ["argmax", "sample"])
+def test_at_epsilon_one_every_control_is_plus_w(agent, control, form, decoding):
+    plain, _ = step(agent, variant="layout", decoding=decoding)
+    found, weight = step(agent, epsilon=1.0, form=form, decoding=decoding, **CONTROLS[control])
+    np.testing.assert_array_equal(found, plain)
+    assert not weight.any()
+
+
+def test_a_constant_weight_of_one_in_the_papers_form_is_hard_tde(agent):
+    found, weight = step(agent, always=1.0, epsilon=1.0)  # no gap exceeds epsilon
+    np.testing.assert_array_equal(found, step(agent, variant="tde")[0])
+    np.testing.assert_array_equal(weight, np.ones(EPISODES))
+
+
+# The weight of another episode
+
+
+def test_shuffled_weights_are_those_of_other_episodes(agent):
+    own, shuffled = (step(agent, shuffled=shuffled)[1] for shuffled in (False, True))
+    np.testing.assert_array_equal(own, np.asarray(agent.layout.gap))
+    np.testing.assert_array_equal(np.sort(shuffled), np.sort(own))
+    assert (own != shuffled).any()
+    # Gaps that name their episodes: who gets whose.
+    named = agent._replace(layout=agent.layout.replace(gap=jnp.arange(EPISODES) / 100))
+    donor = np.rint(100 * step(named, shuffled=True)[1]).astype(int)
+    assert sorted(donor) == list(range(EPISODES))
+    assert (donor == np.arange(EPISODES)).mean() < 0.1
+    # The same at any time and with any key.
+    later = named._replace(state=named.state.replace(time=named.state.time + 2))
+    keys = jax.vmap(jax.random.fold_in, (0, None))(EPISODE_KEYS, 5)
+    np.testing.assert_array_equal(np.rint(100 * step(later, keys, shuffled=True)[1]), donor)
+
+
+def test_shuffling_equal_weights_changes_nothing(agent):
+    equal = agent._replace(layout=agent.layout.replace(gap=jnp.full(EPISODES, 0.7)))
+    for decoding in ("argmax", "sample"):
+        own, shuffled = (step(equal, decoding=decoding, shuffled=shuffled) for shuffled in (False, True))
+        np.testing.assert_array_equal(shuffled[0], own[0])
+        np.testing.assert_array_equal(shuffled[1], own[1])
+
+
+def test_shuffling_unequal_ones_changes_actions(agent):
+    apart = agent._replace(layout=agent.layout.replace(gap=(jnp.arange(EPISODES) % 2).astype(jnp.float32)))
+    own, shuffled = (step(apart, shuffled=shuffled)[0] for shuffled in (False, True))
+    assert (own != shuffled).any()
+
+
+def test_actions_are_of_the_task(agent):
+    found = np.concatenate([step(agent, decoding="sample", **changes)[0] for changes in CONTROLS.values()])
+    assert set(found) == set(range(NUM_ACTIONS))
