@@ -21,7 +21,7 @@ from jaxnav.evaluation.grid import Evaluator, Outcome
 from jaxnav.evaluation.report import Decoding, Form
 from jaxnav.evaluation.similarity import scene_counts
 from jaxnav.evaluation.tracking import FROZEN, UPDATED, Course, auc_by_step, gap_traces, mean_by_step
-from jaxnav.evaluation.trials import CONTROLS, Results, Trial, mean_weight, trial_grid
+from jaxnav.evaluation.trials import USES, Control, Results, Trial, mean_weight, trial_grid
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.spec import PolicySpec
@@ -29,8 +29,14 @@ from jaxnav.training.calibration import layout_priors
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 FORMS: tuple[Form, ...] = ("residual", "paper")
-#: The uses of sTDE that all is run for: the paper's threshold, and no threshold, in the paper's form.
-USES: tuple[tuple[float, Form], ...] = ((0.5, "residual"), (0.0, "paper"))
+#: What is changed about sTDE with best actions; zeros, which cannot change these, with sampled ones. The constant needs
+#: the mean weight, so it comes later.
+CONTROLS: tuple[tuple[Control, Decoding], ...] = (
+    ("shuffled", "argmax"),
+    ("noise", "argmax"),
+    ("random", "argmax"),
+    ("zeros", "sample"),
+)
 
 
 class Condition(NamedTuple):
@@ -64,13 +70,14 @@ class Bench:
         acting = Acting(world.env, gap_settings(policies.setting)[gap])
         evaluator = self._evaluators.setdefault((acting, policies.spec), Evaluator(acting, policies.spec))
         found: dict[Trial, Outcome] = {}
+        params = world.params(0)
         for first in range(0, len(trials), self.BLOCK):
             block = trials[first : first + self.BLOCK]
             filled = block + block[-1:] * (self.BLOCK - len(block))
             outcome = evaluator(
                 trial_grid(filled, seeds),
                 policies.params,
-                [(episodes, world.params(0))],
+                [(episodes, params)],
                 policies.priors,
                 jax.random.key(self.config.seed),
             )
@@ -86,22 +93,23 @@ def table(condition: Condition, bench: Bench, console: Console) -> dict[str, Any
     episodes, policies = _episodes(world, config), load_policies(run)
     rows: list[dict[str, Any]] = []
     similarity: dict[str, Any] = {}
+    parameters = {"main": _size(policies)}
 
     def add(name: str, gap: str, outcomes: Mapping[Trial, Outcome]) -> Results:
-        results = Results(outcomes, episodes.best_length, episodes.room)
+        results = Results(outcomes, episodes)
         # Without sTDE the gap is of no effect.
         own = (row for row in results.rows(config.seed) if row["variant"] == "stde" or gap == "novelty")
         rows.extend({"training": name, "gap": gap, **row} for row in own)
         return results
 
     plain = bench.outcomes(world, episodes, policies, "novelty", _plain(DECODINGS))
-    epsilons = config.epsilon if config.split == "val" else chosen(config)
+    epsilons = config.epsilon if config.split == "val" else (chosen(config),)
     for gap in ("novelty", "evidence", "clock"):
         trials = [Trial("stde", decoding, *use) for use in USES for decoding in DECODINGS]
         if gap == "novelty":
             trials += [Trial("stde", "argmax", epsilon, form) for form in FORMS for epsilon in epsilons]
         if gap != "clock":
-            trials += [Trial("stde", "argmax", *use, control) for use in USES for control in CONTROLS[1:]]
+            trials += [Trial("stde", decoding, *use, control) for use in USES for control, decoding in CONTROLS]
         found = bench.outcomes(world, episodes, policies, gap, trials)
         if gap != "clock":
             weights = {use: mean_weight(found[Trial("stde", "argmax", *use)]) for use in USES}
@@ -115,9 +123,12 @@ def table(condition: Condition, bench: Bench, console: Console) -> dict[str, Any
         if not both:
             loaded = loaded._replace(params=jax.tree.map(lambda x: jnp.concatenate([x, x]), loaded.params))
         trials = [*_plain(("argmax",), both), *(Trial("stde", "argmax", *use) for use in USES)]
+        parameters[name] = _size(loaded)
         add(name, "novelty", bench.outcomes(world, episodes, loaded, "novelty", trials))
+    picked = {} if config.split == "val" else {"chosen": chosen(config)}
     about = {"shift": condition.shift, "world": world.scenes[0].world, "scenes": len(episodes.scenes)}
-    return about | {"episodes": len(episodes.goal), "rows": rows} | similarity
+    about |= {"parameters": parameters}
+    return about | {"episodes": len(episodes.goal), "rows": rows} | similarity | picked
 
 
 def gap_settings(setting: Setting) -> dict[str, Setting]:
@@ -132,7 +143,7 @@ def gap_settings(setting: Setting) -> dict[str, Setting]:
     }
 
 
-def chosen(config: StudyConfig) -> tuple[float, ...]:
+def chosen(config: StudyConfig) -> float:
     """Epsilon of the greatest SR on `val` at the first shift, eq. 5's gap, residual form.
 
     Raises:
@@ -144,7 +155,12 @@ def chosen(config: StudyConfig) -> tuple[float, ...]:
     wanted = {"training": "main", "gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
     wanted["form"] = "residual"
     rows = [row for row in json.loads(path.read_text())["rows"] if all(row[key] == wanted[key] for key in wanted)]
-    return (max(rows, key=lambda row: row["sr"]["mean"])["epsilon"],)
+    return max(rows, key=lambda row: row["sr"]["mean"])["epsilon"]
+
+
+def _size(policies: Policies) -> int:
+    """Number of parameters of one policy."""
+    return sum(leaf[0].size for leaf in jax.tree.leaves(policies.params))
 
 
 def _plain(decodings: Sequence[Decoding], baseline: bool = True) -> list[Trial]:

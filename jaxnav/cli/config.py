@@ -160,6 +160,8 @@ def check(config: RunConfig) -> RunConfig:
                 need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
     arms, strength = config.arms, config.layout.strength
     need(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
+    fixed = config.layout.setting != "calibrated" and (strength, config.layout.reduction) != (None, None)
+    need(not fixed, "layout.setting", config.layout.setting, "only `calibrated` takes a strength and a reduction")
     need(strength is None or 0.0 < strength < float("inf"), "layout.strength", strength, "give a positive number")
     ppo, detector = config.ppo, config.detector
     for name in ("miss_near", "miss_far", "false_alarm"):

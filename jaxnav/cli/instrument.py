@@ -52,7 +52,7 @@ class InstrumentConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, also where the proof fails, or 2 after bad input."""
-    if "--config" in (arguments or []):
+    if any(argument.split("=")[0] == "--config" for argument in arguments or []):
         return exit_code(lambda console: prove(main_run(parse_study(arguments), console), console, result_console()))
     what = "Prove the dial with a finished run, or `--config FILE` with the main run of a study, trained if need be."
     config = tyro.cli(InstrumentConfig, args=arguments, prog="eval.py instrument", description=what)

@@ -4,16 +4,18 @@ import dataclasses
 import json
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from jaxnav.cli.command import exit_code
-from jaxnav.cli.conditions import Bench, Condition, gaps, table
+from jaxnav.cli.conditions import Bench, Condition, chosen, gaps, table
 from jaxnav.cli.instrument import instrument_report, of_study
 from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
+from jaxnav.evaluation.document import check_document, write_document
 from jaxnav.evaluation.report import FORMAT, versions
-from jaxnav.evaluation.study import draw, write_document
+from jaxnav.evaluation.study import draw
 from jaxnav.store.files import write_atomic
 
 
@@ -24,6 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def study(config: StudyConfig, console: Console) -> None:
     """Run whatever of the study is missing, then draw its figures and write its document."""
+    check_document(config.document)
+    if config.split == "test":
+        chosen(config)  # val comes first
     names = list(dict.fromkeys(("main", *config.trainings, *(("real",) if config.real else ()))))
     runs = {name: training(config, name) for name in names}
     for run in runs.values():
@@ -33,7 +38,7 @@ def study(config: StudyConfig, console: Console) -> None:
 
     def part(name: str, make: Callable[[], dict[str, Any]]) -> None:
         path = folder / f"{name}.json"
-        if path.exists() and json.loads(path.read_text())["study"] == about["study"]:
+        if finished(path, about["study"]):
             return
         console.print(f"{path}")
         write_atomic(path, (json.dumps(rounded(about | make()), allow_nan=False) + "\n").encode())
@@ -48,9 +53,18 @@ def study(config: StudyConfig, console: Console) -> None:
         for shift in config.shifts:
             part(f"{name}-shift{shift:g}", partial(table, Condition(run, beside, shift), bench, console))
         part(f"gap-{name}", partial(gaps, run, config, console))
-    draw(folder, config.document.parent / "images" / "study")
+    if config.split == "val":
+        draw(folder, config.document.parent / "images" / "study")
     write_document(config.results, config.document)
     console.print(f"written to {config.document}")
+
+
+def finished(path: Path, study: dict[str, Any]) -> bool:
+    """Whether a part of this very study is there; a damaged file is not, and is made anew."""
+    try:
+        return json.loads(path.read_text())["study"] == study
+    except (FileNotFoundError, ValueError, KeyError):
+        return False
 
 
 def plain(config: StudyConfig) -> dict[str, Any]:

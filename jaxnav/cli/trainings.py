@@ -1,6 +1,7 @@
 """The training runs of the study."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,8 +71,17 @@ def parse_study(arguments: list[str] | None) -> StudyConfig:
     config = parse(StudyConfig(), arguments, "eval.py study", "Put the paper's claims to the test.")
     if unknown := set(config.trainings) - set(CHANGES):
         raise InputError(f"trainings: {sorted(unknown)[0]!r} is unknown; choose from {', '.join(CHANGES)}")
-    if len(set(config.shifts)) < 2:
-        raise InputError(f"shifts: {config.shifts}: give at least two different ones")
+    shifts = config.shifts
+    rising = all(a < b for a, b in itertools.pairwise(shifts))
+    if not (len(shifts) >= 2 and rising and shifts[0] >= 0.0 and shifts[-1] <= 1.0):
+        raise InputError(f"shifts: {shifts}: give two or more from 0 to 1, rising")
+    if not (config.epsilon and all(0.0 <= epsilon < float("inf") for epsilon in config.epsilon)):
+        raise InputError(f"epsilon: {config.epsilon}: give numbers from 0 to below infinity")
+    for name in ("episodes", "steps"):
+        if getattr(config, name) < 1:
+            raise InputError(f"{name}: {getattr(config, name)}: give at least 1")
+    if config.real is not None and not config.real.is_file():
+        raise InputError(f"real: {config.real}: there is no such file")
     return config
 
 

@@ -26,8 +26,8 @@ def make(
       split: `train`, `val` or `test`; training episodes are shorter.
       scenes: path of a scene file to read instead.
       task: what is asked instead of the world's own.
-      seed: of the generated scenes, or of the relabelling of those of a file.
-      shift: layout shift from 0 to 1; on the scenes of a file by relabelling.
+      seed: of the generated scenes, or of the exchange of labels in those of a file.
+      shift: layout shift from 0 to 1; on the scenes of a file by an exchange of labels.
 
     Raises:
       InputError: bad world, split or scene file, or no scene with a reachable goal.

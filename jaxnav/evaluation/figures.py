@@ -83,7 +83,7 @@ def gain_figure(fig5: dict[str, Any]) -> Figure:
     """
     panels = fig5["panels"]
     figure, axes = _grid(2 * len(panels), 1, height=4.4 * len(panels))
-    reach = 1.15 * max(np.abs(panel["gain"]).max() for panel in panels)
+    reach = 1.15 * max(1.0, *(np.abs(panel["gain"]).max() for panel in panels))
     for panel, (above, below) in zip(panels, axes.reshape(-1, 2), strict=True):
         order = np.argsort(panel["similarity"], kind="stable")
         x = np.arange(len(order))

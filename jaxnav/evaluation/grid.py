@@ -158,7 +158,7 @@ def _episodes(
 
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome, keys = progress
-        following, taken = act(cell, policy, agent, keys, acting, params, priors)
+        following, taken = act(cell, policy, agent, running, keys, acting, params, priors)
         outcome = outcome._replace(
             success=outcome.success | (running & taken.success),
             length=outcome.length + running.astype(jnp.int32),
@@ -169,7 +169,7 @@ def _episodes(
 
     progress = _Progress(agent, jnp.ones(count, bool), Outcome.start(count), keys)
     episodes, ended = jnp.arange(count[0]), (progress.outcome, start)
-    for most in (*(count[0] // share for share in _SHARES), 0):
+    for most in (*(count[0] // share for share in _SHARES if count[0] >= share), 0):
         progress = jax.lax.while_loop(lambda own, most=most: own.running.sum() > most, step, progress)
         now = progress.outcome, progress.agent.state
         ended = jax.tree.map(lambda whole, own, at=episodes: whole.at[at].set(own), ended, now)
@@ -202,6 +202,7 @@ def act(
     cell: Inference,
     policy: Policy,
     agent: Agent,
+    running: jax.Array,
     keys: jax.Array,
     acting: Acting,
     params: EnvParams,
@@ -215,6 +216,7 @@ def act(
       cell: how to infer.
       policy: with the cell's parameters.
       agent: the episodes, [E].
+      running: bool [E], those that have not ended.
       keys: [E], of the episodes; folded with the time for a sampled action.
       acting: environment and layout setting.
       params: the environment's.
@@ -223,20 +225,26 @@ def act(
     observation, layout_weights = acting.observe(agent, params)
     pathways = policy.pathways(observation, jnp.where(cell.layout, layout_weights, 1.0))
     factual = policy.decide(pathways, agent.memory)
-    keys = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
-    counterfactual = counterfactual_logits(cell, policy, pathways, agent.memory, keys)
+    own = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
+    counterfactual = counterfactual_logits(cell, policy, pathways, agent.memory, keys, own)
     weight = cell.always + jax.nn.relu(acting.gap(agent) - cell.epsilon)
-    others = jax.random.permutation(jax.random.key(0), len(weight))
-    weight = jnp.where(cell.shuffled, weight[others], weight)
+    weight = jnp.where(cell.shuffled, weight[_next_running(running)], weight)
     residual, paper = (
         remove_experience(factual.logits, counterfactual, weight, form) for form in ("residual", "paper")
     )
     logits = jnp.where(cell.uniform, 0.0, jnp.where(cell.residual, residual, paper))
 
-    sampled = jax.vmap(jax.random.categorical)(keys, logits)
+    sampled = jax.vmap(jax.random.categorical)(own, logits)
     action = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
     found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
     state, _, terminated, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
     layout = acting.believe(agent.layout, state, params, priors)
     following = Agent(state=state, layout=layout, memory=Memory(hidden=factual.hidden, action=action))
     return following, Taken(action, weight, terminated | truncated, terminated & found)
+
+
+def _next_running(running: jax.Array) -> jax.Array:
+    """For each running episode the next one that runs, cyclically: int [E]; of no meaning for others."""
+    order = jnp.argsort(~running)  # stable: those that run first
+    place = jnp.cumsum(running) - 1
+    return order[(place + 1) % jnp.maximum(running.sum(), 1)]

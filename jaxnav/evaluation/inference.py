@@ -15,8 +15,8 @@ from jaxnav.policies.policy import Policy
 class Branch(enum.IntEnum):
     """Where the logits that are taken out come from.
 
-    The policy's counterfactual decision; zeros (nothing but a change of temperature); or normal noise with the standard
-    deviation of the counterfactual logits.
+    The policy's counterfactual decision; zeros (nothing but a change of temperature); or normal noise, the
+    same throughout an episode, with the standard deviation of the counterfactual logits.
     """
 
     COUNTERFACTUAL = 0
@@ -38,8 +38,8 @@ class Inference(struct.PyTreeNode):
       layout: bool, multiply the layout's weights in; otherwise they are ones.
       greedy: bool, take the best action rather than sample.
       uniform: bool, ignore the policy and act at random.
-      noise: float32, the intervention sets scene and goal to uniform random numbers below this; 0 in sTDE.
-      shuffled: bool, take the weight of another episode at the same time, always the same one.
+      intervention: float32, scene and goal are set to uniform random numbers below this; 0 in sTDE.
+      shuffled: bool, take the weight of the next running episode of the list at the same time.
       branch: int32, the logits that are taken out: a `Branch`.
     """
 
@@ -50,13 +50,13 @@ class Inference(struct.PyTreeNode):
     layout: jax.Array
     greedy: jax.Array
     uniform: jax.Array
-    noise: jax.Array
+    intervention: jax.Array
     shuffled: jax.Array
     branch: jax.Array
 
 
 def counterfactual_logits(
-    cell: Inference, policy: Policy, pathways: Pathways, memory: Memory, keys: jax.Array
+    cell: Inference, policy: Policy, pathways: Pathways, memory: Memory, keys: jax.Array, step_keys: jax.Array
 ) -> jax.Array:
     """The logits to take out of E decisions, float32 [E, A].
 
@@ -66,23 +66,27 @@ def counterfactual_logits(
       cell: how to infer.
       policy: with the cell's parameters.
       pathways, memory: of the factual decisions, [E].
-      keys: [E], of the step; folded further.
+      keys, step_keys: [E], of the episodes, and of their present step; folded further.
     """
 
-    def noise(purpose: int, like: jax.Array, draw: Callable[..., jax.Array]) -> jax.Array:
+    def draw(keys: jax.Array, purpose: int, like: jax.Array, how: Callable[..., jax.Array]) -> jax.Array:
         own = jax.vmap(jax.random.fold_in, (0, None))(keys, purpose)
-        return jax.vmap(lambda key: draw(key, like.shape[1:]))(own)
+        return jax.vmap(lambda key: how(key, like.shape[1:]))(own)
 
-    def drawn(field: int) -> jax.Array:
-        value = pathways[field]
+    def value(purpose: int, field: jax.Array) -> jax.Array:
         return jax.lax.cond(
-            cell.noise > 0, lambda: cell.noise * noise(field, value, jax.random.uniform), lambda: jnp.zeros_like(value)
+            cell.intervention > 0,
+            lambda: cell.intervention * draw(step_keys, purpose, field, jax.random.uniform),
+            lambda: jnp.zeros_like(field),
         )
 
-    logits = policy.decide(do(pathways, scene=drawn(0), goal=drawn(1)), memory).logits
+    changed = do(pathways, scene=value(0, pathways.scene), goal=value(1, pathways.goal))
+    logits = policy.decide(changed, memory).logits
     branches = (
         lambda: logits,
         lambda: jnp.zeros_like(logits),
-        lambda: logits.std(axis=-1, keepdims=True) * noise(2, logits, jax.random.normal),
+        lambda: (
+            logits.std(axis=-1, keepdims=True) * draw(keys, 2**30, logits, jax.random.normal)
+        ),  # no time is that late
     )
     return jax.lax.switch(cell.branch, branches)

@@ -53,7 +53,7 @@ def play(
 
     @jax.jit
     def step(weights: Params, agent: Agent, keys: jax.Array) -> tuple[Agent, Taken]:
-        return act(cell, bind(spec, weights), agent, keys, acting, params, priors)
+        return act(cell, bind(spec, weights), agent, jnp.ones(1, bool), keys, acting, params, priors)
 
     keys = jax.random.key(0)[None]
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)

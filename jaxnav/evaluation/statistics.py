@@ -50,9 +50,7 @@ def summary(values: np.ndarray, strata: np.ndarray, generator: np.random.Generat
       InputError: wrong or empty shapes, NaN or infinite values, or no resample.
     """
     values, strata = _checked("values", values, strata, resamples)
-    episodes = _episode_weights(strata, generator, resamples)
-    means = _resampled_means(values, episodes, _seed_weights(len(values), generator, resamples))
-    return _summarise(values.mean(), _std(values), means)
+    return Bootstrap(_episode_weights(strata, generator, resamples), len(values), generator).summary(values)
 
 
 def paired_difference(
@@ -86,13 +84,28 @@ def paired_difference(
         raise InputError(
             f"a {a.shape} and b {b.shape} differ in shape; evaluate both arms on the same seeds and episodes"
         )
-    if same_seeds:
-        return summary(b - a, strata, generator, resamples)
-    episodes = _episode_weights(strata, generator, resamples)
-    means_a, means_b = (
-        _resampled_means(arm, episodes, _seed_weights(len(arm), generator, resamples)) for arm in (a, b)
-    )
-    return _summarise(b.mean() - a.mean(), np.hypot(_std(a), _std(b)), means_b - means_a)
+    return Bootstrap(_episode_weights(strata, generator, resamples), len(a), generator).difference(a, b, same_seeds)
+
+
+class Bootstrap:
+    """Resamples that many results share: equal results get equal intervals. For finite float64 values [S, E]."""
+
+    def __init__(self, episodes: np.ndarray, num_seeds: int, generator: np.random.Generator) -> None:
+        """Draws the seeds; `episodes` [resamples, E] says how much each episode counts, rows adding up to 1."""
+        self._episodes = episodes
+        self._seeds, self._others = (_seed_weights(num_seeds, generator, len(episodes)) for _ in range(2))
+
+    def summary(self, values: np.ndarray) -> Summary:
+        """See `summary`."""
+        return _summarise(values.mean(), _std(values), _resampled_means(values, self._episodes, self._seeds))
+
+    def difference(self, a: np.ndarray, b: np.ndarray, same_seeds: bool) -> Summary:
+        """See `paired_difference`."""
+        if same_seeds:
+            return self.summary(b - a)
+        means_a = _resampled_means(a, self._episodes, self._seeds)
+        means_b = _resampled_means(b, self._episodes, self._others)
+        return _summarise(b.mean() - a.mean(), np.hypot(_std(a), _std(b)), means_b - means_a)
 
 
 def _checked(name: str, values: np.ndarray, strata: np.ndarray, resamples: int) -> tuple[np.ndarray, np.ndarray]:

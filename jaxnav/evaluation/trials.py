@@ -8,18 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.evaluation.association import scene_draws
+from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.inference import Branch, Inference
 from jaxnav.evaluation.metrics import episode_metrics
 from jaxnav.evaluation.report import Decoding, Form
-from jaxnav.evaluation.statistics import paired_difference, summary
+from jaxnav.evaluation.statistics import Bootstrap
 from jaxnav.evaluation.variants import inference_grid, table_row
 
 #: What is changed about sTDE to learn what it owes its effect to: the weight is its own mean at every step, or that of
-#: another episode; what is taken out is nothing but temperature, or noise; the intervention is random instead of zero.
-#: The first needs the mean weight, which is known only after the others.
+#: another episode; zeros or noise are taken out instead of logits; the intervention is random instead of zero.
 Control = Literal["constant", "shuffled", "zeros", "noise", "random"]
-CONTROLS: tuple[Control, ...] = ("constant", "shuffled", "zeros", "noise", "random")
+#: The uses of sTDE that all is run for: the paper's threshold, and no threshold, in the paper's form.
+USES: tuple[tuple[float, Form], ...] = ((0.5, "residual"), (0.0, "paper"))
 METRICS = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
 
 
@@ -55,7 +57,7 @@ class Trial:
             case "noise":
                 changes = {"branch": jnp.int32(Branch.NOISE)}
             case "random":
-                changes = {"noise": jnp.float32(1.0)}
+                changes = {"intervention": jnp.float32(1.0)}
             case None:
                 changes = {}
         return cells.replace(**{name: jnp.broadcast_to(value, (num_seeds,)) for name, value in changes.items()})
@@ -79,9 +81,9 @@ class Results:
       outcomes: of each trial, leaves [S, E].
     """
 
-    def __init__(self, outcomes: Mapping[Trial, Outcome], best_length: np.ndarray, strata: np.ndarray) -> None:
-        self.outcomes, self._strata = outcomes, strata
-        self._metrics = {trial: episode_metrics(outcome, best_length) for trial, outcome in outcomes.items()}
+    def __init__(self, outcomes: Mapping[Trial, Outcome], episodes: EpisodeList) -> None:
+        self.outcomes, self._episodes = outcomes, episodes
+        self._metrics = {trial: episode_metrics(own, episodes.best_length) for trial, own in outcomes.items()}
 
     def success(self, trial: Trial) -> np.ndarray:
         """Success of a trial, float64 [S, E]."""
@@ -90,21 +92,24 @@ class Results:
     def rows(self, seed: int) -> list[dict[str, Any]]:
         """A row of JSON per trial: metrics, and their difference to the layout's weights (theirs: to the baseline).
 
-        SR and SPL are in percent, DTS in metres; intervals as in `jaxnav.evaluation.statistics`. Trials without the row
-        that they would be compared with have no difference.
+        SR and SPL are in percent, DTS in metres. Resamples of the intervals draw seeds, and scenes within room types
+        with all their episodes. Trials without the row that they would be compared with have no difference.
         """
-        return [self._row(trial, seed) for trial in self.outcomes]
+        generator = np.random.default_rng(seed)
+        (scenes,) = scene_draws([self._episodes], generator)
+        drawn = scenes[:, 1:].T.astype(np.float64)
+        num_seeds = len(next(iter(self.outcomes.values())).length)
+        bootstrap = Bootstrap(drawn / drawn.sum(axis=1, keepdims=True), num_seeds, generator)
+        return [self._row(trial, bootstrap) for trial in self.outcomes]
 
-    def _row(self, trial: Trial, seed: int) -> dict[str, Any]:
+    def _row(self, trial: Trial, bootstrap: Bootstrap) -> dict[str, Any]:
         against = Trial("baseline" if trial.variant == "layout" else "layout", trial.decoding)
         row: dict[str, Any] = dataclasses.asdict(trial) | {"mean_weight": mean_weight(self.outcomes[trial])}
         for metric, scale in METRICS.items():
             own = scale * self._metrics[trial][metric]
-            # Equal resamples for every row: equal results get equal intervals.
-            row[metric] = summary(own, self._strata, np.random.default_rng(seed))._asdict()
-            row[metric]["seeds"] = own.mean(axis=1).tolist()
+            row[metric] = bootstrap.summary(own)._asdict() | {"seeds": own.mean(axis=1).tolist()}
             if trial.variant != "baseline" and against in self.outcomes:
-                other, same = scale * self._metrics[against][metric], trial.variant != "layout"
-                difference = paired_difference(other, own, self._strata, np.random.default_rng(seed), same_seeds=same)
+                other = scale * self._metrics[against][metric]
+                difference = bootstrap.difference(other, own, same_seeds=trial.variant != "layout")
                 row.setdefault("difference", {"to": against.variant})[metric] = difference._asdict()
         return row

@@ -74,7 +74,7 @@ def _cell(row: Row, seed: int, num_seeds: int) -> Inference:
         layout=jnp.bool_(layout),
         greedy=jnp.bool_(row.decoding == "argmax"),
         uniform=jnp.bool_(row.variant == "random"),
-        noise=jnp.float32(0.0),
+        intervention=jnp.float32(0.0),
         shuffled=jnp.bool_(False),
         branch=jnp.int32(Branch.COUNTERFACTUAL),
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, State
+from jaxnav.errors import InputError
 from jaxnav.layout import LayoutEstimator, LayoutState, Reduction, Setting, prior_from_counts
 from jaxnav.scenes.task import DONE
 
@@ -70,6 +71,9 @@ def calibrate(
       key: consumed.
       strengths, reductions: to choose from.
       num_walks: parallel walks.
+
+    Raises:
+      InputError: no walk shows two categories together.
     """
     start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
     actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
@@ -104,7 +108,15 @@ def calibrate(
         own = dataclasses.replace(setting, reduction=reduction)  # the strength only enters by the priors
         early, late = jax.jit(jax.vmap(partial(gaps, own), (0, None)))(priors, params)
         found += [
-            Calibration(dataclasses.replace(own, strength=chosen.strength), float(np.nanmedian(e)), float(np.median(f)))
+            Calibration(dataclasses.replace(own, strength=chosen.strength), _median(e), float(np.median(f)))
             for chosen, e, f in zip(choices, np.asarray(early), np.asarray(late), strict=True)
         ]
+    if all(np.isnan(one.early) for one in found):
+        raise InputError("layout: no random walk shows two categories together, so nothing can be calibrated")
     return min(found, key=lambda one: abs(one.early - EARLY) + abs(one.late - LATE))
+
+
+def _median(values: np.ndarray) -> float:
+    """The median of those that are defined, NaN if none is."""
+    defined = values[np.isfinite(values)]
+    return float(np.median(defined)) if len(defined) else float("nan")
