@@ -13,10 +13,13 @@ import tiny
 from jaxnav.causal import remove_experience
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list, together
-from jaxnav.evaluation.grid import Outcome, evaluate_grid
+from jaxnav.evaluation.grid import act, evaluate_grid, first_states
+from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.trials import Trial, trial_grid
 from jaxnav.evaluation.variants import inference_grid, table_rows
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.pathways import NO_ACTION, Memory
+from jaxnav.policies.policy import bind
 from jaxnav.scenes.task import DONE, MOVE_AHEAD
 
 SEEDS, LIMITS = 2, (12, 16)
@@ -29,9 +32,15 @@ ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"])
 WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) for seed in (5, 9, 6, 11)))
 
 
-def run(grid, episodes=EPISODES) -> Outcome:
-    acting = Acting(ENV, tiny.SETTING)
-    return evaluate_grid(grid, WEIGHTS, [(episodes, PARAMS)], acting, tiny.SPEC, PRIORS, jax.random.key(3))[0]
+#: Controls whose weights or logits are of other episodes or drawn by key.
+TRIALS = [
+    Trial("stde", "argmax", 0.0, "paper", "shuffled"),
+    Trial("stde", "sample", 0.2, "residual", "shuffled"),
+    Trial("stde", "argmax", 0.0, "paper", "noise"),
+    Trial("stde", "sample", 0.0, "paper", "random"),
+]
+CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, SEEDS), trial_grid(TRIALS, SEEDS))
+ACTING, KEY = Acting(ENV, tiny.SETTING), jax.random.key(3)
 
 
 class Compilations(logging.Handler):
@@ -42,28 +51,20 @@ class Compilations(logging.Handler):
         self.count = 0
 
     def emit(self, record):
-        self.count += record.getMessage().startswith("Compiling jit(run)")
+        self.count += record.getMessage().startswith("Compiling jit(_run)")
 
 
 @pytest.fixture(scope="module")
 def evaluated():
-    """All rows [R, S, E], the compilations that were counted and the number that was told."""
+    """All rows and trials [R + T, S, E], the compilations that were counted and the number that was told."""
     handler, logger = Compilations(), logging.getLogger("jax")
     logger.addHandler(handler)
     try:
         with jax.log_compiles():
-            outcome, told = evaluate_grid(
-                inference_grid(ROWS, SEEDS),
-                WEIGHTS,
-                [(EPISODES, PARAMS)],
-                Acting(ENV, tiny.SETTING),
-                tiny.SPEC,
-                PRIORS,
-                jax.random.key(3),
-            )
+            outcome, told = evaluate_grid(CELLS, WEIGHTS, [(EPISODES, PARAMS)], ACTING, tiny.SPEC, PRIORS, KEY)
     finally:
         logger.removeHandler(handler)
-    return jax.tree.map(lambda leaf: leaf.reshape(len(ROWS), SEEDS, -1), outcome), handler.count, told
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, SEEDS, len(EPISODES.goal)), outcome), handler.count, told
 
 
 @pytest.fixture(scope="module")
@@ -116,42 +117,40 @@ def test_random_is_another_for_every_seed_and_knows_no_policy(outcome):
     assert 2 < random.length.mean() < 9
 
 
-def test_a_cell_alone_is_the_cell_of_the_grid(outcome):
-    row, seed = ROWS.index(("stde", 0.0, "paper", "sample")), 1
-    cell = jax.tree.map(lambda leaf: leaf[row * SEEDS + seed][None], inference_grid(ROWS, SEEDS))
-    chex.assert_trees_all_equal(tiny.at(run(cell), 0), tiny.at(outcome, row, seed))
+def part(episodes):
+    """Those of the episodes, and all scenes."""
+    return EPISODES._replace(**{name: getattr(EPISODES, name)[episodes] for name in EPISODES._fields[:5]})
 
 
-def test_parts_of_equal_shape_share_a_compilation_and_follow_each_other(outcome):
-    grid = inference_grid([row for row in ROWS if row.decoding == "argmax"], SEEDS)
-    halves = [
-        EPISODES._replace(**{name: getattr(EPISODES, name)[half] for name in EPISODES._fields[:5]})
-        for half in (slice(12), slice(12, 24))
-    ]
-    acting, key = Acting(ENV, tiny.SETTING), jax.random.key(3)
-    parts = [(half, PARAMS) for half in halves]
-    found, compilations = evaluate_grid(grid, WEIGHTS, parts, acting, tiny.SPEC, PRIORS, key)
+def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_others(outcome):
+    """Two parts of few episodes, in another order and by some of the cells in another order."""
+    parts = [np.array([0, 1, 2, 3, 20, 11]), np.array([12, 5, 4, 23, 8, 17])]
+    cells = np.arange(len(ROWS))[::-3]
+    grid = inference_grid([ROWS[i] for i in cells], SEEDS)
+    lists = [part(episodes) for episodes in parts]
+    found, compilations = evaluate_grid(grid, WEIGHTS, [(own, PARAMS) for own in lists], ACTING, tiny.SPEC, PRIORS, KEY)
     assert compilations == 1
-    chex.assert_trees_all_equal(found, run(grid))
-    merged = together(halves)
-    assert merged.scenes == 2 * EPISODES.scenes
-    assert [merged.scenes[i] for i in merged.scene] == [EPISODES.scenes[i] for i in EPISODES.scene]
-    for name in ("goal", "pose", "best_length", "room"):
-        np.testing.assert_array_equal(getattr(merged, name), getattr(EPISODES, name))
-
-
-def test_an_episode_does_not_depend_on_the_others(outcome):
-    some = np.array([0, 1, 2, 3, 20, 11])
-    leaves = ("scene", "goal", "pose", "best_length", "room")
-    subset = EPISODES._replace(**{name: getattr(EPISODES, name)[some] for name in leaves})
-    found = run(inference_grid(ROWS, SEEDS), subset)
-    found = jax.tree.map(lambda leaf: leaf.reshape(len(ROWS), SEEDS, -1), found)
-    expected = jax.tree.map(lambda leaf: leaf[..., some], outcome)
-    # Sampled actions follow the number of the episode, which the first four keep; the best actions do not.
-    chex.assert_trees_all_equal(tiny.at(found, ..., slice(4)), tiny.at(expected, ..., slice(4)))
-    best = np.array([row.decoding == "argmax" for row in ROWS])
+    found = jax.tree.map(lambda leaf: leaf.reshape(len(cells), SEEDS, -1), found)
+    expected = jax.tree.map(lambda leaf: leaf[cells][..., np.concatenate(parts)], outcome)
+    best = np.array([ROWS[i].decoding == "argmax" for i in cells])
     chex.assert_trees_all_equal(tiny.at(found, best), tiny.at(expected, best))
+    # Sampled actions follow the number of the episode in its part, which the first four keep.
+    chex.assert_trees_all_equal(tiny.at(found, ..., slice(4)), tiny.at(expected, ..., slice(4)))
     assert not np.array_equal(found.length[~best], expected.length[~best])
+    merged = together(lists)
+    assert merged.scenes == 2 * EPISODES.scenes
+    assert [merged.scenes[i] for i in merged.scene] == [
+        EPISODES.scenes[i] for i in EPISODES.scene[np.concatenate(parts)]
+    ]
+    for name in ("goal", "pose", "best_length", "room"):
+        np.testing.assert_array_equal(getattr(merged, name), getattr(EPISODES, name)[np.concatenate(parts)])
+
+
+def test_a_single_episode():
+    grid = tiny.at(CELLS, slice(1))
+    found, _ = evaluate_grid(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], ACTING, tiny.SPEC, PRIORS, KEY)
+    assert found.length.shape == (1, 1)
+    assert 1 <= found.length[0, 0] <= max(LIMITS)
 
 
 # Against a plain loop
@@ -195,6 +194,50 @@ def test_outcomes_are_those_of_a_plain_loop(outcome, variant, epsilon, form):
             expected = play(seed + SEEDS * layout, episode, layout, threshold, form or "residual")
             for name, value in expected.items():
                 assert getattr(found, name)[seed, episode] == pytest.approx(value, rel=1e-4, abs=1e-6), (name, episode)
+
+
+@jax.jit
+def take(cell, weights, agent, running, keys):
+    return act(cell, bind(tiny.SPEC, weights), agent, running, keys, ACTING, PARAMS, PRIORS)
+
+
+@pytest.mark.parametrize("trial", range(len(TRIALS)))
+def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, trial):
+    """Leaving ended episodes out changes no one's next running episode and no one's noise."""
+    for seed in range(SEEDS):
+        cell = tiny.at(CELLS, (len(ROWS) + trial) * SEEDS + seed)
+        weights = tiny.at(WEIGHTS, int(cell.params))
+        # Folded with the part, the parameters and the episode.
+        own = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.params)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(own, jnp.arange(len(EPISODES.goal)))
+        agent = ACTING.begin(first_states(EPISODES), bind(tiny.SPEC, weights), PARAMS, PRIORS)
+        running = np.ones(len(EPISODES.goal), bool)
+        success, length, total = ~running, np.zeros(len(running), int), np.zeros(len(running))
+        while running.any():
+            agent, taken = take(cell, weights, agent, running, keys)
+            success |= running & np.asarray(taken.success)
+            length += running
+            total += np.where(running, taken.weight, 0.0)
+            running &= ~np.asarray(taken.ended)
+        found = tiny.at(outcome, len(ROWS) + trial, seed)
+        np.testing.assert_array_equal(found.success, success)
+        np.testing.assert_array_equal(found.length, length)
+        np.testing.assert_allclose(found.weight, total / length, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize(("variant", "epsilon", "form"), [("baseline", None, None), ("stde", 0.2, "residual")])
+def test_playing_an_episode_agrees_with_the_grid(outcome, variant, epsilon, form):
+    row = ROWS.index((variant, epsilon, form, "argmax"))
+    cell = tiny.at(CELLS, row * SEEDS + 1)
+    for episode in (0, 17):
+        start = tiny.at(first_states(EPISODES), episode)
+        trace = play(cell, tiny.at(WEIGHTS, int(cell.params)), start, ACTING, tiny.SPEC, PARAMS, PRIORS)
+        found = tiny.at(outcome, row, 1, episode)
+        assert (len(trace.pose), trace.success) == (found.length, found.success)
+        assert trace.pose[0] == EPISODES.pose[episode]
+        assert not (trace.action[:-1] == DONE).any()
+        if epsilon is not None:
+            assert np.maximum(trace.gap - epsilon, 0).mean() == pytest.approx(found.weight, abs=1e-6)
 
 
 def test_episodes_end_once(outcome):

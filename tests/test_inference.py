@@ -31,8 +31,15 @@ def cell(variant="stde", epsilon=0.0, form="paper", decoding="argmax", **changes
 
 
 LAYOUT = cell("layout")
-NO_BRANCH = {"branch": Branch.ZEROS}
-EPISODE_KEYS = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(3), jnp.arange(EPISODES))
+CONTROLS = {
+    "none": {},
+    "shuffled": {"shuffled": True},
+    "zeros": {"branch": Branch.ZEROS},
+    "noise": {"branch": Branch.NOISE},
+    "random": {"intervention": 1.0},
+}
+EPISODE_KEYS, STEP_KEYS = jax.random.split(jax.random.key(3), (2, EPISODES))
+EVERY = np.ones(EPISODES, bool)
 
 
 @jax.jit
@@ -42,19 +49,19 @@ def begin(weights):
 
 
 @jax.jit
-def take(own, weights, agent, keys):
+def take(own, weights, agent, running, keys):
     """One step."""
-    return act(own, bind(tiny.SPEC, weights), agent, keys, ACTING, PARAMS, PRIORS)
+    return act(own, bind(tiny.SPEC, weights), agent, running, keys, ACTING, PARAMS, PRIORS)
 
 
 @jax.jit
-def both(own, weights, agent, keys):
+def both(own, weights, agent, keys, step_keys):
     """The logits that are taken out, and those of the counterfactual decision."""
     policy = bind(tiny.SPEC, weights)
     observation, layout = ACTING.observe(agent, PARAMS)
     pathways = policy.pathways(observation, layout)
     zeroed = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-    return counterfactual_logits(own, policy, pathways, agent.memory, keys), zeroed.logits
+    return counterfactual_logits(own, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
 
 
 WEIGHTS = tiny.lively(6)
@@ -65,14 +72,14 @@ def agent():
     """The episodes after three steps of + w: the memory is alive and gaps differ."""
     agent = begin(WEIGHTS)
     for _ in range(3):
-        agent, _ = take(LAYOUT, WEIGHTS, agent, EPISODE_KEYS)
+        agent, _ = take(LAYOUT, WEIGHTS, agent, EVERY, EPISODE_KEYS)
     assert len(np.unique(agent.layout.gap)) > 3
     return agent
 
 
-def step(agent, keys=EPISODE_KEYS, **options):
+def step(agent, running=EVERY, **options):
     """What one step takes, and the weights that it takes it with."""
-    _, taken = take(cell(**options), WEIGHTS, agent, keys)
+    _, taken = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
     return np.asarray(taken.action), np.asarray(taken.weight)
 
 
@@ -80,16 +87,16 @@ def step(agent, keys=EPISODE_KEYS, **options):
 
 
 def test_stde_takes_out_the_decision_without_direct_pathways(agent):
-    found, expected = both(cell(), WEIGHTS, agent, EPISODE_KEYS)
+    found, expected = both(cell(), WEIGHTS, agent, EPISODE_KEYS, STEP_KEYS)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_zeros_are_zeros(agent):
-    assert not both(cell(**NO_BRANCH), WEIGHTS, agent, EPISODE_KEYS)[0].any()
+    assert not both(cell(**CONTROLS["zeros"]), WEIGHTS, agent, EPISODE_KEYS, STEP_KEYS)[0].any()
 
 
 def test_noise_is_normal_with_the_spread_of_the_counterfactual_logits(agent):
-    found, counterfactual = both(cell(branch=Branch.NOISE), WEIGHTS, agent, EPISODE_KEYS)
+    found, counterfactual = both(cell(**CONTROLS["noise"]), WEIGHTS, agent, EPISODE_KEYS, STEP_KEYS)
     standard = np.asarray(found) / np.std(counterfactual, axis=1, keepdims=True)
     # 48 episodes of 6 actions: 288 independent draws.
     assert kstest(standard.ravel(), "norm").pvalue > 0.01
@@ -109,24 +116,35 @@ def test_a_random_intervention_sets_scene_and_goal_alone(highest):
     count = 500
     pathways = Pathways(*(jnp.full((count, width), 9.0) for width in (2, 2, 1)), gate=jnp.ones((count, 1)))
     memory = Memory(hidden=jnp.zeros((count, 1)), action=jnp.zeros(count, jnp.int32))
-    keys = jax.random.split(jax.random.key(0), count)
-    found = np.asarray(counterfactual_logits(cell(noise=highest), Open(), pathways, memory, keys))
+    keys = jax.random.split(jax.random.key(0), (2, count))
+
+    def logits(**changes):
+        return np.asarray(counterfactual_logits(cell(**changes), Open(), pathways, memory, *keys))
+
+    found = logits(intervention=highest)
     np.testing.assert_array_equal(found[:, 4], 9.0)
     # Columns of scene and goal are uniform and owe nothing to each other.
     for column in found[:, :4].T:
         assert kstest(column / highest, "uniform").pvalue > 0.01
     assert np.abs(np.corrcoef(found[:, :4].T) - np.eye(4)).max() < 0.15
-    np.testing.assert_array_equal(counterfactual_logits(cell(), Open(), pathways, memory, keys)[:, :4], 0.0)
+    np.testing.assert_array_equal(logits()[:, :4], 0.0)
 
 
-@pytest.mark.parametrize("changes", [{"branch": Branch.NOISE}, {"noise": 1.0}], ids=["noise", "random"])
-def test_what_is_drawn_follows_the_key(agent, changes):
-    first, again = (both(cell(**changes), WEIGHTS, agent, EPISODE_KEYS)[0] for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    # Another key in one episode: other logits there and nowhere else.
-    others = EPISODE_KEYS.at[7].set(jax.random.key(99))
-    changed = (both(cell(**changes), WEIGHTS, agent, others)[0] != first).any(axis=1)
-    assert np.flatnonzero(changed).tolist() == [7]
+@pytest.mark.parametrize("name", ["noise", "random"])
+def test_noise_is_the_same_throughout_an_episode_and_an_intervention_drawn_at_every_step(agent, name):
+    def logits(*keys):
+        return np.asarray(both(cell(**CONTROLS[name]), WEIGHTS, agent, *keys)[0])
+
+    def changed(keys):
+        return keys.at[7].set(jax.random.key(99))
+
+    first = logits(EPISODE_KEYS, STEP_KEYS)
+    np.testing.assert_array_equal(logits(EPISODE_KEYS, STEP_KEYS), first)
+    own, other = (changed(EPISODE_KEYS), STEP_KEYS), (EPISODE_KEYS, changed(STEP_KEYS))
+    followed, ignored = (own, other) if name == "noise" else (other, own)
+    np.testing.assert_array_equal(logits(*ignored), first)
+    # Other logits in the episode of the other key and nowhere else.
+    assert np.flatnonzero((logits(*followed) != first).any(axis=1)).tolist() == [7]
 
 
 # Which actions follow
@@ -137,29 +155,20 @@ def test_what_is_drawn_follows_the_key(agent, changes):
 def test_zeros_leave_the_best_action_as_it_is(agent, form, weight):
     plain, _ = step(agent, variant="layout")
     own = {"form": form, "epsilon": 0.0, "always": weight}
-    zeros, weights = step(agent, **own, **NO_BRANCH)
+    zeros, weights = step(agent, **own, **CONTROLS["zeros"])
     assert (weights >= np.float32(weight)).all()
     np.testing.assert_array_equal(zeros, plain)
     # What the policy's own counterfactual, noise or a random intervention would change.
-    for changes in ({}, {"branch": Branch.NOISE}, {"noise": 1.0}):
-        assert (step(agent, **own | {"always": 2.0}, **changes)[0] != plain).any()
+    for control in ("none", "noise", "random"):
+        assert (step(agent, **own | {"always": 2.0}, **CONTROLS[control])[0] != plain).any()
 
 
 def test_zeros_are_no_control_of_the_papers_form(agent):
     """a - s 0 = a whatever the weight, sampled actions too; in the residual form the policy is sharper: (1 + s) a."""
     plain, _ = step(agent, variant="layout", decoding="sample")
-    own = {"decoding": "sample", "always": 2.0, **NO_BRANCH}
+    own = {"decoding": "sample", "always": 2.0, **CONTROLS["zeros"]}
     np.testing.assert_array_equal(step(agent, form="paper", **own)[0], plain)
     assert (step(agent, form="residual", **own)[0] != plain).any()
-
-
-CONTROLS = {
-    "none": {},
-    "shuffled": {"shuffled": True},
-    "zeros": NO_BRANCH,
-    "noise": {"branch": Branch.NOISE},
-    "random": {"noise": 1.0},
-}
 
 
 @pytest.mark.parametrize("control", CONTROLS)
@@ -181,28 +190,13 @@ def test_a_constant_weight_of_one_in_the_papers_form_is_hard_tde(agent):
 # The weight of another episode
 
 
-def test_shuffled_weights_are_those_of_other_episodes(agent):
-    own, shuffled = (step(agent, shuffled=shuffled)[1] for shuffled in (False, True))
-    np.testing.assert_array_equal(own, np.asarray(agent.layout.gap))
-    np.testing.assert_array_equal(np.sort(shuffled), np.sort(own))
-    assert (own != shuffled).any()
-    # Gaps that name their episodes: who gets whose.
-    named = agent._replace(layout=agent.layout.replace(gap=jnp.arange(EPISODES) / 100))
-    donor = np.rint(100 * step(named, shuffled=True)[1]).astype(int)
-    assert sorted(donor) == list(range(EPISODES))
-    assert (donor == np.arange(EPISODES)).mean() < 0.1
-    # The same at any time and with any key.
-    later = named._replace(state=named.state.replace(time=named.state.time + 2))
-    keys = jax.vmap(jax.random.fold_in, (0, None))(EPISODE_KEYS, 5)
-    np.testing.assert_array_equal(np.rint(100 * step(later, keys, shuffled=True)[1]), donor)
-
-
-def test_shuffling_equal_weights_changes_nothing(agent):
-    equal = agent._replace(layout=agent.layout.replace(gap=jnp.full(EPISODES, 0.7)))
-    for decoding in ("argmax", "sample"):
-        own, shuffled = (step(equal, decoding=decoding, shuffled=shuffled) for shuffled in (False, True))
-        np.testing.assert_array_equal(shuffled[0], own[0])
-        np.testing.assert_array_equal(shuffled[1], own[1])
+@pytest.mark.parametrize("running", [EVERY, np.arange(EPISODES) % 7 != 3, np.arange(EPISODES) == 5])
+def test_a_shuffled_weight_is_that_of_the_next_running_episode(agent, running):
+    gap = jnp.arange(EPISODES) / 100  # names the episode
+    named = agent._replace(layout=agent.layout.replace(gap=gap))
+    _, weight = step(named, running, shuffled=True)
+    # The last one's next is the first; one that runs alone keeps its own.
+    np.testing.assert_array_equal(weight[running], np.roll(gap[running], -1))
 
 
 def test_shuffling_unequal_ones_changes_actions(agent):

@@ -1,49 +1,18 @@
-"""The study's trials: their cells, their episodes against each other bit for bit, and the rows that tell of them."""
+"""The study's trials: their cells, and the rows that tell of them."""
+
+from typing import get_args
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
-from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.grid import Outcome, evaluate_grid
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.inference import Branch
-from jaxnav.evaluation.trials import CONTROLS, Results, Trial, mean_weight, trial_grid
-from jaxnav.policies.acting import Acting
+from jaxnav.evaluation.trials import Control, Results, Trial, mean_weight, trial_grid
 
-SEEDS, EPISODES = 2, 32
-FORMS, DECODINGS = ("residual", "paper"), ("argmax", "sample")
-OTHERS = tuple(control for control in CONTROLS if control != "constant")
-#: For both decodings: + w, hard TDE, sTDE and its controls where everything and where nothing is taken out.
-PLAIN = [Trial(variant, decoding) for decoding in DECODINGS for variant in ("baseline", "layout", "tde")]
-SWEEP = [
-    Trial("stde", decoding, epsilon, form, control)
-    for decoding in DECODINGS
-    for epsilon, form in ((0.0, "paper"), (0.0, "residual"), (1.0, "residual"))
-    for control in (None, *OTHERS)
-]
-WEIGHTS = (0.3, 1.0)
-CONSTANT = [Trial("stde", "argmax", 0.0, "paper", "constant", weight) for weight in WEIGHTS]
-TRIALS = [*PLAIN, *SWEEP, *CONSTANT]
-
-
-@pytest.fixture(scope="module")
-def outcome():
-    """All trials [T, S, E]."""
-    env, params = tiny.world()
-    params = params.replace(step_limit=jnp.array((12, 16), jnp.int32))
-    weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) for seed in (5, 9, 6, 11)))
-    parts = [(episode_list(tiny.BANK, EPISODES, seed=1), params)]
-    priors = 0.05 * tiny.priors()  # a belief that gives way at once: large gaps
-    acting, key = Acting(env, tiny.SETTING), jax.random.key(3)
-    found, _ = evaluate_grid(trial_grid(TRIALS, SEEDS), weights, parts, acting, tiny.SPEC, priors, key)
-    return jax.tree.map(lambda leaf: leaf.reshape(len(TRIALS), SEEDS, -1), found)
-
-
-def pick(outcome, *trial):
-    return tiny.at(outcome, TRIALS.index(Trial(*trial)))
+SEEDS = 2
 
 
 # Cells
@@ -56,9 +25,9 @@ def test_cells_are_those_of_stde_but_for_what_the_control_changes():
         "shuffled": {"shuffled": True},
         "zeros": {"branch": Branch.ZEROS},
         "noise": {"branch": Branch.NOISE},
-        "random": {"noise": 1.0},
+        "random": {"intervention": 1.0},
     }
-    assert set(changed) == set(CONTROLS)
+    assert set(changed) == set(get_args(Control))
     for control, expected in changed.items():
         cells = Trial("stde", "sample", 0.5, "residual", control, 0.3).cells(SEEDS)
         chex.assert_trees_all_equal_shapes_and_dtypes(cells, plain)
@@ -68,51 +37,12 @@ def test_cells_are_those_of_stde_but_for_what_the_control_changes():
 
 
 def test_the_grid_holds_the_seeds_of_one_trial_after_the_other():
-    grid = trial_grid(TRIALS, SEEDS)
-    assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(TRIALS) * SEEDS,)}
-    for i in (0, 1, 10, len(TRIALS) - 1):
+    trials = [Trial("baseline", "sample"), Trial("stde", "argmax", 0.2, "paper", "noise"), Trial("tde", "argmax")]
+    grid = trial_grid(trials, SEEDS)
+    assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(trials) * SEEDS,)}
+    for i, trial in enumerate(trials):
         own = jax.tree.map(lambda leaf, i=i: leaf[SEEDS * i : SEEDS * (i + 1)], grid)
-        chex.assert_trees_all_equal(own, TRIALS[i].cells(SEEDS))
-
-
-# Episodes
-
-
-@pytest.mark.parametrize("control", [None, *OTHERS])
-@pytest.mark.parametrize("decoding", DECODINGS)
-def test_at_epsilon_one_every_control_is_plus_w_bit_for_bit(outcome, decoding, control):
-    layout = pick(outcome, "layout", decoding)
-    chex.assert_trees_all_equal(pick(outcome, "stde", decoding, 1.0, "residual", control), layout)
-    # At epsilon 0 each takes something out.
-    assert (pick(outcome, "stde", decoding, 0.0, "residual", control).weight > 0.1).any()
-
-
-def changes(outcome, *trial):
-    """Whether a trial's episodes, but for their weights, differ from those of + w."""
-    own, layout = (found._replace(weight=0) for found in (pick(outcome, *trial), pick(outcome, "layout", trial[1])))
-    return any(not np.array_equal(a, b) for a, b in zip(own, layout, strict=True))
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_zeros_change_no_best_action_and_every_other_control_does(outcome, form):
-    assert not changes(outcome, "stde", "argmax", 0.0, form, "zeros")
-    for control in (None, "shuffled", "noise", "random"):
-        assert changes(outcome, "stde", "argmax", 0.0, form, control), control
-    # Sampled, they act as a temperature in the residual form alone.
-    assert changes(outcome, "stde", "sample", 0.0, form, "zeros") == (form == "residual")
-
-
-def test_a_shuffled_weight_is_another(outcome):
-    own, shuffled = (pick(outcome, "stde", "argmax", 0.0, "paper", control) for control in (None, "shuffled"))
-    assert not np.array_equal(own.weight, shuffled.weight)
-
-
-def test_a_constant_weight_is_the_weight_of_every_step(outcome):
-    for weight in WEIGHTS:
-        found = pick(outcome, "stde", "argmax", 0.0, "paper", "constant", weight)
-        np.testing.assert_allclose(found.weight, weight, rtol=1e-6)
-    # Of 1, in the paper's form: hard TDE.
-    chex.assert_trees_all_equal(found, pick(outcome, "tde", "argmax"))
+        chex.assert_trees_all_equal(own, trial.cells(SEEDS))
 
 
 # Rows
@@ -139,10 +69,20 @@ def few(success):
     return Outcome(np.array(success, bool), LENGTH, np.ones((2, 4), int), np.full((2, 4), 2.5), WEIGHT)
 
 
+def episodes(scene, room=(0, 0, 0, 0)):
+    """Four episodes in these scenes."""
+    scene, room, two = np.array(scene), np.array(room), np.full(4, 2)
+    names = tuple(f"scene {i}" for i in range(scene.max() + 1))
+    return EpisodeList(scene, np.zeros(4, int), np.zeros(4, int), two, room, ("bedroom", "kitchen"), names)
+
+
+def results(success, about):
+    return Results({trial: few(own) for trial, own in zip(FEW, success, strict=False)}, about)
+
+
 @pytest.fixture(scope="module")
 def small():
-    outcomes = {trial: few(success) for trial, success in zip(FEW, SUCCESS, strict=True)}
-    return Results(outcomes, np.full(4, 2), np.array([0, 0, 1, 1]))
+    return results(SUCCESS, episodes([0, 1, 2, 3]))
 
 
 def test_the_mean_weight_is_over_steps():
@@ -180,7 +120,25 @@ def test_rows_tell_metrics_and_differences(small):
 
 def test_equal_results_have_equal_intervals(small):
     assert small.rows(seed=0) == small.rows(seed=0)
-    same = Results({trial: few(SUCCESS[1]) for trial in FEW[1:3]}, np.full(4, 2), np.array([0, 0, 1, 1]))
-    layout, stde = same.rows(seed=0)
+    _, layout, stde = results([SUCCESS[0], SUCCESS[1], SUCCESS[1]], episodes([0, 1, 2, 3])).rows(seed=0)
     assert stde["sr"] == layout["sr"]
     assert stde["difference"]["sr"] == {"mean": 0.0, "std": 0.0, "ci95": (0.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("scene", "room", "interval"),
+    [
+        # Two scenes of two episodes, both seeds alike: 0, 1/2 or 1 with probabilities 1/4, 1/2, 1/4.
+        ([0, 0, 1, 1], [0, 0, 0, 0], (0.0, 100.0)),
+        # Scenes with as many of both kinds tell the mean whichever are drawn; episodes by themselves would not.
+        ([0, 1, 0, 1], [0, 0, 0, 0], (50.0, 50.0)),
+        # Each the only scene of its room type: both are always there.
+        ([0, 0, 1, 1], [0, 0, 1, 1], (50.0, 50.0)),
+        # A scene of three episodes, one found, and a scene of one: 2 of 6, 2 of 4 or 2 of 2.
+        ([0, 0, 0, 1], [0, 0, 0, 0], (100 / 3, 100.0)),
+    ],
+)
+def test_intervals_draw_scenes_with_all_their_episodes(scene, room, interval):
+    (row,) = results([[[0, 0, 1, 1]] * 2], episodes(scene, room)).rows(seed=0)
+    assert row["sr"]["mean"] == 50.0
+    assert row["sr"]["ci95"] == pytest.approx(interval)

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,20 +39,6 @@ CONTROLS: tuple[tuple[Control, Decoding], ...] = (
 )
 
 
-class Condition(NamedTuple):
-    """Where policies are put to the test.
-
-    Attributes:
-      run: the run that has all trials, and whose scenes they are.
-      others: by name, runs that have the main ones.
-      shift: of the layout.
-    """
-
-    run: RunConfig
-    others: dict[str, RunConfig]
-    shift: float
-
-
 class Bench:
     """Evaluates trials in blocks of one size, so that all that is alike is compiled once."""
 
@@ -86,27 +72,35 @@ class Bench:
         return found
 
 
-def table(condition: Condition, bench: Bench, console: Console) -> dict[str, Any]:
-    """Every trial of every run at one shift, and success against similarity."""
-    run, config = condition.run, bench.config
-    world = evaluation_world(run, config.split, None, condition.shift, console)
-    episodes, policies = _episodes(world, config), load_policies(run)
+def table(run: RunConfig, full: bool, shift: float, bench: Bench, console: Console) -> dict[str, Any]:
+    """The trials of a run at one shift: those of Table 1 with best actions, or in `full` all, and Figs. 4 and 5."""
+    config, both = bench.config, "baseline" in run.arms
+    world = evaluation_world(run, config.split, None, shift, console)
+    episodes, policies = _episodes(world, config), load_policies(run, run.arms)
+    if not both:
+        policies = policies._replace(params=jax.tree.map(lambda x: jnp.concatenate([x, x]), policies.params))
     rows: list[dict[str, Any]] = []
-    similarity: dict[str, Any] = {}
-    parameters = {"main": _size(policies)}
 
-    def add(name: str, gap: str, outcomes: Mapping[Trial, Outcome]) -> Results:
+    def add(gap: str, outcomes: Mapping[Trial, Outcome]) -> Results:
         results = Results(outcomes, episodes)
         # Without sTDE the gap is of no effect.
         own = (row for row in results.rows(config.seed) if row["variant"] == "stde" or gap == "novelty")
-        rows.extend({"training": name, "gap": gap, **row} for row in own)
+        rows.extend({"gap": gap, **row} for row in own)
         return results
 
-    plain = bench.outcomes(world, episodes, policies, "novelty", _plain(DECODINGS))
-    epsilons = config.epsilon if config.split == "val" else (chosen(config),)
+    about = {"shift": shift, "world": world.scenes[0].world, "scenes": len(episodes.scenes), "rows": rows}
+    about |= {"episodes": len(episodes.goal), "parameters": sum(x[0].size for x in jax.tree.leaves(policies.params))}
+    plain = bench.outcomes(world, episodes, policies, "novelty", _plain(DECODINGS if full else ("argmax",), both))
+    if not full:
+        uses = [Trial("stde", "argmax", *use) for use in USES]
+        add("novelty", plain | bench.outcomes(world, episodes, policies, "novelty", uses))
+        return about
+    if config.split == "test":
+        about["chosen"] = chosen(config)
     for gap in ("novelty", "evidence", "clock"):
         trials = [Trial("stde", decoding, *use) for use in USES for decoding in DECODINGS]
         if gap == "novelty":
+            epsilons = config.epsilon if config.split == "val" else (chosen(config),)
             trials += [Trial("stde", "argmax", epsilon, form) for form in FORMS for epsilon in epsilons]
         if gap != "clock":
             trials += [Trial("stde", decoding, *use, control) for use in USES for control, decoding in CONTROLS]
@@ -115,20 +109,10 @@ def table(condition: Condition, bench: Bench, console: Console) -> dict[str, Any
             weights = {use: mean_weight(found[Trial("stde", "argmax", *use)]) for use in USES}
             constants = [Trial("stde", "argmax", *use, "constant", weight) for use, weight in weights.items()]
             found |= bench.outcomes(world, episodes, policies, gap, constants)
-        results = add("main", gap, plain | found)
+        results = add(gap, plain | found)
         if gap == "novelty":
-            similarity = _similarity(world, episodes, policies, results, config)
-    for name, other in condition.others.items():
-        loaded, both = load_policies(other, other.arms), "baseline" in other.arms
-        if not both:
-            loaded = loaded._replace(params=jax.tree.map(lambda x: jnp.concatenate([x, x]), loaded.params))
-        trials = [*_plain(("argmax",), both), *(Trial("stde", "argmax", *use) for use in USES)]
-        parameters[name] = _size(loaded)
-        add(name, "novelty", bench.outcomes(world, episodes, loaded, "novelty", trials))
-    picked = {} if config.split == "val" else {"chosen": chosen(config)}
-    about = {"shift": condition.shift, "world": world.scenes[0].world, "scenes": len(episodes.scenes)}
-    about |= {"parameters": parameters}
-    return about | {"episodes": len(episodes.goal), "rows": rows} | similarity | picked
+            about |= _similarity(world, episodes, policies, results, config)
+    return about
 
 
 def gap_settings(setting: Setting) -> dict[str, Setting]:
@@ -152,15 +136,10 @@ def chosen(config: StudyConfig) -> float:
     path = config.results / "val" / f"main-shift{config.shifts[0]:g}.json"
     if not path.exists():
         raise InputError(f"{path}: is missing; run the study with --split val first, epsilon is chosen there")
-    wanted = {"training": "main", "gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
+    wanted = {"gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
     wanted["form"] = "residual"
     rows = [row for row in json.loads(path.read_text())["rows"] if all(row[key] == wanted[key] for key in wanted)]
     return max(rows, key=lambda row: row["sr"]["mean"])["epsilon"]
-
-
-def _size(policies: Policies) -> int:
-    """Number of parameters of one policy."""
-    return sum(leaf[0].size for leaf in jax.tree.leaves(policies.params))
 
 
 def _plain(decodings: Sequence[Decoding], baseline: bool = True) -> list[Trial]:

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from jaxnav.cli.command import exit_code
-from jaxnav.cli.conditions import Bench, Condition, chosen, gaps, table
+from jaxnav.cli.conditions import Bench, chosen, gaps, table
 from jaxnav.cli.instrument import instrument_report, of_study
 from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
 from jaxnav.evaluation.document import check_document, write_document
@@ -44,15 +44,13 @@ def study(config: StudyConfig, console: Console) -> None:
         write_atomic(path, (json.dumps(rounded(about | make()), allow_nan=False) + "\n").encode())
 
     bench = Bench(config)
-    others = {name: run for name, run in runs.items() if name not in ("main", "real")}
-    for name, beside in (("main", others), ("real", {})):
-        if name not in runs:
-            continue
-        run = runs[name]
-        part(f"instrument-{name}", partial(instrument_report, of_study(config, run), run, console))
+    for name, run in runs.items():
+        full = name in ("main", "real")
         for shift in config.shifts:
-            part(f"{name}-shift{shift:g}", partial(table, Condition(run, beside, shift), bench, console))
-        part(f"gap-{name}", partial(gaps, run, config, console))
+            part(f"{name}-shift{shift:g}", partial(table, run, full, shift, bench, console))
+        if full:
+            part(f"instrument-{name}", partial(instrument_report, of_study(config, run), run, console))
+            part(f"gap-{name}", partial(gaps, run, config, console))
     if config.split == "val":
         draw(folder, config.document.parent / "images" / "study")
     write_document(config.results, config.document)
@@ -68,9 +66,9 @@ def finished(path: Path, study: dict[str, Any]) -> bool:
 
 
 def plain(config: StudyConfig) -> dict[str, Any]:
-    """What makes the study the study it is, as JSON: not where its files are."""
+    """What makes a part of the study what it is, as JSON: not which other parts there are, nor where files are."""
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
-    for name in ("results", "document", "runs", "split"):
+    for name in ("results", "document", "runs", "split", "trainings", "real"):
         settings.pop(name)
     for name in ("run_dir", "save_every", "cache"):
         settings["base"].pop(name)

@@ -34,8 +34,8 @@ class Claim(NamedTuple):
 
 
 def pick(part: Mapping[str, Any], **wanted: Any) -> dict[str, Any]:
-    """The row of a part's table with these entries; best actions and the main run's own gap unless named."""
-    wanted = {"training": "main", "gap": "novelty", "decoding": "argmax", "control": None, **wanted}
+    """The row of a part's table with these entries; best actions and the run's own gap unless named."""
+    wanted = {"gap": "novelty", "decoding": "argmax", "control": None, **wanted}
     return next(row for row in part["rows"] if all(row[key] == value for key, value in wanted.items()))
 
 

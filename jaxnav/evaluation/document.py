@@ -43,7 +43,7 @@ def write_document(results: Path, document: Path) -> None:
         "",
         f"{base['seeds']} seeds, {base['total_steps']:,} steps a policy, {study['episodes']:,} episodes at each shift, "
         "split `val`. Intervals are of 95 %, over seeds and scenes, not corrected for their number. Made by "
-        "`python eval.py study`: every number comes from the results, and all but the reading is written by the command.",
+        "`python eval.py study`: every number comes from the results; all but the reading is written by the command.",
         "",
         "## Reading",
         "",
@@ -69,7 +69,7 @@ def write_document(results: Path, document: Path) -> None:
         lines += ["### Controls", "", *_controls(parts), ""]
         if world == "main":
             lines += ["### How the parts are made: settings, counterfactual branch, one factor at a time", ""]
-            lines += [*_trainings(parts), ""]
+            lines += [*_trainings(found), ""]
         lines += ["### Does the gap track the layout?", "", *_tracking(found[f"gap-{world}"]), ""]
         lines += ["### Figures", "", *_figures(world), ""]
     test = load(results / "test")
@@ -149,25 +149,25 @@ def _control(row: Mapping[str, Any]) -> str:
     return f"{_effect(row['difference']['sr'])} ({row['mean_weight']:.2f})"
 
 
-def _trainings(parts: Sequence[Mapping[str, Any]]) -> list[str]:
-    names = list(dict.fromkeys(row["training"] for row in parts[0]["rows"]))
+def _trainings(found: Results) -> list[str]:
+    shifts = [part["shift"] for part in conditions(found, "main")]
+    names = [name.removesuffix(f"-shift{shifts[0]:g}") for name in found if name.endswith(f"-shift{shifts[0]:g}")]
     variants = {"baseline": {"variant": "baseline"}, "+ w": {"variant": "layout"}, "TDE": {"variant": "tde"}}
     variants |= {use: {"variant": "stde", "epsilon": e, "form": form} for use, (e, form) in NAMED_USES.items()}
-    rows = []
-    for name in names:
+    rows, parameters = [], {}
+    for name in sorted(names, key=lambda name: name != "main"):
+        if name == "real":
+            continue
+        parts = [found[f"{name}-shift{shift:g}"] for shift in shifts]
+        parameters[name] = parts[0]["parameters"]
         for title, wanted in variants.items():
-            if title == "baseline" and not any(
-                r["training"] == name and r["variant"] == title for r in parts[0]["rows"]
-            ):
-                continue
-            found = [pick(part, training=name, **wanted) for part in parts]
-            cells = [f"{row['sr']['mean']:.1f} ± {row['sr']['std']:.1f}" for row in found]
-            rows.append((f"`{name}` {title}", *cells))
-    sizes = sorted(set(parts[0]["parameters"].values()))
-    same = (
-        f"All policies have {sizes[0]:,} parameters." if len(sizes) == 1 else f"Parameters: {parts[0]['parameters']}."
-    )
-    return [*_grid(("SR", *(f"shift {part['shift']:g}" for part in parts)), rows), "", same]
+            if title == "baseline" and not any(row["variant"] == "baseline" for row in parts[0]["rows"]):
+                continue  # a run of the layout's arm alone
+            picked = [pick(part, **wanted) for part in parts]
+            rows.append((f"`{name}` {title}", *(f"{r['sr']['mean']:.1f} ± {r['sr']['std']:.1f}" for r in picked)))
+    sizes = set(parameters.values())
+    same = f"All policies have {sizes.pop():,} parameters." if len(sizes) == 1 else f"Parameters: {parameters}."
+    return [*_grid(("SR", *(f"shift {shift:g}" for shift in shifts)), rows), "", same]
 
 
 def _tracking(course: Mapping[str, Any]) -> list[str]:

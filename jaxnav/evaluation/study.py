@@ -67,7 +67,7 @@ def _ends(course: Mapping[str, Any]) -> dict[str, Any]:
 
 def _sweep(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Fig. 6a, best actions."""
-    wanted = {"training": "main", "gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
+    wanted = {"gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
     lines, epsilons = [], []
     for part in parts:
         rows = [row for row in part["rows"] if all(row[key] == value for key, value in wanted.items())]
