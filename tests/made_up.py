@@ -3,8 +3,9 @@
 import json
 
 from jaxnav.evaluation.dial import BASELINES, MATCHED, MEASURES
-from jaxnav.evaluation.trials import CONTROLS
+from jaxnav.evaluation.trials import USES
 
+RUNS = ("main", "coin", "goal")
 SHIFTS, EPSILONS = (0.0, 1.0), (0.0, 0.5, 1.0)
 STEPS = 30
 BASE = {"seeds": 3, "total_steps": 1_000_000}
@@ -18,9 +19,9 @@ def metric(mean):
     return interval(mean) | {"std": 0.5, "seeds": [mean - 1, mean, mean + 1]}
 
 
-def row(effect, *, training="main", gap="novelty", variant="stde", decoding="argmax", control=None, **use):
+def row(effect, *, gap="novelty", variant="stde", decoding="argmax", control=None, **use):
     """A row of the table; `effect` is its difference in SR, None for the baseline."""
-    own = {"training": training, "gap": gap, "variant": variant, "decoding": decoding, "control": control}
+    own = {"gap": gap, "variant": variant, "decoding": decoding, "control": control}
     own |= {"epsilon": None, "form": None, "mean_weight": 0.25} | use
     own |= {"sr": metric(60.0 + (effect or 0.0)), "spl": metric(30.0), "dts": metric(1.5)}
     if effect is not None:
@@ -28,31 +29,28 @@ def row(effect, *, training="main", gap="novelty", variant="stde", decoding="arg
     return own
 
 
-def rows(shift):
-    """Every row of one shift. At shift 0 sTDE gains nothing; at shift 1 it gains 2 points, 3 of its effects differ."""
-    uses = [{"epsilon": epsilon, "form": form} for form in ("residual", "paper") for epsilon in EPSILONS]
-    references = [{"epsilon": 0.5, "form": "residual"}, {"epsilon": 0.0, "form": "paper"}]
-    found = []
-    for decoding in ("argmax", "sample"):
-        off = 0.0 if decoding == "argmax" else 100.0  # to tell them apart
+def rows(shift, run="main"):
+    """Every row of a run at one shift; `main` gains nothing by sTDE at shift 0, 2 points at shift 1, 5 in full.
 
-        def add(effect, decoding=decoding, off=off, **own):
-            found.append(row(None if effect is None else effect + off, decoding=decoding, **own))
-
-        for training in ("main", "coin", "goal"):
-            if training != "coin":
-                add(None, training=training, variant="baseline")
-            add(3.0 - 2 * shift, training=training, variant="layout")
-            add(-6.0 + shift, training=training, variant="tde")
-            for use in uses:
-                add((5.0 if use["form"] == "paper" else 2.0) * shift, training=training, **use)
-        for use in uses:
-            add(4.0 * shift, gap="evidence", **use)
-            add(0.5 * shift, gap="clock", **use)
+    `coin` has the layout's arm alone. Sampled effects are 100 more, to tell them apart.
+    """
+    found = [] if run == "coin" else [row(None, variant="baseline")]
+    found += [row(3.0 - 2 * shift, variant="layout"), row(-6.0 + shift, variant="tde")]
+    if run != "main":
+        return found + [row(2.0 * shift, epsilon=epsilon, form=form) for epsilon, form in USES]
+    found += [row(None, variant="baseline", decoding="sample")]
+    found += [row(effect + 100.0, variant=name, decoding="sample") for name, effect in (("layout", 1.0), ("tde", -5.0))]
+    for form, effect in (("residual", 2.0 * shift), ("paper", 5.0 * shift)):
+        found += [row(effect, epsilon=epsilon, form=form) for epsilon in EPSILONS]
+    for epsilon, form in USES:
+        use = {"epsilon": epsilon, "form": form}
+        found += [row(100.0, **use, decoding="sample"), row(0.5 * shift, **use, gap="clock")]
+        found += [
+            row(4.0 * shift + off, **use, gap="evidence", decoding=d) for d, off in (("argmax", 0), ("sample", 100))
+        ]
         for gap in ("novelty", "evidence"):
-            for use in references:
-                for control in CONTROLS:
-                    add(0.25, gap=gap, control=control, **use)
+            found += [row(0.25, **use, gap=gap, control=name) for name in ("constant", "shuffled", "noise", "random")]
+            found.append(row(100.25, **use, gap=gap, control="zeros", decoding="sample"))
     return found
 
 
@@ -67,8 +65,11 @@ def gains(slope):
     return own | {"slope": interval(slope, 0.25), "pearson": interval(-0.5, 0.1)}
 
 
-def part(shift):
-    found = {"shift": shift, "world": "rooms", "scenes": 80, "episodes": 1000, "rows": rows(shift)}
+def part(shift, run="main"):
+    found = {"shift": shift, "world": "rooms", "scenes": 80, "episodes": 1000, "rows": rows(shift, run)}
+    found["parameters"] = 12_345
+    if run != "main":
+        return found
     own = {name: gains(-1.5 - shift) for name in ("layout", "stde")}
     return found | {"similarity": similarity(0.3 - 0.2 * shift), "gains": own}
 
@@ -108,18 +109,18 @@ def instrument():
     return {"shifts": table, "matched": matched, "discriminating": losses}
 
 
-def results(worlds=("main",)):
+def results(worlds=("main",), runs=RUNS):
     """The parts by name."""
     about = {"study": {"shifts": list(SHIFTS), "episodes": 1000, "base": BASE}}
-    found = {}
+    found = {f"{run}-shift{shift:g}": about | part(shift, run) for run in runs for shift in SHIFTS}
     for world in worlds:
         found |= {f"{world}-shift{shift:g}": about | part(shift) for shift in SHIFTS}
         found |= {f"instrument-{world}": about | instrument(), f"gap-{world}": about | course()}
     return found
 
 
-def write(folder, worlds=("main",)):
+def write(folder, worlds=("main",), runs=RUNS):
     """The parts as files."""
     folder.mkdir(parents=True)
-    for name, own in results(worlds).items():
+    for name, own in results(worlds, runs).items():
         (folder / f"{name}.json").write_text(json.dumps(own))

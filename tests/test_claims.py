@@ -1,5 +1,7 @@
 """The claims: what is taken from the results, with which sign, and when a claim holds."""
 
+import math
+
 import made_up
 import pytest
 
@@ -10,6 +12,7 @@ from jaxnav.evaluation.claims import Claim, claims, pick
     ("low", "high", "verdict"),
     [
         (0.5, 3.0, "holds"),
+        (0.5, 1.5, "holds, but is small"),  # less than would matter
         (-1.0, 1.5, "does not hold"),  # whatever there is is less than would matter
         (-4.0, -1.0, "does not hold"),
         (-1.0, 2.5, "cannot be told here"),
@@ -28,15 +31,13 @@ def test_a_row_is_picked_by_all_that_is_named_and_else_is_the_main_one():
     part = made_up.part(1.0)
     found = pick(part, variant="stde", epsilon=0.0, form="paper")
     assert found["difference"]["sr"]["mean"] == 5.0  # best actions: 100 more when sampled
-    names = ("training", "gap", "decoding", "control")
-    assert [found[name] for name in names] == ["main", "novelty", "argmax", None]
+    assert [found[name] for name in ("gap", "decoding", "control")] == ["novelty", "argmax", None]
     assert pick(part, variant="stde", epsilon=0.0, form="paper", gap="evidence")["difference"]["sr"]["mean"] == 4.0
     assert pick(part, variant="layout", decoding="sample")["difference"]["sr"]["mean"] == 101.0
-    assert pick(part, variant="layout", training="coin")["training"] == "coin"
     control = pick(part, variant="stde", epsilon=0.0, form="paper", control="noise")
     assert control["control"] == "noise"
     with pytest.raises(StopIteration):
-        pick(part, variant="baseline", training="coin")
+        pick(made_up.part(1.0, "coin"), variant="baseline")
 
 
 # Effects
@@ -56,8 +57,8 @@ def effect(found, text):
 @pytest.mark.parametrize(
     ("text", "mean", "half", "verdict"),
     [
-        # The instrument: 12 points.
-        ("The baseline loses from shift 0 to 1", 12.0, 1.0, "holds"),
+        # The instrument: 9 points, best actions.
+        ("The baseline loses from shift 0 to 1", 9.0, 1.0, "holds"),
         ("The layout's weights help where the layout is as trained", 3.0, 1.0, "holds"),
         # 1 +- 1 reaches 0, and 2.
         ("The layout's weights help at shift 1", 1.0, 1.0, "cannot be told here"),
@@ -72,8 +73,8 @@ def effect(found, text):
         # -2.5 points per 0.1 more similarity.
         ("Gains over the baseline are larger where similarity is low", 2.5, 0.25, "holds"),
         # 0.2 at step 20 is 0.3 below 0.5; frozen, 0.8 is 0.3 above.
-        ("The gap falls below 0.5 by step 20", 0.3, 0.01, "holds"),
-        ("Without updates it stays above 0.5", 0.3, 0.01, "holds"),
+        ("The gap is below 0.5 at step 20", 0.3, 0.01, "holds"),
+        ("Without updates it is above 0.5 at step 20", 0.3, 0.01, "holds"),
         # AUC 0.5 is chance; 0.75 is 0.25 above.
         ("Eq. 5's gap tells shift 1 from none at step 0", 0.0, 0.01, "does not hold"),
         ("Eq. 5's gap tells shift 1 from none at step 20", 0.0, 0.01, "does not hold"),
@@ -95,6 +96,28 @@ def test_the_real_rooms_have_claims_of_their_own():
     results = made_up.results(("main", "real"))
     results["instrument-real"] = results["instrument-real"] | {"discriminating": [made_up.interval(-3.0)]}
     (main, *rest), (real, *others) = (claims(results, world) for world in ("main", "real"))
-    assert (main.mean, real.mean) == (12.0, -3.0)
+    assert (main.mean, real.mean) == (9.0, -3.0)
     assert (main.verdict, real.verdict) == ("holds", "does not hold")
     assert rest == others
+
+
+def test_what_is_undefined_is_told_by_no_verdict_of_its_own():
+    results = made_up.results()
+    undefined = {"mean": None, "ci95": [None, None]}
+    results["main-shift0"]["similarity"]["pearson"] = undefined
+    results["main-shift1"]["gains"]["stde"]["slope"] = undefined
+    found = {claim.text: claim for claim in claims(results)}
+    for text in ("Success follows", "Gains over the baseline"):
+        (mean, low, high), verdict = effect(found, text)
+        assert all(map(math.isnan, (mean, low, high)))
+        assert verdict == "cannot be told here"
+
+
+def test_a_short_course_is_read_at_its_last_step():
+    results = made_up.results()
+    course = results["gap-main"]
+    course["steps"] = course["steps"][:11]
+    found = {claim.text: claim for claim in claims(results)}
+    # Half way from 0.9 to 0.2.
+    assert effect(found, "The gap is below 0.5 at step 10")[0][0] == pytest.approx(0.5 - 0.55)
+    assert "The `evidence` gap does at step 10" in found

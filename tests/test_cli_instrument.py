@@ -63,6 +63,7 @@ def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
     assert last["baseline_sample_sr"]["mean"] == pytest.approx(baseline["sample"])
 
 
+@pytest.mark.slow
 def test_other_scenes_of_another_split(run_dir):
     assert instrument(run_dir, "--shift", 0, 1, "--episodes", 4, "--split", "test", "--scenes-per-split", 6) == 0
     report = json.loads((run_dir / "instrument-test.json").read_text())
@@ -75,7 +76,7 @@ def test_other_scenes_of_another_split(run_dir):
     ("options", "problem"),
     [
         (["--shift", "0.5", "0.5"], "--shift 0.5 0.5: give at least two different shifts"),
-        (["--shift", "0", "2"], "give a seed of at least 0, a shift from 0 to 1"),
+        (["--shift", "-1", "0"], "give numbers from 0 to 1"),
         (["--episodes", "0"], "--episodes 0: give at least 1"),
         (["--seed", "-1"], "--seed -1: give a whole number from 0"),
         (["--scenes-per-split", "0"], "ask for at least one"),
@@ -88,6 +89,7 @@ def test_bad_requests_are_refused_and_write_nothing(run_dir, capsys, options, pr
     assert contents(run_dir) == before
 
 
+@pytest.mark.slow
 def test_a_run_on_scenes_of_a_file(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "scenes.jsonl.gz"
     scenes = generated("rooms", "val", 4)
@@ -102,6 +104,14 @@ def test_a_run_on_scenes_of_a_file(run_dir, tmp_path, capsys):
     assert last["layout_gap"]["mean"] != pytest.approx(first["layout_gap"]["mean"])
     assert instrument(run, "--scenes-per-split", 4) == 2
     assert "is a run on scenes of a file; leave it out" in refusal(capsys)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_with_a_config_it_is_that_of_a_study(tmp_path, capsys, joined):
+    (tmp_path / "study.yaml").write_text("shifts: [1.0]")
+    file = str(tmp_path / "study.yaml")
+    assert instrument(*([f"--config={file}"] if joined else ["--config", file])) == 2
+    assert "shifts: (1.0,): give two or more from 0 to 1, rising" in refusal(capsys)
 
 
 def test_both_commands_lead_here(tmp_path, capsys, monkeypatch):

@@ -6,22 +6,19 @@ from PIL import Image
 
 from jaxnav.evaluation.draw import Episode, draw_episode
 from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.grid import first_states
 from jaxnav.evaluation.plan import view_cone
-from jaxnav.evaluation.playback import play
-from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.policies.acting import Acting
+from jaxnav.evaluation.playback import Trace
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.sight import cell_centres
-from jaxnav.scenes.task import Rules
+from jaxnav.scenes.task import DONE, Rules
 
 
 def test_a_picture_has_a_frame_per_step(tmp_path):
-    env, params = tiny.world()
     episodes = episode_list(tiny.BANK, 12)
-    cell = tiny.at(inference_grid([table_row("stde", 0.1, "residual", "argmax")], 1), 0)
-    start, acting = tiny.at(first_states(episodes), 0), Acting(env, tiny.SETTING)
-    trace = play(cell, tiny.lively(1), start, acting, tiny.SPEC, params, tiny.priors())
+    pose, action = [int(episodes.pose[0])], [0, 1, 2, 1, 0, DONE]
+    for chosen in action[:-1]:
+        pose.append(int(tiny.BANK.successor[pose[-1], chosen]))
+    trace = Trace(np.array(pose), np.array(action), np.linspace(0.9, 0.2, len(pose)), success=False)
     scene = (tiny.KITCHEN, tiny.BEDROOM)[episodes.scene[0]]
     cells = cell_centres(scene, standable_cells(scene.reach))
     episode = Episode(

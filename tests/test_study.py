@@ -2,13 +2,16 @@
 
 import json
 import re
+from typing import get_args
 
 import made_up
 import pytest
 
+from jaxnav.errors import InputError
 from jaxnav.evaluation.claims import claims
-from jaxnav.evaluation.study import CONTROLS, READING, draw, load, write_document
-from jaxnav.evaluation.trials import CONTROLS as ALL_CONTROLS
+from jaxnav.evaluation.document import CONTROLS, READING, check_document, write_document
+from jaxnav.evaluation.study import draw, load
+from jaxnav.evaluation.trials import Control
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +54,21 @@ def test_every_image_that_is_named_is_drawn_and_no_other(folder, text):
     assert set(named) == drawn
 
 
-def test_a_second_time_nothing_changes(folder, text):
-    made_up.write(folder / "again")  # one of the worlds
-    draw(folder / "again", folder / "images")
-    for path in (folder / "images").iterdir():
-        assert path.read_bytes() == (folder / "docs" / "images" / "study" / path.name).read_bytes()
-    write_document(folder / "results", folder / "docs" / "study.md")
-    assert (folder / "docs" / "study.md").read_text() == text
+@pytest.mark.parametrize("text", ["", "My own notes.\n", f"{READING}\nOne line of two.\n"])
+def test_a_document_that_is_none_of_the_studys_is_not_written_over(folder, tmp_path, text):
+    document = tmp_path / "study.md"
+    check_document(document)
+    document.write_text(text)
+    with pytest.raises(InputError, match=r"study.md: is there, without two lines <!-- reading -->; give another"):
+        write_document(folder / "results", document)
+    assert document.read_text() == text
+
+
+def test_parts_of_another_study_are_not_read(folder, tmp_path):
+    made_up.write(tmp_path / "val")
+    left = made_up.results()["coin-shift0"] | {"study": {}}
+    (tmp_path / "val" / "left-shift0.json").write_text(json.dumps(left))
+    assert load(tmp_path / "val") == made_up.results()
 
 
 def test_what_is_written_by_hand_stays(folder, tmp_path):
@@ -71,7 +82,7 @@ def test_what_is_written_by_hand_stays(folder, tmp_path):
     write_document(folder / "results", document)
     assert document.read_text() == by_hand
     # Numbers follow the results, the text by hand does not.
-    made_up.write(tmp_path / "results" / "val")
+    made_up.write(tmp_path / "results" / "val", runs=("main",))
     changed = made_up.results()["main-shift1"]
     changed["rows"] = [row | {"sr": made_up.metric(12.5)} for row in changed["rows"]]
     (tmp_path / "results" / "val" / "main-shift1.json").write_text(json.dumps(changed))
@@ -95,7 +106,7 @@ def test_the_claims_are_those_of_the_results(text):
     found = claims(made_up.results())
     assert list(rows)[2:] == [claim.text for claim in found]
     assert [rows[claim.text][1] for claim in found] == [claim.verdict for claim in found]
-    assert rows["The baseline loses from shift 0 to 1"] == ["+12.0 [+11.0, +13.0] SR points", "holds"]
+    assert rows["The baseline loses from shift 0 to 1"] == ["+9.0 [+8.0, +10.0] SR points", "holds"]
     assert rows["The `evidence` gap does at step 20"] == ["+0.25 [+0.24, +0.26] AUC - 0.5", "holds"]
 
 
@@ -111,21 +122,28 @@ def test_table_1_holds_both_decodings_at_every_shift(text):
 
 
 def test_every_control_is_told(text):
-    assert set(CONTROLS) == set(ALL_CONTROLS)
+    assert set(CONTROLS) == {None, *get_args(Control)}
     rows = table(section(text, "Controls"))
     # Two uses: two gaps with five controls and none each, and the clock; header and rule.
     assert len(rows) == 2 * (2 * 6 + 1) + 2
-    assert rows["sTDE (eps 0.5), gap `novelty`"] == ["+0.0 [-1.0, +1.0]", "+2.0 [+1.0, +3.0]"]
-    assert rows["sTDE (eps 0.5), gap `novelty`, noise taken out"] == 2 * ["+0.2 [-0.8, +1.2]"]
-    assert rows["sTDE (eps 0.5), the released code's novelty clock"][1] == "+0.5 [-0.5, +1.5]"
+    assert rows["sTDE (eps 0.5), gap `novelty`"] == ["+0.0 [-1.0, +1.0] (0.25)", "+2.0 [+1.0, +3.0] (0.25)"]
+    assert rows["sTDE (eps 0.5), gap `novelty`, noise taken out"] == 2 * ["+0.2 [-0.8, +1.2] (0.25)"]
+    # Zeros: with sampled actions, of which they are a control.
+    zeros = rows["sTDE (eps 0.5), gap `novelty`, zeros taken out, sampled actions"]
+    assert zeros == 2 * ["+100.2 [+99.2, +101.2] (0.25)"]
+    assert rows["sTDE (eps 0.5), the released code's novelty clock"][1] == "+0.5 [-0.5, +1.5] (0.25)"
 
 
 def test_other_trainings_have_the_rows_they_have(text):
-    rows = table(section(text, "How the parts are made: settings, counterfactual branch, one factor at a time"))
+    found = section(text, "How the parts are made: settings, counterfactual branch, one factor at a time")
+    rows = table(found)
+    assert list(rows)[2] == "`main` baseline"  # the one to compare with comes first
     assert rows["`goal` + w"] == ["63.0 ± 0.5", "61.0 ± 0.5"]
     assert "`goal` baseline" in rows
     assert "`coin` baseline" not in rows
     assert "`coin` TDE" in rows
+    assert not any("real" in name for name in rows)
+    assert "All policies have 12,345 parameters." in found
 
 
 def test_the_gap_is_told_at_the_steps_that_there_are(text):
@@ -139,6 +157,9 @@ def test_the_gap_is_told_at_the_steps_that_there_are(text):
 def test_results_on_test_are_appended(tmp_path):
     made_up.write(tmp_path / "val")
     made_up.write(tmp_path / "test")
+    for path in (tmp_path / "test").glob("main-shift*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"chosen": 1.0}))
     write_document(tmp_path, tmp_path / "study.md")
     own = section((tmp_path / "study.md").read_text(), "Test, touched once")
     assert table(own)["+ w + sTDE (eps 0.5)"][0] == "62.0 ± 0.5"
+    assert table(own)["+ w + sTDE (eps 1, chosen)"][0] == "62.0 ± 0.5"

@@ -1,4 +1,4 @@
-"""The study's trials: their cells, and the rows that tell of them."""
+"""Rows and trials as cells of the grid, and what is told of the trials."""
 
 from typing import get_args
 
@@ -7,15 +7,45 @@ import jax
 import numpy as np
 import pytest
 
+from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.inference import Branch
 from jaxnav.evaluation.trials import Control, Results, Trial, mean_weight, trial_grid
+from jaxnav.evaluation.variants import inference_grid, table_rows
 
 SEEDS = 2
 
 
 # Cells
+
+ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"])
+
+
+def of_row(grid, i):
+    """The cells of one row or trial."""
+    return jax.tree.map(lambda leaf: leaf[SEEDS * i : SEEDS * (i + 1)], grid)
+
+
+@pytest.mark.parametrize("epsilon", [float("nan"), -0.1, float("inf"), float("-inf")])
+def test_impossible_epsilons_are_refused(epsilon):
+    with pytest.raises(InputError, match=r"--epsilon (nan|-0.1|inf|-inf): give numbers from 0"):
+        table_rows([0.5, epsilon], ["paper"])
+
+
+def test_the_grid_holds_a_cell_per_row_and_seed():
+    grid = inference_grid(ROWS, SEEDS)
+    assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(ROWS) * SEEDS,)}
+    by_row = {row: of_row(grid, i) for i, row in enumerate(ROWS)}
+    # Baseline and Random use the first two sets of parameters, all others the last two.
+    for row, cells in by_row.items():
+        plain = row.variant in ("baseline", "random")
+        np.testing.assert_array_equal(cells.params, [0, 1] if plain else [2, 3])
+        np.testing.assert_array_equal(cells.layout, [not plain] * 2)
+        np.testing.assert_array_equal(cells.greedy, [row.decoding == "argmax"] * 2)
+        np.testing.assert_array_equal(cells.uniform, [row.variant == "random"] * 2)
+        np.testing.assert_array_equal(cells.always, [row.variant == "tde"] * 2)
+        np.testing.assert_array_equal(cells.epsilon, np.float32([np.inf if row.epsilon is None else row.epsilon] * 2))
 
 
 def test_cells_are_those_of_stde_but_for_what_the_control_changes():
@@ -41,11 +71,10 @@ def test_the_grid_holds_the_seeds_of_one_trial_after_the_other():
     grid = trial_grid(trials, SEEDS)
     assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(trials) * SEEDS,)}
     for i, trial in enumerate(trials):
-        own = jax.tree.map(lambda leaf, i=i: leaf[SEEDS * i : SEEDS * (i + 1)], grid)
-        chex.assert_trees_all_equal(own, trial.cells(SEEDS))
+        chex.assert_trees_all_equal(of_row(grid, i), trial.cells(SEEDS))
 
 
-# Rows
+# What is told
 
 #: Four episodes of two seeds; L* = 2, so that success after 4 actions has SPL 0.5.
 FEW = [

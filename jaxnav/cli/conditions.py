@@ -100,8 +100,10 @@ def table(run: RunConfig, full: bool, shift: float, bench: Bench, console: Conso
     for gap in ("novelty", "evidence", "clock"):
         trials = [Trial("stde", decoding, *use) for use in USES for decoding in DECODINGS]
         if gap == "novelty":
-            epsilons = config.epsilon if config.split == "val" else (chosen(config),)
-            trials += [Trial("stde", "argmax", epsilon, form) for form in FORMS for epsilon in epsilons]
+            epsilons = (
+                {*config.epsilon, *(epsilon for epsilon, _ in USES)} if config.split == "val" else {chosen(config)}
+            )
+            trials += [Trial("stde", "argmax", epsilon, form) for form in FORMS for epsilon in sorted(epsilons)]
         if gap != "clock":
             trials += [Trial("stde", decoding, *use, control) for use in USES for control, decoding in CONTROLS]
         found = bench.outcomes(world, episodes, policies, gap, trials)

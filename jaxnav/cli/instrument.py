@@ -73,6 +73,8 @@ def of_study(config: StudyConfig, run: RunConfig) -> InstrumentConfig:
 
 def prove(config: InstrumentConfig, console: Console, out: Console) -> None:
     """Measure at every shift, print the table and what it shows, and write JSON."""
+    if not all(0.0 <= shift <= 1.0 for shift in config.shift):
+        raise InputError(f"--shift {' '.join(map(str, config.shift))}: give numbers from 0 to 1")
     if len(set(config.shift)) < 2:
         raise InputError(f"--shift {' '.join(map(str, config.shift))}: give at least two different shifts")
     if not 0 <= config.seed < 2**32:

@@ -51,7 +51,7 @@ def claims(results: Results, world: str = "main") -> list[Claim]:
     def gain(name: str, part: Mapping[str, Any], **wanted: Any) -> Claim:
         return _claim(name, "SR points", pick(part, **wanted)["difference"]["sr"], least=2.0)
 
-    loss = results[f"instrument-{world}"]["discriminating"][-1]
+    loss = results[f"instrument-{world}"]["discriminating"][0]  # best actions
     course = results[f"gap-{world}"]
     late = min(20, len(course["steps"]) - 1)
     lines = {line["setting"]: line for line in course["auc"][-1]["lines"]}
