@@ -5,7 +5,7 @@ import json
 from jaxnav.evaluation.dial import BASELINES, MATCHED, MEASURES
 from jaxnav.evaluation.trials import USES
 
-RUNS = ("main", "coin", "goal")
+RUNS = ("main", "coin", "gate")
 SHIFTS, EPSILONS = (0.0, 1.0), (0.0, 0.5, 1.0)
 STEPS = 30
 BASE = {"seeds": 3, "total_steps": 1_000_000}

@@ -138,8 +138,8 @@ def test_other_trainings_have_the_rows_they_have(text):
     found = section(text, "How the parts are made: settings, counterfactual branch, one factor at a time")
     rows = table(found)
     assert list(rows)[2] == "`main` baseline"  # the one to compare with comes first
-    assert rows["`goal` + w"] == ["63.0 ± 0.5", "61.0 ± 0.5"]
-    assert "`goal` baseline" in rows
+    assert rows["`gate` + w"] == ["63.0 ± 0.5", "61.0 ± 0.5"]
+    assert "`gate` baseline" in rows
     assert "`coin` baseline" not in rows
     assert "`coin` TDE" in rows
     assert not any("real" in name for name in rows)

@@ -18,6 +18,9 @@ from jaxnav.evaluation.report import FORMAT, versions
 from jaxnav.evaluation.study import draw
 from jaxnav.store.files import write_atomic
 
+#: Runs that have every trial, and those whose worlds are proved as instruments and whose gaps are followed.
+FULL, PROVED = ("main", "goal", "real"), ("main", "real")
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit code: 0, or 2 after bad input."""
@@ -45,10 +48,9 @@ def study(config: StudyConfig, console: Console) -> None:
 
     bench = Bench(config)
     for name, run in runs.items():
-        full = name in ("main", "real")
         for shift in config.shifts:
-            part(f"{name}-shift{shift:g}", partial(table, run, full, shift, bench, console))
-        if full:
+            part(f"{name}-shift{shift:g}", partial(table, run, name in FULL, shift, bench, console))
+        if name in PROVED:
             part(f"instrument-{name}", partial(instrument_report, of_study(config, run), run, console))
             part(f"gap-{name}", partial(gaps, run, config, console))
     if config.split == "val":

@@ -85,6 +85,10 @@ def claims(results: Results, world: str = "main") -> list[Claim]:
         ),
         _line(f"Without updates it is above 0.5 at step {late} (Fig. 6b)", frozen, late, lambda gap: gap - 0.5),
     ]
+    for part in (results.get(f"goal-shift{part['shift']:g}") for part in (last, first) if world == "main"):
+        if part:
+            what = f"The same at shift {part['shift']:g} where the direct pathway sees the goal's detection alone"
+            rows.insert(5, gain(what, part, **full))
     rows += [
         _line(f"Eq. 5's gap tells shift {last['shift']:g} from none at step {step}", lines["calibrated"], step, _above)
         for step in (0, late)

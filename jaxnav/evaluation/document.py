@@ -67,6 +67,9 @@ def write_document(results: Path, document: Path) -> None:
         for decoding in ("argmax", "sample"):
             lines += [f"{'Sampled' if decoding == 'sample' else 'Best'} actions:", "", *_rows(parts, decoding), ""]
         lines += ["### Controls", "", *_controls(parts), ""]
+        if world == "main" and f"goal-shift{parts[0]['shift']:g}" in found:
+            goal = [found[f"goal-shift{part['shift']:g}"] for part in parts]
+            lines += ["### Controls where the direct pathway sees the goal's detection alone", "", *_controls(goal), ""]
         if world == "main":
             lines += ["### How the parts are made: settings, counterfactual branch, one factor at a time", ""]
             lines += [*_trainings(found), ""]
