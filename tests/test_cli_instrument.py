@@ -32,6 +32,7 @@ def instrument(*options):
     return main([*map(str, options)])
 
 
+@pytest.mark.slow
 def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
     assert instrument(run_dir, "--shift", 1, 0, "--episodes", 12) == 0
     printed = capsys.readouterr().out
