@@ -90,9 +90,9 @@ def _effects(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for part in parts:
         rows = []
         for name, row in table_1(part):
-            if row["variant"] == "stde":
+            if row["variant"] == "stde" and row["control"] is None:
                 effect = row["difference"]["sr"]
-                rows.append({"name": name, "mean": effect["mean"], "ci95": effect["ci95"]})
+                rows.append({"name": name.replace("`", ""), "mean": effect["mean"], "ci95": effect["ci95"]})
         groups.append({"title": f"shift {part['shift']:g}", "rows": rows})
     return {"groups": groups}
 
