@@ -38,7 +38,7 @@ class PolicySpec:
       sizes: widths.
       direct: which detections the direct pathway sees; the number of parameters does not depend on it.
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
-        not (released code of HOZ and L-sTDE); a logit of 0 is likely at first, so this also changes how training starts.
+        not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
     """
 
     method: str = "org"
