@@ -148,7 +148,7 @@ def test_only_what_is_missing_or_of_another_study_is_done(made, tmp_path):
     assert again() == [*ASKED, "main-shift1", "gap", *DRAWN]
     assert contents(tmp_path) == before
     # A run more leaves what is there; other episodes do not.
-    assert again("--trainings", "coin", "goal") == [*ASKED, "goal", "goal-shift0", "goal-shift1", *DRAWN]
+    assert again("--trainings", "coin", "gate") == [*ASKED, "gate", "gate-shift0", "gate-shift1", *DRAWN]
     assert again("--episodes", 30) == ASKED + MAIN + COIN + DRAWN
 
 
