@@ -139,6 +139,8 @@ def _controls(parts: Sequence[Mapping[str, Any]]) -> list[str]:
         own = {"variant": "stde", "epsilon": epsilon, "form": form}
         for gap in ("novelty", "evidence"):
             for control, text in CONTROLS.items():
+                if control == "zeros" and form == "paper":
+                    continue  # a - s 0 = a
                 decoding = "sample" if control == "zeros" else "argmax"
                 found = [pick(part, **own, gap=gap, control=control, decoding=decoding) for part in parts]
                 rows.append((f"{use}, gap `{gap}`{text}", *map(_control, found)))
@@ -167,10 +169,15 @@ def _trainings(found: Results) -> list[str]:
             if title == "baseline" and not any(row["variant"] == "baseline" for row in parts[0]["rows"]):
                 continue  # a run of the layout's arm alone
             picked = [pick(part, **wanted) for part in parts]
-            rows.append((f"`{name}` {title}", *(f"{r['sr']['mean']:.1f} ± {r['sr']['std']:.1f}" for r in picked)))
+            rows.append((f"`{name}` {title}", *map(_with_difference, picked)))
     sizes = set(parameters.values())
     same = f"All policies have {sizes.pop():,} parameters." if len(sizes) == 1 else f"Parameters: {parameters}."
-    return [*_grid(("SR", *(f"shift {shift:g}" for shift in shifts)), rows), "", same]
+    return [*_grid(("SR (to + w; + w: to the baseline)", *(f"shift {shift:g}" for shift in shifts)), rows), "", same]
+
+
+def _with_difference(row: Mapping[str, Any]) -> str:
+    difference = f" ({_effect(row['difference']['sr'])})" if "difference" in row else ""
+    return f"{row['sr']['mean']:.1f} ± {row['sr']['std']:.1f}{difference}"
 
 
 def _tracking(course: Mapping[str, Any]) -> list[str]:
