@@ -92,7 +92,7 @@ def test_what_is_written_by_hand_stays(folder, tmp_path):
 
 
 def test_both_worlds_have_their_sections(text):
-    generated, real = text.index("## Generated rooms: 80 scenes"), text.index("## AI2-THOR rooms: 80 scenes")
+    generated, real = text.index("## Generated rooms: 80 scenes"), text.index("## Scenes of the file: 80 scenes")
     assert generated < real
     assert text.count("### Claims") == text.count("### Controls") == 2
     # One factor at a time: of generated rooms alone.

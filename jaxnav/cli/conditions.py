@@ -16,6 +16,7 @@ from jaxnav.cli.trainings import StudyConfig
 from jaxnav.cli.worlds import CompiledWorld, evaluation_world
 from jaxnav.errors import InputError
 from jaxnav.evaluation.association import gain_by_similarity, success_by_similarity
+from jaxnav.evaluation.claims import select
 from jaxnav.evaluation.episodes import EpisodeList, episode_list
 from jaxnav.evaluation.grid import Evaluator, Outcome
 from jaxnav.evaluation.report import Decoding, Form
@@ -138,10 +139,9 @@ def chosen(config: StudyConfig) -> float:
     path = config.results / "val" / f"main-shift{config.shifts[0]:g}.json"
     if not path.exists():
         raise InputError(f"{path}: is missing; run the study with --split val first, epsilon is chosen there")
-    wanted = {"gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
-    wanted["form"] = "residual"
-    rows = [row for row in json.loads(path.read_text())["rows"] if all(row[key] == wanted[key] for key in wanted)]
-    return max(rows, key=lambda row: row["sr"]["mean"])["epsilon"]
+    return max(
+        select(json.loads(path.read_text()), variant="stde", form="residual"), key=lambda row: row["sr"]["mean"]
+    )["epsilon"]
 
 
 def _plain(decodings: Sequence[Decoding], baseline: bool = True) -> list[Trial]:

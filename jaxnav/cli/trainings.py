@@ -80,6 +80,8 @@ def parse_study(arguments: list[str] | None) -> StudyConfig:
     for name in ("episodes", "steps"):
         if getattr(config, name) < 1:
             raise InputError(f"{name}: {getattr(config, name)}: give at least 1")
+    if not 0 <= config.seed < 2**32:
+        raise InputError(f"seed: {config.seed}: give a whole number from 0 to 2**32 - 1")
     if config.real is not None and not config.real.is_file():
         raise InputError(f"real: {config.real}: there is no such file")
     return config

@@ -52,7 +52,7 @@ def write_document(results: Path, document: Path) -> None:
     ]
     for world in worlds(found):
         parts = conditions(found, world)
-        title = "Generated rooms" if world == "main" else "AI2-THOR rooms"
+        title = "Generated rooms" if world == "main" else "Scenes of the file"
         lines += [f"## {title}: {parts[0]['scenes']} scenes", "", "### Claims", "", *_claims(found, world), ""]
         lines += ["### Is it an instrument?", "", *_instrument(found[f"instrument-{world}"]), ""]
         lines += [

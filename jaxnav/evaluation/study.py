@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxnav.evaluation.claims import Results, pick
+from jaxnav.evaluation.claims import Results, pick, select
 from jaxnav.evaluation.figures import (
     auc_figure,
     effects_figure,
@@ -67,12 +67,10 @@ def _ends(course: Mapping[str, Any]) -> dict[str, Any]:
 
 def _sweep(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Fig. 6a, best actions."""
-    wanted = {"gap": "novelty", "variant": "stde", "decoding": "argmax", "control": None}
     lines, epsilons = [], []
     for part in parts:
-        rows = [row for row in part["rows"] if all(row[key] == value for key, value in wanted.items())]
         for form in ("residual", "paper"):
-            own = sorted((row for row in rows if row["form"] == form), key=lambda row: row["epsilon"])
+            own = sorted(select(part, variant="stde", form=form), key=lambda row: row["epsilon"])
             epsilons = [row["epsilon"] for row in own]
             lines.append({"shift": part["shift"], "form": form, **{m: _band(own, m) for m in ("sr", "spl", "dts")}})
     return {"epsilon": epsilons, "lines": lines}
