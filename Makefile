@@ -3,15 +3,20 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-BENCHMARKS := $(filter-out benchmarks/_%,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out _% table,$(basename $(notdir $(wildcard benchmarks/*.py))))
+RESULTS := results/performance
+DOCUMENT = $(if $(filter results/performance,$(RESULTS)),docs/performance.md,$(RESULTS)/performance.md)
+# Neither peers, whose environments hold JAX for processors alone, nor what splits this machine's cores.
+ON_GPU := environment training utilisation inference seeds sweep growth
 
-.PHONY: help setup run test lint test-slow bench lock clean
+.PHONY: help setup run test lint test-slow bench bench-gpu lock clean
 
 help:
 	@echo 'make run        train on procedural rooms, then evaluate the run (runs/rooms)'
 	@echo 'make test       lint, import layers, types and the fast tests'
 	@echo 'make test-slow  the slow tests'
-	@echo 'make bench      every benchmark in benchmarks/'
+	@echo 'make bench      every benchmark into results/performance, then the tables of docs/performance.md'
+	@echo 'make bench-gpu  those that a GPU can run, into results/performance-gpu'
 	@echo 'make setup      only build .venv;  make lock  pin anew;  make clean  remove what was built'
 
 setup: $(READY)
@@ -42,8 +47,19 @@ test: lint
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
 
+# A benchmark that fails leaves its last result as it is, and the others go on.
 bench: $(READY)
-	@set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python $$file; done
+	@mkdir -p $(RESULTS); failed=; for name in $(BENCHMARKS); do \
+	  echo "== $$name"; new=$(RESULTS)/$$name.json.new; \
+	  if $(BIN)/python benchmarks/$$name.py > $$new; then mv $$new $(RESULTS)/$$name.json; \
+	  else rm -f $$new; failed="$$failed $$name"; fi; done; \
+	$(BIN)/python benchmarks/table.py $(RESULTS) $(DOCUMENT) || exit 1; \
+	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+
+bench-gpu: $(READY)
+	@test "$$($(BIN)/python -c 'import jax; print(jax.default_backend())')" = gpu || { \
+	  echo "JAX sees no GPU: $(BIN)/python -m pip install 'jax[cuda12]' adds what it needs" >&2; exit 1; }
+	@$(MAKE) bench RESULTS=results/performance-gpu BENCHMARKS="$(ON_GPU)"
 
 # For maintainers, and the one target that needs uv.
 lock:

@@ -1,18 +1,59 @@
-"""What every benchmark reports with its figures: the machine, the versions, and timings of one function."""
+"""What every benchmark shares: calls timed in turns, spreads, and a report with the machine and the versions."""
 
+import importlib.metadata
 import json
 import os
 import platform
+import resource
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
+Spread = dict[str, float]
 
-def machine() -> dict[str, str | int | None]:
-    """Returns the processor, the devices and the versions that figures depend on."""
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Wall seconds of one call, its arrays waited for."""
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - began
+
+
+def in_turns(calls: Mapping[str, Callable[[], Any]], turns: int = 9) -> dict[str, list[float]]:
+    """Wall seconds of several calls taken in turns (A B A B ...) after a warm-up of each: load hits all alike."""
+    for call in calls.values():
+        seconds(call)
+    rounds = [{name: seconds(call) for name, call in calls.items()} for _ in range(turns)]
+    return {name: [one[name] for one in rounds] for name in calls}
+
+
+def spread(values: Sequence[float], digits: int = 4) -> Spread:
+    """Median, least and greatest, rounded to so many significant digits."""
+    found = {"median": statistics.median(values), "min": min(values), "max": max(values)}
+    return {name: float(f"{value:.{digits}g}") for name, value in found.items()}
+
+
+def rates(taken: Sequence[float], steps: int) -> Spread:
+    """Steps per second of calls of `steps` steps that took these seconds."""
+    return spread([steps / one for one in taken])
+
+
+def ratios(above: Sequence[float], below: Sequence[float]) -> Spread:
+    """Ratios turn by turn of what was timed in the same turns."""
+    return spread([a / b for a, b in zip(above, below, strict=True)])
+
+
+def peak_resident_gb() -> float:
+    """Most memory that this process has held so far."""
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3)
+
+
+def machine() -> dict[str, Any]:
+    """The processor, the devices, the settings and the versions that figures depend on."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -20,35 +61,13 @@ def machine() -> dict[str, str | int | None]:
         "cpu": models[0] if models else platform.processor(),
         "cores": os.cpu_count(),
         "device": jax.devices()[0].device_kind,
+        "devices": jax.device_count(),
+        "allocator": "tuned" if "MALLOC_TOP_PAD_" in os.environ else "default",
         "python": platform.python_version(),
-        "jax": jax.__version__,
+        **{name: importlib.metadata.version(name) for name in ("jax", "flax", "numpy")},
     }
 
 
-def timings(function: Callable, *args, repeats: int = 50) -> dict[str, float]:
-    """Runs a compiled function `repeats` times after one warm-up; wall and processor time per call in milliseconds.
-
-    Processor time sums all threads and is averaged, because its clock is coarse; the least wall time is the one
-    other work on the machine disturbed least.
-    """
-    jax.block_until_ready(function(*args))
-    wall, start = [], time.process_time()
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        jax.block_until_ready(function(*args))
-        wall.append(1e3 * (time.perf_counter() - begin))
-    cpu = 1e3 * (time.process_time() - start) / repeats
-    median = statistics.median(wall)
-    return {"wall_min_ms": min(wall), "wall_median_ms": median, "wall_max_ms": max(wall), "cpu_mean_ms": cpu}
-
-
-def rates(timing: dict[str, float], steps: int) -> dict[str, float]:
-    """Steps per second of calls that take `steps` steps each, from their `timings`."""
-    slowest, fastest = timing["wall_max_ms"], timing["wall_min_ms"]
-    rate = {"median": timing["wall_median_ms"], "min": slowest, "max": fastest}
-    return {name: round(1e3 * steps / wall) for name, wall in rate.items()}
-
-
-def report(results: dict) -> None:
+def report(results: dict[str, Any]) -> None:
     """Prints the machine and the results as one JSON object."""
     print(json.dumps({"machine": machine(), **results}, indent=2))

@@ -1,51 +1,73 @@
-"""Steps per second of the environment alone: `python benchmarks/environment.py`.
+"""Steps per second of the environment alone, and its limit: `python benchmarks/environment.py`.
 
-1,024 parallel episodes take random actions with auto-reset, and every step delivers all observation rows. The limit is
-a loop that does nothing but gather the same rows.
+2,048 parallel episodes take random actions with auto-reset. Of the observation rows they deliver none (an update
+gathers them again by pose), the last, their sum, or all. The limit is a loop that gathers the same rows and does nothing
+else. Keys are split at every step, or all before the first.
 """
+
+from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
-from _common import rates, report, timings
+from _common import in_turns, rates, ratios, report
 
 from jaxnav.env.make import make
 
-EPISODES, STEPS, REPEATS = 1024, 1000, 15
+EPISODES, STEPS = 2048, 500
+
+KEEP: dict[str, Callable] = {
+    "poses": lambda kept, row: (kept, None),
+    "last_row": lambda kept, row: (row, None),
+    "sum_of_rows": lambda kept, row: (kept + row, None),
+    "all_rows": lambda kept, row: (kept, row),
+}
 
 
 def main() -> None:
     env, params = make("rooms")
     key = jax.random.key(0)
     actions = jax.random.randint(key, (STEPS, EPISODES), 0, env.num_actions)
-    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, EPISODES), params)
+    observation, start = jax.vmap(env.reset, (0, None))(jax.random.split(key, EPISODES), params)
 
-    @jax.jit
-    def act(state, row, actions, params):
+    @partial(jax.jit, static_argnums=(0, 1))
+    def act(keep, keys_first, state, row, actions, params):
+        def split(time):
+            return jax.random.split(jax.random.fold_in(key, time), EPISODES)
+
         def step(carry, inputs):
-            time, action = inputs
-            keys = jax.random.split(jax.random.fold_in(key, time), EPISODES)
+            action, keys = inputs
+            keys = keys if keys_first else split(keys)
             observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, carry[0], action, params)
-            return (state, observation.row), state.pose
+            kept, out = KEEP[keep](carry[1], observation.row)
+            return (state, kept), (out, state.pose)
 
-        return jax.lax.scan(step, (state, row), (jnp.arange(STEPS), actions))
+        keys = jnp.arange(STEPS)
+        return jax.lax.scan(step, (state, row), (actions, jax.vmap(split)(keys) if keys_first else keys))
 
-    @jax.jit
-    def gather(row, poses, rows):
-        return jax.lax.scan(lambda _, pose: (rows[pose], None), row, poses)[0]
+    @partial(jax.jit, static_argnums=0)
+    def gather(keep, row, poses, rows):
+        return jax.lax.scan(lambda kept, pose: KEEP[keep](kept, rows[pose]), row, poses)
 
-    _, poses = act(state, observation.row, actions, params)
-    steps = EPISODES * STEPS
-    stepping = timings(act, state, observation.row, actions, params, repeats=REPEATS)
-    gathering = timings(gather, observation.row, poses, params.tables.rows, repeats=REPEATS)
+    _, (_, poses) = act("poses", False, start, observation.row, actions, params)
+    calls = {f"steps_{name}": partial(act, name, False) for name in KEEP}
+    calls |= {"steps_sum_of_rows_keys_first": partial(act, "sum_of_rows", True)}
+    calls = {name: partial(call, start, observation.row, actions, params) for name, call in calls.items()}
+    for name in ("sum_of_rows", "all_rows"):
+        calls[f"gather_{name}"] = partial(gather, name, observation.row, poses, params.tables.rows)
+    taken = in_turns(calls)
     report(
         {
             "episodes": EPISODES,
-            "steps_per_call": steps,
+            "steps": STEPS,
             "row_bytes": env.layout.num_bytes,
             "table_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)),
-            "environment_steps_per_s": rates(stepping, steps),
-            "gather_steps_per_s": rates(gathering, steps),
-            "environment_over_gather": round(gathering["wall_median_ms"] / stepping["wall_median_ms"], 3),
+            "steps_per_s": {name: rates(values, EPISODES * STEPS) for name, values in taken.items()},
+            "over_gather": {
+                "sum_of_rows": ratios(taken["gather_sum_of_rows"], taken["steps_sum_of_rows"]),
+                "sum_of_rows_keys_first": ratios(taken["gather_sum_of_rows"], taken["steps_sum_of_rows_keys_first"]),
+                "all_rows": ratios(taken["gather_all_rows"], taken["steps_all_rows"]),
+            },
         }
     )
 

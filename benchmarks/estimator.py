@@ -1,27 +1,43 @@
-"""Cost of one layout-estimator step with gap for many episodes: `python benchmarks/estimator.py`."""
+"""Cost of one step of the layout estimator for many episodes: `python benchmarks/estimator.py`.
+
+Every setting, and the default one without its gap, as in training. Processor time counts all threads.
+"""
+
+import dataclasses
+import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import report, timings
+from _common import in_turns, report, spread
 
 from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
 
-EPISODES, CATEGORIES, VISIBLE = 4096, 22, 0.15
+EPISODES, CATEGORIES, VISIBLE, CALLS = 4096, 22, 0.15, 50
 
 
 def main() -> None:
     rng = np.random.default_rng(0)
-    counts = rng.integers(1, 500, (CATEGORIES, CATEGORIES))
+    counts = jnp.asarray(rng.integers(1, 500, (CATEGORIES, CATEGORIES)))
     presence = jnp.asarray(rng.random((EPISODES, CATEGORIES)) < VISIBLE)
-    results = {}
-    for name in SETTINGS:
-        estimator = LayoutEstimator(prior_from_counts(jnp.asarray(counts), name), name)
-        state = jax.vmap(lambda _, estimator=estimator: estimator.init())(jnp.arange(EPISODES))
-        result = timings(jax.jit(jax.vmap(estimator.update)), state, presence)
-        result["cpu_us_per_episode_step"] = 1e3 * result["cpu_mean_ms"] / EPISODES
-        results[name] = result
-    report({"episodes": EPISODES, "categories": CATEGORIES, "visible_share": VISIBLE, "settings": results})
+    settings = SETTINGS | {"calibrated_without_gap": dataclasses.replace(SETTINGS["calibrated"], gap="none")}
+    calls = {}
+    for name, setting in settings.items():
+        estimator = LayoutEstimator(prior_from_counts(counts, setting), setting)
+        state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (EPISODES, *leaf.shape)), estimator.init())
+        calls[name] = partial(jax.jit(jax.vmap(estimator.update)), state, presence)
+    wall, found = in_turns(calls, CALLS), {}
+    for name, call in calls.items():
+        began = time.process_time()
+        for _ in range(CALLS):
+            jax.block_until_ready(call())
+        processor = (time.process_time() - began) / CALLS
+        found[name] = {
+            "wall_us_per_step": spread([1e6 * one / EPISODES for one in wall[name]]),
+            "processor_us_per_step": round(1e6 * processor / EPISODES, 3),
+        }
+    report({"episodes": EPISODES, "categories": CATEGORIES, "visible_share": VISIBLE, "settings": found})
 
 
 if __name__ == "__main__":

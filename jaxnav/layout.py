@@ -32,8 +32,9 @@ class Setting:
       own_column: a row also counts its own category; its Dirichlet then has one more entry, of concentration 1.
       gate: update only if two or more categories are visible and the set differs from the last accepted one.
       gap: what D measures: `novelty`, how much the last view changed the belief (eq. 5), or `evidence`, how badly all
-        that was seen so far fits the prior (`evidence_gap`; `reduction`, `decay` and `passes` then have no effect), or
-        `clock`, 1 when the gate opens: what the sum over all rows in `released` comes to, for tanh is saturated there.
+        that was seen so far fits the prior (`evidence_gap`; `reduction`, `decay` and `passes` then have no effect),
+        `clock`, 1 when the gate opens: what the sum over all rows in `released` comes to, for tanh is saturated there,
+        or `none`, which leaves D as it is: training has no use for it.
       decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
       passes: estimator calls per step, >= 1. All but the first find nothing new, so an accepted gap is already decayed.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
@@ -46,7 +47,7 @@ class Setting:
     increment: int = 1
     own_column: bool = False
     gate: bool = True
-    gap: Literal["novelty", "evidence", "clock"] = "novelty"
+    gap: Literal["novelty", "evidence", "clock", "none"] = "novelty"
     decay: float = 0.8
     passes: int = 1
     strength: float | None = 20.0
@@ -278,6 +279,8 @@ class LayoutEstimator(struct.PyTreeNode):
         accept = (seen.sum() >= 2) & (seen != state.last).any() if setting.gate else jnp.bool_(True)
         posterior = jnp.where(accept, alpha + counts, alpha)  # eq. 4
         last = jnp.where(accept, seen, state.last)
+        if setting.gap == "none":
+            return LayoutState(alpha=posterior, last=last, gap=state.gap)
         if setting.gap == "evidence":
             return LayoutState(alpha=posterior, last=last, gap=evidence_gap(self.prior, posterior))
 

@@ -165,7 +165,7 @@ def test_distillation_reaches_only_what_the_counterfactual_branch_uses():
 def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
     """Its gradient is that of the divergence from numbers: neither the factual logits nor the memories have a part."""
     run = rolled(True)
-    t, slot = run.transitions, 3
+    t, slot = run.transitions, 1
     rows, log_pi, memories = ROWS[t.pose[:, slot]], [], []
     memory = tiny.at(run.before.memory, slot)
     for time in range(LENGTH):

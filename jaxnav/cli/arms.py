@@ -1,10 +1,13 @@
 """The two arms of a run: the method alone, and the method with the layout estimator."""
 
+import dataclasses
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from jaxnav.cli.config import ARMS, RunConfig
 from jaxnav.env.objectnav import ObjectNav
@@ -13,6 +16,7 @@ from jaxnav.layout import Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.training.learner import Learner, LearnerState
+from jaxnav.training.sharding import everywhere, replicated, state_sharding
 
 #: The seeds of every arm.
 States = dict[str, list[LearnerState]]
@@ -35,13 +39,17 @@ class Arms:
         self._seeds = config.seeds
         self._chunk = config.chunk
         self._compiled: dict[str, Any] = {}
+        self._starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         self._restarts = {name: jax.jit(learner.restart, donate_argnums=0) for name, learner in self.learners.items()}
+
+    def abstract(self, params: EnvParams) -> States:
+        """Shapes of every seed's state, and on which devices it is."""
+        return jax.eval_shape(self.init, params)
 
     def init(self, params: EnvParams) -> States:
         """Every seed before its first update."""
-        starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         states: States = {}
-        for name, start in starts.items():
+        for name, start in self._starts.items():
             root = jax.random.fold_in(self._root, ARMS.index(name))
             states[name] = [start(jax.random.fold_in(root, seed), params, self._priors) for seed in range(self._seeds)]
         return states
@@ -56,10 +64,9 @@ class Arms:
     def train(self, states: States, params: EnvParams) -> tuple[States, Metrics]:
         """One chunk of updates of every seed, with its metrics. The states are donated."""
         tasks = [(name, seed) for seed in range(self._seeds) for name in self.learners]
+        if not self._compiled:  # one at a time: a compilation takes half a gigabyte, and two at once are hardly quicker
+            self._compiled = {name: self._compile(name, states[name][0], params) for name in self.learners}
         with ThreadPoolExecutor(min(len(tasks), os.cpu_count() or 1)) as pool:
-            if not self._compiled:
-                compiled = pool.map(lambda name: self._compile(name, states[name][0], params), self.learners)
-                self._compiled = dict(zip(self.learners, compiled, strict=True))
             results = list(pool.map(lambda task: self._train(task[0], states[task[0]][task[1]], params), tasks))
         done: States = {name: [] for name in self.learners}
         metrics: Metrics = {name: [] for name in self.learners}
@@ -80,6 +87,71 @@ class Arms:
         return jax.block_until_ready(self._compiled[name](state, self._scalars, params, self._priors))
 
 
+class ShardedArms(Arms):
+    """The same on a mesh of devices: one arm after the other, all its seeds in one call.
+
+    Between calls the states are those of `Arms` with their episodes cut, so that a run may go on with other devices.
+    """
+
+    def __init__(self, config: RunConfig, env: ObjectNav, setting: Setting, priors: jax.Array, mesh: Mesh) -> None:
+        super().__init__(config, env, setting, everywhere(mesh, priors))
+        self._mesh, self._place = mesh, state_sharding(mesh)
+        self._root, self._scalars = everywhere(mesh, (self._root, self._scalars))
+        self._given: EnvParams | None = None
+        for name, learner in self.learners.items():
+            self._starts[name] = jax.jit(learner.init, out_shardings=self._place)
+            self._restarts[name] = jax.jit(learner.restart, out_shardings=self._place, donate_argnums=0)
+
+    def abstract(self, params: EnvParams) -> States:
+        """Shapes of every seed's state, and on which devices it is."""
+        states = jax.eval_shape(super().init, params)
+        places = jax.tree.map(lambda _: self._place, states, is_leaf=lambda node: isinstance(node, LearnerState))
+        return jax.tree.map(lambda leaf, place: leaf.update(sharding=place), states, jax.tree.broadcast(places, states))
+
+    def init(self, params: EnvParams) -> States:
+        """Every seed before its first update."""
+        return super().init(self._everywhere(params))
+
+    def restart(self, states: States, params: EnvParams) -> States:
+        """Every seed with new episodes in other scenes. The states are donated."""
+        return super().restart(states, self._everywhere(params))
+
+    def train(self, states: States, params: EnvParams) -> tuple[States, Metrics]:
+        """One chunk of updates of every seed, with its metrics. The states are donated."""
+        params = self._everywhere(params)
+        if not self._compiled:
+            self._compiled = {name: self._compile_all(name, states[name], params) for name in self.learners}
+        done: States = {}
+        metrics: Metrics = {}
+        for name, train in self._compiled.items():
+            done[name], values = train(states[name], self._scalars, params, self._priors)
+            rows = jax.device_get(values)
+            metrics[name] = [{key: float(value[seed]) for key, value in rows.items()} for seed in range(self._seeds)]
+        return done, metrics
+
+    def _everywhere(self, params: EnvParams) -> EnvParams:
+        if params is not self._given:  # copied once for as long as a bank is used
+            self._given, self._placed = params, everywhere(self._mesh, params)
+        return self._placed
+
+    def _compile_all(self, name: str, states: list[LearnerState], params: EnvParams) -> Any:
+        learner, num_updates = self.learners[name], self._chunk
+
+        def train(states: list[LearnerState], scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
+            stacked = jax.tree.map(lambda *seeds: jnp.stack(seeds), *states)
+            stacked = jax.lax.with_sharding_constraint(stacked, state_sharding(self._mesh, stacked=True))
+            stacked, metrics = jax.vmap(lambda state: learner.train(state, scalars, params, priors, num_updates))(
+                stacked
+            )
+            return [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(len(states))], metrics
+
+        places = [self._place] * len(states), replicated(self._mesh)
+        call = jax.jit(train, out_shardings=places, donate_argnums=0)
+        return call.lower(states, self._scalars, params, self._priors).compile()
+
+
 def _learner(config: RunConfig, env: ObjectNav, setting: Setting | None) -> Learner:
     spec = PolicySpec(config.method, len(env.categories), config.sizes, config.direct, config.done_gate)
+    if setting:
+        setting = dataclasses.replace(setting, gap="none")  # training has no use for it
     return Learner(Acting(env, setting), spec, config.ppo, config.counterfactual)

@@ -12,6 +12,7 @@ from jaxnav.scenes.detector import Detector
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.training.config import Counterfactual, PPOConfig
+from jaxnav.training.sharding import Devices
 
 #: Policies without and with the layout estimator, in the order of the tables; they differ by its weights alone.
 ARMS = ("baseline", "layout")
@@ -87,6 +88,10 @@ class RunConfig:
         are streamed, goes on to the next shard with new episodes.
       save_every: calls between checkpoints.
       cache: folder for compiled scenes that are streamed from disk.
+      devices: what to train on, which changes results by rounding only: so many devices of this process, `cluster` for
+        all that Slurm, Open MPI, Kubernetes or a TPU pod has started this command on, or `HOST:PORT,INDEX,PROCESSES`
+        for command number INDEX of several equal ones, which meet at that address of number 0 and share the file system
+        of `run_dir`; None: one device, and seeds side by side on its cores.
     """
 
     run_dir: Path = Path("runs/rooms")
@@ -103,6 +108,7 @@ class RunConfig:
     chunk: int = 8
     save_every: int = 4
     cache: Path = Path("~/.cache/jaxnav")
+    devices: str | None = None
     worlds: WorldConfig = WorldConfig()
     detector: Detector = Detector()
     layout: LayoutConfig = LayoutConfig()
@@ -150,6 +156,9 @@ def check(config: RunConfig) -> RunConfig:
     need(config.method in METHODS, "method", repr(config.method), f"choose one of {', '.join(METHODS)}")
     for name in ("seeds", "total_steps", "chunk", "save_every"):
         need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
+    if config.devices is not None:
+        forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
+        need(Devices.parse(config.devices) is not None, "devices", repr(config.devices), forms)
     seeds = {"seed": config.seed, "worlds.seed": config.worlds.seed, "detector.seed": config.detector.seed}
     for name, seed in seeds.items():
         need(0 <= seed < 2**32, name, seed, "give a whole number from 0 to 2**32 - 1")

@@ -43,10 +43,10 @@ class Policies(NamedTuple):
 
 
 def settings(config: RunConfig) -> dict[str, Any]:
-    """What makes a run the run it is, as JSON: all its settings but where and how often things are kept."""
+    """What makes a run the run it is, as JSON: all its settings but where it runs and how often what is kept where."""
     plain = dataclasses.asdict(config)
     plain = json.loads(json.dumps(plain, default=str))  # as it is read again: tuples are lists
-    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every", "cache")}
+    return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every", "cache", "devices")}
 
 
 def claim(config: RunConfig) -> None:

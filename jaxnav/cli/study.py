@@ -72,7 +72,7 @@ def plain(config: StudyConfig) -> dict[str, Any]:
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     for name in ("results", "document", "runs", "split", "trainings", "real"):
         settings.pop(name)
-    for name in ("run_dir", "save_every", "cache"):
+    for name in ("run_dir", "save_every", "cache", "devices"):
         settings["base"].pop(name)
     return settings
 

@@ -1,15 +1,17 @@
 """The training command: prior, two arms of N seeds, checkpoints, and the policies at the end."""
 
 import dataclasses
+import json
 import time
 from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxnav.cli.arms import Arms, States
+from jaxnav.cli.arms import Arms, ShardedArms, States
 from jaxnav.cli.command import exit_code
 from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse
@@ -23,6 +25,7 @@ from jaxnav.store.manifest import make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout_priors
 from jaxnav.training.exploration import Exploration, explore
+from jaxnav.training.sharding import Devices, by_first_process, check_agreement, first_process
 
 _EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
 
@@ -36,30 +39,44 @@ def main(arguments: list[str] | None = None) -> int:
 def train(config: RunConfig, console: Console) -> None:
     """Train all arms and seeds of a run, from its last checkpoint if it has one, and export the policies."""
     started = time.monotonic()
+    mesh = connected(config)
+    if not first_process():
+        console = Console(quiet=True)
     world = training_world(config, console)
-    claim(config)
     manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
+    check_agreement(json.dumps(manifest))
+    by_first_process(lambda: claim(config))
 
     found = explored(config, world)
     console.print(f"layout prior from {int(found.steps):,} random steps, {int(found.poses):,} distinct poses")
     setting = calibrated(config, world, found, console)
     priors = layout_priors(found.counts, setting)
 
-    arms = Arms(config, world.env, setting, priors)
+    parts = config, world.env, setting, priors
+    arms = ShardedArms(*parts, mesh) if mesh else Arms(*parts)
     order = bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
         console.print(
             f"one shard after the other: {len(order)} turns in {len(set(order))} of {len(world.banks)} shards"
         )
     first = world.params(order[0])
-    restored = restore(config.run_dir, jax.eval_shape(arms.init, first), manifest)
+    restored = restore(config.run_dir, arms.abstract(first), manifest)
     states, done = restored or (arms.init(first), 0)
-    truncate_after(config.run_dir / LOG_FILE, done)
+    by_first_process(lambda: truncate_after(config.run_dir / LOG_FILE, done))
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
     states = _updates(config, arms, world, order, states, done, manifest, console)
-    _export(config, world.env, states, setting, priors, found)
+    by_first_process(lambda: _export(config, world.env, states, setting, priors, found))
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
+
+
+def connected(config: RunConfig) -> Mesh | None:
+    """The devices that are asked for, other processes joined; None where one is enough."""
+    devices = Devices.parse(config.devices) if config.devices else None
+    if devices is None:
+        return None
+    devices.connect()
+    return devices.mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
 
 
 def explored(config: RunConfig, world: CompiledWorld) -> Exploration:
@@ -114,7 +131,7 @@ def _updates(
             done += config.chunk
             rate, began = steps / (time.monotonic() - began), time.monotonic()
             for name, seeds in metrics.items():
-                for seed, values in enumerate(seeds):
+                for seed, values in enumerate(seeds if first_process() else ()):
                     row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
                     append_row(config.run_dir / LOG_FILE, row | values)
             if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:

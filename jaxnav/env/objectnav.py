@@ -56,7 +56,7 @@ class ObjectNav:
           params: the bank and its limits.
         """
         tables = params.tables
-        bits = jax.random.bits(key, (4,), jnp.uint32)
+        bits = _words(key, 4)
 
         def below(i: int, count: jax.Array) -> jax.Array:
             # Modulo of 32 random bits: the bias is under count / 2**32.
@@ -147,6 +147,22 @@ class ObjectNav:
             "length": last.time,
         }
         return self.observe(state, params), state, reward, terminated, truncated, info
+
+
+def _words(key: jax.Array, count: int) -> jax.Array:
+    """Random words uint32 [count] of a key: its own words through Murmur3's finaliser (Appleby, 2011).
+
+    A key that is split off is random already; a stronger generator would take most of the time of a step, and most
+    steps have no use for it.
+    """
+    words = jax.random.key_data(key)
+    mixed = jnp.uint32(0x9E3779B9) * jnp.arange(1, count + 1, dtype=jnp.uint32)
+    for i in range(words.shape[-1]):
+        mixed = mixed ^ words[i]
+        for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+            mixed = (mixed ^ (mixed >> jnp.uint32(shift))) * jnp.uint32(factor)
+        mixed = mixed ^ (mixed >> jnp.uint32(16))
+    return mixed
 
 
 def build(

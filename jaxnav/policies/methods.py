@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxnav.policies.features import NUM_FEATURES, Features
+from jaxnav.policies.product import Linear, biased, product
 from jaxnav.policies.spec import PolicySpec
 
 
@@ -36,17 +37,33 @@ class Method(Protocol):
 
 
 class CategoryMaps(nnx.Module):
-    """The same two-layer perceptron for the row of every category, side by side: [..., K, M] -> [..., K m]."""
+    """The same two-layer perceptron for every category, side by side: rows [..., K, M] -> [..., K m].
+
+    A row may be [x A | y], x A a mixture of the categories' appearances A [K, d]. The first layer is linear: A passes
+    it once (`looks`) and is mixed after, which spares the product of every row with d rows of the kernel.
+    """
 
     def __init__(self, inputs: int, spec: PolicySpec, rngs: nnx.Rngs) -> None:
-        self.inner = nnx.Linear(inputs, spec.sizes.row_hidden, rngs=rngs)
-        self.outer = nnx.Linear(spec.sizes.row_hidden, spec.sizes.row_outputs, rngs=rngs)
+        self.inner = Linear(inputs, spec.sizes.row_hidden, rngs=rngs)
+        self.outer = Linear(spec.sizes.row_hidden, spec.sizes.row_outputs, rngs=rngs)
         self.width = spec.num_categories * spec.sizes.row_outputs
+
+    def looks(self, appearance: jax.Array) -> jax.Array:
+        """Appearances [K, d] through the first d rows of the first layer, [K, h]."""
+        return appearance @ self.inner.kernel[...][: appearance.shape[-1]]
+
+    def read(self, rows: jax.Array) -> jax.Array:
+        """Rows [..., K, M] through the last M rows of the first layer, [..., K, h]."""
+        return product(rows, self.inner.kernel[...][-rows.shape[-1] :])
+
+    def maps(self, inner: jax.Array) -> jax.Array:
+        """What passed the first layer, [..., K, h] and without its bias, through the rest."""
+        maps = nnx.relu(self.outer(nnx.relu(biased(inner, self.inner))))
+        return maps.reshape(*maps.shape[:-2], -1)
 
     def __call__(self, rows: jax.Array) -> jax.Array:
         """Maps of the rows of all categories."""
-        maps = nnx.relu(self.outer(nnx.relu(self.inner(rows))))
-        return maps.reshape(*maps.shape[:-2], -1)
+        return self.maps(self.read(rows))
 
 
 class NoExperience(nnx.Module):
@@ -68,7 +85,7 @@ class ORG(nnx.Module):
     """
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
-        self.edges = nnx.Linear(NUM_FEATURES, spec.num_categories, rngs=rngs)
+        self.edges = Linear(NUM_FEATURES, spec.num_categories, rngs=rngs)
         shape = (spec.sizes.relation_layers, spec.num_categories, spec.num_categories)
         self.mix = nnx.Param(nnx.initializers.lecun_normal(batch_axis=0)(rngs.params(), shape))
         self.maps = CategoryMaps(spec.sizes.appearance + NUM_FEATURES, spec, rngs)
@@ -78,11 +95,10 @@ class ORG(nnx.Module):
         """Experience from the goal-conditioned relations, each category weighted by the layout."""
         relation = jnp.swapaxes(nnx.relu(self.edges(features.table)), -1, -2)
         for kernel in self.mix[...]:
-            relation = nnx.relu(relation @ kernel)
-        # R^T X with X = visible * appearance, as one product with the shared appearance.
-        aggregated = (relation * features.visible[..., None, :]) @ appearance
-        table = jnp.concatenate([aggregated, features.table], axis=-1)
-        return self.maps(table * weights[..., None])
+            relation = nnx.relu(product(relation, kernel))
+        # R^T X with X = visible * appearance, the appearance already through the first layer of the maps.
+        aggregated = product(relation * features.visible[..., None, :], self.maps.looks(appearance))
+        return self.maps.maps(weights[..., None] * (aggregated + self.maps.read(features.table)))
 
 
 METHODS: dict[str, type[NoExperience] | type[ORG]] = {"rgb": NoExperience, "org": ORG}

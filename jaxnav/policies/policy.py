@@ -14,12 +14,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from jaxnav.env.types import Observation
 from jaxnav.policies.features import CONFIDENCE, NUM_FEATURES, features
 from jaxnav.policies.methods import METHODS, CategoryMaps
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
+from jaxnav.policies.product import Linear, biased, product
+from jaxnav.policies.recurrence import gru
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.rows import RowLayout
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
@@ -39,19 +42,18 @@ class Policy(nnx.Module):
         self.layout = layout
         self.hidden, self.direct, self.done_gate = spec.sizes.hidden, spec.direct, spec.done_gate
         self.appearance = nnx.Embed(spec.num_categories, spec.sizes.appearance, rngs=rngs)
-        self.view = nnx.Linear(2 * layout.view**2, spec.sizes.view_outputs, rngs=rngs)
+        self.view = Linear(2 * layout.view**2, spec.sizes.view_outputs, rngs=rngs)
         self.detections = CategoryMaps(spec.sizes.appearance + NUM_FEATURES, spec, rngs)
         self.sought = nnx.Embed(spec.num_categories, spec.sizes.appearance, rngs=rngs)
         self.method = METHODS[spec.method](spec, rngs)
-        fused = (
-            spec.sizes.view_outputs + self.detections.width + spec.sizes.appearance + self.method.width + NUM_ACTIONS
-        )
-        self.fuse = nnx.Linear(fused, spec.sizes.hidden, rngs=rngs)
+        goal = self.detections.width + spec.sizes.appearance
+        self.widths = (spec.sizes.view_outputs, goal, self.method.width, NUM_ACTIONS)
+        self.fuse = Linear(sum(self.widths), spec.sizes.hidden, rngs=rngs)
         self.core = nnx.GRUCell(spec.sizes.hidden, spec.sizes.hidden, rngs=rngs)
         # Small first logits: the first policy is close to uniform but for Done.
         small = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        self.actor = nnx.Linear(spec.sizes.hidden, NUM_ACTIONS, kernel_init=small, bias_init=_seldom_done, rngs=rngs)
-        self.critic = nnx.Linear(spec.sizes.hidden, 1, rngs=rngs)
+        self.actor = Linear(spec.sizes.hidden, NUM_ACTIONS, kernel_init=small, bias_init=_seldom_done, rngs=rngs)
+        self.critic = Linear(spec.sizes.hidden, 1, rngs=rngs)
 
     def pathways(self, observation: Observation, weights: jax.Array) -> Pathways:
         """Embeddings of what is seen, what is sought and what experience says.
@@ -62,11 +64,12 @@ class Policy(nnx.Module):
         """
         seen = features(observation.row, observation.goal, self.layout)
         appearance = self.appearance.embedding[...]
-        looks = seen.visible[..., None] * jnp.broadcast_to(appearance, (*seen.visible.shape, appearance.shape[-1]))
-        rows = jnp.concatenate([looks, seen.table], axis=-1)
+        looks = self.detections.looks(appearance)
+        looks = seen.visible[..., None] * jnp.broadcast_to(looks, (*seen.visible.shape, looks.shape[-1]))
+        rows = looks + self.detections.read(seen.table)
         if self.direct != "all":
             rows = rows * (seen.goal if self.direct == "goal" else jnp.zeros_like(seen.goal))[..., None]
-        goal = jnp.concatenate([self.detections(rows), seen.goal @ self.sought.embedding[...]], axis=-1)
+        goal = jnp.concatenate([self.detections.maps(rows), seen.goal @ self.sought.embedding[...]], axis=-1)
         confidence = (seen.table[..., CONFIDENCE] * seen.goal).sum(axis=-1, keepdims=True)
         return Pathways(
             scene=nnx.relu(self.view(seen.view)),
@@ -76,15 +79,46 @@ class Policy(nnx.Module):
         )
 
     def decide(self, pathways: Pathways, memory: Memory) -> Decision:
-        """Action logits and value from the pathways and the memory."""
-        previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
-        scene, goal, experience, gate = pathways
-        fused = nnx.relu(self.fuse(jnp.concatenate([scene, goal, experience, previous], axis=-1)))
-        hidden, _ = self.core(memory.hidden, fused)
+        """Action logits and value from the pathways and the memory.
+
+        Where a factual and a counterfactual decision stand in one compiled function, what they share (the products of
+        experience and of memory) is computed once, and what is set to zero not at all.
+        """
+        drive = self.drive(self.direct_input(pathways) + self.mediated_input(pathways, memory.action))
+        hidden = gru(drive, memory.hidden @ self.recurrent_kernel, memory.hidden)
+        return self.act(hidden, pathways.gate)
+
+    def direct_input(self, pathways: Pathways) -> jax.Array:
+        """What enters by the direct pathways, float32 [..., H]: linear, so zero where both are set to zero."""
+        scene, goal, *_ = self._fuse_kernels
+        return product(pathways.scene, scene) + product(pathways.goal, goal)
+
+    def mediated_input(self, pathways: Pathways, action: jax.Array) -> jax.Array:
+        """What enters by experience and with the previous action int32 [...], float32 [..., H]."""
+        *_, experience, previous = self._fuse_kernels
+        one_hot = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
+        return biased(product(pathways.experience, experience) + product(one_hot, previous), self.fuse)
+
+    def drive(self, entering: jax.Array) -> jax.Array:
+        """What drives the recurrent core, float32 [..., 3 H], given all that enters, float32 [..., H]."""
+        return biased(product(nnx.relu(entering), self.core.dense_i.kernel[...]), self.core.dense_i)
+
+    def act(self, hidden: jax.Array, gate: jax.Array) -> Decision:
+        """The decision of a hidden state float32 [..., H] and a gate float32 [..., 1]."""
         logits = self.actor(hidden)
         if self.done_gate:
             logits = jnp.concatenate([logits[..., :DONE], gate * logits[..., DONE:]], axis=-1)
         return Decision(logits=logits, value=self.critic(hidden)[..., 0], hidden=hidden)
+
+    @property
+    def recurrent_kernel(self) -> jax.Array:
+        """float32 [H, 3 H], multiplies the hidden state."""
+        return self.core.dense_h.kernel[...]
+
+    @property
+    def _fuse_kernels(self) -> list[jax.Array]:
+        """The part of the first kernel that each of scene, goal, experience and previous action meets."""
+        return jnp.split(self.fuse.kernel[...], np.cumsum(self.widths)[:-1])
 
     def initial_memory(self, batch: tuple[int, ...] = ()) -> Memory:
         """Memory at the start of an episode."""

@@ -54,10 +54,12 @@ def explore(
         params.tables.num_cells * env.task.rules.poses_per_cell,
         total_repeat_length=len(seen),
     )
-    room = jax.nn.one_hot(params.room[scene], NUM_PRIORS, dtype=jnp.float32)
-    together = jnp.einsum("pr,pi,pj->rij", room, presence, presence, optimize="optimal")
+
+    def together(room: jax.Array) -> jax.Array:
+        return (presence * (params.room[scene] == room)[:, None].astype(jnp.float32)).T @ presence
+
     return Exploration(
-        counts=together,
+        counts=jax.lax.map(together, jnp.arange(NUM_PRIORS)),  # one at a time, to be sparing with memory
         steps=jnp.int32(num_walks * num_steps),
         poses=seen.sum(dtype=jnp.int32),
     )

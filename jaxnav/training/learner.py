@@ -124,28 +124,46 @@ class Learner:
             distil = self.counterfactual == "distil"
             return ppo_loss(policy, transitions, memory, advantage, params, scalars, distil)
 
-        def learn(carry: tuple[Params, Any], episodes: jax.Array) -> tuple[tuple[Params, Any], dict[str, jax.Array]]:
+        def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], dict[str, jax.Array]]:
             weights, optimizer = carry
-            part = (
-                jax.tree.map(lambda x: x[:, episodes], transitions),
-                jax.tree.map(lambda x: x[episodes], memory),
-                advantage[:, episodes],
-            )
             gradient, parts = jax.grad(loss, has_aux=True)(weights, part)
             with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
                 step, optimizer = self._optimizer.update(gradient, optimizer, weights)
             weights = jax.tree.map(lambda w, s: w - rate * s, weights, step)
             return (weights, optimizer), parts | {"gradient_norm": optax.tree.norm(gradient)}
 
+        def epoch(carry: tuple[Params, Any], key: jax.Array) -> tuple[tuple[Params, Any], dict[str, jax.Array]]:
+            order = block_order(key, config.num_envs, config.minibatches)
+            in_time = regroup((transitions, advantage), order, axis=1)
+            return jax.lax.scan(learn, carry, (in_time[0], regroup(memory, order, axis=0), in_time[1]))
+
         keys = jax.random.split(shuffle_key, config.epochs)
-        order = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(keys)
-        parts = order.reshape(config.epochs * config.minibatches, -1)
-        (weights, optimizer), metrics = jax.lax.scan(learn, (state.params, state.optimizer), parts)
+        (weights, optimizer), metrics = jax.lax.scan(epoch, (state.params, state.optimizer), keys)
         metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(transitions, ended, params)
         skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
         metrics["skipped_steps"] = skipped.astype(jnp.float32)
         state = state.replace(params=weights, optimizer=optimizer, agent=agent, update=state.update + 1)
         return state, metrics
+
+
+def block_order(key: jax.Array, episodes: int, minibatches: int) -> jax.Array:
+    """Which episode each block of `minibatches` neighbours gives to which minibatch: int32 [blocks, minibatches].
+
+    Every minibatch gets one episode of every block, so that no device needs the episodes of another.
+    """
+    rows = jnp.broadcast_to(jnp.arange(minibatches), (episodes // minibatches, minibatches))
+    return jax.random.permutation(key, rows, axis=1, independent=True)
+
+
+def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
+    """Leaves whose `axis` holds the episodes, cut into minibatches: [..., B, ...] -> [M, ..., B / M, ...]."""
+
+    def cut(leaf: jax.Array) -> jax.Array:
+        blocks = leaf.reshape(*leaf.shape[:axis], *order.shape, *leaf.shape[axis + 1 :])
+        index = jnp.expand_dims(order, [*range(axis), *range(axis + 2, blocks.ndim)])
+        return jnp.moveaxis(jnp.take_along_axis(blocks, index, axis + 1), axis + 1, 0)
+
+    return jax.tree.map(cut, tree)
 
 
 def _episode_sums(transitions: Transition, ended: jax.Array, params: EnvParams) -> dict[str, jax.Array]:

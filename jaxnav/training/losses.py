@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from jaxnav.causal import do
 from jaxnav.env.types import EnvParams, Observation
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
 from jaxnav.policies.policy import Policy
+from jaxnav.policies.recurrence import gru, unroll
 from jaxnav.training.config import PPOScalars
 from jaxnav.training.rollout import Transition, zero_direct
 
@@ -51,19 +51,13 @@ def replay(policy: Policy, transitions: Transition, memory: Memory, params: EnvP
     """
     observation = Observation(row=params.tables.rows[transitions.pose], goal=transitions.goal)
     pathways = policy.pathways(observation, transitions.weights)
-    seen = zero_direct(pathways, transitions.direct)
     ended = transitions.terminated | transitions.truncated
-
-    def step(memory: Memory, inputs: tuple) -> tuple[Memory, tuple[Decision, Memory]]:
-        pathways, action, ended = inputs
-        decision = policy.decide(pathways, memory)
-        hidden = jnp.where(ended[:, None], 0.0, decision.hidden)
-        following = Memory(hidden=hidden, action=jnp.where(ended, NO_ACTION, action))
-        return following, (decision, memory)
-
-    _, (decisions, memories) = jax.lax.scan(step, memory, (seen, transitions.action, ended))
-    fixed = memories._replace(hidden=jax.lax.stop_gradient(memories.hidden))
-    return decisions, policy.decide(do(pathways, scene=0.0, goal=0.0), fixed)
+    following = jnp.where(ended, NO_ACTION, transitions.action)
+    mediated = policy.mediated_input(pathways, jnp.concatenate([memory.action[None], following[:-1]]))
+    direct = policy.direct_input(zero_direct(pathways, transitions.direct))
+    run = unroll(policy.recurrent_kernel, policy.drive(direct + mediated), ended, memory.hidden)
+    alone = gru(policy.drive(mediated), run.projected, run.before)
+    return policy.act(run.after, pathways.gate), policy.act(alone, pathways.gate)
 
 
 def ppo_loss(

@@ -18,7 +18,7 @@ class Transition(NamedTuple):
     Attributes:
       pose, goal: int32 [B].
       weights: float32 [B, K], the layout's weights for the goal.
-      direct: bool [B], False where both direct pathways were zeroed.
+      direct: bool [B], False where both direct pathways were zeroed; None if they never are.
       action: int32 [B].
       log_prob, value, reward: float32 [B].
       terminated, truncated, success: bool [B].
@@ -28,7 +28,7 @@ class Transition(NamedTuple):
     pose: jax.Array
     goal: jax.Array
     weights: jax.Array
-    direct: jax.Array
+    direct: jax.Array | None
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -39,10 +39,12 @@ class Transition(NamedTuple):
     length: jax.Array
 
 
-def zero_direct(pathways: Pathways, direct: jax.Array) -> Pathways:
-    """Keep the direct pathways where `direct` bool [...] holds, zero them elsewhere."""
-    zeroed = do(pathways, scene=0.0, goal=0.0)
-    return jax.tree.map(lambda kept, zero: jnp.where(direct[..., None], kept, zero), pathways, zeroed)
+def zero_direct(pathways: Pathways, direct: jax.Array | None) -> Pathways:
+    """Keep the direct pathways where `direct` bool [...] holds, zero them elsewhere; None keeps all."""
+    if direct is None:
+        return pathways
+    scene, goal = (jnp.where(direct[..., None], field, 0.0) for field in (pathways.scene, pathways.goal))
+    return do(pathways, scene=scene, goal=goal)
 
 
 class Cut(NamedTuple):
@@ -88,7 +90,7 @@ def rollout(
     """
     num_envs = agent.state.pose.shape[0]
 
-    def decide(agent: Agent, direct: jax.Array) -> tuple[jax.Array, Decision]:
+    def decide(agent: Agent, direct: jax.Array | None = None) -> tuple[jax.Array, Decision]:
         observation, weights = acting.observe(agent, params)
         pathways = zero_direct(policy.pathways(observation, weights), direct)
         return weights, policy.decide(pathways, agent.memory)
@@ -97,7 +99,7 @@ def rollout(
         agent, cut = carry
         time, key = inputs
         coin_key, action_key, env_key = (jax.random.fold_in(key, purpose) for purpose in range(3))
-        direct = jax.random.bernoulli(coin_key, 0.5 if coin else 1.0, (num_envs,))
+        direct = jax.random.bernoulli(coin_key, 0.5, (num_envs,)) if coin else None
         weights, decision = decide(agent, direct)
         action = jax.random.categorical(action_key, decision.logits)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(decision.logits), action[:, None], axis=-1)[:, 0]
@@ -134,9 +136,8 @@ def rollout(
     (agent, cut), transitions = jax.lax.scan(step, (agent, nothing), inputs)
 
     layout = acting.believe(cut.agent.layout, cut.agent.state, params, priors)
-    direct = jnp.ones((num_envs,), bool)
-    _, after_cut = decide(cut.agent._replace(layout=layout), direct)
-    _, after_last = decide(agent, direct)
+    _, after_cut = decide(cut.agent._replace(layout=layout))
+    _, after_last = decide(agent)
     following = jnp.concatenate([transitions.value[1:], after_last.value[None]])
     at_cut = jnp.arange(length)[:, None] == cut.time[None, :]
     following = jnp.where(at_cut, after_cut.value[None, :], following)

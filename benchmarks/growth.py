@@ -1,0 +1,139 @@
+"""Speed, memory and compile time as the problem grows: `python benchmarks/growth.py`.
+
+Each axis is varied alone around the default configuration, every point in a process of its own: random steps of the
+environment alone, the row consumed and not stored, and whole updates of the arm with the layout. Peaks are of resident
+memory, with Python, JAX, its compiler and the scenes. Scenes beyond the default are copies of the default bank's tables
+under indices of their own, which the host holds besides; categories beyond it are names that nothing has. `chunks`
+trains on in one process, whose memory must not grow. Runs stop after three, or once they have taken a few seconds: the
+largest points are timed once, without warm-up.
+"""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import peak_resident_gb, report, seconds, spread
+from _phases import Program, program, update
+
+from jaxnav.cli.arms import Arms
+from jaxnav.cli.config import RunConfig, WorldConfig
+from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav, build
+from jaxnav.env.types import EnvParams
+from jaxnav.layout import SETTINGS
+from jaxnav.scenes.categories import ITHOR_CATEGORIES
+from jaxnav.scenes.compile import Bank, compile_bank
+from jaxnav.scenes.worlds import generated
+from jaxnav.training.calibration import layout_priors
+
+ARM = "layout"
+AXES = {
+    "environments": (64, 256, 1024, 4096, 16384, 65536),
+    "scenes": (80, 400, 2000, 10000),
+    "categories": (22, 50, 100, 200),
+    "hidden": (64, 128, 256, 512, 1024),
+    "chunks": (4, 40),
+}
+ENVIRONMENTS, STEPS = 2048, 2**20  # of the environment alone: episodes side by side, and steps of a call
+RUNS, ENOUGH_S = 3, 4.0
+
+
+def main() -> None:
+    found = {}
+    for axis, values in AXES.items():
+        for value in values:
+            print(f"{axis} {value}", file=sys.stderr, flush=True)
+            done = subprocess.run([sys.executable, __file__, axis, str(value)], stdout=subprocess.PIPE, check=True)
+            found.setdefault(axis, {})[str(value)] = json.loads(done.stdout)
+    report({"arm": ARM, "episodes_of_the_environment_alone": ENVIRONMENTS, **found})
+
+
+def point(axis: str, value: int) -> dict:
+    """The figures of one point."""
+    config = dataclasses.replace(RunConfig(), arms=(ARM,), seeds=1, chunk=1)
+    categories = (*ITHOR_CATEGORIES, *(f"Unseen{i}" for i in range(len(ITHOR_CATEGORIES), 200)))
+    match axis:
+        case "environments":
+            config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=value))
+        case "categories":
+            config = dataclasses.replace(config, worlds=WorldConfig(categories=categories[:value]))
+        case "hidden":
+            config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, hidden=value))
+    scenes = generated(config.world, "train")
+    bank = compile_bank((scenes[i] for i in range(len(scenes))), config.task)
+    env, params = build(tiled(bank, value) if axis == "scenes" else bank, {}, config.train_step_limit)
+    setting, size = SETTINGS[config.layout.setting], len(env.categories)
+    priors = layout_priors(jnp.zeros((NUM_PRIORS, size, size)), setting)
+    arms = Arms(config, env, setting, priors)
+    if axis == "chunks":
+        states = arms.init(params)
+        for _ in range(value):
+            states, _ = arms.train(states, params)
+        return {"peak_resident_gb": peak_resident_gb()}
+
+    found = {"tables_gb": round(sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)) / 2**30, 3)}
+    if axis != "hidden":
+        episodes = value if axis == "environments" else ENVIRONMENTS
+        found |= figures("environment", walking(env, params, episodes), STEPS)
+    learning = update(arms.learners[ARM], config, params, priors)
+    found |= figures("training", learning, config.update_steps)
+    return found | {"gflop_per_update": round(learning.flops / 1e9, 1)}
+
+
+def tiled(bank: Bank, scenes: int) -> Bank:
+    """The bank's scenes over and over, to so many; what the environment does not read is left as it is."""
+    copies = scenes // len(bank.names)
+    shift = (np.arange(copies, dtype=np.int32) * len(bank.ahead)).reshape(-1, 1, 1)
+    names = ("rows", "goal_distance", "num_cells", "goals", "num_goals")
+    return bank._replace(
+        names=bank.names * copies,
+        room_types=bank.room_types * copies,
+        ahead=(bank.ahead + shift).reshape(-1, bank.ahead.shape[1]),
+        first_cell=(bank.first_cell + shift[..., 0]).reshape(-1),
+        **{name: np.concatenate([getattr(bank, name)] * copies) for name in names},
+    )
+
+
+def walking(env: ObjectNav, params: EnvParams, episodes: int) -> Program:
+    """Random steps of parallel episodes with auto-reset, each row kept only until the next."""
+    key = jax.random.key(0)
+    actions = jax.random.randint(key, (STEPS // episodes, episodes), 0, env.num_actions)
+    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, episodes), params)
+
+    def walk(state, row, actions, params):
+        def step(carry, inputs):
+            time, action = inputs
+            keys = jax.random.split(jax.random.fold_in(key, time), episodes)
+            observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, carry[0], action, params)
+            return (state, observation.row), None
+
+        return jax.lax.scan(step, (state, row), (jnp.arange(len(actions)), actions))[0]
+
+    return program(walk, state, observation.row, actions, params)
+
+
+def figures(name: str, program: Program, steps: int) -> dict:
+    """Steps per second of a program, its compile time, and the memory so far."""
+    taken = [seconds(program.call)]
+    while len(taken) <= RUNS and sum(taken) < ENOUGH_S:
+        taken.append(seconds(program.call))
+    timed = taken[1:] or taken
+    device = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    return {
+        f"{name}_steps_per_s": spread([steps / one for one in timed]),
+        f"{name}_runs": len(timed),
+        f"{name}_compile_s": program.compile_s,
+        f"{name}_temp_gb": program.temp_gb,
+        f"{name}_peak_resident_gb": peak_resident_gb(),
+        **({f"{name}_peak_device_gb": round(device / 2**30, 3)} if device else {}),
+    }
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        print(json.dumps(point(sys.argv[1], int(sys.argv[2]))))
+    else:
+        main()

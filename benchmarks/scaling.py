@@ -1,0 +1,155 @@
+"""Training on several devices and processes: `python benchmarks/scaling.py`, on two cores or more, in about 2 minutes.
+
+Weak scaling: every device brings as many episodes (half of the default run's), of one seed of the arm with the layout.
+
+- `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself) and
+  together (as one run), in turns. Together against apart is the price of being one run; apart against alone that of
+  sharing the machine's memory and power.
+- `all_reduce`: seconds of a mean over both processes by its bytes, its latency and its bandwidth; with each process
+  held to one core (`pinned`), where it takes until the scheduler's next tick, and free to use both.
+- `update`: seconds of its rollout and of its learning (what a second epoch adds) alone; what it sums over the
+  processes, counted in the compiled program; seconds to join, to compile, to save a checkpoint and to log.
+- `jitter`: seconds of the work between two sums, over and over; spread of their logarithms.
+- `simulated`: 1, 2 and 4 devices that share this machine's cores. They show that nothing but sums is added: the cores
+  are the same, so steps per second cannot grow beyond what the cores give.
+"""
+
+import json
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+EPISODES, TURNS, SUMS, SHORT = 256, 4, 20, 100
+BYTES = [2**9, 2**12, 2**14, 2**16, 2**20, 2**24]
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        found = pair("process", folder)
+    found["all_reduce"]["free"] = pair("network")
+    simulated = start(["simulated"], flags="--xla_force_host_platform_device_count=4")
+    found["simulated"] = json.loads(simulated.communicate()[0])
+
+    from _common import report
+
+    report({"episodes_per_device": EPISODES, **found})
+
+
+def pair(role: str, *arguments: str) -> dict:
+    """What the first of two processes finds."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    cores = sorted(os.sched_getaffinity(0))
+    both = [start([role, address, index, cores[index], *arguments], address) for index in (0, 1)]
+    said, _ = [process.communicate()[0] for process in both]
+    return json.loads(said.splitlines()[-1])  # gloo speaks first
+
+
+def start(arguments: list, address: str = "", flags: str = "") -> subprocess.Popen:
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_COORDINATOR_BIND_ADDRESS": address or "127.0.0.1:0"}
+    command = [sys.executable, __file__, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def process(address: str, index: str, core: str, folder: str) -> None:
+    """One of two processes; the first one prints."""
+    os.sched_setaffinity(0, {int(core)})  # before JAX counts the cores
+    began = time.perf_counter()
+    from _common import in_turns, ratios, spread
+    from _scaling import Training, collectives, local_mesh, log_spread
+    from jax.experimental.multihost_utils import sync_global_devices
+
+    from jaxnav.training.sharding import Devices, first_process
+
+    devices = Devices(address=address, process=int(index), processes=2)
+    devices.connect()
+    joining = time.perf_counter() - began
+    alone = Training(local_mesh(), EPISODES)
+    together = Training(devices.mesh(1, 2 * EPISODES, 1), 2 * EPISODES)
+    twice = Training(local_mesh(), EPISODES, epochs=2)
+    compiling = together.update_seconds()
+    calls = {
+        "alone": lambda: alone.update() if first_process() else None,
+        "apart": alone.update,
+        "together": together.update,
+        "two_epochs_alone": lambda: twice.update() if first_process() else None,
+    }
+    taken = in_turns({name: lambda c=call: (c(), sync_global_devices("turn")) for name, call in calls.items()}, TURNS)
+    sums = means(together.mesh)
+    saving, logging = together.save(Path(folder)), together.log(Path(folder))
+    short = Training(local_mesh(), EPISODES // 16, minibatches=1)
+    short.update()  # compiles
+    jitter = [short.update_seconds() for _ in range(SHORT)]
+    if not first_process():
+        return
+    steps = alone.steps
+    alone_s, twice_s = (statistics.median(taken[name]) for name in ("alone", "two_epochs_alone"))
+    found = {
+        "processes": {
+            "steps_per_s": {
+                name: spread([(1 if name == "alone" else 2) * steps / one for one in times])
+                for name, times in taken.items()
+                if name != "two_epochs_alone"
+            },
+            "efficiency_together_to_apart": ratios(taken["apart"], taken["together"]),
+            "efficiency_together_to_alone": ratios(taken["alone"], taken["together"]),
+            "efficiency_apart_to_alone": ratios(taken["alone"], taken["apart"]),
+        },
+        "all_reduce": {"pinned": sums},
+        "update": {
+            "rollout_s": round(2 * alone_s - twice_s, 4),
+            "learning_s": round(twice_s - alone_s, 4),
+            **together.sizes(),
+            **collectives(together.program),
+            "join_s": round(joining, 2),
+            "compile_s": round(compiling, 2),
+            "save_s": round(saving, 3),
+            "log_s": round(logging, 6),
+        },
+        "jitter": {"seconds": spread(jitter), "log_standard_deviation": log_spread(jitter)},
+    }
+    print(json.dumps(found))
+
+
+def means(mesh) -> dict:
+    """Seconds of means over a mesh."""
+    from _common import spread
+    from _scaling import all_reduce, line
+
+    sums = {size: all_reduce(mesh, size, SUMS) for size in BYTES}
+    return {"seconds": {str(size): spread(times) for size, times in sums.items()}, **line(sums)}
+
+
+def network(address: str, index: str, _: str) -> None:
+    """One of two processes on any core that only take means."""
+    from jaxnav.training.sharding import Devices
+
+    devices = Devices(address=address, process=int(index), processes=2)
+    devices.connect()
+    print(json.dumps(means(devices.mesh(1, 2, 1))))
+
+
+def simulated() -> None:
+    """1, 2 and 4 devices of one process."""
+    from _common import in_turns, rates, ratios
+    from _scaling import Training
+
+    from jaxnav.training.sharding import Devices
+
+    trainings = {n: Training(Devices(count=n).mesh(1, n * EPISODES // 2, 1), n * EPISODES // 2) for n in (1, 2, 4)}
+    taken = in_turns({str(n): training.update for n, training in trainings.items()}, TURNS)
+    found = {name: {"steps_per_s": rates(times, trainings[int(name)].steps)} for name, times in taken.items()}
+    for name in ("2", "4"):
+        found[name]["efficiency_of_the_same_cores"] = ratios([int(name) * one for one in taken["1"]], taken[name])
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    role = {"process": process, "network": network, "simulated": simulated}[sys.argv[1]] if len(sys.argv) > 1 else main
+    role(*sys.argv[2:])

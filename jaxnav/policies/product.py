@@ -1,0 +1,47 @@
+"""The product of rows with a kernel, as every layer uses it."""
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+
+def kernel_gradient(rows: jax.Array, by_result: jax.Array) -> jax.Array:
+    """The gradient of a kernel float32 [M, N], from rows [..., M] that met it and the gradient by the result [..., N].
+
+    It is asked for as rows^T g of two matrices. JAX's own rule asks for (g^T rows)^T, for which XLA on a CPU copies
+    both operands in transposed order first: two to three times slower where M and N are small.
+    """
+    return jnp.einsum("rm,rn->mn", *(array.reshape(-1, array.shape[-1]) for array in (rows, by_result)))
+
+
+@jax.custom_vjp
+def product(rows: jax.Array, kernel: jax.Array) -> jax.Array:
+    """`rows @ kernel`, float32 [..., M] and [M, N] to [..., N], with `kernel_gradient` for its gradient."""
+    return rows @ kernel
+
+
+def _product(rows: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return rows @ kernel, (rows, kernel)
+
+
+def _gradients(saved: tuple[jax.Array, jax.Array], by_result: jax.Array) -> tuple[jax.Array, jax.Array]:
+    rows, kernel = saved
+    return by_result @ kernel.T, kernel_gradient(rows, by_result)
+
+
+product.defvjp(_product, _gradients)
+
+
+def biased(values: jax.Array, layer: nnx.Linear) -> jax.Array:
+    """Values [..., N] with the bias [N] of a layer added, if it has one."""
+    if layer.bias is None:
+        return values
+    return values + layer.bias[...].reshape((1,) * (values.ndim - 1) + (-1,))
+
+
+class Linear(nnx.Linear):
+    """A linear layer by `product`."""
+
+    def __call__(self, inputs: jax.Array, out_sharding: None = None) -> jax.Array:
+        """Inputs [..., M] to [..., N]."""
+        return biased(product(inputs, self.kernel[...]), self)
