@@ -42,6 +42,9 @@ def draw(results: Path, images: Path) -> None:
     path = results / "growth.json"
     if path.exists():
         _save(growth(json.loads(path.read_text())), images / "growth.png")
+    path = results / "curves.json"
+    if path.exists():
+        _save(curves(json.loads(path.read_text())["success"]), images / "curves.png")
 
 
 def time_to_result(runs: dict[str, Any]) -> Figure:
@@ -56,10 +59,8 @@ def time_to_result(runs: dict[str, Any]) -> Figure:
                 at, seconds, left=left, color=colour, edgecolor="white", height=0.6, label=part if not at else None
             )
             if seconds > NARROW * longest:
-                dark = part in ("learning", "evaluation", "compile", "scenes")
-                axes.text(
-                    left + seconds / 2, at, f"{seconds:.0f}", ha="center", va="center", color="w" if dark else "k"
-                )
+                colour = "w" if part in DARK else "k"
+                axes.text(left + seconds / 2, at, f"{seconds:.0f}", ha="center", va="center", color=colour)
             left += seconds
         axes.text(left + 0.01 * longest, at, f"{left:.0f} s", va="center", weight="bold")
     names = [name.removeprefix("time_to_result").replace("_", " ").strip() or "now" for name in runs]
@@ -69,6 +70,23 @@ def time_to_result(runs: dict[str, Any]) -> Figure:
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(left=False)
     axes.legend(ncols=6, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
+    return figure
+
+
+def curves(found: dict[str, Any]) -> Figure:
+    """Training success by steps, before and after, with 95 % intervals."""
+    figure, panels = plt.subplots(1, len(found), figsize=(9, 3.2), sharey=True, layout="constrained")
+    for axes, (arm, points) in zip(panels, found.items(), strict=True):
+        millions = [int(steps) / 1e6 for steps in points]
+        for version, colour in (("before", ALONE), ("after", TRAINED)):
+            low, mean, high = zip(*(point[version] for point in points.values()), strict=True)
+            axes.plot(millions, mean, color=colour, label=version)
+            axes.fill_between(millions, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.set(title=arm, xlabel="million steps of a policy")
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("training success, %")
+    panels[0].legend(frameon=False)
     return figure
 
 

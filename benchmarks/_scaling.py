@@ -1,6 +1,7 @@
 """What benchmarks/scaling.py measures in its processes."""
 
 import dataclasses
+import math
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -24,25 +25,25 @@ from jaxnav.training.exploration import explore
 
 
 class Training:
-    """The default run with one seed of the arm with the layout, on a mesh; an update at a time."""
+    """The default run with the arm with the layout alone, on a mesh; some updates at a time."""
 
-    def __init__(self, mesh: Mesh, episodes: int, **ppo: int) -> None:
+    def __init__(self, mesh: Mesh, episodes: int, seeds: int = 1, updates: int = 1, **ppo: int) -> None:
         base = RunConfig()
-        config = dataclasses.replace(base, seeds=1, arms=("layout",), chunk=1)
+        config = dataclasses.replace(base, seeds=seeds, arms=("layout",), chunk=updates)
         config = dataclasses.replace(config, ppo=dataclasses.replace(base.ppo, num_envs=episodes, **ppo))
         env, self._params = make(config.world)
         setting = SETTINGS[config.layout.setting]
         counts = jax.jit(explore, static_argnums=(0, 3, 4))(env, self._params, jax.random.key(0), 64, 20).counts
-        self.mesh, self.steps = mesh, config.update_steps
+        self.mesh, self.updates, self.steps = mesh, updates, config.update_steps * seeds  # of an update
         self._arms = ShardedArms(config, env, setting, layout_priors(counts, setting), mesh)
         self._states = self._arms.init(self._params)
 
-    def update(self) -> None:
+    def train(self) -> None:
         self._states, _ = self._arms.train(self._states, self._params)
 
-    def update_seconds(self) -> float:
+    def seconds(self) -> float:
         began = time.perf_counter()
-        self.update()
+        self.train()
         return time.perf_counter() - began
 
     def save(self, folder: Path) -> float:
@@ -70,7 +71,7 @@ class Training:
 
     @property
     def program(self) -> str:
-        """The compiled update."""
+        """The compiled updates."""
         return self._arms._compiled["layout"].as_text()
 
 
@@ -115,8 +116,9 @@ def log_spread(values: Sequence[float]) -> float:
     return round(float(np.log(values).std()), 4)
 
 
-def collectives(program: str) -> dict[str, int]:
-    """All-reduces of one call of a compiled program, their arrays and bytes, loops counted by their turns."""
+def collectives(program: str) -> dict[str, dict[str, int]]:
+    """What one call of a compiled program exchanges: calls, their arrays and bytes by kind, loops by their turns."""
+    kinds = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter", "collective-broadcast")
     bodies: dict[str, list[str]] = {}
     name = ""
     for text in program.splitlines():
@@ -127,19 +129,21 @@ def collectives(program: str) -> dict[str, int]:
             bodies[name].append(text)
 
     def count(name: str) -> np.ndarray:
-        total = np.zeros(3, int)
+        total = np.zeros((len(kinds), 3), int)
         for text in bodies[name]:
-            if found := re.search(r"= (.*?) all-reduce(?:-start)?\(", text):
-                sizes = [4 * _elements(shape) for shape in re.findall(r"\w+\[([\d,]*)\]", found[1])]
-                total += 1, len(sizes), sum(sizes)
+            if found := re.search(rf"= (.*?) ({'|'.join(kinds)})\(", text):
+                sizes = [_bytes(*array) for array in re.findall(r"([a-z]+\d*)\[([\d,]*)\]", found[1])]
+                total[kinds.index(found[2])] += 1, len(sizes), sum(sizes)
             turns = re.search(r'"known_trip_count":\{"n":"(\d+)"\}', text)
             for called in re.findall(r"(?:body|calls|to_apply|branch_computations)=\{?%?([\w.\-]+)", text):
                 total += count(called) * (int(turns[1]) if turns else 1)
         return total
 
-    names = ("all_reduces", "all_reduce_arrays", "all_reduce_bytes")
-    return dict(zip(names, count("ENTRY").tolist(), strict=True))
+    rows = zip(kinds, count("ENTRY").tolist(), strict=True)
+    return {kind: dict(zip(("calls", "arrays", "bytes"), row, strict=True)) for kind, row in rows if row[0]}
 
 
-def _elements(shape: str) -> int:
-    return int(np.prod([int(size) for size in shape.split(",") if size]))
+def _bytes(kind: str, shape: str) -> int:
+    """Of an array such as f32[3,4]."""
+    bits = re.search(r"\d+", kind)
+    return math.prod(int(size) for size in shape.split(",") if size) * (int(bits[0]) // 8 if bits else 1)

@@ -1,8 +1,8 @@
 """Steps per second of the environment alone, and its limit: `python benchmarks/environment.py`.
 
-2,048 parallel episodes take random actions with auto-reset. Of the observation rows they deliver none (an update
-gathers them again by pose), the last, their sum, or all. The limit is a loop that gathers the same rows and does nothing
-else. Keys are split at every step, or all before the first.
+2,048 parallel episodes take random actions with auto-reset. They deliver poses (by which an update gathers rows again),
+the last rows, their sum, or all. The limit is a loop that gathers the same rows and does nothing else. Keys are split at
+every step, or all before the first.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,10 @@ from jaxnav.env.make import make
 EPISODES, STEPS = 2048, 500
 
 KEEP: dict[str, Callable] = {
-    "poses": lambda kept, row: (kept, None),
-    "last_row": lambda kept, row: (row, None),
-    "sum_of_rows": lambda kept, row: (kept + row, None),
-    "all_rows": lambda kept, row: (kept, row),
+    "poses": lambda kept, row, pose: (kept, pose),
+    "last_row": lambda kept, row, pose: (row, None),
+    "sum_of_rows": lambda kept, row, pose: (kept + row, None),
+    "all_rows": lambda kept, row, pose: (kept, row),
 }
 
 
@@ -39,17 +39,17 @@ def main() -> None:
             action, keys = inputs
             keys = keys if keys_first else split(keys)
             observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, carry[0], action, params)
-            kept, out = KEEP[keep](carry[1], observation.row)
-            return (state, kept), (out, state.pose)
+            kept, out = KEEP[keep](carry[1], observation.row, state.pose)
+            return (state, kept), out
 
         keys = jnp.arange(STEPS)
         return jax.lax.scan(step, (state, row), (actions, jax.vmap(split)(keys) if keys_first else keys))
 
     @partial(jax.jit, static_argnums=0)
     def gather(keep, row, poses, rows):
-        return jax.lax.scan(lambda kept, pose: KEEP[keep](kept, rows[pose]), row, poses)
+        return jax.lax.scan(lambda kept, pose: KEEP[keep](kept, rows[pose], pose), row, poses)
 
-    _, (_, poses) = act("poses", False, start, observation.row, actions, params)
+    _, poses = act("poses", False, start, observation.row, actions, params)
     calls = {f"steps_{name}": partial(act, name, False) for name in KEEP}
     calls |= {"steps_sum_of_rows_keys_first": partial(act, "sum_of_rows", True)}
     calls = {name: partial(call, start, observation.row, actions, params) for name, call in calls.items()}

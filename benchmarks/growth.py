@@ -31,10 +31,10 @@ from jaxnav.training.calibration import layout_priors
 
 ARM = "layout"
 AXES = {
-    "environments": (64, 256, 1024, 4096, 16384, 65536),
-    "scenes": (80, 400, 2000, 10000),
-    "categories": (22, 50, 100, 200),
-    "hidden": (64, 128, 256, 512, 1024),
+    "environments": (64, 512, 4096, 65536),
+    "scenes": (80, 1000, 10000),
+    "categories": (22, 66, 200),
+    "hidden": (64, 128, 256, 1024),
     "chunks": (4, 40),
 }
 ENVIRONMENTS, STEPS = 2048, 2**20  # of the environment alone: episodes side by side, and steps of a call

@@ -1,14 +1,16 @@
-"""Training on several devices and processes: `python benchmarks/scaling.py`, on two cores or more, in about 2 minutes.
+"""Training on several devices and processes: `python benchmarks/scaling.py`, on two cores or more, in 3 minutes.
 
 Weak scaling: every device brings as many episodes (half of the default run's), of one seed of the arm with the layout.
 
-- `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself) and
-  together (as one run), in turns. Together against apart is the price of being one run; apart against alone that of
-  sharing the machine's memory and power.
+- `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself),
+  as one run that shares out two seeds, and as one that shares the episodes of a seed, in turns. As one against apart is
+  the price of being one run; apart against alone that of sharing the machine's memory and power. A call does as many
+  updates as the default run's; of the shared episodes, which are slow, it does one.
 - `all_reduce`: seconds of a mean over both processes by its bytes, its latency and its bandwidth; with each process
   held to one core (`pinned`), where it takes until the scheduler's next tick, and free to use both.
-- `update`: seconds of its rollout and of its learning (what a second epoch adds) alone; what it sums over the
-  processes, counted in the compiled program; seconds to join, to compile, to save a checkpoint and to log.
+- `exchanged`: what one call of either exchanges, counted in the compiled program.
+- `update`: seconds of its rollout and of its learning (what a second epoch adds) alone; bytes of the parameters and of
+  a device's episodes; seconds to join, to compile, to save a checkpoint and to log.
 - `jitter`: seconds of the work between two sums, over and over; spread of their logarithms.
 - `simulated`: 1, 2 and 4 devices that share this machine's cores. They show that nothing but sums is added: the cores
   are the same, so steps per second cannot grow beyond what the cores give.
@@ -22,9 +24,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
-EPISODES, TURNS, SUMS, SHORT = 256, 4, 20, 100
+EPISODES, CALL, TURNS, SUMS, SHORT = 256, 8, 4, 20, 100  # CALL: updates of a call, as in the default run
 BYTES = [2**9, 2**12, 2**14, 2**16, 2**20, 2**24]
 
 
@@ -61,7 +64,7 @@ def process(address: str, index: str, core: str, folder: str) -> None:
     """One of two processes; the first one prints."""
     os.sched_setaffinity(0, {int(core)})  # before JAX counts the cores
     began = time.perf_counter()
-    from _common import in_turns, ratios, spread
+    from _common import in_turns, rates, ratios, spread
     from _scaling import Training, collectives, local_mesh, log_spread
     from jax.experimental.multihost_utils import sync_global_devices
 
@@ -70,45 +73,49 @@ def process(address: str, index: str, core: str, folder: str) -> None:
     devices = Devices(address=address, process=int(index), processes=2)
     devices.connect()
     joining = time.perf_counter() - began
-    alone = Training(local_mesh(), EPISODES)
-    together = Training(devices.mesh(1, 2 * EPISODES, 1), 2 * EPISODES)
-    twice = Training(local_mesh(), EPISODES, epochs=2)
-    compiling = together.update_seconds()
-    calls = {
-        "alone": lambda: alone.update() if first_process() else None,
-        "apart": alone.update,
-        "together": together.update,
-        "two_epochs_alone": lambda: twice.update() if first_process() else None,
+    trainings = {
+        "alone": Training(local_mesh(), EPISODES, updates=CALL),
+        "apart": Training(local_mesh(), EPISODES, updates=CALL),
+        "shared_seeds": Training(devices.mesh(2, EPISODES, 1), EPISODES, seeds=2, updates=CALL),
+        "shared_episodes": Training(devices.mesh(1, 2 * EPISODES, 1), 2 * EPISODES),
+        "two_epochs_alone": Training(local_mesh(), EPISODES, updates=CALL, epochs=2),
     }
-    taken = in_turns({name: lambda c=call: (c(), sync_global_devices("turn")) for name, call in calls.items()}, TURNS)
+    together = trainings["shared_episodes"]
+    compiling = together.seconds()
+
+    def turn(name: str) -> None:
+        if first_process() or not name.endswith("alone"):
+            trainings[name].train()
+        sync_global_devices("turn")
+
+    calls = in_turns({name: partial(turn, name) for name in trainings}, TURNS)
+    taken = {name: [one / trainings[name].updates for one in times] for name, times in calls.items()}
     sums = means(together.mesh)
     saving, logging = together.save(Path(folder)), together.log(Path(folder))
     short = Training(local_mesh(), EPISODES // 16, minibatches=1)
-    short.update()  # compiles
-    jitter = [short.update_seconds() for _ in range(SHORT)]
+    short.train()  # compiles
+    jitter = [short.seconds() for _ in range(SHORT)]
     if not first_process():
         return
-    steps = alone.steps
-    alone_s, twice_s = (statistics.median(taken[name]) for name in ("alone", "two_epochs_alone"))
+    update = {name: statistics.median(times) for name, times in taken.items()}
+    as_one = ("shared_seeds", "shared_episodes")
+    steps = {name: trainings[name].steps * (2 if name == "apart" else 1) for name in ("alone", "apart", *as_one)}
     found = {
         "processes": {
-            "steps_per_s": {
-                name: spread([(1 if name == "alone" else 2) * steps / one for one in times])
-                for name, times in taken.items()
-                if name != "two_epochs_alone"
-            },
-            "efficiency_together_to_apart": ratios(taken["apart"], taken["together"]),
-            "efficiency_together_to_alone": ratios(taken["alone"], taken["together"]),
-            "efficiency_apart_to_alone": ratios(taken["alone"], taken["apart"]),
+            "steps_per_s": {name: rates(taken[name], count) for name, count in steps.items()},
+            "to_apart": {name: ratios(taken["apart"], taken[name]) for name in as_one},
+            "to_alone": {name: ratios(taken["alone"], taken[name]) for name in ("apart", *as_one)},
         },
         "all_reduce": {"pinned": sums},
+        "exchanged": {
+            name: {"updates": trainings[name].updates, **collectives(trainings[name].program)} for name in as_one
+        },
         "update": {
-            "rollout_s": round(2 * alone_s - twice_s, 4),
-            "learning_s": round(twice_s - alone_s, 4),
+            "rollout_s": round(2 * update["alone"] - update["two_epochs_alone"], 4),
+            "learning_s": round(update["two_epochs_alone"] - update["alone"], 4),
             **together.sizes(),
-            **collectives(together.program),
             "join_s": round(joining, 2),
-            "compile_s": round(compiling, 2),
+            "compile_s": round(compiling - update["shared_episodes"], 2),
             "save_s": round(saving, 3),
             "log_s": round(logging, 6),
         },
@@ -143,7 +150,7 @@ def simulated() -> None:
     from jaxnav.training.sharding import Devices
 
     trainings = {n: Training(Devices(count=n).mesh(1, n * EPISODES // 2, 1), n * EPISODES // 2) for n in (1, 2, 4)}
-    taken = in_turns({str(n): training.update for n, training in trainings.items()}, TURNS)
+    taken = in_turns({str(n): training.train for n, training in trainings.items()}, TURNS)
     found = {name: {"steps_per_s": rates(times, trainings[int(name)].steps)} for name, times in taken.items()}
     for name in ("2", "4"):
         found[name]["efficiency_of_the_same_cores"] = ratios([int(name) * one for one in taken["1"]], taken[name])

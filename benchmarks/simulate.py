@@ -72,8 +72,9 @@ def update(measured: dict, network: Network, hosts: int, share: float, generator
     # Between two minibatches every host is slowed by noise of its own, and all wait for the slowest.
     noise = np.exp(sigma * generator.standard_normal((SAMPLES, hosts)) - sigma**2 / 2)
     slowest = noise.max(axis=1).mean() / noise.mean()
-    sums = own["all_reduces" if network.grouped else "all_reduce_arrays"]
-    latency, transfer = network.all_reduce(hosts, own["all_reduce_bytes"] / sums) if hosts > 1 else (0, 0)
+    exchanged = measured["exchanged"]["shared_episodes"]["all-reduce"]
+    sums = exchanged["calls" if network.grouped else "arrays"]
+    latency, transfer = network.all_reduce(hosts, exchanged["bytes"] / sums) if hosts > 1 else (0, 0)
     saving = own["save_s"] + hosts * share * own["agent_bytes"] / Assumed().disk_bytes_per_s
     return {
         "rollout": rollout,
@@ -157,22 +158,23 @@ def table(rows: list[dict]) -> str:
 def measured_table(measured: dict) -> str:
     """The same of what was measured."""
     processes, simulated, own = measured["processes"], measured["simulated"], measured["update"]
+    rates, to_apart, to_alone = (processes[name] for name in ("steps_per_s", "to_apart", "to_alone"))
 
     def row(name: str, rate: dict, efficiency: dict | None) -> str:
         shown = f"{efficiency['median']:.2f} ({efficiency['min']:.2f}-{efficiency['max']:.2f})" if efficiency else ""
         return f"| {name} | {rate['median']:,.0f} | {shown} |"
 
-    rates = processes["steps_per_s"]
     free, pinned = measured["all_reduce"]["free"], measured["all_reduce"]["pinned"]
+    sums = measured["exchanged"]["shared_episodes"]["all-reduce"]
     jitter = measured["jitter"]["log_standard_deviation"]
     return "\n".join(
         [
             "| weak scaling | steps/s | efficiency |",
             "| :-- | --: | --: |",
             row("one process on one core, the other idle", rates["alone"], None),
-            row("two processes apart, to one alone", rates["apart"], processes["efficiency_apart_to_alone"]),
-            row("two processes together, to two apart", rates["together"], processes["efficiency_together_to_apart"]),
-            row("the same, to one alone", rates["together"], processes["efficiency_together_to_alone"]),
+            row("two processes apart, to one alone", rates["apart"], to_alone["apart"]),
+            row("two as one run, a seed each, to two apart", rates["shared_seeds"], to_apart["shared_seeds"]),
+            row("two as one run of one seed, to two apart", rates["shared_episodes"], to_apart["shared_episodes"]),
             row("one device on both cores", simulated["1"]["steps_per_s"], None),
             *(
                 row(
@@ -187,8 +189,8 @@ def measured_table(measured: dict) -> str:
             "| :-- | --: |",
             f"| an update alone: rollout, learning | {own['rollout_s']:.3f} s, {own['learning_s']:.3f} s |",
             f"| parameters | {own['parameter_bytes']:,} bytes |",
-            f"| sums over both in an update | {own['all_reduces']}, of {own['all_reduce_arrays']} arrays |",
-            f"| bytes of these together | {own['all_reduce_bytes']:,} |",
+            f"| sums in an update of one seed | {sums['calls']}, of {sums['arrays']} arrays |",
+            f"| bytes of these together | {sums['bytes']:,} |",
             f"| a sum of an array (gloo), each process held to one core | {1e6 * pinned['latency_s']:.0f} us |",
             f"| the same, free to use both | {1e6 * free['latency_s']:.0f} us |",
             f"| bandwidth then | {free['bytes_per_s'] / 1e6:,.0f} MB/s |",

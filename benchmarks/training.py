@@ -1,91 +1,62 @@
 """Steps per second of training with the default policy, learning included: `python benchmarks/training.py`.
 
-All seeds of both arms side by side, as `train.py` runs them; each arm alone, with the rollout's share; and the memory
-of a compiled chunk of updates.
+All seeds of both arms, as `train.py` runs them, in turns with one seed of each arm. The program of a chunk of updates
+is compared with that of a training a hundred times as long: equal programs need equal memory.
 """
 
-import dataclasses
-import time
+from functools import partial
 
 import jax
-from _common import rates, report, timings
+from _common import in_turns, peak_resident_gb, rates, report
+from _phases import program
 
 from jaxnav.cli.arms import Arms
 from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
-from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS
-from jaxnav.policies.policy import bind
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
-from jaxnav.training.learner import Learner
-from jaxnav.training.rollout import rollout
 
-CHUNK, REPEATS = 2, 5
+CHUNK, TURNS = 4, 5
 
 
 def main() -> None:
-    config = dataclasses.replace(RunConfig(), chunk=CHUNK)
+    config = RunConfig(chunk=CHUNK)
     env, params = make(config.world)
     counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
     setting = SETTINGS[config.layout.setting]
     priors = layout_priors(counts, setting)
     arms = Arms(config, env, setting, priors)
-    steps = CHUNK * config.ppo.num_envs * config.ppo.rollout * config.seeds * len(arms.learners)
+    kept = {"states": arms.init(params)}
+
+    def everything():
+        kept["states"], _ = arms.train(kept["states"], params)
+
+    calls, steps = {"all arms and seeds": everything}, CHUNK * config.update_steps
+    temporary, same = {}, {}
+    for name, learner in arms.learners.items():
+        state = jax.jit(learner.init)(jax.random.key(0), params, priors)
+        train = partial(learner.train, num_updates=CHUNK)
+        inputs = state, config.ppo.scalars(config.total_updates), params, priors
+        own = program(train, *inputs)
+        calls[name], temporary[name] = own.call, own.temp_gb
+        longer = state, config.ppo.scalars(100 * config.total_updates), params, priors
+        same[name] = jax.jit(train).lower(*inputs).as_text() == jax.jit(train).lower(*longer).as_text()
+    taken = in_turns(calls, TURNS)
+    many = config.seeds * len(arms.learners)
     report(
         {
             "episodes": config.ppo.num_envs,
-            "rollout": config.ppo.rollout,
-            "updates_per_call": CHUNK,
+            "rollout_steps": config.ppo.rollout,
             "seeds": config.seeds,
-            "all_arms_and_seeds_steps_per_s": side_by_side(arms, params, steps),
-            "arms": {name: alone(learner, config, params, priors) for name, learner in arms.learners.items()},
+            "steps_per_s": {
+                name: rates(taken[name], steps * (many if name == "all arms and seeds" else 1)) for name in calls
+            },
+            "temporary_gb_of_a_chunk": temporary,
+            "same_program_for_100_times_the_steps": same,
+            "peak_resident_gb": peak_resident_gb(),
         }
     )
-
-
-def side_by_side(arms: Arms, params: EnvParams, steps: int) -> dict:
-    states, _ = arms.train(arms.init(params), params)
-    measured = []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        states, _ = arms.train(states, params)
-        measured.append(round(steps / (time.perf_counter() - began)))
-    measured.sort()
-    return {"median": measured[REPEATS // 2], "min": measured[0], "max": measured[-1]}
-
-
-def alone(learner: Learner, config: RunConfig, params, priors) -> dict:
-    state = jax.jit(learner.init)(jax.random.key(0), params, priors)
-
-    @jax.jit
-    def train(state, scalars, params, priors):
-        return learner.train(state, scalars, params, priors, CHUNK)
-
-    @jax.jit
-    def act(state, params, priors):
-        policy = bind(learner.spec, state.params)
-        coin = learner.counterfactual == "coin"
-        return rollout(learner.acting, policy, state.agent, state.key, config.ppo.rollout, coin, params, priors)
-
-    def lowered(total_steps: int):
-        return train.lower(state, config.ppo.scalars(total_steps), params, priors)
-
-    compiled = lowered(config.total_steps).compile()
-    memory = compiled.memory_analysis()
-    training = timings(compiled, state, config.ppo.scalars(config.total_steps), params, priors, repeats=REPEATS)
-    acting = timings(act, state, params, priors, repeats=REPEATS)
-    steps = config.ppo.num_envs * config.ppo.rollout
-    longer = lowered(100 * config.total_steps).as_text()
-    return {
-        "steps_per_s": rates(training, CHUNK * steps),
-        "rollout_steps_per_s": rates(acting, steps),
-        "rollout_share": round(CHUNK * acting["wall_median_ms"] / training["wall_median_ms"], 3),
-        "temp_bytes": memory.temp_size_in_bytes,
-        "argument_bytes": memory.argument_size_in_bytes,
-        # Equal programs need equal memory.
-        "same_program_for_100_times_the_steps": lowered(config.total_steps).as_text() == longer,
-    }
 
 
 if __name__ == "__main__":

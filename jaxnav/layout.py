@@ -34,7 +34,7 @@ class Setting:
       gap: what D measures: `novelty`, how much the last view changed the belief (eq. 5), or `evidence`, how badly all
         that was seen so far fits the prior (`evidence_gap`; `reduction`, `decay` and `passes` then have no effect),
         `clock`, 1 when the gate opens: what the sum over all rows in `released` comes to, for tanh is saturated there,
-        or `none`, which leaves D as it is: training has no use for it.
+        or `none`: D stays 0, so that sTDE takes nothing out. Training has no use for D.
       decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
       passes: estimator calls per step, >= 1. All but the first find nothing new, so an accepted gap is already decayed.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.

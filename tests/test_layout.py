@@ -92,6 +92,22 @@ def views_of(*sets) -> np.ndarray:
     return np.array([[i in visible for i in range(K)] for visible in sets])
 
 
+def test_belief_without_a_gap_is_the_same_belief():
+    counts = jnp.arange(16.0).reshape(4, 4) + 1.0
+    setting = SETTINGS["calibrated"]
+    plain, without = (
+        LayoutEstimator(prior_from_counts(counts, setting), own)
+        for own in (setting, dataclasses.replace(setting, gap="none"))
+    )
+    one, other = plain.init(), without.init()
+    for seen in ([1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]):
+        one, other = (est.update(belief, jnp.array(seen)) for est, belief in ((plain, one), (without, other)))
+        np.testing.assert_array_equal(one.alpha, other.alpha)
+        np.testing.assert_array_equal(one.last, other.last)
+        assert one.gap > 0.0
+        assert other.gap == 0.0
+
+
 def test_released_gap_is_a_clock():
     """Saturated KL: 0.8 when a new view of two or more comes, then 0.64 of the last value while nothing is new."""
     views = views_of({2}, {0, 1}, {0, 1}, {0, 1}, {0, 1, 2}, {3}, {0, 1, 2}, {0, 2})

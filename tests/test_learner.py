@@ -1,5 +1,6 @@
 """PPO learns; chunks, seeds side by side and poisoned rewards change nothing that they should not."""
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import chex
@@ -11,7 +12,7 @@ import tiny
 from test_rollout import ACTING, ENVS, LENGTH, PARAMS, PRIORS, act
 
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
+from jaxnav.training.learner import Learner, block_order, regroup
 
 CONFIG = PPOConfig(
     num_envs=ENVS,
@@ -169,6 +170,33 @@ def test_the_learning_rate_falls_to_zero(seeds):
     last = seeds.replace(update=jnp.full(2, UPDATES, jnp.int32))
     states, _ = one_update(last, SCALARS, PARAMS, PRIORS)
     chex.assert_trees_all_equal(states.params, seeds.params)
+
+
+def test_minibatches_take_every_episode_once_and_one_of_every_block():
+    """Six episodes in two minibatches: blocks 01, 23, 45; all leaves are cut alike."""
+    order = block_order(jax.random.key(3), 6, 2)
+    episodes = jnp.arange(6)
+    steps = jnp.broadcast_to(10 * episodes, (4, 6))  # [T, B]
+    parts, memory = regroup(steps, order, axis=1), regroup(episodes, order, axis=0)
+    assert parts.shape == (2, 4, 3)
+    np.testing.assert_array_equal(parts, np.broadcast_to(10 * memory[:, None], parts.shape))
+    np.testing.assert_array_equal(np.sort(np.ravel(memory)), episodes)
+    np.testing.assert_array_equal(memory // 2, [[0, 1, 2]] * 2)
+
+
+def test_minibatches_differ_between_epochs():
+    orders = {tuple(np.ravel(block_order(jax.random.key(i), 32, 4))) for i in range(8)}
+    assert len(orders) == 8
+
+
+def test_a_method_without_experience_trains():
+    spec = dataclasses.replace(tiny.SPEC, method="rgb")
+    learner = dataclasses.replace(LEARNER, spec=spec, acting=dataclasses.replace(ACTING, setting=None))
+    before = learner.init(jax.random.key(0), PARAMS, PRIORS)
+    after, metrics = jax.jit(learner.update)(before, SCALARS, PARAMS, PRIORS)
+    chex.assert_tree_all_finite((after.params, metrics))
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).sum()), before.params, after.params)
+    assert moved["view"]["kernel"] > 0.0
 
 
 def test_ppo_learns():

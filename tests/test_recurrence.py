@@ -72,9 +72,10 @@ def test_unrolled_gradients(rollout):
     assert np.abs(np.asarray(found[0] - without)).max() > 0.1  # the second decision does teach the kernel
 
 
+@pytest.mark.parametrize("width", [9, 0])
 @pytest.mark.parametrize("shape", [(), (6,), (2, 3, 5)])
-def test_product_has_jaxs_gradients(shape):
-    rows, kernel, by_result = drawn(8, *shape, 9), drawn(9, 9, 4), drawn(10, *shape, 4)
+def test_product_has_jaxs_gradients(shape, width):
+    rows, kernel, by_result = drawn(8, *shape, width), drawn(9, width, 4), drawn(10, *shape, 4)
     value, pull = jax.vjp(product, rows, kernel)
     expected, expected_pull = jax.vjp(jnp.matmul, rows, kernel)
     np.testing.assert_array_equal(value, expected)

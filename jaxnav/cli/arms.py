@@ -147,7 +147,8 @@ class ShardedArms(Arms):
 
         places = [self._place] * len(states), replicated(self._mesh)
         call = jax.jit(train, out_shardings=places, donate_argnums=0)
-        return call.lower(states, self._scalars, params, self._priors).compile()
+        with jax.set_mesh(self._mesh):
+            return call.lower(states, self._scalars, params, self._priors).compile()
 
 
 def _learner(config: RunConfig, env: ObjectNav, setting: Setting | None) -> Learner:

@@ -108,7 +108,7 @@ class RunConfig:
     chunk: int = 8
     save_every: int = 4
     cache: Path = Path("~/.cache/jaxnav")
-    devices: str | None = None
+    devices: int | str | None = None
     worlds: WorldConfig = WorldConfig()
     detector: Detector = Detector()
     layout: LayoutConfig = LayoutConfig()
@@ -158,7 +158,7 @@ def check(config: RunConfig) -> RunConfig:
         need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
     if config.devices is not None:
         forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
-        need(Devices.parse(config.devices) is not None, "devices", repr(config.devices), forms)
+        need(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), forms)
     seeds = {"seed": config.seed, "worlds.seed": config.worlds.seed, "detector.seed": config.detector.seed}
     for name, seed in seeds.items():
         need(0 <= seed < 2**32, name, seed, "give a whole number from 0 to 2**32 - 1")

@@ -72,7 +72,7 @@ def train(config: RunConfig, console: Console) -> None:
 
 def connected(config: RunConfig) -> Mesh | None:
     """The devices that are asked for, other processes joined; None where one is enough."""
-    devices = Devices.parse(config.devices) if config.devices else None
+    devices = None if config.devices is None else Devices.parse(str(config.devices))
     if devices is None:
         return None
     devices.connect()

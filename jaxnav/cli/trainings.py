@@ -82,6 +82,8 @@ def parse_study(arguments: list[str] | None) -> StudyConfig:
             raise InputError(f"{name}: {getattr(config, name)}: give at least 1")
     if not 0 <= config.seed < 2**32:
         raise InputError(f"seed: {config.seed}: give a whole number from 0 to 2**32 - 1")
+    if not isinstance(config.base.devices, int | None):
+        raise InputError(f"base.devices: {config.base.devices}: a study is one process; give a number of devices")
     if config.real is not None and not config.real.is_file():
         raise InputError(f"real: {config.real}: there is no such file")
     return config

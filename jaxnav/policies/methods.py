@@ -63,7 +63,7 @@ class CategoryMaps(nnx.Module):
 
     def __call__(self, rows: jax.Array) -> jax.Array:
         """Maps of the rows of all categories."""
-        return self.maps(self.read(rows))
+        return self.maps(product(rows, self.inner.kernel[...]))
 
 
 class NoExperience(nnx.Module):
@@ -81,7 +81,8 @@ class ORG(nnx.Module):
     """Object relation graph (Du et al., ECCV 2020): relations between categories, given their boxes and the goal.
 
     The table [R^T X | T | g] of K rows, X the appearance and T the boxes of the detected categories, is the experience
-    that the layout weights multiply (eq. 7), before the perceptron that reads it.
+    that the layout weights multiply (eq. 7), before the perceptron that reads it. Its first layer is linear: the
+    weights multiply what has passed it, which is the same.
     """
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:

@@ -82,7 +82,7 @@ class Policy(nnx.Module):
         """Action logits and value from the pathways and the memory.
 
         Where a factual and a counterfactual decision stand in one compiled function, what they share (the products of
-        experience and of memory) is computed once, and what is set to zero not at all.
+        experience and of memory) is computed once.
         """
         drive = self.drive(self.direct_input(pathways) + self.mediated_input(pathways, memory.action))
         hidden = gru(drive, memory.hidden @ self.recurrent_kernel, memory.hidden)

@@ -52,6 +52,9 @@ def unroll(kernel: jax.Array, drive: jax.Array, ended: jax.Array, hidden: jax.Ar
       drive: float32 [T, B, 3 H].
       ended: bool [T, B], the episode ended with this step.
       hidden: float32 [B, H], at the start.
+
+    Returns:
+      The states along the rollout. In reverse mode only, and as to gradients as `Unrolled` has it.
     """
     return _unroll(kernel, drive, ended, hidden)[0]
 

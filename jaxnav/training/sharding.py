@@ -43,7 +43,7 @@ class Devices:
 
     @classmethod
     def parse(cls, text: str) -> "Devices | None":
-        """Read `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`; None if it is neither."""
+        """Read `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`; None if it is none of these."""
         if text == "cluster":
             return cls()
         if re.fullmatch(r"[1-9]\d*", text):
@@ -142,8 +142,10 @@ def check_agreement(text: str) -> None:
     Raises:
       InputError: some do not.
     """
+    if jax.process_count() == 1:
+        return
     digest = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint32)
-    told = multihost_utils.process_allgather(digest) if jax.process_count() > 1 else digest[None]
+    told = multihost_utils.process_allgather(digest)
     if others := [index for index, other in enumerate(told) if (other != told[0]).any()]:
         raise InputError(
             f"config: processes {others} have other settings, scenes or versions than process 0; give all the same"

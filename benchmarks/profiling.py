@@ -1,0 +1,102 @@
+"""Where the time of one training update goes, operation by operation: `python benchmarks/profiling.py [ARM]`.
+
+A compiled chunk of updates of one seed runs under JAX's profiler. Every XLA operation of the trace is looked up in the
+compiled program for its kind, its shape and the part of the program it comes from. Milliseconds are an operation's own,
+summed over an update; operations overlap little, so the sum is near the wall time.
+"""
+
+import collections
+import gzip
+import json
+import re
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import jax
+from _common import report, seconds, spread
+
+from jaxnav.cli.arms import Arms
+from jaxnav.cli.config import RunConfig
+from jaxnav.env.make import make
+from jaxnav.layout import SETTINGS
+from jaxnav.training.calibration import layout_priors
+from jaxnav.training.exploration import explore
+
+CHUNK, RUNS, LONGEST = 4, 5, 15
+OPERATION = re.compile(r"\s*(?:ROOT )?%?([\w.\-]+) = (\S+) ([\w\-]+)\(")
+METADATA = re.compile(r'op_name="([^"]*)"')
+
+
+def main() -> None:
+    arm = sys.argv[1] if len(sys.argv) > 1 else "layout"
+    config = RunConfig(chunk=CHUNK, seeds=1)
+    env, params = make(config.world)
+    counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
+    setting = SETTINGS[config.layout.setting]
+    priors = layout_priors(counts, setting)
+    learner = Arms(config, env, setting, priors).learners[arm]
+    state = jax.jit(learner.init)(jax.random.key(0), params, priors)
+    inputs = state, config.ppo.scalars(config.total_updates), params, priors
+    compiled = jax.jit(partial(learner.train, num_updates=CHUNK)).lower(*inputs).compile()
+    wall = [1e3 * seconds(lambda: compiled(*inputs)) / CHUNK for _ in range(RUNS + 1)][1:]
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            jax.block_until_ready(compiled(*inputs))
+        (trace,) = Path(folder).rglob("*.trace.json.gz")
+        events = json.loads(gzip.decompress(trace.read_bytes()))["traceEvents"]
+    found = operations(compiled.as_text() or "", events, config)
+    kinds: collections.Counter[str] = collections.Counter()
+    for one in found:
+        kinds[one["kind"]] += one["ms"]
+    report(
+        {
+            "arm": arm,
+            "wall_ms_per_update": spread(wall),
+            "ms_by_kind": {kind: round(ms, 1) for kind, ms in kinds.most_common()},
+            "longest": found[:LONGEST],
+        }
+    )
+
+
+def operations(program: str, events: list[dict], config: RunConfig) -> list[dict]:
+    """The operations of a trace, the longest first, with what the program's text says of each."""
+    known = {}
+    for line in program.splitlines():
+        if match := OPERATION.match(line):
+            name, shape, operation = match.groups()
+            origin = METADATA.search(line)
+            known[name] = (shape.split("{")[0], operation, origin[1] if origin else "")
+    spent, calls = collections.Counter(), collections.Counter()
+    for event in events:
+        # Loops and conditions hold other operations, which are there themselves.
+        if event.get("ph") == "X" and known.get(event["name"], ("", "while", ""))[1] not in ("while", "conditional"):
+            spent[event["name"]] += event["dur"]
+            calls[event["name"]] += 1
+    return [
+        {
+            "operation": name,
+            "shape": known[name][0],
+            "kind": kind(known[name][1], name, known[name][2], calls[name] / CHUNK, config),
+            "calls": round(calls[name] / CHUNK),
+            "ms": round(micro / CHUNK / 1e3, 3),
+        }
+        for name, micro in spent.most_common()
+    ]
+
+
+def kind(operation: str, name: str, origin: str, calls: float, config: RunConfig) -> str:
+    """What an operation is for; how often it runs tells the loop that it is in."""
+    backward = "backward" if "transpose(jvp" in origin else "forward"
+    if calls >= config.ppo.minibatches * config.ppo.rollout:
+        return f"loop over steps, {backward}"
+    if calls >= config.ppo.rollout:
+        return "rollout"
+    if operation == "dot" or name.startswith("ynn_fusion"):
+        return f"products, {backward}"
+    return "transposed copies" if "copy" in name or "transpose" in name else f"element by element, {backward}"
+
+
+if __name__ == "__main__":
+    main()
