@@ -4,7 +4,7 @@ An entry's figure is its first call less its second, so it holds tracing and low
 compile anew at every call and their own work is short, so it is their first call. *Cold* is a new process; *cached* is
 a new process that finds JAX's persistent cache (`jax_compilation_cache_dir`) as another one left it. Sizes are the
 defaults of `train.py` and `eval.py`; `train` is the main training step, the compiled chunk of updates that `Arms` runs,
-for each arm alone and for both, which are compiled side by side. The chunk is of 2 updates and one seed is trained, so
+for each arm alone and for both, compiled one after the other. The chunk is of 2 updates and one seed is trained, so
 that the calls are short: neither changes the program but for the length of its loop.
 """
 

@@ -5,7 +5,7 @@ Weak scaling: every device brings as many episodes (half of the default run's), 
 - `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself),
   as one run that shares out two seeds, and as one that shares the episodes of a seed, in turns. As one against apart is
   the price of being one run; apart against alone that of sharing the machine's memory and power. A call does as many
-  updates as the default run's; of the shared episodes, which are slow, it does one.
+  updates as the default run's; where episodes are shared, which is slow, it does one.
 - `all_reduce`: seconds of a mean over both processes by its bytes, its latency and its bandwidth; with each process
   held to one core (`pinned`), where it takes until the scheduler's next tick, and free to use both.
 - `exchanged`: what one call of either exchanges, counted in the compiled program.
@@ -40,7 +40,7 @@ def main() -> None:
 
     from _common import report
 
-    report({"episodes_per_device": EPISODES, **found})
+    report({"episodes_per_device": EPISODES, "updates_per_call": CALL, **found})
 
 
 def pair(role: str, *arguments: str) -> dict:
@@ -107,9 +107,7 @@ def process(address: str, index: str, core: str, folder: str) -> None:
             "to_alone": {name: ratios(taken["alone"], taken[name]) for name in ("apart", *as_one)},
         },
         "all_reduce": {"pinned": sums},
-        "exchanged": {
-            name: {"updates": trainings[name].updates, **collectives(trainings[name].program)} for name in as_one
-        },
+        "exchanged": {name: collectives(trainings[name].program) for name in as_one},
         "update": {
             "rollout_s": round(2 * update["alone"] - update["two_epochs_alone"], 4),
             "learning_s": round(update["two_epochs_alone"] - update["alone"], 4),

@@ -166,7 +166,9 @@ def measured_table(measured: dict) -> str:
 
     free, pinned = measured["all_reduce"]["free"], measured["all_reduce"]["pinned"]
     sums = measured["exchanged"]["shared_episodes"]["all-reduce"]
-    jitter = measured["jitter"]["log_standard_deviation"]
+    seeds = measured["exchanged"]["shared_seeds"].values()
+    calls, arrays = (sum(kind[unit] for kind in seeds) for unit in ("calls", "arrays"))
+    jitter, megabytes = measured["jitter"]["log_standard_deviation"], free["bytes_per_s"] / 1e6
     return "\n".join(
         [
             "| weak scaling | steps/s | efficiency |",
@@ -189,14 +191,12 @@ def measured_table(measured: dict) -> str:
             "| :-- | --: |",
             f"| an update alone: rollout, learning | {own['rollout_s']:.3f} s, {own['learning_s']:.3f} s |",
             f"| parameters | {own['parameter_bytes']:,} bytes |",
-            f"| sums in an update of one seed | {sums['calls']}, of {sums['arrays']} arrays |",
-            f"| bytes of these together | {sums['bytes']:,} |",
-            f"| a sum of an array (gloo), each process held to one core | {1e6 * pinned['latency_s']:.0f} us |",
-            f"| the same, free to use both | {1e6 * free['latency_s']:.0f} us |",
-            f"| bandwidth then | {free['bytes_per_s'] / 1e6:,.0f} MB/s |",
+            f"| sums in an update of one seed | {sums['calls']}, of {sums['arrays']} arrays, {sums['bytes']:,} bytes |",
+            f"| exchanges in {measured['updates_per_call']} updates of a seed each | {calls}, of {arrays} arrays |",
+            f"| a sum of an array (gloo), each process held to one core | {1e6 * pinned['latency_s']:,.0f} us |",
+            f"| the same, free to use both; bandwidth | {1e6 * free['latency_s']:.0f} us, {megabytes:,.0f} MB/s |",
             f"| noise between two minibatches, log-normal sigma | {jitter:.3f} |",
-            f"| join, compile | {own['join_s']:.1f} s, {own['compile_s']:.1f} s |",
-            f"| save, log a row | {own['save_s']:.2f} s, {1e6 * own['log_s']:.0f} us |",
+            f"| join, compile, save | {own['join_s']:.1f} s, {own['compile_s']:.1f} s, {own['save_s']:.2f} s |",
         ]
     )
 

@@ -18,7 +18,7 @@ from jaxnav.layout import SETTINGS
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
 
-SIDE, PRODUCTS, TURNS = 1024, 16, 15
+SIDE, PRODUCTS, TURNS = 1024, 16, 31
 GOALS = {"learning_over_f32_peak": 0.45, "rollout_share_of_update": 0.35}
 
 

@@ -24,13 +24,14 @@ TOLERANCE = 1e-5
 
 # Two seeds on one device, on two (a seed each) and on four (a pair for each seed, which shares its episodes).
 AGREEMENT = """
-import dataclasses, json, sys
+import contextlib, dataclasses, json, sys
 import jax, numpy as np
 import tiny
 from jaxnav.cli.arms import Arms, ShardedArms
 from jaxnav.cli.config import RunConfig
 from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS
+from jaxnav.policies.product import product
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.sharding import Devices
 
@@ -58,7 +59,17 @@ def policies(count):
         for state, values in zip(states["layout"], metrics["layout"])
     ]
 
+def collectives(within):
+    # What a kernel's gradient exchanges whose rows' episodes are shared by two devices.
+    mesh = Devices(count=2).mesh(seeds=1, num_envs=16, minibatches=2)
+    place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "episodes"))
+    rows, kernel = jax.device_put(np.ones((6, 16, 3), np.float32), place), np.ones((3, 5), np.float32)
+    with jax.set_mesh(mesh) if within else contextlib.nullcontext():
+        text = jax.jit(jax.grad(lambda k, r: product(r, k).sum())).lower(kernel, rows).compile().as_text()
+    return {name: name + "(" in text for name in ("all-gather", "all-reduce")}
+
 found = {count: policies(count) for count in map(int, sys.argv[1:])}
+found |= {"within": collectives(True), "without": collectives(False)}
 try:
     Devices(count=4).mesh(seeds=2, num_envs=18, minibatches=2)
 except InputError as error:
@@ -107,6 +118,13 @@ def test_another_seed_is_another_policy():
     assert distance(*trained(1, 4)["1"]) > 100 * TOLERANCE
 
 
+def test_devices_share_episodes_without_gathering_them():
+    """Only sums are exchanged; without the mesh made known, the rows are made one axis and gathered."""
+    found = trained(1, 4)
+    assert found["within"] == {"all-gather": False, "all-reduce": True}
+    assert found["without"]["all-gather"]
+
+
 def test_devices_that_cannot_be_shared_out_are_refused():
     assert trained(1, 4)["refused"] == (
         "config: ppo.num_envs is 18; with 4 devices for 2 seeds the episodes of each are shared by 2: "
@@ -129,7 +147,8 @@ def test_devices_are_read(text, devices):
 @pytest.mark.parametrize("text", ["0", "-1", "two", "host:1,2,2", "host,0,2", "host:1,0", ""])
 def test_other_devices_are_refused(text, tmp_path, capsys):
     assert train(write_config(tmp_path), tmp_path / "run", f"--devices={text}") == 2
-    assert f"devices is {text!r}; give a number, `cluster` or HOST:PORT,INDEX,PROCESSES" in refusal(capsys)
+    message = refusal(capsys).replace("'", "")  # what reads as a number is not quoted
+    assert f"devices is {text}; give a number, `cluster` or HOST:PORT,INDEX,PROCESSES" in message
 
 
 def test_more_devices_than_there_are_are_refused(tmp_path, capsys):
