@@ -1,14 +1,15 @@
 """Where the time of one training update goes, operation by operation: `python benchmarks/profiling.py [ARM]`.
 
 A compiled chunk of updates of one seed runs under JAX's profiler. Every XLA operation of the trace is looked up in the
-compiled program for its kind, its shape and the part of the program it comes from. Milliseconds are an operation's own,
-summed over an update; operations overlap little, so the sum is near the wall time.
+compiled program for its kind, its shape and the part of the program it comes from. Milliseconds are of an update: the
+median of an operation's runs times their number, so that a disturbance of some does not count.
 """
 
 import collections
 import gzip
 import json
 import re
+import statistics
 import sys
 import tempfile
 from functools import partial
@@ -68,22 +69,22 @@ def operations(program: str, events: list[dict], config: RunConfig) -> list[dict
             name, shape, operation = match.groups()
             origin = METADATA.search(line)
             known[name] = (shape.split("{")[0], operation, origin[1] if origin else "")
-    spent, calls = collections.Counter(), collections.Counter()
+    runs: dict[str, list[float]] = collections.defaultdict(list)
     for event in events:
         # Loops and conditions hold other operations, which are there themselves.
         if event.get("ph") == "X" and known.get(event["name"], ("", "while", ""))[1] not in ("while", "conditional"):
-            spent[event["name"]] += event["dur"]
-            calls[event["name"]] += 1
-    return [
+            runs[event["name"]].append(event["dur"])
+    found = [
         {
             "operation": name,
             "shape": known[name][0],
-            "kind": kind(known[name][1], name, known[name][2], calls[name] / CHUNK, config),
-            "calls": round(calls[name] / CHUNK),
-            "ms": round(micro / CHUNK / 1e3, 3),
+            "kind": kind(known[name][1], name, known[name][2], len(own) / CHUNK, config),
+            "calls": round(len(own) / CHUNK),
+            "ms": round(statistics.median(own) * len(own) / CHUNK / 1e3, 3),
         }
-        for name, micro in spent.most_common()
+        for name, own in runs.items()
     ]
+    return sorted(found, key=lambda one: -one["ms"])
 
 
 def kind(operation: str, name: str, origin: str, calls: float, config: RunConfig) -> str:
