@@ -1,7 +1,7 @@
 """jaxnav's trainer as a process: `python benchmarks/_jaxnav_worker.py ARM EPOCHS MINIBATCHES UPDATES`.
 
-ARM is `baseline` (the method without layout; its loss is PPO's alone) or `layout` (the default of `train.py`: the
-layout estimator runs beside the rollout, and the counterfactual branch is distilled).
+ARM is `baseline` (the method without layout; its loss is PPO's alone) or `layout` (the layout estimator runs beside the
+rollout, with the gap that `train.py` leaves out, and the counterfactual branch is distilled).
 """
 
 import dataclasses

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from _common import rates, ratios, report
+from _common import TUNED_ALLOCATOR, rates, ratios, report
 
 EPISODES, TURNS, PATIENCE_S = 2048, 7, 150
 HOME = Path(__file__).parents[1] / ".cache" / "peers"
@@ -33,12 +33,7 @@ PINS = {
 }
 KINDS = {
     "like_for_like": {},
-    "tuned": {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
-        "MALLOC_MMAP_THRESHOLD_": "8589934592",
-        "MALLOC_TRIM_THRESHOLD_": "8589934592",
-        "MALLOC_TOP_PAD_": "268435456",
-    },
+    "tuned": {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", **TUNED_ALLOCATOR},
 }
 
 

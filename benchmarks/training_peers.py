@@ -17,18 +17,13 @@ import sys
 import venv
 from pathlib import Path
 
-from _common import in_turns, rates, ratios, report
+from _common import TUNED_ALLOCATOR, in_turns, rates, ratios, report
 
 from jaxnav.training.config import PPOConfig
 
 HERE = Path(__file__).parent
 PEERS = HERE.parent / ".cache" / "peers"
 PINNED = ("rejax==0.1.3", "gymnax==0.0.9", "jax==0.10.2", "jaxlib==0.10.2", "flax==0.12.8")
-TUNED = {
-    "MALLOC_MMAP_THRESHOLD_": "8589934592",
-    "MALLOC_TRIM_THRESHOLD_": "8589934592",
-    "MALLOC_TOP_PAD_": "268435456",
-}
 TURNS = 5
 OURS, DEFAULT = "jaxnav, baseline", "jaxnav, layout and distillation"
 REJAX, LEAN, RECURRENT = "rejax, two torsos", "rejax, linear critic", "purejaxrl style"
@@ -54,10 +49,10 @@ class Trainer:
     def __init__(self, name: str, allocator: str, *settings: int) -> None:
         script, *kind = SCRIPTS[name]
         python = PEERS / "rejax" / "bin" / "python" if name in (REJAX, LEAN) else sys.executable
-        kept = {key: value for key, value in os.environ.items() if key not in TUNED}
+        kept = {key: value for key, value in os.environ.items() if key not in TUNED_ALLOCATOR}
         self._process = subprocess.Popen(
             [python, HERE / script, *kind, *map(str, settings)],
-            env=kept | {"PYTHONPATH": str(HERE.parent)} | (TUNED if allocator == "tuned" else {}),
+            env=kept | {"PYTHONPATH": str(HERE.parent)} | (TUNED_ALLOCATOR if allocator == "tuned" else {}),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
