@@ -12,7 +12,7 @@ from jaxnav.env.types import EnvParams, Observation, State
 from jaxnav.policies.features import NUM_FEATURES, features
 from jaxnav.policies.policy import SELDOM
 from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.tables.observation_row import RowLayout
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.types import EnvParams
 from jaxnav.policies.policy import bind
+from jaxnav.runs.config import RunConfig
+from jaxnav.training.collect import rollout
 from jaxnav.training.learner import Learner
-from jaxnav.training.rollout import rollout
+from jaxnav.training.trainer import Arms
 
 
 class Program(NamedTuple):

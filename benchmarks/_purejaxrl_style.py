@@ -18,7 +18,7 @@ from flax.training.train_state import TrainState
 
 from jaxnav.env.make import make
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.tables.observation_row import RowLayout
 from jaxnav.training.config import PPOConfig
 
 SPEC = PolicySpec()

@@ -17,7 +17,7 @@ from rejax.networks import DiscretePolicy
 
 from jaxnav.env.make import make
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.tables.observation_row import RowLayout
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 

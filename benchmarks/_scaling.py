@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxnav.cli.arms import ShardedArms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig
 from jaxnav.store.checkpoint import save
 from jaxnav.store.runlog import append_row
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import ShardedArms
 
 
 class Training:

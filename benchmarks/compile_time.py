@@ -23,8 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from _common import report, seconds
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.objectnav import NUM_PRIORS, build
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import Evaluator, first_states
@@ -34,10 +32,12 @@ from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.policy import init_params
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.compile import compile_bank
+from jaxnav.runs.config import RunConfig
+from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.worlds import WORLDS, generated
 from jaxnav.training.calibration import calibrate, layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import Arms
 
 EPISODES, CHUNK = 2048, 2
 GOALS = {"train_both_arms_cold_s": 15.0}

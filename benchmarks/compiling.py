@@ -5,7 +5,7 @@ import time
 
 from _common import report
 
-from jaxnav.scenes.compile import compile_scene
+from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.worlds import WORLDS, generated
 
 REPEATS = 7

@@ -19,15 +19,15 @@ import numpy as np
 from _common import peak_resident_gb, report, seconds, spread
 from _phases import Program, program, update
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig, WorldConfig
 from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav, build
 from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
-from jaxnav.scenes.compile import Bank, compile_bank
+from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.worlds import generated
 from jaxnav.training.calibration import layout_priors
+from jaxnav.training.trainer import Arms
 
 ARM = "layout"
 AXES = {

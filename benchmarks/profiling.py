@@ -18,12 +18,12 @@ from pathlib import Path
 import jax
 from _common import report, seconds, spread
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import Arms
 
 CHUNK, RUNS, LONGEST = 4, 5, 15
 OPERATION = re.compile(r"\s*(?:ROOT )?%?([\w.\-]+) = (\S+) ([\w\-]+)\(")

@@ -68,7 +68,7 @@ def process(address: str, index: str, core: str, folder: str) -> None:
     from _scaling import Training, collectives, local_mesh, log_spread
     from jax.experimental.multihost_utils import sync_global_devices
 
-    from jaxnav.training.sharding import Devices, first_process
+    from jaxnav.training.devices import Devices, first_process
 
     devices = Devices(address=address, process=int(index), processes=2)
     devices.connect()
@@ -133,7 +133,7 @@ def means(mesh) -> dict:
 
 def network(address: str, index: str, _: str) -> None:
     """One of two processes on any core that only take means."""
-    from jaxnav.training.sharding import Devices
+    from jaxnav.training.devices import Devices
 
     devices = Devices(address=address, process=int(index), processes=2)
     devices.connect()
@@ -145,7 +145,7 @@ def simulated() -> None:
     from _common import in_turns, rates, ratios
     from _scaling import Training
 
-    from jaxnav.training.sharding import Devices
+    from jaxnav.training.devices import Devices
 
     trainings = {n: Training(Devices(count=n).mesh(1, n * EPISODES // 2, 1), n * EPISODES // 2) for n in (1, 2, 4)}
     taken = in_turns({str(n): training.train for n, training in trainings.items()}, TURNS)

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 from _common import in_turns, rates, ratios, report
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig
 from jaxnav.training.calibration import layout_priors
+from jaxnav.training.trainer import Arms
 
 ARM, SEEDS, TURNS = "layout", (1, 2, 4, 8), 5
 GOALS = {"8_seeds_together_over_apart": 0.95}

@@ -15,12 +15,12 @@ from pathlib import Path
 from _common import report
 from rich.console import Console
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig, WorldConfig
 from jaxnav.cli.train import explored
-from jaxnav.cli.worlds import bank_order, read_ahead, training_world
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig, WorldConfig
+from jaxnav.runs.worlds import bank_order, read_ahead, training_world
 from jaxnav.training.calibration import layout_priors
+from jaxnav.training.trainer import Arms
 
 TURNS, CHUNK = 7, 8
 

@@ -14,17 +14,17 @@ import numpy as np
 from _common import in_turns, ratios, report, seconds, spread
 from rich.console import Console
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
-from jaxnav.cli.worlds import evaluation_world, training_world
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import Evaluator
 from jaxnav.evaluation.inference import Inference
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.acting import Acting
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.worlds import evaluation_world, training_world
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import Arms
 
 ARM, EPSILONS, SEEDS, EPISODES = "layout", [round(0.1 * i, 1) for i in range(11)], 8, 128
 UPDATES, TURNS, COMPILED = 12, 3, 2

@@ -21,13 +21,13 @@ from _phases import phases
 
 import jaxnav.cli.eval
 import jaxnav.cli.train
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.cli.options import parse
 from jaxnav.env.make import make
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import Arms
 
 TIMED: dict[str, tuple[tuple[Any, str], ...]] = {
     "scenes": ((jaxnav.cli.train, "training_world"), (jaxnav.cli.eval, "evaluation_world")),

@@ -10,12 +10,12 @@ import jax
 from _common import in_turns, peak_resident_gb, rates, report
 from _phases import program
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import Arms
 
 CHUNK, TURNS = 4, 5
 

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from _common import in_turns, ratios, report, spread
 from _phases import phases
 
-from jaxnav.cli.arms import Arms
-from jaxnav.cli.config import RunConfig
 from jaxnav.env.make import make
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.config import RunConfig
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import explore
+from jaxnav.training.trainer import Arms
 
 SIDE, PRODUCTS, TURNS = 1024, 16, 31
 GOALS = {"learning_over_f32_peak": 0.45, "rollout_share_of_update": 0.35}

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from exact import exact_kl
 from hypothesis import given
 from scipy.special import digamma
+from support.dirichlet import exact_kl
 
 from jaxnav.layout import SETTINGS, LayoutEstimator, LayoutState, Setting, prior_from_counts
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-import tiny
+from support import tiny_world as tiny
 
 import jaxnav
 from jaxnav.__main__ import main

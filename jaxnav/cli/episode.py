@@ -10,17 +10,17 @@ import tyro
 from rich.console import Console
 
 from jaxnav.cli.command import exit_code
-from jaxnav.cli.runs import load_policies, load_run
-from jaxnav.cli.worlds import evaluation_world
 from jaxnav.env.types import State
 from jaxnav.errors import InputError
-from jaxnav.evaluation.draw import Episode, draw_episode
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
+from jaxnav.runs.directory import load_policies, load_run
+from jaxnav.runs.worlds import evaluation_world
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.sight import cell_centres
+from jaxnav.scenes.tables.visibility import cell_centres
+from jaxnav.viz.episode import Episode, draw_episode
 
 
 @dataclasses.dataclass(frozen=True)

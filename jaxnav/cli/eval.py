@@ -11,14 +11,12 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from jaxnav.baselines.shortest_path import oracle_outcome
 from jaxnav.cli.command import exit_code, result_console
-from jaxnav.cli.runs import load_policies, load_run, settings
-from jaxnav.cli.worlds import evaluation_shift, evaluation_world, read_ahead
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Outcome, evaluate_grid
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.oracle import oracle_outcome
 from jaxnav.evaluation.report import (
     Form,
     build_difference,
@@ -30,6 +28,8 @@ from jaxnav.evaluation.report import (
 )
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.policies.acting import Acting
+from jaxnav.runs.directory import load_policies, load_run, settings
+from jaxnav.runs.worlds import evaluation_shift, evaluation_world, read_ahead
 from jaxnav.store.files import write_atomic
 
 

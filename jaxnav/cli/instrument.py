@@ -9,24 +9,24 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from jaxnav.baselines.difficulty import expected_length, random_success
+from jaxnav.baselines.frontier import frontier_outcome
 from jaxnav.cli.command import exit_code, result_console
-from jaxnav.cli.config import RunConfig
-from jaxnav.cli.runs import Policies, load_policies, load_run, settings
-from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
-from jaxnav.cli.worlds import CompiledWorld, evaluation_world, read_ahead
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
-from jaxnav.evaluation.dial import Totals, compare, console_table, verdicts
-from jaxnav.evaluation.difficulty import expected_length, random_success
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
-from jaxnav.evaluation.frontier import frontier_outcome
 from jaxnav.evaluation.grid import evaluate_grid
 from jaxnav.evaluation.report import FORMAT, versions, write_report
 from jaxnav.evaluation.similarity import layout_gap, layout_similarity, scene_counts
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.directory import Policies, load_policies, load_run, settings
+from jaxnav.runs.worlds import CompiledWorld, evaluation_world, read_ahead
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.compile import Bank
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.study.config import StudyConfig, ensure, parse_study, training
+from jaxnav.study.dial import Totals, compare, console_table, verdicts
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import tyro
 
-from jaxnav.cli.overlay import apply_yaml
+from jaxnav.runs.overlay import apply_yaml
 
 Config = TypeVar("Config")
 

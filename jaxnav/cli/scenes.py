@@ -5,9 +5,9 @@ import sys
 import tyro
 
 from jaxnav.cli.command import exit_code, result_console
-from jaxnav.cli.importing import ImportConfig, import_scenes
 from jaxnav.cli.showing import ShowConfig, show_scene
 from jaxnav.cli.telling import StatsConfig, tell_statistics
+from jaxnav.scenes.files.importing import ImportConfig, import_scenes
 
 COMMANDS = {"import": ImportConfig, "show": ShowConfig, "stats": StatsConfig}
 

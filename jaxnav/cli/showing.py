@@ -21,17 +21,17 @@ from rich.console import Console
 
 from jaxnav.cli.telling import Source
 from jaxnav.errors import InputError
-from jaxnav.evaluation.draw import AGENT, ARROW, SEEN
-from jaxnav.evaluation.plan import GOAL, HEIGHTS, INK, PALE, TALL, WALL, draw_room, extent, scene_size, view_cone
 from jaxnav.scenes.categories import category_ids
-from jaxnav.scenes.compile import compile_scene
-from jaxnav.scenes.detector import PERFECT
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, RowLayout
 from jaxnav.scenes.scene import CELL, Scene
-from jaxnav.scenes.sight import cell_centres
+from jaxnav.scenes.tables.compile import compile_scene
+from jaxnav.scenes.tables.detector import PERFECT
+from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, RowLayout
+from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import Rules, Task
 from jaxnav.store.files import write_atomic
+from jaxnav.viz.episode import AGENT, ARROW, SEEN
+from jaxnav.viz.plan import GOAL, HEIGHTS, INK, PALE, TALL, WALL, draw_room, extent, scene_size, view_cone
 
 DPI = 120
 # Inches: the plan is as large as fits between these sides, the panel beside it.

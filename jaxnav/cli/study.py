@@ -10,13 +10,13 @@ from typing import Any
 from rich.console import Console
 
 from jaxnav.cli.command import exit_code
-from jaxnav.cli.conditions import Bench, chosen, gaps, table
 from jaxnav.cli.instrument import instrument_report, of_study
-from jaxnav.cli.trainings import StudyConfig, ensure, parse_study, training
-from jaxnav.evaluation.document import check_document, write_document
 from jaxnav.evaluation.report import FORMAT, versions
-from jaxnav.evaluation.study import draw
 from jaxnav.store.files import write_atomic
+from jaxnav.study.config import StudyConfig, ensure, parse_study, training
+from jaxnav.study.document import check_document, write_document
+from jaxnav.study.measure import Bench, chosen, gaps, table
+from jaxnav.study.results import draw
 
 #: Runs that have every trial, and those whose worlds are proved as instruments and whose gaps are followed.
 FULL, PROVED = ("main", "goal", "real"), ("main", "real")

@@ -12,17 +12,17 @@ from rich.progress import track
 from rich.table import Table
 from rich.text import Text
 
-from jaxnav.cli.runs import load_policies, load_run
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
-from jaxnav.evaluation.plan import scene_size
 from jaxnav.evaluation.similarity import layout_gap, layout_similarity, seen_together
+from jaxnav.runs.directory import load_policies, load_run
 from jaxnav.scenes.categories import ROOM_TYPES, category_ids, unknown_types
-from jaxnav.scenes.compile import compile_scene
-from jaxnav.scenes.rows import RowLayout
 from jaxnav.scenes.scene import SPLITS, Scene
+from jaxnav.scenes.tables.compile import compile_scene
+from jaxnav.scenes.tables.observation_row import RowLayout
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
+from jaxnav.viz.plan import scene_size
 
 _PAIRS = 15
 

@@ -11,21 +11,21 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxnav.cli.arms import Arms, ShardedArms, States
 from jaxnav.cli.command import exit_code
-from jaxnav.cli.config import RunConfig, check
 from jaxnav.cli.options import parse
-from jaxnav.cli.runs import LOG_FILE, POLICIES, claim, settings
-from jaxnav.cli.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.layout import SETTINGS, Setting
+from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.directory import LOG_FILE, POLICIES, claim, settings
+from jaxnav.runs.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.export import export_params
 from jaxnav.store.manifest import make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout_priors
+from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
 from jaxnav.training.exploration import Exploration, explore
-from jaxnav.training.sharding import Devices, by_first_process, check_agreement, first_process
+from jaxnav.training.trainer import Arms, ShardedArms, States
 
 _EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
 

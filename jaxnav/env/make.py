@@ -5,7 +5,7 @@ from pathlib import Path
 from jaxnav.env.objectnav import ObjectNav, build
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
-from jaxnav.scenes.compile import compile_bank
+from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, from_file, generated
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxnav.env.types import EnvParams, Observation, State, StepResult, Tables
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.compile import Bank
-from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.scenes.tables.observation_row import RowLayout
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
 #: Index of the layout prior that all room types outside `ROOM_TYPES` share, and the number of priors.

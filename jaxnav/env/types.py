@@ -7,7 +7,7 @@ from flax import struct
 
 
 class Tables(struct.PyTreeNode):
-    """A bank of scenes on the device; see `jaxnav.scenes.compile.Bank` for the shapes."""
+    """A bank of scenes on the device; see `jaxnav.scenes.tables.compile.Bank` for the shapes."""
 
     ahead: jax.Array
     rows: jax.Array
@@ -56,7 +56,7 @@ class Observation(struct.PyTreeNode):
     """What the agent perceives.
 
     Attributes:
-      row: uint8 [R], the packed row of the pose (see `jaxnav.scenes.rows.RowLayout`).
+      row: uint8 [R], the packed row of the pose (see `jaxnav.scenes.tables.observation_row.RowLayout`).
       goal: int32 [], category that is sought.
     """
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.compile import Bank
+from jaxnav.scenes.tables.compile import Bank
 
 
 class EpisodeList(NamedTuple):

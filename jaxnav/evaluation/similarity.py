@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxnav.scenes.compile import Bank
-from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.scenes.tables.observation_row import RowLayout
 
 #: Share of the uniform distribution in both sides of the layout gap, so that it stays finite.
 UNIFORM = 0.05

@@ -5,7 +5,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxnav.scenes.rows import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, VIEW_BLOCKED, VIEW_FREE, RowLayout
+from jaxnav.scenes.tables.observation_row import (
+    AHEAD_SCALE,
+    RIGHT_SCALE,
+    SIZE_SCALE,
+    VIEW_BLOCKED,
+    VIEW_FREE,
+    RowLayout,
+)
 
 NUM_FEATURES = 9  # per category, the goal flag included
 CONFIDENCE = 1  # which of them is the detection's confidence, 0 to 1

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from jaxnav.numerics.product import Linear, biased, product
 from jaxnav.policies.features import NUM_FEATURES, Features
-from jaxnav.policies.product import Linear, biased, product
 from jaxnav.policies.spec import PolicySpec
 
 

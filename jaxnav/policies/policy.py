@@ -18,13 +18,13 @@ import numpy as np
 from flax import nnx
 
 from jaxnav.env.types import Observation
+from jaxnav.numerics.product import Linear, biased, product
+from jaxnav.numerics.recurrence import gru
 from jaxnav.policies.features import CONFIDENCE, NUM_FEATURES, features
 from jaxnav.policies.methods import METHODS, CategoryMaps
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
-from jaxnav.policies.product import Linear, biased, product
-from jaxnav.policies.recurrence import gru
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.rows import RowLayout
+from jaxnav.scenes.tables.observation_row import RowLayout
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 Params = dict[str, Any]

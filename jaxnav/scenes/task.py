@@ -12,7 +12,7 @@ from jaxnav.scenes.categories import (
     ROBOTHOR_CATEGORIES,
     ROBOTHOR_GOALS,
 )
-from jaxnav.scenes.detector import Detector
+from jaxnav.scenes.tables.detector import Detector
 
 NUM_ACTIONS = 6
 MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTIONS)

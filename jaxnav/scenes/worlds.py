@@ -8,11 +8,11 @@ from typing import Protocol
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
-from jaxnav.scenes.homes import generate_apartment, generate_house
-from jaxnav.scenes.io import read_scenes
-from jaxnav.scenes.record import read_bytes
-from jaxnav.scenes.relabel import relabel
-from jaxnav.scenes.rooms import generate_room_at
+from jaxnav.scenes.files.record import read_bytes
+from jaxnav.scenes.files.scene_file import read_scenes
+from jaxnav.scenes.generate.homes import generate_apartment, generate_house
+from jaxnav.scenes.generate.relabel import relabel
+from jaxnav.scenes.generate.rooms import generate_room_at
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
 

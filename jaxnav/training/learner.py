@@ -12,9 +12,9 @@ from jaxnav.env.types import EnvParams
 from jaxnav.policies.acting import Acting, Agent
 from jaxnav.policies.policy import Params, bind, init_params
 from jaxnav.policies.spec import PolicySpec
+from jaxnav.training.collect import Transition, rollout
 from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
-from jaxnav.training.losses import advantages, ppo_loss
-from jaxnav.training.rollout import Transition, rollout
+from jaxnav.training.loss import advantages, ppo_loss
 
 _INIT, _START, _UPDATES = range(3)  # purposes of a seed's keys
 _ROLLOUT, _SHUFFLE, _RESTART = range(3)  # purposes of an update's keys

@@ -1,0 +1,1 @@
+"""Agents that learn nothing: shortest path, frontier search, uniformly random."""

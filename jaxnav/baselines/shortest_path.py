@@ -1,0 +1,69 @@
+"""The shortest-path oracle: it knows the way, walks it in the environment, and so checks environment and metrics."""
+
+import functools
+from collections.abc import Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.env.objectnav import ObjectNav
+from jaxnav.env.types import EnvParams, State
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.grid import Outcome, first_states
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.scenes.task import DONE, MOVE_AHEAD
+
+
+def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
+    """A shortest sequence of actions for each episode, int32 [T, E], its Done repeated up to the longest one."""
+    successor, goal = bank.successor, episodes.goal
+    pose, left, actions = episodes.pose, episodes.best_length, []
+    while (left > 0).any():
+        after = successor[pose]
+        nearer = bank.best_length[after[:, :DONE], goal[:, None]] == (left - 1)[:, None]
+        action = np.where(left > 1, nearer.argmax(axis=1), DONE)
+        pose, left = after[np.arange(len(pose)), action], np.maximum(left - 1, 0)
+        actions.append(action)
+    return np.array(actions, np.int32)
+
+
+def oracle_outcome(
+    banks: Iterable[Bank], lists: Sequence[EpisodeList], params: Iterable[EnvParams], env: ObjectNav
+) -> Outcome:
+    """What the environment makes of the oracle's actions, leaves [E] over the episodes of all banks.
+
+    Args:
+      banks: of scenes.
+      lists: episodes in each.
+      params: the environment's, bank by bank.
+      env: the environment.
+    """
+    actions = [oracle_actions(bank, episodes) for bank, episodes in zip(banks, lists, strict=True)]
+    longest = max(map(len, actions))
+    padded = [np.pad(steps, ((0, longest - len(steps)), (0, 0)), constant_values=DONE) for steps in actions]
+    outcomes = [
+        replay(jnp.asarray(steps), first_states(episodes), own, env)
+        for steps, episodes, own in zip(padded, lists, params, strict=True)
+    ]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *outcomes)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) -> Outcome:
+    """What the environment makes of fixed actions int32 [T, E] from states [E]; leaves [E]."""
+
+    def step(carry: tuple[State, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
+        state, running, outcome = carry
+        found = jax.vmap(env.found, (0, None))(state, params)
+        state, _, terminated, truncated = jax.vmap(env.advance, (0, 0, None))(state, action, params)
+        outcome = outcome._replace(
+            success=outcome.success | (running & terminated & found),
+            length=outcome.length + running.astype(jnp.int32),
+            moves=outcome.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
+        )
+        return (state, running & ~terminated & ~truncated, outcome), None
+
+    first = (state, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))
+    (state, _, outcome), _ = jax.lax.scan(step, first, actions)
+    return outcome._replace(distance=params.tables.goal_distance[env.cell(state.pose), state.goal])

@@ -1,0 +1,1 @@
+"""Divergences and linear and recurrent products, with their gradients."""

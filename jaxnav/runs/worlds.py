@@ -1,0 +1,145 @@
+"""The scenes of a run: compiled in memory, or as shards on disk where there are many."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from jaxnav.runs.config import RunConfig
+from jaxnav.env.objectnav import ObjectNav, build
+from jaxnav.env.types import EnvParams
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import unknown_types
+from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank
+from jaxnav.scenes.tables.shards import Shards, compile_shards
+from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
+
+
+@dataclasses.dataclass(frozen=True)
+class CompiledWorld:
+    """The scenes of one split, compiled.
+
+    Attributes:
+      scenes: as read or generated.
+      env: the environment.
+      banks: their tables; one in memory, or several that stay on disk until they are used.
+      step_limits: actions of an episode by room type.
+      step_limit: the same in other rooms.
+      num_cells, num_scenes: of the largest bank.
+      fingerprint: text that differs wherever the banks differ.
+    """
+
+    scenes: Scenes
+    env: ObjectNav
+    banks: Sequence[Bank] | Shards
+    step_limits: dict[str, int]
+    step_limit: int
+    num_cells: int
+    num_scenes: int
+    fingerprint: str
+
+    def params(self, index: int) -> EnvParams:
+        """The environment's parameters with one of the banks, all of equal shape."""
+        return build(self.banks[index], self.step_limits, self.step_limit, self.num_cells, self.num_scenes)[1]
+
+
+def training_world(config: RunConfig, console: Console) -> CompiledWorld:
+    """The training scenes of a run."""
+    scenes = _scenes(config, "train", config.scenes, config.worlds.shift, console)
+    return _compiled(config, scenes, {}, config.train_step_limit, console)
+
+
+def evaluation_world(
+    config: RunConfig, split: str, scenes: Path | None, shift: float | None, console: Console
+) -> CompiledWorld:
+    """The scenes to evaluate a run in: one split of its own world or file, or of another file, or at another shift.
+
+    Raises:
+      InputError: bad scene file, no scene of the split, or a bad shift.
+    """
+    world = WORLDS[config.world]
+    limits = {"living_room": config.worlds.large_step_limit or world.large_step_limit}
+    limit = config.worlds.step_limit or world.step_limit
+    chosen = _scenes(config, split, scenes or config.scenes, evaluation_shift(config, scenes, shift), console)
+    return _compiled(config, chosen, limits, limit, console)
+
+
+def evaluation_shift(config: RunConfig, scenes: Path | None, shift: float | None) -> float:
+    """The shift that is asked for, else the run's own; another file is taken as it is."""
+    if shift is not None:
+        return shift
+    return 0.0 if scenes else config.worlds.shift
+
+
+def _scenes(config: RunConfig, split: str, path: Path | None, shift: float, console: Console) -> Scenes:
+    if path is None:
+        return generated(config.world, split, getattr(config.worlds, f"num_{split}"), config.worlds.seed, shift)
+    scenes = from_file(path, split, shift, config.worlds.seed, config.task.categories)
+    if counts := unknown_types(scenes.scenes, config.task.categories):
+        types = ", ".join(f"{name} x {count}" for name, count in counts.most_common(5))
+        rest = f" and {len(counts) - 5} more" if len(counts) > 5 else ""
+        console.print(f"{path}: types that are no category and only block the sight: {types}{rest}", soft_wrap=True)
+    return scenes
+
+
+def _compiled(
+    config: RunConfig, scenes: Scenes, step_limits: dict[str, int], step_limit: int, console: Console
+) -> CompiledWorld:
+    task, shard_scenes = config.task, config.worlds.shard_scenes
+    env = ObjectNav(task, WORLDS[config.world].shaping if config.worlds.shaping is None else config.worlds.shaping)
+    if len(scenes) <= shard_scenes:
+        bank = compile_bank((scenes[i] for i in range(len(scenes))), task)
+        console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{_left_out(bank.skipped)}")
+        about = len(bank.ahead), len(bank.names), f"{checksum(bank):08x}"
+        return CompiledWorld(scenes, env, (bank,), step_limits, step_limit, *about)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(f"compiling {len(scenes):,} scenes")
+
+        def report(done: int, total: int) -> None:
+            progress.update(bar, completed=done, total=total)
+
+        try:
+            shards = compile_shards(scenes, task, shard_scenes, config.cache.expanduser(), report)
+        except OSError as error:
+            raise InputError(f"--cache {config.cache}: {error.strerror}; give another folder, or make room") from error
+    if config.chunk * config.ppo.rollout < config.train_step_limit:
+        raise InputError(
+            f"config: chunk is {config.chunk}; where scenes are streamed it must last for a whole episode: give at "
+            f"least {-(-config.train_step_limit // config.ppo.rollout)}"
+        )
+    size = sum(file.stat().st_size for file in shards.folder.rglob("*.npy")) / 1e9
+    console.print(
+        f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size:.2f} GB in {shards.folder}"
+        f"{_left_out(shards.skipped)}",
+        soft_wrap=True,
+    )
+    about = shards.num_cells, shards.num_scenes, f"{shards.checksum:08x}"
+    return CompiledWorld(scenes, env, shards, step_limits, step_limit, *about)
+
+
+def _left_out(skipped: Sequence[str]) -> str:
+    return f" ({len(skipped)} scenes without a goal left out)" if skipped else ""
+
+
+def bank_order(world: CompiledWorld, seed: int, turns: int) -> list[int]:
+    """Which bank is trained in at each turn: pass after pass over all of them, each in an order of its own."""
+    count = len(world.banks)
+    passes = [np.random.default_rng([seed, i]).permutation(count).tolist() for i in range(-(-turns // count))]
+    return [bank for order in passes for bank in order][:turns]
+
+
+def read_ahead(world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
+    """The environment's parameters with one bank after the other, the next one read while one is used."""
+    if not order:
+        return
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(world.params, order[0])
+        for i, bank in enumerate(order):
+            params = coming.result()
+            if i + 1 < len(order) and order[i + 1] != bank:
+                coming = pool.submit(world.params, order[i + 1])
+            yield params

@@ -1,0 +1,1 @@
+"""The scene file and importers of other formats."""

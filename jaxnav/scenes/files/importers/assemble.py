@@ -1,0 +1,95 @@
+"""The last step of every importer: standable points and objects become a scene."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxnav.scenes.files.record import Record
+from jaxnav.scenes.files.scene_file import derive_walls
+from jaxnav.scenes.scene import CELL, Room, Scene
+
+SNAP = 0.02  # metres that a standable point may be off the lattice
+MAX_SIDE = 2000  # cells; a larger extent is a mistake
+MARGIN = 3  # cells around the standable ones; what lies beyond cannot be told from a wall
+
+
+class Thing(NamedTuple):
+    """An object of a scene.
+
+    Attributes:
+      type: name of its type.
+      box: centre x, y, z and full size sx, sy, sz in metres of its axis-aligned box.
+      yaw: degrees.
+      parent: index of the object that it rests on or in, or -1.
+    """
+
+    type: str
+    box: Sequence[float]
+    yaw: float = 0.0
+    parent: int = -1
+
+
+def lattice_cells(record: Record, field: str, points: Sequence[Sequence[float]]) -> np.ndarray:
+    """Lattice indices (iz, ix) of points (x, z) in metres, int [N, 2].
+
+    Raises:
+      InputError: there is no point, one is not on the lattice, or they lie too far apart.
+    """
+    if not len(points):
+        raise record.error(field, "holds no point to stand on; give at least one")
+    xz = np.asarray(points, np.float64)
+    cells = np.rint(xz / CELL).astype(np.int64)
+    off = np.abs(xz - CELL * cells).max(axis=1)
+    if (off > SNAP).any():
+        worst = xz[off.argmax()].tolist()
+        raise record.error(field, f"holds {worst}; x and z must be multiples of {CELL} (within {SNAP})")
+    if (np.ptp(cells, axis=0) > MAX_SIDE).any():
+        raise record.error(field, f"spans more than {MAX_SIDE * CELL:g} m; give one scene at a time")
+    return cells[:, ::-1]
+
+
+def scene_of_cells(
+    name: str, world: str, room_type: str, split: str, cells: np.ndarray, things: Sequence[Thing]
+) -> Scene:
+    """A scene whose walls are derived from what is neither standable nor furniture.
+
+    Args:
+      name, world, room_type, split: see `Scene`.
+      cells: int [N, 2], standable lattice indices (iz, ix), z = 0.25 iz and x = 0.25 ix.
+      things: the objects.
+    """
+    low = cells.min(axis=0) - MARGIN
+    reach = np.zeros(cells.max(axis=0) - low + MARGIN + 1, bool)
+    reach[tuple((cells - low).T)] = True
+    origin = (CELL * float(low[1]), CELL * float(low[0]))
+    boxes = np.array([thing.box for thing in things], np.float64).reshape(-1, 6)
+    return scene(name, world, room_type, split, origin, reach, derive_walls(reach, origin, boxes), things)
+
+
+def scene(
+    name: str,
+    world: str,
+    room_type: str,
+    split: str,
+    origin: tuple[float, float],
+    reach: np.ndarray,
+    walls: np.ndarray,
+    things: Sequence[Thing],
+    rooms: tuple[Room, ...] = (),
+) -> Scene:
+    """A scene of these objects; the other arguments are its attributes."""
+    return Scene(
+        name=name,
+        world=world,
+        room_type=room_type,
+        split=split,
+        origin=origin,
+        reach=reach,
+        walls=walls,
+        types=tuple(thing.type for thing in things),
+        boxes=np.array([thing.box for thing in things], np.float64).reshape(-1, 6),
+        yaws=np.array([thing.yaw for thing in things], np.float64),
+        parents=np.array([thing.parent for thing in things], np.int64),
+        rooms=rooms,
+    )

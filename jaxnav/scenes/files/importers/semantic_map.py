@@ -1,0 +1,156 @@
+"""Semantic floor maps of the SemExp kind (`*_info.pbz2`), and the scenes that they show.
+
+A map gives what episode files lack, the free floor, in layers of 0 and 1 at 5 cm. Its pixel [i, j] covers Habitat's x
+from `origin[1] + 5 i` to `+ 5` cm, and Habitat's z from `origin[0] + 5 j` to `+ 5` cm.
+"""
+
+import dataclasses
+import reprlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import GIBSON_CATEGORIES
+from jaxnav.scenes.files.importers.assemble import Thing, scene_of_cells
+from jaxnav.scenes.files.importers.pickled_arrays import PickledArray, read_pickle
+from jaxnav.scenes.files.record import Record
+from jaxnav.scenes.generate.sizes import typical_box
+from jaxnav.scenes.lattice import connected_parts
+from jaxnav.scenes.scene import Scene
+
+_LAYERS = 1 + len(GIBSON_CATEGORIES)  # navigable floor, then the categories in this order
+_MAX_SIDE = 2000  # pixels, 100 m
+_PIXEL, _CELL = 5, 25  # centimetres
+_FAR = 10**7  # centimetres of an origin, or pixels; what lies beyond is a mistake
+_MIN_PIXELS = 3  # of an object; less is noise
+
+# A strip this wide (pixels) between floor on both sides, and this long (cells), is a wall. The floor of a map ends 0.1
+# to 0.2 m before an obstacle, so what makes the strip is at most 0.4 m thick, yet 1 m long: no usual furniture.
+_STRIP_WIDTH = (4, 12)
+_STRIP_LENGTH = 4
+
+
+class FloorMap(NamedTuple):
+    """The map of one floor.
+
+    Attributes:
+      height: of the floor, metres, Habitat's y.
+      origin: Habitat's (x, z) of the low corner of pixel [0, 0], whole centimetres.
+      layers: bool [16, nx, nz], the navigable floor and then `GIBSON_CATEGORIES`.
+    """
+
+    height: float
+    origin: tuple[int, int]
+    layers: np.ndarray
+
+
+def read_maps(path: Path) -> dict[str, dict[int, Record]]:
+    """The floors of every scene by their numbers, each to be checked by `floor_map`.
+
+    Raises:
+      InputError: the file cannot be read (`read_pickle`) or holds something else.
+    """
+    scenes = read_pickle(path)
+    if not isinstance(scenes, dict) or not scenes or not all(isinstance(name, str) and name for name in scenes):
+        raise InputError(f"{path}: holds no maps by name of scene; give a file like val_info.pbz2")
+    maps: dict[str, dict[int, Record]] = {}
+    for name, floors in scenes.items():
+        where = f"{path}, scene {reprlib.repr(name)}"
+        if not isinstance(floors, dict) or not floors or not all(type(k) is int and 0 <= k < 1000 for k in floors):
+            raise InputError(f"{where}: has no floors by number; give 0, 1, ...")
+        maps[name] = {
+            k: Record(f"{where}: floor {k}", floor if isinstance(floor, dict) else {}) for k, floor in floors.items()
+        }
+    return maps
+
+
+def floor_map(record: Record) -> FloorMap:
+    """The checked map of a floor.
+
+    Raises:
+      InputError: a field is missing or wrong.
+    """
+    height, origin, layers = (record.get(field) for field in ("floor_height", "origin", "sem_map"))
+    if type(height) not in (int, float) or not abs(height) < _FAR:
+        raise record.error("floor_height", "is no finite number; give metres")
+    corner = origin.values.astype(float) if isinstance(origin, PickledArray) else np.zeros(0)
+    if corner.shape != (2,) or not (np.abs(corner) < _FAR).all():
+        raise record.error("origin", "is no array of two finite numbers; give (z, x) in centimetres")
+    shape = layers.values.shape if isinstance(layers, PickledArray) else ()
+    if len(shape) != 3 or shape[0] != _LAYERS or not 0 < min(shape) <= max(shape) <= _MAX_SIDE:
+        expected = f"[{_LAYERS}, H, W] with sides up to {_MAX_SIDE}"
+        raise record.error("sem_map", f"is no array {expected}; give the floor and {_LAYERS - 1} categories")
+    if not ((layers.values == 0) | (layers.values == 1)).all():
+        raise record.error("sem_map", "holds other values than 0 and 1; give layers of 0 and 1")
+    z, x = np.rint(corner).astype(int).tolist()
+    return FloorMap(float(height), (x, z), layers.values == 1)
+
+
+def scene_of_map(record: Record, name: str, split: str, floor: FloorMap) -> Scene:
+    """The scene of one floor; its x is Habitat's, its z is minus Habitat's.
+
+    A lattice point is standable if the pixel under it is navigable, for navigable floor already keeps the agent's
+    radius clear of obstacles. An object is what touches within a category's layer, at the typical height. Walls are the
+    cells far from everything (`derive_walls`) and thin strips that part the floor.
+
+    Raises:
+      InputError: the floor has no standable point or no object.
+    """
+    cells, things = _standable(floor), list(_things(floor))
+    if not len(cells):
+        raise record.error("sem_map", "has no standable point in layer 0; leave the floor out")
+    if not things:
+        raise record.error("sem_map", "has no object in layers 1 and up; leave the floor out")
+    scene = scene_of_cells(name, "gibson", "house", split, cells, things)
+    return dataclasses.replace(scene, walls=scene.walls | _thin_walls(floor, scene))
+
+
+def _standable(floor: FloorMap) -> np.ndarray:
+    """Lattice indices (iz, ix), int [N, 2]."""
+    (x, i), (z, j) = (_lattice(low, count) for low, count in zip(floor.origin, floor.layers.shape[1:], strict=True))
+    at_x, at_z = np.nonzero(floor.layers[0][np.ix_(i, j)])
+    return np.stack([-z[at_z], x[at_x]], axis=1)
+
+
+def _lattice(low: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lattice indices on one axis of a map, and their pixels."""
+    index = np.arange(-(-low // _CELL), -(-(low + _PIXEL * count) // _CELL))
+    return index, (_CELL * index - low) // _PIXEL
+
+
+def _things(floor: FloorMap) -> Iterator[Thing]:
+    for name, layer in zip(GIBSON_CATEGORIES, floor.layers[1:], strict=True):
+        _, height, _, y = typical_box(name)
+        for part in connected_parts(layer):
+            if len(part) >= _MIN_PIXELS:
+                low, high = part.min(axis=0), part.max(axis=0) + 1
+                x, z = ((floor.origin + _PIXEL * (low + high) / 2) / 100).tolist()
+                size_x, size_z = (_PIXEL * (high - low) / 100).tolist()
+                yield Thing(name, (x, y, 0.0 - z, size_x, height, size_z))
+
+
+def _thin_walls(floor: FloorMap, scene: Scene) -> np.ndarray:
+    """Bool [nz, nx], cells in the middle of long thin strips between floor on both sides."""
+    free, objects = floor.layers[0], floor.layers[1:].any(axis=0)
+    middles = (_strip_middles(free) | _strip_middles(free.T).T) & ~objects
+    x, z = (floor.origin + _PIXEL * (np.argwhere(middles) + 0.5)).T / 100
+    index = np.rint((np.stack([-z, x], axis=1) - scene.origin[::-1]) * 100 / _CELL).astype(int)
+    inside = ((index >= 0) & (index < scene.reach.shape)).all(axis=1)
+    strips, walls = np.zeros_like(scene.reach), np.zeros_like(scene.reach)
+    strips[tuple(index[inside].T)] = True
+    for part in connected_parts(strips & ~scene.reach):
+        if len(part) >= _STRIP_LENGTH:
+            walls[tuple(part.T)] = True
+    return walls
+
+
+def _strip_middles(free: np.ndarray) -> np.ndarray:
+    """Pixels in the middle of a thin gap between free pixels of their row."""
+    column = np.arange(free.shape[1])
+    before = np.maximum.accumulate(np.where(free, column, -_FAR), axis=1)
+    after = np.minimum.accumulate(np.where(free, column, _FAR)[:, ::-1], axis=1)[:, ::-1]
+    width = after - before - 1
+    return (width >= _STRIP_WIDTH[0]) & (width <= _STRIP_WIDTH[1]) & (np.abs(2 * column - before - after) <= 1)

@@ -1,0 +1,1 @@
+"""Procedural rooms, apartments and houses."""

@@ -1,0 +1,173 @@
+"""A procedural world of single rooms whose layouts follow the measured statistics of AI2-THOR."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
+from jaxnav.scenes.generate.furnish import Furnishing, draw_contents, furnish
+from jaxnav.scenes.generate.relabel import relabel
+from jaxnav.scenes.generate.room_rules import room_statistics
+from jaxnav.scenes.generate.room_shapes import draw_shape, wall_mask
+from jaxnav.scenes.generate.shift import check_scene_arguments
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.scene import CELL, SPLITS, Scene
+
+AGENT_RADIUS = 0.2  # metres
+OBSTACLE_HEIGHTS = (0.1, 1.7)  # boxes that reach into this range are in the agent's way, metres
+FIND_DISTANCE = 1.2  # from every target to the nearest standable cell at most, metres
+CELLS_TOLERANCE = 0.15  # of the number of standable cells that was drawn for a room
+CONNECTED_SHARE = 0.9  # of the cells that are free must be connected
+ATTEMPTS = 40  # at a room of the drawn size
+
+TARGETS = frozenset(ITHOR_CATEGORIES)
+
+
+def generate_rooms(
+    num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0, shift: float = 0.0
+) -> list[Scene]:
+    """Generates single rooms; a scene depends on the seed, its split, its index and the shift alone.
+
+    Args:
+      num_train: number of training scenes, at least 0; room types take turns.
+      num_val: number of validation scenes.
+      num_test: number of test scenes.
+      seed: at least 0.
+      shift: share of the categories in a room that exchange their labels, from 0 to 1; see `relabel`.
+
+    Returns:
+      The scenes, split by split, named like `train-kitchen-003`.
+
+    Raises:
+      InputError: a count or the seed is negative, the shift is not in [0, 1], or there is no scene at all.
+    """
+    counts = dict(zip(SPLITS, (num_train, num_val, num_test), strict=True))
+    for split, count in counts.items():
+        if count < 0:
+            raise InputError(f"generate_rooms: num_{split} is {count}; give a number of at least 0")
+        check_scene_arguments("generate_rooms", split, count, seed, shift)
+    if not sum(counts.values()):
+        raise InputError("generate_rooms: num_train, num_val and num_test are all 0; ask for at least one scene")
+    return [generate_room_at(split, i, seed, shift) for split, count in counts.items() for i in range(count)]
+
+
+def generate_room_at(split: str, index: int, seed: int, shift: float = 0.0) -> Scene:
+    """The scene of `generate_rooms` with the given split and index, from 0; room types take turns.
+
+    Raises:
+      InputError: unknown split, negative index or seed, or a shift that is not in [0, 1].
+    """
+    check_scene_arguments("generate_room_at", split, index, seed, shift)
+    room_type = ROOM_TYPES[index % len(ROOM_TYPES)]
+    drawn = _draw_room(room_type, np.random.default_rng((seed, SPLITS.index(split), index)))
+    walls, furniture = wall_mask(drawn.furniture.shape), drawn.furniture
+    scene = make_scene(f"{split}-{room_type}-{index:03d}", "rooms", room_type, split, walls, drawn.reach, furniture)
+    return relabel(scene, ITHOR_CATEGORIES, shift, seed)
+
+
+class DrawnRoom(NamedTuple):
+    """A furnished room and its standable cells, bool [nz, nx]."""
+
+    furniture: Furnishing
+    reach: np.ndarray
+
+
+def _draw_room(room_type: str, rng: np.random.Generator) -> DrawnRoom:
+    """Draws rooms of the given type until one can be walked through and everything in it can be found."""
+    statistics = room_statistics()[room_type]
+    while True:
+        # Between the measured quartiles the logarithm of the number of cells is uniform.
+        cells = np.exp(np.interp(rng.random(), np.linspace(0.0, 1.0, 5), np.log(statistics.cells)))
+        contents = draw_contents(statistics.items, rng)
+        size = cells  # what the room is laid out for: corrected by what its furniture leaves
+        for _ in range(ATTEMPTS):
+            notched = rng.random() < statistics.l_shape
+            shape = draw_shape(size, statistics.fill, statistics.margin, statistics.aspect, notched, rng)
+            room = furnish(Furnishing(shape), statistics.items, contents, rng)
+            if room is None:
+                size *= 1.05
+                continue
+            reach, whole = _standable(room)
+            ratio = reach.sum() / cells
+            if abs(ratio - 1.0) < CELLS_TOLERANCE and whole and _everything_found(reach, room):
+                return DrawnRoom(room, reach)
+            size *= np.clip(ratio, 0.7, 1.4) ** -0.7
+
+
+def _standable(room: Furnishing) -> tuple[np.ndarray, bool]:
+    """The standable cells, bool [nz, nx], and whether they are nearly all that is free."""
+    free = free_cells(wall_mask(room.shape), room.boxes)
+    reach = connected(free)
+    return reach, bool(reach.sum() >= CONNECTED_SHARE * free.sum())
+
+
+def connected(free: np.ndarray) -> np.ndarray:
+    """The largest connected part of the free cells, bool [nz, nx]."""
+    reach = np.zeros_like(free)
+    reach[tuple(standable_cells(free).T)] = True
+    return reach
+
+
+def free_cells(walls: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Cells with room for a disc of the agent's radius.
+
+    Args:
+      walls: bool [nz, nx].
+      boxes: float64 [N, 2, 3], low and high corners (x, y, z) from the low corner of cell [1, 1].
+
+    Returns:
+      bool [nz, nx].
+    """
+    return away_from_boxes(away_from_walls(walls), boxes)
+
+
+def away_from_walls(walls: np.ndarray) -> np.ndarray:
+    """Cells that are far enough from every wall, bool [nz, nx]; outside there are walls."""
+    # Cell centres are 0.125 m from a neighbouring wall, 0.177 m from a diagonal one and 0.375 m from the next.
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(walls, 1, constant_values=True), (3, 3))
+    return np.logical_not(windows.any(axis=(2, 3)))
+
+
+def away_from_boxes(free: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Those of the cells `free` [nz, nx] that are far enough from every box as well."""
+    free = free.copy()
+    iz, ix = np.nonzero(free)
+    centres = CELL * (np.stack([ix, iz], axis=-1) - 0.5)
+    low_height, high_height = OBSTACLE_HEIGHTS
+    boxes = boxes[(boxes[:, 0, 1] < high_height) & (boxes[:, 1, 1] > low_height)][:, :, [0, 2]]
+    away = np.maximum(np.maximum(boxes[:, 0] - centres[:, None], centres[:, None] - boxes[:, 1]), 0.0)
+    free[iz, ix] = (np.linalg.norm(away, axis=-1) >= AGENT_RADIUS).all(axis=1)
+    return free
+
+
+def _everything_found(reach: np.ndarray, room: Furnishing) -> bool:
+    """Whether a standable cell is near enough to the centre of every target."""
+    targets = room.boxes[[name in TARGETS for name in room.types]].mean(axis=1)[:, [0, 2]]
+    centres = CELL * (np.argwhere(reach)[:, ::-1] - 0.5)
+    distances = np.linalg.norm(targets[:, None] - centres, axis=-1)
+    return bool((distances.min(axis=1, initial=np.inf) <= FIND_DISTANCE).all())
+
+
+def make_scene(
+    name: str, world: str, room_type: str, split: str, walls: np.ndarray, reach: np.ndarray, furniture: Furnishing
+) -> Scene:
+    """The scene of a furnished room, with the world's origin at a cell in its middle."""
+    nz, nx = walls.shape
+    origin = (-CELL * (nx // 2), -CELL * (nz // 2))
+    low, high = furniture.boxes[:, 0], furniture.boxes[:, 1]
+    shift = (origin[0] + CELL / 2, 0.0, origin[1] + CELL / 2)
+    boxes = np.round(np.concatenate([(low + high) / 2 + shift, high - low], axis=1), 3)
+    return Scene(
+        name=name,
+        world=world,
+        room_type=room_type,
+        split=split,
+        origin=origin,
+        reach=reach,
+        walls=walls,
+        types=tuple(furniture.types),
+        boxes=boxes,
+        yaws=90.0 * np.array(furniture.turns),
+        parents=np.array(furniture.parents),
+    )

@@ -1,0 +1,1 @@
+"""Compilation of scenes to tables over every pose."""

@@ -1,0 +1,50 @@
+"""The count of floating-point operations that the benchmarks divide by."""
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+ROWS, WIDTH, STEPS = 5, 7, 11
+
+
+@pytest.fixture(scope="module")
+def phases():
+    spec = importlib.util.spec_from_file_location("_phases", BENCHMARKS / "_phases.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def recurrent(weights, inputs, state):
+    """Loss of a linear recurrence: two products a step."""
+
+    def step(state, own):
+        state = jnp.tanh(own @ weights + state @ weights)
+        return state, None
+
+    return jax.lax.scan(step, state, inputs)[0].sum()
+
+
+ARGUMENTS = (jnp.ones((WIDTH, WIDTH)), jnp.ones((STEPS, ROWS, WIDTH)), jnp.ones((ROWS, WIDTH)))
+PRODUCT = 2 * ROWS * WIDTH * WIDTH
+
+
+def test_a_scan_counts_once_per_iteration(phases):
+    jaxpr = jax.make_jaxpr(jax.jit(recurrent))(*ARGUMENTS).jaxpr
+    assert phases.matmul_flops(jaxpr) == 2 * STEPS * PRODUCT
+
+
+def test_a_gradient_counts_forward_and_backward(phases):
+    # Back: by the weights twice and by the state once per step; nobody asks for the gradient by the inputs.
+    jaxpr = jax.make_jaxpr(jax.jit(jax.grad(recurrent)))(*ARGUMENTS).jaxpr
+    assert phases.matmul_flops(jaxpr) == (2 + 3) * STEPS * PRODUCT
+
+
+def test_batched_products_count_per_entry(phases):
+    many = jnp.ones((3, ROWS, WIDTH))
+    jaxpr = jax.make_jaxpr(lambda a: jnp.einsum("bij,bkj->bik", a, a))(many).jaxpr
+    assert phases.matmul_flops(jaxpr) == 3 * 2 * ROWS * ROWS * WIDTH

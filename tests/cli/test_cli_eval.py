@@ -1,0 +1,176 @@
+"""The eval command end to end, and all that it refuses."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from support.commands import SEEDS, contents, evaluate, finished_run, refusal
+
+from jaxnav.scenes.categories import ITHOR_CATEGORIES
+from jaxnav.scenes.files.scene_file import write_scenes
+from jaxnav.scenes.worlds import generated
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    return finished_run(tmp_path_factory)[1]
+
+
+ROWS = 2 * (2 + 1 + 2) + 2  # of each decoding baseline, layout, TDE and sTDE at two epsilons; Random; the oracle
+
+
+@pytest.fixture(scope="module")
+def evaluated(run_dir, tmp_path_factory):
+    """The report and the episodes of an evaluation, written into a folder that is not there yet."""
+    target = tmp_path_factory.mktemp("eval") / "new" / "table.json"
+    assert evaluate(run_dir, "--episodes", 18, "--epsilon", 0, 0.5, "--json", target) == 0
+    return target
+
+
+def _episodes(report):
+    with report.with_suffix(".episodes.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_report_holds_all_rows_and_differences(evaluated):
+    report = json.loads(evaluated.read_text())
+    assert list(report) == ["run", "rows", "differences", "compilations", "versions", "format"]
+    assert report["run"]["method"] == "org"
+    assert report["run"]["steps_per_policy"] == 512
+    assert report["run"]["prior_steps"] == 64 * 20
+    assert report["compilations"] == 1
+    assert len(report["rows"]) == ROWS
+    for row in report["rows"]:
+        assert (row["method"], row["world"], row["split"], row["seeds"]) == ("ORG", "rooms", "val", SEEDS)
+        assert row["episodes"] == 20  # rounded up to a multiple of the four room types
+        for metric in ("sr", "spl", "dts", "sae"):
+            low, high = row[metric]["ci95"]
+            assert low <= row[metric]["mean"] <= high
+    settings = [(row["variant"], row["epsilon"], row["decoding"], row["form"]) for row in report["rows"]]
+    assert len(set(settings)) == ROWS
+    assert ("stde", 0.5, "argmax", "residual") in settings
+    oracle = next(row for row in report["rows"] if row["variant"] == "oracle")
+    short = np.array([float(r["best_length"]) for r in _episodes(evaluated) if r["variant"] == "oracle"]) <= 12
+    assert oracle["sr"]["mean"] == oracle["spl"]["mean"] >= 100 * short.mean()  # all but those beyond the step limit
+    # Layout against baseline, the others against layout: four rows of each decoding, three metrics.
+    assert len(report["differences"]) == 2 * 4 * 3
+
+
+def test_the_episodes_are_written_row_by_row(evaluated):
+    rows = _episodes(evaluated)
+    assert len(rows) == ROWS * SEEDS * 20
+    report = json.loads(evaluated.read_text())
+    for row in report["rows"]:
+        epsilon = "" if row["epsilon"] is None else str(row["epsilon"])
+        own = [
+            r for r in rows if (r["variant"], r["epsilon"], r["decoding"]) == (row["variant"], epsilon, row["decoding"])
+        ]
+        assert len(own) == SEEDS * 20
+        for metric, scale in (("sr", 100), ("spl", 100), ("dts", 1)):
+            assert scale * np.mean([float(r[metric]) for r in own]) == pytest.approx(row[metric]["mean"], rel=1e-4)
+    for row in rows:
+        limit = 14 if row["room"] == "living_room" else 12
+        assert 1 <= int(row["length"]) <= limit
+        assert row["goal"] in ITHOR_CATEGORIES
+        assert 0 <= float(row["mean_weight"]) <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--epsilon", "nan"], "--epsilon nan: give numbers from 0 to below infinity"),
+        (["--epsilon", "0.5", "-0.5"], "--epsilon -0.5: give"),
+        (["--epsilon", "inf"], "--epsilon inf: give"),
+        (["--episodes", "0"], "--episodes 0: give at least 1"),
+        (["--seed", "-1"], "--seed -1: give a whole number from 0"),
+    ],
+)
+def test_bad_evaluations_are_refused_and_write_nothing(run_dir, capsys, options, problem):
+    before = contents(run_dir)
+    assert evaluate(run_dir, *options) == 2
+    assert problem in refusal(capsys)
+    assert contents(run_dir) == before
+
+
+def test_a_directory_without_a_run_is_refused(tmp_path, capsys):
+    for folder in (tmp_path, tmp_path / "none"):
+        assert evaluate(folder) == 2
+        assert f"{folder}: holds no run (config.json is missing); train one there first" in refusal(capsys)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_run_that_is_not_finished_is_refused(tmp_path, run_dir, capsys):
+    shutil.copy(run_dir / "config.json", tmp_path)
+    assert evaluate(tmp_path) == 2
+    assert f"{tmp_path}/policies/baseline-0: is missing, so training has not finished" in refusal(capsys)
+    # One policy is missing still: training was ended while it exported them.
+    shutil.copytree(run_dir / "policies", tmp_path / "policies")
+    (tmp_path / "policies" / "layout-1" / "policy.json").unlink()
+    assert evaluate(tmp_path) == 2
+    assert f"{tmp_path}/policies/layout-1: not an exported policy" in refusal(capsys)
+    assert not list(tmp_path.glob("eval*"))
+
+
+@pytest.mark.slow
+def test_evaluations_are_equal_byte_for_byte(run_dir, evaluated, tmp_path):
+    for seed, equal in ((0, True), (1, False)):
+        again = tmp_path / f"{seed}.json"
+        assert evaluate(run_dir, "--episodes", 18, "--epsilon", 0, 0.5, "--json", again, "--seed", seed) == 0
+        assert (again.read_bytes() == evaluated.read_bytes()) == equal
+        episodes = [path.with_suffix(".episodes.csv").read_bytes() for path in (again, evaluated)]
+        assert (episodes[0] == episodes[1]) == equal
+
+
+def test_damaged_files_are_named(tmp_path, run_dir, capsys):
+    scenes = tmp_path / "scenes.jsonl.gz"
+    scenes.write_bytes(b"not compressed")
+    assert evaluate(run_dir, "--scenes", scenes) == 2
+    assert f"{scenes}, line 1: not JSON" in refusal(capsys)
+    text = (run_dir / "config.json").read_text()
+    (tmp_path / "config.json").write_text(text[: len(text) // 2])
+    assert evaluate(tmp_path) == 2
+    assert f"{tmp_path}/config.json" in refusal(capsys)
+
+
+def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(run_dir, run)
+    assert evaluate(run, "--episodes", 4, "--shift", 1) == 0
+    report = json.loads((run / "eval-val-shift1.json").read_text())
+    assert report["run"]["evaluation_shift"] == 1.0
+    assert report["run"]["worlds"]["shift"] == 0.0
+    assert not (run / "eval-val.json").exists()
+    capsys.readouterr()
+    assert evaluate(run, "--shift", 1.5) == 2
+    assert "give a seed of at least 0, a shift from 0 to 1" in refusal(capsys)
+
+
+def test_a_shift_relabels_a_scene_file(run_dir, tmp_path, capsys):
+    run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
+    shutil.copytree(run_dir, run)
+    config = json.loads((run / "config.json").read_text())
+    config["worlds"]["shift"] = 0.5  # of the run's own scenes; a file is taken as it is
+    (run / "config.json").write_text(json.dumps(config))
+    write_scenes(file, (generated("rooms", "val")[i] for i in range(2)))
+    told = {}
+    for shift, options in ((0.0, ()), (1.0, ("--shift", 1))):
+        target = tmp_path / f"{shift}.json"
+        assert evaluate(run, "--episodes", 40, "--scenes", file, "--json", target, *options) == 0
+        assert json.loads(target.read_text())["run"]["evaluation_shift"] == shift
+        told[shift] = [(row["scene"], row["goal"], row["start_pose"], row["best_length"]) for row in _episodes(target)]
+    assert told[0.0] != told[1.0]
+    capsys.readouterr()
+    assert evaluate(run, "--shift", 1.5, "--scenes", file) == 2
+    assert "relabelling: seed 0, shift 1.5; give" in refusal(capsys)
+
+
+def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(run_dir, run)
+    config = json.loads((run / "config.json").read_text())
+    config["detector"]["false_alarm"] = 0.25
+    (run / "config.json").write_text(json.dumps(config))
+    assert evaluate(run) == 2
+    assert "was trained for another task than its run says" in refusal(capsys)

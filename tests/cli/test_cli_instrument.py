@@ -1,0 +1,124 @@
+"""The instrument command end to end, and all that it refuses."""
+
+import json
+import runpy
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import contents, evaluate, finished_run, refusal
+
+from jaxnav import __main__ as commands
+from jaxnav.baselines.difficulty import expected_length, random_success
+from jaxnav.baselines.frontier import frontier_outcome
+from jaxnav.cli.instrument import main
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.scenes.files.scene_file import write_scenes
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import ROOMS
+from jaxnav.scenes.worlds import generated
+from jaxnav.study.dial import MEASURES
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    run = tmp_path_factory.mktemp("instrument") / "run"
+    shutil.copytree(finished_run(tmp_path_factory)[1], run)
+    return run
+
+
+def instrument(*options):
+    return main([*map(str, options)])
+
+
+@pytest.mark.slow
+def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
+    assert instrument(run_dir, "--shift", 1, 0, "--episodes", 12) == 0
+    printed = capsys.readouterr().out
+    report = json.loads((run_dir / "instrument-val.json").read_text())
+    assert list(report) == ["run", "shifts", "matched", "discriminating", "versions", "format"]
+    assert [own["shift"] for own in report["shifts"]] == [0.0, 1.0]
+    for title, _ in MEASURES.values():
+        assert title in printed
+    assert evaluate(run_dir, "--episodes", 12, "--shift", 1, "--json", run_dir / "eval.json") == 0
+    rows = json.loads((run_dir / "eval.json").read_text())["rows"]
+    baseline = {row["decoding"]: row["sr"]["mean"] for row in rows if row["variant"] == "baseline"}
+    for own in report["shifts"]:
+        assert (own["scenes"], own["episodes"]) == (4, 12)
+        # Three episodes in each scene: means over scenes are means over episodes.
+        scenes = generated("rooms", "val", 4, 0, own["shift"])
+        bank = compile_bank((scenes[i] for i in range(4)), ROOMS)
+        limits = np.array([14 if room == "living_room" else 12 for room in bank.room_types])
+        searched = frontier_outcome(bank, episode_list(bank, 12), limits)
+        assert own["best_length"]["mean"] == pytest.approx(expected_length(bank).mean())
+        assert own["random_sr"]["mean"] == pytest.approx(100 * random_success(bank, limits).mean())
+        assert own["frontier_sr"]["mean"] == pytest.approx(100 * np.asarray(searched.success).mean())
+        assert own["frontier_steps"]["mean"] == pytest.approx(np.asarray(searched.length).mean())
+        assert own["layout_gap"]["mean"] > 0
+        assert 0 < own["layout_similarity"]["mean"] < 1
+        # One scene of each room type: no scene is drawn anew.
+        assert own["best_length"]["ci95"] == pytest.approx(2 * [own["best_length"]["mean"]])
+    last = report["shifts"][-1]
+    assert last["baseline_argmax_sr"]["mean"] == pytest.approx(baseline["argmax"])
+    assert last["baseline_sample_sr"]["mean"] == pytest.approx(baseline["sample"])
+
+
+@pytest.mark.slow
+def test_other_scenes_of_another_split(run_dir):
+    assert instrument(run_dir, "--shift", 0, 1, "--episodes", 4, "--split", "test", "--scenes-per-split", 6) == 0
+    report = json.loads((run_dir / "instrument-test.json").read_text())
+    assert [own["scenes"] for own in report["shifts"]] == [6, 6]
+    assert report["run"]["worlds"]["num_test"] == 6
+    assert report["run"]["evaluation_split"] == "test"
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--shift", "0.5", "0.5"], "--shift 0.5 0.5: give at least two different shifts"),
+        (["--shift", "-1", "0"], "give numbers from 0 to 1"),
+        (["--episodes", "0"], "--episodes 0: give at least 1"),
+        (["--seed", "-1"], "--seed -1: give a whole number from 0"),
+        (["--scenes-per-split", "0"], "ask for at least one"),
+    ],
+)
+def test_bad_requests_are_refused_and_write_nothing(run_dir, capsys, options, problem):
+    before = contents(run_dir)
+    assert instrument(run_dir, *options) == 2
+    assert problem in refusal(capsys)
+    assert contents(run_dir) == before
+
+
+@pytest.mark.slow
+def test_a_run_on_scenes_of_a_file(run_dir, tmp_path, capsys):
+    run, file = tmp_path / "run", tmp_path / "scenes.jsonl.gz"
+    scenes = generated("rooms", "val", 4)
+    write_scenes(file, [scenes[i] for i in range(4)])
+    shutil.copytree(run_dir, run)
+    settings = json.loads((run / "config.json").read_text()) | {"scenes": str(file)}
+    (run / "config.json").write_text(json.dumps(settings))
+    assert instrument(run, "--shift", 0, 1, "--episodes", 20) == 0
+    first, last = json.loads((run / "instrument-val.json").read_text())["shifts"]
+    # Labels are exchanged: paths and goals stay, what is seen together does not.
+    assert last["best_length"]["mean"] == pytest.approx(first["best_length"]["mean"])
+    assert last["layout_gap"]["mean"] != pytest.approx(first["layout_gap"]["mean"])
+    assert instrument(run, "--scenes-per-split", 4) == 2
+    assert "is a run on scenes of a file; leave it out" in refusal(capsys)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_with_a_config_it_is_that_of_a_study(tmp_path, capsys, joined):
+    (tmp_path / "study.yaml").write_text("shifts: [1.0]")
+    file = str(tmp_path / "study.yaml")
+    assert instrument(*([f"--config={file}"] if joined else ["--config", file])) == 2
+    assert "shifts: (1.0,): give two or more from 0 to 1, rising" in refusal(capsys)
+
+
+def test_both_commands_lead_here(tmp_path, capsys, monkeypatch):
+    assert commands.main(["instrument", str(tmp_path), "--shift", "1"]) == 2
+    assert "give at least two different shifts" in refusal(capsys)
+    monkeypatch.setattr("sys.argv", ["eval.py", "instrument", str(tmp_path), "--shift", "1"])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(str(Path(commands.__file__).parents[1] / "eval.py"), run_name="__main__")
+    assert "give at least two different shifts" in refusal(capsys)

@@ -1,0 +1,62 @@
+"""A training run that is killed and started again, against one that is left alone."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.commands import POLICIES, SEEDS, write_config
+
+from jaxnav.store.runlog import read_rows
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def start(config_file, run_dir, cache, *options):
+    """The command in a process of its own; compiled code is kept, or every start would take its time."""
+    command = [sys.executable, "train.py", "--config", str(config_file), "--run-dir", str(run_dir), *options]
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process):
+    _, error = process.communicate()
+    assert process.returncode == 0, error
+    return error
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_killed_and_resumed_run_is_an_uninterrupted_one_bit_for_bit(tmp_path):
+    config_file = write_config(tmp_path)
+    cache, long = tmp_path / "cache", ("--total-steps", "7680")  # 60 updates, 30 chunks
+    whole, killed, other = tmp_path / "whole", tmp_path / "killed", tmp_path / "other"
+    finish(start(config_file, whole, cache, *long))
+    generator = random.Random(0)
+    for seen in (0, 2, 10, 24, 40):  # the update after whose checkpoint it is killed, at a random moment
+        process = start(config_file, killed, cache, *long)
+        while (
+            seen
+            and process.poll() is None
+            and not any(int(path.name) >= seen for path in killed.glob("checkpoints/*") if path.name.isdigit())
+        ):
+            time.sleep(0.001)
+        time.sleep(generator.uniform(0, 0.3) if seen else generator.uniform(1, 4))
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+    assert "resumed after update" in finish(start(config_file, killed, cache, *long))
+    names = ["metrics.jsonl", *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES))]
+    for name in names:
+        assert (killed / name).read_bytes() == (whole / name).read_bytes(), name
+    assert len(read_rows(killed / "metrics.jsonl")) == 30 * 2 * SEEDS
+    finish(start(config_file, other, cache, *long, "--seed", "1"))
+    for name in names:
+        assert (other / name).read_bytes() != (whole / name).read_bytes(), name

@@ -1,0 +1,137 @@
+"""The import command: every format to a scene file that trains, splits by pattern, and what it refuses."""
+
+import gzip
+import json
+
+import pytest
+from support.commands import refusal
+from support.fuzz_importers import CRASHED, FORMATS, fuzz
+from test_import_ai2thor import METADATA
+from test_import_procthor import HOUSE, door
+
+from jaxnav.__main__ import main
+from jaxnav.env.make import make
+from jaxnav.env.testing import check_environment
+from jaxnav.scenes.files.scene_file import read_scenes
+
+
+def run(*arguments):
+    return main(["scenes", "import", *map(str, arguments)])
+
+
+@pytest.mark.parametrize(("form", "world"), [(form, "rooms" if "a" in form.name[:2] else "houses") for form in FORMATS])
+def test_every_format_becomes_an_environment(tmp_path, capsys, form, world):
+    source, target = form.write(tmp_path, form.content), tmp_path / "new" / "scenes.jsonl.gz"
+    options = [tmp_path / option if option.endswith(".pbz2") else option for option in form.options]
+    code = run(form.name, source, target, "--split", "val", "--categories", "Chair", "Bed", "Fridge", "Sink",
+               "DiningTable", *options)  # fmt: skip
+    told = capsys.readouterr().err
+    assert code == 0, told
+    assert "scenes imported, 0 refused" in told
+    scenes = read_scenes(target)
+    assert {scene.split for scene in scenes} == {"val"}
+    if form.name == "procthor":  # its table is no goal of the houses, but can be looked for
+        from jaxnav.scenes.task import Task
+        from jaxnav.scenes.worlds import WORLDS
+
+        rules = WORLDS["houses"].task.rules
+        check_environment(*make("houses", "val", target, Task(("DiningTable", "Bowl"), rules=rules)), num_steps=8)
+
+
+def test_patterns_divide_a_file_into_splits(tmp_path, capsys):
+    rooms = [METADATA | {"sceneName": f"FloorPlan{number}"} for number in (1, 21, 22, 23)]
+    source = tmp_path / "rooms.jsonl"
+    source.write_text("\n".join(map(json.dumps, rooms)))
+    first, second = tmp_path / "a.jsonl.gz", tmp_path / "b.jsonl.gz"
+    assert run("ai2thor", source, first, "--val", "*21", "*23", "--test", "FloorPlan2?") == 0
+    assert [scene.split for scene in read_scenes(first)] == ["train", "val", "test", "val"]
+    assert run("scenes", first, second, "--test", "FloorPlan1") == 0  # a scene file can be divided anew
+    assert [scene.split for scene in read_scenes(second)] == ["test", "train", "train", "train"]
+    assert "4 scenes imported, 0 refused" in capsys.readouterr().err
+
+
+def test_refused_scenes_are_told_and_counted_and_the_others_kept(tmp_path, capsys):
+    nowhere = HOUSE | {"doors": [door("wall|9|0.00|0.00|1.00|0.00", 1.0, 2.0)]}
+    source, target = tmp_path / "houses.jsonl.gz", tmp_path / "scenes.jsonl.gz"
+    source.write_bytes(gzip.compress("\n".join(json.dumps(house) for house in (HOUSE, nowhere)).encode()))
+    assert run("procthor", source, target) == 0
+    told = capsys.readouterr().err
+    assert f"refused: {source}" in told
+    assert "doors[0]: wall0" in told
+    assert "unknown type, only blocks the sight: Bowl x 1" in told
+    assert "1 scenes imported, 1 refused" in told
+    assert len(read_scenes(target)) == 1
+
+
+def test_two_scenes_of_one_name_are_one_too_many(tmp_path, capsys):
+    source, target = tmp_path / "rooms.jsonl", tmp_path / "scenes.jsonl.gz"
+    source.write_text(f"{json.dumps(METADATA)}\n{json.dumps(METADATA)}")
+    assert run("ai2thor", source, target) == 0
+    assert "name is that of an earlier scene" in capsys.readouterr().err
+    assert len(read_scenes(target)) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["room.json", "out.jsonl.gz", "--categories", "Unicorn", "Dragon"], "objects are of no known type"),
+        (["room.json", "out.json"], "out.json: give a name that ends in .jsonl.gz"),
+        (["gone.json", "out.jsonl.gz"], "gone.json"),
+        (["cut.json.gz", "out.jsonl.gz"], "is cut short or damaged"),
+        (["room.json", "room.json/out.jsonl.gz"], "cannot be written"),
+    ],
+)
+def test_what_cannot_be_imported_leaves_nothing(tmp_path, monkeypatch, capsys, arguments, problem):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room.json").write_text(json.dumps(METADATA))
+    (tmp_path / "cut.json.gz").write_bytes(gzip.compress(json.dumps(METADATA).encode())[:-9])
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert run("ai2thor", *arguments) == 2
+    told = capsys.readouterr().err
+    assert problem in told
+    assert told.splitlines()[-1].startswith("error: ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_a_simulator_that_is_not_there_is_named(tmp_path, capsys):
+    assert run("ai2thor", "FloorPlan1", tmp_path / "o.jsonl.gz", "--from-controller") == 2
+    assert "pip install ai2thor" in refusal(capsys)
+
+
+@pytest.mark.parametrize(
+    ("form", "option", "problem"),
+    [
+        ("procthor", ["--from-controller"], "--from-controller: is for the format ai2thor, not for procthor"),
+        ("ai2thor", ["--maps", "a.pbz2"], "--maps: is for the format habitat, not for ai2thor"),
+        ("habitat", ["--assets", "a.json"], "--assets: is for the format procthor, not for habitat"),
+        ("ai2thor", ["--base", "a.jsonl.gz"], "--base: is for the format replacements, not for ai2thor"),
+        ("replacements", [], "--base: is missing; replacements need the scene file"),
+        ("ai2thor", ["--val", "FloorPlan9?"], "pattern 'FloorPlan9?': fits no scene"),
+    ],
+)
+def test_options_without_effect_are_refused(tmp_path, capsys, form, option, problem):
+    (tmp_path / "room.json").write_text(json.dumps(METADATA))
+    assert run(form, tmp_path / "room.json", tmp_path / "o.jsonl.gz", *option) == 2
+    assert problem in refusal(capsys)
+
+
+def test_bad_lines_of_a_scene_file_leave_the_others(tmp_path, capsys):
+    (tmp_path / "room.json").write_text(json.dumps(METADATA))
+    good, mixed = tmp_path / "good.jsonl.gz", tmp_path / "mixed.jsonl.gz"
+    assert run("ai2thor", tmp_path / "room.json", good) == 0
+    line = gzip.decompress(good.read_bytes())
+    mixed.write_bytes(line + line.replace(b'"train"', b'"trial"') + b"{]\n" + line)
+    assert run("scenes", mixed, tmp_path / "o.jsonl.gz") == 0
+    told = capsys.readouterr().err
+    assert "1 scenes imported, 3 refused" in told
+    assert "line 2" in told
+    assert "line 3: not JSON" in told
+    assert "name is that of line 1 too" in told
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_mutated_files_never_crash_nor_leave_half_a_file(form, capsys):
+    codes, _ = fuzz(form, 40)
+    assert codes[CRASHED] == 0
+    assert min(codes[0], codes[2]) >= 2
+    capsys.readouterr()

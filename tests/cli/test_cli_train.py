@@ -1,0 +1,206 @@
+"""The train command end to end, and all that it refuses."""
+
+import csv
+import dataclasses
+import gzip
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.commands import POLICIES, SEEDS, contents, evaluate, finished_run, refusal, train
+
+from jaxnav.cli import train as train_command
+from jaxnav.layout import SETTINGS, Setting
+from jaxnav.scenes.categories import ITHOR_CATEGORIES
+from jaxnav.store.export import load_params
+from jaxnav.store.runlog import read_rows
+from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, layout_priors
+
+
+@pytest.fixture(scope="module")
+def config_file(tmp_path_factory):
+    return finished_run(tmp_path_factory)[0]
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    return finished_run(tmp_path_factory)[1]
+
+
+# Training
+
+
+def test_a_run_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
+    assert {folder.name for folder in (run_dir / "policies").iterdir()} == POLICIES
+    assert {folder.name for folder in (run_dir / "checkpoints").iterdir()} == {"2", "4"}
+    rows = read_rows(run_dir / "metrics.jsonl")
+    identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
+    assert sorted(identities) == sorted((s, a, i) for s in (2, 4) for a in ("baseline", "layout") for i in range(SEEDS))
+    for row in rows:
+        assert row["distil_loss"] > 0
+        assert all(math.isfinite(value) for value in row.values() if not isinstance(value, str))
+        assert row["env_steps"] == row["step"] * 16 * 8
+        assert row["episodes"] > 0
+        assert row["skipped_steps"] == 0
+
+
+def test_policies_say_how_they_are_used(run_dir):
+    loaded = {name: load_params(run_dir / "policies" / name) for name in POLICIES}
+    for name, (tensors, spec) in loaded.items():
+        assert spec["method"] == "org"
+        assert spec["categories"] == list(ITHOR_CATEGORIES)
+        assert spec["sizes"]["hidden"] == 16
+        if name.startswith("layout"):
+            setting = Setting(**spec["layout"])
+            assert setting == dataclasses.replace(
+                SETTINGS["calibrated"], strength=setting.strength, reduction=setting.reduction
+            )
+            assert setting.strength in STRENGTHS
+            assert setting.reduction in REDUCTIONS
+        else:
+            assert spec["layout"] is None
+        assert tensors["layout"]["counts"].shape == (5, 22, 22)
+        assert spec["prior_steps"] == 64 * 20
+        assert 0 < spec["prior_poses"] <= 64 * 21
+        assert tensors["layout"]["prior"].shape == (5, 22, 22)
+        assert all(np.isfinite(leaf).all() for leaf in tensors["policy"]["core"]["dense_i"].values())
+    kernels = [tensors["policy"]["fuse"]["kernel"].tobytes() for tensors, _ in loaded.values()]
+    assert len(set(kernels)) == 4
+
+
+def test_a_finished_run_is_left_as_it_is(run_dir, config_file, capsys):
+    before = contents(run_dir)
+    assert train(config_file, run_dir) == 0
+    assert "resumed after update 4 of 4" in capsys.readouterr().err
+    assert contents(run_dir) == before
+
+
+# Refusals of training
+
+
+def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, capsys):
+    before = contents(run_dir)
+    assert train(config_file, run_dir, "--seeds", 3, "--ppo.gamma", 0.5) == 2
+    error = refusal(capsys)
+    assert "holds another run (there != asked for): ppo.gamma: 0.99 != 0.5; seeds: 2 != 3;" in error
+    assert contents(run_dir) == before
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("sede: 1", "unknown key sede; did you mean seed?"),
+        ("ppo: {num_env: 4}", "unknown key ppo.num_env; did you mean ppo.num_envs?"),
+        ("seeds: two", "seeds must be int, but is 'two' (str)"),
+        ("ppo: {gamma: [1]}", "ppo.gamma must be float, but is [1] (list)"),
+        ("counterfactual: maybe", "counterfactual must be one of 'none', 'coin', 'distil', but is 'maybe'"),
+        ("method: orgy", "method is 'orgy'; choose one of rgb, org"),
+        ("seeds: 0", "seeds is 0; give at least 1"),
+        ("sizes: {hidden: -8}", "sizes.hidden is -8; give at least 1"),
+        ("worlds: {num_train: 0}", "worlds.num_train is 0; give at least 1"),
+        ("ppo: {num_envs: 10, minibatches: 4}", "ppo.num_envs is 10; give a multiple of ppo.minibatches (4)"),
+        ("ppo: {rollout: 31}", "ppo.rollout is 31; give at most worlds.train_step_limit (30)"),
+        ("ppo: {learning_rate: .inf}", "ppo.learning_rate is inf; give a positive number"),
+        ("detector: {miss_far: 1.5}", "detector.miss_far is 1.5; give a probability"),
+        ("seed: -1", "seed is -1; give a whole number from 0 to 2**32 - 1"),
+        ("seed: 4294967296", "seed is 4294967296; give a whole number from 0"),
+        ("worlds: {seed: -1}", "worlds.seed is -1; give a whole number from 0"),
+        ("detector: {seed: -1}", "detector.seed is -1; give a whole number from 0"),
+        ("worlds: {shift: 1.5}", "worlds.shift is 1.5; give a number from 0 to 1"),
+        ("worlds: {shaping: .inf}", "worlds.shaping is inf; give 0 or more"),
+        ("worlds: {categories: [Chair]}", "worlds.categories is ('Chair',); give at least 2"),
+        (
+            "worlds: {categories: [Chair, Sink, Chair]}",
+            "worlds.categories is ('Chair', 'Sink', 'Chair'); give each once",
+        ),
+        ("worlds: {goals: [Chair, Unicorn]}", "worlds.goals is ['Unicorn']; give some of the categories AlarmClock,"),
+        ("{world: houses, scenes: none.jsonl.gz}", "none.jsonl.gz: cannot be read"),
+        (
+            "{world: houses, worlds: {num_train: 9, shard_scenes: 8}, chunk: 1}",
+            "chunk is 1; where scenes are streamed it",
+        ),
+        ("seeds: 1\nseeds: 2", "line 2: not valid YAML (seeds is given twice)"),
+    ],
+)
+def test_bad_settings_are_refused_before_anything_is_made(tmp_path, capsys, line, problem):
+    file = tmp_path / "bad.yaml"
+    file.write_text(line)
+    assert train(file, tmp_path / "run", "--cache", tmp_path / "cache") == 2
+    assert problem in refusal(capsys)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["--ppo.gamma", "--seeds", "--layout.setting"])
+def test_bad_options_are_refused(tmp_path, capsys, option):
+    with pytest.raises(SystemExit) as exit:
+        train_command.main(["--run-dir", str(tmp_path / "run"), option, "nonsense"])
+    assert exit.value.code == 2
+    assert option in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+WHOLE = gzip.compress(b'{"name": "a"}\n' * 9, mtime=0)
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (None, "cannot be read (No such file or directory)"),
+        (b"not compressed", "line 1: not JSON"),
+        (WHOLE[:-9], "is cut short or damaged"),
+        (gzip.compress(b"{]\n"), "line 1: not JSON"),
+        (WHOLE, "line 1, scene 'a': world is missing; add it"),
+        (gzip.compress(b""), "holds no scene"),
+    ],
+)
+def test_bad_scene_files_are_refused_by_name(tmp_path, capsys, data, problem):
+    file = tmp_path / "scenes.jsonl.gz"
+    if data is not None:
+        file.write_bytes(data)
+    assert train_command.main(["--run-dir", str(tmp_path / "new"), "--scenes", str(file)]) == 2
+    error = refusal(capsys)
+    assert str(file) in error
+    assert problem in error
+    assert not (tmp_path / "new").exists()
+
+
+def test_directories_that_are_something_else_are_refused(tmp_path, config_file, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert train(config_file, file) == 2
+    assert f"{file}: is a file; choose another --run-dir" in refusal(capsys)
+    assert train(config_file, tmp_path) == 2
+    assert f"{tmp_path}: is not empty and holds no run" in refusal(capsys)
+    assert contents(tmp_path) == {"file": b"mine"}
+
+
+def test_a_damaged_config_is_named(tmp_path, run_dir, config_file, capsys):
+    text = (run_dir / "config.json").read_text()
+    (tmp_path / "config.json").write_text(text[: len(text) // 2])
+    assert train(config_file, tmp_path) == 2
+    assert f"{tmp_path}/config.json" in refusal(capsys)
+
+
+@pytest.mark.slow
+def test_a_vocabulary_of_ones_own_is_trained_resumed_and_evaluated(tmp_path, config_file, capsys):
+    """Three categories, two of them goals, in a run that is then found finished and evaluated."""
+    run_dir = tmp_path / "own"
+    options = ("--seeds", 1, "--total-steps", 256, "--worlds.categories", "Chair", "Sink", "LightSwitch",
+               "--worlds.goals", "Sink", "LightSwitch")  # fmt: skip
+    assert train(config_file, run_dir, *options) == 0
+    assert train(config_file, run_dir, *options) == 0
+    assert "resumed after update 2 of 2" in capsys.readouterr().err
+    task = load_params(run_dir / "policies" / "layout-0")[1]["task"]
+    assert (task["categories"], task["goals"]) == (["Chair", "Sink", "LightSwitch"], ["Sink", "LightSwitch"])
+    assert evaluate(run_dir, "--episodes", 8) == 0
+    with (run_dir / "eval-val.episodes.csv").open() as file:
+        assert {row["goal"] for row in csv.DictReader(file)} == {"Sink", "LightSwitch"}
+
+
+def test_room_types_without_training_scenes_get_the_prior_of_all_together():
+    counts = np.zeros((3, 2, 2), np.float32)
+    counts[0], counts[2] = [[5, 3], [3, 4]], [[2, 1], [1, 2]]
+    # By the letter of the paper the prior is the counts and one: 3 + 1, 3 + 1 + 1, 1 + 1.
+    priors = layout_priors(jnp.asarray(counts), "paper")
+    np.testing.assert_array_equal(priors[:, 0, 1], [4, 5, 2])

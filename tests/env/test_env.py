@@ -1,0 +1,253 @@
+"""One episode: its contract, how it starts and ends, and how environments are made."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chisquare
+from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, draw
+
+from jaxnav.env.make import make
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, build
+from jaxnav.env.testing import check_environment
+from jaxnav.env.types import State
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import ROOM_TYPES
+from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
+from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, Task
+from jaxnav.scenes.worlds import WORLDS, generated
+
+REAL_FILE = Path(__file__).parents[3] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
+SCENES = generate_rooms(4, 4, 0)  # one of each type
+BANK = compile_bank(SCENES[:4], Task())
+# One cell: the book is found at headings 7, 0 and 1, the chair from behind.
+ONE_CELL = compile_bank([draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Chair", 0, 1.5, -1, *SMALL))], Task(CATEGORIES))
+
+
+def in_one_cell(goal=BOOK, heading=0, time=0):
+    return State(pose=jnp.int32(2 * heading), scene=jnp.int32(0), goal=jnp.int32(goal), time=jnp.int32(time))
+
+
+def test_contract_on_generated_rooms():
+    check_environment(*build(BANK, {}, 5))
+
+
+def test_contract_on_real_rooms():
+    if not REAL_FILE.exists():
+        pytest.skip("the real rooms are not here")
+    check_environment(*build(compile_bank(read_scenes(REAL_FILE)[::25], Task()), {}, 100))
+
+
+class EndsTwice(ObjectNav):
+    """A wrong environment: the last step is truncated, whatever it was."""
+
+    def advance(self, state, action, params):
+        after, reward, terminated, _ = super().advance(state, action, params)
+        return after, reward, terminated, after.time >= params.step_limit[state.scene]
+
+
+class NeverStartsAnew(ObjectNav):
+    """A wrong environment: time goes on after an ending."""
+
+    def step(self, key, state, action, params):
+        observation, after, *rest = super().step(key, state, action, params)
+        return observation, after.replace(time=state.time + 1), *rest
+
+
+class AsksForTooMuch(ObjectNav):
+    """A wrong environment: it seeks a category that it does not know."""
+
+    def observe(self, state, params):
+        return super().observe(state, params).replace(goal=state.goal + len(self.categories))
+
+
+class Lies(ObjectNav):
+    """A wrong environment: every step is a success."""
+
+    def step(self, key, state, action, params):
+        *rest, info = super().step(key, state, action, params)
+        return *rest, info | {"success": jnp.ones_like(info["success"])}
+
+
+@pytest.mark.parametrize(
+    ("broken", "promise"),
+    [
+        (EndsTwice, "terminated and truncated at once"),
+        (NeverStartsAnew, "not followed by a new episode"),
+        (AsksForTooMuch, "a goal that is no category"),
+        (Lies, "a success that is not an ending"),
+    ],
+)
+def test_contract_refuses_broken_environments(broken, promise):
+    env, params = build(BANK, {}, 5)
+    check_environment(env, params, num_steps=1)
+    with pytest.raises(AssertionError, match=promise):
+        check_environment(broken(env.task), params)
+
+
+@pytest.mark.parametrize(
+    ("heading", "goal", "reward", "success"), [(0, BOOK, 5.0, True), (0, CHAIR, -0.01, False), (4, CHAIR, 5.0, True)]
+)
+def test_done_on_the_last_step_is_terminated_only(heading, goal, reward, success):
+    env, params = build(ONE_CELL, {}, 3)
+    state = in_one_cell(goal, heading, time=2)
+    _, after, gained, terminated, truncated, info = env.step(jax.random.key(0), state, jnp.int32(DONE), params)
+    assert (gained, terminated, truncated) == (np.float32(reward), True, False)
+    assert (info["success"], info["length"], after.time) == (success, 3, 0)
+
+
+def test_the_step_limit_truncates():
+    env, params = build(ONE_CELL, {}, 3)
+    state, endings = in_one_cell(), []
+    for action in (LOOK_DOWN, MOVE_AHEAD, LOOK_UP):
+        state, reward, terminated, truncated = env.advance(state, jnp.int32(action), params)
+        endings.append((bool(terminated), bool(truncated)))
+        assert reward == np.float32(-0.01)
+    assert endings == [(False, False), (False, False), (False, True)]
+    assert (state.time, state.pose) == (3, 0)
+
+
+def test_an_ending_does_not_leak_the_next_episode():
+    env, params = build(BANK, {}, 1)  # every step ends an episode
+    keys = jax.random.split(jax.random.key(0), 400)
+    _, state = jax.vmap(env.reset, (0, None))(keys, params)
+    action = jnp.arange(400) % 6
+    observation, after, _, _, _, info = jax.vmap(env.step, (0, 0, 0, None))(keys[::-1], state, action, params)
+    final, seen = info["final_state"], info["final_observation"]
+    np.testing.assert_array_equal(final.pose, BANK.successor[state.pose, action])
+    np.testing.assert_array_equal(final.scene, state.scene)
+    np.testing.assert_array_equal(seen.goal, state.goal)
+    np.testing.assert_array_equal(seen.row, BANK.rows[final.pose])
+    # The new episodes are others, and observed as such.
+    assert (np.asarray(after.scene) != state.scene).mean() > 0.5
+    np.testing.assert_array_equal(observation.row, BANK.rows[after.pose])
+    np.testing.assert_array_equal(observation.goal, after.goal)
+
+
+@pytest.mark.parametrize("rules", [ROOMS, HOUSES])
+def test_starts_are_uniform(rules):
+    # A scene of 4 cells with one goal, and one of 1 cell with two goals.
+    wide = draw(["..", ".."], ("Book", 0, 1.5, 1, *SMALL))
+    narrow = draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Fridge", 1, 0.9, 0.5, 0.3, 1.2, 0.3))
+    bank = compile_bank([wide, narrow], Task(CATEGORIES, rules=rules))
+    env, params = build(bank, {}, 10)
+    _, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 40_000), params)
+    pose, scene, goal = np.asarray(state.pose), np.asarray(state.scene), np.asarray(state.goal)
+    assert not np.asarray(state.time).any()
+
+    def uniform(values, choices):
+        counts = np.bincount(np.searchsorted(choices, values), minlength=len(choices))
+        assert np.isin(values, choices).all()
+        return chisquare(counts).pvalue > 1e-3
+
+    assert uniform(scene, [0, 1])
+    assert (goal[scene == 0] == BOOK).all()
+    assert uniform(goal[scene == 1], [0, 2])
+    starts = np.arange(0, 5 * rules.poses_per_cell, len(rules.horizons))  # cell and heading; level
+    assert uniform(pose[scene == 0], starts[: 4 * rules.headings])
+    assert uniform(pose[scene == 1], starts[4 * rules.headings :])
+    assert not uniform(np.append(scene, np.zeros(1000, int)), [0, 1])  # the test can tell
+
+
+@pytest.mark.parametrize(("rules", "ahead"), [(ROOMS, 1.0), (HOUSES, 0.75)])
+def test_shaping_rewards_metres_nearer_to_the_goal(rules, ahead):
+    # A corridor of 8 cells along z; the book's centre is at z = 2.75, its footprint from 2.5 m on (sight: 2.75 - z to
+    # the centre, walk: 2.5 - z to the footprint). Each MoveAhead is 0.25 m, whatever is measured.
+    corridor = draw(["."] * 8, ("Book", 0, 1.0, 2.75, 0.5, 0.5, 0.5))
+    bank = compile_bank([corridor], Task(CATEGORIES, rules=rules))
+    plain, params = build(bank, {}, 100)
+    shaped, _ = build(bank, {}, 100, shaping=2.0)
+    per_cell = rules.poses_per_cell
+    back = rules.headings // 2 * len(rules.horizons)
+    start = State(pose=jnp.int32(3 * per_cell), scene=jnp.int32(0), goal=jnp.int32(BOOK), time=jnp.int32(0))
+    turned = start.replace(pose=start.pose + back)
+    assert plain.advance(start, jnp.int32(MOVE_AHEAD), params)[1] == jnp.float32(-0.01)
+    for state, action, metres in [(start, MOVE_AHEAD, 0.25), (turned, MOVE_AHEAD, -0.25), (start, LOOK_UP, 0.0)]:
+        reward = shaped.advance(state, jnp.int32(action), params)[1]
+        np.testing.assert_allclose(reward, -0.01 + 2.0 * metres, atol=1e-6)
+    done = start.replace(pose=jnp.int32(7 * per_cell))
+    np.testing.assert_allclose(bank.goal_distance[7, BOOK], ahead)  # z = 1.75
+    assert shaped.advance(done, jnp.int32(DONE), params)[1] == 5.0
+    assert make("rooms")[0].shaping == 0.0
+
+
+def test_padded_tables_hold_the_same_episodes():
+    cells, cell_poses = len(BANK.ahead), BANK.task.rules.poses_per_cell
+    env, params = build(BANK, {"kitchen": 7}, 9)
+    padded_env, padded = build(BANK, {"kitchen": 7}, 9, cells + 10, 6)
+    assert padded_env == env
+    # 4 scenes, and the first two again.
+    assert (params.step_limit.tolist(), padded.step_limit.tolist()) == ([7, 9, 9, 9], [7, 9, 9, 9, 7, 9])
+    assert (params.room.tolist(), padded.room.tolist()) == ([0, 1, 2, 3], [0, 1, 2, 3, 0, 1])
+    tables, longer = vars(params.tables), vars(padded.tables)
+    for name in ("first_cell", "num_cells", "goals", "num_goals"):
+        np.testing.assert_array_equal(longer[name], np.asarray(tables[name])[[0, 1, 2, 3, 0, 1]])
+    for name, added in (("ahead", 10), ("goal_distance", 10), ("rows", 10 * cell_poses)):
+        np.testing.assert_array_equal(longer[name][:-added], tables[name])
+        assert not np.asarray(longer[name][-added:]).any()
+    small = build(BANK, {}, 9, cells - 1, 2)[1]
+    assert (len(small.tables.ahead), len(small.room)) == (cells, 4)
+
+
+@pytest.mark.parametrize(
+    ("world", "categories", "goals", "rules", "limits"),
+    [
+        ("rooms", 22, 22, ROOMS, (30, [100, 200, 100, 100])),
+        ("apartments", 22, 12, APARTMENTS, (100, [500])),
+        ("houses", 15, 6, HOUSES, (100, [500])),
+    ],
+)
+def test_the_worlds_are_those_of_the_page(tmp_path, world, categories, goals, rules, limits):
+    task = WORLDS[world].task
+    assert (len(task.categories), task.is_goal().sum(), task.rules) == (categories, goals, rules)
+    # A book and a television, both of which every world knows, in each room type and in a home.
+    room = draw(["."], ("Book", 0, 1.0, 0.5, *SMALL), ("Television", 0, 1.0, 0.5, *SMALL))
+    types = ROOM_TYPES if world == "rooms" else ("apartment",)
+    path = tmp_path / "scenes.jsonl.gz"
+    write_scenes(path, [named_room(room, split, kind) for split in ("train", "val") for kind in types])
+    for split, expected in zip(("train", "val"), ([limits[0]] * len(types), limits[1]), strict=True):
+        env, params = make(world, split, path)
+        assert env.task == task
+        assert params.step_limit.tolist() == expected
+        assert params.room.tolist() == ([0, 1, 2, 3] if world == "rooms" else [OTHER_ROOM])
+
+
+def named_room(room, split, room_type):
+    return dataclasses.replace(room, name=f"{split}-{room_type}", split=split, room_type=room_type)
+
+
+def test_make_generates_a_world():
+    env, params = make("houses", "val", seed=3)
+    check_environment(env, params, num_envs=4, num_steps=16)
+    scenes = generated("houses", "val", seed=3)
+    bank = compile_bank([scenes[i] for i in range(len(scenes))], WORLDS["houses"].task)
+    np.testing.assert_array_equal(params.tables.rows, bank.rows)
+
+
+def test_make_from_a_scene_file_with_a_task_of_ones_own(tmp_path):
+    path = tmp_path / "rooms.jsonl.gz"
+    write_scenes(path, SCENES)
+    types = tuple(scene.room_type for scene in SCENES[4:])
+    assert types == ROOM_TYPES
+    task = Task(("Television", "Sink"), rules=HOUSES)
+    env, params = make("rooms", "val", path, task)
+    assert (env.task, env.categories, env.num_actions) == (task, ("Television", "Sink"), 6)
+    assert params.tables.ahead.shape[1] == 12
+
+
+def test_make_refuses_what_it_does_not_know(tmp_path):
+    with pytest.raises(InputError, match=r"world 'romms': choose one of rooms, apartments, houses"):
+        make("romms")
+    path = tmp_path / "train.jsonl.gz"
+    write_scenes(path, SCENES[:1])
+    with pytest.raises(InputError, match=r"split 'valid': choose one of train, val, test"):
+        make("rooms", "valid", path)
+    with pytest.raises(InputError, match=r"train\.jsonl\.gz: holds no scene of split 'test'; it holds train"):
+        make("rooms", "test", path)
+    with pytest.raises(InputError, match="reachable goal"):
+        make("rooms", "train", path, Task(("Unicorn",)))

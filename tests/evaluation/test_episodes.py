@@ -1,0 +1,103 @@
+"""Evaluation episodes: the fixed list, an oracle's full marks on it, and the metrics."""
+
+import chex
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+
+from jaxnav.baselines.shortest_path import oracle_actions, oracle_outcome, replay
+from jaxnav.env.objectnav import build
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.grid import Outcome, first_states
+from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, Rules, Task
+
+EPISODES = episode_list(tiny.BANK, 24, seed=1)
+
+
+def test_episodes_are_possible_and_know_their_best_length():
+    for scene, goal, pose, best in zip(*EPISODES[:4], strict=True):
+        assert goal in tiny.BANK.goals[scene, : tiny.BANK.num_goals[scene]]
+        first = tiny.BANK.first_cell[scene] * tiny.POSES_PER_CELL
+        assert first <= pose < first + tiny.BANK.num_cells[scene] * tiny.POSES_PER_CELL
+        assert best == tiny.BANK.best_length[pose, goal] >= 1
+    assert len(set(EPISODES.pose.tolist())) > 12  # all over the rooms
+
+
+def test_episodes_are_equally_many_per_room_type_and_scene():
+    bank = compile_bank(generate_rooms(0, 6, 0, seed=1), Task())  # two kitchens and living rooms, one of the others
+    assert len(bank.names) == 6
+    episodes = episode_list(bank, 42)
+    assert episodes.rooms == ("bathroom", "bedroom", "kitchen", "living_room")
+    # 42 / 4 is rounded up to 11 of each; where there are two scenes they take turns: 6 and 5.
+    np.testing.assert_array_equal(np.bincount(episodes.room), [11] * 4)
+    by_scene = {bank.room_types[scene]: [] for scene in range(6)}
+    for scene, number in enumerate(np.bincount(episodes.scene)):
+        by_scene[bank.room_types[scene]].append(number)
+    assert by_scene == {"kitchen": [6, 5], "living_room": [6, 5], "bedroom": [11], "bathroom": [11]}
+    assert all(
+        episodes.rooms[room] == bank.room_types[scene]
+        for room, scene in zip(episodes.room, episodes.scene, strict=True)
+    )
+    assert (episodes.best_length >= 1).all()
+
+
+def test_episodes_are_fixed_by_bank_and_seed():
+    chex.assert_trees_all_equal(episode_list(tiny.BANK, 24, seed=1)[:5], EPISODES[:5])
+    assert not np.array_equal(episode_list(tiny.BANK, 24, seed=2).pose, EPISODES.pose)
+
+
+def test_no_episodes_are_refused():
+    with pytest.raises(InputError, match="--episodes 0: give at least 1"):
+        episode_list(tiny.BANK, 0)
+
+
+# The shortest way in generated rooms
+
+
+@pytest.mark.parametrize("rules", [Rules(), Rules(headings=12, horizons=(0.0,), success="near", success_distance=1.0)])
+def test_an_oracle_has_full_marks(rules):
+    """It goes down the table of best lengths: SR 1 and SPL 1, exactly."""
+    bank = compile_bank(generate_rooms(0, 4, 0, seed=5), Task(rules=rules))
+    env, params = build(bank, {}, 100)
+    episodes = episode_list(bank, 200)
+    actions = oracle_actions(bank, episodes)
+    outcome = oracle_outcome([bank], [episodes], [params], env)
+    np.testing.assert_array_equal(outcome.length, episodes.best_length)
+    metrics = episode_metrics(outcome, episodes.best_length)
+    np.testing.assert_array_equal(metrics["sr"], np.ones(200))
+    np.testing.assert_array_equal(metrics["spl"], np.ones(200))
+    # Found means 1.5 m (1 m to walk) at most, of which DTS takes 1 m off.
+    assert metrics["dts"].max() <= rules.success_distance - 1.0 + 1e-6
+    assert metrics["sae"].max() <= 1
+    assert np.median(outcome.length) > 3
+
+    # Nothing is taken for granted: other actions fail, and a step limit stops the oracle too.
+    astray = replay(np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), first_states(episodes), params, env)
+    assert not astray.success.any()
+    stopped = replay(actions, first_states(episodes), build(bank, {}, 3)[1], env)
+    np.testing.assert_array_equal(stopped.success, episodes.best_length <= 3)
+
+
+# Metrics
+
+
+def test_metrics_by_hand():
+    outcome = Outcome(
+        success=np.array([True, True, False, True]),
+        length=np.array([10, 1, 30, 4], np.int32),
+        moves=np.array([6, 0, 20, 3], np.int32),
+        distance=np.array([1.4, 0.3, 3.5, 1.0], np.float32),
+        weight=np.zeros(4, np.float32),
+    )
+    metrics = episode_metrics(outcome, np.array([5, 1, 6, 4]))
+    np.testing.assert_array_equal(metrics["sr"], [1, 1, 0, 1])
+    # Success x L* / length: 5 / 10, 1 / 1, no success, 4 / 4.
+    np.testing.assert_array_equal(metrics["spl"], [0.5, 1, 0, 1])
+    # Distance less 1 m, at least 0.
+    np.testing.assert_allclose(metrics["dts"], [0.4, 0, 2.5, 0], atol=1e-6)
+    # MoveAheads / (length - 1): 6 / 9; an episode of Done alone has none; no success; 3 / 3.
+    np.testing.assert_allclose(metrics["sae"], [2 / 3, 0, 0, 1])

@@ -1,0 +1,255 @@
+"""The evaluation grid against plain loops and against itself, cell by cell."""
+
+import logging
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+
+from jaxnav.causal import remove_experience
+from jaxnav.evaluation.episodes import episode_list, together
+from jaxnav.evaluation.grid import act, evaluate_grid, first_states
+from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.variants import inference_grid, table_rows
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.pathways import NO_ACTION, Memory
+from jaxnav.policies.policy import bind
+from jaxnav.scenes.task import DONE, MOVE_AHEAD
+from jaxnav.study.trials import Trial, trial_grid
+
+SEEDS, LIMITS = 2, (12, 16)
+ENV, PARAMS = tiny.world()
+PARAMS = PARAMS.replace(step_limit=jnp.array(LIMITS, jnp.int32))
+PRIORS = 0.05 * tiny.priors()  # a belief that gives way at once: large gaps
+EPISODES = episode_list(tiny.BANK, 24, seed=1)
+ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"])
+#: Parameters of the two baselines, then of the two layout policies; seeds that say Done here and there.
+WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) for seed in (5, 9, 6, 11)))
+
+
+#: Controls whose weights or logits are of other episodes or drawn by key.
+TRIALS = [
+    Trial("stde", "argmax", 0.0, "paper", "shuffled"),
+    Trial("stde", "sample", 0.2, "residual", "shuffled"),
+    Trial("stde", "argmax", 0.0, "paper", "noise"),
+    Trial("stde", "sample", 0.0, "paper", "random"),
+]
+CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, SEEDS), trial_grid(TRIALS, SEEDS))
+ACTING, KEY = Acting(ENV, tiny.SETTING), jax.random.key(3)
+
+
+class Compilations(logging.Handler):
+    """The compilations of the grid that JAX reports."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def emit(self, record):
+        self.count += record.getMessage().startswith("Compiling jit(_run)")
+
+
+@pytest.fixture(scope="module")
+def evaluated():
+    """All rows and trials [R + T, S, E], the compilations that were counted and the number that was told."""
+    handler, logger = Compilations(), logging.getLogger("jax")
+    logger.addHandler(handler)
+    try:
+        with jax.log_compiles():
+            outcome, told = evaluate_grid(CELLS, WEIGHTS, [(EPISODES, PARAMS)], ACTING, tiny.SPEC, PRIORS, KEY)
+    finally:
+        logger.removeHandler(handler)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, SEEDS, len(EPISODES.goal)), outcome), handler.count, told
+
+
+@pytest.fixture(scope="module")
+def outcome(evaluated):
+    return evaluated[0]
+
+
+def pick(outcome, variant, epsilon=None, form=None, decoding="argmax"):
+    """The outcome [S, E] of one row."""
+    return tiny.at(outcome, ROWS.index((variant, epsilon, form, decoding)))
+
+
+# Cells
+
+
+def test_the_whole_grid_is_one_compilation(evaluated):
+    _, counted, told = evaluated
+    assert counted == told == 1
+    # Of each decoding: baseline, layout, TDE, and two forms of three sTDE. And Random.
+    assert len(ROWS) == 2 * (3 + 6) + 1
+
+
+@pytest.mark.parametrize("decoding", ["argmax", "sample"])
+@pytest.mark.parametrize("form", ["residual", "paper"])
+def test_at_epsilon_one_nothing_is_taken_out_bit_for_bit(outcome, form, decoding):
+    layout = pick(outcome, "layout", decoding=decoding)
+    chex.assert_trees_all_equal(pick(outcome, "stde", 1.0, form, decoding), layout)
+    assert not layout.weight.any()
+    # At epsilon 0 something is taken out, and it matters.
+    stde = pick(outcome, "stde", 0.0, form, decoding)
+    assert 0.1 < stde.weight.max() < 1
+    assert not np.array_equal(stde.length, layout.length)
+
+
+def test_hard_tde_takes_all_experience_out(outcome):
+    np.testing.assert_array_equal(pick(outcome, "tde", form="paper").weight, np.ones((SEEDS, 24)))
+    assert not np.array_equal(pick(outcome, "tde", form="paper").length, pick(outcome, "layout").length)
+
+
+def test_the_weight_falls_as_epsilon_rises(outcome):
+    # The first step is the same for all, so that its gap is; afterwards they part.
+    means = [pick(outcome, "stde", epsilon, "residual").weight.mean() for epsilon in (0.0, 0.2, 1.0)]
+    assert means[0] > means[1] > means[2] == 0
+
+
+def test_random_is_another_for_every_seed_and_knows_no_policy(outcome):
+    random = pick(outcome, "random", decoding="sample")
+    assert not np.array_equal(random.length[0], random.length[1])
+    # Done is one of six actions: of all last actions a sixth would be right at best.
+    assert 2 < random.length.mean() < 9
+
+
+def part(episodes):
+    """Those of the episodes, and all scenes."""
+    return EPISODES._replace(**{name: getattr(EPISODES, name)[episodes] for name in EPISODES._fields[:5]})
+
+
+def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_others(outcome):
+    """Two parts of few episodes, in another order and by some of the cells in another order."""
+    parts = [np.array([0, 1, 2, 3, 20, 11]), np.array([12, 5, 4, 23, 8, 17])]
+    cells = np.arange(len(ROWS))[::-3]
+    grid = inference_grid([ROWS[i] for i in cells], SEEDS)
+    lists = [part(episodes) for episodes in parts]
+    found, compilations = evaluate_grid(grid, WEIGHTS, [(own, PARAMS) for own in lists], ACTING, tiny.SPEC, PRIORS, KEY)
+    assert compilations == 1
+    found = jax.tree.map(lambda leaf: leaf.reshape(len(cells), SEEDS, -1), found)
+    expected = jax.tree.map(lambda leaf: leaf[cells][..., np.concatenate(parts)], outcome)
+    best = np.array([ROWS[i].decoding == "argmax" for i in cells])
+    chex.assert_trees_all_equal(tiny.at(found, best), tiny.at(expected, best))
+    # Sampled actions follow the number of the episode in its part, which the first four keep.
+    chex.assert_trees_all_equal(tiny.at(found, ..., slice(4)), tiny.at(expected, ..., slice(4)))
+    assert not np.array_equal(found.length[~best], expected.length[~best])
+    merged = together(lists)
+    assert merged.scenes == 2 * EPISODES.scenes
+    assert [merged.scenes[i] for i in merged.scene] == [
+        EPISODES.scenes[i] for i in EPISODES.scene[np.concatenate(parts)]
+    ]
+    for name in ("goal", "pose", "best_length", "room"):
+        np.testing.assert_array_equal(getattr(merged, name), getattr(EPISODES, name)[np.concatenate(parts)])
+
+
+def test_a_single_episode():
+    grid = tiny.at(CELLS, slice(1))
+    found, _ = evaluate_grid(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], ACTING, tiny.SPEC, PRIORS, KEY)
+    assert found.length.shape == (1, 1)
+    assert 1 <= found.length[0, 0] <= max(LIMITS)
+
+
+# Against a plain loop
+
+
+def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
+    """One episode, best actions, by single calls."""
+    scene, goal, pose = (int(getattr(EPISODES, name)[episode]) for name in ("scene", "goal", "pose"))
+    prior, weights, belief = PRIORS[PARAMS.room[scene]], tiny.at(WEIGHTS, seed), None
+    memory = Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
+    length, action, total, moves = 0, None, 0.0, 0
+    while length < LIMITS[scene] and action != DONE:
+        row = tiny.BANK.rows[pose]
+        belief = tiny.believe(prior, belief, row)
+        relevance = tiny.goal_weights(belief, goal) if layout else jnp.ones(3)
+        factual, counterfactual = tiny.decide(weights, row, goal, relevance, memory)
+        weight = jnp.maximum(belief.gap - epsilon, 0)
+        logits = remove_experience(factual.logits, counterfactual.logits, weight, form)
+        action = int(np.argmax(logits))
+        length, moves, total = length + 1, moves + (action == MOVE_AHEAD), total + float(weight)
+        memory = Memory(factual.hidden, jnp.int32(action))  # what is carried on is factual
+        pose = int(tiny.BANK.successor[pose, action])
+    return {
+        "success": action == DONE and tiny.BANK.best_length[pose, goal] == 1,
+        "length": length,
+        "moves": moves,
+        "distance": tiny.BANK.goal_distance[pose // tiny.POSES_PER_CELL, goal],
+        "weight": total / length,
+    }
+
+
+@pytest.mark.parametrize(
+    ("variant", "epsilon", "form"),
+    [("baseline", None, None), ("layout", None, None), ("stde", 0.0, "paper"), ("stde", 0.2, "residual")],
+)
+def test_outcomes_are_those_of_a_plain_loop(outcome, variant, epsilon, form):
+    found = pick(outcome, variant, epsilon, form)
+    layout, threshold = variant != "baseline", jnp.float32(np.inf if epsilon is None else epsilon)
+    for seed in range(SEEDS):
+        for episode in range(0, 24, 3):
+            expected = plain_loop(seed + SEEDS * layout, episode, layout, threshold, form or "residual")
+            for name, value in expected.items():
+                assert getattr(found, name)[seed, episode] == pytest.approx(value, rel=1e-4, abs=1e-6), (name, episode)
+
+
+@jax.jit
+def begin(weights):
+    return ACTING.begin(first_states(EPISODES), bind(tiny.SPEC, weights), PARAMS, PRIORS)
+
+
+@jax.jit
+def take(cell, weights, agent, running, keys):
+    return act(cell, bind(tiny.SPEC, weights), agent, running, keys, ACTING, PARAMS, PRIORS)
+
+
+@pytest.mark.parametrize("trial", range(len(TRIALS)))
+def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, trial):
+    """Leaving ended episodes out changes no one's next running episode and no one's noise."""
+    for seed in range(SEEDS):
+        cell = tiny.at(CELLS, (len(ROWS) + trial) * SEEDS + seed)
+        weights = tiny.at(WEIGHTS, int(cell.params))
+        # Folded with the part, the parameters and the episode.
+        own = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.params)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(own, jnp.arange(len(EPISODES.goal)))
+        agent = begin(weights)
+        running = np.ones(len(EPISODES.goal), bool)
+        success, length, total = ~running, np.zeros(len(running), int), np.zeros(len(running))
+        while running.any():
+            agent, taken = take(cell, weights, agent, running, keys)
+            success |= running & np.asarray(taken.success)
+            length += running
+            total += np.where(running, taken.weight, 0.0)
+            running &= ~np.asarray(taken.ended)
+        found = tiny.at(outcome, len(ROWS) + trial, seed)
+        np.testing.assert_array_equal(found.success, success)
+        np.testing.assert_array_equal(found.length, length)
+        np.testing.assert_allclose(found.weight, total / length, rtol=1e-5, atol=1e-7)
+
+
+def test_playing_an_episode_agrees_with_the_grid(outcome):
+    row = ROWS.index(("stde", 0.2, "residual", "argmax"))
+    cell = tiny.at(CELLS, row * SEEDS + 1)
+    for episode in (0, 17):
+        start = tiny.at(first_states(EPISODES), episode)
+        trace = play(cell, tiny.at(WEIGHTS, int(cell.params)), start, ACTING, tiny.SPEC, PARAMS, PRIORS)
+        found = tiny.at(outcome, row, 1, episode)
+        assert (len(trace.pose), trace.success) == (found.length, found.success)
+        assert trace.pose[0] == EPISODES.pose[episode]
+        assert not (trace.action[:-1] == DONE).any()
+        assert np.maximum(trace.gap - 0.2, 0).mean() == pytest.approx(found.weight, abs=1e-6)
+
+
+def test_episodes_end_once(outcome):
+    """There is no second episode after Done or after the limit of the scene."""
+    limits = np.array(LIMITS)[EPISODES.scene]
+    assert (outcome.length >= 1).all()
+    assert (outcome.length <= limits).all()
+    assert (outcome.length == limits).any()
+    assert (outcome.moves <= outcome.length).all()
+    # Success takes Done where the goal is found, so the shortest way at least.
+    assert (outcome.length >= EPISODES.best_length)[outcome.success].all()
+    assert outcome.success.any()
+    assert not outcome.success.all()

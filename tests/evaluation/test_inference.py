@@ -1,0 +1,210 @@
+"""sTDE and its controls, step by step: what is taken out, with which weight, and which actions follow."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import kstest
+from support import tiny_world as tiny
+
+from jaxnav.causal import do
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.grid import act, first_states
+from jaxnav.evaluation.inference import Branch, counterfactual_logits
+from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.pathways import Decision, Memory, Pathways
+from jaxnav.policies.policy import bind
+from jaxnav.scenes.task import NUM_ACTIONS
+
+EPISODES = 48
+ENV, PARAMS = tiny.world()
+PRIORS = 0.05 * tiny.priors()  # a belief that gives way at once: large gaps
+ACTING = Acting(ENV, tiny.SETTING)
+START = first_states(episode_list(tiny.BANK, EPISODES, seed=1))
+
+
+def cell(variant="stde", epsilon=0.0, form="paper", decoding="argmax", **changes):
+    """One cell of the grid, changed."""
+    one = tiny.at(inference_grid([table_row(variant, epsilon, form, decoding)], 1), 0)
+    return one.replace(**{name: jnp.asarray(value, getattr(one, name).dtype) for name, value in changes.items()})
+
+
+LAYOUT = cell("layout")
+CONTROLS = {
+    "none": {},
+    "shuffled": {"shuffled": True},
+    "zeros": {"branch": Branch.ZEROS},
+    "noise": {"branch": Branch.NOISE},
+    "random": {"intervention": 1.0},
+}
+EPISODE_KEYS, STEP_KEYS = jax.random.split(jax.random.key(3), (2, EPISODES))
+EVERY = np.ones(EPISODES, bool)
+
+
+@jax.jit
+def begin(weights):
+    """The episodes after their first view."""
+    return ACTING.begin(START, bind(tiny.SPEC, weights), PARAMS, PRIORS)
+
+
+@jax.jit
+def take(own, weights, agent, running, keys):
+    """One step."""
+    return act(own, bind(tiny.SPEC, weights), agent, running, keys, ACTING, PARAMS, PRIORS)
+
+
+@jax.jit
+def both(own, weights, agent, keys, step_keys):
+    """The logits that are taken out, and those of the counterfactual decision."""
+    policy = bind(tiny.SPEC, weights)
+    observation, layout = ACTING.observe(agent, PARAMS)
+    pathways = policy.pathways(observation, layout)
+    zeroed = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
+    return counterfactual_logits(own, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
+
+
+WEIGHTS = tiny.lively(6)
+
+
+@pytest.fixture(scope="module")
+def agent():
+    """The episodes after three steps of + w: the memory is alive and gaps differ."""
+    agent = begin(WEIGHTS)
+    for _ in range(3):
+        agent, _ = take(LAYOUT, WEIGHTS, agent, EVERY, EPISODE_KEYS)
+    assert len(np.unique(agent.layout.gap)) > 3
+    return agent
+
+
+def step(agent, running=EVERY, **options):
+    """What one step takes, and the weights that it takes it with."""
+    _, taken = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
+    return np.asarray(taken.action), np.asarray(taken.weight)
+
+
+# What is taken out
+
+
+def test_stde_takes_out_the_decision_without_direct_pathways(agent):
+    found, expected = both(cell(), WEIGHTS, agent, EPISODE_KEYS, STEP_KEYS)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_zeros_are_zeros(agent):
+    assert not both(cell(**CONTROLS["zeros"]), WEIGHTS, agent, EPISODE_KEYS, STEP_KEYS)[0].any()
+
+
+def test_noise_is_normal_with_the_spread_of_the_counterfactual_logits(agent):
+    found, counterfactual = both(cell(**CONTROLS["noise"]), WEIGHTS, agent, EPISODE_KEYS, STEP_KEYS)
+    standard = np.asarray(found) / np.std(counterfactual, axis=1, keepdims=True)
+    # 48 episodes of 6 actions: 288 independent draws.
+    assert kstest(standard.ravel(), "norm").pvalue > 0.01
+    assert abs(np.corrcoef(np.asarray(found).ravel(), np.asarray(counterfactual).ravel())[0, 1]) < 0.2
+
+
+class Open:
+    """A policy whose logits are its pathways: two numbers of scene, two of goal, one of experience."""
+
+    def decide(self, pathways, memory):
+        logits = jnp.concatenate(pathways[:3], axis=-1)
+        return Decision(logits=logits, value=logits[:, 0], hidden=memory.hidden)
+
+
+@pytest.mark.parametrize("highest", [0.25, 2.0])
+def test_a_random_intervention_sets_scene_and_goal_alone(highest):
+    count = 500
+    pathways = Pathways(*(jnp.full((count, width), 9.0) for width in (2, 2, 1)), gate=jnp.ones((count, 1)))
+    memory = Memory(hidden=jnp.zeros((count, 1)), action=jnp.zeros(count, jnp.int32))
+    keys = jax.random.split(jax.random.key(0), (2, count))
+
+    def logits(**changes):
+        return np.asarray(counterfactual_logits(cell(**changes), Open(), pathways, memory, *keys))
+
+    found = logits(intervention=highest)
+    np.testing.assert_array_equal(found[:, 4], 9.0)
+    # Columns of scene and goal are uniform and owe nothing to each other.
+    for column in found[:, :4].T:
+        assert kstest(column / highest, "uniform").pvalue > 0.01
+    assert np.abs(np.corrcoef(found[:, :4].T) - np.eye(4)).max() < 0.15
+    np.testing.assert_array_equal(logits()[:, :4], 0.0)
+
+
+@pytest.mark.parametrize("name", ["noise", "random"])
+def test_noise_is_the_same_throughout_an_episode_and_an_intervention_drawn_at_every_step(agent, name):
+    def logits(*keys):
+        return np.asarray(both(cell(**CONTROLS[name]), WEIGHTS, agent, *keys)[0])
+
+    def changed(keys):
+        return keys.at[7].set(jax.random.key(99))
+
+    first = logits(EPISODE_KEYS, STEP_KEYS)
+    np.testing.assert_array_equal(logits(EPISODE_KEYS, STEP_KEYS), first)
+    own, other = (changed(EPISODE_KEYS), STEP_KEYS), (EPISODE_KEYS, changed(STEP_KEYS))
+    followed, ignored = (own, other) if name == "noise" else (other, own)
+    np.testing.assert_array_equal(logits(*ignored), first)
+    # Other logits in the episode of the other key and nowhere else.
+    assert np.flatnonzero((logits(*followed) != first).any(axis=1)).tolist() == [7]
+
+
+# Which actions follow
+
+
+@pytest.mark.parametrize("form", ["paper", "residual"])
+@pytest.mark.parametrize("weight", [0.3, 2.0])
+def test_zeros_leave_the_best_action_as_it_is(agent, form, weight):
+    plain, _ = step(agent, variant="layout")
+    own = {"form": form, "epsilon": 0.0, "always": weight}
+    zeros, weights = step(agent, **own, **CONTROLS["zeros"])
+    assert (weights >= np.float32(weight)).all()
+    np.testing.assert_array_equal(zeros, plain)
+    # What the policy's own counterfactual, noise or a random intervention would change.
+    for control in ("none", "noise", "random"):
+        assert (step(agent, **own | {"always": 2.0}, **CONTROLS[control])[0] != plain).any()
+
+
+def test_zeros_are_no_control_of_the_papers_form(agent):
+    """a - s 0 = a whatever the weight, sampled actions too; in the residual form the policy is sharper: (1 + s) a."""
+    plain, _ = step(agent, variant="layout", decoding="sample")
+    own = {"decoding": "sample", "always": 2.0, **CONTROLS["zeros"]}
+    np.testing.assert_array_equal(step(agent, form="paper", **own)[0], plain)
+    assert (step(agent, form="residual", **own)[0] != plain).any()
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("form", ["paper", "residual"])
+@pytest.mark.parametrize("decoding", ["argmax", "sample"])
+def test_at_epsilon_one_every_control_is_plus_w(agent, control, form, decoding):
+    plain, _ = step(agent, variant="layout", decoding=decoding)
+    found, weight = step(agent, epsilon=1.0, form=form, decoding=decoding, **CONTROLS[control])
+    np.testing.assert_array_equal(found, plain)
+    assert not weight.any()
+
+
+def test_a_constant_weight_of_one_in_the_papers_form_is_hard_tde(agent):
+    found, weight = step(agent, always=1.0, epsilon=1.0)  # no gap exceeds epsilon
+    np.testing.assert_array_equal(found, step(agent, variant="tde")[0])
+    np.testing.assert_array_equal(weight, np.ones(EPISODES))
+
+
+# The weight of another episode
+
+
+@pytest.mark.parametrize("running", [EVERY, np.arange(EPISODES) % 7 != 3, np.arange(EPISODES) == 5])
+def test_a_shuffled_weight_is_that_of_the_next_running_episode(agent, running):
+    gap = jnp.arange(EPISODES) / 100  # names the episode
+    named = agent._replace(layout=agent.layout.replace(gap=gap))
+    _, weight = step(named, running, shuffled=True)
+    # The last one's next is the first; one that runs alone keeps its own.
+    np.testing.assert_array_equal(weight[running], np.roll(gap[running], -1))
+
+
+def test_shuffling_unequal_ones_changes_actions(agent):
+    apart = agent._replace(layout=agent.layout.replace(gap=(jnp.arange(EPISODES) % 2).astype(jnp.float32)))
+    own, shuffled = (step(apart, shuffled=shuffled)[0] for shuffled in (False, True))
+    assert (own != shuffled).any()
+
+
+def test_actions_are_of_the_task(agent):
+    found = np.concatenate([step(agent, decoding="sample", **changes)[0] for changes in CONTROLS.values()])
+    assert set(found) == set(range(NUM_ACTIONS))

@@ -1,0 +1,109 @@
+"""The divergence of equation 5 in float32, against float64 and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import digamma, gammaln
+from support.dirichlet import exact_kl
+
+from jaxnav.layout import presence_kl, update_kl
+
+
+def draws(seed: int, k: int, n: int = 4000):
+    """Priors 0.01..2e4 of several kinds with counts 0..3, as (name, prior [n, k], counts [n, k])."""
+    rng = np.random.default_rng(seed)
+    scale = np.exp(rng.uniform(np.log(1e-2), np.log(2e4), (n, 1)))
+    sparse = rng.integers(0, 4, (n, k)) * (rng.random((n, k)) < rng.random((n, 1)))
+    full = rng.integers(1, 4, (n, k))
+    near = np.exp(rng.normal(size=(n, k)) * 10 ** rng.uniform(-6, -1, (n, 1)))
+    extremes = np.where(rng.random((n, k)) < 0.5, rng.uniform(0.01, 0.05, (n, k)), np.maximum(scale, 1))
+    kinds = {
+        "log-uniform": (np.exp(rng.uniform(np.log(1e-2), np.log(2e4), (n, k))), sparse),
+        "extremes": (extremes, sparse),
+        "near-proportional": (full * near * scale / 3, full),
+        "proportional": (scale * np.ones(k), np.ones((n, k), int) * rng.integers(1, 4, (n, 1))),
+    }
+    for name, (prior, counts) in kinds.items():
+        yield name, np.clip(prior, 1e-2, 2e4).astype(np.float32), counts
+
+
+def worst_error(function, k: int) -> float:
+    errors = []
+    for name, prior, counts in draws(k, k):
+        exact = exact_kl(prior, counts)
+        value = np.asarray(jax.jit(function)(prior, counts.astype(np.float32)))
+        large = exact > 1e-6
+        errors.append(np.abs(value[large] / exact[large] - 1).max())
+        print(f"K = {k}, {name}: worst relative error {errors[-1]:.1e}")
+    return max(errors)
+
+
+@pytest.mark.parametrize("k", [2, 3, 22, 40])
+def test_update_kl_is_accurate_in_float32(k):
+    assert worst_error(update_kl, k) < 1e-3
+
+
+def test_lgamma_differences_are_not():
+    """Negative control: the textbook formula in float32 misses the bound by orders of magnitude."""
+    from jax.scipy.special import digamma as psi
+    from jax.scipy.special import gammaln as lgamma
+
+    def textbook(a, c):
+        b = a + c
+        entries = lgamma(a) - lgamma(b) + c * (psi(b) - psi(b.sum(-1, keepdims=True)))
+        return lgamma(b.sum(-1)) - lgamma(a.sum(-1)) + entries.sum(-1)
+
+    assert worst_error(textbook, 22) > 1
+
+
+def test_reference_agrees_with_the_textbook_formula_in_float64():
+    rng = np.random.default_rng(0)
+    a, c = rng.uniform(0.05, 30, (200, 8)), rng.integers(0, 4, (200, 8))
+    b = a + c
+    textbook = gammaln(b.sum(-1)) - gammaln(a.sum(-1)) + (gammaln(a) - gammaln(b)).sum(-1)
+    textbook += (c * (digamma(b) - digamma(b.sum(-1, keepdims=True)))).sum(-1)
+    np.testing.assert_allclose(exact_kl(a, c), textbook, rtol=1e-8, atol=1e-12)
+
+
+def test_update_kl_against_monte_carlo():
+    # KL = E_posterior[log posterior / prior] = const + E[sum_j c_j log theta_j]; 2e5 samples.
+    a, c = np.array([0.5, 2.0, 4.0, 1.5]), np.array([1, 0, 2, 0])
+    theta = np.random.default_rng(0).dirichlet(a + c, 200_000)
+    b = a + c
+    log_ratio = gammaln(b.sum()) - gammaln(a.sum()) + (gammaln(a) - gammaln(b)).sum() + np.log(theta) @ c
+    standard_error = log_ratio.std() / np.sqrt(len(theta))
+    assert standard_error < 0.01
+    kl = update_kl(jnp.asarray(a, jnp.float32), jnp.asarray(c))
+    assert abs(float(kl) - log_ratio.mean()) < 4 * standard_error
+
+
+def test_update_kl_is_positive_and_zero_only_without_counts():
+    for _, prior, counts in draws(0, 5):
+        kl = np.asarray(update_kl(jnp.asarray(prior), jnp.asarray(counts)))
+        empty = counts.sum(-1) == 0
+        assert (kl[empty] == 0).all()
+        assert (kl[~empty] >= 0).all()
+        assert (kl[exact_kl(prior, counts) > 1e-6] > 0).all()
+
+
+def test_update_kl_leaves_out_entries_with_prior_zero():
+    padded = update_kl(jnp.array([0.0, 1.0, 2.0, 0.0]), jnp.array([0.0, 1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(padded, update_kl(jnp.array([1.0, 2.0]), jnp.array([1.0, 0.0])), rtol=1e-6)
+    # By hand, a = (1, 2), c = (1, 0): g(1, 1) - g(3, 1) = psi(2) - psi(4) + log 3 = log 3 - 1/2 - 1/3.
+    np.testing.assert_allclose(padded, np.log(3) - 5 / 6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("increment", [1, 2, 5])
+def test_presence_kl_is_update_kl_for_equal_counts(increment):
+    rng = np.random.default_rng(increment)
+    for name, prior, counts in draws(increment, 22):
+        counts = increment * (counts > 0) * (rng.random(counts.shape) < 0.5)
+        total = sum(
+            exact_kl(np.stack([a, np.full_like(a, 1e9)], -1), np.stack([c, 0 * c], -1))
+            for a, c in zip(prior.T, counts.T, strict=True)
+        )  # g(a, c): the rest of the Dirichlet is too large to matter
+        value = jax.jit(presence_kl, static_argnums=2)(prior, counts.astype(np.float32), increment)
+        error = np.abs(value - np.maximum(exact_kl(prior, counts), 0)) / np.maximum(total, 1e-30)
+        print(f"increment {increment}, {name}: worst error {error.max():.1e} of the sum of g")
+        assert error.max() < 2e-5

@@ -1,0 +1,159 @@
+"""Options of the policy: which detections the direct pathway sees, and the gate on Done."""
+
+import dataclasses
+import functools
+from typing import get_args
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
+from support.tiny_world import BANK, SIZES, SPEC, lively
+
+from jaxnav.causal import do
+from jaxnav.env.types import Observation
+from jaxnav.policies.pathways import Memory, Pathways
+from jaxnav.policies.policy import DONE_GATE, bind, init_params
+from jaxnav.policies.spec import Direct
+from jaxnav.scenes.task import DONE, NUM_ACTIONS
+
+DIRECT = get_args(Direct)
+K, BATCH = len(CATEGORIES), 6
+GOAL = np.array([BOOK, CHAIR, FRIDGE] * 2)
+SEEN, UNSEEN = [128, 51, 140, 90], [0, 0, 0, 0]  # bytes: confidence, ahead, right, size
+
+
+def with_detections(detections):
+    """Observations of the same views with these detections, bytes [BATCH, K, 4]."""
+    row = BANK.rows[np.arange(BATCH)].copy()
+    row[:, : 4 * K] = np.reshape(detections, (BATCH, 4 * K))
+    return Observation(row=jnp.asarray(row), goal=jnp.asarray(GOAL))
+
+
+def detections(goal, others):
+    """The goal's detection in every episode, and that of the two other categories."""
+    found = np.empty((BATCH, K, 4), np.uint8)
+    found[:] = others
+    found[np.arange(BATCH), GOAL] = goal
+    return found
+
+
+def memory(seed=0):
+    generator = np.random.default_rng(seed)
+    hidden = jnp.asarray(generator.normal(size=(BATCH, SIZES.hidden)), jnp.float32)
+    return Memory(hidden=hidden, action=jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32))
+
+
+class Compiled:
+    """The same parameters under options of their own."""
+
+    def __init__(self, **options):
+        spec = dataclasses.replace(SPEC, **options)
+        policy = bind(spec, lively(0))
+        self.pathways = jax.jit(lambda observation: policy.pathways(observation, jnp.ones((BATCH, K))))
+        self.decide = jax.jit(lambda pathways, memory: policy.decide(pathways, memory))
+
+
+@pytest.fixture(scope="module", params=DIRECT)
+def direct(request):
+    return request.param, Compiled(direct=request.param)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return Compiled()
+
+
+@pytest.fixture(scope="module")
+def gated():
+    return Compiled(done_gate=True)
+
+
+# Which detections the direct pathway sees
+
+
+def test_detections_of_other_categories_reach_the_direct_pathway_only_if_it_sees_all(direct):
+    name, policy = direct
+    one, other = (policy.pathways(with_detections(detections(SEEN, others))) for others in (SEEN, UNSEEN))
+    np.testing.assert_array_equal(one.scene, other.scene)
+    # In every episode: experience speaks of the others whatever the direct pathway sees.
+    assert (one.experience != other.experience).any(axis=1).all()
+    assert (one.goal != other.goal).any(axis=1).tolist() == [name == "all"] * BATCH
+
+
+def test_the_detection_of_the_goal_reaches_it_unless_it_sees_none(direct):
+    name, policy = direct
+    one, other = (policy.pathways(with_detections(detections(goal, SEEN))) for goal in (SEEN, UNSEEN))
+    assert (one.experience != other.experience).any(axis=1).all()
+    assert (one.goal != other.goal).any(axis=1).tolist() == [name != "none"] * BATCH
+
+
+def test_what_is_sought_is_always_known(direct):
+    _, policy = direct
+    goal = policy.pathways(with_detections(detections(UNSEEN, UNSEEN))).goal
+    assert len(np.unique(np.asarray(goal), axis=0)) == K
+
+
+def test_the_policy_acts_on_what_is_left(direct):
+    """`none` still acts on detections, by way of experience alone: without it they are of no effect."""
+    name, policy = direct
+    one, other = (policy.pathways(with_detections(detections(seen, seen))) for seen in (SEEN, UNSEEN))
+    assert (policy.decide(one, memory()).logits != policy.decide(other, memory()).logits).any(axis=1).all()
+    one, other = (policy.decide(do(own, experience=0.0), memory()).logits for own in (one, other))
+    assert (one != other).any(axis=1).tolist() == [name != "none"] * BATCH
+
+
+def test_the_number_of_parameters_is_the_same_for_all_options():
+    specs = [dataclasses.replace(SPEC, direct=name, done_gate=gate) for name in DIRECT for gate in (False, True)]
+    first, *others = (jax.eval_shape(functools.partial(init_params, spec), jax.random.key(1)) for spec in specs)
+    assert sum(leaf.size for leaf in jax.tree.leaves(first)) > 1000
+    assert others == 5 * [first]
+
+
+# The gate on Done
+
+#: 255 is certain, 51 a fifth, 0 undetected.
+CONFIDENCE = np.array([255, 51, 0, 0, 128, 1])
+FACTOR = np.array([0.58, 0.116, 0.0, 0.0, 0.58 * 128 / 255, 0.58 / 255], np.float32)
+
+
+def uncertain(others=SEEN):
+    """The goal detected with those confidences."""
+    found = detections(SEEN, others)
+    found[np.arange(BATCH), GOAL, 0] = CONFIDENCE
+    return with_detections(found)
+
+
+def test_the_gate_is_the_confidence_of_the_goal(gated, plain):
+    assert DONE_GATE == 0.58
+    for others in (SEEN, UNSEEN):  # whatever else is detected
+        np.testing.assert_allclose(gated.pathways(uncertain(others)).gate[:, 0], FACTOR, rtol=1e-6)
+    np.testing.assert_array_equal(plain.pathways(uncertain()).gate, np.ones((BATCH, 1)))
+
+
+@pytest.mark.parametrize("intervention", [{}, {"scene": 0.0, "goal": 0.0}, {"experience": 0.0}])
+def test_the_gate_multiplies_the_logit_of_done_alone(gated, plain, intervention):
+    """By the same factor in the factual decision and in any counterfactual one."""
+    observation = uncertain()
+    pathways = do(gated.pathways(observation), **intervention)
+    found = gated.decide(pathways, memory())
+    free = plain.decide(do(plain.pathways(observation), **intervention), memory())
+    np.testing.assert_allclose(found.logits[:, :DONE], free.logits[:, :DONE], rtol=1e-6)
+    np.testing.assert_allclose(found.logits[:, DONE], FACTOR * free.logits[:, DONE], rtol=1e-5, atol=1e-9)
+    assert (found.logits[CONFIDENCE == 0, DONE] == 0).all()
+    assert (free.logits[:, DONE] != 0).all()
+    np.testing.assert_allclose(found.value, free.value, rtol=1e-5)
+    np.testing.assert_allclose(found.hidden, free.hidden, rtol=1e-5)
+
+
+def test_the_gate_sees_the_goal_where_the_direct_pathway_sees_nothing():
+    gate = Compiled(direct="none", done_gate=True).pathways(uncertain()).gate
+    np.testing.assert_allclose(gate[:, 0], FACTOR, rtol=1e-6)
+
+
+def test_a_gate_that_is_off_is_ignored(plain):
+    pathways = plain.pathways(uncertain())
+    closed = Pathways(*pathways[:3], gate=jnp.zeros_like(pathways.gate))
+    chex.assert_trees_all_equal(plain.decide(closed, memory()), plain.decide(pathways, memory()))

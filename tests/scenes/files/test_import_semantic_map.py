@@ -1,0 +1,191 @@
+"""Semantic floor maps: pixels to lattice points and boxes, thin walls, damaged maps."""
+
+import bz2
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.ndimage
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import GIBSON_CATEGORIES
+from jaxnav.scenes.files.importers.semantic_map import floor_map, read_maps, scene_of_map
+from jaxnav.scenes.lattice import connected_parts, standable_cells
+from jaxnav.scenes.scene import Scene
+
+CHAIR, BED = (1 + GIBSON_CATEGORIES.index(name) for name in ("Chair", "Bed"))
+
+
+def l_shaped_floor(height: float = 0.0, **changes: object) -> dict:
+    """3 x 3 m, Habitat's x from 2 to 5 m and z from -1 to 2 m; floor without the quarter of large x and z."""
+    layers = np.zeros((16, 60, 60))
+    layers[0] = 1
+    layers[0, 30:, 30:] = 0
+    layers[0, 36:54, :18] = 0  # around the chair
+    layers[CHAIR, 40:50, 4:14] = 1
+    return {"floor_height": height, "sem_map": layers, "origin": np.array([-100, 200])} | changes
+
+
+def bedroom(height: float = 2.9) -> dict:
+    """The same walls; a bed instead of the chair."""
+    floor = l_shaped_floor(height)
+    floor["sem_map"][CHAIR] = 0
+    floor["sem_map"][BED, 38:52, 2:16] = 1
+    return floor
+
+
+def write_maps(path: Path, maps: object, protocol: int = 4) -> Path:
+    path.write_bytes(bz2.compress(pickle.dumps(maps, protocol)))
+    return path
+
+
+def scene_of(tmp_path: Path, floor: dict) -> Scene:
+    record = read_maps(write_maps(tmp_path / "maps.pbz2", {"Home": {0: floor}}))["Home"][0]
+    return scene_of_map(record, "Home_floor0", "val", floor_map(record))
+
+
+def standable(scene: Scene) -> set[tuple[float, float]]:
+    """Points (x, z)."""
+    return {(scene.origin[0] + 0.25 * ix, scene.origin[1] + 0.25 * iz) for iz, ix in np.argwhere(scene.reach).tolist()}
+
+
+@pytest.mark.parametrize(
+    ("origin", "pixel", "points"),
+    [
+        # Pixel (10, 15): x from 2.00 + 0.50 m, z from -1.00 + 0.75 m: the lattice point x = 2.5, z = -(-0.25).
+        ((-100, 200), (10, 15), {(2.5, 0.25)}),
+        ((-98, 203), (9, 14), {(2.5, 0.25)}),  # x 2.48 to 2.53 and z -0.28 to -0.23 m
+        ((-98, 203), (10, 14), set()),  # x 2.53 to 2.58 m holds no multiple of 0.25
+    ],
+)
+def test_the_pixel_under_a_lattice_point_decides(tmp_path, origin, pixel, points):
+    floor = l_shaped_floor(origin=np.array(origin))
+    floor["sem_map"][0] = 0
+    floor["sem_map"][0][pixel] = 1
+    try:
+        found = standable(scene_of(tmp_path, floor))
+    except InputError as error:
+        assert "floor 0: sem_map has no standable point" in str(error)  # noqa: PT017  (reading may also succeed)
+        found = set()
+    assert found == points
+
+
+def test_l_shaped_floor_with_a_chair(tmp_path):
+    scene = scene_of(tmp_path, l_shaped_floor())
+    # Lattice x 2.00 to 4.75 m (12 points), of which 2.00 to 3.25 (6) go on to all 12 of z; z -1.00 to 0.25 m (6).
+    points = {(2 + 0.25 * i, 1 - 0.25 * j) for i in range(12) for j in range(12) if i < 6 or j < 6}
+    # Around the chair pixels 36-53 and 0-17: x 3.80 to 4.70 m is 4.00, 4.25, 4.50; z -1.00 to -0.10 is -1.00 to -0.25.
+    points -= {(x, z) for x in (4.0, 4.25, 4.5) for z in (1.0, 0.75, 0.5, 0.25)}
+    assert standable(scene) == points
+    assert len(standable_cells(scene.reach)) == len(points) == 96
+    # Chair: pixels 40-49 and 4-13, so x 4.00 to 4.50 and Habitat's z -0.80 to -0.30 m; a chair is 0.95 m high.
+    assert (scene.world, scene.room_type, scene.types) == ("gibson", "house", ("Chair",))
+    np.testing.assert_allclose(scene.boxes, [[4.25, 0.48, 0.55, 0.5, 0.95, 0.5]], atol=1e-12)
+    assert not (scene.walls & scene.reach).any()
+
+
+def rooms_parted_by(strip: slice, door: slice) -> dict:
+    """4 x 4 m of floor, parted at the pixels `strip` of x except for the pixels `door` of z."""
+    layers = np.zeros((16, 80, 80), np.uint8)
+    layers[0] = 1
+    layers[0, strip] = 0
+    layers[0, strip, door] = 1
+    layers[CHAIR, 2:8, 2:8] = 1
+    layers[0, 2:8, 2:8] = 0
+    return {"floor_height": 0.0, "sem_map": layers, "origin": np.array([0, 0])}
+
+
+def inner_walls(scene: Scene) -> np.ndarray:
+    """Without the outermost cells, which lie three from every standable one."""
+    inner = np.zeros_like(scene.walls)
+    inner[1:-1, 1:-1] = scene.walls[1:-1, 1:-1]
+    return inner
+
+
+def test_a_long_thin_strip_between_floors_is_a_wall(tmp_path):
+    # Pixels 36-45 are x 1.80 to 2.30 m, their middle 2.05 m: cells at x = 2.00, index 8 + 3 of margin.
+    scene = scene_of(tmp_path, rooms_parted_by(slice(36, 46), slice(30, 45)))
+    walls = np.argwhere(inner_walls(scene))
+    assert set(walls[:, 1].tolist()) == {11}
+    # The door is at Habitat's z 1.50 to 2.25 m, so the cells from 1.50 to 2.00 m are floor. The last begins at 3.875 m.
+    z = [-(scene.origin[1] + 0.25 * iz) for iz in walls[::-1, 0].tolist()]
+    assert z == [*np.arange(0, 1.5, 0.25), *np.arange(2.25, 4.25, 0.25)]
+
+
+@pytest.mark.parametrize(
+    ("strip", "door"),
+    [
+        (slice(30, 48), slice(30, 45)),  # 0.9 m wide: may be furniture
+        (slice(36, 46), slice(12, 80)),  # 0.6 m long
+        (slice(36, 38), slice(30, 45)),  # 0.1 m: no obstacle leaves so little
+    ],
+)
+def test_wide_short_or_narrow_strips_are_no_walls(tmp_path, strip, door):
+    assert not inner_walls(scene_of(tmp_path, rooms_parted_by(strip, door))).any()
+
+
+@given(hnp.arrays(bool, (7, 9)))
+def test_connected_parts_are_those_of_scipy(mask):
+    labels, count = scipy.ndimage.label(mask, np.ones((3, 3)))
+    parts = connected_parts(mask)
+    expected = [np.argwhere(labels == k + 1) for k in range(count)]
+    assert sorted(part.tolist() for part in parts) == sorted(part.tolist() for part in expected)
+
+
+def test_connected_parts_of_a_long_snake():
+    snake = np.zeros((40, 41), bool)
+    snake[::4] = snake[2::8, -1] = snake[6::8, 0] = True
+    snake[1::8, -1] = snake[3::8, -1] = snake[5::8, 0] = snake[7::8, 0] = True
+    assert [len(part) for part in connected_parts(snake)] == [snake.sum()]
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"floor_height": np.float64("nan")}, "floor_height is no finite number"),
+        ({"floor_height": 10**5000}, "floor_height is no finite number"),
+        ({"origin": [0, 0]}, "origin is no array"),
+        ({"origin": np.array([0.0, np.inf])}, "origin is no array"),
+        ({"origin": np.array([0, -(2**63)])}, "origin is no array"),
+        ({"sem_map": np.zeros((15, 4, 4))}, r"sem_map is no array \[16, H, W\]"),
+        ({"sem_map": np.zeros((16, 2001, 1))}, r"sem_map is no array \[16, H, W\]"),
+        ({"sem_map": np.zeros((16, 0, 4))}, r"sem_map is no array \[16, H, W\]"),
+        ({"sem_map": np.full((16, 4, 4), np.nan)}, "sem_map holds other values"),
+        ({"sem_map": np.full((16, 4, 4), 2)}, "sem_map holds other values"),
+        ({"sem_map": np.zeros((16, 40, 40))}, "sem_map has no standable point"),
+        ({"sem_map": np.pad(np.ones((1, 40, 40)), ((0, 15), (0, 0), (0, 0)))}, "sem_map has no object"),
+    ],
+)
+def test_bad_floors_are_refused(tmp_path, changes, problem):
+    with pytest.raises(InputError, match=r"maps\.pbz2, scene 'Home': floor 0: " + problem):
+        scene_of(tmp_path, l_shaped_floor(**changes))
+
+
+FLOOR = {
+    "floor_height": 0.5,
+    "sem_map": np.eye(16, 100, dtype=np.uint8).reshape(16, 10, 10),
+    "origin": np.zeros(2, int),
+}
+PICKLES = [pickle.dumps({"Home": {0: FLOOR}}, protocol) for protocol in (3, 4, 5)]
+
+
+@given(st.sampled_from(PICKLES), st.data())
+def test_mutated_pickles_never_raise_another_error(tmp_path_factory, whole, data):
+    places = st.integers(0, 200) | st.integers(0, len(whole) - 1)  # most of what is not the layers stands in front
+    mutated = bytearray(whole)
+    for at in data.draw(st.lists(places, min_size=1, max_size=3)):
+        mutated[at] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / "mutated.pbz2"
+    path.write_bytes(
+        bz2.compress(mutated[: data.draw(st.integers(100, len(whole)))] if data.draw(st.booleans()) else mutated)
+    )
+    try:
+        for floors in read_maps(path).values():
+            for record in floors.values():
+                assert isinstance(scene_of_map(record, "Home", "val", floor_map(record)), Scene)
+    except InputError as error:
+        assert str(error).startswith(str(path))  # noqa: PT017  (reading may also succeed)

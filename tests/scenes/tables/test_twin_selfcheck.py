@@ -1,0 +1,227 @@
+"""The plain-Python twin against tiny scenes worked by hand: moves, the course of an episode, its measures, the view."""
+
+import math
+
+import pytest
+from support.scenes import APARTMENTS, BOOK, CHAIR, HOUSES, SMALL, draw, single, twin
+from support.twin import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
+
+
+@pytest.mark.parametrize(
+    ("heading", "cell"),
+    [(0, (2, 1)), (1, (2, 2)), (2, (1, 2)), (3, (0, 2)), (4, (0, 1)), (5, (0, 0)), (6, (1, 0)), (7, (2, 0))],
+)
+def test_move_ahead_goes_to_the_neighbour_of_the_heading(heading, cell):
+    # Clockwise from +z: 45 degrees is +z +x, 90 degrees +x, ...
+    episode = twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading)
+    assert episode.step(MOVE_AHEAD) == (-0.01, False, False)
+    assert episode.pose == (*cell, heading, 0)
+
+
+@pytest.mark.parametrize(
+    ("headings", "cell"),
+    [
+        ((0,), (2, 1)),
+        ((1, 2), (2, 2)),
+        ((3,), (1, 2)),
+        ((4, 5), (0, 2)),
+        ((6,), (0, 1)),
+        ((7, 8), (0, 0)),
+        ((9,), (1, 0)),
+        ((10, 11), (2, 0)),
+    ],
+)
+def test_of_twelve_headings_two_lead_to_each_diagonal_cell(headings, cell):
+    # 30 and 60 degrees are 15 from 45, and 30 from 0 and 90.
+    for heading in headings:
+        episode = twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading, rules=APARTMENTS)
+        episode.step(MOVE_AHEAD)
+        assert episode.pose == (*cell, heading, 0)
+
+
+def test_a_diagonal_move_needs_only_its_own_cell():
+    episode = twin(draw([".#", "#."]), heading=1)
+    episode.step(MOVE_AHEAD)
+    assert episode.cell == (1, 1)
+
+
+@pytest.mark.parametrize("heading", [0, 2, 4, 6, 7])
+def test_a_blocked_move_changes_nothing_and_costs_a_step(heading):
+    # [1, 0] and [0, 1] are not standable, the other neighbours lie outside.
+    episode = twin(draw([".#", "#."]), heading=heading)
+    assert episode.step(MOVE_AHEAD) == (-0.01, False, False)
+    assert (episode.pose, episode.steps) == ((0, 0, heading, 0), 1)
+
+
+def test_standable_is_the_largest_component_and_the_first_of_equal_ones():
+    assert twin(draw([".#..", "##..", "####"]), cell=(0, 2)).standable() == {(0, 2), (0, 3), (1, 2), (1, 3)}
+    assert twin(draw(["..#..", "..#.."])).standable() == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    with pytest.raises(ValueError, match="not standable"):
+        twin(draw(["..#..", "..#.."]), cell=(0, 3))
+
+
+def test_rotations_wrap_and_looks_stop_at_their_limits():
+    episode = twin(draw(["."]))
+    poses = []
+    for action in (ROTATE_LEFT, ROTATE_RIGHT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, LOOK_DOWN, LOOK_UP):
+        assert episode.step(action) == (-0.01, False, False)
+        poses.append((episode.heading, episode.horizon))
+    assert poses == [(7, 0), (0, 0), (1, 0), (1, 0), (1, 1), (1, 1), (1, 0)]
+
+
+def test_twelve_headings_go_around_and_a_single_horizon_stays():
+    episode = twin(draw(["."]), rules=HOUSES)
+    poses = []
+    for action in (ROTATE_LEFT, LOOK_DOWN, LOOK_UP, ROTATE_RIGHT, ROTATE_RIGHT):
+        episode.step(action)
+        poses.append((episode.heading, episode.horizon))
+    assert poses == [(11, 0), (11, 0), (11, 0), (0, 0), (1, 0)]
+
+
+def test_done_ends_the_episode_and_pays_where_the_goal_is_found():
+    book = ("Book", 0, 1.5, 1, *SMALL)
+    assert single(book).step(DONE) == (5.0, True, False)
+    assert single(book, heading=4).step(DONE) == (-0.01, True, False)
+    wrong = single(book, goal=CHAIR)
+    assert wrong.step(DONE) == (-0.01, True, False)
+    with pytest.raises(RuntimeError, match="over"):
+        wrong.step(DONE)
+
+
+def test_truncation_at_the_step_limit_unless_done():
+    episode = single(("Book", 0, 1.5, 1, *SMALL), step_limit=2)
+    assert episode.step(LOOK_UP) == (-0.01, False, False)
+    assert episode.step(LOOK_UP) == (-0.01, False, True)
+    episode.reset(BOOK, (0, 0), 0, 0, 2)
+    episode.step(LOOK_UP)
+    assert episode.step(DONE) == (5.0, True, False)
+
+
+def test_best_length_in_a_corridor():
+    # The book at z = 2.5 is within 1.5 m from iz = 4 on. Along the corridor only headings 0 and 4 move.
+    corridor = draw(["."] * 6, ("Book", 0, 1.5, 2.5, *SMALL))
+    assert twin(corridor).best_length() == 5  # 4 moves, Done
+    assert twin(corridor, heading=4).best_length() == 9  # 4 turns first
+    assert twin(corridor, cell=(5, 0), heading=4).best_length() == 4  # 45 degrees off (< 50) will do: 3 turns, Done
+    assert twin(corridor, cell=(4, 0)).best_length() == 1
+    assert twin(corridor, goal=CHAIR).best_length() is None
+
+
+def test_best_length_counts_looking_down_and_starts_at_the_start():
+    # On the floor at z = 2 and 1.5 m away from iz = 2: level, rise -1.5 >= -1.19 x 1.5 = -1.79, so it is in view.
+    # From iz = 3, 1.25 m away, -1.49 > -1.5: one look down.
+    scene = draw(["."] * 4, ("Book", 0, 0, 2, *SMALL))
+    assert twin(scene, cell=(2, 0)).best_length() == 1
+    assert twin(scene, cell=(3, 0)).best_length() == 2
+    episode = twin(scene)
+    episode.step(MOVE_AHEAD)
+    episode.step(MOVE_AHEAD)
+    assert (episode.best_length(), episode.step(DONE)) == (3, (5.0, True, False))
+
+
+def test_best_length_is_none_where_a_wall_hides_the_goal():
+    scene = (["...", "###", "###"], ("Book", 0.25, 1.5, 0.75, *SMALL))
+    assert twin(draw(*scene), cell=(0, 1)).best_length() == 1
+    assert twin(draw(*scene, walls=[(1, 0), (1, 1), (1, 2)]), cell=(0, 1)).best_length() is None
+
+
+def test_goal_distance_is_to_the_nearest_goal_less_a_metre():
+    books = (("Book", 3, 0.5, 4, *SMALL), ("Book", 6, 0.5, 8, *SMALL), ("Chair", 0, 0.5, 2, *SMALL))
+    episode = twin(draw([".", ".", "."], *books))
+    assert episode.goal_distance() == pytest.approx(4.0)  # |(3, 4)| - 1
+    episode.step(MOVE_AHEAD)
+    assert episode.goal_distance() == pytest.approx(math.hypot(3, 3.75) - 1)
+    assert single(("Book", 0.6, 0.5, 0.8, *SMALL)).goal_distance() == 0.0
+
+
+# Walking
+
+CHEST = (0.5, 0.5, 0.5)  # its footprint reaches 0.25 m to every side
+
+
+@pytest.mark.parametrize(("z", "found"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
+def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, found):
+    for heading in range(12):
+        assert single(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).found() == found
+    assert single(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).found() == {BOOK}  # in its footprint: no way at all
+
+
+def walk_to_the_book(rows, *place, walls=(), cell=(0, 0)):
+    return twin(draw(rows, ("Book", *place), walls=walls), cell=cell, rules=HOUSES).scene.walk(cell, BOOK)
+
+
+def test_walks_go_by_cells_and_then_straight():
+    # To the corner (0.5, 1) straight from [0, 0], 1.118 m: more than 1 m. From [1, 1], a diagonal step on, it is
+    # |(0.25, 0.75)| = 0.791, from [1, 0], an upright one on, |(0.5, 0.75)| = 0.901: 1.144 and 1.151 in all.
+    rows = ["..", ".."]
+    assert walk_to_the_book(rows, 0.75, 1, 1.25, *CHEST) == pytest.approx(0.25 * 2**0.5 + 0.625**0.5)
+    assert walk_to_the_book([".#", ".#"], 0.75, 1, 1.25, *CHEST) == pytest.approx(0.25 + 0.8125**0.5)
+    assert walk_to_the_book(rows, 0.75, 1, 1.25, *CHEST, cell=(1, 1)) == pytest.approx(0.625**0.5)
+    assert walk_to_the_book(["."], 0.75, 1, 1.25, *CHEST) == math.inf
+
+
+def test_walks_go_round_thin_walls():
+    # The footprint begins at z = 0.75 and ends at x = 0.25.
+    book = (0, 1, 1, *CHEST)
+    assert walk_to_the_book(["...."] * 4, *book) == pytest.approx(0.75)
+    # Behind the wall cells [2, 0] to [2, 2] the way is [1, 1], [1, 2], [2, 3], [3, 2]: three diagonal steps and one,
+    # and 0.25 m straight. The line from [2, 3] to (0.25, 0.75) would pass [2, 2].
+    rows, walls = ["....", "....", "###.", "...."], [(2, 0), (2, 1), (2, 2)]
+    assert walk_to_the_book(rows, *book, walls=walls) == pytest.approx(3 * 0.25 * 2**0.5 + 0.25 + 0.25)
+    assert walk_to_the_book(["....", "....", "####", "...."], *book, walls=[*walls, (2, 3)]) == math.inf
+
+
+def test_walls_of_the_start_and_of_the_object_do_not_count():
+    # A footprint from z = 0.4 to 0.6 in the wall cell [2, 0] from 0.375 to 0.625 that holds its centre: 0.4 m.
+    rows, thin = [".", "#", "#"], (0, 1, 0.5, 0.5, 0.5, 0.2)
+    assert walk_to_the_book(rows, *thin, walls=[(2, 0)]) == pytest.approx(0.4)
+    assert walk_to_the_book(rows, *thin, walls=[(1, 0), (2, 0)]) == math.inf
+    assert walk_to_the_book(rows, *thin, walls=[(0, 0)]) == pytest.approx(0.4)
+    # A chest from 0.5 to 1.0 m that only reaches into that wall cell stands behind the wall.
+    assert walk_to_the_book(rows, 0, 1, 0.75, *CHEST, walls=[(2, 0)]) == math.inf
+    assert walk_to_the_book([*rows, "#"], 0, 1, 0.75, *CHEST, walls=[(3, 0)]) == pytest.approx(0.5)
+
+
+def test_measures_of_walks():
+    # The footprint begins at z = 1.75: within 1 m from z = 0.75 on, three moves away, and half a turn before them.
+    corridor = draw(["."] * 6, ("Book", 0, 0.5, 2, *CHEST))
+    assert twin(corridor, rules=HOUSES).best_length() == 4
+    assert twin(corridor, heading=6, rules=HOUSES).best_length() == 10
+    assert twin(corridor, cell=(3, 0), heading=6, rules=HOUSES).best_length() == 1
+    assert twin(corridor, rules=HOUSES).goal_distance() == pytest.approx(0.75)
+    assert twin(corridor, cell=(4, 0), rules=HOUSES).goal_distance() == 0.0
+    assert twin(corridor, goal=CHAIR, rules=HOUSES).goal_distance() == math.inf
+
+
+# The view
+
+
+def picture(episode):
+    """The view, the far edge first."""
+    cells = episode.view()
+    return ["".join("?.#"[value] for value in cells[i : i + 11]) for i in range(110, -1, -11)]
+
+
+def test_the_view_at_30_degrees():
+    # Half of it is 0.824 cells a step. Heading 1 of 12, f = (1/2, 0.866): 3 steps ahead are (x, z) = (1.5, 2.6), the
+    # cell [3, 2], for 1.5 is rounded to 2; 1 step is [1, 0], for 0.5 is rounded to 0.
+    rows = [list("." * 13) for _ in range(13)]
+    rows[3][2] = rows[1][0] = "#"
+    seen = picture(twin(draw(["".join(row) for row in rows]), heading=1, rules=APARTMENTS))
+    assert [row[5] for row in seen[:-5:-1]] == [".", "#", ".", "#"]
+    # 4 steps are (2, 3.46), [3, 2] again; 3 to the left of it, at (2 - 2.60, 3.46 + 1.5), the lattice has ended.
+    assert seen[-5:] == ["??#..#...??", "???..#..???", "????...????", "?????#?????", "?????.?????"]
+
+
+def test_what_hides_the_floor():
+    # 5 steps ahead of the camera stands a chest, 0.9 m high.
+    chest = ("Chest", 1, 0.45, 1.25, 0.3, 0.9, 0.3)
+    scene = draw(["." * 9] * 12, chest)
+    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=APARTMENTS))[::-1]] == ["."] * 11
+    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 6 + ["?"] * 5
+    # What stands beyond the lattice hides nothing.
+    scene = draw(["." * 9] * 5, chest)
+    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 5 + ["#"] * 6
+    # Neither does the own cell, nor that which is looked at.
+    scene = draw(["." * 9] * 5, walls=[(0, 4), (3, 4)])
+    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 4 + ["?"] * 7

@@ -1,0 +1,166 @@
+"""The study's document and figures, from made-up results."""
+
+import json
+import re
+from typing import get_args
+
+import pytest
+from support import study_results as made_up
+
+from jaxnav.errors import InputError
+from jaxnav.study.claims import claims
+from jaxnav.study.document import CONTROLS, READING, check_document, write_document
+from jaxnav.study.results import draw, load
+from jaxnav.study.trials import Control
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Results of both worlds on val, the document and its images."""
+    folder = tmp_path_factory.mktemp("study")
+    made_up.write(folder / "results" / "val", ("main", "real"))
+    draw(folder / "results" / "val", folder / "docs" / "images" / "study")
+    write_document(folder / "results", folder / "docs" / "study.md")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text(folder):
+    return (folder / "docs" / "study.md").read_text()
+
+
+def section(text, title):
+    """The lines of the first section of this title, up to the next one."""
+    return text.split(f"# {title}\n", 1)[1].split("\n#", 1)[0]
+
+
+def table(lines):
+    """Cells by the first cell of their row, the last of equal ones."""
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines() if line.startswith("|")
+    ]
+    return {first: rest for first, *rest in rows}
+
+
+def test_parts_are_loaded_by_name(folder):
+    assert load(folder / "results" / "val") == made_up.results(("main", "real"))
+    assert load(folder / "results" / "test") == {}
+
+
+def test_every_image_that_is_named_is_drawn_and_no_other(folder, text):
+    named = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
+    assert len(set(named)) == len(named) == 2 * 6
+    drawn = {str(path.relative_to(folder / "docs")) for path in (folder / "docs").rglob("*.png")}
+    assert set(named) == drawn
+
+
+@pytest.mark.parametrize("text", ["", "My own notes.\n", f"{READING}\nOne line of two.\n"])
+def test_a_document_that_is_none_of_the_studys_is_not_written_over(folder, tmp_path, text):
+    document = tmp_path / "study.md"
+    check_document(document)
+    document.write_text(text)
+    with pytest.raises(InputError, match=r"study.md: is there, without two lines <!-- reading -->; give another"):
+        write_document(folder / "results", document)
+    assert document.read_text() == text
+
+
+def test_parts_of_another_study_are_not_read(folder, tmp_path):
+    made_up.write(tmp_path / "val")
+    left = made_up.results()["coin-shift0"] | {"study": {}}
+    (tmp_path / "val" / "left-shift0.json").write_text(json.dumps(left))
+    assert load(tmp_path / "val") == made_up.results()
+
+
+def test_what_is_written_by_hand_stays(folder, tmp_path):
+    document = tmp_path / "study.md"
+    write_document(folder / "results", document)
+    before = document.read_text()
+    assert before.count(READING) == 2
+    head, _, tail = before.split(READING)
+    document.write_text(f"{head}{READING}\nAs found:\n\n* | a table |\n{READING}{tail}")
+    by_hand = document.read_text()
+    write_document(folder / "results", document)
+    assert document.read_text() == by_hand
+    # Numbers follow the results, the text by hand does not.
+    made_up.write(tmp_path / "results" / "val", runs=("main",))
+    changed = made_up.results()["main-shift1"]
+    changed["rows"] = [row | {"sr": made_up.metric(12.5)} for row in changed["rows"]]
+    (tmp_path / "results" / "val" / "main-shift1.json").write_text(json.dumps(changed))
+    write_document(tmp_path / "results", document)
+    assert "\nAs found:\n\n* | a table |\n" in document.read_text()
+    assert "| 12.5 ± 0.5 |" in document.read_text()
+
+
+def test_both_worlds_have_their_sections(text):
+    generated, real = text.index("## Generated rooms: 80 scenes"), text.index("## Scenes of the file: 80 scenes")
+    assert generated < real
+    assert text.count("### Claims") == text.count("### Controls") == 2
+    # One factor at a time: of generated rooms alone.
+    assert text.count("### How the parts are made") == 1
+    assert "Test, touched once" not in text
+    assert "3 seeds, 1,000,000 steps a policy, 1,000 episodes at each shift" in text
+
+
+def test_the_claims_are_those_of_the_results(text):
+    rows = table(section(text, "Claims"))
+    found = claims(made_up.results())
+    assert list(rows)[2:] == [claim.text for claim in found]
+    assert [rows[claim.text][1] for claim in found] == [claim.verdict for claim in found]
+    assert rows["The baseline loses from shift 0 to 1"] == ["+9.0 [+8.0, +10.0] SR points", "holds"]
+    assert rows["The `evidence` gap does at step 20"] == ["+0.25 [+0.24, +0.26] AUC - 0.5", "holds"]
+
+
+def test_table_1_holds_both_decodings_at_every_shift(text):
+    best, sampled = section(text, "Table 1").split("Sampled actions:")
+    assert section(text, "Table 1").count("**shift") == 4
+    # The last shift's rows: 60 and the effect.
+    assert table(best)["+ w + sTDE (eps 0, paper's form)"] == [
+        "65.0 ± 0.5", "30.0 ± 0.5", "1.50 ± 0.50", "+5.0 [+4.0, +6.0]", "0.250",
+    ]  # fmt: skip
+    assert table(best)["baseline"][3] == ""
+    assert table(sampled)["+ w"][3] == "+101.0 [+100.0, +102.0]"
+
+
+def test_every_control_is_told(text):
+    assert set(CONTROLS) == {None, *get_args(Control)}
+    rows = table(section(text, "Controls"))
+    # Two uses: two gaps with five controls and none each, and the clock; no zeros in the paper's form; header and rule.
+    assert len(rows) == 2 * (2 * 6 + 1) - 2 + 2
+    assert rows["sTDE (eps 0.5), gap `novelty`"] == ["+0.0 [-1.0, +1.0] (0.25)", "+2.0 [+1.0, +3.0] (0.25)"]
+    assert rows["sTDE (eps 0.5), gap `novelty`, noise taken out"] == 2 * ["+0.2 [-0.8, +1.2] (0.25)"]
+    # Zeros: with sampled actions, of which they are a control.
+    zeros = rows["sTDE (eps 0.5), gap `novelty`, zeros taken out, sampled actions"]
+    assert zeros == 2 * ["+100.2 [+99.2, +101.2] (0.25)"]
+    assert rows["sTDE (eps 0.5), the released code's novelty clock"][1] == "+0.5 [-0.5, +1.5] (0.25)"
+
+
+def test_other_trainings_have_the_rows_they_have(text):
+    found = section(text, "How the parts are made: settings, counterfactual branch, one factor at a time")
+    rows = table(found)
+    assert list(rows)[2] == "`main` baseline"  # the one to compare with comes first
+    assert [cell.split(" (")[0] for cell in rows["`gate` + w"]] == ["63.0 ± 0.5", "61.0 ± 0.5"]
+    assert rows["`gate` + w"][0].endswith("(+3.0 [+2.0, +4.0])")
+    assert "`gate` baseline" in rows
+    assert "`coin` baseline" not in rows
+    assert "`coin` TDE" in rows
+    assert not any("real" in name for name in rows)
+    assert "All policies have 12,345 parameters." in found
+
+
+def test_the_gap_is_told_at_the_steps_that_there_are(text):
+    found = section(text, "Does the gap track the layout?")
+    assert table(found)["setting"] == ["0", "1", "5", "10", "20"]  # 30 steps
+    assert table(found)["`evidence`"][-1] == "0.75 [0.74, 0.76]"
+    # 1 - step / 30.
+    assert "Episodes that still run at these steps, shift 0: 100, 97, 83, 67, 33 %." in found
+
+
+def test_results_on_test_are_appended(tmp_path):
+    made_up.write(tmp_path / "val")
+    made_up.write(tmp_path / "test")
+    for path in (tmp_path / "test").glob("main-shift*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"chosen": 1.0}))
+    write_document(tmp_path, tmp_path / "study.md")
+    own = section((tmp_path / "study.md").read_text(), "Test, touched once")
+    assert table(own)["+ w + sTDE (eps 0.5)"][0] == "62.0 ± 0.5"
+    assert table(own)["+ w + sTDE (eps 1, chosen)"][0] == "62.0 ± 0.5"

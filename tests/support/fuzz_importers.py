@@ -1,0 +1,146 @@
+"""Mutated files of every format through the import command: `python tests/fuzz_importers.py [RUNS]` prints the counts.
+
+A run replaces or deletes up to three values of a fixture at random places, or damages bytes of its files. Whatever
+comes of it, the command must end with code 0 and a whole scene file, or with code 2 and none.
+"""
+
+import bz2
+import collections
+import copy
+import gzip
+import json
+import pickle
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from test_import_ai2thor import METADATA
+from test_import_habitat import EPISODES, STARTS
+from test_import_procthor import HOUSE
+from test_import_scene_data import FILES
+from test_import_semantic_map import bedroom, l_shaped_floor
+
+from jaxnav.cli.scenes import main
+from jaxnav.scenes.files.scene_file import read_scenes
+
+CRASHED = -1
+NASTY = [None, True, -1, 0, 7, 1e308, -0.13, 10**400, float("nan"), float("inf"), "", "Floor", "\ud800", [], {}, [[]]]
+
+
+class Format(NamedTuple):
+    """A format's fixture: its content, and how it is written; a folder's files are members of the content."""
+
+    name: str
+    content: object
+    write: Callable[[Path, object], Path]
+    options: tuple[str, ...] = ()
+
+
+def _text(name: str) -> Callable[[Path, object], Path]:
+    def write(folder: Path, content: object) -> Path:
+        path = folder / name
+        data = json.dumps(content).encode()
+        path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+        return path
+
+    return write
+
+
+def _scene_folder(folder: Path, content: object) -> Path:
+    scene = folder / "Scene_Data" / "FloorPlan401"
+    scene.mkdir(parents=True)
+    for name, value in content.items() if isinstance(content, dict) else ():
+        (scene / Path(str(name)).name.encode("ascii", "ignore").decode()).write_text(json.dumps(value))
+    return folder / "Scene_Data"
+
+
+def _mapped(folder: Path, content: object) -> Path:
+    path = _text("val.json.gz")(folder, {"episodes": STARTS})
+    (folder / "maps.pbz2").write_bytes(bz2.compress(pickle.dumps(content)))
+    return path
+
+
+FORMATS = (
+    Format("procthor", HOUSE, _text("house.json")),
+    Format("ai2thor", METADATA, _text("room.json.gz")),
+    Format("scene-data", FILES, _scene_folder),
+    Format("habitat", EPISODES, _text("val.json.gz")),
+    Format("habitat", {"Home": {0: l_shaped_floor(), 1: bedroom()}}, _mapped, ("--maps", "maps.pbz2")),
+)
+
+
+def mutated(content: object, draw: random.Random) -> object:
+    """A copy with up to three values deleted or replaced."""
+    root = copy.deepcopy(content)
+    for _ in range(draw.randint(1, 3)):
+        node, deep = root, draw.random()
+        while node:
+            key = draw.choice(sorted(node, key=str) if isinstance(node, dict) else range(len(node)))
+            if not isinstance(node[key], dict | list) or not node[key] or draw.random() < 0.1 + 0.2 * deep:
+                break
+            node = node[key]
+        if not node:
+            continue
+        if draw.random() < 0.3:
+            del node[key]
+        else:
+            node[key] = copy.deepcopy(draw.choice(NASTY))
+    return root
+
+
+def damaged(data: bytes, draw: random.Random) -> bytes:
+    """Bytes cut short, or with one of them changed."""
+    if draw.random() < 0.5:
+        return data[: draw.randrange(len(data) + 1)]
+    at = draw.randrange(len(data))
+    return data[:at] + bytes([draw.randrange(256)]) + data[at + 1 :]
+
+
+def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, float]:
+    """Runs by exit code (or CRASHED), and the seconds of the slowest.
+
+    Raises:
+      AssertionError: a run that leaves a file without success, or none with it.
+    """
+    draw, codes, slowest = random.Random(seed), collections.Counter(), 0.0
+    for _ in range(runs):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / "in").mkdir()
+            whole = draw.random() < 0.3
+            source = form.write(folder / "in", form.content if whole else mutated(form.content, draw))
+            if whole:
+                file = draw.choice(sorted(path for path in folder.rglob("*") if path.is_file()))
+                file.write_bytes(damaged(file.read_bytes(), draw))
+            options = [str(folder / "in" / o) if o.endswith(".pbz2") else o for o in form.options]
+            target = folder / "out" / "scenes.jsonl.gz"
+            began = time.perf_counter()
+            try:
+                code = main(["import", form.name, str(source), str(target), *options])
+            except Exception:
+                code = CRASHED
+            slowest = max(slowest, time.perf_counter() - began)
+            codes[code] += 1
+            left = [path.name for path in target.parent.iterdir()] if target.parent.exists() else []
+            assert left == ([target.name] if code == 0 else []), (code, left)
+            if code == 0:
+                read_scenes(target)
+    return codes, slowest
+
+
+if __name__ == "__main__":
+    RUNS = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+    table = Table("format", "runs", "imported", "refused", "crashed", "slowest (s)")
+    silent, sys.stderr = sys.stderr, open("/dev/null", "w")  # noqa: SIM115 - what the command says of every run
+    for form in FORMATS:
+        counts, longest = fuzz(form, RUNS)
+        numbers = (RUNS, counts[0], counts[2], counts[CRASHED])
+        table.add_row(" ".join((form.name, *form.options)), *map(str, numbers), f"{longest:.2f}")
+    sys.stderr = silent
+    Console().print(table)

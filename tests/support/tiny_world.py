@@ -1,0 +1,81 @@
+"""A world of two drawn rooms and policies of a few thousand parameters: what acts and learns compiles in seconds."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.causal import do
+from jaxnav.env.objectnav import NUM_PRIORS, build
+from jaxnav.env.types import Observation
+from jaxnav.layout import LayoutEstimator, prior_from_counts
+from jaxnav.policies.policy import bind, init_params
+from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.task import Task
+from support.scenes import CATEGORIES, SMALL, draw
+
+SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4, relation_layers=2)
+SPEC = PolicySpec(method="org", num_categories=len(CATEGORIES), sizes=SIZES)
+SETTING = "calibrated"
+#: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
+LIMITS = (6, 8)
+
+_ITEMS = (("Book", 0.25, 0.8, 1.75, *SMALL), ("Chair", 1.5, 0.5, 1.5, 0.5, 0.9, 0.5), ("Book", 1.5, 0.8, 0.0, *SMALL))
+KITCHEN = draw(["....##", "....##", "....##", "....##", "######"], *_ITEMS)
+BEDROOM = dataclasses.replace(
+    draw(["..", "..", ".."], ("Fridge", 0.25, 0.9, 2.0, 0.7, 1.8, 0.7), ("Chair", -0.5, 0.5, 0.5, 0.5, 0.9, 0.5)),
+    name="other",
+    room_type="bedroom",
+)
+BANK = compile_bank([KITCHEN, BEDROOM], Task(CATEGORIES))
+POSES_PER_CELL = BANK.task.rules.poses_per_cell
+
+
+def world():
+    """The environment and its parameters."""
+    return build(BANK, {"kitchen": LIMITS[0], "bedroom": LIMITS[1]}, 0)
+
+
+def priors():
+    """Some prior of each room type."""
+    counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, *2 * [len(CATEGORIES)]))
+    return jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts))
+
+
+_init = jax.jit(init_params, static_argnums=0)
+
+
+def lively(seed, spec=SPEC):
+    """Random parameters that act by what they see, unlike those of a fresh policy, which are close to indifferent."""
+    params = _init(spec, jax.random.key(seed))
+    kernel = jax.random.normal(jax.random.key(seed + 1000), params["actor"]["kernel"].shape)
+    loud = {
+        name: jax.tree.map(lambda leaf: 3 * leaf, node) for name, node in params.items() if name in ("fuse", "method")
+    }
+    return params | loud | {"actor": params["actor"] | {"kernel": kernel, "bias": jnp.zeros(6)}}
+
+
+@jax.jit
+def decide(weights, row, goal, layout_weights, memory):
+    """One decision and its counterfactual, both direct pathways zero."""
+    policy = bind(SPEC, weights)
+    pathways = policy.pathways(Observation(row=row, goal=goal), layout_weights)
+    return policy.decide(pathways, memory), policy.decide(do(pathways, scene=0.0, goal=0.0), memory)
+
+
+@jax.jit
+def believe(prior, layout, row):
+    """One belief after what is detected in `row`; `layout` is None at the start of an episode."""
+    estimator = LayoutEstimator(prior, SETTING)
+    return estimator.update(estimator.init() if layout is None else layout, RowLayout(len(CATEGORIES)).presence(row))
+
+
+goal_weights = jax.jit(LayoutEstimator.goal_weights)
+
+
+def at(tree, *index):
+    """The leaves at an index."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)

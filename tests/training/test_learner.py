@@ -1,0 +1,210 @@
+"""PPO learns; chunks, seeds side by side and poisoned rewards change nothing that they should not."""
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from test_rollout import ACTING, ENVS, LENGTH, PARAMS, PRIORS, act
+
+from jaxnav.training.config import PPOConfig
+from jaxnav.training.learner import Learner, block_order, regroup
+
+CONFIG = PPOConfig(
+    num_envs=ENVS,
+    rollout=LENGTH,
+    epochs=4,
+    minibatches=2,
+    learning_rate=4e-3,
+    gamma=0.97,
+    gae_lambda=0.9,
+    clip=0.2,
+    entropy=0.05,
+    value=0.5,
+    max_grad_norm=0.5,
+    distil=0.02,
+)
+LEARNER = Learner(acting=ACTING, spec=tiny.SPEC, config=CONFIG, counterfactual="distil")
+UPDATES = 400
+SCALARS = CONFIG.scalars(UPDATES)
+METRICS = {
+    "success", "return", "length", "truncated", "episodes", "skipped_steps",
+    "policy_loss", "value_loss", "entropy", "distil_loss", "gradient_norm",
+}  # fmt: skip
+
+init = jax.jit(LEARNER.init)
+traces = []
+
+
+@jax.jit
+def one_update(states, scalars, params, priors):
+    """A chunk of one update of several seeds, as in a run."""
+    traces.append(1)
+    return jax.lax.map(lambda state: LEARNER.train(state, scalars, params, priors, 1), states)
+
+
+@jax.jit
+def two_updates(state, scalars, params, priors):
+    """A chunk of two updates of one seed."""
+    traces.append(2)
+    return LEARNER.train(state, scalars, params, priors, 2)
+
+
+@pytest.fixture(scope="module")
+def seeds():
+    """Two seeds before their first update."""
+    states = [init(jax.random.key(seed), PARAMS, PRIORS) for seed in range(2)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+
+
+@pytest.fixture(scope="module")
+def chunks(seeds):
+    """Both seeds after one update, and the first one, alone, after two; compiled side by side."""
+    with ThreadPoolExecutor() as pool:
+        one = pool.submit(one_update, seeds, SCALARS, PARAMS, PRIORS)
+        two = pool.submit(two_updates, tiny.at(seeds, 0), SCALARS, PARAMS, PRIORS)
+        return one.result(), two.result()
+
+
+@pytest.fixture(scope="module")
+def first(chunks):
+    return chunks[0]
+
+
+@pytest.fixture(scope="module")
+def whole(chunks):
+    return chunks[1]
+
+
+def assert_same(a, b):
+    chex.assert_trees_all_equal(a.replace(key=jax.random.key_data(a.key)), b.replace(key=jax.random.key_data(b.key)))
+
+
+def kernel(states):
+    return np.asarray(states.params["fuse"]["kernel"])
+
+
+def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, whole):
+    second = one_update(first[0], SCALARS, PARAMS, PRIORS)
+    assert_same(tiny.at(second[0], 0), whole[0])
+    assert whole[0].update == 2
+    # Metrics of the whole are those of the parts: sums of episodes, means over updates, means over episodes.
+    parts = [{name: float(value[0]) for name, value in metrics.items()} for _, metrics in (first, second)]
+    found = {name: float(value) for name, value in whole[1].items()}
+    assert found["episodes"] == sum(part["episodes"] for part in parts)
+    for name in ("success", "return", "length", "truncated"):
+        assert found[name] * found["episodes"] == pytest.approx(sum(part[name] * part["episodes"] for part in parts))
+    for name in ("policy_loss", "entropy", "gradient_norm"):
+        assert found[name] == pytest.approx(sum(part[name] for part in parts) / 2)
+
+
+def test_another_seed_gives_another_policy(first, seeds):
+    for states in (seeds, first[0]):
+        assert not np.array_equal(kernel(states)[0], kernel(states)[1])
+    # So does another key of the updates alone.
+    rekeyed = seeds.replace(key=seeds.key[::-1])
+    assert not np.array_equal(kernel(one_update(rekeyed, SCALARS, PARAMS, PRIORS)[0])[0], kernel(first[0])[0])
+
+
+def test_metrics_are_finite_scalars(whole):
+    metrics = whole[1]
+    assert metrics.keys() == METRICS
+    for name, value in metrics.items():
+        assert value.shape == (), name
+        assert value.dtype == jnp.float32, name
+        assert np.isfinite(value), name
+    assert metrics["skipped_steps"] == 0
+    assert metrics["gradient_norm"] > 0
+
+
+def test_episode_statistics_are_those_of_the_episodes_that_ended(seeds, first):
+    """Of one update, recounted from the rollout that it makes."""
+    start = tiny.at(seeds, 0)
+    key = jax.random.fold_in(jax.random.fold_in(start.key, start.update), 0)
+    t = jax.tree.map(np.asarray, act(start.params, start.agent, key, False)[1])
+    metrics = {name: float(value[0]) for name, value in first[1].items()}
+    ended = t.terminated | t.truncated
+    assert metrics["episodes"] == ended.sum() > 20
+    # A successful episode's last action earns 5, every other one costs 0.01.
+    returns = np.where(t.success, 5 + 0.01, 0) - 0.01 * t.length
+    for name, values in {"success": t.success, "length": t.length, "truncated": t.truncated, "return": returns}.items():
+        assert metrics[name] == pytest.approx(values[ended].mean(), rel=1e-5), name
+
+
+def test_no_episode_that_ends_counts_as_none(seeds):
+    """After 6 steps none has reached a limit of 1000, and an actor that never says Done ends none either."""
+    bias = seeds.params["actor"]["bias"].at[:, -1].set(-1e9)
+    mute = seeds.replace(params=seeds.params | {"actor": seeds.params["actor"] | {"bias": bias}})
+    _, metrics = one_update(mute, SCALARS, PARAMS.replace(step_limit=jnp.full(2, 1000, jnp.int32)), PRIORS)
+    for name in ("episodes", "success", "return", "length", "truncated"):
+        np.testing.assert_array_equal(metrics[name], [0, 0])
+
+
+def test_chunks_and_other_scalars_do_not_trace_again(first):
+    before = len(traces)
+    states, _ = one_update(first[0], SCALARS, PARAMS, PRIORS)
+    one_update(states, SCALARS.replace(learning_rate=jnp.float32(0.1), entropy=jnp.float32(0.5)), PARAMS, PRIORS)
+    one_update(states, SCALARS, PARAMS.replace(success_reward=jnp.float32(1)), 2 * PRIORS)
+    assert len(traces) == before
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+def test_gradients_that_are_not_finite_are_skipped_and_counted(seeds, poison):
+    poisoned = PARAMS.replace(success_reward=jnp.float32(poison), step_reward=jnp.float32(poison))
+    states, metrics = one_update(seeds, SCALARS, poisoned, PRIORS)
+    np.testing.assert_array_equal(metrics["skipped_steps"], [8, 8])  # 4 epochs of 2 minibatches
+    # Neither the parameters nor the moments have changed, so that learning goes on as if nothing had been.
+    chex.assert_trees_all_equal(states.params, seeds.params)
+    chex.assert_trees_all_equal(states.optimizer.inner_state, seeds.optimizer.inner_state)
+    healed, metrics = one_update(states, SCALARS, PARAMS, PRIORS)
+    np.testing.assert_array_equal(metrics["skipped_steps"], [0, 0])
+    chex.assert_tree_all_finite(healed.params)
+    assert not np.array_equal(kernel(healed), kernel(states))
+
+
+def test_the_learning_rate_falls_to_zero(seeds):
+    last = seeds.replace(update=jnp.full(2, UPDATES, jnp.int32))
+    states, _ = one_update(last, SCALARS, PARAMS, PRIORS)
+    chex.assert_trees_all_equal(states.params, seeds.params)
+
+
+def test_minibatches_take_every_episode_once_and_one_of_every_block():
+    """Six episodes in two minibatches: blocks 01, 23, 45; all leaves are cut alike."""
+    order = block_order(jax.random.key(3), 6, 2)
+    episodes = jnp.arange(6)
+    steps = jnp.broadcast_to(10 * episodes, (4, 6))  # [T, B]
+    parts, memory = regroup(steps, order, axis=1), regroup(episodes, order, axis=0)
+    assert parts.shape == (2, 4, 3)
+    np.testing.assert_array_equal(parts, np.broadcast_to(10 * memory[:, None], parts.shape))
+    np.testing.assert_array_equal(np.sort(np.ravel(memory)), episodes)
+    np.testing.assert_array_equal(memory // 2, [[0, 1, 2]] * 2)
+
+
+def test_minibatches_differ_between_epochs():
+    orders = {tuple(np.ravel(block_order(jax.random.key(i), 32, 4))) for i in range(8)}
+    assert len(orders) == 8
+
+
+def test_a_method_without_experience_trains():
+    spec = dataclasses.replace(tiny.SPEC, method="rgb")
+    learner = dataclasses.replace(LEARNER, spec=spec, acting=dataclasses.replace(ACTING, setting=None))
+    before = learner.init(jax.random.key(0), PARAMS, PRIORS)
+    after, metrics = jax.jit(learner.update)(before, SCALARS, PARAMS, PRIORS)
+    chex.assert_tree_all_finite((after.params, metrics))
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).sum()), before.params, after.params)
+    assert moved["view"]["kernel"] > 0.0
+
+
+def test_ppo_learns():
+    """A random policy soon says Done and is right by chance; a trained one finds the goals within 20 steps."""
+    params = PARAMS.replace(step_limit=jnp.full(2, 20, jnp.int32))
+    state, success = init(jax.random.key(0), params, PRIORS), []
+    for _ in range(UPDATES // 2):
+        state, metrics = two_updates(state, SCALARS, params, PRIORS)
+        success.append(float(metrics["success"]))
+    assert np.mean(success[:5]) < 0.5
+    assert np.mean(success[-20:]) > 0.9
