@@ -12,7 +12,7 @@ from jaxnav.env.types import EnvParams, Observation, State
 from jaxnav.policies.features import NUM_FEATURES, features
 from jaxnav.policies.policy import SELDOM
 from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 
@@ -59,16 +59,16 @@ def packed(observation: Observation, action: jax.Array) -> jax.Array:
     return jnp.concatenate([observation.row, jnp.stack([observation.goal, action]).astype(jnp.uint8)])
 
 
-def unpacked(array: jax.Array, layout: RowLayout) -> jax.Array:
+def unpacked(array: jax.Array, row_format: RowFormat) -> jax.Array:
     """From batches of `packed` arrays to what `Torso` reads."""
     array = array.astype(jnp.uint8)  # a trainer may build its parameters with an array of floats
     observation = Observation(array[..., :-2], array[..., -2].astype(jnp.int32))
-    return vector(observation, array[..., -1].astype(jnp.int32), layout)
+    return vector(observation, array[..., -1].astype(jnp.int32), row_format)
 
 
-def vector(observation: Observation, action: jax.Array, layout: RowLayout) -> jax.Array:
+def vector(observation: Observation, action: jax.Array, row_format: RowFormat) -> jax.Array:
     """The policy's features as one float32 vector: view, table, previous action."""
-    seen = features(observation.row, observation.goal, layout)
+    seen = features(observation.row, observation.goal, row_format)
     table = seen.table.reshape(*seen.table.shape[:-2], -1)
     return jnp.concatenate([seen.view, table, jax.nn.one_hot(action, NUM_ACTIONS)], axis=-1)
 

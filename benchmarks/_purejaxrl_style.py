@@ -18,7 +18,7 @@ from flax.training.train_state import TrainState
 
 from jaxnav.env.make import make
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.training.config import PPOConfig
 
 SPEC = PolicySpec()
@@ -136,8 +136,8 @@ def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, updat
 def main(epochs: int, minibatches: int, updates: int) -> None:
     env, params = make("rooms")
     config = PPOConfig(epochs=epochs, minibatches=minibatches)
-    layout = RowLayout(SPEC.num_categories)
-    adapter = Adapter(env, lambda observation, action: vector(observation, action, layout))
+    row_format = RowFormat(SPEC.num_categories)
+    adapter = Adapter(env, lambda observation, action: vector(observation, action, row_format))
     network: Any = ActorCritic()
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate, eps=1e-5))
     reset_key, init_key, key = jax.random.split(jax.random.key(0), 3)

@@ -17,12 +17,12 @@ from rejax.networks import DiscretePolicy
 
 from jaxnav.env.make import make
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 
 SPEC = PolicySpec()
-LAYOUT = RowLayout(SPEC.num_categories)
+LAYOUT = RowFormat(SPEC.num_categories)
 
 
 class GymnaxObjectNav(Adapter):

@@ -60,7 +60,7 @@ def main() -> None:
         {
             "episodes": EPISODES,
             "steps": STEPS,
-            "row_bytes": env.layout.num_bytes,
+            "row_bytes": env.row_format.num_bytes,
             "table_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)),
             "steps_per_s": {name: rates(values, EPISODES * STEPS) for name, values in taken.items()},
             "over_gather": {

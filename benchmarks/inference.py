@@ -170,7 +170,7 @@ def against_released(env: ObjectNav, world: World, counts: jax.Array) -> dict[st
         return {"not_installed": str(PYTHON)}
     states = walked(env, world.params, 1)
     rows = jnp.stack([world.params.tables.rows[state.pose[0]] for state in states])
-    seen = features(rows, jnp.concatenate([state.goal for state in states]), env.layout)
+    seen = features(rows, jnp.concatenate([state.goal for state in states]), env.row_format)
     prior = layout_priors(counts, "released")[world.params.room[states[0].scene[0]]]
     arrays = {"table": seen.table, "view": seen.view, "prior": prior}
     with worker({name: np.asarray(array) for name, array in arrays.items()}) as (about, ask):

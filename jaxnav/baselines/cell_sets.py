@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxnav.scenes.scene import CELL
 from jaxnav.scenes.tables.detector import MIN_RANGE
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NEIGHBOURS, Rules
 
 #: Cells from the start to the edge of what counts as standable, and from there to the edge of the square: room for
@@ -41,7 +41,7 @@ class Body(NamedTuple):
 @functools.lru_cache
 def body(rules: Rules) -> Body:
     """How it moves and sees under the rules (docs/environment.md)."""
-    view = RowLayout(0).view
+    view = RowFormat(0).view
     ahead, right = np.arange(view).repeat(view), np.tile(np.arange(view) - view // 2, view)
     offsets = rules.view_offsets(view).reshape(rules.headings, -1, 2)
     flat = offsets @ (SIDE, 1)

@@ -24,7 +24,7 @@ from jaxnav.scenes.tables.observation_row import (
     SIZE_SCALE,
     VIEW_BLOCKED,
     VIEW_FREE,
-    RowLayout,
+    RowFormat,
 )
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, Rules
 
@@ -48,8 +48,7 @@ def frontier_outcome(bank: Bank, episodes: EpisodeList, step_limit: np.ndarray) 
     starts = zip(episodes.pose.tolist(), episodes.goal.tolist(), limits.tolist(), strict=True)
     walks = [list(walk(bank, successor, *start)) for start in starts]
     last, action = np.array([steps[-1] for steps in walks], np.int32).T
-    byte, bit = RowLayout(len(bank.task.categories)).found_at(episodes.goal)
-    found = bank.rows[last, byte] >> bit.astype(np.uint8) & 1 > 0
+    found = bank.best_length[last, episodes.goal] == 1
     end = successor[last, action] // bank.task.rules.poses_per_cell
     moves = [sum(action == MOVE_AHEAD for _, action in steps) for steps in walks]
     return Outcome(
@@ -66,12 +65,12 @@ def walk(bank: Bank, successor: np.ndarray, pose: int, goal: int, limit: int) ->
 
     The bank takes it from pose to pose (by `successor`, int [P, 6]); of it the searcher gets view and detection alone.
     """
-    rules, layout = bank.task.rules, RowLayout(len(bank.task.categories))
+    rules, row_format = bank.task.rules, RowFormat(len(bank.task.categories))
     horizons = len(rules.horizons)
     searcher = Searcher(rules, pose // horizons % rules.headings, pose % horizons)
     for _ in range(limit):
         row = bank.rows[pose]
-        action = searcher.act(layout.view_cells(row), layout.detections(row)[goal])
+        action = searcher.act(row_format.view_cells(row), row_format.detections(row)[goal])
         yield pose, action
         if action == DONE:
             return
@@ -111,8 +110,8 @@ class Searcher:
         """Perceive, and choose the next action.
 
         Args:
-          view: uint8 [V V], see `RowLayout.view_cells`.
-          detection: uint8 [4], of the goal, see `RowLayout.detections`.
+          view: uint8 [V V], see `RowFormat.view_cells`.
+          detection: uint8 [4], of the goal, see `RowFormat.detections`.
         """
         self._remember(view)
         action = DONE if self._sees_goal(detection) else self._next()

@@ -55,7 +55,7 @@ def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) 
 
     def step(carry: tuple[State, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
         state, running, outcome = carry
-        found = jax.vmap(env.found, (0, None))(state, params)
+        found = jax.vmap(env.succeeds, (0, None))(state, params)
         state, _, terminated, truncated = jax.vmap(env.advance, (0, 0, None))(state, action, params)
         outcome = outcome._replace(
             success=outcome.success | (running & terminated & found),

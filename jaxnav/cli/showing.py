@@ -26,7 +26,7 @@ from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL, Scene
 from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.tables.detector import PERFECT
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, RowLayout
+from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, RowFormat
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import Rules, Task
 from jaxnav.store.files import write_atomic
@@ -122,13 +122,13 @@ def view_from(scene: Scene, task: Task, pose: tuple[float, float, float] | None)
     Raises:
       InputError: nobody can stand there, or look that way.
     """
-    rules, layout = task.rules, RowLayout(len(task.categories))
+    rules, row_format = task.rules, RowFormat(len(task.categories))
     centres = cell_centres(scene, standable_cells(scene.reach))
     rows = compile_scene(scene, task).rows[:: len(rules.horizons)]  # of the level camera
-    best = int(layout.presence(rows).sum(axis=1).argmax()) if pose is None else _pose(centres, rules, *pose)
+    best = int(row_format.presence(rows).sum(axis=1).argmax()) if pose is None else _pose(centres, rules, *pose)
     cell, heading = divmod(best, rules.headings)
     place, forward = centres[cell], rules.directions()[heading]
-    confidence, ahead, right, _ = layout.detections(rows[best]).astype(np.float64).T
+    confidence, ahead, right, _ = row_format.detections(rows[best]).astype(np.float64).T
     reported = place + np.outer(ahead / AHEAD_SCALE, forward)
     reported += np.outer((right - 128.0) / RIGHT_SCALE, (forward[1], -forward[0]))
     ids, places = np.array(category_ids(scene.types, task.categories)), scene.boxes[:, [0, 2]]

@@ -19,7 +19,7 @@ from jaxnav.runs.directory import load_policies, load_run
 from jaxnav.scenes.categories import ROOM_TYPES, category_ids, unknown_types
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.tables.compile import compile_scene
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
 from jaxnav.viz.plan import scene_size
@@ -151,7 +151,7 @@ def scene_numbers(scene: Scene, task: Task) -> Numbers:
         cells=len(table.ahead),
         size=scene_size(scene),
         objects=np.bincount(ids, minlength=num_categories),
-        detected=RowLayout(num_categories).presence(table.rows).sum(axis=0),
+        detected=RowFormat(num_categories).presence(table.rows).sum(axis=0),
         poses=len(table.rows),
         together=seen_together(table.rows, num_categories),
         lengths=np.stack([np.bincount(own, minlength=starts.max() + 1) for own in starts.T]),

@@ -12,7 +12,7 @@ import numpy as np
 from jaxnav.env.types import EnvParams, Observation, State, StepResult, Tables
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.compile import Bank
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
 #: Index of the layout prior that all room types outside `ROOM_TYPES` share, and the number of priors.
@@ -39,9 +39,9 @@ class ObjectNav:
         return self.task.categories
 
     @property
-    def layout(self) -> RowLayout:
-        """Where things stand in an observation row."""
-        return RowLayout(len(self.categories))
+    def row_format(self) -> RowFormat:
+        """How an observation row is packed."""
+        return RowFormat(len(self.categories))
 
     @property
     def num_actions(self) -> int:
@@ -92,10 +92,10 @@ class ObjectNav:
         """Global cell int32 [] of a pose."""
         return pose // self.task.rules.poses_per_cell
 
-    def found(self, state: State, params: EnvParams) -> jax.Array:
-        """Whether Done would succeed here, bool []."""
-        byte, bit = self.layout.found_at(state.goal)
-        return (params.tables.rows[state.pose, byte] >> bit.astype(jnp.uint8)) & jnp.uint8(1) > 0
+    def succeeds(self, state: State, params: EnvParams) -> jax.Array:
+        """Whether Done would succeed here, bool []; rewards and metrics read it, agents cannot."""
+        byte, bit = state.goal // 8, (state.goal % 8).astype(jnp.uint8)
+        return (params.tables.success[state.pose, byte] >> bit) & jnp.uint8(1) > 0
 
     def advance(
         self, state: State, action: jax.Array, params: EnvParams
@@ -113,7 +113,7 @@ class ObjectNav:
         """
         done = action == DONE
         time = state.time + 1
-        reward = jnp.where(done & self.found(state, params), params.success_reward, params.step_reward)
+        reward = jnp.where(done & self.succeeds(state, params), params.success_reward, params.step_reward)
         truncated = ~done & (time >= params.step_limit[state.scene])
         pose = self.after(state.pose, action, params)
         if self.shaping:
@@ -143,7 +143,7 @@ class ObjectNav:
         info = {
             "final_state": last,
             "final_observation": self.observe(last, params),
-            "success": terminated & self.found(last, params),
+            "success": terminated & self.succeeds(last, params),
             "length": last.time,
         }
         return self.observe(state, params), state, reward, terminated, truncated, info
@@ -185,6 +185,7 @@ def build(
     """
     rooms = [ROOM_TYPES.index(room) if room in ROOM_TYPES else OTHER_ROOM for room in bank.room_types]
     limits = [step_limits.get(room, default_limit) for room in bank.room_types]
+    poses_per_cell = bank.task.rules.poses_per_cell
     more_cells = max(num_cells - len(bank.ahead), 0)
     scenes = np.arange(max(num_scenes, len(bank.names))) % len(bank.names)
 
@@ -197,7 +198,8 @@ def build(
 
     tables = Tables(
         ahead=padded(bank.ahead),
-        rows=padded(bank.rows, bank.task.rules.poses_per_cell),
+        rows=padded(bank.rows, poses_per_cell),
+        success=padded(np.packbits(bank.best_length == 1, axis=1, bitorder="little"), poses_per_cell),
         goal_distance=padded(bank.goal_distance),
         **{
             name: jnp.asarray(getattr(bank, name)[scenes]) for name in ("first_cell", "num_cells", "goals", "num_goals")

@@ -59,7 +59,7 @@ def check_environment(
 
 
 def _check_observation(env: ObjectNav, observation: Observation, num_envs: int) -> None:
-    chex.assert_shape(observation.row, (num_envs, env.layout.num_bytes))
+    chex.assert_shape(observation.row, (num_envs, env.row_format.num_bytes))
     chex.assert_type([observation.row, observation.goal], [jnp.uint8, jnp.int32])
     goal = np.asarray(observation.goal)
     _promise(bool(np.all((goal >= 0) & (goal < len(env.categories)))), "a goal that is no category")

@@ -7,10 +7,15 @@ from flax import struct
 
 
 class Tables(struct.PyTreeNode):
-    """A bank of scenes on the device; see `jaxnav.scenes.tables.compile.Bank` for the shapes."""
+    """A bank of scenes on the device; see `jaxnav.scenes.tables.compile.Bank` for the shapes.
+
+    `success`, uint8 [P, ceil(K / 8)], holds a bit per pose and goal: whether Done succeeds there. It stands apart from
+    the rows, so that no observation holds it.
+    """
 
     ahead: jax.Array
     rows: jax.Array
+    success: jax.Array
     goal_distance: jax.Array
     first_cell: jax.Array
     num_cells: jax.Array
@@ -56,7 +61,7 @@ class Observation(struct.PyTreeNode):
     """What the agent perceives.
 
     Attributes:
-      row: uint8 [R], the packed row of the pose (see `jaxnav.scenes.tables.observation_row.RowLayout`).
+      row: uint8 [R], the packed row of the pose (see `jaxnav.scenes.tables.observation_row.RowFormat`).
       goal: int32 [], category that is sought.
     """
 

@@ -236,7 +236,7 @@ def act(
 
     sampled = jax.vmap(jax.random.categorical)(own, logits)
     action = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
-    found = jax.vmap(acting.env.found, (0, None))(agent.state, params)
+    found = jax.vmap(acting.env.succeeds, (0, None))(agent.state, params)
     state, _, terminated, truncated = jax.vmap(acting.env.advance, (0, 0, None))(agent.state, action, params)
     layout = acting.believe(agent.layout, state, params, priors)
     following = Agent(state=state, layout=layout, memory=Memory(hidden=factual.hidden, action=action))

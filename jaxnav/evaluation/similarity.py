@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxnav.scenes.tables.compile import Bank
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 
 #: Share of the uniform distribution in both sides of the layout gap, so that it stays finite.
 UNIFORM = 0.05
@@ -13,13 +13,13 @@ def seen_together(rows: np.ndarray, num_categories: int) -> np.ndarray:
     """Poses at which two categories are detected together, n_ij.
 
     Args:
-      rows: uint8 [P, R], see `RowLayout`.
+      rows: uint8 [P, R], see `RowFormat`.
       num_categories: K.
 
     Returns:
       float64 [K, K], symmetric, whole numbers, 0 on the diagonal.
     """
-    presence = RowLayout(num_categories).presence(rows).astype(np.float64)
+    presence = RowFormat(num_categories).presence(rows).astype(np.float64)
     together = presence.T @ presence
     np.fill_diagonal(together, 0.0)
     return together

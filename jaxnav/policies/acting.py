@@ -61,7 +61,7 @@ class Acting:
             return None
 
         def one(layout: LayoutState, state: State) -> LayoutState:
-            presence = self.env.layout.presence(params.tables.rows[state.pose])
+            presence = self.env.row_format.presence(params.tables.rows[state.pose])
             return LayoutEstimator(priors[params.room[state.scene]], setting).update(layout, presence)
 
         return jax.vmap(one)(layout, state)

@@ -11,7 +11,7 @@ from jaxnav.scenes.tables.observation_row import (
     SIZE_SCALE,
     VIEW_BLOCKED,
     VIEW_FREE,
-    RowLayout,
+    RowFormat,
 )
 
 NUM_FEATURES = 9  # per category, the goal flag included
@@ -36,17 +36,17 @@ class Features(NamedTuple):
     goal: jax.Array
 
 
-def features(row: jax.Array, goal: jax.Array, layout: RowLayout) -> Features:
+def features(row: jax.Array, goal: jax.Array, row_format: RowFormat) -> Features:
     """Unpack rows uint8 [..., R] and goals int [...]."""
-    cells = layout.view_cells(row)
+    cells = row_format.view_cells(row)
     view = jnp.concatenate([cells == VIEW_FREE, cells == VIEW_BLOCKED], axis=-1).astype(jnp.float32)
-    confidence, ahead, right, size = jnp.moveaxis(layout.detections(row).astype(jnp.float32), -1, 0)
+    confidence, ahead, right, size = jnp.moveaxis(row_format.detections(row).astype(jnp.float32), -1, 0)
     visible = (confidence > 0).astype(jnp.float32)
     ahead = ahead / (AHEAD_SCALE * _REACH)
     right = (right - 128.0) / (RIGHT_SCALE * _REACH)
     distance = jnp.sqrt(ahead**2 + right**2)
     scale = 1.0 / jnp.maximum(distance, 0.01)
-    one_hot = jax.nn.one_hot(goal, layout.num_categories, dtype=jnp.float32)
+    one_hot = jax.nn.one_hot(goal, row_format.num_categories, dtype=jnp.float32)
     seen = jnp.stack(
         [visible, confidence / 255.0, ahead, right, distance, right * scale, ahead * scale, size / SIZE_SCALE], axis=-1
     )

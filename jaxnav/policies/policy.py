@@ -24,7 +24,7 @@ from jaxnav.policies.features import CONFIDENCE, NUM_FEATURES, features
 from jaxnav.policies.methods import METHODS, CategoryMaps
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 Params = dict[str, Any]
@@ -38,11 +38,11 @@ class Policy(nnx.Module):
     """Three pathways and a recurrent decision; works on single observations and on batches."""
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
-        layout = RowLayout(spec.num_categories)
-        self.layout = layout
+        row_format = RowFormat(spec.num_categories)
+        self.row_format = row_format
         self.hidden, self.direct, self.done_gate = spec.sizes.hidden, spec.direct, spec.done_gate
         self.appearance = nnx.Embed(spec.num_categories, spec.sizes.appearance, rngs=rngs)
-        self.view = Linear(2 * layout.view**2, spec.sizes.view_outputs, rngs=rngs)
+        self.view = Linear(2 * row_format.view**2, spec.sizes.view_outputs, rngs=rngs)
         self.detections = CategoryMaps(spec.sizes.appearance + NUM_FEATURES, spec, rngs)
         self.sought = nnx.Embed(spec.num_categories, spec.sizes.appearance, rngs=rngs)
         self.method = METHODS[spec.method](spec, rngs)
@@ -62,7 +62,7 @@ class Policy(nnx.Module):
           observation: a batch [...] of observations.
           weights: float32 [..., K], the layout's weights for the goal (eq. 7); ones leave the layout out.
         """
-        seen = features(observation.row, observation.goal, self.layout)
+        seen = features(observation.row, observation.goal, self.row_format)
         appearance = self.appearance.embedding[...]
         looks = self.detections.looks(appearance)
         looks = seen.visible[..., None] * jnp.broadcast_to(looks, (*seen.visible.shape, looks.shape[-1]))

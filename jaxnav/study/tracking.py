@@ -107,7 +107,7 @@ def _walks(
 
         def step(carry: tuple, _: None) -> tuple[tuple, tuple[jax.Array, jax.Array]]:
             agent, running, beliefs = carry
-            presence = env.layout.presence(params.tables.rows[agent.state.pose])
+            presence = env.row_format.presence(params.tables.rows[agent.state.pose])
             beliefs = [
                 _watch(setting, prior[room], belief, presence)
                 for setting, prior, belief in zip(settings, setting_priors, beliefs, strict=True)

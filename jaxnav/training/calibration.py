@@ -86,7 +86,7 @@ def calibrate(
             return LayoutEstimator(priors[params.room[state.scene]], setting)
 
         def see(state: State, layout: LayoutState) -> tuple[LayoutState, tuple[jax.Array, jax.Array]]:
-            presence = env.layout.presence(params.tables.rows[state.pose])
+            presence = env.row_format.presence(params.tables.rows[state.pose])
             new = jax.vmap(LayoutEstimator.update)(estimators(state), layout, presence)
             return new, (new.gap, (new.alpha != layout.alpha).any(axis=(1, 2)))
 

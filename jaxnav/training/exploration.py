@@ -48,7 +48,7 @@ def explore(
     seen = jnp.zeros(params.tables.rows.shape[0], bool).at[state.pose].set(True)
     (_, seen), _ = jax.lax.scan(step, (state, seen), actions)
 
-    presence = (env.layout.presence(params.tables.rows) & seen[:, None]).astype(jnp.float32)
+    presence = (env.row_format.presence(params.tables.rows) & seen[:, None]).astype(jnp.float32)
     scene = jnp.repeat(
         jnp.arange(len(params.room)),
         params.tables.num_cells * env.task.rules.poses_per_cell,

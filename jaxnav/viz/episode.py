@@ -14,7 +14,7 @@ from PIL import Image
 
 from jaxnav.evaluation.playback import Trace
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, RowLayout
+from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, RowFormat
 from jaxnav.scenes.task import DONE, Task
 from jaxnav.viz.plan import GOAL, INK, draw_room, view_cone
 
@@ -121,7 +121,7 @@ def _draw_agent(axes: Axes, episode: Episode, step: int) -> list:
 
 
 def _detections(episode: Episode, step: int) -> np.ndarray:
-    return RowLayout(len(episode.task.categories)).detections(episode.rows[step]).astype(np.float64)
+    return RowFormat(len(episode.task.categories)).detections(episode.rows[step]).astype(np.float64)
 
 
 def _draw_detected(axes: Axes, episode: Episode, step: int) -> None:

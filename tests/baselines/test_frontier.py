@@ -12,7 +12,7 @@ from jaxnav.baselines.frontier import frontier_outcome, walk
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.detector import PERFECT, Detector
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, MOVE_AHEAD, ROTATE_RIGHT, Task
 
 BLIND = Detector(miss_near=1.0, miss_far=1.0, false_alarm=0.0)
@@ -89,13 +89,13 @@ def test_a_blind_searcher_goes_on_to_the_step_limit():
 
 def test_a_single_false_alarm_is_not_believed():
     bank = compiled(draw(["....."] * 5, ("Chair", 1.0, 0.45, 1.5, 0.5, 0.9, 0.5)))
-    rows, layout = bank.rows.copy(), RowLayout(len(CATEGORIES))
+    rows, row_format = bank.rows.copy(), RowFormat(len(CATEGORIES))
     start = pose(12, heading=0)
-    layout.detections(rows[start])[BOOK] = (120, 51, 128, 153)  # a book 1 m ahead, in this pose alone
-    assert (layout.detections(rows)[:, BOOK, 0] > 0).sum() == 1
+    row_format.detections(rows[start])[BOOK] = (120, 51, 128, 153)  # a book 1 m ahead, in this pose alone
+    assert (row_format.detections(rows)[:, BOOK, 0] > 0).sum() == 1
     assert DONE not in searched(bank._replace(rows=rows), start)
     # Where the next pose (the same, looking down) agrees, it is.
-    layout.detections(rows[start + 1])[BOOK] = (120, 51, 128, 153)
+    row_format.detections(rows[start + 1])[BOOK] = (120, 51, 128, 153)
     assert searched(bank._replace(rows=rows), start) == [LOOK_DOWN, DONE]
 
 
@@ -118,10 +118,9 @@ def test_it_knows_only_what_it_perceives(seed, start, goal):
     actions = searched(alone, start, goal)
     # Other scenes in the bank, and another place in it.
     assert searched(among, start + len(among.rows) - len(alone.rows), goal) == actions
-    # Nothing of the truth: no lengths, no distances, no found bits, no other categories' detections.
-    rows, layout = alone.rows.copy(), RowLayout(len(CATEGORIES))
-    rows[:, 4 * len(CATEGORIES)] = 0
-    layout.detections(rows)[:, [k for k in range(len(CATEGORIES)) if k != goal]] = 0
+    # Nothing of the truth: no lengths, no distances, no other categories' detections.
+    rows, row_format = alone.rows.copy(), RowFormat(len(CATEGORIES))
+    row_format.detections(rows)[:, [k for k in range(len(CATEGORIES)) if k != goal]] = 0
     stripped = alone._replace(
         rows=rows, best_length=0 * alone.best_length, goal_distance=0 * alone.goal_distance, ahead=0 * alone.ahead
     )

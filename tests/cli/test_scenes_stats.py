@@ -14,7 +14,7 @@ from jaxnav.evaluation.similarity import layout_gap, layout_similarity, scene_co
 from jaxnav.runs.directory import load_policies, load_run
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.tables.compile import compile_bank, compile_scene
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import generated
 
@@ -77,9 +77,11 @@ def test_categories_and_path_lengths(file, capsys):
 
 def test_pairs_seen_together(file, capsys):
     shown = stats(capsys, file)
-    layout, names = RowLayout(len(Task().categories)), Task().categories
+    row_format, names = RowFormat(len(Task().categories)), Task().categories
     rows = np.concatenate([compile_scene(scene, Task()).rows for scene in (KITCHEN, BEDROOM)])
-    seen = np.array([[bool(found[names.index(name)]) for name in ("Book", "Chair")] for found in layout.presence(rows)])
+    seen = np.array(
+        [[bool(found[names.index(name)]) for name in ("Book", "Chair")] for found in row_format.presence(rows)]
+    )
     rare, other = sorted((0, 1), key=lambda k: seen[:, k].sum())
     given, base = seen[seen[:, rare], other].mean(), seen[:, other].mean()
     phi = np.corrcoef(seen.T)[0, 1]

@@ -11,19 +11,19 @@ from scipy.special import rel_entr
 from support import tiny_world as tiny
 
 from jaxnav.evaluation.similarity import expected, layout_gap, layout_similarity, scene_counts
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 
 K = 4
 MATRICES = st.lists(st.integers(0, 30), min_size=K * K, max_size=K * K).map(lambda n: np.array(n, float).reshape(K, K))
 
 
 def test_counts_are_those_of_the_poses_of_each_scene_one_by_one():
-    bank, layout = tiny.BANK, RowLayout(len(tiny.CATEGORIES))
+    bank, row_format = tiny.BANK, RowFormat(len(tiny.CATEGORIES))
     counts = scene_counts(bank)
     assert counts.shape == (2, 3, 3)
     first = bank.num_cells[0] * tiny.POSES_PER_CELL  # the kitchen's 16 cells, then the bedroom's 6
     for scene, rows in enumerate((bank.rows[:first], bank.rows[first:])):
-        sets = [set(np.flatnonzero(row)) for row in layout.presence(rows)]
+        sets = [set(np.flatnonzero(row)) for row in row_format.presence(rows)]
         for i in range(3):
             for j in range(3):
                 assert counts[scene, i, j] == (i != j) * sum({i, j} <= seen for seen in sets)

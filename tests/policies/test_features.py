@@ -7,7 +7,7 @@ from support.scenes import CATEGORIES
 from support.tiny_world import BANK
 
 from jaxnav.policies.features import NUM_FEATURES, features
-from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowLayout
+from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat
 
 K, VIEW = len(CATEGORIES), 11
 
@@ -17,11 +17,11 @@ def packed_row():
     detections = np.array([[[255, 255, 1, 51], [0, 99, 7, 200], [51, 0, 128, 255]]], np.uint8)
     view = np.zeros((1, VIEW, VIEW), np.uint8)
     view[0, 0, 0], view[0, 10, 10] = VIEW_FREE, VIEW_BLOCKED
-    return jnp.asarray(RowLayout(K).pack(detections, np.zeros((1, K), bool), view)[0])
+    return jnp.asarray(RowFormat(K).pack(detections, view)[0])
 
 
 def test_features_of_a_row_packed_by_hand():
-    seen = features(packed_row(), jnp.int32(2), RowLayout(K))
+    seen = features(packed_row(), jnp.int32(2), RowFormat(K))
     half = np.sqrt(0.5)
     # Category 0: confidence 255 / 255 = 1; ahead 255 / 51 = 5 m -> 1; right (1 - 128) / 25.4 = -5 m -> -1; distance
     # sqrt(2); sine -1 / sqrt(2), cosine 1 / sqrt(2); size 51 / 127.5 = 0.4. It is not the goal.
@@ -37,12 +37,12 @@ def test_features_of_a_row_packed_by_hand():
 
 
 def test_a_goal_that_is_not_detected_has_its_flag_alone():
-    table = features(packed_row(), jnp.int32(1), RowLayout(K)).table
+    table = features(packed_row(), jnp.int32(1), RowFormat(K)).table
     np.testing.assert_array_equal(table[1], [0] * (NUM_FEATURES - 1) + [1])
     np.testing.assert_array_equal(table[:, -1], [0, 1, 0])
 
 
 def test_features_of_every_row_of_a_bank_are_finite_and_of_order_one():
-    seen = features(jnp.asarray(BANK.rows), jnp.zeros(len(BANK.rows), jnp.int32), RowLayout(K))
+    seen = features(jnp.asarray(BANK.rows), jnp.zeros(len(BANK.rows), jnp.int32), RowFormat(K))
     assert (np.abs(np.concatenate(jax.tree.map(np.ravel, list(seen)))) <= 2).all()
-    np.testing.assert_array_equal(seen.visible, RowLayout(K).presence(BANK.rows))
+    np.testing.assert_array_equal(seen.visible, RowFormat(K).presence(BANK.rows))

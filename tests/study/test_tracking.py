@@ -16,7 +16,7 @@ from jaxnav.evaluation.episodes import EpisodeList, episode_list
 from jaxnav.layout import LayoutEstimator, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, LOOK_UP
 from jaxnav.study.tracking import FROZEN, UPDATED, GapTraces, auc, auc_by_step, gap_traces, mean_by_step
 
@@ -25,7 +25,7 @@ ACTING = Acting(ENV, tiny.SETTING)
 
 
 def presence(pose):
-    return RowLayout(len(tiny.CATEGORIES)).presence(tiny.BANK.rows[pose])
+    return RowFormat(len(tiny.CATEGORIES)).presence(tiny.BANK.rows[pose])
 
 
 def episodes():

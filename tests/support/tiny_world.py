@@ -13,7 +13,7 @@ from jaxnav.layout import LayoutEstimator, prior_from_counts
 from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from support.scenes import CATEGORIES, SMALL, draw
 
@@ -70,7 +70,7 @@ def decide(weights, row, goal, layout_weights, memory):
 def believe(prior, layout, row):
     """One belief after what is detected in `row`; `layout` is None at the start of an episode."""
     estimator = LayoutEstimator(prior, SETTING)
-    return estimator.update(estimator.init() if layout is None else layout, RowLayout(len(CATEGORIES)).presence(row))
+    return estimator.update(estimator.init() if layout is None else layout, RowFormat(len(CATEGORIES)).presence(row))
 
 
 goal_weights = jax.jit(LayoutEstimator.goal_weights)

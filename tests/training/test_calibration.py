@@ -89,7 +89,7 @@ def gap_run(presence, prior, reduction):
 def by_hand(counts):
     """Medians (early, late) of every pair (reduction, strength)."""
     poses, rooms = walks()
-    presence = np.asarray(ENV.layout.presence(tiny.BANK.rows))[poses]
+    presence = np.asarray(ENV.row_format.presence(tiny.BANK.rows))[poses]
     found = {}
     for reduction, strength in PAIRS:
         priors = np.asarray(layout_priors(counts, Setting(strength=strength)))

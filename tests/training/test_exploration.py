@@ -12,7 +12,7 @@ from jaxnav.scenes.task import DONE
 from jaxnav.training.exploration import explore
 
 ENV, PARAMS = tiny.world()
-PRESENCE = np.asarray(ENV.layout.presence(tiny.BANK.rows))
+PRESENCE = np.asarray(ENV.row_format.presence(tiny.BANK.rows))
 KITCHEN, BEDROOM = (ROOM_TYPES.index(name) for name in tiny.BANK.room_types)
 KITCHEN_POSES, BEDROOM_POSES = (int(n) * tiny.POSES_PER_CELL for n in tiny.BANK.num_cells)
 run = jax.jit(explore, static_argnums=(0, 3, 4))

@@ -11,7 +11,7 @@ from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import ahead_of, best_lengths, standable_cells, successors, walking_distances
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.detector import detection_range, object_size
-from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowLayout
+from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowFormat
 from jaxnav.scenes.tables.visibility import (
     TOLERANCE,
     cell_centres,
@@ -29,7 +29,7 @@ class SceneTable(NamedTuple):
     Attributes:
       name, room_type: of the scene.
       ahead: int32 [C, H], cell after MoveAhead.
-      rows: uint8 [P, R], what is perceived (see `RowLayout`).
+      rows: uint8 [P, R], what is perceived (see `RowFormat`).
       best_length: uint16 [P, K], L*, 0 where a goal cannot be reached or is none.
       goal_distance: float32 [C, K], metres to the nearest object of a category, inf without one: horizontally to its
         centre where success is to see it, else the walk to its footprint.
@@ -82,7 +82,7 @@ class Bank(NamedTuple):
 
 def compile_scene(scene: Scene, task: Task) -> SceneTable:
     """Compile one scene (rules: docs/environment.md)."""
-    rules, layout = task.rules, RowLayout(len(task.categories))
+    rules, row_format = task.rules, RowFormat(len(task.categories))
     cells = standable_cells(scene.reach)
     centres = cell_centres(scene, cells)
     ahead = ahead_of(cells, rules)
@@ -127,7 +127,7 @@ def compile_scene(scene: Scene, task: Task) -> SceneTable:
         name=scene.name,
         room_type=scene.room_type,
         ahead=ahead,
-        rows=layout.pack(detections, found, _ego_views(scene, rules, cells, layout.view)),
+        rows=row_format.pack(detections, _ego_views(scene, rules, cells, row_format.view)),
         best_length=best_lengths(successors(ahead, rules), found),
         goal_distance=goal_distance.astype(np.float32),
     )

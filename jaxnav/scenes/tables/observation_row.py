@@ -11,7 +11,7 @@ AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE = 51.0, 25.4, 127.5
 
 
 @dataclasses.dataclass(frozen=True)
-class RowLayout:
+class RowFormat:
     """Where things stand in a row of uint8; works on NumPy and JAX arrays alike.
 
     Attributes:
@@ -28,23 +28,18 @@ class RowLayout:
         return -(-(self._view_at + self._view_bytes) // 32) * 32
 
     @property
-    def _found_at(self) -> int:
-        return 4 * self.num_categories
-
-    @property
     def _view_at(self) -> int:
-        return self._found_at + -(-self.num_categories // 8)
+        return 4 * self.num_categories
 
     @property
     def _view_bytes(self) -> int:
         return -(-self.view * self.view // 4)
 
-    def pack(self, detections: np.ndarray, found: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Pack detections uint8 [P, K, 4], found bool [P, K] and view uint8 [P, V, V] into rows [P, num_bytes]."""
-        num_poses = len(found)
+    def pack(self, detections: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """Pack detections uint8 [P, K, 4] and view uint8 [P, V, V] into rows [P, num_bytes]."""
+        num_poses = len(view)
         rows = np.zeros((num_poses, self.num_bytes), np.uint8)
-        rows[:, : self._found_at] = detections.reshape(num_poses, self._found_at)
-        rows[:, self._found_at : self._view_at] = np.packbits(found, axis=1, bitorder="little")
+        rows[:, : self._view_at] = detections.reshape(num_poses, self._view_at)
         cells = np.zeros((num_poses, 4 * self._view_bytes), np.uint8)
         cells[:, : self.view * self.view] = view.reshape(num_poses, self.view * self.view)
         groups = cells.reshape(num_poses, self._view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)
@@ -53,11 +48,11 @@ class RowLayout:
 
     def detections(self, rows: Any) -> Any:
         """Detections of rows uint8 [..., num_bytes]: uint8 [..., K, 4] confidence, ahead, right, size."""
-        return rows[..., : self._found_at].reshape(*rows.shape[:-1], self.num_categories, 4)
+        return rows[..., : self._view_at].reshape(*rows.shape[:-1], self.num_categories, 4)
 
     def presence(self, rows: Any) -> Any:
         """Which categories are detected, bool [..., K]."""
-        return rows[..., 0 : self._found_at : 4] > 0
+        return rows[..., 0 : self._view_at : 4] > 0
 
     def view_cells(self, rows: Any) -> Any:
         """The ego-centric view, uint8 [..., V * V], row 0 nearest to the agent, column 0 leftmost."""
@@ -65,7 +60,3 @@ class RowLayout:
         shifts = np.array([0, 2, 4, 6], np.uint8).reshape((1,) * packed.ndim + (4,))
         cells = (packed[..., None] >> shifts) & np.uint8(3)
         return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]
-
-    def found_at(self, goal: Any) -> tuple[Any, Any]:
-        """Byte of the row and bit of the byte (both int32) that say whether `goal` is found."""
-        return self._found_at + goal // 8, goal % 8

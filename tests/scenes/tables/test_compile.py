@@ -13,11 +13,11 @@ from jaxnav.scenes.lattice import ahead_of, best_lengths, standable_cells, succe
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import compile_bank, compile_scene
 from jaxnav.scenes.tables.detector import PERFECT
-from jaxnav.scenes.tables.observation_row import RowLayout
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.tables.visibility import rectangles
 from jaxnav.scenes.task import Task
 
-LAYOUT = RowLayout(len(CATEGORIES))
+LAYOUT = RowFormat(len(CATEGORIES))
 BOOK_AHEAD = ("Book", 0, 1.5, 2, *SMALL)
 
 
@@ -30,22 +30,19 @@ def table_of(scene, rules=ROOMS):
 
 @pytest.mark.parametrize(("num_categories", "num_bytes"), [(22, 128), (37, 192)])
 def test_rows_unpack_to_what_was_packed(num_categories, num_bytes):
-    # 22: 88 + 3 + 31 = 122 bytes (121 cells of 2 bits are 30.25 bytes); 37: 148 + 5 + 31 = 184; whole lines of 32.
-    layout, draws, poses = RowLayout(num_categories), np.random.default_rng(0), 50
+    # 22: 88 + 31 = 119 bytes (121 cells of 2 bits are 30.25 bytes); 37: 148 + 31 = 179; whole lines of 32.
+    row_format, draws, poses = RowFormat(num_categories), np.random.default_rng(0), 50
     detections = draws.integers(0, 256, (poses, num_categories, 4), np.uint8)
     detections[draws.random((poses, num_categories)) < 0.5] = 0
-    found = draws.random((poses, num_categories)) < 0.3
     view = draws.integers(0, 3, (poses, 11, 11), np.uint8)
-    rows = layout.pack(detections, found, view)
-    assert (rows.shape, rows.dtype) == ((poses, layout.num_bytes), np.uint8)
-    assert layout.num_bytes == num_bytes
+    rows = row_format.pack(detections, view)
+    assert (rows.shape, rows.dtype) == ((poses, row_format.num_bytes), np.uint8)
+    assert row_format.num_bytes == num_bytes
     for array in (rows, jnp.asarray(rows)):
-        np.testing.assert_array_equal(layout.detections(array), detections)
-        np.testing.assert_array_equal(layout.presence(array), detections[..., 0] > 0)
-        np.testing.assert_array_equal(layout.view_cells(array), view.reshape(poses, -1))
-        np.testing.assert_array_equal(layout.view_cells(array[0]), view[0].reshape(-1))
-    byte, bit = layout.found_at(np.arange(num_categories))
-    np.testing.assert_array_equal(rows[:, byte] >> bit.astype(np.uint8) & 1, found)
+        np.testing.assert_array_equal(row_format.detections(array), detections)
+        np.testing.assert_array_equal(row_format.presence(array), detections[..., 0] > 0)
+        np.testing.assert_array_equal(row_format.view_cells(array), view.reshape(poses, -1))
+        np.testing.assert_array_equal(row_format.view_cells(array[0]), view[0].reshape(-1))
 
 
 def test_the_bytes_of_a_detection():

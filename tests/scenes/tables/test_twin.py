@@ -1,6 +1,6 @@
 """The compiled environment against the plain-Python twin: the same episodes in both, and not one difference.
 
-The byte row is taken apart here by the words of docs/environment.md, without `RowLayout`.
+The byte row is taken apart here by the words of docs/environment.md, without `RowFormat`.
 """
 
 import collections
@@ -96,11 +96,7 @@ def same_distance(metres, expected):
 
 def row_differences(row, twin, task):
     """What of an observation row differs from the twin, by name."""
-    count, goals = len(task.categories), set(np.flatnonzero(task.is_goal()).tolist())
-    entries, bits, view = np.split(row, [4 * count, 4 * count + math.ceil(count / 8)])
-    found = np.flatnonzero(np.unpackbits(bits, bitorder="little", count=count))
-    if goals & set(found.tolist()) != goals & twin.found():
-        yield "found"
+    entries, view = np.split(row, [4 * len(task.categories)])
     if (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121].tolist() != twin.view():
         yield "view"
     for entry, instances in zip(entries.reshape(-1, 4), twin.detections(), strict=True):
@@ -118,7 +114,7 @@ def roll_out(env, params, seed):
     def act(key, state):
         steer, choose, step = jax.random.split(key, 3)
         last = state.time + 1 == params.step_limit[state.scene]
-        done = jax.random.bernoulli(steer, jnp.where(env.found(state, params) | last, 0.2, 0.01))
+        done = jax.random.bernoulli(steer, jnp.where(env.succeeds(state, params) | last, 0.2, 0.01))
         action = jnp.where(done, DONE, jax.random.randint(choose, (), 0, DONE))
         _, after, reward, terminated, truncated, info = env.step(step, state, action, params)
         return after, (state, action, reward, terminated, truncated, info)
@@ -198,6 +194,10 @@ def differences_of(scene, guide, task, every=1):
     assert len(successor) == len(table.rows) == len(guide.cells) * task.rules.poses_per_cell
     for pose in range(0, len(successor), every):
         differences.update(row_differences(table.rows[pose], guide.place(pose), task))
+        goals = set(np.flatnonzero(task.is_goal()).tolist())
+        differences["success"] += (
+            set(np.flatnonzero(table.best_length[pose] == 1).tolist()) != goals & guide.place(pose).found()
+        )
         for action in range(DONE + 1):
             guide.place(pose).step(action)
             differences["successor"] += successor[pose, action] != guide.pose()
