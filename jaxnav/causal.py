@@ -14,7 +14,9 @@ Pathways = TypeVar("Pathways", bound=Any)
 
 
 def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
-    """Sets pathways to given values and leaves the others at their factual values: the do-operator.
+    """Set pathways to given values: the do-operator.
+
+    The others keep their factual values.
 
     Args:
       pathways: a `NamedTuple` of arrays, such as (scene, goal, experience).
@@ -35,7 +37,7 @@ def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
 
 
 def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
-    """Total direct effect (eq. 1): TDE = a - a_bar.
+    """Return the total direct effect a - a_bar (eq. 1).
 
     Args:
       logits: float [..., A], factual logits a.
@@ -47,29 +49,17 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
     return logits - counterfactual
 
 
-def remove_experience(
-    logits: jax.Array, counterfactual: jax.Array, weight: jax.Array, form: Form = "residual"
-) -> jax.Array:
-    """Subtracts the share `weight` of what experience alone would do; the constant weight 1 is hard removal.
+def removal_weight(gap: jax.Array, epsilon: jax.Array | float) -> jax.Array:
+    """Return the weight ReLU(D - epsilon) of eq. 2.
 
     Args:
-      logits: float [..., A], factual logits a.
-      counterfactual: float [..., A], counterfactual logits a_bar.
-      weight: float32 [...], s >= 0.
-      form: `paper`: a - s a_bar (s = 1 is `tde`); `residual`: (1 + s) a - s a_bar, which keeps the temperature of a.
-        The two rank actions alike when the paper's weight is s / (1 + s).
+      gap: float32 [...], layout gap D in [0, 1].
+      epsilon: scalar or [...], threshold; may be traced. At 1 or more the weight is 0.
 
     Returns:
-      float [..., A], bit-identical to `logits` where weight is 0.
-
-    Raises:
-      ValueError: unknown form.
+      float32 [...], in [0, 1].
     """
-    if form not in ("paper", "residual"):
-        raise ValueError(f"form={form!r}: choose 'paper' or 'residual'")
-    s = weight[..., None].astype(logits.dtype)
-    combined = (logits if form == "paper" else (1 + s) * logits) - s * counterfactual
-    return jnp.where(s == 0, logits, combined)  # 0 * a_bar may still flip the sign of a zero
+    return jax.nn.relu(gap - epsilon)
 
 
 def stde(
@@ -79,19 +69,24 @@ def stde(
     epsilon: jax.Array | float,
     form: Form = "residual",
 ) -> jax.Array:
-    """Soft total direct effect (eq. 2): a - ReLU(D - epsilon) a_bar.
+    """Return the soft total direct effect (eq. 2).
 
     Args:
       logits: float [..., A], factual logits a.
       counterfactual: float [..., A], counterfactual logits a_bar.
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
-      form: how the two are combined, see `remove_experience`.
+      form: with s = ReLU(D - epsilon), `paper`: a - s a_bar (`tde` at s = 1); `residual`: (1 + s) a - s a_bar, which
+        keeps the temperature of a. The two rank actions alike when the paper's weight is s / (1 + s).
 
     Returns:
-      float [..., A].
+      float [..., A], bit-identical to `logits` where s is 0.
 
     Raises:
       ValueError: unknown form.
     """
-    return remove_experience(logits, counterfactual, jax.nn.relu(gap - epsilon), form)
+    if form not in ("paper", "residual"):
+        raise ValueError(f"form={form!r}: choose 'paper' or 'residual'")
+    s = removal_weight(gap, epsilon)[..., None].astype(logits.dtype)
+    combined = (logits if form == "paper" else (1 + s) * logits) - s * counterfactual
+    return jnp.where(s == 0, logits, combined)  # 0 * a_bar may still flip the sign of a zero

@@ -8,14 +8,14 @@ callers `vmap`.
 
 import dataclasses
 import difflib
+import typing
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-#: Smallest concentration of a category that can be seen; below it a first sighting has an unbounded divergence.
-MIN_CONCENTRATION = 1e-2
+from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, presence_kl
 
 #: Over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
 Reduction = Literal["mean_visible", "mean", "sum"]
@@ -23,7 +23,9 @@ Reduction = Literal["mean_visible", "mean", "sum"]
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """How the estimator reads equations 4 to 6; the defaults are `calibrated`. Out of range raises a ValueError.
+    """Say how the estimator reads equations 4 to 6.
+
+    The defaults are `calibrated`. A value out of range raises a ValueError.
 
     Attributes:
       rows: rows that are updated: those of `visible` categories, or `all` (eq. 4 to the letter).
@@ -55,6 +57,11 @@ class Setting:
     form: Literal["paper", "residual"] = "residual"
 
     def __post_init__(self):
+        choices = typing.get_type_hints(type(self))
+        literals = {name: typing.get_args(hint) for name, hint in choices.items() if typing.get_origin(hint) is Literal}
+        for name, options in literals.items():
+            if getattr(self, name) not in options:
+                raise ValueError(f"{name} is {getattr(self, name)!r}: choose one of {', '.join(options)}")
         for name, valid, mend in (
             ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
             ("decay", 0 <= self.decay <= 1, "a number from 0 to 1"),
@@ -79,7 +86,7 @@ SETTINGS = {
 
 
 def named_setting(setting: str | Setting) -> Setting:
-    """Looks a setting up by name; a `Setting` passes through.
+    """Return the setting of a name; a `Setting` passes through.
 
     Raises:
       ValueError: unknown name; the message gives the nearest.
@@ -93,7 +100,7 @@ def named_setting(setting: str | Setting) -> Setting:
 
 
 def prior_from_counts(counts: jax.Array, setting: str | Setting = "calibrated") -> jax.Array:
-    """Turns co-occurrence counts from exploration into the prior alpha*.
+    """Make the prior alpha* from co-occurrence counts of exploration.
 
     Args:
       counts: real [K, K], how often j was seen with i; the diagonal is ignored.
@@ -118,89 +125,13 @@ def prior_from_counts(counts: jax.Array, setting: str | Setting = "calibrated") 
     return jnp.maximum(alpha, MIN_CONCENTRATION) * others
 
 
-def _excess(t: jax.Array, log1p_t: jax.Array) -> jax.Array:
-    """t - log(1 + t) >= 0 for t > -1, without cancellation: with s = t / (2 + t), log(1 + t) = 2 artanh(s)."""
-    s = t / (2 + t)
-    r = s * s
-    return jnp.where(jnp.abs(t) < 0.3, s * t - 2 * s * r * (1 / 3 + r * (1 / 5 + r / 7)), t - log1p_t)
-
-
-def _bregman_remainder(a: jax.Array, c: jax.Array, log_ratio: jax.Array) -> jax.Array:
-    """What a `_excess`(c / a) leaves of the Bregman divergence of lnGamma; log_ratio = log((a + c) / a).
-
-    One step of the recurrence moves a to a + 1, where Stirling's series holds; no term exceeds the order of the result.
-    """
-    b = a + c
-    p, q = 1 / (a + 1), 1 / (b + 1)
-    log_next = jnp.log1p(c * p)  # log((b + 1) / (a + 1))
-    half_log = _excess(-c * q, -log_next) / 2
-    t = c * q / a
-    shift = t * c / b - (a + 1) * _excess(t, log_ratio - log_next)
-    # Divergences of x^-1, x^-3 and x^-5; 1/1680 instead of 1/1260 makes the cut series best over x >= 1.
-    cubic = p * p + 2 * p * q + 3 * q * q
-    quintic = p**4 + 2 * p**3 * q + 3 * p**2 * q**2 + 4 * p * q**3 + 5 * q**4
-    return half_log + shift + c * c * p * q * q * (1 / 12 - cubic / 360 + quintic / 1680)
-
-
-def update_kl(prior: jax.Array, counts: jax.Array) -> jax.Array:
-    """KL( Dir(prior + counts) || Dir(prior) ) in nats, accurate in float32 where lgamma differences are not.
-
-    With g(a, c) = lnGamma(a) - lnGamma(a + c) + c psi(a + c), the Bregman divergence of lnGamma, the divergence is
-    sum_j g(a_j, c_j) - g(a_0, N). The leading parts of both, a (u - log(1 + u)) with u = c / a, merge into
-    sum_j a_j (v_j - log(1 + v_j)), 1 + v_j = posterior share / prior share: no term cancels.
-
-    Args:
-      prior: float32 [..., K], concentrations, 0.01 or more; 0 with count 0 leaves an entry out.
-      counts: real [..., K], >= 0.
-
-    Returns:
-      float32 [...], relative error below 1e-3 (concentrations up to 2e4) wherever the divergence exceeds 1e-6.
-    """
-    counts = counts.astype(jnp.float32)
-    a = jnp.where(prior > 0, prior, 1)
-    a_0, n = prior.sum(-1, keepdims=True), counts.sum(-1, keepdims=True)
-    log_a, log_0 = jnp.log1p(counts / a), jnp.log1p(n / a_0)
-    v = (counts / a - n / a_0) / (1 + n / a_0)
-    entries = prior * _excess(v, log_a - log_0) + _bregman_remainder(a, counts, log_a)
-    return entries.sum(-1) - _bregman_remainder(a_0, n, log_0)[..., 0]
-
-
-def presence_kl(prior: jax.Array, counts: jax.Array, increment: int) -> jax.Array:
-    """`update_kl` where every count is 0 or `increment`: several times faster, for the estimator's inner loop.
-
-    For whole counts g(a, n) = sum_{i < n} [psi(a + n) - log(a + i)]: with a rational form of exp(psi) each term is the
-    log of 1 + a positive number, and an entry's terms are multiplied out before the logarithm is taken.
-
-    Args:
-      prior: float32 [..., K], concentrations, 0.01 or more; 0 with count 0 leaves an entry out.
-      counts: float32 [..., K], 0 or `increment`.
-      increment: whole number from 1 to 50; the product overflows at more.
-
-    Returns:
-      float32 [...], >= 0; the error is below 2e-5 of the sum of the g(a_j, c_j).
-    """
-    a = jnp.maximum(prior, MIN_CONCENTRATION)
-    x = a + (increment - 1)
-    growth = jnp.zeros_like(a)  # exp(g(a, increment)) - 1
-    for k in range(increment):
-        # exp(psi(x + 1)) = x + P(x) / Q(x): exact to x^-1, fitted to 1.2e-5 of g(a, 1) over a >= 0.01; here P + k Q.
-        numerator = ((0.5 + k) * x + (0.87228 + 1.66123 * k)) * x + (0.44703 + 0.79623 * k)
-        denominator = (x + 1.66123) * x + 0.79623
-        factor = numerator / (denominator * (a + (increment - 1 - k)))
-        growth = growth + factor + growth * factor
-    seen = counts > 0
-    a_0, n = prior.sum(-1), increment * seen.sum(-1).astype(jnp.float32)
-    log_0 = jnp.log1p(n / a_0)
-    g = jnp.log1p(jnp.where(seen, growth, 0)).sum(-1)
-    return jnp.maximum(g - a_0 * _excess(n / a_0, log_0) - _bregman_remainder(a_0, n, log_0), 0)
-
-
 def evidence_gap(prior: jax.Array, alpha: jax.Array) -> jax.Array:
-    """Gap D by the evidence of an episode: how far what was seen together falls short of agreeing with the prior.
+    """Return the gap D by the evidence of an episode.
 
-    With the expected shares p_i = alpha*_i / a_i before and q_i = alpha_i / (a_i + n_i) after n_i sightings, row i
-    agrees by p_i . q_i, the probability that one draw of each is alike. For layouts drawn from the prior that has mean
-    p_i . p_i and variance n_i v_i / ((a_i + n_i) (a_i + 1)), where v_i is the variance of p_ij, j drawn from p_i. So
+    It says how far what was seen together falls short of agreeing with the prior. With the expected shares p_i =
+    alpha*_i / a_i before and q_i = alpha_i / (a_i + n_i) after n_i sightings, row i agrees by p_i . q_i, the
+    probability that one draw of each is alike. For layouts drawn from the prior that has mean p_i . p_i and variance
+    n_i v_i / ((a_i + n_i) (a_i + 1)), where v_i is the variance of p_ij, j drawn from p_i. So
 
       z = sum_i (p_i . p_i - p_i . q_i) / sum_i sqrt(n_i v_i / ((a_i + n_i) (a_i + 1))),
 
@@ -226,7 +157,7 @@ def evidence_gap(prior: jax.Array, alpha: jax.Array) -> jax.Array:
 
 
 class LayoutState(struct.PyTreeNode):
-    """The belief within one episode.
+    """Hold the belief within one episode.
 
     Attributes:
       alpha: float32 [K, K], concentrations; 0 on the diagonal unless the setting counts a row's own category.
@@ -240,7 +171,7 @@ class LayoutState(struct.PyTreeNode):
 
 
 class LayoutEstimator(struct.PyTreeNode):
-    """Equations 3 to 6 for one episode.
+    """Estimate the layout of one episode (eqs. 3 to 6).
 
     Attributes:
       prior: float32 [K, K], alpha* as from `prior_from_counts`.
@@ -254,13 +185,16 @@ class LayoutEstimator(struct.PyTreeNode):
         named_setting(self.setting)
 
     def init(self) -> LayoutState:
-        """Returns the belief at the start of an episode: alpha = alpha*, nothing accepted, D = 0."""
+        """Return the belief at an episode's start.
+
+        alpha = alpha*, nothing accepted, D = 0.
+        """
         return LayoutState(
             alpha=self.prior, last=jnp.zeros(self.prior.shape[-1], dtype=bool), gap=jnp.zeros((), dtype=jnp.float32)
         )
 
     def update(self, state: LayoutState, presence: jax.Array) -> LayoutState:
-        """Takes in the categories visible at one step (eqs. 3-5).
+        """Take in the categories visible at one step (eqs. 3-5).
 
         `state` is the belief before the step, `presence` bool or real [K], nonzero where a category is visible. Returns
         the belief after the step; its gap is the divergence of the one from the other, or of the belief from the prior.
@@ -295,16 +229,33 @@ class LayoutEstimator(struct.PyTreeNode):
         return LayoutState(alpha=posterior, last=last, gap=gap)
 
     @staticmethod
-    def expectation(state: LayoutState) -> jax.Array:
-        """Expected co-occurrence w (eq. 6): float32 [K, K], w_ij = p(j seen given i seen), w_ii = 1.
+    def expectation(state: LayoutState, goal: jax.Array | int | None = None) -> jax.Array:
+        """Return the expected co-occurrence w (eq. 6).
 
-        With `own_column` w_ii is 1 + the share of i in its own row, as in the released code.
+        w_ij = p(j seen given i seen) and w_ii = 1. With `own_column` w_ii is 1 + the share of i in its own row, as in
+        the released code.
+
+        Args:
+          state: the belief.
+          goal: int [], for the column w[:, goal] alone; None for all of w.
+
+        Returns:
+          float32 [K, K], or [K] with a goal.
         """
-        share = state.alpha / state.alpha.sum(-1, keepdims=True)
-        return share + jnp.eye(share.shape[0], dtype=share.dtype)
+        if goal is None:
+            return jax.vmap(LayoutEstimator.expectation, (None, 0), 1)(state, jnp.arange(state.alpha.shape[-1]))
+        share = state.alpha[:, goal] / state.alpha.sum(-1)
+        return share.at[goal].add(1)
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """The column w[:, goal], w x g of eq. 7: float32 [K], how far each category speaks for `goal`, int []."""
-        share = state.alpha[:, goal] / state.alpha.sum(-1)
-        return share.at[goal].add(1)
+        """Return w x g of eq. 7: how far each category speaks for a goal.
+
+        Args:
+          state: the belief.
+          goal: int [], the category that is sought.
+
+        Returns:
+          float32 [K].
+        """
+        return LayoutEstimator.expectation(state, goal)

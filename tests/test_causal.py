@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxnav.causal import do, remove_experience, stde, tde
+from jaxnav.causal import do, removal_weight, stde, tde
 
 FORMS = ("paper", "residual")
 LOGITS = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32))
@@ -50,13 +50,13 @@ def test_worked_arithmetic():
     np.testing.assert_array_equal(stde(a, a_bar, gap, 0.5, "paper"), [1.0, 1.5])
     np.testing.assert_array_equal(stde(a, a_bar, gap, 0.5, "residual"), [1.5, 1.75])
     # A weight of 1 is eq. 1 in the paper's form, and eq. 1 plus a in the other.
-    np.testing.assert_array_equal(remove_experience(a, a_bar, jnp.float32(1), "paper"), tde(a, a_bar))
-    np.testing.assert_array_equal(remove_experience(a, a_bar, jnp.float32(1), "residual"), a + tde(a, a_bar))
+    np.testing.assert_array_equal(stde(a, a_bar, jnp.float32(1), 0.0, "paper"), tde(a, a_bar))
+    np.testing.assert_array_equal(stde(a, a_bar, jnp.float32(1), 0.0, "residual"), a + tde(a, a_bar))
 
 
 def test_unknown_form():
     with pytest.raises(ValueError, match="'papr'"):
-        remove_experience(jnp.ones(2), jnp.ones(2), jnp.float32(1), "papr")  # type: ignore[arg-type]
+        stde(jnp.ones(2), jnp.ones(2), jnp.float32(1), 0.0, "papr")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -89,6 +89,7 @@ def test_weight_is_at_most_one_minus_epsilon(gap, epsilon):
     weight = stde(jnp.zeros((1, 1)), -jnp.ones((1, 1)), jnp.full(1, gap), epsilon, "paper")
     np.testing.assert_allclose(weight, max(gap - epsilon, 0), atol=1e-6)
     assert 0 <= float(weight[0, 0]) <= 1 - epsilon + 1e-6
+    np.testing.assert_array_equal(removal_weight(jnp.float32(gap), epsilon), weight[0, 0])
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -105,8 +106,8 @@ def test_forms_agree_on_the_choice_at_matching_weights():
     # (1 + s) a - s a_bar = (1 + s) (a - s / (1 + s) a_bar).
     a, a_bar = jax.random.normal(jax.random.key(0), (2, 50, 6))
     s = jnp.linspace(0.01, 0.5, 50)
-    residual = remove_experience(a, a_bar, s, "residual")
-    paper = remove_experience(a, a_bar, s / (1 + s), "paper")
+    residual = stde(a, a_bar, s, 0.0, "residual")
+    paper = stde(a, a_bar, s / (1 + s), 0.0, "paper")
     np.testing.assert_allclose(residual, (1 + s)[:, None] * paper, rtol=1e-5, atol=1e-5)
 
 

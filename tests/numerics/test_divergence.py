@@ -7,7 +7,7 @@ import pytest
 from scipy.special import digamma, gammaln
 from support.dirichlet import exact_kl
 
-from jaxnav.layout import presence_kl, update_kl
+from jaxnav.numerics.dirichlet import presence_kl, update_kl
 
 
 def draws(seed: int, k: int, n: int = 4000):
