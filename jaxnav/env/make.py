@@ -1,5 +1,6 @@
-"""From the name of a world or a scene file to an environment."""
+"""From the name of a world to an environment."""
 
+import dataclasses
 from pathlib import Path
 
 from jaxnav.env.objectnav import ObjectNav, build
@@ -18,7 +19,7 @@ def make(
     seed: int = 0,
     shift: float = 0.0,
 ) -> tuple[ObjectNav, EnvParams]:
-    """An environment and its parameters.
+    """Make an environment and its parameters.
 
     Args:
       world: `rooms`, `apartments` or `houses`: what is asked of the agent and how long episodes may last, and the
@@ -34,13 +35,15 @@ def make(
     """
     if world not in WORLDS:
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}; a scene file goes to `scenes`")
-    own = WORLDS[world]
-    task = task or own.task
+    usual = WORLDS[world]
+    task = task or usual.task
     if scenes is None:
         chosen = generated(world, split, None, seed, shift)
     else:
         chosen = from_file(scenes, split, shift, seed, task.categories)
     bank = compile_bank((chosen[i] for i in range(len(chosen))), task)
     if split == "train":
-        return build(bank, {}, own.train_step_limit, shaping=own.shaping)
-    return build(bank, {"living_room": own.large_step_limit}, own.step_limit)
+        env, params = build(bank, {}, usual.train_step_limit, shaping=usual.shaping)
+    else:
+        env, params = build(bank, {"living_room": usual.large_step_limit}, usual.step_limit)
+    return dataclasses.replace(env, made_with=params), params

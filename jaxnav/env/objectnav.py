@@ -1,6 +1,7 @@
-"""One ObjectNav episode as pure functions: reset, step and observe are integer arithmetic and gathers.
+"""One ObjectNav episode as pure functions.
 
-Written for a single episode; batch with `jax.vmap`. The rules are those of docs/environment.md.
+Reset, step and observe are integer arithmetic and gathers. Written for a single episode; batch with `jax.vmap`. The
+rules are those of docs/environment.md.
 """
 
 import dataclasses
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.env.spaces import Box, Dict, Discrete
 from jaxnav.env.types import EnvParams, Observation, State, StepResult, Tables
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.compile import Bank
@@ -22,34 +24,65 @@ NUM_PRIORS = OTHER_ROOM + 1
 
 @dataclasses.dataclass(frozen=True)
 class ObjectNav:
-    """The environment; hashable, holds sizes and names only.
+    """Hold an environment; hashable.
+
+    The interface is that of gymnax 1.0.
 
     Attributes:
       task: what is asked of the agent.
       shaping: reward for every metre that an action brings the agent nearer to its goal (by `goal_distance`), in
         training.
+      made_with: parameters that `jaxnav.make` made with it.
     """
 
     task: Task
     shaping: float = 0.0
+    made_with: EnvParams | None = dataclasses.field(default=None, compare=False, repr=False)
+
+    @property
+    def name(self) -> str:
+        """Return the name of the environment."""
+        return "ObjectNav"
+
+    @property
+    def default_params(self) -> EnvParams:
+        """Return the parameters that `jaxnav.make` made with it.
+
+        Raises:
+          ValueError: it was not made by `jaxnav.make`.
+        """
+        if self.made_with is None:
+            raise ValueError("default_params: this environment was built by hand; jaxnav.make returns both")
+        return self.made_with
+
+    def observation_space(self, params: EnvParams) -> Dict:
+        """Return the space of observations."""
+        row = Box(0, 255, (self.row_format.num_bytes,), jnp.uint8)
+        return Dict({"row": row, "goal": Discrete(len(self.categories))})
+
+    def action_space(self, params: EnvParams | None = None) -> Discrete:
+        """Return the space of actions."""
+        return Discrete(self.num_actions)
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """Names of what can be detected, [K]."""
+        """Return the names of what can be detected, [K]."""
         return self.task.categories
 
     @property
     def row_format(self) -> RowFormat:
-        """How an observation row is packed."""
+        """Return how an observation row is packed."""
         return RowFormat(len(self.categories))
 
     @property
     def num_actions(self) -> int:
-        """Size of the action space."""
+        """Return the size of the action space."""
         return NUM_ACTIONS
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
-        """Start an episode: scene, goal among its possible ones, cell and heading, each uniform; horizon 0.
+        """Start an episode.
+
+        Scene, goal among its possible ones, cell and heading are each uniform; the horizon is 0.
 
         Args:
           key: consumed.
@@ -72,11 +105,11 @@ class ObjectNav:
         return self.observe(state, params), state
 
     def observe(self, state: State, params: EnvParams) -> Observation:
-        """What the agent perceives in a state."""
+        """Return what the agent perceives in a state."""
         return Observation(row=params.tables.rows[state.pose], goal=state.goal)
 
     def after(self, pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
-        """Pose int32 [] that an action int32 [] leads to."""
+        """Return the pose int32 [] that an action int32 [] leads to."""
         headings, horizons = self.task.rules.headings, len(self.task.rules.horizons)
         cell, heading, horizon = pose // (headings * horizons), pose // horizons % headings, pose % horizons
 
@@ -89,11 +122,14 @@ class ObjectNav:
         return (cell * headings + heading) * horizons + horizon
 
     def cell(self, pose: jax.Array) -> jax.Array:
-        """Global cell int32 [] of a pose."""
+        """Return the global cell int32 [] of a pose."""
         return pose // self.task.rules.poses_per_cell
 
     def succeeds(self, state: State, params: EnvParams) -> jax.Array:
-        """Whether Done would succeed here, bool []; rewards and metrics read it, agents cannot."""
+        """Return whether Done would succeed here, bool [].
+
+        Rewards and metrics read it; agents cannot.
+        """
         byte, bit = state.goal // 8, (state.goal % 8).astype(jnp.uint8)
         return (params.tables.success[state.pose, byte] >> bit) & jnp.uint8(1) > 0
 
@@ -123,7 +159,9 @@ class ObjectNav:
         return state.replace(pose=pose, time=time), reward, done, truncated
 
     def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
-        """Take an action; an episode that ends is followed by a new one at once (same-step auto-reset).
+        """Take an action, with same-step auto-reset.
+
+        An episode that ends is followed by a new one at once.
 
         Args:
           key: consumed; used only if the episode ends.
@@ -133,8 +171,8 @@ class ObjectNav:
 
         Returns:
           observation, state, reward, terminated, truncated, info. After an ending, observation and state are those of
-          the new episode; `info` tells of the episode that the action belongs to: `final_state` and `final_observation`
-          after the action, `success` bool [] and `length` int32 [] (actions so far).
+          the new episode; `info` is about the episode that the action belongs to: `final_state` and
+          `final_observation` after the action, `success` bool [] and `length` int32 [] (actions so far).
         """
         last, reward, terminated, truncated = self.advance(state, action, params)
         _, fresh = self.reset(key, params)
@@ -150,10 +188,10 @@ class ObjectNav:
 
 
 def _words(key: jax.Array, count: int) -> jax.Array:
-    """Random words uint32 [count] of a key: its own words through Murmur3's finaliser (Appleby, 2011).
+    """Return random words uint32 [count] of a key.
 
-    A key that is split off is random already; a stronger generator would take most of the time of a step, and most
-    steps have no use for it.
+    They are its words through Murmur3's finaliser (Appleby, 2011). A key that is split off is random already; a
+    stronger generator would take most of the time of a step, and most steps have no use for it.
     """
     words = jax.random.key_data(key)
     mixed = jnp.uint32(0x9E3779B9) * jnp.arange(1, count + 1, dtype=jnp.uint32)
@@ -173,7 +211,7 @@ def build(
     num_scenes: int = 0,
     shaping: float = 0.0,
 ) -> tuple[ObjectNav, EnvParams]:
-    """Environment and parameters of a compiled bank.
+    """Build environment and parameters of a compiled bank.
 
     Args:
       bank: the scenes.

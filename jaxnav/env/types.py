@@ -1,4 +1,4 @@
-"""The words of the environment: parameters, state and observation of one episode."""
+"""Parameters, state and observation of one episode."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ from flax import struct
 
 
 class Tables(struct.PyTreeNode):
-    """A bank of scenes on the device; see `jaxnav.scenes.tables.compile.Bank` for the shapes.
+    """Hold a bank of scenes on the device.
 
-    `success`, uint8 [P, ceil(K / 8)], holds a bit per pose and goal: whether Done succeeds there. It stands apart from
-    the rows, so that no observation holds it.
+    See `jaxnav.scenes.tables.compile.Bank` for the shapes. `success`, uint8 [P, ceil(K / 8)], holds a bit per pose and
+    goal: whether Done succeeds there. It stands apart from the rows, so that no observation holds it.
     """
 
     ahead: jax.Array
@@ -24,13 +24,13 @@ class Tables(struct.PyTreeNode):
 
 
 class EnvParams(struct.PyTreeNode):
-    """What may differ between two runs of the same compiled environment.
+    """Hold what may differ between runs of one compiled environment.
 
     Attributes:
       tables: the bank.
       room: int32 [S], index of each scene's room type (it picks the layout prior).
       step_limit: int32 [S], actions after which an episode of a scene is truncated.
-      success_reward: float32 [], reward of Done where the goal is found.
+      success_reward: float32 [], reward of Done where it succeeds.
       step_reward: float32 [], reward of every other action.
     """
 
@@ -42,7 +42,7 @@ class EnvParams(struct.PyTreeNode):
 
 
 class State(struct.PyTreeNode):
-    """One episode.
+    """Hold the state of one episode.
 
     Attributes:
       pose: int32 [], global pose index.
@@ -58,7 +58,7 @@ class State(struct.PyTreeNode):
 
 
 class Observation(struct.PyTreeNode):
-    """What the agent perceives.
+    """Hold what the agent perceives.
 
     Attributes:
       row: uint8 [R], the packed row of the pose (see `jaxnav.scenes.tables.observation_row.RowFormat`).
