@@ -11,8 +11,9 @@ from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome, first_states
+from jaxnav.policies.acting import Acting, Agent
 from jaxnav.scenes.tables.compile import Bank
-from jaxnav.scenes.task import DONE, MOVE_AHEAD
+from jaxnav.scenes.task import DONE
 
 
 def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
@@ -53,17 +54,15 @@ def oracle_outcome(
 def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) -> Outcome:
     """What the environment makes of fixed actions int32 [T, E] from states [E]; leaves [E]."""
 
-    def step(carry: tuple[State, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
-        state, running, outcome = carry
-        found = jax.vmap(env.succeeds, (0, None))(state, params)
-        state, _, terminated, truncated = jax.vmap(env.advance, (0, 0, None))(state, action, params)
-        outcome = outcome._replace(
-            success=outcome.success | (running & terminated & found),
-            length=outcome.length + running.astype(jnp.int32),
-            moves=outcome.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
-        )
-        return (state, running & ~terminated & ~truncated, outcome), None
+    acting, nothing = Acting(env), jnp.zeros(state.pose.shape)
 
-    first = (state, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))
-    (state, _, outcome), _ = jax.lax.scan(step, first, actions)
-    return outcome._replace(distance=params.tables.goal_distance[env.cell(state.pose), state.goal])
+    def step(carry: tuple[Agent, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
+        agent, running, outcome = carry
+        agent, taken = acting.step(agent, action, None, params)
+        return (agent, running & ~taken.ended, outcome.after(running, action, taken.success, nothing)), None
+
+    agent = acting.begin(state, None, None, params)
+    first = (agent, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))
+    (agent, _, outcome), _ = jax.lax.scan(step, first, actions)
+    last = agent.state
+    return outcome._replace(distance=params.tables.goal_distance[env.cell(last.pose), last.goal])

@@ -10,7 +10,7 @@ from jaxnav.scenes.tables.compile import Bank
 
 
 class EpisodeList(NamedTuple):
-    """E episodes, fixed before anything is run.
+    """Hold E episodes, fixed before anything is run.
 
     Attributes:
       scene, goal, pose: int32 [E], indices into the bank.
@@ -30,9 +30,10 @@ class EpisodeList(NamedTuple):
 
 
 def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0, part: int = 0) -> EpisodeList:
-    """Draw the episodes of a bank by the paper's rule: equally many per room type, balanced over its scenes.
+    """Draw the episodes of a bank by the paper's rule.
 
-    In each scene the goal is uniform over its possible categories, the start uniform over all poses that can reach it.
+    Equally many per room type, balanced over its scenes. In each scene the goal is uniform over its possible
+    categories, the start uniform over all poses that can reach it.
 
     Args:
       bank: the scenes.
@@ -66,7 +67,10 @@ def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0, part: int = 0)
 
 
 def together(lists: Sequence[EpisodeList]) -> EpisodeList:
-    """Lists of several banks as one, for statistics and reports; its `scene` is an index into its own `scenes`."""
+    """Join the lists of several banks, for statistics and reports.
+
+    The `scene` of the whole list is an index into its `scenes`.
+    """
     rooms = tuple(sorted({room for episodes in lists for room in episodes.rooms}))
     first = np.cumsum([0] + [len(episodes.scenes) for episodes in lists])
 

@@ -8,14 +8,14 @@ GOAL_RADIUS = 1.0  # metres that DTS takes off the distance to the goal
 
 
 def episode_metrics(outcome: Outcome, best_length: np.ndarray) -> dict[str, np.ndarray]:
-    """SR, SPL, SAE (each in [0, 1]) and DTS (metres) of every episode.
+    """Return SR, SPL, SAE and DTS of every episode.
 
     Args:
       outcome: leaves [..., E].
       best_length: int [E], L* in actions with Done.
 
     Returns:
-      float64 [..., E] by the names `sr`, `spl`, `dts`, `sae`.
+      float64 [..., E] by the names `sr`, `spl`, `sae` (each in [0, 1]) and `dts` (metres).
     """
     success = np.asarray(outcome.success, np.float64)
     length, moves = np.asarray(outcome.length), np.asarray(outcome.moves)

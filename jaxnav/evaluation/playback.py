@@ -7,21 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.types import EnvParams, State
-from jaxnav.evaluation.grid import Taken, act
+from jaxnav.evaluation.grid import act
 from jaxnav.evaluation.inference import Inference
-from jaxnav.policies.acting import Acting, Agent
-from jaxnav.policies.policy import Params, bind
-from jaxnav.policies.spec import PolicySpec
+from jaxnav.policies.acting import Acting, Agent, Taken, carried
+from jaxnav.policies.methods import Knowledge
+from jaxnav.policies.policy import Params
 
 
 class Trace(NamedTuple):
-    """The T decisions of one episode.
+    """Hold the T decisions of one episode.
 
     Attributes:
       pose: int32 [T], pose at which each action was chosen.
       action: int32 [T]; only the last can be Done.
       gap: float32 [T], layout gap D.
-      success: whether the episode ended with Done where the goal is found.
+      success: whether the episode ended with Done where it succeeds.
     """
 
     pose: np.ndarray
@@ -35,9 +35,8 @@ def play(
     weights: Params,
     start: State,
     acting: Acting,
-    spec: PolicySpec,
     params: EnvParams,
-    priors: jax.Array,
+    knowledge: Knowledge,
 ) -> Trace:
     """Play one episode to its end, step by step.
 
@@ -45,24 +44,24 @@ def play(
       cell: how to infer, leaves []; `cell.params` is not used.
       weights: parameters of the policy.
       start: of the episode, leaves [].
-      acting: environment and layout setting.
-      spec: sizes of the policy.
+      acting: how to act.
       params: the environment's.
-      priors: float32 [rooms, K, K].
+      knowledge: what was learned before training.
     """
 
     @jax.jit
     def step(weights: Params, agent: Agent, keys: jax.Array) -> tuple[Agent, Taken]:
-        return act(cell, bind(spec, weights), agent, jnp.ones(1, bool), keys, acting, params, priors)
+        after, taken, _ = act(cell, acting.bind(weights), agent, jnp.ones(1, bool), keys, acting, params, knowledge)
+        return after, taken
 
     keys = jax.random.key(0)[None]
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
-    agent = acting.begin(first, bind(spec, weights), params, priors)
+    agent = acting.begin(first, acting.bind(weights).initial_memory((1,)), knowledge, params)
     steps = []
     while True:
         pose, gap = agent.state.pose, acting.gap(agent)
         agent, taken = step(weights, agent, keys)
-        steps.append((pose[0], taken.action[0], gap[0]))
+        steps.append((pose[0], carried(taken.agent).action[0], gap[0]))
         if taken.ended[0]:
             break
     pose, action, gap = (np.asarray(column) for column in zip(*steps, strict=True))

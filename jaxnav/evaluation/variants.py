@@ -13,7 +13,7 @@ from jaxnav.evaluation.report import Decoding, Form, Variant
 
 
 class Row(NamedTuple):
-    """One row of the table, S cells of the grid.
+    """Name one row of the table, S cells of the grid.
 
     Attributes:
       variant: what is evaluated.
@@ -27,9 +27,16 @@ class Row(NamedTuple):
     form: Form | None
     decoding: Decoding
 
+    @property
+    def arm(self) -> str | None:
+        """Return the arm whose policies it takes; None for any."""
+        if self.variant in ("random", "oracle"):
+            return None
+        return "baseline" if self.variant == "baseline" else "layout"
+
 
 def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: Decoding) -> Row:
-    """One row, with nothing in it that its variant does not use.
+    """Make one row, with nothing in it that its variant does not use.
 
     Raises:
       InputError: an epsilon outside [0, inf), or NaN.
@@ -43,8 +50,11 @@ def table_row(variant: Variant, epsilon: float | None, form: Form | None, decodi
     return Row(variant, epsilon, form, decoding)
 
 
-def table_rows(epsilons: Sequence[float], forms: Sequence[Form]) -> list[Row]:
-    """Baseline, layout, hard TDE, and sTDE at every epsilon and in every form, argmax then sampled, and Random.
+def table_rows(epsilons: Sequence[float], forms: Sequence[Form], arms: Sequence[str]) -> list[Row]:
+    """Make the rows of an evaluation.
+
+    Baseline, layout, hard TDE, and sTDE at every epsilon and in every form, argmax then sampled, and Random; without
+    those of arms that were not trained.
 
     Raises:
       InputError: no epsilon, or one outside [0, inf), or NaN.
@@ -55,25 +65,33 @@ def table_rows(epsilons: Sequence[float], forms: Sequence[Form]) -> list[Row]:
     for decoding in ("argmax", "sample"):
         rows += [table_row(variant, None, None, decoding) for variant in ("baseline", "layout", "tde")]
         rows += [table_row("stde", *setting, decoding) for setting in itertools.product(epsilons, forms)]
+    rows = [row for row in rows if row.arm in arms]
     return [*rows, table_row("random", None, None, "sample")]
 
 
-def inference_grid(rows: Sequence[Row], num_seeds: int) -> Inference:
-    """The grid of R rows and S seeds, leaves [R S]; parameters are stacked baseline seeds first, then layout seeds."""
-    cells = [_cell(row, seed, num_seeds) for row in rows for seed in range(num_seeds)]
+def inference_grid(rows: Sequence[Row], arms: Sequence[str], num_seeds: int) -> Inference:
+    """Make the grid of R rows and S seeds, leaves [R S].
+
+    Args:
+      rows: the rows; their arms must be there.
+      arms: names of the arms, in the order in which their parameters are stacked, S each.
+      num_seeds: S.
+    """
+    cells = [_cell(row, arms, seed, num_seeds) for row in rows for seed in range(num_seeds)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cells)
 
 
-def _cell(row: Row, seed: int, num_seeds: int) -> Inference:
-    layout = row.variant not in ("random", "baseline")
+def _cell(row: Row, arms: Sequence[str], seed: int, num_seeds: int) -> Inference:
+    place = 0 if row.arm is None else arms.index(row.arm)
     return Inference(
-        params=jnp.int32(seed + num_seeds * layout),
+        params=jnp.int32(seed + num_seeds * place),
         epsilon=jnp.float32(float("inf") if row.epsilon is None else row.epsilon),
-        always=jnp.float32(row.variant == "tde"),
+        hard=jnp.bool_(row.variant == "tde"),
         residual=jnp.bool_(row.form == "residual"),
-        layout=jnp.bool_(layout),
+        layout=jnp.bool_(row.arm == "layout"),
         greedy=jnp.bool_(row.decoding == "argmax"),
         uniform=jnp.bool_(row.variant == "random"),
+        gap=jnp.float32(float("nan")),
         intervention=jnp.float32(0.0),
         shuffled=jnp.bool_(False),
         branch=jnp.int32(Branch.COUNTERFACTUAL),

@@ -1,7 +1,7 @@
-"""Acting in parallel episodes: the policy, its memory and the belief about the layout, step by step."""
+"""The agent's step, the one way in which episodes are acted."""
 
 import dataclasses
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,83 +9,229 @@ import jax.numpy as jnp
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, Observation, State
 from jaxnav.layout import LayoutEstimator, LayoutState, Setting
-from jaxnav.policies.pathways import Memory
-from jaxnav.policies.policy import Policy
+from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
+from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
+from jaxnav.policies.policy import Params, Policy, bind
+from jaxnav.policies.spec import PolicySpec
 
 Tree = TypeVar("Tree")
 
 
 class Agent(NamedTuple):
-    """B parallel episodes.
+    """Hold B parallel episodes and what their agents carry.
 
     Attributes:
       state: the episodes, leaves [B].
       layout: the beliefs about their layouts, leaves [B, ...]; None where the policy does not use them.
-      memory: the recurrent memories, leaves [B, ...].
+      note: the notes of the method's tracker, leaves [B, ...]; None without one.
+      memory: the policy's memories, leaves [B, ...]; None where no policy acts.
     """
 
     state: State
     layout: LayoutState | None
-    memory: Memory
+    note: Any
+    memory: Memory | None
+
+
+class View(NamedTuple):
+    """Hold what a policy gets at one step.
+
+    Attributes:
+      observation: leaves [B, ...].
+      weights: float32 [B, K], the layout's weights for the goals (eq. 7); ones without the layout.
+      reading: what the tracker read of the notes, leaves [B, ...]; None without one.
+    """
+
+    observation: Observation
+    weights: jax.Array
+    reading: Any
+
+
+class Taken(NamedTuple):
+    """Hold what came of one step, leaves [B, ...].
+
+    Attributes:
+      reward: float32.
+      terminated: bool, Done was chosen.
+      truncated: bool, the step limit was reached.
+      success: bool, Done was chosen where it succeeds.
+      moved: bool, the cell was changed.
+      agent: after the action and before a reset, the last view not yet taken in.
+    """
+
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    success: jax.Array
+    moved: jax.Array
+    agent: Agent
+
+    @property
+    def ended(self) -> jax.Array:
+        """Return which episodes ended, bool [B]."""
+        return self.terminated | self.truncated
 
 
 @dataclasses.dataclass(frozen=True)
 class Acting:
-    """How episodes are acted: the environment, and whether and how the layout is estimated.
+    """Say how episodes are acted; hashable.
 
     Attributes:
       env: the environment.
-      setting: the layout estimator's setting; None leaves the layout out (its weights are then ones).
+      spec: of the policy; None where actions are given.
+      setting: of the layout estimator; None leaves the layout out.
     """
 
     env: ObjectNav
-    setting: str | Setting | None
+    spec: PolicySpec | None = None
+    setting: Setting | None = None
 
-    def observe(self, agent: Agent, params: EnvParams) -> tuple[Observation, jax.Array]:
-        """What the episodes perceive, and the layout's weights float32 [B, K] for their goals."""
+    @property
+    def method(self) -> Method | None:
+        """Return the policy's method."""
+        return None if self.spec is None else find_method(self.spec.method)
+
+    def bind(self, params: Params) -> Policy:
+        """Bind parameters to the policy."""
+        if self.spec is None:
+            raise ValueError("Acting without a spec has no policy to bind; give one")
+        return bind(self.spec, params)
+
+    def view(self, agent: Agent, knowledge: Knowledge | None, params: EnvParams) -> View:
+        """Return what the policy gets in the present states."""
         observation = jax.vmap(self.env.observe, (0, None))(agent.state, params)
         if agent.layout is None:
-            return observation, jnp.ones((*agent.state.goal.shape, len(self.env.categories)))
-        return observation, jax.vmap(LayoutEstimator.goal_weights)(agent.layout, agent.state.goal)
+            weights = jnp.ones((*agent.state.goal.shape, len(self.env.categories)))
+        else:
+            weights = jax.vmap(LayoutEstimator.goal_weights)(agent.layout, agent.state.goal)
+        reading = None
+        if self._tracker is not None:
+            reading = jax.vmap(self._tracker.read, (0, None, 0))(agent.note, knowledge, agent.state.goal)
+        return View(observation, weights, reading)
 
     def gap(self, agent: Agent) -> jax.Array:
-        """The layout gaps D float32 [B]; 0 where the layout is left out."""
+        """Return the layout gaps D float32 [B]; 0 without the layout."""
         return jnp.zeros(agent.state.goal.shape) if agent.layout is None else agent.layout.gap
 
-    def believe(
-        self, layout: LayoutState | None, state: State, params: EnvParams, priors: jax.Array
-    ) -> LayoutState | None:
-        """Update the beliefs with what is detected in the current states; priors float32 [rooms, K, K]."""
-        setting = self.setting
-        if setting is None or layout is None:
-            return None
+    def start(self, key: jax.Array, count: int, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
+        """Start episodes at random; the key is consumed.
 
-        def one(layout: LayoutState, state: State) -> LayoutState:
-            presence = self.env.row_format.presence(params.tables.rows[state.pose])
-            return LayoutEstimator(priors[params.room[state.scene]], setting).update(layout, presence)
+        Args:
+          key: typed PRNG key.
+          count: B, number of episodes.
+          memory: at the start, leaves [B, ...]; see `Policy.initial_memory`.
+          knowledge: what was learned before training; None where neither layout nor tracker is used.
+          params: the environment's.
+        """
+        _, state = jax.vmap(self.env.reset, (0, None))(jax.random.split(key, count), params)
+        return self.begin(state, memory, knowledge, params)
 
-        return jax.vmap(one)(layout, state)
+    def begin(self, state: State, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
+        """Begin episodes in states with leaves [B], the first view taken in."""
+        action, moved = jnp.full(state.pose.shape, NO_ACTION, jnp.int32), jnp.zeros(state.pose.shape, bool)
+        return self.perceive(self._fresh(state, memory, knowledge, params), action, moved, knowledge, params)
 
-    def first_belief(self, state: State, params: EnvParams, priors: jax.Array) -> LayoutState | None:
-        """Beliefs before anything is seen."""
-        setting = self.setting
-        if setting is None:
-            return None
-        return jax.vmap(lambda s: LayoutEstimator(priors[params.room[s.scene]], setting).init())(state)
+    def step(
+        self,
+        agent: Agent,
+        choice: jax.Array,
+        knowledge: Knowledge | None,
+        params: EnvParams,
+        *,
+        policy: Policy | None = None,
+        decision: Decision | None = None,
+        keys: jax.Array | None = None,
+    ) -> tuple[Agent, Taken]:
+        """Act once in every episode; beliefs and notes follow.
 
-    def start(self, key: jax.Array, num_envs: int, policy: Policy, params: EnvParams, priors: jax.Array) -> Agent:
-        """Start B episodes at random; the key is consumed."""
-        _, state = jax.vmap(self.env.reset, (0, None))(jax.random.split(key, num_envs), params)
-        return self.begin(state, policy, params, priors)
+        Args:
+          agent: the episodes, [B].
+          choice: int32 [B], what was chosen; an action unless the method has a control of its own.
+          knowledge: what was learned before training; None where neither layout nor tracker is used.
+          params: the environment's.
+          policy, decision: that chose, and what it decided; None where actions are given.
+          keys: [B], of the episodes that follow those that end (same-step auto-reset); without, an episode goes on.
 
-    def begin(self, state: State, policy: Policy, params: EnvParams, priors: jax.Array) -> Agent:
-        """Start B episodes in these states, leaves [B], with the first view taken in."""
-        layout = self.believe(self.first_belief(state, params, priors), state, params, priors)
-        return Agent(state=state, layout=layout, memory=policy.initial_memory(state.pose.shape))
+        Returns:
+          The agent after the step, in a new episode where one ended and keys are given, and what came of it.
+        """
+        action = choice if self.method is None else jax.vmap(self.method.control.act)(choice, agent.note)
+        last, reward, terminated, truncated, success, state = self._act(agent.state, action, keys, params)
+        moved = self.env.cell(last.pose) != self.env.cell(agent.state.pose)
+        memory = None if decision is None else decision.memory(action)
+        before_reset = agent._replace(state=last, memory=memory)
+        taken = Taken(reward, terminated, truncated, success, moved, before_reset)
+        if keys is None:
+            return self.perceive(before_reset, action, moved, knowledge, params), taken
+        fresh = self._fresh(
+            state, None if policy is None else policy.initial_memory(state.pose.shape), knowledge, params
+        )
+        following = select(taken.ended, fresh, before_reset)._replace(state=state)
+        action, moved = jnp.where(taken.ended, NO_ACTION, action), moved & ~taken.ended
+        return self.perceive(following, action, moved, knowledge, params), taken
+
+    def perceive(self, agent: Agent, action: jax.Array, moved: jax.Array, knowledge: Any, params: EnvParams) -> Agent:
+        """Take the present views into beliefs and notes, once per step.
+
+        Args:
+          agent: the episodes, [B].
+          action: int32 [B], that led there.
+          moved: bool [B], whether it changed the cell.
+          knowledge, params: as in `step`.
+        """
+        layout, note = agent.layout, agent.note
+        if layout is not None and self.setting is not None:
+            setting, row_format = self.setting, self.env.row_format
+
+            def believe(layout: LayoutState, state: State) -> LayoutState:
+                presence = row_format.presence(params.tables.rows[state.pose])
+                return LayoutEstimator(knowledge.layout[params.room[state.scene]], setting).update(layout, presence)
+
+            layout = jax.vmap(believe)(layout, agent.state)
+        if self._tracker is not None:
+            headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
+            heading = agent.state.pose // horizons % headings
+            percept = Percept(params.tables.rows[agent.state.pose], heading, action, moved)
+            note = jax.vmap(self._tracker.update, (0, None, 0))(note, knowledge, percept)
+        return agent._replace(layout=layout, note=note)
+
+    @property
+    def _tracker(self) -> Any:
+        return None if self.method is None else self.method.tracker
+
+    def _act(self, state: State, action: jax.Array, keys: jax.Array | None, params: EnvParams) -> tuple[Any, ...]:
+        """Take actions in the environment.
+
+        Returns:
+          The state after the action, reward, terminated, truncated and success, and the state to go on with.
+        """
+        if keys is None:
+            success = jax.vmap(self.env.succeeds, (0, None))(state, params)
+            last, reward, terminated, truncated = jax.vmap(self.env.advance, (0, 0, None))(state, action, params)
+            return last, reward, terminated, truncated, terminated & success, last
+        step = jax.vmap(self.env.step, (0, 0, 0, None))
+        _, following, reward, terminated, truncated, info = step(keys, state, action, params)
+        return info["final_state"], reward, terminated, truncated, info["success"], following
+
+    def _fresh(self, state: State, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
+        """Return agents before anything is seen."""
+        layout, note, setting = None, None, self.setting
+        if setting is not None:
+            layout = jax.vmap(lambda s: LayoutEstimator(knowledge.layout[params.room[s.scene]], setting).init())(state)
+        if self._tracker is not None:
+            first = self._tracker.init(knowledge)
+            note = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.pose.shape, *jnp.shape(leaf))), first)
+        return Agent(state, layout, note, memory)
+
+
+def carried(agent: Agent) -> Memory:
+    """Return the memory of an agent that a policy acts for."""
+    assert agent.memory is not None
+    return agent.memory
 
 
 def select(condition: jax.Array, yes: Tree, no: Tree) -> Tree:
-    """Per episode, the leaves [B, ...] of one tree or of the other."""
+    """Choose per episode the leaves [B, ...] of one tree or another."""
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)

@@ -20,7 +20,7 @@ _REACH = 5.0  # metres; scales the offsets to about 1
 
 
 class Features(NamedTuple):
-    """What the networks see of an observation.
+    """Hold what the networks see of an observation.
 
     Attributes:
       view: float32 [..., 2 V V], standable and not standable cells of the ego-centric view.

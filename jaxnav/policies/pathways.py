@@ -1,11 +1,11 @@
-"""The causal graph of the paper as types: what a decision is made from, and what an intervention may replace.
+"""The causal graph of the paper as types.
 
 S (what is seen) ---------> A
 G (what is sought) -------> A
 S, G --> Z (experience) --> A
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -13,7 +13,7 @@ from jaxnav.scenes.task import NUM_ACTIONS
 
 
 class Pathways(NamedTuple):
-    """The embeddings on the three pathways into the action.
+    """Hold the embeddings on the three pathways into the action.
 
     Attributes:
       scene: float32 [..., S], the direct pathway S -> A: what lies around.
@@ -29,29 +29,37 @@ class Pathways(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What an agent carries through its episode.
+    """Hold what a policy carries through an episode.
 
     Attributes:
       hidden: float32 [..., H], recurrent state; zeros at the start.
-      action: int32 [...], the previous action; `NUM_ACTIONS` at the start.
+      action: int32 [...], the previous action; `NO_ACTION` at the start.
+      fast: fast weights of the method's adaptation, leaves [...]; None without one.
     """
 
     hidden: jax.Array
     action: jax.Array
+    fast: Any = None
 
 
 class Decision(NamedTuple):
-    """The outcome of one decision.
+    """Hold the outcome of one decision.
 
     Attributes:
       logits: float32 [..., A].
       value: float32 [...], estimated return.
       hidden: float32 [..., H], recurrent state after the decision.
+      fast: fast weights after the decision; None without adaptation.
     """
 
     logits: jax.Array
     value: jax.Array
     hidden: jax.Array
+    fast: Any = None
+
+    def memory(self, action: jax.Array) -> Memory:
+        """Return the memory after an action int32 [...] that followed."""
+        return Memory(hidden=self.hidden, action=action, fast=self.fast)
 
 
 NO_ACTION = NUM_ACTIONS

@@ -1,4 +1,4 @@
-"""The sizes of a policy: all that is needed, beside its parameters, to build it again."""
+"""What a policy is built from, beside its parameters."""
 
 import dataclasses
 from typing import Literal
@@ -9,7 +9,7 @@ Direct = Literal["all", "goal", "none"]
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Widths that all methods share.
+    """Hold the widths that all methods share.
 
     Attributes:
       hidden: H, width of the recurrent state and of the fused input.
@@ -17,7 +17,6 @@ class Sizes:
       appearance: d, width of a category's embedding.
       row_hidden: width of the perceptron that reads a category's row.
       row_outputs: m, its outputs per category.
-      relation_layers: layers of ORG's relation matrix.
     """
 
     hidden: int = 128
@@ -25,17 +24,17 @@ class Sizes:
     appearance: int = 16
     row_hidden: int = 32
     row_outputs: int = 8
-    relation_layers: int = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class PolicySpec:
-    """What a policy is built from.
+    """Hold what a policy is built from; hashable.
 
     Attributes:
-      method: name of the method, a key of `METHODS`; how experience is made.
+      method: name of the method, see `jaxnav.policies.methods.find_method`.
       num_categories: K.
-      sizes: widths.
+      sizes: widths that all methods share.
+      method_sizes: (name, value) of the method's own sizes that are not the usual ones.
       direct: which detections the direct pathway sees; the number of parameters does not depend on it.
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
@@ -44,5 +43,6 @@ class PolicySpec:
     method: str = "org"
     num_categories: int = 22
     sizes: Sizes = Sizes()
+    method_sizes: tuple[tuple[str, int], ...] = ()
     direct: Direct = "all"
     done_gate: bool = False

@@ -1,4 +1,4 @@
-"""The estimator's prior strength and reduction, chosen on random walks in the training scenes."""
+"""Calibration of the layout estimator on random walks."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, State
+from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
-from jaxnav.layout import LayoutEstimator, LayoutState, Reduction, Setting, prior_from_counts
+from jaxnav.layout import Reduction, Setting, prior_from_counts
+from jaxnav.policies.acting import Acting, Agent
+from jaxnav.policies.methods import Knowledge
 from jaxnav.scenes.task import DONE
 
 #: What a gap should be like in the training layouts, after Fig. 6b: large in the first three views that the belief
@@ -24,18 +26,25 @@ REDUCTIONS: tuple[Reduction, ...] = ("mean_visible", "sum")
 
 
 def layout_priors(counts: jax.Array, setting: str | Setting) -> jax.Array:
-    """The layout prior of each room type, float32 [rooms, K, K], from what exploration counted.
+    """Make the layout priors of exploration's counts.
 
     Every pair starts with one sighting (the all-ones Dirichlet). A room type that training has no scene of gets the
     prior of all its scenes together.
+
+    Args:
+      counts: float32 [rooms, K, K], see `Exploration`.
+      setting: of the estimator.
+
+    Returns:
+      float32 [rooms, K, K], the prior of each room type.
     """
     met = counts.any(axis=(1, 2), keepdims=True)
     counts = jnp.where(met, counts, counts.sum(axis=0, keepdims=True))
-    return jax.vmap(lambda own: prior_from_counts(own + 1.0, setting))(counts)
+    return jax.vmap(lambda room: prior_from_counts(room + 1.0, setting))(counts)
 
 
 class Calibration(NamedTuple):
-    """The setting that was chosen, and how its gap runs.
+    """Hold the chosen setting, and how its gap runs.
 
     Attributes:
       setting: with the chosen strength and reduction.
@@ -58,10 +67,10 @@ def calibrate(
     reductions: Sequence[Reduction] = REDUCTIONS,
     num_walks: int = 256,
 ) -> Calibration:
-    """Choose strength and reduction so that the gap runs as in the paper's Fig. 6b where the layout is as trained.
+    """Choose strength and reduction of the estimator.
 
-    Of all pairs the one with the least |early - 0.75| + |late - 0.25| is taken, early and late being medians over the
-    same random walks without Done.
+    The gap is to run as in the paper's Fig. 6b where the layout is as trained. Of all pairs the one with the least
+    |early - 0.75| + |late - 0.25| is taken, early and late being medians over the same random walks without Done.
 
     Args:
       env: the environment.
@@ -79,44 +88,41 @@ def calibrate(
     actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
 
     def gaps(setting: Setting, priors: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
-        """Mean gap of the early views (NaN without any) and gap of the late step, [num_walks]."""
-        _, state = jax.vmap(env.reset, (0, None))(jax.random.split(start_key, num_walks), params)
+        """Return the mean early gap (NaN without any) and the late gap, [num_walks]."""
+        acting, knowledge = Acting(env, setting=setting), Knowledge(priors)
 
-        def estimators(state: State) -> LayoutEstimator:
-            return LayoutEstimator(priors[params.room[state.scene]], setting)
+        def alpha(agent: Agent) -> jax.Array:
+            assert agent.layout is not None
+            return agent.layout.alpha
 
-        def see(state: State, layout: LayoutState) -> tuple[LayoutState, tuple[jax.Array, jax.Array]]:
-            presence = env.row_format.presence(params.tables.rows[state.pose])
-            new = jax.vmap(LayoutEstimator.update)(estimators(state), layout, presence)
-            return new, (new.gap, (new.alpha != layout.alpha).any(axis=(1, 2)))
+        def step(agent: Agent, action: jax.Array) -> tuple[Agent, tuple[jax.Array, jax.Array]]:
+            after, _ = acting.step(agent, action, knowledge, params)
+            return after, (acting.gap(after), (alpha(after) != alpha(agent)).any(axis=(1, 2)))
 
-        def step(carry: tuple[State, LayoutState], action: jax.Array) -> tuple:
-            state, *_ = jax.vmap(env.advance, (0, 0, None))(carry[0], action, params)
-            layout, seen = see(state, carry[1])
-            return (state, layout), seen
-
-        layout, first = see(state, jax.vmap(LayoutEstimator.init)(estimators(state)))
-        _, later = jax.lax.scan(step, (state, layout), actions)
-        gap, taken = (jnp.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
-        early = taken & (jnp.cumsum(taken, axis=0) <= EARLY_VIEWS)
+        agent = acting.start(start_key, num_walks, None, knowledge, params)
+        prior = priors[params.room[agent.state.scene]]
+        first = acting.gap(agent), (alpha(agent) != prior).any(axis=(1, 2))
+        _, later = jax.lax.scan(step, agent, actions)
+        gap, accepted = (jnp.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
+        early = accepted & (jnp.cumsum(accepted, axis=0) <= EARLY_VIEWS)
         return jnp.where(early, gap, 0.0).sum(axis=0) / early.astype(jnp.float32).sum(axis=0), gap[-1]
 
     choices = [dataclasses.replace(setting, strength=strength) for strength in strengths]
     priors = jnp.stack([layout_priors(counts, chosen) for chosen in choices])
-    found = []
+    calibrations = []
     for reduction in reductions:
-        own = dataclasses.replace(setting, reduction=reduction)  # the strength only enters by the priors
-        early, late = jax.jit(jax.vmap(partial(gaps, own), (0, None)))(priors, params)
-        found += [
-            Calibration(dataclasses.replace(own, strength=chosen.strength), _median(e), float(np.median(f)))
+        reduced = dataclasses.replace(setting, reduction=reduction)  # the strength only enters by the priors
+        early, late = jax.jit(jax.vmap(partial(gaps, reduced), (0, None)))(priors, params)
+        calibrations += [
+            Calibration(dataclasses.replace(reduced, strength=chosen.strength), _median(e), float(np.median(f)))
             for chosen, e, f in zip(choices, np.asarray(early), np.asarray(late), strict=True)
         ]
-    if all(np.isnan(one.early) for one in found):
+    if all(np.isnan(one.early) for one in calibrations):
         raise InputError("layout: no random walk shows two categories together, so nothing can be calibrated")
-    return min(found, key=lambda one: abs(one.early - EARLY) + abs(one.late - LATE))
+    return min(calibrations, key=lambda one: abs(one.early - EARLY) + abs(one.late - LATE))
 
 
 def _median(values: np.ndarray) -> float:
-    """The median of those that are defined, NaN if none is."""
+    """Return the median of defined values, NaN without any."""
     defined = values[np.isfinite(values)]
     return float(np.median(defined)) if len(defined) else float("nan")

@@ -10,7 +10,7 @@ from flax import struct
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Recurrent PPO.
+    """Configure recurrent PPO.
 
     Attributes:
       num_envs: parallel episodes of each seed.
@@ -41,18 +41,24 @@ class PPOConfig:
     distil: float = 0.5
 
     def num_updates(self, total_steps: int) -> int:
-        """Updates that `total_steps` environment steps of a seed take, rounded up."""
+        """Return the updates that environment steps of a seed take.
+
+        They are rounded up.
+        """
         return -(-total_steps // (self.num_envs * self.rollout))
 
     def scalars(self, num_updates: int) -> "PPOScalars":
-        """The traced part, for a training of `num_updates` updates."""
+        """Return the traced part, for so many updates in all."""
         names = [name for name in PPOScalars.__dataclass_fields__ if name != "num_updates"]
         settings = {name: jnp.float32(getattr(self, name)) for name in names}
         return PPOScalars(**settings, num_updates=jnp.float32(num_updates))
 
 
 class PPOScalars(struct.PyTreeNode):
-    """The settings that may change without compiling anew; float32 [] each, see `PPOConfig`."""
+    """Hold the settings that may change without compiling anew.
+
+    float32 [] each, see `PPOConfig`.
+    """
 
     learning_rate: jax.Array
     gamma: jax.Array

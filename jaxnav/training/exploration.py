@@ -1,4 +1,4 @@
-"""The experience that the layout prior is made of: a random agent walks the training scenes."""
+"""Random walks in the training scenes, of which the layout prior is made."""
 
 from typing import NamedTuple
 
@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
-from jaxnav.env.types import EnvParams, State
+from jaxnav.env.types import EnvParams
+from jaxnav.policies.acting import Acting, Agent
 from jaxnav.scenes.task import DONE
 
 
 class Exploration(NamedTuple):
-    """What the random agent found.
+    """Hold what random walks saw.
 
     Attributes:
       counts: float32 [rooms, K, K], poses at which two categories were detected together, by room type.
@@ -27,7 +28,9 @@ class Exploration(NamedTuple):
 def explore(
     env: ObjectNav, params: EnvParams, key: jax.Array, num_walks: int = 2048, num_steps: int = 100
 ) -> Exploration:
-    """Count what is detected together along random walks without Done, each pose once (paper, section 3.3, stage i).
+    """Count what is detected together along random walks.
+
+    Walks know no Done, and each pose counts once (paper, section 3.3, stage i).
 
     Args:
       env: the environment.
@@ -37,16 +40,17 @@ def explore(
       num_steps: steps of each.
     """
     start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
-    _, state = jax.vmap(env.reset, (0, None))(jax.random.split(start_key, num_walks), params)
+    acting = Acting(env)
+    agent = acting.start(start_key, num_walks, None, None, params)
     actions = jax.random.randint(walk_key, (num_steps, num_walks), 0, DONE)
 
-    def step(carry: tuple[State, jax.Array], action: jax.Array) -> tuple[tuple[State, jax.Array], None]:
-        state, seen = carry
-        state, *_ = jax.vmap(env.advance, (0, 0, None))(state, action, params)
-        return (state, seen.at[state.pose].set(True)), None
+    def step(carry: tuple[Agent, jax.Array], action: jax.Array) -> tuple[tuple[Agent, jax.Array], None]:
+        agent, seen = carry
+        agent, _ = acting.step(agent, action, None, params)
+        return (agent, seen.at[agent.state.pose].set(True)), None
 
-    seen = jnp.zeros(params.tables.rows.shape[0], bool).at[state.pose].set(True)
-    (_, seen), _ = jax.lax.scan(step, (state, seen), actions)
+    seen = jnp.zeros(params.tables.rows.shape[0], bool).at[agent.state.pose].set(True)
+    (_, seen), _ = jax.lax.scan(step, (agent, seen), actions)
 
     presence = (env.row_format.presence(params.tables.rows) & seen[:, None]).astype(jnp.float32)
     scene = jnp.repeat(

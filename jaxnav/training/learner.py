@@ -1,4 +1,4 @@
-"""The learner: everything that changes between two updates, and chunks of updates as one compiled call."""
+"""The learner: collect, loss and apply as chunks of updates in one compiled call."""
 
 import dataclasses
 from typing import Any
@@ -10,18 +10,21 @@ from flax import struct
 
 from jaxnav.env.types import EnvParams
 from jaxnav.policies.acting import Acting, Agent
-from jaxnav.policies.policy import Params, bind, init_params
-from jaxnav.policies.spec import PolicySpec
-from jaxnav.training.collect import Transition, rollout
+from jaxnav.policies.methods import Knowledge, Method, Stage
+from jaxnav.policies.policy import Params, init_params
+from jaxnav.training.apply import apply_gradient, make_optimizer
+from jaxnav.training.collect import Rollout, Transition, collect
 from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
-from jaxnav.training.loss import advantages, ppo_loss
+from jaxnav.training.loss import advantages, ppo_loss, replay
 
 _INIT, _START, _UPDATES = range(3)  # purposes of a seed's keys
 _ROLLOUT, _SHUFFLE, _RESTART = range(3)  # purposes of an update's keys
 
+Metrics = dict[str, jax.Array]
+
 
 class LearnerState(struct.PyTreeNode):
-    """One seed of a run.
+    """Hold one seed of a run.
 
     Attributes:
       params: of the policy.
@@ -40,48 +43,37 @@ class LearnerState(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """What stays the same during a run and is compiled in.
+    """Hold what stays the same during a run and is compiled in.
 
     Attributes:
       acting: how the episodes are acted.
-      spec: sizes of the policy.
       config: of PPO; its scalars are traced, so only the sizes matter here.
       counterfactual: how the counterfactual branch is trained.
+      stage: number of the method's stage of training.
     """
 
     acting: Acting
-    spec: PolicySpec
     config: PPOConfig
     counterfactual: Counterfactual
+    stage: int = 0
 
-    @property
-    def _optimizer(self) -> optax.GradientTransformation:
-        # An update whose gradient is not finite is skipped and counted.
-        chain = optax.chain(optax.clip_by_global_norm(self.config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
-        return optax.apply_if_finite(chain, max_consecutive_errors=2**30)
-
-    def init(self, key: jax.Array, params: EnvParams, priors: jax.Array) -> LearnerState:
-        """A seed before its first update; the key is consumed."""
+    def init(self, key: jax.Array, params: EnvParams, knowledge: Knowledge) -> LearnerState:
+        """Start a seed; the key is consumed."""
         init_key, start_key, update_key = (jax.random.fold_in(key, purpose) for purpose in (_INIT, _START, _UPDATES))
-        weights = init_params(self.spec, init_key)
-        agent = self.acting.start(start_key, self.config.num_envs, bind(self.spec, weights), params, priors)
-        return LearnerState(
-            params=weights,
-            optimizer=self._optimizer.init(weights),
-            agent=agent,
-            key=update_key,
-            update=jnp.int32(0),
-        )
+        assert self.acting.spec is not None
+        weights = init_params(self.acting.spec, init_key)
+        agent = self._start(weights, start_key, params, knowledge)
+        optimizer = make_optimizer(self.config).init(weights)
+        return LearnerState(params=weights, optimizer=optimizer, agent=agent, key=update_key, update=jnp.int32(0))
 
-    def restart(self, state: LearnerState, params: EnvParams, priors: jax.Array) -> LearnerState:
-        """The same seed with new episodes, for scenes other than before."""
+    def restart(self, state: LearnerState, params: EnvParams, knowledge: Knowledge) -> LearnerState:
+        """Give a seed new episodes, in scenes other than before."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.update), _RESTART)
-        policy = bind(self.spec, state.params)
-        return state.replace(agent=self.acting.start(key, self.config.num_envs, policy, params, priors))
+        return state.replace(agent=self._start(state.params, key, params, knowledge))
 
     def train(
-        self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array, num_updates: int
-    ) -> tuple[LearnerState, dict[str, jax.Array]]:
+        self, state: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge, num_updates: int
+    ) -> tuple[LearnerState, Metrics]:
         """Do some updates.
 
         Returns:
@@ -90,8 +82,8 @@ class Learner:
           of the optimizer whose gradient was not finite.
         """
 
-        def step(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, jax.Array]]:
-            return self.update(state, scalars, params, priors)
+        def step(state: LearnerState, _: None) -> tuple[LearnerState, Metrics]:
+            return self.update(state, scalars, params, knowledge)
 
         state, metrics = jax.lax.scan(step, state, None, length=num_updates)
         sums = {name: value.sum() for name, value in metrics.items()}
@@ -102,72 +94,94 @@ class Learner:
         return state, per_episode | {name: value / num_updates for name, value in sums.items()} | counts
 
     def update(
-        self, state: LearnerState, scalars: PPOScalars, params: EnvParams, priors: jax.Array
-    ) -> tuple[LearnerState, dict[str, jax.Array]]:
-        """Roll out once and learn from it for some epochs."""
+        self, state: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge
+    ) -> tuple[LearnerState, Metrics]:
+        """Collect once and learn from it for some epochs."""
         key = jax.random.fold_in(state.key, state.update)
         rollout_key, shuffle_key = (jax.random.fold_in(key, purpose) for purpose in (_ROLLOUT, _SHUFFLE))
-        config, memory = self.config, state.agent.memory
-        policy = bind(self.spec, state.params)
-        agent, transitions, following = rollout(
-            self.acting, policy, state.agent, rollout_key, config.rollout, self.counterfactual == "coin", params, priors
+        policy, coin = self.acting.bind(state.params), self.counterfactual == "coin"
+        agent, rollout = collect(
+            self.acting, policy, state.agent, rollout_key, self.config.rollout, coin, params, knowledge
         )
-        ended = transitions.terminated | transitions.truncated
-        advantage = advantages(
-            transitions.reward, transitions.value, following, ended, scalars.gamma, scalars.gae_lambda
-        )
-        rate = scalars.learning_rate * (1.0 - state.update.astype(jnp.float32) / scalars.num_updates)
-
-        def loss(weights: Params, part: tuple[Any, ...]) -> tuple[jax.Array, dict[str, jax.Array]]:
-            transitions, memory, advantage = part
-            policy = bind(self.spec, weights)
-            distil = self.counterfactual == "distil"
-            return ppo_loss(policy, transitions, memory, advantage, params, scalars, distil)
-
-        def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], dict[str, jax.Array]]:
-            weights, optimizer = carry
-            gradient, parts = jax.grad(loss, has_aux=True)(weights, part)
-            with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
-                step, optimizer = self._optimizer.update(gradient, optimizer, weights)
-            weights = jax.tree.map(lambda w, s: w - rate * s, weights, step)
-            return (weights, optimizer), parts | {"gradient_norm": optax.tree.norm(gradient)}
-
-        def epoch(carry: tuple[Params, Any], key: jax.Array) -> tuple[tuple[Params, Any], dict[str, jax.Array]]:
-            order = block_order(key, config.num_envs, config.minibatches)
-            in_time = regroup((transitions, advantage), order, axis=1)
-            return jax.lax.scan(learn, carry, (in_time[0], regroup(memory, order, axis=0), in_time[1]))
-
-        keys = jax.random.split(shuffle_key, config.epochs)
-        (weights, optimizer), metrics = jax.lax.scan(epoch, (state.params, state.optimizer), keys)
-        metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(transitions, ended, params)
+        (weights, optimizer), metrics = self._learn(state, rollout, shuffle_key, scalars, params)
+        metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(rollout.transitions, params)
         skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
         metrics["skipped_steps"] = skipped.astype(jnp.float32)
-        state = state.replace(params=weights, optimizer=optimizer, agent=agent, update=state.update + 1)
-        return state, metrics
+        return state.replace(params=weights, optimizer=optimizer, agent=agent, update=state.update + 1), metrics
+
+    def _learn(
+        self, state: LearnerState, rollout: Rollout, key: jax.Array, scalars: PPOScalars, params: EnvParams
+    ) -> tuple[tuple[Params, Any], Metrics]:
+        """Take a gradient step for every minibatch of every epoch."""
+        transitions, config = rollout.transitions, self.config
+        returns = transitions.reward, transitions.value, rollout.next_value, transitions.ended
+        advantage = advantages(*returns, scalars.gamma, scalars.gae_lambda)
+        rate = scalars.learning_rate * (1.0 - state.update.astype(jnp.float32) / scalars.num_updates)
+
+        def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], Metrics]:
+            gradient, parts = jax.grad(self._loss, has_aux=True)(carry[0], part, params, scalars)
+            carry = apply_gradient(config, *carry, gradient, rate, self._stage.trainable)
+            return carry, parts | {"gradient_norm": optax.tree.norm(gradient)}
+
+        def epoch(carry: tuple[Params, Any], key: jax.Array) -> tuple[tuple[Params, Any], Metrics]:
+            order = block_order(key, config.num_envs, config.minibatches)
+            in_time = regroup((transitions, advantage), order, axis=1)
+            return jax.lax.scan(learn, carry, (in_time[0], regroup(rollout.memory, order, axis=0), in_time[1]))
+
+        return jax.lax.scan(epoch, (state.params, state.optimizer), jax.random.split(key, config.epochs))
+
+    def _loss(
+        self, weights: Params, part: tuple[Any, ...], params: EnvParams, scalars: PPOScalars
+    ) -> tuple[jax.Array, Metrics]:
+        """Return the loss of a minibatch (transitions, memory, advantage)."""
+        transitions, memory, advantage = part
+        replayed = replay(self.acting.bind(weights), transitions, memory, params)
+        loss = self._stage.loss or ppo_loss
+        return loss(replayed, advantage, scalars, self.counterfactual == "distil", self._method)
+
+    def _start(self, weights: Params, key: jax.Array, params: EnvParams, knowledge: Knowledge) -> Agent:
+        memory = self.acting.bind(weights).initial_memory((self.config.num_envs,))
+        return self.acting.start(key, self.config.num_envs, memory, knowledge, params)
+
+    @property
+    def _method(self) -> Method:
+        assert self.acting.method is not None
+        return self.acting.method
+
+    @property
+    def _stage(self) -> Stage:
+        return self._method.stages[self.stage]
 
 
 def block_order(key: jax.Array, episodes: int, minibatches: int) -> jax.Array:
-    """Which episode each block of `minibatches` neighbours gives to which minibatch: int32 [blocks, minibatches].
+    """Draw which episode each block of neighbours gives to which minibatch.
 
     Every minibatch gets one episode of every block, so that no device needs the episodes of another.
+
+    Returns:
+      int32 [blocks, minibatches], blocks of `minibatches` neighbours.
     """
     rows = jnp.broadcast_to(jnp.arange(minibatches), (episodes // minibatches, minibatches))
     return jax.random.permutation(key, rows, axis=1, independent=True)
 
 
 def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
-    """Leaves whose `axis` holds the episodes, cut into minibatches: [..., B, ...] -> [M, ..., B / M, ...]."""
+    """Divide leaves into minibatches, [..., B, ...] -> [M, ..., B / M, ...].
 
-    def cut(leaf: jax.Array) -> jax.Array:
+    `axis` is that of the episodes.
+    """
+
+    def divide(leaf: jax.Array) -> jax.Array:
         blocks = leaf.reshape(*leaf.shape[:axis], *order.shape, *leaf.shape[axis + 1 :])
         index = jnp.expand_dims(order, [*range(axis), *range(axis + 2, blocks.ndim)])
         return jnp.moveaxis(jnp.take_along_axis(blocks, index, axis + 1), axis + 1, 0)
 
-    return jax.tree.map(cut, tree)
+    return jax.tree.map(divide, tree)
 
 
-def _episode_sums(transitions: Transition, ended: jax.Array, params: EnvParams) -> dict[str, jax.Array]:
-    """Sums over the episodes that ended in a rollout, float32 [] each."""
+def _episode_sums(transitions: Transition, params: EnvParams) -> dict[str, jax.Array]:
+    """Return sums over the episodes that ended, float32 [] each."""
+    ended = transitions.ended
 
     def total(values: jax.Array) -> jax.Array:
         return jnp.where(ended, values.astype(jnp.float32), 0.0).sum()

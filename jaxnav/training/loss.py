@@ -1,31 +1,40 @@
-"""Advantages and losses of recurrent PPO; no loop over updates, no optimiser."""
+"""Loss: advantages and the losses of recurrent PPO."""
+
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from jaxnav.causal import do
 from jaxnav.env.types import EnvParams, Observation
 from jaxnav.numerics.recurrence import gru, unroll
-from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
+from jaxnav.policies.acting import select
+from jaxnav.policies.methods import Method
+from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
 from jaxnav.policies.policy import Policy
 from jaxnav.training.collect import Transition, zero_direct
 from jaxnav.training.config import PPOScalars
 
+Parts = dict[str, jax.Array]
+
 
 def advantages(
-    reward: jax.Array, value: jax.Array, following: jax.Array, ended: jax.Array, gamma: jax.Array, lambda_: jax.Array
+    reward: jax.Array, value: jax.Array, next_value: jax.Array, ended: jax.Array, gamma: jax.Array, lambda_: jax.Array
 ) -> jax.Array:
-    """Generalised advantage estimates (Schulman et al., 2016), float32 [T, B].
+    """Return generalised advantage estimates, float32 [T, B].
+
+    Source: Schulman et al., 2016.
 
     Args:
       reward: float32 [T, B].
       value: float32 [T, B], of the state before each step.
-      following: float32 [T, B], value of the state after it within the same episode: 0 after a termination, that of
-        the cut state after a truncation.
+      next_value: float32 [T, B], value of the state after it within the same episode: 0 after a termination, that of
+        the last state after a truncation.
       ended: bool [T, B], the episode ended with this step, either way.
       gamma: float32 [], discount.
       lambda_: float32 [].
     """
-    delta = reward + gamma * following - value
+    delta = reward + gamma * next_value - value
     decay = gamma * lambda_ * (1.0 - ended.astype(jnp.float32))
 
     def back(advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -36,7 +45,27 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
-def replay(policy: Policy, transitions: Transition, memory: Memory, params: EnvParams) -> tuple[Decision, Decision]:
+class Replay(NamedTuple):
+    """Hold decisions made again along a rollout, leaves [T, B, ...].
+
+    Attributes:
+      policy: with the parameters to differentiate by.
+      transitions: of the rollout.
+      pathways: before the direct ones are zeroed, and before the experience attends.
+      decisions: the factual ones.
+      counterfactual: with both direct pathways zeroed, but the same experience and (fixed) memory.
+      params: the environment's.
+    """
+
+    policy: Policy
+    transitions: Transition
+    pathways: Pathways
+    decisions: Decision
+    counterfactual: Decision
+    params: EnvParams
+
+
+def replay(policy: Policy, transitions: Transition, memory: Memory, params: EnvParams) -> Replay:
     """Decide again along a rollout.
 
     Args:
@@ -44,42 +73,63 @@ def replay(policy: Policy, transitions: Transition, memory: Memory, params: EnvP
       transitions: [T, B].
       memory: at the start of the rollout, [B].
       params: the environment's; observations are gathered from its tables.
-
-    Returns:
-      The decisions [T, B] and, with both direct pathways zeroed but the same experience and (fixed) memory, the
-      counterfactual ones.
     """
     observation = Observation(row=params.tables.rows[transitions.pose], goal=transitions.goal)
-    pathways = policy.pathways(observation, transitions.weights)
-    ended = transitions.terminated | transitions.truncated
-    following = jnp.where(ended, NO_ACTION, transitions.action)
-    mediated = policy.mediated_input(pathways, jnp.concatenate([memory.action[None], following[:-1]]))
+    pathways = policy.encode(observation, transitions.weights, transitions.reading)
+    again = _step_by_step if policy.recurrent else _in_parallel
+    return Replay(policy, transitions, pathways, *again(policy, pathways, transitions, memory), params)
+
+
+def _in_parallel(
+    policy: Policy, pathways: Pathways, transitions: Transition, memory: Memory
+) -> tuple[Decision, Decision]:
+    """Decide again where only the recurrent core needs the memory."""
+    previous = jnp.where(transitions.ended, NO_ACTION, transitions.action)
+    mediated = policy.mediated_input(pathways, jnp.concatenate([memory.action[None], previous[:-1]]))
     direct = policy.direct_input(zero_direct(pathways, transitions.direct))
-    run = unroll(policy.recurrent_kernel, policy.drive(direct + mediated), ended, memory.hidden)
+    run = unroll(policy.recurrent_kernel, policy.drive(direct + mediated), transitions.ended, memory.hidden)
     alone = gru(policy.drive(mediated), run.projected, run.before)
     return policy.act(run.after, pathways.gate), policy.act(alone, pathways.gate)
 
 
-def ppo_loss(
-    policy: Policy,
-    transitions: Transition,
-    memory: Memory,
-    advantage: jax.Array,
-    params: EnvParams,
-    scalars: PPOScalars,
-    distil: bool,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped PPO loss over [T, B], and where `distil` holds the counterfactual branch's.
+def _step_by_step(
+    policy: Policy, pathways: Pathways, transitions: Transition, memory: Memory
+) -> tuple[Decision, Decision]:
+    """Decide again where experience or adaptation need the memory."""
+    fresh = policy.initial_memory(memory.action.shape)
 
-    The latter teaches the branch without its direct pathways to act like the factual policy as well as experience and
-    memory allow: KL(pi || counterfactual), the target fixed.
+    def step(memory: Memory, inputs: tuple[Pathways, Any, jax.Array, jax.Array]) -> tuple[Memory, Any]:
+        encoded, direct, action, ended = inputs
+        decision = policy.decide(zero_direct(policy.attend(encoded, memory), direct), memory)
+        fixed = jax.lax.stop_gradient(memory)
+        counterfactual = policy.decide(do(policy.attend(encoded, fixed), scene=0.0, goal=0.0), fixed)
+        return select(ended, fresh, decision.memory(action)), (decision, counterfactual)
+
+    inputs = pathways, transitions.direct, transitions.action, transitions.ended
+    return jax.lax.scan(step, memory, inputs)[1]
+
+
+def ppo_loss(
+    replayed: Replay, advantage: jax.Array, scalars: PPOScalars, distil: bool, method: Method
+) -> tuple[jax.Array, Parts]:
+    """Return the clipped PPO loss over [T, B].
+
+    Where `distil` holds, the counterfactual branch learns to act like the factual policy as well as experience and
+    memory allow: KL(pi || counterfactual), the target fixed. The method's auxiliary loss is added.
+
+    Args:
+      replayed: the decisions made again.
+      advantage: float32 [T, B].
+      scalars: weights and the clip.
+      distil: whether the counterfactual branch is trained.
+      method: may bring an auxiliary loss.
 
     Returns:
       The loss float32 [] and its parts by name.
     """
-    decisions, counterfactual = replay(policy, transitions, memory, params)
+    transitions, decisions = replayed.transitions, replayed.decisions
     log_pi = jax.nn.log_softmax(decisions.logits)
-    log_prob = jnp.take_along_axis(log_pi, transitions.action[..., None], axis=-1)[..., 0]
+    log_prob = jnp.take_along_axis(log_pi, transitions.choice[..., None], axis=-1)[..., 0]
     ratio = jnp.exp(log_prob - transitions.log_prob)
     target = advantage + transitions.value
     scaled = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
@@ -90,8 +140,16 @@ def ppo_loss(
     loss = policy_loss + scalars.value * value_loss - scalars.entropy * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
     if distil:
-        fixed = jax.lax.stop_gradient(log_pi)
-        divergence = (jnp.exp(fixed) * (fixed - jax.nn.log_softmax(counterfactual.logits))).sum(axis=-1).mean()
+        divergence = _distillation(log_pi, replayed.counterfactual.logits)
         loss = loss + scalars.distil * divergence
         parts["distil_loss"] = divergence
+    if method.auxiliary is not None:
+        auxiliary, named = method.auxiliary(replayed)
+        loss, parts = loss + auxiliary, parts | named
     return loss, parts
+
+
+def _distillation(log_pi: jax.Array, counterfactual: jax.Array) -> jax.Array:
+    """Return the mean KL(pi || counterfactual), pi fixed."""
+    fixed = jax.lax.stop_gradient(log_pi)
+    return (jnp.exp(fixed) * (fixed - jax.nn.log_softmax(counterfactual))).sum(axis=-1).mean()

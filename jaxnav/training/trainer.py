@@ -1,7 +1,8 @@
-"""The two arms of a run: the method alone, and the method with the layout estimator."""
+"""The trainer: all arms and seeds of a run, side by side."""
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,12 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
-from jaxnav.layout import Setting
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.config import ARMS, RunConfig
+from jaxnav.policies.methods import Knowledge, Stage
+from jaxnav.training.config import PPOScalars
 from jaxnav.training.devices import everywhere, replicated, state_sharding
 from jaxnav.training.learner import Learner, LearnerState
 
@@ -22,125 +20,163 @@ from jaxnav.training.learner import Learner, LearnerState
 States = dict[str, list[LearnerState]]
 Metrics = dict[str, list[dict[str, float]]]
 
+#: Purposes of the keys of the arms: policies without and with the layout estimator.
+ARM_KEYS = {"baseline": 0, "layout": 1}
 
-class Arms:
-    """All arms and seeds of a run; each arm is compiled once, and seeds of both run side by side on the cores.
+
+class Trainer:
+    """Train all arms and seeds of a run.
+
+    Each arm is compiled once for each stage of its method, and seeds of all arms run side by side on the cores.
 
     Attributes:
-      learners: the learner of each arm.
+      learners: the learner of each arm, by name.
     """
 
-    def __init__(self, config: RunConfig, env: ObjectNav, setting: Setting, priors: jax.Array) -> None:
-        settings = {"baseline": None, "layout": setting}
-        self.learners = {name: _learner(config, env, settings[name]) for name in config.arms}
-        self._scalars = config.ppo.scalars(config.total_updates)
-        self._priors = priors
-        self._root = jax.random.key(config.seed)
-        self._seeds = config.seeds
-        self._chunk = config.chunk
-        self._compiled: dict[str, Any] = {}
+    def __init__(
+        self,
+        learners: Mapping[str, Learner],
+        scalars: PPOScalars,
+        knowledge: Knowledge,
+        key: jax.Array,
+        seeds: int,
+        chunk: int,
+    ) -> None:
+        """Prepare; nothing is compiled yet.
+
+        Args:
+          learners: of each arm, a name in `ARM_KEYS`.
+          scalars: the traced settings of PPO.
+          knowledge: what was learned before training.
+          key: typed PRNG key [] of all arms and seeds.
+          seeds: S, of each arm.
+          chunk: updates of one call of `train`.
+        """
+        self.learners = dict(learners)
+        self._scalars, self._knowledge, self._key = scalars, knowledge, key
+        self._seeds, self._chunk = seeds, chunk
+        self._compiled: dict[tuple[str, int], Any] = {}
         self._starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         self._restarts = {name: jax.jit(learner.restart, donate_argnums=0) for name, learner in self.learners.items()}
 
     def abstract(self, params: EnvParams) -> States:
-        """Shapes of every seed's state, and on which devices it is."""
+        """Return shapes and devices of every seed's state."""
         return jax.eval_shape(self.init, params)
 
     def init(self, params: EnvParams) -> States:
-        """Every seed before its first update."""
+        """Start every seed."""
         states: States = {}
         for name, start in self._starts.items():
-            root = jax.random.fold_in(self._root, ARMS.index(name))
-            states[name] = [start(jax.random.fold_in(root, seed), params, self._priors) for seed in range(self._seeds)]
+            root = jax.random.fold_in(self._key, ARM_KEYS[name])
+            keys = [jax.random.fold_in(root, seed) for seed in range(self._seeds)]
+            states[name] = [start(key, params, self._knowledge) for key in keys]
         return states
 
     def restart(self, states: States, params: EnvParams) -> States:
-        """Every seed with new episodes in other scenes. The states are donated."""
+        """Give every seed new episodes in other scenes; donates the states."""
         return {
-            name: [self._restarts[name](state, params, self._priors) for state in seeds]
+            name: [self._restarts[name](state, params, self._knowledge) for state in seeds]
             for name, seeds in states.items()
         }
 
-    def train(self, states: States, params: EnvParams) -> tuple[States, Metrics]:
-        """One chunk of updates of every seed, with its metrics. The states are donated."""
+    def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
+        """Do a chunk of updates of every seed; donates the states.
+
+        Args:
+          states: of every seed.
+          params: the environment's.
+          stage: number of the methods' stage, see `stage_at`.
+
+        Returns:
+          The states after the chunk, and its metrics.
+        """
         tasks = [(name, seed) for seed in range(self._seeds) for name in self.learners]
-        if not self._compiled:  # one at a time: a compilation takes half a gigabyte, and two at once are hardly quicker
-            self._compiled = {name: self._compile(name, states[name][0], params) for name in self.learners}
+        for name in self.learners:  # one at a time: a compilation takes half a gigabyte, and two are hardly quicker
+            self._compile(name, stage, states[name], params)
         with ThreadPoolExecutor(min(len(tasks), os.cpu_count() or 1)) as pool:
-            results = list(pool.map(lambda task: self._train(task[0], states[task[0]][task[1]], params), tasks))
-        done: States = {name: [] for name in self.learners}
+            results = list(pool.map(lambda task: self._call(task, stage, states, params), tasks))
+        after: States = {name: [] for name in self.learners}
         metrics: Metrics = {name: [] for name in self.learners}
         for (name, _), (state, values) in zip(tasks, results, strict=True):
-            done[name].append(state)
+            after[name].append(state)
             metrics[name].append({key: float(value) for key, value in values.items()})
-        return done, metrics
+        return after, metrics
 
-    def _compile(self, name: str, state: LearnerState, params: EnvParams) -> Any:
-        learner, num_updates = self.learners[name], self._chunk
+    def _compile(self, name: str, stage: int, states: list[LearnerState], params: EnvParams) -> Any:
+        """Compile the chunk of an arm, unless it is."""
+        if (name, stage) not in self._compiled:
+            learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
 
-        def train(state: LearnerState, scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
-            return learner.train(state, scalars, params, priors, num_updates)
+            def train(state: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
+                return learner.train(state, scalars, params, knowledge, num_updates)
 
-        return jax.jit(train, donate_argnums=0).lower(state, self._scalars, params, self._priors).compile()
+            lowered = jax.jit(train, donate_argnums=0).lower(states[0], self._scalars, params, self._knowledge)
+            self._compiled[name, stage] = lowered.compile()
+        return self._compiled[name, stage]
 
-    def _train(self, name: str, state: LearnerState, params: EnvParams) -> tuple[LearnerState, dict[str, jax.Array]]:
-        return jax.block_until_ready(self._compiled[name](state, self._scalars, params, self._priors))
+    def _call(self, task: tuple[str, int], stage: int, states: States, params: EnvParams) -> Any:
+        (name, seed), call = task, self._compiled[task[0], stage]
+        return jax.block_until_ready(call(states[name][seed], self._scalars, params, self._knowledge))
 
 
-class ShardedArms(Arms):
-    """The same on a mesh of devices: one arm after the other, all its seeds in one call.
+class ShardedTrainer(Trainer):
+    """Train on a mesh of devices: arm by arm, all seeds in one call.
 
-    Between calls the states are those of `Arms` with their episodes cut, so that a run may go on with other devices.
+    Between calls the states are those of `Trainer` with their episodes divided, so that a run may go on with other
+    devices.
     """
 
-    def __init__(self, config: RunConfig, env: ObjectNav, setting: Setting, priors: jax.Array, mesh: Mesh) -> None:
-        super().__init__(config, env, setting, everywhere(mesh, priors))
+    def __init__(self, *arguments: Any, mesh: Mesh, **named: Any) -> None:
+        """Prepare as `Trainer`, on a mesh."""
+        super().__init__(*arguments, **named)
         self._mesh, self._place = mesh, state_sharding(mesh)
-        self._root, self._scalars = everywhere(mesh, (self._root, self._scalars))
+        self._key, self._scalars, self._knowledge = everywhere(mesh, (self._key, self._scalars, self._knowledge))
         self._given: EnvParams | None = None
         for name, learner in self.learners.items():
             self._starts[name] = jax.jit(learner.init, out_shardings=self._place)
             self._restarts[name] = jax.jit(learner.restart, out_shardings=self._place, donate_argnums=0)
 
     def abstract(self, params: EnvParams) -> States:
-        """Shapes of every seed's state, and on which devices it is."""
+        """Return shapes and devices of every seed's state."""
         states = jax.eval_shape(super().init, params)
         places = jax.tree.map(lambda _: self._place, states, is_leaf=lambda node: isinstance(node, LearnerState))
         return jax.tree.map(lambda leaf, place: leaf.update(sharding=place), states, jax.tree.broadcast(places, states))
 
     def init(self, params: EnvParams) -> States:
-        """Every seed before its first update."""
+        """Start every seed."""
         return super().init(self._everywhere(params))
 
     def restart(self, states: States, params: EnvParams) -> States:
-        """Every seed with new episodes in other scenes. The states are donated."""
+        """Give every seed new episodes in other scenes; donates the states."""
         return super().restart(states, self._everywhere(params))
 
-    def train(self, states: States, params: EnvParams) -> tuple[States, Metrics]:
-        """One chunk of updates of every seed, with its metrics. The states are donated."""
+    def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
+        """Do a chunk of updates of every seed; see `Trainer.train`."""
         params = self._everywhere(params)
-        if not self._compiled:
-            self._compiled = {name: self._compile_all(name, states[name], params) for name in self.learners}
-        done: States = {}
+        after: States = {}
         metrics: Metrics = {}
-        for name, train in self._compiled.items():
-            done[name], values = train(states[name], self._scalars, params, self._priors)
+        for name in self.learners:
+            train = self._compile(name, stage, states[name], params)
+            after[name], values = train(states[name], self._scalars, params, self._knowledge)
             rows = jax.device_get(values)
             metrics[name] = [{key: float(value[seed]) for key, value in rows.items()} for seed in range(self._seeds)]
-        return done, metrics
+        return after, metrics
 
     def _everywhere(self, params: EnvParams) -> EnvParams:
         if params is not self._given:  # copied once for as long as a bank is used
             self._given, self._placed = params, everywhere(self._mesh, params)
         return self._placed
 
-    def _compile_all(self, name: str, states: list[LearnerState], params: EnvParams) -> Any:
-        learner, num_updates = self.learners[name], self._chunk
+    def _compile(self, name: str, stage: int, states: list[LearnerState], params: EnvParams) -> Any:
+        """Compile the chunk of all seeds of an arm, unless it is."""
+        if (name, stage) in self._compiled:
+            return self._compiled[name, stage]
+        learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
 
-        def train(states: list[LearnerState], scalars: Any, params: EnvParams, priors: jax.Array) -> Any:
+        def train(states: list[LearnerState], scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
             stacked = jax.tree.map(lambda *seeds: jnp.stack(seeds), *states)
             stacked = jax.lax.with_sharding_constraint(stacked, state_sharding(self._mesh, stacked=True))
-            stacked, metrics = jax.vmap(lambda state: learner.train(state, scalars, params, priors, num_updates))(
+            stacked, metrics = jax.vmap(lambda state: learner.train(state, scalars, params, knowledge, num_updates))(
                 stacked
             )
             return [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(len(states))], metrics
@@ -148,11 +184,20 @@ class ShardedArms(Arms):
         places = [self._place] * len(states), replicated(self._mesh)
         call = jax.jit(train, out_shardings=places, donate_argnums=0)
         with jax.set_mesh(self._mesh):
-            return call.lower(states, self._scalars, params, self._priors).compile()
+            self._compiled[name, stage] = call.lower(states, self._scalars, params, self._knowledge).compile()
+        return self._compiled[name, stage]
 
 
-def _learner(config: RunConfig, env: ObjectNav, setting: Setting | None) -> Learner:
-    spec = PolicySpec(config.method, len(env.categories), config.sizes, config.direct, config.done_gate)
-    if setting:
-        setting = dataclasses.replace(setting, gap="none")  # training has no use for it
-    return Learner(Acting(env, setting), spec, config.ppo, config.counterfactual)
+def stage_at(stages: tuple[Stage, ...], share: float) -> int:
+    """Return the number of the stage after a share of all updates.
+
+    Args:
+      stages: of a method, in order.
+      share: of the updates that are done, in [0, 1).
+    """
+    end = 0.0
+    for number, stage in enumerate(stages):
+        end += stage.share
+        if share < end - 1e-9:
+            return number
+    return len(stages) - 1

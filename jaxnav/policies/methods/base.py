@@ -1,0 +1,194 @@
+"""The seam for methods: what a method may bring, and what it gets by default."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+
+import jax
+import numpy as np
+from flax import nnx
+
+from jaxnav.policies.features import Features
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.scenes.task import NUM_ACTIONS
+
+if TYPE_CHECKING:
+    from jaxnav.policies.pathways import Decision, Memory, Pathways
+    from jaxnav.policies.policy import Policy
+    from jaxnav.policies.spec import PolicySpec
+
+#: A nested dict of arrays, or a pytree of a method's own.
+Tree = Any
+
+
+class Knowledge(NamedTuple):
+    """Hold what is learned before training: traced, exported, fixed.
+
+    Attributes:
+      layout: float32 [rooms, K, K], the layout prior alpha* of each room type.
+      method: nested dict of arrays, what the method's `learn` returned; empty if it learns nothing.
+    """
+
+    layout: jax.Array
+    method: Tree = {}  # noqa: RUF012  (never written to)
+
+
+class Percept(NamedTuple):
+    """Describe what a tracker is told at one step.
+
+    Attributes:
+      row: uint8 [R], the observation row after the action.
+      heading: int32 [], compass heading, 0 to H - 1, clockwise.
+      action: int32 [], the action that led here; `NO_ACTION` at the start.
+      moved: bool [], whether it changed the cell.
+    """
+
+    row: jax.Array
+    heading: jax.Array
+    action: jax.Array
+    moved: jax.Array
+
+
+class Tracker(Protocol):
+    """Remember an episode without parameters; hashable.
+
+    A note lives in the agent and is updated once per environment step, the first view of an episode included. All
+    functions take one episode; callers `vmap`.
+    """
+
+    def init(self, knowledge: Knowledge) -> Tree:
+        """Return the note before anything is seen."""
+        ...
+
+    def update(self, note: Tree, knowledge: Knowledge, percept: Percept) -> Tree:
+        """Take in one step."""
+        ...
+
+    def read(self, note: Tree, knowledge: Knowledge, goal: jax.Array) -> Tree:
+        """Return what the network reads; rollouts store it."""
+        ...
+
+
+class Experience(nnx.Module):
+    """Make the mediator Z of what is seen and sought.
+
+    Subclasses take `(spec, rngs)` and set `width`.
+
+    Attributes:
+      sizes: the method's own whole-number sizes and their defaults, beside those that all methods share.
+      width: Z, the size of the experience.
+      recurrent: whether `attend` reads the memory; training then unrolls the policy step by step.
+    """
+
+    sizes: ClassVar[Mapping[str, int]] = {}
+    width: int
+    recurrent = False
+
+    def __init__(self, spec: "PolicySpec", rngs: nnx.Rngs) -> None:
+        raise NotImplementedError
+
+    def size(self, spec: "PolicySpec", name: str) -> int:
+        """Return one of the method's own sizes."""
+        return dict(spec.method_sizes).get(name, self.sizes[name])
+
+    def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Tree) -> Tree:
+        """Encode without memory, in parallel over time.
+
+        Args:
+          features: what is seen and sought, leaves [..., K, ...].
+          appearance: float32 [K, d], an embedding per category.
+          weights: float32 [..., K], w x g of eq. 7; ones leave the layout out.
+          reading: what the method's tracker read, leaves [...]; None without a tracker.
+
+        Returns:
+          float32 [..., Z], or any pytree with leaves [...] that `attend` turns into that.
+        """
+        raise NotImplementedError
+
+    def attend(self, encoded: Tree, memory: "Memory") -> jax.Array:
+        """Return the experience float32 [..., Z], given the memory."""
+        del memory
+        return encoded
+
+
+class Control(Protocol):
+    """Turn the policy's choices into actions; hashable."""
+
+    @property
+    def num_choices(self) -> int:
+        """Return the size of the policy's output."""
+        ...
+
+    def act(self, choice: jax.Array, note: Tree) -> jax.Array:
+        """Return the action int32 [] of a choice int32 [] in an episode."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Primitive:
+    """Choose the actions themselves."""
+
+    num_choices: int = NUM_ACTIONS
+
+    def act(self, choice: jax.Array, note: Tree) -> jax.Array:
+        """Return the choice."""
+        del note
+        return choice
+
+
+class Adaptation(Protocol):
+    """Change a policy within an episode, by fast weights in its memory; hashable."""
+
+    def init(self, policy: "Policy", batch: tuple[int, ...]) -> Tree:
+        """Return the fast weights at an episode's start, leaves [*batch, ...]."""
+        ...
+
+    def decide(self, policy: "Policy", pathways: "Pathways", memory: "Memory") -> "Decision":
+        """Decide with the fast weights `memory.fast`, and return the next ones.
+
+        `policy.decide_plainly` is the decision without them.
+        """
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Describe one part of a method's training.
+
+    Attributes:
+      share: of all updates, above 0; the shares of a method add up to 1.
+      loss: the loss in place of PPO's, with the arguments and results of `jaxnav.training.loss.ppo_loss`.
+      trainable: whether the parameter at a path of names is trained; None for all.
+    """
+
+    share: float = 1.0
+    loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None
+    trainable: Callable[[tuple[str, ...]], bool] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """Name what a method brings; the defaults do nothing.
+
+    Attributes:
+      experience: the module that makes Z, built with `(spec, rngs)`.
+      perceive: what of the observation the networks get; None for everything. It may change the number of categories.
+      tracker: what an episode remembers without parameters.
+      learn: from the banks of training scenes and counts float32 [rooms, K, K] (poses of exploration at which two
+        categories were detected together) to what is known before training, a nested dict of arrays.
+      stages: of training, in order.
+      auxiliary: one more term of the loss, from a `jaxnav.training.loss.Replay` to a loss float32 [] and named parts.
+      adaptation: how the policy changes within an episode.
+      control: how its choices become actions.
+      hosts_layout: whether the layout's weights can enter; if not, it is trained without the layout alone.
+    """
+
+    experience: type[Experience]
+    perceive: Callable[[Features], Features] | None = None
+    tracker: Tracker | None = None
+    learn: Callable[[Iterable[Bank], np.ndarray], Tree] | None = None
+    stages: tuple[Stage, ...] = (Stage(),)
+    auxiliary: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None
+    adaptation: Adaptation | None = None
+    control: Control = Primitive()
+    hosts_layout: bool = True
