@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.command import exit_code
+from jaxnav.cli.console import exit_code
 from jaxnav.env.types import State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list

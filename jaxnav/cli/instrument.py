@@ -11,7 +11,7 @@ from rich.console import Console
 
 from jaxnav.baselines.difficulty import expected_length, random_success
 from jaxnav.baselines.frontier import frontier_outcome
-from jaxnav.cli.command import exit_code, result_console
+from jaxnav.cli.console import exit_code, result_console
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together

@@ -4,7 +4,7 @@ import sys
 
 import tyro
 
-from jaxnav.cli.command import exit_code, result_console
+from jaxnav.cli.console import exit_code, result_console
 from jaxnav.cli.showing import ShowConfig, show_scene
 from jaxnav.cli.telling import StatsConfig, tell_statistics
 from jaxnav.scenes.files.importing import ImportConfig, import_scenes

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from jaxnav.cli.command import exit_code
+from jaxnav.cli.console import exit_code
 from jaxnav.cli.instrument import instrument_report, of_study
 from jaxnav.evaluation.report import FORMAT, versions
 from jaxnav.store.files import write_atomic

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.cli.command import exit_code
+from jaxnav.cli.console import exit_code
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import FORMAT, markdown_table
 

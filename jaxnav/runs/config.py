@@ -1,26 +1,30 @@
-"""The settings of a run, from dataclass defaults, a YAML overlay and the command line, in this order."""
+"""The settings of a run and what is possible among them."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from jaxnav.errors import InputError
 from jaxnav.layout import Reduction
-from jaxnav.policies.methods import METHODS
-from jaxnav.policies.spec import Direct, Sizes
+from jaxnav.policies.methods import Method, find_method
+from jaxnav.policies.spec import Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.detector import Detector
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.training.config import Counterfactual, PPOConfig
 from jaxnav.training.devices import Devices
 
-#: Policies without and with the layout estimator, in the order of the tables; they differ by its weights alone.
-ARMS = ("baseline", "layout")
+Arm = Literal["baseline", "layout"]
+#: Policies without and with the layout estimator; they differ by its weights alone.
+ARMS: tuple[Arm, ...] = ("baseline", "layout")
 
 
 @dataclasses.dataclass(frozen=True)
 class WorldConfig:
-    """Which scenes there are and how long episodes may last; what is None is as usual in the world.
+    """Choose scenes and lengths of episodes.
+
+    What is None is as usual in the world.
 
     Attributes:
       num_train, num_val, num_test: generated scenes of each split.
@@ -51,7 +55,7 @@ class WorldConfig:
 
 @dataclasses.dataclass(frozen=True)
 class LayoutConfig:
-    """How the layout is estimated.
+    """Choose how the layout is estimated.
 
     Attributes:
       setting: of the estimator.
@@ -69,14 +73,15 @@ class LayoutConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """A training run.
+    """Configure a training run.
 
     Attributes:
       run_dir: where everything the run makes is kept; training goes on where it stopped.
-      method: how experience is made.
+      method: how experience is made: a name of this package, an entry point of the group `jaxnav.methods`, or
+        `package.module:NAME`.
       world: what is asked of the agent, and the generated scenes it lives in unless `scenes` is given.
       scenes: scene file to read instead; its splits are used.
-      arms: kinds of policies that are trained.
+      arms: kinds of policies that are trained; a method that cannot host the layout has the baseline alone.
       seeds: policies trained of each kind.
       total_steps: environment steps of each policy, rounded up to whole chunks. The layout's policies have seen the
         prior's random steps (`layout.walks x layout.steps`) besides.
@@ -88,6 +93,7 @@ class RunConfig:
         are streamed, goes on to the next shard with new episodes.
       save_every: calls between checkpoints.
       cache: folder for compiled scenes that are streamed from disk.
+      method_sizes: whole-number sizes that only the method has, where they are not the usual ones.
       devices: what to train on, which changes results by rounding only: so many devices of this process, `cluster` for
         all that Slurm, Open MPI, Kubernetes or a TPU pod has started this command on, or `HOST:PORT,INDEX,PROCESSES`
         for command number INDEX of several equal ones, which meet at that address of number 0 and share the file system
@@ -98,7 +104,7 @@ class RunConfig:
     method: str = "org"
     world: Literal["rooms", "apartments", "houses"] = "rooms"
     scenes: Path | None = None
-    arms: tuple[Literal["baseline", "layout"], ...] = ARMS
+    arms: tuple[Arm, ...] = ARMS
     seeds: int = 3
     total_steps: int = 2_000_000
     seed: int = 0
@@ -113,93 +119,127 @@ class RunConfig:
     detector: Detector = Detector()
     layout: LayoutConfig = LayoutConfig()
     sizes: Sizes = Sizes()
+    method_sizes: dict[str, int] = dataclasses.field(default_factory=dict)
     ppo: PPOConfig = PPOConfig()
 
     @property
     def source(self) -> str | Path:
-        """Where the scenes come from."""
+        """Return where the scenes come from."""
         return self.scenes or self.world
 
     @property
     def task(self) -> Task:
-        """What is asked of the agent."""
-        own, worlds = WORLDS[self.world].task, self.worlds
+        """Return what is asked of the agent."""
+        task, worlds = WORLDS[self.world].task, self.worlds
         if worlds.categories is not None:
-            own = dataclasses.replace(own, categories=worlds.categories, goals=())
-        return dataclasses.replace(
-            own, goals=own.goals if worlds.goals is None else worlds.goals, detector=self.detector
-        )
+            task = dataclasses.replace(task, categories=worlds.categories, goals=())
+        goals = task.goals if worlds.goals is None else worlds.goals
+        return dataclasses.replace(task, goals=goals, detector=self.detector)
+
+    @property
+    def policy_spec(self) -> PolicySpec:
+        """Return what its policies are built from."""
+        sizes = tuple(sorted(self.method_sizes.items()))
+        return PolicySpec(self.method, len(self.task.categories), self.sizes, sizes, self.direct, self.done_gate)
 
     @property
     def train_step_limit(self) -> int:
-        """Actions of a training episode."""
+        """Return the actions of a training episode."""
         return self.worlds.train_step_limit or WORLDS[self.world].train_step_limit
 
     @property
     def update_steps(self) -> int:
-        """Environment steps of one policy between two updates."""
+        """Return the environment steps of a policy between two updates."""
         return self.ppo.num_envs * self.ppo.rollout
 
     @property
     def total_updates(self) -> int:
-        """Updates of each policy, rounded up to whole chunks."""
+        """Return the updates of each policy, in whole chunks."""
         return -(-self.ppo.num_updates(self.total_steps) // self.chunk) * self.chunk
 
 
 def check(config: RunConfig) -> RunConfig:
-    """The same config, or an `InputError` that names the first impossible setting."""
+    """Return the config, complete and possible.
 
-    def need(holds: bool, name: str, value: object, mend: str) -> None:
-        if not holds:
-            raise InputError(f"config: {name} is {value}; {mend}")
+    A method that cannot host the layout loses the arm `layout`.
 
-    need(config.method in METHODS, "method", repr(config.method), f"choose one of {', '.join(METHODS)}")
+    Raises:
+      InputError: names the first impossible setting.
+    """
+    method = find_method(config.method)
+    if not method.hosts_layout and config.arms == ARMS:
+        config = dataclasses.replace(config, arms=("baseline",))
+    _check_method(config, method)
+    _check_numbers(config)
+    _check_layout(config)
+    _check_learning(config)
+    _check_world(config)
+    return config
+
+
+def _need(holds: bool, name: str, value: object, mend: str) -> None:
+    if not holds:
+        raise InputError(f"config: {name} is {value}; {mend}")
+
+
+def _check_method(config: RunConfig, method: Method) -> None:
+    arms, sizes = config.arms, method.experience.sizes
+    _need(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
+    hosted = method.hosts_layout or "layout" not in arms
+    _need(hosted, "arms", arms, f"method {config.method!r} cannot host the layout; give baseline alone")
+    for name, value in config.method_sizes.items():
+        known = f"{config.method!r} has {', '.join(sizes)}" if sizes else f"{config.method!r} has no sizes of its own"
+        _need(name in sizes, f"method_sizes.{name}", value, f"is unknown; {known}")
+        _need(value >= 1, f"method_sizes.{name}", value, "give at least 1")
+
+
+def _check_numbers(config: RunConfig) -> None:
     for name in ("seeds", "total_steps", "chunk", "save_every"):
-        need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
+        _need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
     if config.devices is not None:
         forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
-        need(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), forms)
+        _need(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), forms)
     seeds = {"seed": config.seed, "worlds.seed": config.worlds.seed, "detector.seed": config.detector.seed}
     for name, seed in seeds.items():
-        need(0 <= seed < 2**32, name, seed, "give a whole number from 0 to 2**32 - 1")
+        _need(0 <= seed < 2**32, name, seed, "give a whole number from 0 to 2**32 - 1")
     for group in ("worlds", "layout", "sizes", "ppo"):
         for field in dataclasses.fields(getattr(config, group)):
             value = getattr(getattr(config, group), field.name)
             if isinstance(value, int) and field.name != "seed":
-                need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
-    arms, strength = config.arms, config.layout.strength
-    need(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
-    fixed = config.layout.setting != "calibrated" and (strength, config.layout.reduction) != (None, None)
-    need(not fixed, "layout.setting", config.layout.setting, "only `calibrated` takes a strength and a reduction")
-    need(strength is None or 0.0 < strength < float("inf"), "layout.strength", strength, "give a positive number")
-    ppo, detector = config.ppo, config.detector
-    for name in ("miss_near", "miss_far", "false_alarm"):
-        value = getattr(detector, name)
-        need(0.0 <= value <= 1.0, f"detector.{name}", value, "give a probability from 0 to 1")
-    for name in ("gamma", "gae_lambda"):
-        need(0.0 <= getattr(ppo, name) <= 1.0, f"ppo.{name}", getattr(ppo, name), "give a number from 0 to 1")
-    for name in ("learning_rate", "clip", "max_grad_norm"):
-        need(0.0 < getattr(ppo, name) < float("inf"), f"ppo.{name}", getattr(ppo, name), "give a positive number")
-    for name in ("entropy", "value", "distil"):
-        need(0.0 <= getattr(ppo, name) < float("inf"), f"ppo.{name}", getattr(ppo, name), "give 0 or more")
-    need(
-        ppo.num_envs % ppo.minibatches == 0,
-        "ppo.num_envs",
-        ppo.num_envs,
-        f"give a multiple of ppo.minibatches ({ppo.minibatches})",
-    )
-    need(
-        ppo.rollout <= config.train_step_limit,
-        "ppo.rollout",
-        ppo.rollout,
-        f"give at most worlds.train_step_limit ({config.train_step_limit})",
-    )
-    task, shift = config.task, config.worlds.shift
-    need(0.0 <= shift <= 1.0, "worlds.shift", shift, "give a number from 0 to 1")
-    shaping = config.worlds.shaping
-    need(shaping is None or 0.0 <= shaping < float("inf"), "worlds.shaping", shaping, "give 0 or more")
-    need(len(task.categories) >= 2, "worlds.categories", task.categories, "give at least 2")
-    need(len(set(task.categories)) == len(task.categories), "worlds.categories", task.categories, "give each once")
+                _need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
+
+
+def _check_layout(config: RunConfig) -> None:
+    layout, strength = config.layout, config.layout.strength
+    fixed = layout.setting != "calibrated" and (strength, layout.reduction) != (None, None)
+    _need(not fixed, "layout.setting", layout.setting, "only `calibrated` takes a strength and a reduction")
+    _need(strength is None or 0.0 < strength < float("inf"), "layout.strength", strength, "give a positive number")
+
+
+def _check_learning(config: RunConfig) -> None:
+    ppo = config.ppo
+    _need_all(ppo, "ppo", ("gamma", "gae_lambda"), lambda x: 0.0 <= x <= 1.0, "give a number from 0 to 1")
+    rates = ("learning_rate", "clip", "max_grad_norm")
+    _need_all(ppo, "ppo", rates, lambda x: 0.0 < x < float("inf"), "give a positive number")
+    _need_all(ppo, "ppo", ("entropy", "value", "distil"), lambda x: 0.0 <= x < float("inf"), "give 0 or more")
+    divided, mend = ppo.num_envs % ppo.minibatches == 0, f"give a multiple of ppo.minibatches ({ppo.minibatches})"
+    _need(divided, "ppo.num_envs", ppo.num_envs, mend)
+    mend = f"give at most worlds.train_step_limit ({config.train_step_limit})"
+    _need(ppo.rollout <= config.train_step_limit, "ppo.rollout", ppo.rollout, mend)
+
+
+def _check_world(config: RunConfig) -> None:
+    rates = ("miss_near", "miss_far", "false_alarm")
+    _need_all(config.detector, "detector", rates, lambda x: 0.0 <= x <= 1.0, "give a probability from 0 to 1")
+    task, shift, shaping = config.task, config.worlds.shift, config.worlds.shaping
+    _need(0.0 <= shift <= 1.0, "worlds.shift", shift, "give a number from 0 to 1")
+    _need(shaping is None or 0.0 <= shaping < float("inf"), "worlds.shaping", shaping, "give 0 or more")
+    _need(len(task.categories) >= 2, "worlds.categories", task.categories, "give at least 2")
+    _need(len(set(task.categories)) == len(task.categories), "worlds.categories", task.categories, "give each once")
     unknown = [goal for goal in task.goals if goal not in task.categories]
-    need(not unknown, "worlds.goals", unknown, f"give some of the categories {', '.join(task.categories)}")
-    return config
+    _need(not unknown, "worlds.goals", unknown, f"give some of the categories {', '.join(task.categories)}")
+
+
+def _need_all(group: Any, prefix: str, names: tuple[str, ...], valid: Callable[[float], bool], mend: str) -> None:
+    for name in names:
+        _need(valid(getattr(group, name)), f"{prefix}.{name}", getattr(group, name), mend)

@@ -1,4 +1,4 @@
-"""A YAML file laid over a tree of frozen config dataclasses; only what the file names changes."""
+"""A YAML file laid over a tree of frozen config dataclasses."""
 
 import dataclasses
 import difflib
@@ -15,12 +15,16 @@ from jaxnav.errors import InputError
 
 Config = TypeVar("Config")
 
+#: Names of settings that have changed: old to new.
+RENAMED = {"sizes.relation_layers": "method_sizes.relation_layers"}
+
 
 def apply_yaml(default: Config, path: str | Path) -> Config:
-    """`default` with the values of a YAML file, each checked against the annotation of its field.
+    """Return `default` with the values of a YAML file.
 
-    Known annotations: `bool`, `int`, `float`, `str`, `Path`, `Literal`, `X | None`, `tuple`, nested dataclasses.
-    Where a float is expected, whole numbers and texts such as `3e-4` (text to YAML 1.1) are taken as floats.
+    Only what the file names changes, and each value is checked against the annotation of its field. Known annotations:
+    `bool`, `int`, `float`, `str`, `Path`, `Literal`, `X | None`, `tuple`, `dict`, nested dataclasses. Where a float is
+    expected, whole numbers and texts such as `3e-4` (text to YAML 1.1) are taken as floats.
 
     Args:
       default: instance of a frozen dataclass.
@@ -36,7 +40,10 @@ def apply_yaml(default: Config, path: str | Path) -> Config:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which would let the last of two equal keys win; this one refuses them."""
+    """Load YAML safely, and refuse equal keys.
+
+    YAML's safe loader would let the last of them win.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -67,12 +74,14 @@ def _load(path: Path) -> Any:
 def _overlay(default: Any, values: Any, path: Path, prefix: str) -> Any:
     if not isinstance(values, dict):
         where = f"{prefix.rstrip('.')} " if prefix else ""
-        raise InputError(f"{path}: {where}holds {_found(values)}; give a mapping of names to values")
+        raise InputError(f"{path}: {where}holds {_shown(values)}; give a mapping of names to values")
     annotations = typing.get_type_hints(type(default))
     names = [field.name for field in dataclasses.fields(default)]
     changes = {}
     for name, value in values.items():
         key = f"{prefix}{name}"
+        if renamed := [new for old, new in RENAMED.items() if f".{key}".endswith(f".{old}")]:
+            raise InputError(f"{path}: unknown key {key}; it is {renamed[0]} now")
         if name not in names:
             near = difflib.get_close_matches(str(name), names, n=1)
             mend = f"did you mean {prefix}{near[0]}?" if near else f"known here are {', '.join(names)}"
@@ -84,16 +93,16 @@ def _overlay(default: Any, values: Any, path: Path, prefix: str) -> Any:
             changes[name] = _convert(value, annotations[name])
         except _Mismatch as error:
             expected = _describe(annotations[name])
-            raise InputError(f"{path}: {key} must be {expected}, but is {_found(value)}; change the value") from error
+            raise InputError(f"{path}: {key} must be {expected}, but is {_shown(value)}; change the value") from error
     return dataclasses.replace(default, **changes)
 
 
 class _Mismatch(Exception):
-    """The value does not fit the annotation."""
+    """Say that the value does not fit the annotation."""
 
 
 def _convert(value: Any, annotation: Any) -> Any:
-    """The value as the annotated type, or `_Mismatch`."""
+    """Convert the value to the annotated type, or raise `_Mismatch`."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (Union, types.UnionType):
         for argument in arguments:
@@ -107,6 +116,8 @@ def _convert(value: Any, annotation: Any) -> Any:
             return value
     elif origin is tuple:
         return _convert_tuple(value, arguments)
+    elif origin is dict:
+        return _convert_dict(value, arguments)
     elif annotation is float:
         return _convert_float(value)
     elif annotation is Path:
@@ -129,6 +140,12 @@ def _convert_tuple(value: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(_convert(item, argument) for item, argument in zip(value, arguments, strict=True))
 
 
+def _convert_dict(value: Any, arguments: tuple[Any, ...]) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        raise _Mismatch
+    return {_convert(key, arguments[0]): _convert(item, arguments[1]) for key, item in value.items()}
+
+
 def _convert_float(value: Any) -> float:
     if type(value) not in (int, float, str):
         raise _Mismatch
@@ -142,7 +159,7 @@ def _convert_float(value: Any) -> float:
 
 
 def _describe(annotation: Any) -> str:
-    """The annotation in words: `float or null`, `one of 'a', 'b'`, `a list of int`."""
+    """Describe an annotation: `float or null`, `one of 'a', 'b'`."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (Union, types.UnionType):
         return " or ".join(map(_describe, arguments))
@@ -152,10 +169,12 @@ def _describe(annotation: Any) -> str:
         return f"a list of {_describe(arguments[0])}"
     if origin is tuple:
         return f"a list [{', '.join(map(_describe, arguments))}]"
+    if origin is dict:
+        return f"a mapping of {_describe(arguments[0])} to {_describe(arguments[1])}"
     if annotation is Path:
         return "a path"
     return "null" if annotation is types.NoneType else annotation.__name__
 
 
-def _found(value: Any) -> str:
+def _shown(value: Any) -> str:
     return "null" if value is None else f"{reprlib.repr(value)} ({type(value).__name__})"

@@ -1,4 +1,4 @@
-"""The scenes of a run: compiled in memory, or as shards on disk where there are many."""
+"""The scenes of a run, compiled in memory or as shards on disk."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -9,10 +9,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from jaxnav.runs.config import RunConfig
 from jaxnav.env.objectnav import ObjectNav, build
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import unknown_types
 from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank
 from jaxnav.scenes.tables.shards import Shards, compile_shards
@@ -21,7 +21,7 @@ from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
 
 @dataclasses.dataclass(frozen=True)
 class CompiledWorld:
-    """The scenes of one split, compiled.
+    """Hold the compiled scenes of one split.
 
     Attributes:
       scenes: as read or generated.
@@ -43,12 +43,15 @@ class CompiledWorld:
     fingerprint: str
 
     def params(self, index: int) -> EnvParams:
-        """The environment's parameters with one of the banks, all of equal shape."""
+        """Return the environment's parameters with one of the banks.
+
+        Those of all banks are of equal shape.
+        """
         return build(self.banks[index], self.step_limits, self.step_limit, self.num_cells, self.num_scenes)[1]
 
 
 def training_world(config: RunConfig, console: Console) -> CompiledWorld:
-    """The training scenes of a run."""
+    """Compile the training scenes of a run."""
     scenes = _scenes(config, "train", config.scenes, config.worlds.shift, console)
     return _compiled(config, scenes, {}, config.train_step_limit, console)
 
@@ -56,7 +59,9 @@ def training_world(config: RunConfig, console: Console) -> CompiledWorld:
 def evaluation_world(
     config: RunConfig, split: str, scenes: Path | None, shift: float | None, console: Console
 ) -> CompiledWorld:
-    """The scenes to evaluate a run in: one split of its own world or file, or of another file, or at another shift.
+    """Compile the scenes to evaluate a run in.
+
+    One split of its own world or file, or of another file, or at another shift.
 
     Raises:
       InputError: bad scene file, no scene of the split, or a bad shift.
@@ -69,7 +74,10 @@ def evaluation_world(
 
 
 def evaluation_shift(config: RunConfig, scenes: Path | None, shift: float | None) -> float:
-    """The shift that is asked for, else the run's own; another file is taken as it is."""
+    """Return the shift that is asked for, else the run's.
+
+    Another file is taken as it is.
+    """
     if shift is not None:
         return shift
     return 0.0 if scenes else config.worlds.shift
@@ -126,14 +134,20 @@ def _left_out(skipped: Sequence[str]) -> str:
 
 
 def bank_order(world: CompiledWorld, seed: int, turns: int) -> list[int]:
-    """Which bank is trained in at each turn: pass after pass over all of them, each in an order of its own."""
+    """Draw which bank is trained in at each turn.
+
+    Pass after pass over all of them, each in an order of its own.
+    """
     count = len(world.banks)
     passes = [np.random.default_rng([seed, i]).permutation(count).tolist() for i in range(-(-turns // count))]
     return [bank for order in passes for bank in order][:turns]
 
 
 def read_ahead(world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
-    """The environment's parameters with one bank after the other, the next one read while one is used."""
+    """Yield the environment's parameters with one bank after another.
+
+    The next one is read while one is used.
+    """
     if not order:
         return
     with ThreadPoolExecutor(1) as pool:

@@ -12,10 +12,8 @@ from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import first_states
 from jaxnav.layout import LayoutEstimator, LayoutState, Setting
-from jaxnav.policies.acting import Acting, Agent
-from jaxnav.policies.pathways import Memory
-from jaxnav.policies.policy import Params, bind
-from jaxnav.policies.spec import PolicySpec
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.policy import Params
 from jaxnav.study.association import RESAMPLES, interval, scene_draws, weight_below
 
 #: The beliefs behind a gap: updated by what is seen (eq. 4), or left at the prior.

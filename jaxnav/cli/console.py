@@ -1,4 +1,4 @@
-"""What all commands share: what they say, and how bad input ends them."""
+"""What all commands share."""
 
 from collections.abc import Callable
 
@@ -7,8 +7,11 @@ from rich.console import Console
 from jaxnav.errors import InputError
 
 
-def exit_code(command: Callable[[Console], None]) -> int:
-    """Run a command, which tells of its progress on the console it gets: 0, or 2 after bad input, told in one line."""
+def exit_code(command: Callable[[Console], object]) -> int:
+    """Run a command and return its exit code.
+
+    The command gets a console to tell of its progress on. The code is 0, or 2 after bad input, told in one line.
+    """
     console = Console(stderr=True, highlight=False)
     try:
         command(console)
@@ -19,5 +22,5 @@ def exit_code(command: Callable[[Console], None]) -> int:
 
 
 def result_console() -> Console:
-    """The console for a command's result, 120 columns wide wherever it goes."""
+    """Return the console for a result, 120 columns wide."""
     return Console(width=120, highlight=False)

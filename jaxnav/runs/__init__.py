@@ -1,0 +1,1 @@
+"""A training run: its configuration, directory, scenes, training and evaluation."""

@@ -1,0 +1,198 @@
+"""Evaluation of a run: fixed episodes, all variants and epsilons at once."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from jaxnav.baselines.shortest_path import oracle_outcome
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
+from jaxnav.evaluation.grid import Evaluator, Outcome
+from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.report import Form, build_difference, build_report, build_row, write_report
+from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
+from jaxnav.runs.directory import Run, settings
+from jaxnav.runs.worlds import evaluation_shift, evaluation_world, read_ahead
+from jaxnav.store.files import write_atomic
+
+
+class Results(NamedTuple):
+    """Hold an evaluation; R rows, S seeds, E episodes.
+
+    Attributes:
+      rows: of the table.
+      outcome: how the episodes went, leaves [R, S, E].
+      episodes: that were run.
+      categories: [K] names.
+      report: the table, paired differences, settings and versions, as JSON.
+    """
+
+    rows: list[Row]
+    outcome: Outcome
+    episodes: EpisodeList
+    categories: tuple[str, ...]
+    report: dict[str, Any]
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Return `sr`, `spl`, `sae` in [0, 1] and `dts` in metres, float64 [R, S, E]."""
+        return episode_metrics(self.outcome, self.episodes.best_length)
+
+    def write(self, path: Path) -> None:
+        """Write the report as JSON, and a CSV row per episode beside it.
+
+        Raises:
+          OSError: a file cannot be written.
+        """
+        write_report(path, self.report)
+        episodes = path.with_name(f"{path.name.removesuffix('.json')}.episodes.csv")
+        write_atomic(episodes, _episode_csv(self).encode())
+
+
+def evaluate(
+    run: Run,
+    *,
+    split: str = "val",
+    scenes: Path | None = None,
+    shift: float | None = None,
+    episodes: int = 1000,
+    epsilon: Sequence[float] = (0.5,),
+    form: Sequence[Form] | None = None,
+    seed: int = 0,
+    console: Console | None = None,
+) -> Results:
+    """Evaluate a run on fixed episodes, in one compiled call.
+
+    Args:
+      run: a finished run.
+      split: scenes to evaluate on.
+      scenes: scene file to read instead of the run's own world or file.
+      shift: layout shift, from 0 to 1; None for the run's, and 0 with `scenes`.
+      episodes: in the fixed list, balanced over room types and scenes.
+      epsilon: thresholds of sTDE.
+      form: how sTDE combines the logits; None for that of the run's layout setting.
+      seed: of the episode list, the sampled actions and the bootstrap, from 0 to 2**32 - 1.
+      console: to tell of progress on; None for silence.
+
+    Raises:
+      InputError: no finished run, or an impossible argument.
+    """
+    if not 0 <= seed < 2**32:
+        raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
+    console = console or Console(quiet=True)
+    config, policies = run.config, run.policies()
+    if form is None:
+        form = () if policies.setting is None else (policies.setting.form,)
+    rows = table_rows(epsilon, form, policies.arms)
+    world = evaluation_world(config, split, scenes, shift, console)
+    everything = range(len(world.banks))
+    each = -(-episodes // len(world.banks))
+    lists = [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
+    evaluator = Evaluator(policies.acting(world.env))
+    outcome = evaluator(
+        inference_grid(rows, policies.arms, policies.seeds),
+        policies.params,
+        zip(lists, read_ahead(world, everything), strict=True),
+        policies.knowledge,
+        jax.random.key(seed),
+    )
+    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
+    shortest = oracle_outcome(world.banks, lists, read_ahead(world, everything), world.env)
+    rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)
+    about = settings(config) | {
+        "steps_per_policy": config.total_updates * config.update_steps,
+        "prior_steps": policies.prior_steps,
+        "evaluation_source": str(scenes or config.source),
+        "evaluation_shift": evaluation_shift(config, scenes, shift),
+        "evaluation_seed": seed,
+    }
+    results = Results(rows, outcome, together(lists), world.env.categories, {})
+    names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
+    table, differences = _table(results, names, seed), _differences(results, seed)
+    return results._replace(report=build_report(table, differences, evaluator.compilations, about))
+
+
+def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
+    """Add a row to outcomes [R, S, E]: the oracle's [E], the same for all seeds."""
+
+    def added(leaf: np.ndarray, row: np.ndarray) -> np.ndarray:
+        return np.concatenate([leaf, np.broadcast_to(row, leaf.shape[1:])[None].astype(leaf.dtype)])
+
+    return jax.tree.map(added, outcome, shortest)
+
+
+def _table(results: Results, names: dict[str, str], seed: int) -> list[dict[str, Any]]:
+    """Make the table; equal resamples for every row, so that equal results get equal intervals."""
+    metrics = results.metrics()
+    return [
+        build_row(
+            variant=row.variant,
+            **names,
+            epsilon=row.epsilon,
+            decoding=row.decoding,
+            form=row.form,
+            metrics={name: values[i] for name, values in metrics.items()},
+            best_lengths=results.episodes.best_length,
+            strata=results.episodes.room,
+            generator=np.random.default_rng(seed),
+        )
+        for i, row in enumerate(results.rows)
+    ]
+
+
+def _differences(results: Results, seed: int) -> list[dict[str, Any]]:
+    """Make the paired differences that the table is read for, where both rows are there."""
+    metrics, rows = results.metrics(), results.rows
+    differences = []
+    for i, row in enumerate(rows):
+        if row.arm != "layout":
+            continue
+        reference = "baseline" if row.variant == "layout" else "layout"
+        against = Row(reference, None, None, row.decoding)
+        if against not in rows:
+            continue
+        differences += [
+            build_difference(
+                metric,
+                (reference, metrics[metric][rows.index(against)]),
+                (row.variant, metrics[metric][i]),
+                epsilon=row.epsilon,
+                form=row.form,
+                decoding=row.decoding,
+                strata=results.episodes.room,
+                generator=np.random.default_rng(seed),
+                same_seeds=reference == "layout",
+            )
+            for metric in ("sr", "spl", "dts")
+        ]
+    return differences
+
+
+def _episode_csv(results: Results) -> str:
+    """Make one line per row of the table, seed and episode."""
+    metrics, outcome, episodes = results.metrics(), results.outcome, results.episodes
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        [*Row._fields, "seed", "scene", "room", "goal", "start_pose", "best_length", "length", *metrics, "mean_weight"]
+    )
+    fixed = [
+        (episodes.scenes[scene], episodes.rooms[room], results.categories[goal], pose, best)
+        for scene, room, goal, pose, best in zip(
+            episodes.scene, episodes.room, episodes.goal, episodes.pose, episodes.best_length, strict=True
+        )
+    ]
+    for r, row in enumerate(results.rows):
+        for seed in range(outcome.length.shape[1]):
+            columns = (outcome.length, *metrics.values(), outcome.weight)
+            values = np.stack([np.asarray(column)[r, seed] for column in columns], axis=-1)
+            writer.writerows(
+                (*row, seed, *known, *(f"{value:.6g}" for value in measured))
+                for known, measured in zip(fixed, values.tolist(), strict=True)
+            )
+    return text.getvalue()

@@ -1,0 +1,88 @@
+"""The sweep: every epsilon and every seed in one compiled call."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import episode_list, together
+from jaxnav.evaluation.grid import Evaluator, Outcome
+from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.report import Decoding, Form
+from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.runs.directory import Run
+from jaxnav.runs.worlds import evaluation_world, read_ahead
+
+
+class Sweep(NamedTuple):
+    """Hold a sweep of X thresholds and S seeds over E episodes.
+
+    Attributes:
+      epsilon: float64 [X].
+      sr, spl: float64 [X, S, E], in [0, 1].
+      dts: float64 [X, S, E], metres.
+      outcome: how the episodes went, leaves [X, S, E].
+      compilations: that it took; 1 where the scenes are in memory.
+    """
+
+    epsilon: np.ndarray
+    sr: np.ndarray
+    spl: np.ndarray
+    dts: np.ndarray
+    outcome: Outcome
+    compilations: int
+
+
+def sweep(
+    run: Run,
+    epsilon: Sequence[float] | np.ndarray,
+    params: Any = None,
+    *,
+    split: str = "val",
+    scenes: Path | None = None,
+    shift: float | None = None,
+    episodes: int = 1000,
+    decoding: Decoding = "argmax",
+    form: Form | None = None,
+    seed: int = 0,
+) -> Sweep:
+    """Evaluate sTDE at every threshold and seed in one compiled call.
+
+    Args:
+      run: a finished run with the arm `layout`.
+      epsilon: thresholds [X]; at 1 or more nothing is removed.
+      params: parameters of your own, leaves [S, ...]; None for the run's.
+      split, scenes, shift, episodes, form, seed: as in `jaxnav.evaluate`.
+      decoding: `argmax` for best actions, `sample` for sampled ones.
+
+    Raises:
+      InputError: no finished run, a run without the arm `layout`, or an impossible argument.
+    """
+    policies = run.policies(("layout",))
+    if policies.setting is None:
+        raise InputError(f"{run.config.run_dir}: its layout arm has no layout setting; train the run anew")
+    if not len(epsilon):
+        raise InputError("epsilon: give at least one number")
+    form = policies.setting.form if form is None else form
+    policies = policies if params is None else policies._replace(params=jax.tree.map(jnp.asarray, params))
+    rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilon]
+    world = evaluation_world(run.config, split, scenes, shift, Console(quiet=True))
+    each = -(-episodes // len(world.banks))
+    lists = [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
+    evaluator = Evaluator(policies.acting(world.env))
+    outcome = evaluator(
+        inference_grid(rows, policies.arms, policies.seeds),
+        policies.params,
+        zip(lists, read_ahead(world, range(len(world.banks))), strict=True),
+        policies.knowledge,
+        jax.random.key(seed),
+    )
+    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
+    metrics = episode_metrics(outcome, together(lists).best_length)
+    sr, spl, dts = (metrics[name] for name in ("sr", "spl", "dts"))
+    return Sweep(np.asarray(epsilon, np.float64), sr, spl, dts, outcome, evaluator.compilations)
