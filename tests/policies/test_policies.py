@@ -45,7 +45,7 @@ class Compiled:
     """A policy with compiled methods."""
 
     def __init__(self, method):
-        spec = dataclasses.replace(SPEC, method=method)
+        spec = dataclasses.replace(SPEC, method=method, method_sizes=SPEC.method_sizes if method == "org" else ())
         policy = bind(spec, lively(0, spec))
         self.experience_width = policy.method.width
         self.pathways = jax.jit(lambda observation, weights: policy.pathways(observation, weights))
@@ -53,7 +53,7 @@ class Compiled:
         self.initial_memory = policy.initial_memory
 
 
-@pytest.fixture(scope="module", params=METHODS)
+@pytest.fixture(scope="module", params=["rgb", "org"])
 def policy(request):
     return Compiled(request.param)
 
@@ -215,7 +215,8 @@ from jaxnav.policies import policy, spec
 from jaxnav.store.export import load_params
 from jaxnav.env.types import Observation
 params, told = load_params(Path(sys.argv[1]))
-bound = policy.bind(spec.PolicySpec(told["method"], told["num_categories"], spec.Sizes(**told["sizes"])), params)
+sizes = spec.Sizes(**told["sizes"]), tuple(map(tuple, told["method_sizes"]))
+bound = policy.bind(spec.PolicySpec(told["method"], told["num_categories"], *sizes), params)
 given = np.load(sys.argv[2])
 observation = Observation(row=jnp.asarray(given["row"]), goal=jnp.asarray(given["goal"]))
 pathways = bound.pathways(observation, jnp.asarray(given["weights"]))

@@ -8,8 +8,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runs.overlay import apply_yaml
 from jaxnav.errors import InputError
+from jaxnav.runs.overlay import apply_yaml
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,8 @@ import numpy as np
 from jaxnav.causal import do
 from jaxnav.env.objectnav import NUM_PRIORS, build
 from jaxnav.env.types import Observation
-from jaxnav.layout import LayoutEstimator, prior_from_counts
+from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
+from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import compile_bank
@@ -17,9 +18,9 @@ from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from support.scenes import CATEGORIES, SMALL, draw
 
-SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4, relation_layers=2)
-SPEC = PolicySpec(method="org", num_categories=len(CATEGORIES), sizes=SIZES)
-SETTING = "calibrated"
+SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
+SPEC = PolicySpec("org", len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),))
+SETTING = SETTINGS["calibrated"]
 #: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
 LIMITS = (6, 8)
 
@@ -39,10 +40,10 @@ def world():
     return build(BANK, {"kitchen": LIMITS[0], "bedroom": LIMITS[1]}, 0)
 
 
-def priors():
+def knowledge():
     """Some prior of each room type."""
     counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, *2 * [len(CATEGORIES)]))
-    return jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts))
+    return Knowledge(jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts)))
 
 
 _init = jax.jit(init_params, static_argnums=0)

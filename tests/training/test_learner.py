@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from test_rollout import ACTING, ENVS, LENGTH, PARAMS, PRIORS, act
+from support.rollouts import ACTING, ENVS, KNOWLEDGE, LENGTH, PARAMS, act
 
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import Knowledge
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.learner import Learner, block_order, regroup
 
@@ -28,7 +30,7 @@ CONFIG = PPOConfig(
     max_grad_norm=0.5,
     distil=0.02,
 )
-LEARNER = Learner(acting=ACTING, spec=tiny.SPEC, config=CONFIG, counterfactual="distil")
+LEARNER = Learner(acting=ACTING, config=CONFIG, counterfactual="distil")
 UPDATES = 400
 SCALARS = CONFIG.scalars(UPDATES)
 METRICS = {
@@ -41,23 +43,23 @@ traces = []
 
 
 @jax.jit
-def one_update(states, scalars, params, priors):
+def one_update(states, scalars, params, knowledge):
     """A chunk of one update of several seeds, as in a run."""
     traces.append(1)
-    return jax.lax.map(lambda state: LEARNER.train(state, scalars, params, priors, 1), states)
+    return jax.lax.map(lambda state: LEARNER.train(state, scalars, params, knowledge, 1), states)
 
 
 @jax.jit
-def two_updates(state, scalars, params, priors):
+def two_updates(state, scalars, params, knowledge):
     """A chunk of two updates of one seed."""
     traces.append(2)
-    return LEARNER.train(state, scalars, params, priors, 2)
+    return LEARNER.train(state, scalars, params, knowledge, 2)
 
 
 @pytest.fixture(scope="module")
 def seeds():
     """Two seeds before their first update."""
-    states = [init(jax.random.key(seed), PARAMS, PRIORS) for seed in range(2)]
+    states = [init(jax.random.key(seed), PARAMS, KNOWLEDGE) for seed in range(2)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
 
 
@@ -65,8 +67,8 @@ def seeds():
 def chunks(seeds):
     """Both seeds after one update, and the first one, alone, after two; compiled side by side."""
     with ThreadPoolExecutor() as pool:
-        one = pool.submit(one_update, seeds, SCALARS, PARAMS, PRIORS)
-        two = pool.submit(two_updates, tiny.at(seeds, 0), SCALARS, PARAMS, PRIORS)
+        one = pool.submit(one_update, seeds, SCALARS, PARAMS, KNOWLEDGE)
+        two = pool.submit(two_updates, tiny.at(seeds, 0), SCALARS, PARAMS, KNOWLEDGE)
         return one.result(), two.result()
 
 
@@ -89,7 +91,7 @@ def kernel(states):
 
 
 def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, whole):
-    second = one_update(first[0], SCALARS, PARAMS, PRIORS)
+    second = one_update(first[0], SCALARS, PARAMS, KNOWLEDGE)
     assert_same(tiny.at(second[0], 0), whole[0])
     assert whole[0].update == 2
     # Metrics of the whole are those of the parts: sums of episodes, means over updates, means over episodes.
@@ -107,7 +109,7 @@ def test_another_seed_gives_another_policy(first, seeds):
         assert not np.array_equal(kernel(states)[0], kernel(states)[1])
     # So does another key of the updates alone.
     rekeyed = seeds.replace(key=seeds.key[::-1])
-    assert not np.array_equal(kernel(one_update(rekeyed, SCALARS, PARAMS, PRIORS)[0])[0], kernel(first[0])[0])
+    assert not np.array_equal(kernel(one_update(rekeyed, SCALARS, PARAMS, KNOWLEDGE)[0])[0], kernel(first[0])[0])
 
 
 def test_metrics_are_finite_scalars(whole):
@@ -125,7 +127,7 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended(seeds, first):
     """Of one update, recounted from the rollout that it makes."""
     start = tiny.at(seeds, 0)
     key = jax.random.fold_in(jax.random.fold_in(start.key, start.update), 0)
-    t = jax.tree.map(np.asarray, act(start.params, start.agent, key, False)[1])
+    t = jax.tree.map(np.asarray, act(start.params, start.agent, key, False)[1].transitions)
     metrics = {name: float(value[0]) for name, value in first[1].items()}
     ended = t.terminated | t.truncated
     assert metrics["episodes"] == ended.sum() > 20
@@ -139,28 +141,28 @@ def test_no_episode_that_ends_counts_as_none(seeds):
     """After 6 steps none has reached a limit of 1000, and an actor that never says Done ends none either."""
     bias = seeds.params["actor"]["bias"].at[:, -1].set(-1e9)
     mute = seeds.replace(params=seeds.params | {"actor": seeds.params["actor"] | {"bias": bias}})
-    _, metrics = one_update(mute, SCALARS, PARAMS.replace(step_limit=jnp.full(2, 1000, jnp.int32)), PRIORS)
+    _, metrics = one_update(mute, SCALARS, PARAMS.replace(step_limit=jnp.full(2, 1000, jnp.int32)), KNOWLEDGE)
     for name in ("episodes", "success", "return", "length", "truncated"):
         np.testing.assert_array_equal(metrics[name], [0, 0])
 
 
 def test_chunks_and_other_scalars_do_not_trace_again(first):
     before = len(traces)
-    states, _ = one_update(first[0], SCALARS, PARAMS, PRIORS)
-    one_update(states, SCALARS.replace(learning_rate=jnp.float32(0.1), entropy=jnp.float32(0.5)), PARAMS, PRIORS)
-    one_update(states, SCALARS, PARAMS.replace(success_reward=jnp.float32(1)), 2 * PRIORS)
+    states, _ = one_update(first[0], SCALARS, PARAMS, KNOWLEDGE)
+    one_update(states, SCALARS.replace(learning_rate=jnp.float32(0.1), entropy=jnp.float32(0.5)), PARAMS, KNOWLEDGE)
+    one_update(states, SCALARS, PARAMS.replace(success_reward=jnp.float32(1)), Knowledge(2 * KNOWLEDGE.layout))
     assert len(traces) == before
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf")])
 def test_gradients_that_are_not_finite_are_skipped_and_counted(seeds, poison):
     poisoned = PARAMS.replace(success_reward=jnp.float32(poison), step_reward=jnp.float32(poison))
-    states, metrics = one_update(seeds, SCALARS, poisoned, PRIORS)
+    states, metrics = one_update(seeds, SCALARS, poisoned, KNOWLEDGE)
     np.testing.assert_array_equal(metrics["skipped_steps"], [8, 8])  # 4 epochs of 2 minibatches
     # Neither the parameters nor the moments have changed, so that learning goes on as if nothing had been.
     chex.assert_trees_all_equal(states.params, seeds.params)
     chex.assert_trees_all_equal(states.optimizer.inner_state, seeds.optimizer.inner_state)
-    healed, metrics = one_update(states, SCALARS, PARAMS, PRIORS)
+    healed, metrics = one_update(states, SCALARS, PARAMS, KNOWLEDGE)
     np.testing.assert_array_equal(metrics["skipped_steps"], [0, 0])
     chex.assert_tree_all_finite(healed.params)
     assert not np.array_equal(kernel(healed), kernel(states))
@@ -168,7 +170,7 @@ def test_gradients_that_are_not_finite_are_skipped_and_counted(seeds, poison):
 
 def test_the_learning_rate_falls_to_zero(seeds):
     last = seeds.replace(update=jnp.full(2, UPDATES, jnp.int32))
-    states, _ = one_update(last, SCALARS, PARAMS, PRIORS)
+    states, _ = one_update(last, SCALARS, PARAMS, KNOWLEDGE)
     chex.assert_trees_all_equal(states.params, seeds.params)
 
 
@@ -191,9 +193,9 @@ def test_minibatches_differ_between_epochs():
 
 def test_a_method_without_experience_trains():
     spec = dataclasses.replace(tiny.SPEC, method="rgb")
-    learner = dataclasses.replace(LEARNER, spec=spec, acting=dataclasses.replace(ACTING, setting=None))
-    before = learner.init(jax.random.key(0), PARAMS, PRIORS)
-    after, metrics = jax.jit(learner.update)(before, SCALARS, PARAMS, PRIORS)
+    learner = dataclasses.replace(LEARNER, acting=Acting(ACTING.env, spec))
+    before = learner.init(jax.random.key(0), PARAMS, KNOWLEDGE)
+    after, metrics = jax.jit(learner.update)(before, SCALARS, PARAMS, KNOWLEDGE)
     chex.assert_tree_all_finite((after.params, metrics))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).sum()), before.params, after.params)
     assert moved["view"]["kernel"] > 0.0
@@ -202,9 +204,9 @@ def test_a_method_without_experience_trains():
 def test_ppo_learns():
     """A random policy soon says Done and is right by chance; a trained one finds the goals within 20 steps."""
     params = PARAMS.replace(step_limit=jnp.full(2, 20, jnp.int32))
-    state, success = init(jax.random.key(0), params, PRIORS), []
+    state, success = init(jax.random.key(0), params, KNOWLEDGE), []
     for _ in range(UPDATES // 2):
-        state, metrics = two_updates(state, SCALARS, params, PRIORS)
+        state, metrics = two_updates(state, SCALARS, params, KNOWLEDGE)
         success.append(float(metrics["success"]))
     assert np.mean(success[:5]) < 0.5
     assert np.mean(success[-20:]) > 0.9

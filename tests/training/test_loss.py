@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import tiny_world as tiny
-from test_rollout import ENVS, LENGTH, PARAMS, ROWS, decide_again, rolled
+from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, ROWS, decide_again, rolled
 
+from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION, Memory, Pathways
-from jaxnav.policies.policy import bind
 from jaxnav.training.collect import zero_direct
 from jaxnav.training.config import PPOConfig, PPOScalars
-from jaxnav.training.loss import advantages, ppo_loss
+from jaxnav.training.loss import advantages, ppo_loss, replay
 
 F = np.float32
 
@@ -29,47 +29,47 @@ def column(*values):
 
 def test_advantages_by_hand():
     # Gamma = lambda = 1/2, so a delta counts a quarter one step earlier. Step 1 ends by Done: nothing follows. Step 3
-    # is cut at a state of value 4. Step 4 goes on with the state after the rollout, of value 6.
+    # is truncated at a state of value 4. Step 4 goes on with the state after the rollout, of value 6.
     value = column(F(1), F(2), F(1), F(1), F(2))
     reward = column(F(1), F(0), F(2), F(1), F(3))
-    following = column(F(2), F(0), F(1), F(4), F(6))
+    next_value = column(F(2), F(0), F(1), F(4), F(6))
     ended = column(False, True, False, True, False)
     # delta_4 = 3 + 6/2 - 2 = 4                      A_4 = 4
     # delta_3 = 1 + 4/2 - 1 = 2, the episode ends:   A_3 = 2
     # delta_2 = 2 + 1/2 - 1 = 1.5                    A_2 = 1.5 + 2/4 = 2
     # delta_1 = 0 + 0/2 - 2 = -2, it ends:           A_1 = -2
     # delta_0 = 1 + 2/2 - 1 = 1                      A_0 = 1 - 2/4 = 0.5
-    found = advantages(reward, value, following, ended, jnp.float32(0.5), jnp.float32(0.5))
+    found = advantages(reward, value, next_value, ended, jnp.float32(0.5), jnp.float32(0.5))
     np.testing.assert_array_equal(found, column(0.5, -2.0, 2.0, 2.0, 4.0))
 
 
 def random_steps(seed, length=7, envs=5):
     generator = np.random.default_rng(seed)
-    reward, value, cut = generator.normal(size=(3, length, envs)).astype(F)
+    reward, value, last = generator.normal(size=(3, length, envs)).astype(F)
     terminated, truncated = generator.random((2, length, envs)) < 0.2
     truncated &= ~terminated
-    following = np.concatenate([value[1:], generator.normal(size=(1, envs)).astype(F)])
-    following = np.where(truncated, cut, np.where(terminated, F(0), following))
-    return reward, value, following, terminated | truncated
+    next_value = np.concatenate([value[1:], generator.normal(size=(1, envs)).astype(F)])
+    next_value = np.where(truncated, last, np.where(terminated, F(0), next_value))
+    return reward, value, next_value, terminated | truncated
 
 
 @given(st.integers(0, 1000), st.floats(0, 1, width=32), st.floats(0, 1, width=32))
 def test_advantages_in_numpy(seed, gamma, lambda_):
-    reward, value, following, ended = random_steps(seed)
+    reward, value, next_value, ended = random_steps(seed)
     expected = np.zeros_like(reward)
     for b in range(reward.shape[1]):
         advantage = 0.0
         for t in reversed(range(len(reward))):
-            delta = reward[t, b] + gamma * following[t, b] - value[t, b]
+            delta = reward[t, b] + gamma * next_value[t, b] - value[t, b]
             advantage = delta if ended[t, b] else delta + gamma * lambda_ * advantage
             expected[t, b] = advantage
-    found = jax.jit(advantages)(reward, value, following, ended, F(gamma), F(lambda_))
+    found = jax.jit(advantages)(reward, value, next_value, ended, F(gamma), F(lambda_))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 @given(st.integers(0, 1000), st.floats(0, 1, width=32))
 def test_at_lambda_one_the_advantage_is_the_discounted_return_minus_the_value(seed, gamma):
-    reward, value, following, ended = random_steps(seed)
+    reward, value, next_value, ended = random_steps(seed)
     length, envs = reward.shape
     expected = np.zeros_like(reward)
     for b in range(envs):
@@ -77,8 +77,8 @@ def test_at_lambda_one_the_advantage_is_the_discounted_return_minus_the_value(se
             # The rewards up to the end of the episode or of the rollout, then what follows there.
             last = next((i for i in range(t, length) if ended[i, b]), length - 1)
             rewards = sum(gamma ** (i - t) * reward[i, b] for i in range(t, last + 1))
-            expected[t, b] = rewards + gamma ** (last + 1 - t) * following[last, b] - value[t, b]
-    found = jax.jit(advantages)(reward, value, following, ended, F(gamma), F(1))
+            expected[t, b] = rewards + gamma ** (last + 1 - t) * next_value[last, b] - value[t, b]
+    found = jax.jit(advantages)(reward, value, next_value, ended, F(gamma), F(1))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -94,7 +94,8 @@ def scalars(**changes) -> PPOScalars:
 @functools.partial(jax.jit, static_argnums=3)
 def loss(weights, advantage, scalars, distil):
     run = rolled(True)
-    return ppo_loss(bind(tiny.SPEC, weights), run.transitions, run.before.memory, advantage, PARAMS, scalars, distil)
+    replayed = replay(ACTING.bind(weights), run.transitions, run.memory, PARAMS)
+    return ppo_loss(replayed, advantage, scalars, distil, METHODS["org"])
 
 
 def some_advantage():
@@ -127,7 +128,7 @@ def loss_in_numpy(decisions, counterfactual, transitions, advantage):
 @pytest.mark.parametrize("distil", [False, True])
 def test_the_loss_is_that_of_numpy(distil):
     run, advantage = rolled(True), some_advantage()
-    decisions = decide_again(NEW, run.transitions, run.before.memory)
+    decisions = decide_again(NEW, run.transitions, run.memory)
     expected = loss_in_numpy(*jax.tree.map(np.asarray, decisions), run.transitions, advantage)
     total = expected["policy_loss"] + 0.7 * expected["value_loss"] - 0.03 * expected["entropy"]
     if distil:
@@ -167,7 +168,7 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
     run = rolled(True)
     t, slot = run.transitions, 1
     rows, log_pi, memories = ROWS[t.pose[:, slot]], [], []
-    memory = tiny.at(run.before.memory, slot)
+    memory = tiny.at(run.memory, slot)
     for time in range(LENGTH):
         now = tiny.at(t, time, slot)
         memories.append(memory)
@@ -185,9 +186,10 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
 
     def distil_loss(weights):
         one = jax.tree.map(lambda leaf: leaf[:, [slot]], t)
-        memory = jax.tree.map(lambda leaf: leaf[[slot]], run.before.memory)
+        memory = jax.tree.map(lambda leaf: leaf[[slot]], run.memory)
         nothing = jnp.zeros((LENGTH, 1))
-        return ppo_loss(bind(tiny.SPEC, weights), one, memory, nothing, PARAMS, scalars(**DISTIL_ONLY), True)[0]
+        replayed = replay(ACTING.bind(weights), one, memory, PARAMS)
+        return ppo_loss(replayed, nothing, scalars(**DISTIL_ONLY), True, METHODS["org"])[0]
 
     assert t.direct[:, slot].any()
     assert not t.direct[:, slot].all()
