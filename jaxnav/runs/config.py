@@ -136,11 +136,10 @@ class RunConfig:
         goals = task.goals if worlds.goals is None else worlds.goals
         return dataclasses.replace(task, goals=goals, detector=self.detector)
 
-    @property
-    def policy_spec(self) -> PolicySpec:
+    def policy_spec(self, num_categories: int) -> PolicySpec:
         """Return what its policies are built from."""
         sizes = tuple(sorted(self.method_sizes.items()))
-        return PolicySpec(self.method, len(self.task.categories), self.sizes, sizes, self.direct, self.done_gate)
+        return PolicySpec(self.method, num_categories, self.sizes, sizes, self.direct, self.done_gate)
 
     @property
     def train_step_limit(self) -> int:

@@ -160,10 +160,10 @@ def make_trainer(
       knowledge: what was learned before training.
       mesh: of devices; None for one device.
     """
+    spec = config.policy_spec(len(env.categories))
     settings = {"baseline": None, "layout": dataclasses.replace(setting, gap="none")}
     learners = {
-        name: Learner(Acting(env, config.policy_spec, settings[name]), config.ppo, config.counterfactual)
-        for name in config.arms
+        name: Learner(Acting(env, spec, settings[name]), config.ppo, config.counterfactual) for name in config.arms
     }
     scalars, key = config.ppo.scalars(config.total_updates), jax.random.key(config.seed)
     arguments = learners, scalars, knowledge, key, config.seeds, config.chunk

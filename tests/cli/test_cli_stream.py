@@ -16,12 +16,14 @@ from support.commands import CONFIG, evaluate, train
 
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.layout import Setting
+from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig, WorldConfig
+from jaxnav.runs.train import make_trainer
 from jaxnav.runs.worlds import bank_order, evaluation_world, read_ahead, training_world
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.store.runlog import read_rows
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.trainer import Arms
+from jaxnav.training.trainer import Trainer
 
 OPTIONS = ("--worlds.num-train", 9, "--worlds.shard-scenes", 3, "--total-steps", 1024)
 
@@ -86,10 +88,10 @@ def test_banks_are_read_one_ahead(world, monkeypatch):
 def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
     config = RunConfig(ppo=PPOConfig(num_envs=32, rollout=4, minibatches=2), seeds=1, sizes=tiny.SIZES)
-    arms = Arms(config, world.env, Setting(), jnp.ones((NUM_PRIORS, 22, 22)))
-    before = arms.init(world.params(0))
+    trainer = make_trainer(config, world.env, Setting(), Knowledge(jnp.ones((NUM_PRIORS, 22, 22))))
+    before = trainer.init(world.params(0))
     kept = jax.tree.map(np.array, before["layout"][0].replace(key=None))
-    after = arms.restart(before, world.params(1))["layout"][0]
+    after = trainer.restart(before, world.params(1))["layout"][0]
     chex.assert_trees_all_equal(
         (after.params, after.optimizer, after.update), (kept.params, kept.optimizer, kept.update)
     )
@@ -101,15 +103,15 @@ def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
 @pytest.mark.slow
 def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache, tmp_path, monkeypatch, capsys):
     """8 updates in chunks of 2 go through four turns of three shards; the second half comes after a stop."""
-    stopped, calls, whole = tmp_path / "stopped", [], Arms.train
+    stopped, calls, whole = tmp_path / "stopped", [], Trainer.train
 
-    def train_twice(self, states, params):
+    def train_twice(self, states, params, stage):
         calls.append(1)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return whole(self, states, params)
+        return whole(self, states, params, stage)
 
-    monkeypatch.setattr(Arms, "train", train_twice)
+    monkeypatch.setattr(Trainer, "train", train_twice)
     with pytest.raises(KeyboardInterrupt):
         train(config_file, stopped, *OPTIONS, "--cache", cache)
     assert [row["step"] for row in read_rows(stopped / "metrics.jsonl")] == [2, 2, 4, 4]

@@ -95,7 +95,7 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("seeds: two", "seeds must be int, but is 'two' (str)"),
         ("ppo: {gamma: [1]}", "ppo.gamma must be float, but is [1] (list)"),
         ("counterfactual: maybe", "counterfactual must be one of 'none', 'coin', 'distil', but is 'maybe'"),
-        ("method: orgy", "method is 'orgy'; choose one of rgb, org"),
+        ("method: orgy", "method 'orgy': is unknown; did you mean 'org'?"),
         ("seeds: 0", "seeds is 0; give at least 1"),
         ("sizes: {hidden: -8}", "sizes.hidden is -8; give at least 1"),
         ("worlds: {num_train: 0}", "worlds.num_train is 0; give at least 1"),

@@ -10,36 +10,43 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 
-from jaxnav.causal import remove_experience
+from jaxnav.causal import stde
 from jaxnav.evaluation.episodes import episode_list, together
-from jaxnav.evaluation.grid import act, evaluate_grid, first_states
+from jaxnav.evaluation.grid import Evaluator, act, first_states
+from jaxnav.evaluation.inference import Branch
 from jaxnav.evaluation.playback import play
-from jaxnav.evaluation.variants import inference_grid, table_rows
+from jaxnav.evaluation.variants import inference_grid, table_row, table_rows
 from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.policies.policy import bind
 from jaxnav.scenes.task import DONE, MOVE_AHEAD
-from jaxnav.study.trials import Trial, trial_grid
 
 SEEDS, LIMITS = 2, (12, 16)
 ENV, PARAMS = tiny.world()
 PARAMS = PARAMS.replace(step_limit=jnp.array(LIMITS, jnp.int32))
-PRIORS = 0.05 * tiny.priors()  # a belief that gives way at once: large gaps
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)  # a belief that gives way at once: large gaps
 EPISODES = episode_list(tiny.BANK, 24, seed=1)
-ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"])
+ARMS = ("baseline", "layout")
+ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"], ARMS)
 #: Parameters of the two baselines, then of the two layout policies; seeds that say Done here and there.
 WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) for seed in (5, 9, 6, 11)))
 
 
-#: Controls whose weights or logits are of other episodes or drawn by key.
-TRIALS = [
-    Trial("stde", "argmax", 0.0, "paper", "shuffled"),
-    Trial("stde", "sample", 0.2, "residual", "shuffled"),
-    Trial("stde", "argmax", 0.0, "paper", "noise"),
-    Trial("stde", "sample", 0.0, "paper", "random"),
+def control(epsilon, form, decoding, **changes):
+    """The cells of sTDE with something changed."""
+    cells = inference_grid([table_row("stde", epsilon, form, decoding)], ARMS, SEEDS)
+    return cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
+
+
+#: Controls whose gaps or logits are of other episodes or drawn by key.
+CONTROLS = [
+    control(0.0, "paper", "argmax", shuffled=True),
+    control(0.2, "residual", "sample", shuffled=True),
+    control(0.0, "paper", "argmax", branch=Branch.NOISE),
+    control(0.0, "paper", "sample", intervention=1.0),
 ]
-CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, SEEDS), trial_grid(TRIALS, SEEDS))
-ACTING, KEY = Acting(ENV, tiny.SETTING), jax.random.key(3)
+CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, ARMS, SEEDS), *CONTROLS)
+ACTING, KEY = Acting(ENV, tiny.SPEC, tiny.SETTING), jax.random.key(3)
 
 
 class Compilations(logging.Handler):
@@ -60,10 +67,15 @@ def evaluated():
     logger.addHandler(handler)
     try:
         with jax.log_compiles():
-            outcome, told = evaluate_grid(CELLS, WEIGHTS, [(EPISODES, PARAMS)], ACTING, tiny.SPEC, PRIORS, KEY)
+            evaluator = Evaluator(ACTING)
+            outcome = evaluator(CELLS, WEIGHTS, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
     finally:
         logger.removeHandler(handler)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, SEEDS, len(EPISODES.goal)), outcome), handler.count, told
+    return (
+        jax.tree.map(lambda leaf: leaf.reshape(-1, SEEDS, len(EPISODES.goal)), outcome),
+        handler.count,
+        evaluator.compilations,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +137,11 @@ def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_othe
     """Two parts of few episodes, in another order and by some of the cells in another order."""
     parts = [np.array([0, 1, 2, 3, 20, 11]), np.array([12, 5, 4, 23, 8, 17])]
     cells = np.arange(len(ROWS))[::-3]
-    grid = inference_grid([ROWS[i] for i in cells], SEEDS)
+    grid = inference_grid([ROWS[i] for i in cells], ARMS, SEEDS)
     lists = [part(episodes) for episodes in parts]
-    found, compilations = evaluate_grid(grid, WEIGHTS, [(own, PARAMS) for own in lists], ACTING, tiny.SPEC, PRIORS, KEY)
-    assert compilations == 1
+    evaluator = Evaluator(ACTING)
+    found = evaluator(grid, WEIGHTS, [(episodes, PARAMS) for episodes in lists], KNOWLEDGE, KEY)
+    assert evaluator.compilations == 1
     found = jax.tree.map(lambda leaf: leaf.reshape(len(cells), SEEDS, -1), found)
     expected = jax.tree.map(lambda leaf: leaf[cells][..., np.concatenate(parts)], outcome)
     best = np.array([ROWS[i].decoding == "argmax" for i in cells])
@@ -147,7 +160,7 @@ def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_othe
 
 def test_a_single_episode():
     grid = tiny.at(CELLS, slice(1))
-    found, _ = evaluate_grid(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], ACTING, tiny.SPEC, PRIORS, KEY)
+    found = Evaluator(ACTING)(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], KNOWLEDGE, KEY)
     assert found.length.shape == (1, 1)
     assert 1 <= found.length[0, 0] <= max(LIMITS)
 
@@ -158,7 +171,7 @@ def test_a_single_episode():
 def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
     """One episode, best actions, by single calls."""
     scene, goal, pose = (int(getattr(EPISODES, name)[episode]) for name in ("scene", "goal", "pose"))
-    prior, weights, belief = PRIORS[PARAMS.room[scene]], tiny.at(WEIGHTS, seed), None
+    prior, weights, belief = KNOWLEDGE.layout[PARAMS.room[scene]], tiny.at(WEIGHTS, seed), None
     memory = Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
     length, action, total, moves = 0, None, 0.0, 0
     while length < LIMITS[scene] and action != DONE:
@@ -167,7 +180,7 @@ def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
         relevance = tiny.goal_weights(belief, goal) if layout else jnp.ones(3)
         factual, counterfactual = tiny.decide(weights, row, goal, relevance, memory)
         weight = jnp.maximum(belief.gap - epsilon, 0)
-        logits = remove_experience(factual.logits, counterfactual.logits, weight, form)
+        logits = stde(factual.logits, counterfactual.logits, belief.gap, epsilon, form)
         action = int(np.argmax(logits))
         length, moves, total = length + 1, moves + (action == MOVE_AHEAD), total + float(weight)
         memory = Memory(factual.hidden, jnp.int32(action))  # what is carried on is factual
@@ -197,33 +210,34 @@ def test_outcomes_are_those_of_a_plain_loop(outcome, variant, epsilon, form):
 
 @jax.jit
 def begin(weights):
-    return ACTING.begin(first_states(EPISODES), bind(tiny.SPEC, weights), PARAMS, PRIORS)
+    memory = ACTING.bind(weights).initial_memory(EPISODES.goal.shape)
+    return ACTING.begin(first_states(EPISODES), memory, KNOWLEDGE, PARAMS)
 
 
 @jax.jit
 def take(cell, weights, agent, running, keys):
-    return act(cell, bind(tiny.SPEC, weights), agent, running, keys, ACTING, PARAMS, PRIORS)
+    return act(cell, ACTING.bind(weights), agent, running, keys, ACTING, PARAMS, KNOWLEDGE)
 
 
-@pytest.mark.parametrize("trial", range(len(TRIALS)))
-def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, trial):
+@pytest.mark.parametrize("number", range(len(CONTROLS)))
+def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, number):
     """Leaving ended episodes out changes no one's next running episode and no one's noise."""
     for seed in range(SEEDS):
-        cell = tiny.at(CELLS, (len(ROWS) + trial) * SEEDS + seed)
+        cell = tiny.at(CELLS, (len(ROWS) + number) * SEEDS + seed)
         weights = tiny.at(WEIGHTS, int(cell.params))
         # Folded with the part, the parameters and the episode.
-        own = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.params)
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(own, jnp.arange(len(EPISODES.goal)))
+        folded = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.params)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(folded, jnp.arange(len(EPISODES.goal)))
         agent = begin(weights)
         running = np.ones(len(EPISODES.goal), bool)
         success, length, total = ~running, np.zeros(len(running), int), np.zeros(len(running))
         while running.any():
-            agent, taken = take(cell, weights, agent, running, keys)
+            agent, taken, weight = take(cell, weights, agent, running, keys)
             success |= running & np.asarray(taken.success)
             length += running
-            total += np.where(running, taken.weight, 0.0)
+            total += np.where(running, weight, 0.0)
             running &= ~np.asarray(taken.ended)
-        found = tiny.at(outcome, len(ROWS) + trial, seed)
+        found = tiny.at(outcome, len(ROWS) + number, seed)
         np.testing.assert_array_equal(found.success, success)
         np.testing.assert_array_equal(found.length, length)
         np.testing.assert_allclose(found.weight, total / length, rtol=1e-5, atol=1e-7)
@@ -234,7 +248,7 @@ def test_playing_an_episode_agrees_with_the_grid(outcome):
     cell = tiny.at(CELLS, row * SEEDS + 1)
     for episode in (0, 17):
         start = tiny.at(first_states(EPISODES), episode)
-        trace = play(cell, tiny.at(WEIGHTS, int(cell.params)), start, ACTING, tiny.SPEC, PARAMS, PRIORS)
+        trace = play(cell, tiny.at(WEIGHTS, int(cell.params)), start, ACTING, PARAMS, KNOWLEDGE)
         found = tiny.at(outcome, row, 1, episode)
         assert (len(trace.pose), trace.success) == (found.length, found.success)
         assert trace.pose[0] == EPISODES.pose[episode]

@@ -13,20 +13,20 @@ from jaxnav.evaluation.grid import act, first_states
 from jaxnav.evaluation.inference import Branch, counterfactual_logits
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.pathways import Decision, Memory, Pathways
-from jaxnav.policies.policy import bind
 from jaxnav.scenes.task import NUM_ACTIONS
 
 EPISODES = 48
 ENV, PARAMS = tiny.world()
-PRIORS = 0.05 * tiny.priors()  # a belief that gives way at once: large gaps
-ACTING = Acting(ENV, tiny.SETTING)
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)  # a belief that gives way at once: large gaps
+ACTING = Acting(ENV, tiny.SPEC, tiny.SETTING)
 START = first_states(episode_list(tiny.BANK, EPISODES, seed=1))
 
 
 def cell(variant="stde", epsilon=0.0, form="paper", decoding="argmax", **changes):
     """One cell of the grid, changed."""
-    one = tiny.at(inference_grid([table_row(variant, epsilon, form, decoding)], 1), 0)
+    one = tiny.at(inference_grid([table_row(variant, epsilon, form, decoding)], ("baseline", "layout"), 1), 0)
     return one.replace(**{name: jnp.asarray(value, getattr(one, name).dtype) for name, value in changes.items()})
 
 
@@ -45,23 +45,22 @@ EVERY = np.ones(EPISODES, bool)
 @jax.jit
 def begin(weights):
     """The episodes after their first view."""
-    return ACTING.begin(START, bind(tiny.SPEC, weights), PARAMS, PRIORS)
+    return ACTING.begin(START, ACTING.bind(weights).initial_memory((EPISODES,)), KNOWLEDGE, PARAMS)
 
 
 @jax.jit
-def take(own, weights, agent, running, keys):
+def take(cell, weights, agent, running, keys):
     """One step."""
-    return act(own, bind(tiny.SPEC, weights), agent, running, keys, ACTING, PARAMS, PRIORS)
+    return act(cell, ACTING.bind(weights), agent, running, keys, ACTING, PARAMS, KNOWLEDGE)
 
 
 @jax.jit
-def both(own, weights, agent, keys, step_keys):
+def both(cell, weights, agent, keys, step_keys):
     """The logits that are taken out, and those of the counterfactual decision."""
-    policy = bind(tiny.SPEC, weights)
-    observation, layout = ACTING.observe(agent, PARAMS)
-    pathways = policy.pathways(observation, layout)
+    policy = ACTING.bind(weights)
+    pathways = policy.pathways(*ACTING.view(agent, KNOWLEDGE, PARAMS), agent.memory)
     zeroed = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-    return counterfactual_logits(own, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
+    return counterfactual_logits(cell, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
 
 
 WEIGHTS = tiny.lively(6)
@@ -72,15 +71,15 @@ def agent():
     """The episodes after three steps of + w: the memory is alive and gaps differ."""
     agent = begin(WEIGHTS)
     for _ in range(3):
-        agent, _ = take(LAYOUT, WEIGHTS, agent, EVERY, EPISODE_KEYS)
+        agent, *_ = take(LAYOUT, WEIGHTS, agent, EVERY, EPISODE_KEYS)
     assert len(np.unique(agent.layout.gap)) > 3
     return agent
 
 
 def step(agent, running=EVERY, **options):
     """What one step takes, and the weights that it takes it with."""
-    _, taken = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
-    return np.asarray(taken.action), np.asarray(taken.weight)
+    _, taken, weight = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
+    return np.asarray(taken.agent.memory.action), np.asarray(weight)
 
 
 # What is taken out
@@ -140,8 +139,8 @@ def test_noise_is_the_same_throughout_an_episode_and_an_intervention_drawn_at_ev
 
     first = logits(EPISODE_KEYS, STEP_KEYS)
     np.testing.assert_array_equal(logits(EPISODE_KEYS, STEP_KEYS), first)
-    own, other = (changed(EPISODE_KEYS), STEP_KEYS), (EPISODE_KEYS, changed(STEP_KEYS))
-    followed, ignored = (own, other) if name == "noise" else (other, own)
+    of_episode, of_step = (changed(EPISODE_KEYS), STEP_KEYS), (EPISODE_KEYS, changed(STEP_KEYS))
+    followed, ignored = (of_episode, of_step) if name == "noise" else (of_step, of_episode)
     np.testing.assert_array_equal(logits(*ignored), first)
     # Other logits in the episode of the other key and nowhere else.
     assert np.flatnonzero((logits(*followed) != first).any(axis=1)).tolist() == [7]
@@ -154,21 +153,21 @@ def test_noise_is_the_same_throughout_an_episode_and_an_intervention_drawn_at_ev
 @pytest.mark.parametrize("weight", [0.3, 2.0])
 def test_zeros_leave_the_best_action_as_it_is(agent, form, weight):
     plain, _ = step(agent, variant="layout")
-    own = {"form": form, "epsilon": 0.0, "always": weight}
-    zeros, weights = step(agent, **own, **CONTROLS["zeros"])
-    assert (weights >= np.float32(weight)).all()
+    constant = {"form": form, "epsilon": 0.0, "gap": weight}
+    zeros, weights = step(agent, **constant, **CONTROLS["zeros"])
+    np.testing.assert_array_equal(weights, np.float32(weight))
     np.testing.assert_array_equal(zeros, plain)
     # What the policy's own counterfactual, noise or a random intervention would change.
     for control in ("none", "noise", "random"):
-        assert (step(agent, **own | {"always": 2.0}, **CONTROLS[control])[0] != plain).any()
+        assert (step(agent, **constant | {"gap": 2.0}, **CONTROLS[control])[0] != plain).any()
 
 
 def test_zeros_are_no_control_of_the_papers_form(agent):
     """a - s 0 = a whatever the weight, sampled actions too; in the residual form the policy is sharper: (1 + s) a."""
     plain, _ = step(agent, variant="layout", decoding="sample")
-    own = {"decoding": "sample", "always": 2.0, **CONTROLS["zeros"]}
-    np.testing.assert_array_equal(step(agent, form="paper", **own)[0], plain)
-    assert (step(agent, form="residual", **own)[0] != plain).any()
+    constant = {"decoding": "sample", "gap": 2.0, **CONTROLS["zeros"]}
+    np.testing.assert_array_equal(step(agent, form="paper", **constant)[0], plain)
+    assert (step(agent, form="residual", **constant)[0] != plain).any()
 
 
 @pytest.mark.parametrize("control", CONTROLS)
@@ -182,7 +181,7 @@ def test_at_epsilon_one_every_control_is_plus_w(agent, control, form, decoding):
 
 
 def test_a_constant_weight_of_one_in_the_papers_form_is_hard_tde(agent):
-    found, weight = step(agent, always=1.0, epsilon=1.0)  # no gap exceeds epsilon
+    found, weight = step(agent, gap=1.0, epsilon=0.0)
     np.testing.assert_array_equal(found, step(agent, variant="tde")[0])
     np.testing.assert_array_equal(weight, np.ones(EPISODES))
 
@@ -201,8 +200,8 @@ def test_a_shuffled_weight_is_that_of_the_next_running_episode(agent, running):
 
 def test_shuffling_unequal_ones_changes_actions(agent):
     apart = agent._replace(layout=agent.layout.replace(gap=(jnp.arange(EPISODES) % 2).astype(jnp.float32)))
-    own, shuffled = (step(apart, shuffled=shuffled)[0] for shuffled in (False, True))
-    assert (own != shuffled).any()
+    plain, shuffled = (step(apart, shuffled=shuffled)[0] for shuffled in (False, True))
+    assert (plain != shuffled).any()
 
 
 def test_actions_are_of_the_task(agent):

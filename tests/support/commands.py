@@ -12,7 +12,8 @@ chunk: 2
 save_every: 1
 worlds: {num_train: 4, num_val: 4, num_test: 4, train_step_limit: 10, step_limit: 12, large_step_limit: 14}
 layout: {setting: calibrated, walks: 64, steps: 20}
-sizes: {hidden: 16, view_outputs: 8, appearance: 4, row_hidden: 8, row_outputs: 2, relation_layers: 1}
+sizes: {hidden: 16, view_outputs: 8, appearance: 4, row_hidden: 8, row_outputs: 2}
+method_sizes: {relation_layers: 1}
 ppo: {num_envs: 16, rollout: 8, epochs: 1, minibatches: 2, learning_rate: 1e-2, distil: 0.1}
 """
 SEEDS, POLICIES = 2, {"baseline-0", "baseline-1", "layout-0", "layout-1"}

@@ -27,8 +27,8 @@ AGREEMENT = """
 import contextlib, dataclasses, json, sys
 import jax, numpy as np
 from support import tiny_world as tiny
-from jaxnav.training.trainer import Arms, ShardedArms
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.train import make_trainer
 from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS
 from jaxnav.numerics.product import product
@@ -42,14 +42,14 @@ config = dataclasses.replace(
 env, params = tiny.world()
 
 def policies(count):
-    parts = config, env, SETTINGS["calibrated"], tiny.priors()
+    parts = config, env, SETTINGS["calibrated"], tiny.knowledge()
     mesh = Devices(count=count).mesh(seeds=2, num_envs=16, minibatches=2)
-    arms = ShardedArms(*parts, mesh) if count > 1 else Arms(*parts)
-    states = arms.init(params)
+    trainer = make_trainer(*parts, mesh if count > 1 else None)
+    states = trainer.init(params)
     shards = states["layout"][0].agent.state.pose.addressable_shards
     assert [shard.data.shape[0] for shard in shards] == {1: [16], 2: [16, 16], 4: [8, 8, 8, 8]}[count]
     for _ in range(2):
-        states, metrics = arms.train(states, params)
+        states, metrics = trainer.train(states, params)
     return [
         {
             "params": np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(state.params)]).tolist(),
