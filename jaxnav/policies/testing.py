@@ -18,7 +18,7 @@ from jaxnav.layout import SETTINGS, prior_from_counts
 from jaxnav.policies.acting import Acting, Agent, View, carried
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
 from jaxnav.policies.pathways import Memory
-from jaxnav.policies.policy import Policy, init_params
+from jaxnav.policies.policy import Params, Policy, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.worlds import WORLDS, generated
@@ -52,15 +52,21 @@ def check_method(name: str, method_sizes: Mapping[str, int] | None = None, steps
     spec = PolicySpec(name, len(env.categories), _SIZES, tuple(sorted((method_sizes or {}).items())))
     acting = Acting(env, spec, SETTINGS["calibrated"] if method.hosts_layout else None)
     knowledge, key = _knowledge(method, env, bank), jax.random.key(seed)
-    policy = acting.bind(_lively(init_params(spec, key), key))
-    agent = acting.start(key, _BATCH, policy.initial_memory((_BATCH,)), knowledge, params)
-    agents = [agent]
+    weights = _lively(jax.jit(init_params, static_argnums=0)(spec, key), key)
+
+    @jax.jit
+    def start() -> Agent:
+        memory = acting.bind(weights).initial_memory((_BATCH,))
+        return acting.start(key, _BATCH, memory, knowledge, params)
+
+    act = jax.jit(lambda agent, key: _act(acting, acting.bind(weights), agent, key, knowledge, params))
+    agents = [start()]
     for time in range(steps):
-        agents.append(_act(acting, policy, agents[-1], jax.random.fold_in(key, time), knowledge, params))
+        agents.append(act(agents[-1], jax.random.fold_in(key, time)))
         action = carried(agents[-1]).action
         _promise(bool(((action >= 0) & (action < env.num_actions)).all()), "a choice that becomes no action")
     _check_notes(method, agents, env, knowledge, params)
-    _check_decision(acting, policy, agents[-1], method.control.num_choices, knowledge, params)
+    _check_decision(acting, weights, agents[-1], method.control.num_choices, knowledge, params)
 
 
 def _knowledge(method: Method, env: ObjectNav, bank: Bank) -> Knowledge:
@@ -91,6 +97,7 @@ def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge:
     if tracker is None:
         return
     headings, horizons = env.task.rules.headings, len(env.task.rules.horizons)
+    update = jax.jit(lambda note, percept: tracker.update(note, knowledge, percept))
     for i in range(_BATCH):
         note = tracker.init(knowledge)
         for before, agent in zip([None, *agents], agents, strict=False):
@@ -98,27 +105,29 @@ def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge:
             moved = jnp.bool_(before is not None and env.cell(before.state.pose[i]) != env.cell(pose))
             heading = pose // horizons % headings
             percept = Percept(params.tables.rows[pose], heading, carried(agent).action[i], moved)
-            note = tracker.update(note, knowledge, percept)
+            note = update(note, percept)
             kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.note)
             chex.assert_trees_all_equal_shapes_and_dtypes(kept, note)
             chex.assert_trees_all_close(kept, note, rtol=1e-5, atol=1e-6)
 
 
 def _check_decision(
-    acting: Acting, policy: Policy, agent: Agent, num_choices: int, knowledge: Knowledge, params: EnvParams
+    acting: Acting, weights: Params, agent: Agent, num_choices: int, knowledge: Knowledge, params: EnvParams
 ) -> None:
     """Check pathways and decisions of a batch in the middle of its episodes."""
     view, memory = acting.view(agent, knowledge, params), carried(agent)
-    pathways = policy.pathways(*view, memory)
-    decision = policy.decide(pathways, memory)
-    chex.assert_shape(pathways.experience, (_BATCH, policy.method.width))
+    embed = jax.jit(lambda view, memory: acting.bind(weights).pathways(*view, memory))
+    decide = jax.jit(lambda pathways, memory: acting.bind(weights).decide(pathways, memory))
+    pathways = embed(view, memory)
+    decision = decide(pathways, memory)
+    chex.assert_shape(pathways.experience, (_BATCH, acting.bind(weights).method.width))
     chex.assert_shape([decision.logits, decision.value], [(_BATCH, num_choices), (_BATCH,)])
     chex.assert_type([pathways.experience, decision.logits, decision.value], jnp.float32)
     chex.assert_trees_all_equal_shapes_and_dtypes(decision.memory(memory.action), memory)
     chex.assert_tree_all_finite((pathways, decision))
     for i in range(_BATCH):
         one: tuple[View, Memory] = jax.tree.map(lambda leaf, i=i: leaf[i], (view, memory))
-        alone = policy.decide(policy.pathways(*one[0], one[1]), one[1])
+        alone = decide(embed(*one), one[1])
         expected = jax.tree.map(lambda leaf, i=i: leaf[i], decision)
         chex.assert_trees_all_close(alone, expected, rtol=1e-4, atol=1e-5)
 
@@ -126,8 +135,8 @@ def _check_decision(
     chex.assert_trees_all_equal(counterfactual.experience, pathways.experience)
     elsewhere = jax.tree.map(lambda leaf: jnp.roll(leaf, 1, axis=0), pathways)
     mixed = elsewhere._replace(experience=pathways.experience, gate=pathways.gate)
-    deaf = policy.decide(do(mixed, scene=0.0, goal=0.0), memory).logits
-    chex.assert_trees_all_equal(deaf, policy.decide(counterfactual, memory).logits)
+    deaf = decide(do(mixed, scene=0.0, goal=0.0), memory).logits
+    chex.assert_trees_all_equal(deaf, decide(counterfactual, memory).logits)
 
 
 def _promise(kept: bool, broken: str) -> None:

@@ -56,7 +56,7 @@ def lively(seed, spec=SPEC):
     loud = {
         name: jax.tree.map(lambda leaf: 3 * leaf, node) for name, node in params.items() if name in ("fuse", "method")
     }
-    return params | loud | {"actor": params["actor"] | {"kernel": kernel, "bias": jnp.zeros(6)}}
+    return params | loud | {"actor": params["actor"] | {"kernel": kernel, "bias": jnp.zeros(kernel.shape[-1])}}
 
 
 @jax.jit
