@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from _common import report, seconds
 
-from jaxnav.env.objectnav import NUM_PRIORS, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import Evaluator, first_states
 from jaxnav.evaluation.playback import play

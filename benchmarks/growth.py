@@ -19,7 +19,8 @@ import numpy as np
 from _common import peak_resident_gb, report, seconds, spread
 from _phases import Program, program, update
 
-from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS
 from jaxnav.runs.config import RunConfig, WorldConfig

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from jaxnav.policies.methods import METHODS, Experience, Knowledge, Method
     from jaxnav.policies.testing import check_method
     from jaxnav.runs.config import RunConfig
-    from jaxnav.runs.directory import Policies, Run
+    from jaxnav.runs.directory import Run
     from jaxnav.runs.evaluate import Results, evaluate
+    from jaxnav.runs.policies import Policies
     from jaxnav.runs.policy import LoadedPolicy, load_policy
     from jaxnav.runs.sweep import Sweep, sweep
     from jaxnav.runs.train import train
@@ -56,7 +57,7 @@ _HOMES = {
     "Knowledge": "policies.methods",
     "LoadedPolicy": "runs.policy",
     "Method": "policies.methods",
-    "Policies": "runs.directory",
+    "Policies": "runs.policies",
     "Results": "runs.evaluate",
     "Run": "runs.directory",
     "RunConfig": "runs.config",

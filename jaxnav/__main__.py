@@ -1,4 +1,4 @@
-"""The jaxnav command: `python -m jaxnav train | eval | episode | instrument | study | scenes | table`."""
+"""The jaxnav command."""
 
 import difflib
 import importlib
@@ -18,7 +18,10 @@ HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {what}\n" f
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command that the first argument names; returns its exit code, 2 for an unknown one."""
+    """Run the command that the first argument names.
+
+    Returns its exit code, 2 for an unknown one.
+    """
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print(HELP + "\nEach has its own --help.")

@@ -1,4 +1,6 @@
-"""The layout estimator: a Dirichlet belief about which categories are seen together, equations 3 to 6.
+"""The layout estimator, equations 3 to 6.
+
+It holds a Dirichlet belief about which categories are seen together.
 
 Row i of `alpha` [K, K] parametrises a Dirichlet over the categories j != i seen together with category i. The belief
 starts at the prior alpha*, gains counts as the episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5, or
@@ -249,7 +251,7 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """Return w x g of eq. 7: how far each category speaks for a goal.
+        """Return w x g (eq. 7): each category's word for a goal.
 
         Args:
           state: the belief.

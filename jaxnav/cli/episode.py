@@ -16,7 +16,8 @@ from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
-from jaxnav.runs.directory import load_policies, load_run
+from jaxnav.runs.directory import load_run
+from jaxnav.runs.policies import load_policies
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.visibility import cell_centres

@@ -9,7 +9,8 @@ from rich.console import Console
 
 from jaxnav.cli.console import exit_code, result_console
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import Form, console_table, difference_table
+from jaxnav.evaluation.report import Form
+from jaxnav.evaluation.report_tables import console_table, difference_table
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import evaluate
 
@@ -44,7 +45,7 @@ class EvalConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code is 0, or 2 after bad input."""
+    """Run the command and return its exit code."""
     config = tyro.cli(EvalConfig, args=arguments, prog="eval.py", description="Evaluate a training run.")
     return exit_code(lambda console: _evaluate(config, console, result_console()))
 
@@ -77,7 +78,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
 
 
 def _target(config: EvalConfig) -> Path:
-    """Return where the table goes, refused early if it cannot be written."""
+    """Return where the table goes, or refuse early."""
     source = "" if config.scenes is None else f"{config.scenes.name.split('.')[0]}-"
     name = f"eval-{source}{config.split}" + ("" if config.shift is None else f"-shift{config.shift:g}")
     target = config.json or config.run / f"{name}.json"

@@ -21,7 +21,8 @@ from jaxnav.evaluation.similarity import layout_gap, layout_similarity, scene_co
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Policies, load_policies, load_run, settings
+from jaxnav.runs.directory import load_run, settings
+from jaxnav.runs.policies import Policies, load_policies
 from jaxnav.runs.worlds import CompiledWorld, evaluation_world, read_ahead
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.compile import Bank

@@ -9,12 +9,13 @@ import tyro
 
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import FORMAT, markdown_table
+from jaxnav.evaluation.report import FORMAT
+from jaxnav.evaluation.report_tables import markdown_table
 
 
 @dataclasses.dataclass(frozen=True)
 class TableConfig:
-    """An evaluation as Markdown.
+    """Choose an evaluation to print.
 
     Attributes:
       file: JSON that `eval.py` wrote.
@@ -24,7 +25,7 @@ class TableConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns the exit code: 0, or 2 after bad input."""
+    """Run the command and return its exit code."""
     config = tyro.cli(TableConfig, args=arguments, prog="jaxnav table", description="Print an evaluation as Markdown.")
     return exit_code(lambda _: print(markdown_table(_read(config.file)), end=""))
 

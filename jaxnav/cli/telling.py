@@ -15,7 +15,8 @@ from rich.text import Text
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
 from jaxnav.evaluation.similarity import layout_gap, layout_similarity, seen_together
-from jaxnav.runs.directory import load_policies, load_run
+from jaxnav.runs.directory import load_run
+from jaxnav.runs.policies import load_policies
 from jaxnav.scenes.categories import ROOM_TYPES, category_ids, unknown_types
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.tables.compile import compile_scene

@@ -7,6 +7,6 @@ from jaxnav.runs.train import train
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code is 0, or 2 after bad input."""
+    """Run the command and return its exit code."""
     what = "Train a method with and without the layout estimator."
     return exit_code(lambda console: train(parse(RunConfig(), arguments, "train.py", what), console))

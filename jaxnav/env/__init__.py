@@ -1,1 +1,1 @@
-"""One episode: reset, step and observe; from worlds to environments, and a check of their contract."""
+"""The environment: one episode, its spaces, and a check of its contract."""

@@ -3,7 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from jaxnav.env.objectnav import ObjectNav, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.scenes.tables.compile import compile_bank

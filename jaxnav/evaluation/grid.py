@@ -1,4 +1,4 @@
-"""Every variant, epsilon, decoding and seed over the same fixed episodes, in one compiled call."""
+"""The evaluation grid: every variant, epsilon and seed in one compiled call."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -45,7 +45,7 @@ class Outcome(NamedTuple):
         )
 
     def after(self, running: jax.Array, action: jax.Array, success: jax.Array, weight: jax.Array) -> "Outcome":
-        """Return the outcome after one more step of the running episodes.
+        """Return the outcome after one more step.
 
         Args:
           running: bool, before the step.
@@ -93,7 +93,7 @@ class Evaluator:
         knowledge: Knowledge,
         key: jax.Array,
     ) -> Outcome:
-        """Run every cell of a grid over every episode, without auto-reset.
+        """Run every cell of a grid over every episode.
 
         Args:
           grid: leaves [C].
@@ -144,7 +144,7 @@ def _run_episodes(
     knowledge: Knowledge,
     key: jax.Array,
 ) -> Outcome:
-    """Run one cell over all episodes until the last one has ended.
+    """Run one cell until the last episode has ended.
 
     Few are long: when no more than half of the episodes still run, only these are carried on, and so on.
     """

@@ -1,4 +1,4 @@
-"""How a policy is used at inference: sTDE, what it is compared with, and its controls."""
+"""Inference: sTDE, what it is compared with, and its controls."""
 
 import enum
 from collections.abc import Callable
@@ -25,7 +25,7 @@ class Branch(enum.IntEnum):
 
 
 class Inference(struct.PyTreeNode):
-    """Say how one set of parameters is used, leaves [] or [C].
+    """Say how parameters are used, leaves [] or [C].
 
     Experience is removed by sTDE (eq. 2) with the threshold `epsilon`, or by TDE (eq. 1) where `hard` holds; neither
     has an effect with epsilon = inf. The last four are controls.

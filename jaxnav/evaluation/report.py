@@ -1,4 +1,4 @@
-"""Evaluation report: rows of metrics as JSON, as a console table and as a Markdown table.
+"""The evaluation report: JSON, a console table, a Markdown table.
 
 A report is a plain dictionary that JSON holds exactly; SR, SPL and SAE are in percent (0-100), DTS in metres.
 """
@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Summary, paired_difference, summary
@@ -28,7 +26,6 @@ Form = Literal["residual", "paper"]
 #: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
 _SCALES: dict[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0, "sae": 100.0}
 _BUCKETS = {"L>=1": 1, "L>=5": 5}
-_COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
 
 
 def build_row(
@@ -45,7 +42,9 @@ def build_row(
     strata: np.ndarray,
     generator: np.random.Generator,
 ) -> dict[str, Any]:
-    """One row: a variant's metrics over all episodes and over the buckets L* >= 1 and L* >= 5.
+    """Build one row: a variant's metrics.
+
+    They are over all episodes and over the buckets L* >= 1 and L* >= 5.
 
     Every episode has L* >= 1, so the overall metrics are those of the first bucket. A bucket without episodes holds
     `"episodes": 0` and no metrics.
@@ -102,7 +101,9 @@ def build_difference(
     generator: np.random.Generator,
     same_seeds: bool = False,
 ) -> dict[str, Any]:
-    """Paired difference `compared - reference` of one metric over all episodes, in the report's units.
+    """Build one paired difference of a metric.
+
+    It is `compared - reference` over all episodes, in the report's units.
 
     Args:
       metric: `sr`, `spl`, `dts` or `sae`.
@@ -128,7 +129,10 @@ def build_difference(
 def build_report(
     rows: list[dict[str, Any]], differences: list[dict[str, Any]], compilations: int, run: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report: rows, differences, number of compilations the evaluation took, settings, versions and format."""
+    """Build the report.
+
+    It holds rows, differences, the number of compilations that the evaluation took, settings, versions and format.
+    """
     return {
         "run": run,
         "rows": rows,
@@ -140,7 +144,10 @@ def build_report(
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide the results; `jaxnav` may run uninstalled, from its source."""
+    """Return the versions that decide the results.
+
+    They are of Python and of packages; `jaxnav` may run uninstalled, from its source.
+    """
     try:
         jaxnav = importlib.metadata.version("jaxnav")
     except importlib.metadata.PackageNotFoundError:
@@ -150,79 +157,14 @@ def versions() -> dict[str, str]:
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Writes the report as JSON; the file is replaced at once, so a reader never sees half of one.
+    """Write the report as JSON.
+
+    The file is replaced at once, so a reader never sees half of one.
 
     Raises:
       ValueError: the report holds NaN or an infinity; nothing is written.
     """
     write_atomic(path, (json.dumps(report, indent=2, allow_nan=False) + "\n").encode())
-
-
-def console_table(report: dict[str, Any]) -> Table:
-    """Table for a terminal: a line per row, `mean ± std [95 % interval]`, under a header per world, split, decoding."""
-    table = Table("Variant", *(title for title, _ in _COLUMNS.values()))
-    for heading, lines in _groups(report).items():
-        table.add_section()
-        table.add_row(Text(heading, style="bold"))
-        for cells in lines:
-            table.add_row(*map(Text, cells))  # Text: brackets are not markup
-    return table
-
-
-def difference_table(report: dict[str, Any]) -> Table:
-    """Table of the paired differences: a line per comparison and decoding, `mean [95 % interval]`."""
-    lines: dict[tuple[str, str], list[str]] = {}
-    for entry in report["differences"]:
-        compared = _label({**entry, "variant": entry["to"], "method": ""})
-        reference = "+ w" if entry["from"] == "layout" else entry["from"]
-        _, digits = _COLUMNS[entry["metric"]]
-        low, high = entry["ci95"]
-        cell = f"{entry['mean']:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
-        lines.setdefault((f"{compared} - {reference}", entry["decoding"]), []).append(cell)
-    table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in _COLUMNS.values()))
-    for names, cells in lines.items():
-        table.add_row(*map(Text, (*names, *cells)))
-    return table
-
-
-def markdown_table(report: dict[str, Any]) -> str:
-    """The same table in Markdown, ending with a newline."""
-    lines = [("Variant", *(title for title, _ in _COLUMNS.values())), ("---", *("---:" for _ in _COLUMNS))]
-    for heading, group in _groups(report).items():
-        lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
-
-
-def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
-    """Cells of the lines under each heading, in order of first appearance."""
-    groups: dict[str, list[tuple[str, ...]]] = {}
-    for row in report["rows"]:
-        heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
-        cells = (_label(row), *(_cell(row[metric], digits) for metric, (_, digits) in _COLUMNS.items()))
-        groups.setdefault(heading, []).append(cells)
-    return groups
-
-
-def _label(row: dict[str, Any]) -> str:
-    match row["variant"]:
-        case "oracle":
-            label = "Shortest path (oracle)"
-        case "random":
-            label = "Random"
-        case "baseline":
-            label = f"{row['method']} (baseline)"
-        case "layout":
-            label = "+ w (layout)"
-        case "tde":
-            label = "+ w + TDE"
-        case _:
-            label = f"+ w + sTDE (eps={row['epsilon']:g})"
-    return label + (", paper form" if row["variant"] == "stde" and row["form"] == "paper" else "")
-
-
-def _cell(metric: dict[str, Any], digits: int) -> str:
-    low, high = metric["ci95"]
-    return f"{metric['mean']:.{digits}f} ± {metric['std']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def _to_report_units(metric: Metric, values: np.ndarray) -> np.ndarray:

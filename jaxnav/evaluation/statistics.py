@@ -15,7 +15,7 @@ _BOUNDS = (2.5, 97.5)
 
 
 class Summary(NamedTuple):
-    """A mean with its spread, all in the unit of the values.
+    """Hold a mean with its spread, in the values' unit.
 
     Attributes:
       mean: mean over seeds and episodes.
@@ -29,7 +29,9 @@ class Summary(NamedTuple):
 
 
 def summary(values: np.ndarray, strata: np.ndarray, generator: np.random.Generator, resamples: int = 2000) -> Summary:
-    """Mean of per-episode results, with a stratified, crossed bootstrap interval.
+    """Summarise per-episode results, with a bootstrap interval.
+
+    The bootstrap is stratified and crossed.
 
     A resample draws S seeds with replacement and, within each stratum, as many episodes with replacement as it holds;
     all seeds share the episode draw (the pigeonhole bootstrap, Owen 2007, with strata). The interval thus includes
@@ -61,7 +63,9 @@ def paired_difference(
     resamples: int = 2000,
     same_seeds: bool = False,
 ) -> Summary:
-    """Mean of `b - a` on the same episodes; both arms share every episode draw, so episode difficulty cancels.
+    """Summarise `b - a` on the same episodes.
+
+    Both arms share every episode draw, so that the difficulty of episodes cancels.
 
     Arms trained apart have nothing in common at equal seed indexes: by default their seeds are drawn independently and
     `std` is sqrt(std_a^2 + std_b^2). With `same_seeds`, row s of both arms comes from the same network (sTDE against
@@ -88,19 +92,25 @@ def paired_difference(
 
 
 class Bootstrap:
-    """Resamples that many results share: equal results get equal intervals. For finite float64 values [S, E]."""
+    """Hold resamples that many results share.
+
+    Equal results get equal intervals. For finite float64 values [S, E].
+    """
 
     def __init__(self, episodes: np.ndarray, num_seeds: int, generator: np.random.Generator) -> None:
-        """Draws the seeds; `episodes` [resamples, E] says how much each episode counts, rows adding up to 1."""
+        """Draw the seeds.
+
+        `episodes` [resamples, E] says how much each episode counts, rows adding up to 1.
+        """
         self._episodes = episodes
         self._seeds, self._others = (_seed_weights(num_seeds, generator, len(episodes)) for _ in range(2))
 
     def summary(self, values: np.ndarray) -> Summary:
-        """See `summary`."""
+        """Summarise results; see `summary`."""
         return _summarise(values.mean(), _std(values), _resampled_means(values, self._episodes, self._seeds))
 
     def difference(self, a: np.ndarray, b: np.ndarray, same_seeds: bool) -> Summary:
-        """See `paired_difference`."""
+        """Summarise a difference; see `paired_difference`."""
         if same_seeds:
             return self.summary(b - a)
         means_a = _resampled_means(a, self._episodes, self._seeds)
@@ -122,7 +132,10 @@ def _checked(name: str, values: np.ndarray, strata: np.ndarray, resamples: int) 
 
 
 def _episode_weights(strata: np.ndarray, generator: np.random.Generator, resamples: int) -> np.ndarray:
-    """Weights [resamples, E], each row the share of draws that fell on each episode; strata keep their sizes."""
+    """Draw episodes, strata keeping their sizes.
+
+    Returns weights [resamples, E], each row the share of draws that fell on each episode.
+    """
     counts = np.zeros((resamples, len(strata)))
     for stratum in np.unique(strata):
         members = np.flatnonzero(strata == stratum)
@@ -135,7 +148,10 @@ def _seed_weights(seeds: int, generator: np.random.Generator, resamples: int) ->
 
 
 def _draw_counts(size: int, generator: np.random.Generator, resamples: int) -> np.ndarray:
-    """How often each of `size` items comes up in `size` draws with replacement: int [resamples, size]."""
+    """Count how often items come up in draws.
+
+    `size` draws with replacement of `size` items; int [resamples, size].
+    """
     draws = generator.integers(size, size=(resamples, size))
     draws += np.arange(resamples)[:, None] * size  # one block of bins for each resample
     return np.bincount(draws.ravel(), minlength=resamples * size).reshape(resamples, size)

@@ -13,7 +13,7 @@ from jaxnav.evaluation.report import Decoding, Form, Variant
 
 
 class Row(NamedTuple):
-    """Name one row of the table, S cells of the grid.
+    """Name one row of the table.
 
     Attributes:
       variant: what is evaluated.
@@ -36,7 +36,7 @@ class Row(NamedTuple):
 
 
 def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: Decoding) -> Row:
-    """Make one row, with nothing in it that its variant does not use.
+    """Make one row of what its variant uses.
 
     Raises:
       InputError: an epsilon outside [0, inf), or NaN.
@@ -70,7 +70,7 @@ def table_rows(epsilons: Sequence[float], forms: Sequence[Form], arms: Sequence[
 
 
 def inference_grid(rows: Sequence[Row], arms: Sequence[str], num_seeds: int) -> Inference:
-    """Make the grid of R rows and S seeds, leaves [R S].
+    """Make the grid of rows and seeds, leaves [R S].
 
     Args:
       rows: the rows; their arms must be there.

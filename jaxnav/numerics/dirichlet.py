@@ -11,7 +11,7 @@ MIN_CONCENTRATION = 1e-2
 
 
 def _excess(t: jax.Array, log1p_t: jax.Array) -> jax.Array:
-    """Return t - log(1 + t) >= 0 for t > -1.
+    """Return t - log(1 + t), for t > -1.
 
     Without cancellation: with s = t / (2 + t), log(1 + t) = 2 artanh(s).
     """
@@ -39,7 +39,7 @@ def _bregman_remainder(a: jax.Array, c: jax.Array, log_ratio: jax.Array) -> jax.
 
 
 def update_kl(prior: jax.Array, counts: jax.Array) -> jax.Array:
-    """Return KL( Dir(prior + counts) || Dir(prior) ) for any counts.
+    """Return KL(Dir(prior + counts) || Dir(prior)) for any counts.
 
     In nats, and accurate in float32 where differences of lnGamma are not. With g(a, c) = lnGamma(a) - lnGamma(a + c) +
     c psi(a + c), the Bregman divergence of lnGamma, the divergence is sum_j g(a_j, c_j) - g(a_0, N). The leading parts

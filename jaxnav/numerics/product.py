@@ -1,4 +1,4 @@
-"""The product of rows with a kernel, as the layers use it, and its gradient."""
+"""The product of rows with a kernel, and its gradient."""
 
 import math
 from typing import Any
@@ -9,7 +9,9 @@ from flax import nnx
 
 
 def kernel_gradient(rows: jax.Array, by_result: jax.Array) -> jax.Array:
-    """The gradient of a kernel float32 [M, N], from rows [..., M] that met it and the gradient by the result [..., N].
+    """Return the gradient of a kernel, float32 [M, N].
+
+    It is made of the rows [..., M] that met the kernel and the gradient by the result [..., N].
 
     It is asked for as rows^T g of two matrices. JAX's own rule asks for (g^T rows)^T, for which XLA on a CPU copies
     both operands in transposed order first: two to three times slower where M and N are small. Within a mesh the rows
@@ -24,7 +26,10 @@ def kernel_gradient(rows: jax.Array, by_result: jax.Array) -> jax.Array:
 
 @jax.custom_vjp
 def product(rows: jax.Array, kernel: jax.Array) -> jax.Array:
-    """`rows @ kernel`, float32 [..., M] and [M, N] to [..., N]; differentiable in reverse mode only."""
+    """Return `rows @ kernel`.
+
+    Float32 [..., M] and [M, N] to [..., N]; differentiable in reverse mode only.
+    """
     return rows @ kernel
 
 
@@ -41,15 +46,18 @@ product.defvjp(_product, _gradients)
 
 
 def biased(values: jax.Array, layer: nnx.Linear) -> jax.Array:
-    """Values [..., N] with the bias [N] of a layer added, if it has one."""
+    """Add a layer's bias [N] to values [..., N].
+
+    Without a bias nothing is added.
+    """
     if layer.bias is None:
         return values
     return values + layer.bias[...].reshape((1,) * (values.ndim - 1) + (-1,))
 
 
 class Linear(nnx.Linear):
-    """A linear layer by `product`, in float32."""
+    """Apply a linear layer by `product`, in float32."""
 
     def __call__(self, inputs: jax.Array, out_sharding: Any = None) -> jax.Array:
-        """Inputs [..., M] to [..., N]."""
+        """Take inputs [..., M] to [..., N]."""
         return biased(product(inputs, self.kernel[...]), self)

@@ -1,4 +1,4 @@
-"""The recurrent core: one step, and a whole rollout with the gradient of its kernel taken in one product."""
+"""The recurrent core: one step, and a whole rollout."""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +9,9 @@ from jaxnav.numerics.product import kernel_gradient
 
 
 def gru(drive: jax.Array, projected: jax.Array, hidden: jax.Array) -> jax.Array:
-    """One step of a gated recurrent unit (Cho et al., 2014), as `flax.nnx.GRUCell` has it.
+    """Take one step of a gated recurrent unit.
+
+    As `flax.nnx.GRUCell` has it (Cho et al., 2014).
 
     Args:
       drive: float32 [..., 3 H], what the input contributes to reset gate, update gate and candidate.
@@ -26,7 +28,7 @@ def gru(drive: jax.Array, projected: jax.Array, hidden: jax.Array) -> jax.Array:
 
 
 class Unrolled(NamedTuple):
-    """The core along a rollout; leaves [T, B, ...].
+    """Hold the core along a rollout, leaves [T, B, ...].
 
     Attributes:
       after: float32 [T, B, H], hidden state after each step, before a reset.
@@ -42,7 +44,9 @@ class Unrolled(NamedTuple):
 
 @jax.custom_vjp
 def unroll(kernel: jax.Array, drive: jax.Array, ended: jax.Array, hidden: jax.Array) -> Unrolled:
-    """The core over T steps of B episodes; the hidden state starts at zero again after each ending.
+    """Unroll the core over T steps of B episodes.
+
+    The hidden state starts at zero again after each ending.
 
     Differentiating the loop itself would add up the kernel's gradient step by step, a [H, 3 H] matrix read and written
     T times; here the loop returns what the steps received, and the gradient is one product over T B rows.
@@ -74,8 +78,8 @@ def _unroll_gradient(saved: Any, cotangent: Unrolled) -> tuple[jax.Array, jax.Ar
     kernel, before, ended, pulls = saved
 
     def step(later: jax.Array, inputs: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        pull, ended, own = inputs
-        drive, projected, hidden = pull(own + jnp.where(ended[:, None], 0.0, later))
+        pull, ended, received = inputs
+        drive, projected, hidden = pull(received + jnp.where(ended[:, None], 0.0, later))
         return hidden + projected @ kernel.T, (drive, projected)
 
     nothing = jnp.zeros_like(before[0])

@@ -110,7 +110,10 @@ class Acting:
         return View(observation, weights, reading)
 
     def gap(self, agent: Agent) -> jax.Array:
-        """Return the layout gaps D float32 [B]; 0 without the layout."""
+        """Return the layout gaps D, float32 [B].
+
+        They are 0 without the layout.
+        """
         return jnp.zeros(agent.state.goal.shape) if agent.layout is None else agent.layout.gap
 
     def start(self, key: jax.Array, count: int, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
@@ -127,7 +130,10 @@ class Acting:
         return self.begin(state, memory, knowledge, params)
 
     def begin(self, state: State, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
-        """Begin episodes in states with leaves [B], the first view taken in."""
+        """Begin episodes in given states.
+
+        The leaves of the states are [B]; the first view is taken in.
+        """
         action, moved = jnp.full(state.pose.shape, NO_ACTION, jnp.int32), jnp.zeros(state.pose.shape, bool)
         return self.perceive(self._fresh(state, memory, knowledge, params), action, moved, knowledge, params)
 
@@ -171,7 +177,7 @@ class Acting:
         return self.perceive(following, action, moved, knowledge, params), taken
 
     def perceive(self, agent: Agent, action: jax.Array, moved: jax.Array, knowledge: Any, params: EnvParams) -> Agent:
-        """Take the present views into beliefs and notes, once per step.
+        """Take the present views into beliefs and notes.
 
         Args:
           agent: the episodes, [B].
@@ -225,13 +231,13 @@ class Acting:
 
 
 def carried(agent: Agent) -> Memory:
-    """Return the memory of an agent that a policy acts for."""
+    """Return the memory of agents that a policy acts for."""
     assert agent.memory is not None
     return agent.memory
 
 
 def select(condition: jax.Array, yes: Tree, no: Tree) -> Tree:
-    """Choose per episode the leaves [B, ...] of one tree or another."""
+    """Choose the leaves [B, ...] of either tree, per episode."""
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)

@@ -25,10 +25,16 @@ class CategoryMaps(nnx.Module):
         return appearance @ self.inner.kernel[...][: appearance.shape[-1]]
 
     def project_rows(self, rows: jax.Array) -> jax.Array:
-        """Take rows [..., K, M] through its last M inputs, [..., K, h]."""
+        """Take rows through the first layer's last M inputs.
+
+        From [..., K, M] to [..., K, h].
+        """
         return product(rows, self.inner.kernel[...][-rows.shape[-1] :])
 
     def finish(self, inner: jax.Array) -> jax.Array:
-        """Take [..., K, h], without the first bias, through the rest."""
+        """Finish what passed the first layer without its bias.
+
+        From [..., K, h] to [..., K m].
+        """
         maps = nnx.relu(self.outer(nnx.relu(biased(inner, self.inner))))
         return maps.reshape(*maps.shape[:-2], -1)

@@ -64,7 +64,7 @@ class Policy(nnx.Module):
     def pathways(
         self, observation: Observation, weights: jax.Array, reading: Any = None, memory: Memory | None = None
     ) -> Pathways:
-        """Embed what is seen, what is sought and what experience says.
+        """Embed what is seen, sought and known by experience.
 
         Args:
           observation: a batch [...] of observations.
@@ -125,17 +125,26 @@ class Policy(nnx.Module):
         return product(pathways.scene, scene) + product(pathways.goal, goal)
 
     def mediated_input(self, pathways: Pathways, action: jax.Array) -> jax.Array:
-        """Return what enters by experience and previous action, float32 [..., H]."""
+        """Return what enters by experience and previous action.
+
+        Float32 [..., H]; the action is int32 [...].
+        """
         *_, experience, previous = self._fuse_kernels
         one_hot = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
         return biased(product(pathways.experience, experience) + product(one_hot, previous), self.fuse)
 
     def drive(self, entering: jax.Array) -> jax.Array:
-        """Return the core's input float32 [..., 3 H] of all that enters, [..., H]."""
+        """Return the core's input, float32 [..., 3 H].
+
+        It is made of all that enters, float32 [..., H].
+        """
         return biased(product(nnx.relu(entering), self.core.dense_i.kernel[...]), self.core.dense_i)
 
     def act(self, hidden: jax.Array, gate: jax.Array) -> Decision:
-        """Decide by a hidden state float32 [..., H] and a gate [..., 1]."""
+        """Decide by a hidden state and a gate.
+
+        They are float32 [..., H] and [..., 1].
+        """
         logits = self.actor(hidden)
         if self.done_gate:
             logits = jnp.concatenate([logits[..., :DONE], gate * logits[..., DONE:]], axis=-1)
@@ -148,7 +157,7 @@ class Policy(nnx.Module):
 
     @property
     def recurrent_kernel(self) -> jax.Array:
-        """Return the kernel float32 [H, 3 H] of the hidden state."""
+        """Return the hidden state's kernel, float32 [H, 3 H]."""
         return self.core.dense_h.kernel[...]
 
     @property

@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.causal import do
-from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS, prior_from_counts
 from jaxnav.policies.acting import Acting, Agent, View, carried
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
-from jaxnav.policies.pathways import Memory
+from jaxnav.policies.pathways import Memory, Pathways
 from jaxnav.policies.policy import Params, Policy, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import Bank, compile_bank
@@ -76,7 +77,7 @@ def _knowledge(method: Method, env: ObjectNav, bank: Bank) -> Knowledge:
 
 
 def _lively(params: dict[str, Any], key: jax.Array) -> dict[str, Any]:
-    """Return parameters of a policy that is not indifferent, as a fresh one is."""
+    """Return parameters of a policy that is not indifferent."""
     kernel = jax.random.normal(key, params["actor"]["kernel"].shape)
     return params | {"actor": params["actor"] | {"kernel": kernel}}
 
@@ -92,7 +93,7 @@ def _act(
 
 
 def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge: Knowledge, params: EnvParams) -> None:
-    """Check that notes are those of a tracker that takes in every view once."""
+    """Check that notes take in every view once."""
     tracker = method.tracker
     if tracker is None:
         return
@@ -114,9 +115,13 @@ def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge:
 def _check_decision(
     acting: Acting, weights: Params, agent: Agent, num_choices: int, knowledge: Knowledge, params: EnvParams
 ) -> None:
-    """Check pathways and decisions of a batch in the middle of its episodes."""
+    """Check pathways and decisions in the middle of episodes."""
     view, memory = acting.view(agent, knowledge, params), carried(agent)
-    embed = jax.jit(lambda view, memory: acting.bind(weights).pathways(*view, memory))
+
+    def embed_view(view: View, memory: Memory) -> Pathways:
+        return acting.bind(weights).pathways(*view, memory)
+
+    embed = jax.jit(embed_view)
     decide = jax.jit(lambda pathways, memory: acting.bind(weights).decide(pathways, memory))
     pathways = embed(view, memory)
     decision = decide(pathways, memory)
@@ -127,7 +132,7 @@ def _check_decision(
     chex.assert_tree_all_finite((pathways, decision))
     for i in range(_BATCH):
         one: tuple[View, Memory] = jax.tree.map(lambda leaf, i=i: leaf[i], (view, memory))
-        alone = decide(embed(*one), one[1])
+        alone = decide(embed(one[0], one[1]), one[1])
         expected = jax.tree.map(lambda leaf, i=i: leaf[i], decision)
         chex.assert_trees_all_close(alone, expected, rtol=1e-4, atol=1e-5)
 

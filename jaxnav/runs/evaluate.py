@@ -40,11 +40,14 @@ class Results(NamedTuple):
     report: dict[str, Any]
 
     def metrics(self) -> dict[str, np.ndarray]:
-        """Return `sr`, `spl`, `sae` in [0, 1] and `dts` in metres, float64 [R, S, E]."""
+        """Return the metrics of every episode, float64 [R, S, E].
+
+        `sr`, `spl` and `sae` are in [0, 1], `dts` in metres.
+        """
         return episode_metrics(self.outcome, self.episodes.best_length)
 
     def write(self, path: Path) -> None:
-        """Write the report as JSON, and a CSV row per episode beside it.
+        """Write the report, and a CSV row per episode.
 
         Raises:
           OSError: a file cannot be written.
@@ -118,7 +121,7 @@ def evaluate(
 
 
 def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
-    """Add a row to outcomes [R, S, E]: the oracle's [E], the same for all seeds."""
+    """Add the oracle's row [E] to outcomes [R, S, E]."""
 
     def added(leaf: np.ndarray, row: np.ndarray) -> np.ndarray:
         return np.concatenate([leaf, np.broadcast_to(row, leaf.shape[1:])[None].astype(leaf.dtype)])
@@ -127,7 +130,10 @@ def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
 
 
 def _table(results: Results, names: dict[str, str], seed: int) -> list[dict[str, Any]]:
-    """Make the table; equal resamples for every row, so that equal results get equal intervals."""
+    """Make the table.
+
+    Resamples are equal for every row, so that equal results get equal intervals.
+    """
     metrics = results.metrics()
     return [
         build_row(
@@ -146,7 +152,7 @@ def _table(results: Results, names: dict[str, str], seed: int) -> list[dict[str,
 
 
 def _differences(results: Results, seed: int) -> list[dict[str, Any]]:
-    """Make the paired differences that the table is read for, where both rows are there."""
+    """Make the paired differences of rows that are there."""
     metrics, rows = results.metrics(), results.rows
     differences = []
     for i, row in enumerate(rows):
@@ -174,7 +180,7 @@ def _differences(results: Results, seed: int) -> list[dict[str, Any]]:
 
 
 def _episode_csv(results: Results) -> str:
-    """Make one line per row of the table, seed and episode."""
+    """Make a line per row, seed and episode."""
     metrics, outcome, episodes = results.metrics(), results.outcome, results.episodes
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -16,7 +16,7 @@ from jaxnav.policies.methods import Knowledge, Percept, find_method
 from jaxnav.policies.pathways import Decision, Memory
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.directory import read_export
+from jaxnav.runs.policies import read_export
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 
@@ -38,7 +38,9 @@ class EpisodeMemory(NamedTuple):
 
 
 class LoadedPolicy(struct.PyTreeNode):
-    """Act on observations; a pytree, so that it may be jitted and vmapped.
+    """Act on observations.
+
+    A pytree, so that it may be jitted and vmapped.
 
     Attributes:
       params: of the network.
@@ -120,7 +122,7 @@ class LoadedPolicy(struct.PyTreeNode):
         layout: LayoutState | None,
         epsilon: jax.Array | float,
     ) -> tuple[Decision, jax.Array]:
-        """Return the factual decision, and its logits without what experience alone would do."""
+        """Return the factual decision, and logits without experience."""
         policy = bind(self.spec, self.params)
         pathways = policy.pathways(observation, weights, reading, memory)
         decision = policy.decide(pathways, memory)

@@ -20,7 +20,7 @@ from jaxnav.runs.worlds import evaluation_world, read_ahead
 
 
 class Sweep(NamedTuple):
-    """Hold a sweep of X thresholds and S seeds over E episodes.
+    """Hold a sweep over X thresholds, S seeds, E episodes.
 
     Attributes:
       epsilon: float64 [X].
@@ -51,7 +51,7 @@ def sweep(
     form: Form | None = None,
     seed: int = 0,
 ) -> Sweep:
-    """Evaluate sTDE at every threshold and seed in one compiled call.
+    """Evaluate every threshold and seed in one compiled call.
 
     Args:
       run: a finished run with the arm `layout`.

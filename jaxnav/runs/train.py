@@ -1,4 +1,4 @@
-"""Training of a run: prior, arms and seeds, checkpoints, and the policies at the end."""
+"""Training of a run, from the prior to the exported policies."""
 
 import dataclasses
 import json
@@ -19,7 +19,8 @@ from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import METHODS, Knowledge, find_method
 from jaxnav.policies.testing import check_method
 from jaxnav.runs.config import RunConfig, check
-from jaxnav.runs.directory import LOG_FILE, POLICIES, Run, claim, export_policy, settings
+from jaxnav.runs.directory import LOG_FILE, Run, claim, settings
+from jaxnav.runs.policies import POLICIES, export_policy
 from jaxnav.runs.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.manifest import make_manifest
@@ -34,7 +35,7 @@ _EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, 
 
 
 def train(config: RunConfig, console: Console | None = None) -> Run:
-    """Train all arms and seeds of a run, and export the policies.
+    """Train a run and export its policies.
 
     Training goes on from the run's last checkpoint if it has one.
 
@@ -98,7 +99,7 @@ def _checked(config: RunConfig) -> RunConfig:
 
 
 def connected(config: RunConfig) -> Mesh | None:
-    """Join other processes and return the devices that are asked for.
+    """Join other processes and return the mesh of devices.
 
     None where one device is enough.
     """
@@ -110,7 +111,10 @@ def connected(config: RunConfig) -> Mesh | None:
 
 
 def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
-    """Walk the training scenes at random, the walks divided among the banks."""
+    """Walk the training scenes at random.
+
+    The walks are divided among the banks.
+    """
     key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
     walks = -(-config.layout.walks // len(world.banks))
     walk = jax.jit(explore, static_argnums=(0, 3, 4))
@@ -141,7 +145,10 @@ def calibrate_setting(config: RunConfig, world: CompiledWorld, explored: Explora
 
 
 def learn_knowledge(config: RunConfig, world: CompiledWorld, explored: Exploration, setting: Setting) -> Knowledge:
-    """Learn what is known before training: the layout priors, and what the method learns."""
+    """Learn what is known before training.
+
+    That is the layout priors, and what the method learns.
+    """
     learn, layout = find_method(config.method).learn, layout_priors(explored.counts, setting)
     if learn is None:
         return Knowledge(layout)
@@ -180,7 +187,10 @@ def _do_updates(
     manifest: dict[str, Any],
     console: Console,
 ) -> States:
-    """Train chunk by chunk, each in the next bank of scenes; between chunks log, show and save."""
+    """Train chunk by chunk.
+
+    Each is in the next bank of scenes; between chunks the run logs, shows and saves.
+    """
     stages = find_method(config.method).stages
     steps = config.chunk * config.update_steps * config.seeds * len(states)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())

@@ -9,7 +9,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from jaxnav.env.objectnav import ObjectNav, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig

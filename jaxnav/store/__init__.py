@@ -1,1 +1,1 @@
-"""Checkpoints, exported parameters and the run log. Imports no other part of jaxnav but its errors."""
+"""Checkpoints, exported parameters and the run log."""

@@ -22,7 +22,9 @@ State = TypeVar("State")
 
 
 def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> None:
-    """Commits `state` and `manifest` as `step` of the run and drops all but the latest two; done when it returns.
+    """Save the state of a run at a step.
+
+    State and manifest are committed when it returns; all but the latest two steps are dropped.
 
     Args:
       run_dir: folder of the run; checkpoints go to `run_dir/checkpoints/<step>`.
@@ -46,7 +48,9 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
 
 
 def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str, Any]) -> tuple[State, int] | None:
-    """The latest committed state of the run and its step, or None if it has none yet.
+    """Restore the latest committed state and its step.
+
+    Returns None if the run has none yet.
 
     Args:
       run_dir: folder of the run.
@@ -80,7 +84,10 @@ def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str
 
 @contextlib.contextmanager
 def _damage_named(where: Path) -> Iterator[None]:
-    """Turns what Orbax and TensorStore raise over missing or broken files into one message with a mend."""
+    """Turn what reading broken files raises into one message.
+
+    Orbax and TensorStore raise much over missing or broken files; the message names the mend.
+    """
     try:
         yield
     except (ValueError, KeyError, OSError) as error:
@@ -107,7 +114,7 @@ def _open(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.
 
 
 def _describe(state: Any) -> dict[str, str]:
-    """Path to `dtype[shape]` of every leaf, for example `.params['kernel']: float32[3,4]`."""
+    """Describe every leaf: `.params['kernel']: float32[3,4]`."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         name = jax.tree_util.keystr(path)
@@ -119,7 +126,10 @@ def _describe(state: Any) -> dict[str, str]:
 
 
 def _placed(abstract_state: State) -> State:
-    """The abstract state with a sharding on every leaf, so that the one on disk is not used."""
+    """Place every leaf of an abstract state.
+
+    With a sharding on every leaf the one on disk is not used.
+    """
     default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     return jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding or default), abstract_state

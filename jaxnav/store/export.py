@@ -19,7 +19,9 @@ _PARAMS, _POLICY = "params.safetensors", "policy.json"
 
 
 def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
-    """Writes parameters and what is needed to build the policy around them; replaces an earlier export.
+    """Write parameters and what the policy is built from.
+
+    An earlier export is replaced.
 
     `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, `spec` and the SHA-256 of the
     parameters; it is written last, so an export cut short is refused by `load_params` instead of being mixed.
@@ -40,7 +42,9 @@ def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, An
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The parameters, a nested dict of NumPy arrays, and the spec of an export.
+    """Load the parameters and the spec of an export.
+
+    The parameters are a nested dict of NumPy arrays.
 
     Raises:
       InputError: no export there, another format version, or files that do not belong together.

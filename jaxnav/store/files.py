@@ -5,7 +5,9 @@ from pathlib import Path
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Replaces `path` by `data`: a reader, or a crash at any moment, finds the old content or the new, never a part.
+    """Replace a file at once.
+
+    A reader, or a crash at any moment, finds the old content or the new, never a part.
 
     Missing parent folders are made.
 

@@ -1,4 +1,4 @@
-"""What a checkpoint says about itself, and whether it belongs to the run that asks for it."""
+"""What a checkpoint says about itself."""
 
 import json
 from collections.abc import Mapping
@@ -14,7 +14,9 @@ _PACKAGES = ("jaxnav", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "nu
 
 
 def make_manifest(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest of a run: `format_version`, `config` and package `versions`, as JSON gives them back.
+    """Make the manifest of a run.
+
+    It holds `format_version`, `config` and package `versions`, as JSON gives them back.
 
     Args:
       config: nested mapping of JSON values; tuples become lists.
@@ -24,7 +26,9 @@ def make_manifest(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_manifest(where: object, saved: Any, expected: Mapping[str, Any]) -> None:
-    """Refuses a checkpoint of another format version or config; package versions may differ.
+    """Refuse a checkpoint of another format version or config.
+
+    Package versions may differ.
 
     Args:
       where: the checkpoint, for the message.
@@ -49,7 +53,10 @@ def check_manifest(where: object, saved: Any, expected: Mapping[str, Any]) -> No
 
 
 def differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Where two nested mappings differ: `"train.lr: 0.1 != 0.2"` per dotted key, `(absent)` for a missing one."""
+    """List where two nested mappings differ.
+
+    `"train.lr: 0.1 != 0.2"` per dotted key, `(absent)` for a missing one.
+    """
     lines = []
     for key in sorted(a.keys() | b.keys()):
         left, right = a.get(key, _ABSENT), b.get(key, _ABSENT)
@@ -69,10 +76,10 @@ _ABSENT = _Absent()
 
 
 def _versions() -> dict[str, str]:
-    found = {}
+    versions = {}
     for package in _PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[package] = "not installed"  # run from a source tree
-    return found
+            versions[package] = "not installed"  # run from a source tree
+    return versions

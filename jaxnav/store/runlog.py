@@ -15,7 +15,9 @@ from jaxnav.store.files import write_atomic
 
 
 def append_row(path: Path, row: Mapping[str, int | float | str | None]) -> None:
-    """Appends `row`, which holds an int `step`, to the log; it has left this process when the call returns.
+    """Append a row to the log.
+
+    The row holds an int `step`; it has left this process when the call returns.
 
     NaN and infinities are written as null, since JSON has no word for them.
     """
@@ -25,7 +27,9 @@ def append_row(path: Path, row: Mapping[str, int | float | str | None]) -> None:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a log in order, without a last line torn by a crash; none if there is no file.
+    """Read the rows of a log in order.
+
+    Without a last line torn by a crash; none if there is no file.
 
     Raises:
       InputError: another line than the last is no JSON object with an int `step`.
@@ -44,7 +48,9 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def truncate_after(path: Path, step: int) -> None:
-    """Drops the rows later than `step` and a torn last line; a missing log stays missing.
+    """Drop the rows later than a step.
+
+    A torn last line is dropped too; a missing log stays missing.
 
     Raises:
       InputError: as `read_rows`; the log is then left as it is.

@@ -11,7 +11,8 @@ from jaxnav.cli.options import parse
 from jaxnav.cli.train import train
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, WorldConfig, check
-from jaxnav.runs.directory import load_policies, load_run, settings
+from jaxnav.runs.directory import load_run, settings
+from jaxnav.runs.policies import load_policies
 
 
 @dataclasses.dataclass(frozen=True)

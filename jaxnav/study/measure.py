@@ -19,7 +19,7 @@ from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Policies, load_policies
+from jaxnav.runs.policies import Policies, load_policies
 from jaxnav.runs.worlds import CompiledWorld, evaluation_world
 from jaxnav.study.association import gain_by_similarity, success_by_similarity
 from jaxnav.study.claims import select

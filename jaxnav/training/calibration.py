@@ -88,7 +88,10 @@ def calibrate(
     actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
 
     def gaps(setting: Setting, priors: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
-        """Return the mean early gap (NaN without any) and the late gap, [num_walks]."""
+        """Return mean early gap and late gap, [num_walks].
+
+        The early one is NaN where nothing was accepted.
+        """
         acting, knowledge = Acting(env, setting=setting), Knowledge(priors)
 
         def alpha(agent: Agent) -> jax.Array:

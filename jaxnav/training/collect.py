@@ -67,7 +67,7 @@ class Rollout(NamedTuple):
 
 
 class Truncation(NamedTuple):
-    """Hold the last state of a truncated episode, to bootstrap from.
+    """Hold the last state of a truncated episode.
 
     At most one per slot and rollout, as a rollout is no longer than the shortest step limit.
 

@@ -1,4 +1,6 @@
-"""One run on many devices, of one process or of several: seeds side by side, the episodes of each shared out.
+"""Devices: one run on many of them.
+
+The devices are of one process or of several; seeds are side by side, and the episodes of each are shared out.
 
 The devices form a mesh (seeds, episodes). Parameters, tables and priors are on all devices; the leaves of an agent are
 cut along its episodes. What is computed stays that of one device: random numbers do not depend on where they are drawn,
@@ -27,7 +29,7 @@ _SEEDS, _EPISODES = "seeds", "episodes"
 
 @dataclasses.dataclass(frozen=True)
 class Devices:
-    """Devices to train on.
+    """Name devices to train on.
 
     Attributes:
       count: so many of this process; None takes all devices of all processes.
@@ -43,18 +45,21 @@ class Devices:
 
     @classmethod
     def parse(cls, text: str) -> "Devices | None":
-        """Read `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`; None if it is none of these."""
+        """Read `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`.
+
+        Returns None if the text is none of these.
+        """
         if text == "cluster":
             return cls()
         if re.fullmatch(r"[1-9]\d*", text):
             return cls(count=int(text))
-        found = re.fullmatch(r"(.+:\d+),(\d+),(\d+)", text)
-        if found and int(found[2]) < int(found[3]):
-            return cls(address=found[1], process=int(found[2]), processes=int(found[3]))
+        parts = re.fullmatch(r"(.+:\d+),(\d+),(\d+)", text)
+        if parts and int(parts[2]) < int(parts[3]):
+            return cls(address=parts[1], process=int(parts[2]), processes=int(parts[3]))
         return None
 
     def connect(self) -> None:
-        """Join the other processes, if there are any; before anything is computed.
+        """Join the other processes, before anything is computed.
 
         Raises:
           InputError: no launcher tells of the processes, or the first one cannot be reached.
@@ -72,16 +77,18 @@ class Devices:
             ) from error
 
     def mesh(self, seeds: int, num_envs: int, minibatches: int) -> Mesh:
-        """The mesh: as many groups of devices as divide the seeds, each with an equal share of every minibatch.
+        """Make the mesh of devices.
+
+        It has as many groups of devices as divide the seeds, each with an equal share of every minibatch.
 
         Raises:
           InputError: there are fewer devices, or the episodes cannot be shared out.
         """
-        found = jax.devices()
-        count = self.count or len(found)
-        if count > len(found):
+        devices = jax.devices()
+        count = self.count or len(devices)
+        if count > len(devices):
             raise InputError(
-                f"config: devices is {count}; there are {len(found)} (on a CPU as many as "
+                f"config: devices is {count}; there are {len(devices)} (on a CPU as many as "
                 f"XLA_FLAGS=--xla_force_host_platform_device_count={count} makes)"
             )
         groups = math.gcd(count, seeds)
@@ -91,16 +98,19 @@ class Devices:
                 f"config: ppo.num_envs is {num_envs}; with {count} devices for {seeds} seeds the episodes of each are "
                 f"shared by {share}: give a multiple of {share} x ppo.minibatches ({minibatches})"
             )
-        return Mesh(np.array(found[:count]).reshape(groups, share), (_SEEDS, _EPISODES))
+        return Mesh(np.array(devices[:count]).reshape(groups, share), (_SEEDS, _EPISODES))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Whole on every device."""
+    """Place whole arrays on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
-    """Where the leaves of a seed's state are, or of `stacked` seeds': episodes are cut, stacked seeds as well."""
+    """Place the leaves of a seed's state.
+
+    Or of `stacked` seeds' states: episodes are divided, stacked seeds as well.
+    """
     seeds = (_SEEDS,) if stacked else ()
     whole = NamedSharding(mesh, PartitionSpec(*seeds))
     episodes = NamedSharding(mesh, PartitionSpec(*seeds, _EPISODES))
@@ -115,12 +125,12 @@ def everywhere(mesh: Mesh, tree: Tree) -> Tree:
 
 
 def first_process() -> bool:
-    """Whether this is the process that writes."""
+    """Return whether this is the process that writes."""
     return jax.process_index() == 0
 
 
 def by_first_process(action: Callable[[], Any]) -> None:
-    """Let the first process do something while the others wait for it.
+    """Let the first process act while the others wait.
 
     Raises:
       InputError: in every process, if the first one was refused.

@@ -43,7 +43,7 @@ class LearnerState(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """Hold what stays the same during a run and is compiled in.
+    """Hold what is compiled in during a run.
 
     Attributes:
       acting: how the episodes are acted.
@@ -154,7 +154,7 @@ class Learner:
 
 
 def block_order(key: jax.Array, episodes: int, minibatches: int) -> jax.Array:
-    """Draw which episode each block of neighbours gives to which minibatch.
+    """Draw the minibatch of every episode, block by block.
 
     Every minibatch gets one episode of every block, so that no device needs the episodes of another.
 
@@ -166,7 +166,9 @@ def block_order(key: jax.Array, episodes: int, minibatches: int) -> jax.Array:
 
 
 def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
-    """Divide leaves into minibatches, [..., B, ...] -> [M, ..., B / M, ...].
+    """Divide leaves into minibatches.
+
+    [..., B, ...] -> [M, ..., B / M, ...].
 
     `axis` is that of the episodes.
     """

@@ -46,7 +46,7 @@ def advantages(
 
 
 class Replay(NamedTuple):
-    """Hold decisions made again along a rollout, leaves [T, B, ...].
+    """Hold decisions made again, leaves [T, B, ...].
 
     Attributes:
       policy: with the parameters to differentiate by.

@@ -73,14 +73,14 @@ class Trainer:
         return states
 
     def restart(self, states: States, params: EnvParams) -> States:
-        """Give every seed new episodes in other scenes; donates the states."""
+        """Give every seed new episodes; donates the states."""
         return {
             name: [self._restarts[name](state, params, self._knowledge) for state in seeds]
             for name, seeds in states.items()
         }
 
     def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
-        """Do a chunk of updates of every seed; donates the states.
+        """Do a chunk of updates; donates the states.
 
         Args:
           states: of every seed.
@@ -120,7 +120,9 @@ class Trainer:
 
 
 class ShardedTrainer(Trainer):
-    """Train on a mesh of devices: arm by arm, all seeds in one call.
+    """Train on a mesh of devices.
+
+    Arm by arm, all seeds in one call.
 
     Between calls the states are those of `Trainer` with their episodes divided, so that a run may go on with other
     devices.
@@ -147,7 +149,7 @@ class ShardedTrainer(Trainer):
         return super().init(self._everywhere(params))
 
     def restart(self, states: States, params: EnvParams) -> States:
-        """Give every seed new episodes in other scenes; donates the states."""
+        """Give every seed new episodes; donates the states."""
         return super().restart(states, self._everywhere(params))
 
     def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
@@ -168,7 +170,7 @@ class ShardedTrainer(Trainer):
         return self._placed
 
     def _compile(self, name: str, stage: int, states: list[LearnerState], params: EnvParams) -> Any:
-        """Compile the chunk of all seeds of an arm, unless it is."""
+        """Compile the chunk of an arm, unless it is."""
         if (name, stage) in self._compiled:
             return self._compiled[name, stage]
         learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
@@ -189,7 +191,7 @@ class ShardedTrainer(Trainer):
 
 
 def stage_at(stages: tuple[Stage, ...], share: float) -> int:
-    """Return the number of the stage after a share of all updates.
+    """Return the stage after a share of all updates.
 
     Args:
       stages: of a method, in order.

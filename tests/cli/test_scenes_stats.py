@@ -11,7 +11,8 @@ from support.scenes import SMALL, draw
 from jaxnav.cli import scenes as scenes_command
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.evaluation.similarity import layout_gap, layout_similarity, scene_counts
-from jaxnav.runs.directory import load_policies, load_run
+from jaxnav.runs.directory import load_run
+from jaxnav.runs.policies import load_policies
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.tables.compile import compile_bank, compile_scene
 from jaxnav.scenes.tables.observation_row import RowFormat

@@ -10,8 +10,9 @@ import pytest
 from scipy.stats import chisquare
 from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, draw
 
+from jaxnav.env.build import build
 from jaxnav.env.make import make
-from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, build
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav
 from jaxnav.env.testing import check_environment
 from jaxnav.env.types import State
 from jaxnav.errors import InputError

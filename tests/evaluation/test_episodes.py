@@ -6,7 +6,7 @@ import pytest
 from support import tiny_world as tiny
 
 from jaxnav.baselines.shortest_path import oracle_actions, oracle_outcome, replay
-from jaxnav.env.objectnav import build
+from jaxnav.env.build import build
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import Outcome, first_states

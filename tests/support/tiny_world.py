@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.causal import do
-from jaxnav.env.objectnav import NUM_PRIORS, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.env.types import Observation
 from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
 from jaxnav.policies.methods import Knowledge

@@ -1,4 +1,4 @@
-"""The seam for methods: what a method may bring, and what it gets by default."""
+"""The seam for methods."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -120,7 +120,7 @@ class Control(Protocol):
         ...
 
     def act(self, choice: jax.Array, note: Tree) -> jax.Array:
-        """Return the action int32 [] of a choice int32 [] in an episode."""
+        """Return the action int32 [] of a choice int32 []."""
         ...
 
 
@@ -137,14 +137,22 @@ class Primitive:
 
 
 class Adaptation(Protocol):
-    """Change a policy within an episode, by fast weights in its memory; hashable."""
+    """Change a policy within an episode; hashable.
+
+    The fast weights are part of the memory.
+    """
 
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> Tree:
-        """Return the fast weights at an episode's start, leaves [*batch, ...]."""
+        """Return the fast weights at an episode's start.
+
+        Their leaves are [*batch, ...].
+        """
         ...
 
     def decide(self, policy: "Policy", pathways: "Pathways", memory: "Memory") -> "Decision":
-        """Decide with the fast weights `memory.fast`, and return the next ones.
+        """Decide with fast weights, and return the next ones.
+
+        They are `memory.fast`.
 
         `policy.decide_plainly` is the decision without them.
         """

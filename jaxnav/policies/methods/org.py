@@ -15,7 +15,7 @@ from jaxnav.policies.spec import PolicySpec
 
 
 class ObjectRelations(Experience):
-    """Relate the detected categories to each other and to the goal.
+    """Relate the detected categories and the goal.
 
     The table [R^T X | T | g] of K rows, X the appearance and T the boxes of the detected categories, is the experience
     that the layout weights multiply (eq. 7), before the perceptron that reads it. Its first layer is linear: the

@@ -18,7 +18,7 @@ from support.scenes import APARTMENTS, HOUSES, ROOMS, coarse_scene, maze_scene
 from support.twin import DONE, Twin
 from support.twin_scene import largest_component
 
-from jaxnav.env.objectnav import build
+from jaxnav.env.build import build
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.files.scene_file import read_scenes
 from jaxnav.scenes.generate.rooms import generate_rooms

@@ -1,0 +1,81 @@
+"""The evaluation report as tables for a terminal and in Markdown."""
+
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+_COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
+
+
+def console_table(report: dict[str, Any]) -> Table:
+    """Make the table for a terminal.
+
+    A line per row, `mean ± std [95 % interval]`, under a header per world, split and decoding.
+    """
+    table = Table("Variant", *(title for title, _ in _COLUMNS.values()))
+    for heading, lines in _groups(report).items():
+        table.add_section()
+        table.add_row(Text(heading, style="bold"))
+        for cells in lines:
+            table.add_row(*map(Text, cells))  # Text: brackets are not markup
+    return table
+
+
+def difference_table(report: dict[str, Any]) -> Table:
+    """Make the table of the paired differences.
+
+    A line per comparison and decoding, `mean [95 % interval]`.
+    """
+    lines: dict[tuple[str, str], list[str]] = {}
+    for entry in report["differences"]:
+        compared = _label({**entry, "variant": entry["to"], "method": ""})
+        reference = "+ w" if entry["from"] == "layout" else entry["from"]
+        _, digits = _COLUMNS[entry["metric"]]
+        low, high = entry["ci95"]
+        cell = f"{entry['mean']:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+        lines.setdefault((f"{compared} - {reference}", entry["decoding"]), []).append(cell)
+    table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in _COLUMNS.values()))
+    for names, cells in lines.items():
+        table.add_row(*map(Text, (*names, *cells)))
+    return table
+
+
+def markdown_table(report: dict[str, Any]) -> str:
+    """Make the table in Markdown, ending with a newline."""
+    lines = [("Variant", *(title for title, _ in _COLUMNS.values())), ("---", *("---:" for _ in _COLUMNS))]
+    for heading, group in _groups(report).items():
+        lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
+    """Group the cells of lines by heading, in order."""
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for row in report["rows"]:
+        heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
+        cells = (_label(row), *(_cell(row[metric], digits) for metric, (_, digits) in _COLUMNS.items()))
+        groups.setdefault(heading, []).append(cells)
+    return groups
+
+
+def _label(row: dict[str, Any]) -> str:
+    match row["variant"]:
+        case "oracle":
+            label = "Shortest path (oracle)"
+        case "random":
+            label = "Random"
+        case "baseline":
+            label = f"{row['method']} (baseline)"
+        case "layout":
+            label = "+ w (layout)"
+        case "tde":
+            label = "+ w + TDE"
+        case _:
+            label = f"+ w + sTDE (eps={row['epsilon']:g})"
+    return label + (", paper form" if row["variant"] == "stde" and row["form"] == "paper" else "")
+
+
+def _cell(metric: dict[str, Any], digits: int) -> str:
+    low, high = metric["ci95"]
+    return f"{metric['mean']:.{digits}f} ± {metric['std']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

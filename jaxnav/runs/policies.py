@@ -1,0 +1,170 @@
+"""The policies of a run: how they are exported and read again."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.env.objectnav import ObjectNav
+from jaxnav.errors import InputError
+from jaxnav.layout import Setting
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import Knowledge, find_method
+from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.runs.config import RunConfig
+from jaxnav.store.export import export_params, load_params
+from jaxnav.store.manifest import differences
+from jaxnav.training.exploration import Exploration
+
+#: Folder of the exported policies in a run directory.
+POLICIES = "policies"
+
+
+class Policies(NamedTuple):
+    """Hold the policies of a run, or some arms.
+
+    Attributes:
+      params: leaves [A S, ...], the S seeds of each arm after those of the arm before.
+      arms: names of the A arms.
+      knowledge: what was learned before training.
+      counts: float32 [rooms, K, K], that the layout priors were made of.
+      spec: what the policies are built from.
+      setting: of the layout estimator, as calibrated; None without the arm `layout`.
+      prior_steps: random steps that the priors were collected in.
+    """
+
+    params: dict[str, Any]
+    arms: tuple[str, ...]
+    knowledge: Knowledge
+    counts: jax.Array
+    spec: PolicySpec
+    setting: Setting | None
+    prior_steps: int
+
+    @property
+    def seeds(self) -> int:
+        """Return the number of seeds of each arm."""
+        return len(jax.tree.leaves(self.params)[0]) // len(self.arms)
+
+    def of(self, arm: str) -> dict[str, Any]:
+        """Return the parameters of an arm, leaves [S, ...]."""
+        first = self.seeds * self.arms.index(arm)
+        return jax.tree.map(lambda leaf: leaf[first : first + self.seeds], self.params)
+
+    def acting(self, env: ObjectNav) -> Acting:
+        """Return how they act in an environment."""
+        return Acting(env, self.spec, self.setting)
+
+
+def load_policies(run: RunConfig, arms: Sequence[str] | None = None) -> Policies:
+    """Load the exported policies of a run.
+
+    Args:
+      run: its settings.
+      arms: names of the arms to load; None for all.
+
+    Raises:
+      InputError: training has not finished, or left an arm out, or an export is damaged.
+    """
+    arms = tuple(run.arms if arms is None else arms)
+    if absent := [arm for arm in arms if arm not in run.arms]:
+        raise InputError(f"{run.run_dir}: was trained without the arm {absent[0]!r}; train one with all --arms")
+    folders = {arm: [run.run_dir / POLICIES / f"{arm}-{seed}" for seed in range(run.seeds)] for arm in arms}
+    if missing := [folder for paths in folders.values() for folder in paths if not folder.exists()]:
+        raise InputError(f"{missing[0]}: is missing, so training has not finished; run train.py again with this run")
+    loaded = {arm: [load_params(folder) for folder in paths] for arm, paths in folders.items()}
+    told = "layout" if "layout" in arms else arms[-1]  # its last seed says what holds for all
+    tensors, spec = loaded[told][-1]
+    where = folders[told][-1]
+    stacked = [seed["policy"] for seeds in loaded.values() for seed, _ in seeds]
+    policies = _policies_of(where, tensors, spec)
+    policies = policies._replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked), arms=arms)
+    if different := differences(spec["task"], json.loads(json.dumps(dataclasses.asdict(run.task)))):
+        raise InputError(
+            f"{where}: was trained for another task than its run says (there != here): {'; '.join(different)}; "
+            "use the version that trained the run"
+        )
+    return policies
+
+
+def read_export(folder: Path) -> Policies:
+    """Read one exported policy; its parameters have no leading axis.
+
+    Raises:
+      InputError: no export there, or a damaged one, or one of another version.
+    """
+    return _policies_of(folder, *load_params(folder))
+
+
+def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> Policies:
+    """Return what an export says.
+
+    Its parameters have no leading axis.
+
+    Raises:
+      InputError: the spec is of another version, or the method cannot be found.
+    """
+    try:
+        find_method(spec["method"])
+        sizes, method_sizes = Sizes(**spec["sizes"]), tuple(sorted(spec["method_sizes"].items()))
+        built = spec["method"], len(spec["categories"]), sizes, method_sizes, spec["direct"], spec["done_gate"]
+        return Policies(
+            params=jax.tree.map(jnp.asarray, tensors["policy"]),
+            arms=(),
+            knowledge=Knowledge(
+                layout=jnp.asarray(tensors["layout"]["prior"]),
+                method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
+            ),
+            counts=jnp.asarray(tensors["layout"]["counts"]),
+            spec=PolicySpec(*built),
+            setting=None if spec["layout"] is None else Setting(**spec["layout"]),
+            prior_steps=spec["prior_steps"],
+        )
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{where}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
+        ) from error
+
+
+def export_policy(
+    folder: Path,
+    config: RunConfig,
+    params: dict[str, Any],
+    knowledge: Knowledge,
+    setting: Setting | None,
+    explored: Exploration,
+) -> None:
+    """Export one policy and what acting with it takes.
+
+    Args:
+      folder: made if missing.
+      config: of its run.
+      params: of the policy.
+      knowledge: what was learned before training.
+      setting: of the layout estimator; None without the layout.
+      explored: what the priors were made of.
+    """
+    spec = {
+        "method": config.method,
+        "categories": list(config.task.categories),
+        "task": dataclasses.asdict(config.task),
+        "sizes": dataclasses.asdict(config.sizes),
+        "method_sizes": config.method_sizes,
+        "direct": config.direct,
+        "done_gate": config.done_gate,
+        "layout": None if setting is None else dataclasses.asdict(setting),
+        "prior_steps": int(explored.steps),
+        "prior_poses": int(explored.poses),
+    }
+    layout = {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.counts)}
+    tensors = {"policy": jax.device_get(params), "layout": layout}
+    if knowledge.method:
+        tensors["knowledge"] = jax.device_get(knowledge.method)
+    export_params(folder, tensors, spec)
