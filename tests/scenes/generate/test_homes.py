@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from support.lattice import EIGHT, FOUR, parts_of
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, GIBSON_GOALS, ROBOTHOR_GOALS
@@ -14,7 +14,6 @@ from jaxnav.scenes.generate.room_shapes import make_shape, wall_mask
 from jaxnav.scenes.scene import CELL, Room, Scene
 
 MILLIMETRES = 2e-3  # boxes are rounded to 1 mm
-EIGHT = np.ones((3, 3), int)  # neighbours of a cell
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +98,7 @@ def test_scene_invariants(apartments: list[Scene], houses: list[Scene]):
         assert scene.yaws.shape == scene.parents.shape == (n,)
         assert ((scene.parents >= -1) & (scene.parents < np.arange(n))).all()
         assert not {"Doorway", "Partition"} & set(scene.types)
-        assert ndimage.label(scene.reach, EIGHT)[1] == 1  # one connected part
+        assert parts_of(scene.reach, EIGHT).count == 1  # one connected part
 
 
 def test_boxes_meet_neither_walls_nor_each_other_nor_the_agent(apartments: list[Scene], houses: list[Scene]):
@@ -140,7 +139,7 @@ def test_all_rooms_of_a_house_can_be_walked_into(houses: list[Scene]):
         assert not (floors.any(axis=0) & scene.walls).any()
         # Reach is one part, so a standable cell in every room and door means that one can walk between them all.
         assert all((scene.reach & floor).sum() >= 5 for floor in floors), scene.name
-        doors, number = ndimage.label(~scene.walls & ~floors.any(axis=0))
+        doors, number = parts_of(~scene.walls & ~floors.any(axis=0), FOUR)
         assert number >= len(scene.rooms) - 1  # a tree at least
         for door in range(1, number + 1):
             assert DOOR_WIDTHS[0] <= (doors == door).sum() <= DOOR_WIDTHS[-1]  # 1 to 2 m

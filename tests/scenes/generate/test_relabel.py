@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.scene_records import assert_scenes_equal
 from support.scenes import SMALL, draw
-from test_scene_io import assert_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
@@ -86,7 +86,7 @@ def test_a_share_of_the_categories_exchanges_labels_by_a_derangement(objects, sh
     # What is no category stays none, with its name; so do the names of those that are not exchanged.
     assert new.get(-1, -1) == -1
     assert all(b == a for b, a, k in zip(scene.types, shifted.types, before, strict=True) if new[k] == k)
-    assert_equal(dataclasses.replace(shifted, types=scene.types), scene)  # boxes, cells, walls, name, ...
+    assert_scenes_equal(dataclasses.replace(shifted, types=scene.types), scene)  # boxes, cells, walls, name, ...
     # The nearest number of groups, but at least one; all at full shift.
     exchanged, present = sum(k != v for k, v in new.items()), len(set(before) - {-1})
     groups = present // 2

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_scene_io import assert_equal
+from support.scene_records import assert_scenes_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, ITHOR_CATEGORIES, ROBOTHOR_CATEGORIES, category_ids
@@ -110,12 +110,12 @@ def test_rooms_are_the_same_one_by_one():
     places = [("train", 0), ("train", 1), ("train", 2), ("val", 0), ("test", 0)]
     for scene, (split, i) in zip(together, places, strict=True):
         alone = generate_room_at(split, i, 2, 0.5)
-        assert_equal(alone, scene)
+        assert_scenes_equal(alone, scene)
 
 
 def test_a_shifted_room_is_its_twin_with_other_labels():
     for twin, scene in zip(scenes_of("rooms", 0.0), scenes_of("rooms", 1.0), strict=True):
-        assert_equal(dataclasses.replace(scene, types=twin.types), twin)
+        assert_scenes_equal(dataclasses.replace(scene, types=twin.types), twin)
         before, after = (category_ids(s.types, ITHOR_CATEGORIES) for s in (twin, scene))
         assert all(a != b or a == -1 for a, b in zip(before, after, strict=True))
         assert sorted(collections.Counter(before).values()) == sorted(collections.Counter(after).values())

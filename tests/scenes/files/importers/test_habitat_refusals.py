@@ -1,15 +1,15 @@
 """Habitat ObjectNav files that cannot be used: refused one by one, and mutated files raise nothing else."""
 
-import copy
 import gzip
 import json
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_import_habitat import EPISODES, STARTS, episode, split_of, write_json
-from test_import_semantic_map import l_shaped_floor, write_maps
-from test_scene_refusals import JSON_VALUES
+from support.importer_inputs.habitat import EPISODES, STARTS, episode, write_json
+from support.importer_inputs.semantic_maps import l_shaped_floor, write_maps
+from support.mutations import changed, mutated, mutated_bytes
+from support.scene_records import scenes_and_errors
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.habitat import read_habitat
@@ -22,7 +22,7 @@ def test_scenes_and_floors_are_refused_one_by_one(tmp_path):
     write_json(content / "A.json.gz", {"episodes": [episode(0, 0, 0, scene_id="x/Away.glb")]})
     (content / "B.json.gz").write_bytes(gzip.compress(b"{}")[:-5])
     write_json(content / "Home.json.gz", {"episodes": STARTS[:72]})
-    scenes, errors = split_of(read_habitat(tmp_path / "val", "val", maps))
+    scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val", maps))
     assert [scene.name for scene in scenes] == ["Home_floor0"]
     for error, problem in zip(
         errors,
@@ -37,39 +37,37 @@ def test_scenes_and_floors_are_refused_one_by_one(tmp_path):
         assert problem in error
 
 
-def changed(*keys_and_value: object) -> dict:
-    """EPISODES with the value at a path of keys replaced."""
-    content = copy.deepcopy(EPISODES)
-    *keys, last, value = keys_and_value
-    node = content
-    for key in keys:
-        node = node[key]
-    node[last] = value
-    return content
-
-
-CHAIR = ("goals_by_category", "Home.glb_chair", 0)
+CHAIR_GOAL = ("goals_by_category", "Home.glb_chair", 0)
 
 
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (changed("episodes", 1, "start_position", [0, float("nan"), 0]), "episodes[1]: start_position is nan"),
-        (changed("episodes", 1, "start_position", [0, 0]), "episodes[1]: start_position is [0, 0]; give a list of 3"),
-        (changed("goals_by_category", {}), "floor 0: goals has no object on this floor; give a semantic"),
-        (changed("goals_by_category", 3), "goals_by_category is 3"),
-        (changed(*CHAIR, "position", None), "goals_by_category: Home.glb_chair[0]: position is None"),
-        (changed(*CHAIR, "object_category", ""), "object_category is ''"),
-        (changed(*CHAIR, "view_points", [{}]), "view_points[0]: agent_state is missing"),
         (
-            changed("episodes", EPISODES["episodes"][:9:3]),
+            changed(EPISODES, "episodes", 1, "start_position", [0, float("nan"), 0]),
+            "episodes[1]: start_position is nan",
+        ),
+        (
+            changed(EPISODES, "episodes", 1, "start_position", [0, 0]),
+            "episodes[1]: start_position is [0, 0]; give a list of 3",
+        ),
+        (changed(EPISODES, "goals_by_category", {}), "floor 0: goals has no object on this floor; give a semantic"),
+        (changed(EPISODES, "goals_by_category", 3), "goals_by_category is 3"),
+        (changed(EPISODES, *CHAIR_GOAL, "position", None), "goals_by_category: Home.glb_chair[0]: position is None"),
+        (changed(EPISODES, *CHAIR_GOAL, "object_category", ""), "object_category is ''"),
+        (changed(EPISODES, *CHAIR_GOAL, "view_points", [{}]), "view_points[0]: agent_state is missing"),
+        (
+            changed(EPISODES, "episodes", EPISODES["episodes"][:9:3]),
             "are 5 cells, of which only 2 are connected; give a semantic",
         ),
-        (changed("episodes", 0, "start_position", [9e5, 0, 0]), "floor 0: start_position spans more than 500 m"),
+        (
+            changed(EPISODES, "episodes", 0, "start_position", [9e5, 0, 0]),
+            "floor 0: start_position spans more than 500 m",
+        ),
     ],
 )
 def test_scenes_that_cannot_be_used_are_named(tmp_path, content, problem):
-    _, errors = split_of(read_habitat(write_json(tmp_path / "Home.json.gz", content), "val"))
+    _, errors = scenes_and_errors(read_habitat(write_json(tmp_path / "Home.json.gz", content), "val"))
     assert "Home.json.gz, scene 'Home': " in errors[0]
     assert problem in errors[0]
 
@@ -91,26 +89,13 @@ def test_files_that_cannot_be_used_are_refused(tmp_path, content, problem):
         list(read_habitat(tmp_path / "none.json.gz", "val"))
 
 
-@given(st.data(), JSON_VALUES)
-def test_mutated_episodes_never_raise_another_error(tmp_path_factory, data, value):
-    content = copy.deepcopy(EPISODES)
-    node: dict | list = content
-    while True:
-        key = data.draw(st.sampled_from(sorted(node) if isinstance(node, dict) else range(len(node))))
-        if not isinstance(node[key], dict | list) or not node[key] or data.draw(st.integers(0, 3)) == 0:
-            break
-        node = node[key]
-    if data.draw(st.booleans()):
-        del node[key]
-    else:
-        node[key] = value
+@given(mutated(EPISODES), st.booleans())
+def test_mutated_episodes_never_raise_another_error(tmp_path_factory, content, mapped):
     folder = tmp_path_factory.getbasetemp()
     path = write_json(folder / "mutated.json.gz", content)
-    maps = data.draw(st.sampled_from([None, folder / "maps.pbz2"]))
-    if maps:
-        write_maps(maps, {"Home": {0: l_shaped_floor()}})
+    maps = write_maps(folder / "maps.pbz2", {"Home": {0: l_shaped_floor()}}) if mapped else None
     try:
-        scenes, errors = split_of(read_habitat(path, "val", maps))
+        scenes, errors = scenes_and_errors(read_habitat(path, "val", maps))
     except InputError as error:
         assert str(error).startswith(str(path))  # noqa: PT017  (reading may also succeed)
     else:
@@ -120,13 +105,10 @@ def test_mutated_episodes_never_raise_another_error(tmp_path_factory, data, valu
             read_scenes(folder / "mutated.jsonl.gz")
 
 
-WHOLE = gzip.compress(json.dumps(EPISODES).encode(), mtime=0)
-
-
-@given(st.integers(0, len(WHOLE) - 1), st.integers(0, 255), st.integers(0, len(WHOLE)), st.binary(max_size=4))
-def test_mutated_bytes_never_raise_another_error(tmp_path_factory, at, byte, end, tail):
+@given(mutated_bytes(gzip.compress(json.dumps(EPISODES).encode(), mtime=0)))
+def test_mutated_bytes_never_raise_another_error(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "bytes.json.gz"
-    path.write_bytes(WHOLE[:at] + bytes([byte]) + WHOLE[at + 1 : end] + tail)
+    path.write_bytes(content)
     try:
         list(read_habitat(path, "val"))
     except InputError as error:
