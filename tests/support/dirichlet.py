@@ -5,7 +5,10 @@ from scipy.special import digamma
 
 
 def exact_kl(prior, counts) -> np.ndarray:
-    """Float64, whole counts: lnGamma(a + n) - lnGamma(a) is the sum of log(a + i), so no large terms cancel."""
+    """Return the divergence of a posterior from its prior, for whole counts.
+
+    lnGamma(a + n) - lnGamma(a) is the sum of log(a + i), so no large terms cancel.
+    """
     a, c = np.asarray(prior, np.float64), np.asarray(counts, np.int64)
     a_0, n = a.sum(-1), c.sum(-1)
 

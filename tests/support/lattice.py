@@ -14,10 +14,10 @@ FOUR, EIGHT = ndimage.generate_binary_structure(2, 1), ndimage.generate_binary_s
 
 
 class Parts(NamedTuple):
-    """Describe the connected parts of a mask: labels from 1, 0 outside, and their number."""
+    """Describe the connected parts of a mask: labels from 1, 0 outside, and how many."""
 
     labels: np.ndarray
-    count: int
+    number: int
 
 
 def points_of(scene: Scene, mask: np.ndarray) -> Points:

@@ -98,7 +98,7 @@ def test_scene_invariants(apartments: list[Scene], houses: list[Scene]):
         assert scene.yaws.shape == scene.parents.shape == (n,)
         assert ((scene.parents >= -1) & (scene.parents < np.arange(n))).all()
         assert not {"Doorway", "Partition"} & set(scene.types)
-        assert parts_of(scene.reach, EIGHT).count == 1  # one connected part
+        assert parts_of(scene.reach, EIGHT).number == 1  # one connected part
 
 
 def test_boxes_meet_neither_walls_nor_each_other_nor_the_agent(apartments: list[Scene], houses: list[Scene]):

@@ -1,4 +1,4 @@
-"""The plain-Python twin against tiny scenes worked by hand: moves, the course of an episode, its measures, the view."""
+"""The plain-Python twin against scenes worked out by hand: moves, the course of an episode, its measures, the view."""
 
 import math
 
@@ -139,11 +139,11 @@ def test_goal_distance_is_to_the_nearest_goal_less_a_metre():
 CHEST = (0.5, 0.5, 0.5)  # its footprint reaches 0.25 m to every side
 
 
-@pytest.mark.parametrize(("z", "found"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
-def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, found):
+@pytest.mark.parametrize(("z", "goals"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
+def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, goals):
     for heading in range(12):
-        assert single(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).found() == found
-    assert single(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).found() == {BOOK}  # in its footprint: no way at all
+        assert single(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).successes() == goals
+    assert single(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).successes() == {BOOK}  # in its footprint: no way at all
 
 
 def walk_to_the_book(rows, *place, walls=(), cell=(0, 0)):
@@ -222,6 +222,6 @@ def test_what_hides_the_floor():
     # What stands beyond the lattice hides nothing.
     scene = draw(["." * 9] * 5, chest)
     assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 5 + ["#"] * 6
-    # Neither does the own cell, nor that which is looked at.
+    # Neither does the cell of the agent, nor that which is looked at.
     scene = draw(["." * 9] * 5, walls=[(0, 4), (3, 4)])
     assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 4 + ["?"] * 7
