@@ -57,11 +57,11 @@ def test_citation_carries_the_version() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "matches"),
     [("see /root/notes", True), ("'/home/ann/x'", True), ("https://site.org/home/x", False), ("runs/work/x", False)],
 )
-def test_machine_path_pattern(text: str, found: bool) -> None:
-    assert bool(MACHINE_PATH.search(text)) is found
+def test_machine_path_pattern(text: str, matches: bool) -> None:
+    assert bool(MACHINE_PATH.search(text)) is matches
 
 
 def test_no_machine_paths() -> None:
