@@ -3,12 +3,12 @@
 import collections
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.real_scenes import ITHOR, require
 from support.scene_records import assert_scenes_equal
 from support.scenes import SMALL, draw
 
@@ -21,7 +21,6 @@ from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.task import ROOMS
 from jaxnav.scenes.worlds import from_file
 
-REAL_FILE = Path(__file__).parents[4] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
 SHIFTS = st.floats(0, 1)
 SEEDS = st.integers(0, 2**32)
 NAMES = st.text(max_size=12)
@@ -179,14 +178,13 @@ def test_scenes_of_a_file_are_relabelled_one_by_one(tmp_path):
     assert from_file(file, "train", 0.0, 5).identity == from_file(file, "train").identity
 
 
-@pytest.mark.skipif(not REAL_FILE.exists(), reason="the real rooms are not here")
 def test_real_rooms_stay_equally_difficult():
-    """Every goal is another one: the same starts and path lengths, in another column."""
-    own, shifted = from_file(REAL_FILE, "val"), from_file(REAL_FILE, "val", 1.0)
+    # Every goal is another one: the same starts and path lengths, in another column.
+    unshifted, shifted = (from_file(require(ITHOR), "val", shift) for shift in (0.0, 1.0))
     moved = 0
-    for i in range(0, len(own), 5):
-        before, after = (compile_scene(scenes[i], ROOMS).best_length for scenes in (own, shifted))
-        for goal, new in becomes(own[i], 1.0).items():
+    for i in range(0, len(unshifted), 5):
+        before, after = (compile_scene(scenes[i], ROOMS).best_length for scenes in (unshifted, shifted))
+        for goal, new in becomes(unshifted[i], 1.0).items():
             if goal >= 0:
                 np.testing.assert_array_equal(before[:, goal], after[:, new])
                 moved += goal != new

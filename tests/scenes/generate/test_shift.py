@@ -163,11 +163,11 @@ def test_marginals_stay_put(world: str):
     cells = [np.mean([scene.reach.sum() for scene in scenes]) for scenes in (before, after)]
     assert cells[1] == pytest.approx(cells[0], rel=0.06)
     heights: list[dict[str, list[float]]] = [collections.defaultdict(list), collections.defaultdict(list)]
-    for found, scenes in zip(heights, (before, after), strict=True):
+    for by_category, scenes in zip(heights, (before, after), strict=True):
         for scene in scenes:
             for i, y in zip(category_ids(scene.types, categories), scene.boxes[:, 1], strict=True):
                 if i >= 0:
-                    found[categories[i]].append(y)
+                    by_category[categories[i]].append(y)
     common = [name for name in heights[0] if len(heights[0][name]) >= 15]
     for name in common:  # like footing: a category is at most half a metre higher or lower
         assert np.mean(heights[1][name]) == pytest.approx(np.mean(heights[0][name]), abs=0.5), name
