@@ -53,7 +53,7 @@ def test_make_generates_a_world():
     np.testing.assert_array_equal(params.tables.rows, bank.rows)
 
 
-def test_make_from_a_scene_file_with_a_task_of_ones_own(tmp_path):
+def test_make_from_a_scene_file_with_another_task(tmp_path):
     path = tmp_path / "rooms.jsonl.gz"
     scenes = generate_rooms(4, 4, 0)
     write_scenes(path, scenes)

@@ -39,7 +39,7 @@ def test_of_twelve_headings_two_lead_to_each_diagonal_cell(headings, cell):
         assert episode.pose == (*cell, heading, 0)
 
 
-def test_a_diagonal_move_needs_only_its_own_cell():
+def test_a_diagonal_move_needs_only_the_cell_it_leads_to():
     episode = twin(draw([".#", "#."]), heading=1)
     episode.step(MOVE_AHEAD)
     assert episode.cell == (1, 1)
@@ -60,7 +60,7 @@ def test_standable_is_the_largest_component_and_the_first_of_equal_ones():
         twin(draw(["..#..", "..#.."]), cell=(0, 3))
 
 
-def test_rotations_wrap_and_looks_stop_at_their_limits():
+def test_rotations_wrap_and_horizons_stop_at_their_limits():
     episode = twin(draw(["."]))
     poses = []
     for action in (ROTATE_LEFT, ROTATE_RIGHT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, LOOK_DOWN, LOOK_UP):
@@ -78,7 +78,7 @@ def test_twelve_headings_go_around_and_a_single_horizon_stays():
     assert poses == [(11, 0), (11, 0), (11, 0), (0, 0), (1, 0)]
 
 
-def test_done_ends_the_episode_and_pays_where_the_goal_is_found():
+def test_done_ends_the_episode_and_pays_where_it_succeeds():
     book = ("Book", 0, 1.5, 1, *SMALL)
     assert single(book).step(DONE) == (5.0, True, False)
     assert single(book, heading=4).step(DONE) == (-0.01, True, False)

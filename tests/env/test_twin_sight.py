@@ -126,7 +126,7 @@ def test_a_box_below_085_hides_nothing(top, clear):
     assert detected(single(("Book", 0, 0, 1.5, *SMALL), table, horizon=1)) == ({BOOK} if clear else set())
 
 
-def test_a_target_is_not_hidden_by_its_own_box_but_by_another_one():
+def test_a_target_is_hidden_by_another_box_only():
     fridge = ("Fridge", 0, 0.9, 1.2, 0.7, 1.8, 0.7)
     # The book is in the fridge, the chair right behind it.
     scene = (fridge, ("Book", 0, 1.2, 1.4, *SMALL), ("Chair", 0, 0.8, 2, 0.4, 0.4, 0.4))

@@ -185,7 +185,7 @@ def test_the_dial_moves_away_from_the_training_distribution(world: str):
 
 
 @pytest.mark.parametrize("world", HOMES)
-def test_placed_anew_by_their_own_rules_objects_stay_in_the_training_distribution(world: str):
+def test_placed_anew_by_their_rules_objects_stay_in_the_training_distribution(world: str):
     assert (
         moved_apart(scenes_of(world, 0.0), scenes_of(world, NEARLY_ZERO, 1), WORLDS[world][1], np.random.default_rng(0))
         > 0.01

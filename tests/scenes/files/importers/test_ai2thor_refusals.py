@@ -122,7 +122,7 @@ def refusal_of(path: Path) -> str:
     return str(result)
 
 
-def test_files_cut_short_anywhere_are_refused(tmp_path):
+def test_files_that_end_anywhere_are_refused(tmp_path):
     content = gzip.compress(json.dumps(METADATA).encode(), mtime=0)
     path = tmp_path / "room.json.gz"
     for length in range(0, len(content), 7):

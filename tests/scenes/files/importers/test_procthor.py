@@ -82,7 +82,7 @@ def test_doorframes_are_open_and_doors_to_the_outside_are_shut(scene_of):
 
 
 @pytest.mark.parametrize("turn", [1, -1])
-def test_a_room_with_a_corner_cut_out(scene_of, turn):
+def test_an_l_shaped_room(scene_of, turn):
     corners = [(0, 0), (0, 4), (2, 4), (2, 2), (4, 2), (4, 0)][::turn]
     bowl = item("Bowl|2|0", "Bowl_1", 1.0, 1.9, 1.0)  # from 1.85 m, above the agent
     scene = scene_of(build(("Bathroom", corners), objects=(bowl,), agent=(0.5, 0.5)))

@@ -68,11 +68,11 @@ def test_the_other_houses_of_a_file_are_imported(tmp_path):
     path = tmp_path / "val.jsonl.gz"
     lines = [json.dumps(HOUSE), "{", "", json.dumps(without(HOUSE, "rooms")), json.dumps(HOUSE)]
     path.write_bytes(gzip.compress("\n".join(lines).encode()))
-    first, cut, bad, last = read_procthor(path, "val")
+    first, partial, bad, last = read_procthor(path, "val")
     assert isinstance(first, Scene)
     assert isinstance(last, Scene)
     assert (first.name, last.name) == ("val-0", "val-3")
-    assert str(cut).startswith(f"{path}, line 2: not JSON")
+    assert str(partial).startswith(f"{path}, line 2: not JSON")
     assert str(bad).startswith(f"{path}, line 4: house 'val-2': rooms is missing")
 
 

@@ -202,7 +202,7 @@ def test_objects_put_back_on_their_pivots_are_where_they_were(tmp_path):
 
 
 @pytest.mark.slow
-def test_nearly_everything_can_be_found_in_the_simulators_rooms():
+def test_nearly_every_object_can_be_reached_in_the_simulators_rooms():
     present = reachable = 0
     for scene in map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))):
         present += len(set(category_ids(scene.types, ITHOR_CATEGORIES)) - {-1})
