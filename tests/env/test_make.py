@@ -1,4 +1,4 @@
-"""From the name of a world or a scene file to an environment."""
+"""Environments by the name of a world or file."""
 
 import dataclasses
 

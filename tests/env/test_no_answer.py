@@ -1,4 +1,4 @@
-"""What an agent perceives holds no bit that tells whether Done would succeed."""
+"""Observations hold no bit that says whether Done would succeed."""
 
 import functools
 

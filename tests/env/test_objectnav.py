@@ -1,4 +1,4 @@
-"""One episode: how it starts, what its steps give, and how it ends."""
+"""One episode: its start, its steps and its end."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The public check of the contract: passed by the environment, failed by broken ones."""
+"""The public check of the contract, with broken environments."""
 
 import jax.numpy as jnp
 import pytest

@@ -40,7 +40,7 @@ TASKS = {
 
 @functools.cache
 def scenes_of(source: str) -> list[Scene]:
-    """Return a scene of each room type, or six drawn ones."""
+    """Return a scene of each room type, or six drawn."""
     if source == "coarse":
         return [coarse_scene(seed) for seed in range(6)]
     if source == "maze":
@@ -72,7 +72,10 @@ class Rollout(NamedTuple):
 
 
 def roll_out(env: ObjectNav, params: EnvParams, seed: int) -> Rollout:
-    """Take random steps, with Done likelier where it succeeds or time is up."""
+    """Take random steps.
+
+    Done is likelier where it succeeds or time is up.
+    """
 
     def act(key, state):
         steer, choose, step = jax.random.split(key, 3)
@@ -97,7 +100,7 @@ def roll_out(env: ObjectNav, params: EnvParams, seed: int) -> Rollout:
 def step_differences(
     step: Rollout, guide: Guide, expected: tuple[float, bool, bool], first_pose: int, bank: Bank
 ) -> Iterator[str]:
-    """Yield what of a step differs from what the twin gave, by name."""
+    """Yield names of what differs between step and twin."""
     twin, after = guide.twin, step.info["final_state"]
     cell = after.pose // bank.task.rules.poses_per_cell
     yield from row_differences(step.info["final_observation"].row, twin, len(bank.task.categories))
@@ -156,7 +159,7 @@ def test_standable_cells():
 
 
 def differences_of(scene: Scene, guide: Guide, task: Task, every: int = 1) -> collections.Counter[str]:
-    """Count what of every so many poses differs from the twin."""
+    """Count what differs from the twin at poses, by name."""
     table, differences = compile_scene(scene, task), collections.Counter()
     successor = successors(table.ahead, task.rules)
     assert len(successor) == len(table.rows) == len(guide.cells) * task.rules.poses_per_cell

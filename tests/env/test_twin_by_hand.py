@@ -1,4 +1,4 @@
-"""The plain-Python twin against scenes worked out by hand: moves, the course of an episode, its measures, the view."""
+"""The twin by hand: moves, endings, measures and the view."""
 
 import math
 
@@ -197,7 +197,7 @@ def test_measures_of_walks():
 
 
 def picture(episode):
-    """The view, the far edge first."""
+    """Return the view, the far edge first."""
     cells = episode.view()
     return ["".join("?.#"[value] for value in cells[i : i + 11]) for i in range(110, -1, -11)]
 

@@ -1,4 +1,4 @@
-"""The plain-Python twin against scenes worked out by hand: view cone, line of sight, success and detection.
+"""The twin by hand: sight, success and detection.
 
 Most scenes have the one standable cell [0, 0]: the camera is at (0, 1.5, 0) and the objects before it are at z > 0.
 """

@@ -19,7 +19,10 @@ def rollout():
 
 
 def plain(kernel, drive, ended, hidden):
-    """The definition, a Python loop that autodiff sees through; a second decision must not move the memory."""
+    """Unroll by definition, in a Python loop.
+
+    A second decision must not move the memory.
+    """
     after, before, projected = [], [], []
     for t in range(T):
         before.append(jax.lax.stop_gradient(hidden))
@@ -51,7 +54,10 @@ def test_hidden_state_starts_at_zero_after_an_ending(rollout):
 
 
 def test_unrolled_gradients(rollout):
-    """Of a loss on the states and on a second decision that shares memory and products."""
+    """Check gradients of a loss with a second decision.
+
+    The second decision shares memory and products.
+    """
     ended, other = rollout[2], normal(5, T, B, 3 * H)
 
     def loss(loop, kernel, drive, hidden):

@@ -1,4 +1,4 @@
-"""Moves on the lattice: connected parts, standable cells and shortest action counts."""
+"""Moves on the lattice: connected parts and shortest action counts."""
 
 from collections import deque
 

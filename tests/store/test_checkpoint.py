@@ -52,7 +52,7 @@ def as_data(state: State) -> State:
 
 
 def restored(run_dir: Path, abstract: Any = ABSTRACT, manifest: Mapping[str, Any] = MANIFEST) -> tuple[Any, int]:
-    """Return the latest state and its step; fail if there is none."""
+    """Return the latest state and its step, which must exist."""
     result = checkpoint.restore(run_dir, abstract, manifest)
     assert result is not None
     return result

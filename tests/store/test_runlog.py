@@ -1,4 +1,4 @@
-"""The run log: rows, torn lines, and what is dropped on resume."""
+"""The run log: rows, torn lines, and resuming."""
 
 import pytest
 from hypothesis import given

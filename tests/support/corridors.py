@@ -1,4 +1,7 @@
-"""Corridors of several lengths, compiled into shards; importable by the processes that compile them."""
+"""Corridors of several lengths, compiled into shards.
+
+Processes that compile them import them from here.
+"""
 
 import dataclasses
 import time
@@ -17,7 +20,10 @@ TASK = Task(CATEGORIES)
 
 @dataclasses.dataclass(frozen=True)
 class Corridors:
-    """Hold corridors with a book at the end, but for those of `without`."""
+    """Hold corridors with a book at the end.
+
+    Those of `without` have none.
+    """
 
     count: int = 7
     without: tuple[int, ...] = ()
@@ -35,7 +41,10 @@ class Corridors:
 
 @dataclasses.dataclass(frozen=True)
 class GatedCorridors(Corridors):
-    """Hold corridors of which those of `gated` wait until the file `gate` is there."""
+    """Hold corridors that wait for a file.
+
+    Those of `gated` wait until `gate` is there.
+    """
 
     gate: str = "/nonexistent"
     gated: tuple[int, ...] = ()

@@ -1,11 +1,11 @@
-"""The Dirichlet divergence in float64, for tests of the float32 one."""
+"""The Dirichlet divergence in float64."""
 
 import numpy as np
 from scipy.special import digamma
 
 
 def exact_kl(prior, counts) -> np.ndarray:
-    """Return the divergence of a posterior from its prior, for whole counts.
+    """Return the divergence of a posterior from its prior.
 
     lnGamma(a + n) - lnGamma(a) is the sum of log(a + i), so no large terms cancel.
     """

@@ -35,7 +35,7 @@ NASTY = [None, True, -1, 0, 7, 1e308, -0.13, 10**400, float("nan"), float("inf")
 
 
 class Format(NamedTuple):
-    """Describe an input of a format: its content, and how it is written.
+    """Describe an input: format, content, and a writer.
 
     The files of a folder are members of the content.
     """
@@ -79,14 +79,17 @@ FORMATS = (
 
 
 def mutated(content: object, draw: random.Random) -> object:
-    """Return a copy with up to three values deleted or replaced."""
+    """Return a copy with up to three values replaced.
+
+    They may be deleted, too.
+    """
     for _ in range(draw.randint(1, 3)):
         content = edited(content, draw.choice, lambda: copy.deepcopy(draw.choice(NASTY)))
     return content
 
 
 def damaged(data: bytes, draw: random.Random) -> bytes:
-    """Return bytes without their end, or with one of them changed."""
+    """Return bytes without their end, or with one changed."""
     if draw.random() < 0.5:
         return data[: draw.randrange(len(data) + 1)]
     at = draw.randrange(len(data))
@@ -94,7 +97,7 @@ def damaged(data: bytes, draw: random.Random) -> bytes:
 
 
 def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, float]:
-    """Return runs by exit code (or CRASHED), and the slowest's seconds.
+    """Return runs by exit code, and the slowest's seconds.
 
     Raises:
       AssertionError: a run that leaves a file without success, or none with it.

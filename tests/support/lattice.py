@@ -14,19 +14,19 @@ FOUR, EIGHT = ndimage.generate_binary_structure(2, 1), ndimage.generate_binary_s
 
 
 class Parts(NamedTuple):
-    """Describe the connected parts of a mask: labels from 1, 0 outside, and how many."""
+    """Describe connected parts: labels from 1, 0 outside; their number."""
 
     labels: np.ndarray
     number: int
 
 
 def points_of(scene: Scene, mask: np.ndarray) -> Points:
-    """Return the points (x, z) of the cells of a mask."""
+    """Return the points (x, z) of a mask's cells."""
     return {(scene.origin[0] + CELL * ix, scene.origin[1] + CELL * iz) for iz, ix in np.argwhere(mask).tolist()}
 
 
 def block(x0: float, x1: float, z0: float, z1: float) -> Points:
-    """Return the lattice points (x, z) of a rectangle, its border included."""
+    """Return the lattice points (x, z) of a rectangle."""
     return {(x, z) for x in np.arange(x0, x1 + 0.1, CELL).tolist() for z in np.arange(z0, z1 + 0.1, CELL).tolist()}
 
 

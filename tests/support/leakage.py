@@ -1,4 +1,4 @@
-"""Single bits of what an agent perceives, as predictors of success.
+"""Single bits of an observation, as predictors of success.
 
 A bit, or its complement, predicts whether Done would succeed with a balanced accuracy: the mean of the rates at which
 it is right where Done succeeds and where it does not. It may not do better than the detection of the goal itself.
@@ -27,7 +27,7 @@ SIGNIFICANCE = 0.01
 
 
 class Rates(NamedTuple):
-    """Describe predictors: how often they are positive where Done succeeds, and elsewhere.
+    """Describe how often predictors are positive.
 
     Attributes:
       hits, alarms: float [...], the two rates.
@@ -77,7 +77,7 @@ class Leaks(NamedTuple):
 
 
 def step_into(env: ObjectNav, state: State, params: EnvParams) -> dict[str, Observation]:
-    """Return what an agent is shown by a step into a state, by name.
+    """Return what a step into a state shows, by name.
 
     The step is a turn to the right, from the heading to the left.
     """
@@ -87,7 +87,7 @@ def step_into(env: ObjectNav, state: State, params: EnvParams) -> dict[str, Obse
 
 
 def find_leaks(env: ObjectNav, params: EnvParams, bank: Bank) -> Leaks:
-    """Return the bits that predict success better than the goal's detection.
+    """Return bits that predict success better than the goal's detection.
 
     Args:
       env, params: the environment, whose steps show the bits.
@@ -116,7 +116,7 @@ def find_leaks(env: ObjectNav, params: EnvParams, bank: Bank) -> Leaks:
 
 
 def _states(bank: Bank, goal: int) -> tuple[State, np.ndarray]:
-    """Return all poses of a bank, and in which of them a goal is possible."""
+    """Return all poses, and where a goal is possible."""
     counts = bank.num_cells * bank.task.rules.poses_per_cell
     scene = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
     possible = np.array([goal in goals[:number] for goals, number in zip(bank.goals, bank.num_goals, strict=True)])
@@ -125,19 +125,19 @@ def _states(bank: Bank, goal: int) -> tuple[State, np.ndarray]:
 
 
 def _named(shown: dict[str, Observation]) -> dict[str, np.ndarray]:
-    """Return the bytes uint8 [P, ...] of every array that is shown, by name."""
+    """Return the bytes uint8 [P, ...] of arrays, by name."""
     leaves = jax.tree_util.tree_leaves_with_path(shown)
     arrays = {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
     return {name: np.ascontiguousarray(a).reshape(len(a), -1).view(np.uint8) for name, a in arrays.items()}
 
 
 def _detection_bytes(env: ObjectNav) -> np.ndarray:
-    """Return which bytes of a row hold the detection of each category, int [K, 4]."""
+    """Return the bytes of each detection, int [K, 4]."""
     return env.row_format.detections(np.arange(env.row_format.num_bytes))
 
 
 def _by_detection(env: ObjectNav, rows: np.ndarray, goal: int, succeeds: np.ndarray) -> Rates:
-    """Return the best predictor by distance or confidence of the goal's detection.
+    """Return the best predictor by the goal's detection.
 
     Where success is to be near, whatever is seen, it is that of a full turn, one prediction a cell.
     """

@@ -1,4 +1,4 @@
-"""Changed copies of JSON values, texts and bytes: at a path of keys, or wherever Hypothesis chooses."""
+"""Changed copies of JSON values, texts and bytes."""
 
 import copy
 import functools
@@ -20,7 +20,7 @@ JSON_VALUES = st.recursive(
 
 
 def changed(document: Any, *keys_and_value: Any) -> Any:
-    """Return a copy with the value at a path of keys replaced."""
+    """Return a copy with the value at some keys replaced."""
     copied = copy.deepcopy(document)
     *keys, last, value = keys_and_value
     functools.reduce(lambda node, key: node[key], keys, copied)[last] = value
@@ -28,14 +28,14 @@ def changed(document: Any, *keys_and_value: Any) -> Any:
 
 
 def without(document: Any, *keys: Any) -> Any:
-    """Return a copy with the value at a path of keys deleted."""
+    """Return a copy with the value at some keys deleted."""
     copied = copy.deepcopy(document)
     del functools.reduce(lambda node, key: node[key], keys[:-1], copied)[keys[-1]]
     return copied
 
 
 def edited(document: Any, choose: Callable[[Sequence[Any]], Any], draw_value: Callable[[], Any]) -> Any:
-    """Return a copy with the value at a random path of keys deleted or replaced.
+    """Return a copy with one value deleted or replaced.
 
     Args:
       document: JSON value; an empty one is returned as it is.
@@ -58,13 +58,16 @@ def edited(document: Any, choose: Callable[[Sequence[Any]], Any], draw_value: Ca
 
 @st.composite
 def mutated(draw: st.DrawFn, document: Any) -> Any:
-    """Draw copies of a JSON value with something at a random path deleted or replaced."""
+    """Draw copies of a JSON value with one edit."""
     return edited(document, lambda options: draw(st.sampled_from(options)), lambda: draw(JSON_VALUES))
 
 
 @st.composite
 def mutated_text(draw: st.DrawFn, text: str) -> str:
-    """Draw copies of a text with up to 20 characters in one place replaced by up to 6."""
+    """Draw copies of a text with one edit.
+
+    Up to 20 characters are replaced by up to 6.
+    """
     start = draw(st.integers(0, len(text)))
     end = min(start + draw(st.integers(0, 20)), len(text))
     return text[:start] + draw(st.text('[]{}",.:-#0123456789eNn\\u\n ', max_size=6)) + text[end:]
@@ -72,6 +75,9 @@ def mutated_text(draw: st.DrawFn, text: str) -> str:
 
 @st.composite
 def mutated_bytes(draw: st.DrawFn, content: bytes) -> bytes:
-    """Draw copies of bytes with one of them replaced, the end cut off and up to 4 bytes added."""
+    """Draw copies of bytes that are changed and cut off.
+
+    One is replaced, the end goes, and up to 4 are added.
+    """
     at, end = draw(st.integers(0, len(content) - 1)), draw(st.integers(0, len(content)))
     return content[:at] + bytes([draw(st.integers(0, 255))]) + content[at + 1 : end] + draw(st.binary(max_size=4))

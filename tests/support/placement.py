@@ -8,12 +8,12 @@ MILLIMETRES = 2e-3  # boxes are rounded to 1 mm
 
 
 def corners(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the low and high corners [N, 3] of boxes [N, 6]."""
+    """Return the low and high corners [N, 3] of boxes."""
     return boxes[:, :3] - boxes[:, 3:] / 2, boxes[:, :3] + boxes[:, 3:] / 2
 
 
 def cell_centres(scene: Scene, mask: np.ndarray) -> np.ndarray:
-    """Return x, z [C, 2] of the cells of a mask."""
+    """Return x, z [C, 2] of a mask's cells."""
     return np.asarray(scene.origin) + CELL * np.argwhere(mask)[:, ::-1]
 
 
@@ -47,7 +47,7 @@ def check_nothing_overlaps(scene: Scene) -> None:
 
 
 def check_agent_fits(scene: Scene, radius: float) -> None:
-    """Check that no obstacle is nearer than `radius` metres to a standable cell."""
+    """Check that obstacles are `radius` metres away from standable cells."""
     low, high = corners(scene.boxes)
     obstacle = (low[:, 1] < 1.7) & (high[:, 1] > 0.1)
     cells = cell_centres(scene, scene.reach)[:, None]

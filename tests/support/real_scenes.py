@@ -1,4 +1,4 @@
-"""Files of real scenes beside the repository; a test that needs one is skipped where it is missing."""
+"""Files of real scenes beside the repository."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ ROBOTHOR = _FOLDER / "robothor_train.jsonl.gz"
 
 
 def require(path: Path) -> Path:
-    """Return the path of a file, or skip the test that asks for it."""
+    """Return a path, or skip the test without it."""
     if not path.exists():
         pytest.skip(f"{path.name} is not here")
     return path

@@ -1,4 +1,4 @@
-"""Scene files of a few records, and comparisons of the scenes that are read from files."""
+"""Scene files of a few records, and comparisons of scenes."""
 
 import collections
 import dataclasses
@@ -35,19 +35,19 @@ def write_records(path: Path, *records: object) -> Path:
 
 
 def as_scene(result: Scene | InputError) -> Scene:
-    """Return the scene that an importer gave; fail if it gave an error."""
+    """Return a result that must be a scene."""
     assert isinstance(result, Scene), result
     return result
 
 
 def scenes_and_errors(results: Iterable[Scene | InputError]) -> tuple[list[Scene], list[str]]:
-    """Return the scenes that an importer gave, and the messages of its errors."""
+    """Return the scenes among results, and the errors' messages."""
     results = list(results)
     return [r for r in results if isinstance(r, Scene)], [str(r) for r in results if isinstance(r, InputError)]
 
 
 def assert_scenes_equal(a: Scene | InputError, b: Scene | InputError) -> None:
-    """Check that all fields of two scenes are equal, with their types and dtypes."""
+    """Check that two scenes are equal, types and dtypes included."""
     a, b = as_scene(a), as_scene(b)
     for field in dataclasses.fields(Scene):
         left, right = getattr(a, field.name), getattr(b, field.name)
@@ -62,7 +62,10 @@ def assert_scenes_equal(a: Scene | InputError, b: Scene | InputError) -> None:
 
 
 def check_outcomes(results: Iterable[Scene | InputError], outcomes: collections.Counter[type], path: Path) -> None:
-    """Check that every result is a scene that a scene file can hold, or an error that names its file; count them."""
+    """Check that results are storable scenes or named errors.
+
+    A scene file can hold the scenes, and errors name their file. They are counted by type.
+    """
     for result in results:
         outcomes[type(result)] += 1
         if isinstance(result, InputError):

@@ -1,4 +1,4 @@
-"""Scenes drawn by hand or at random, rules, and the twin in them.
+"""Scenes drawn by hand or at random, and their twins.
 
 Scenes are drawn with row 0 (the smallest z) first; the origin is (0, 0), so cell [iz, ix] is at x = ix / 4, z = iz / 4.
 """
@@ -53,7 +53,7 @@ def draw(
     walls: Iterable[tuple[int, int]] = (),
     origin: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
-    """Return a scene of objects (type, x, y, z, sx, sy, sz) with wall cells (iz, ix)."""
+    """Return a scene with objects and wall cells (iz, ix)."""
     reach = np.array([[mark == "." for mark in row] for row in rows])
     solid = np.zeros_like(reach)
     for cell in walls:
@@ -74,7 +74,7 @@ def coarse_scene(seed: int) -> Scene:
 
 
 def maze_scene(seed: int) -> Scene:
-    """Draw nine chambers with thin walls, and boxes on and in them.
+    """Draw nine chambers with thin walls, and boxes.
 
     Walls are one cell wide, and most have a door.
     """
@@ -136,7 +136,10 @@ def twin(
 
 
 def single(*objects: Object, walls: Iterable[tuple[int, int]] = (), **start: Any) -> Twin:
-    """Return the twin at the one standable cell [0, 0] of 16 x 4."""
+    """Return the twin in a lattice with one cell.
+
+    The standable cell is [0, 0] of 16 x 4.
+    """
     return twin(draw([".###"] + ["####"] * 15, *objects, walls=walls), **start)
 
 

@@ -110,7 +110,7 @@ class Twin:
         )
 
     def best_length(self) -> int | None:
-        """Return the least actions from the start to success, or None.
+        """Return the least actions from the start to success.
 
         Done is included.
         """

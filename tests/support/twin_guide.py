@@ -1,4 +1,4 @@
-"""The twin of a scene, its poses by number, and comparisons with compiled tables.
+"""The twin of a scene, and comparisons with compiled tables.
 
 The byte row is taken apart here by the words of docs/environment.md, without `RowFormat`.
 """
@@ -15,7 +15,7 @@ from support.twin_scene import largest_component
 
 
 class Guide:
-    """Hold the twin of a scene, and its poses by number."""
+    """Hold the twin of a scene, its poses by number."""
 
     def __init__(self, scene: Scene, task: Task):
         reach = largest_component({(iz, ix) for iz, ix in np.argwhere(scene.reach).tolist()})
@@ -37,7 +37,7 @@ class Guide:
 
 
 def agrees(entry: np.ndarray, instance: tuple[float, float, float]) -> bool:
-    """Check that four bytes are those of an instance, within half a quantum."""
+    """Check four bytes against an instance, within half a quantum."""
     ahead, right, apparent = instance
     distance = math.hypot(ahead, right)
     reach = min(max(apparent * max(distance, 0.25) / 0.12, 1.5), 5.0)
@@ -46,13 +46,13 @@ def agrees(entry: np.ndarray, instance: tuple[float, float, float]) -> bool:
 
 
 def same_distance(metres: float, expected: float) -> bool:
-    """Check that a distance in metres is the twin's, which is less a metre."""
+    """Check a distance against the twin's, less a metre."""
     distance = max(float(metres) - 1.0, 0.0)
     return distance == expected or abs(distance - expected) < 1e-6
 
 
 def row_differences(row: np.ndarray, twin: Twin, num_categories: int) -> Iterator[str]:
-    """Yield what of an observation row differs from the twin, by name."""
+    """Yield the names of what differs between row and twin."""
     entries, view = np.split(row, [4 * num_categories])
     if (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121].tolist() != twin.view():
         yield "view"

@@ -49,7 +49,7 @@ def degrees(rules: Rules, heading: int) -> float:
 
 @functools.cache
 def neighbour(rules: Rules, heading: int) -> Cell:
-    """Return (dz, dx) of the neighbour in the direction nearest to the heading."""
+    """Return (dz, dx) of the neighbour in a heading's direction."""
 
     def turn(step: Cell) -> float:
         return abs((math.degrees(math.atan2(step[1], step[0])) - degrees(rules, heading) + 180) % 360 - 180)
@@ -59,9 +59,9 @@ def neighbour(rules: Rules, heading: int) -> Cell:
 
 @functools.cache
 def view_lines(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None]:
-    """Return the place (dz, dx) of each view cell and those before it.
+    """Return the place (dz, dx) of each view cell.
 
-    It is None outside the cone.
+    With it come the places that the line to it passes. Both are None outside the cone.
     """
     yaw = math.radians(degrees(rules, heading))
     view: list[tuple[Cell, set[Cell]] | None] = []
@@ -81,7 +81,7 @@ def view_lines(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None
 
 
 class TwinScene:
-    """Hold a scene under some rules, and what has been computed of it."""
+    """Hold a scene under some rules, with what was computed."""
 
     def __init__(self, scene: Scene, categories: tuple[str, ...], rules: Rules):
         self.rules = rules
@@ -110,7 +110,7 @@ class TwinScene:
         return math.dist(self.position(cell), (box.centre[0], box.centre[2]))
 
     def detectable(self, cell: Cell) -> list[tuple[Box, float]]:
-        """Return the objects that can be detected from a cell, and their distances.
+        """Return the objects detected from a cell, and their distances.
 
         They have a category and a clear line of sight, and are within their range.
         """
@@ -122,7 +122,7 @@ class TwinScene:
         return self._detectable[cell]
 
     def _clear(self, cell: Cell, target: Box) -> bool:
-        """Check that the camera over a cell sees the centre of `target`."""
+        """Check that the camera over a cell sees a box."""
         x, z = self.position(cell)
         camera, goal = (x, self.rules.camera, z), target.centre
         length = math.dist(camera, goal)
@@ -141,7 +141,7 @@ class TwinScene:
         return not self._walled((x, z), end[::2], goal[::2])  # a wall cell blocks at every height
 
     def _walled(self, start: Sequence[float], end: Sequence[float], target: Sequence[float]) -> bool:
-        """Check whether a segment in the plane meets a wall cell.
+        """Check whether a segment in the plane meets walls.
 
         Those that contain its start or the target do not count.
         """
@@ -158,7 +158,7 @@ class TwinScene:
         return False
 
     def offsets(self, cell: Cell, heading: int, horizon: int, box: Box) -> tuple[float, float, bool]:
-        """Return how far ahead and right `box` is, and whether in view."""
+        """Return metres ahead and right of a box, and visibility."""
         x, z = self.position(cell)
         vx, up, vz = box.centre[0] - x, box.centre[1] - self.rules.camera, box.centre[2] - z
         yaw, pitch = math.radians(degrees(self.rules, heading)), math.radians(self.rules.horizons[horizon])
@@ -170,7 +170,7 @@ class TwinScene:
         return ahead, right, depth > 0 and abs(right) <= across and abs(rise) <= high
 
     def walk(self, cell: Cell, category: int) -> float:
-        """Return the metres to walk to the nearest object of a category.
+        """Return the metres to walk to a category's nearest object.
 
         They are infinite if there is no way.
         """
@@ -189,7 +189,7 @@ class TwinScene:
         return self._walks[category].get(cell, math.inf)
 
     def _straight(self, box: Box) -> Iterator[tuple[float, Cell]]:
-        """Yield the last parts of walks to a box: length and first cell."""
+        """Yield length and first cell of walks' last parts."""
         for cell in self.standable:
             here = self.position(cell)
             end = box.nearest(*here)
@@ -198,7 +198,7 @@ class TwinScene:
                 yield length, cell
 
     def view(self, cell: Cell, heading: int) -> list[int]:
-        """Return the ego-centric view, from the near edge and the left."""
+        """Return the ego-centric view, near edge and left first."""
         iz, ix = cell
         view = []
         for look in view_lines(self.rules, heading):

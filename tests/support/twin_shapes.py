@@ -30,7 +30,7 @@ def contains(point: Sequence[float], centre: Sequence[float], half: Sequence[flo
 
 
 class Box:
-    """Describe an object: centre, half sides, and what follows from its size."""
+    """Describe an object: centre, half sides, and what they imply."""
 
     def __init__(self, values: Sequence[float], category: int | None):
         x, y, z, sx, sy, sz = (float(value) for value in values)
@@ -45,6 +45,6 @@ class Box:
         self.range = min(max(self.size / 0.12, 1.5), 5.0)
 
     def nearest(self, x: float, z: float) -> tuple[float, float]:
-        """Return the point of the footprint that is nearest to (x, z)."""
+        """Return the point of the footprint nearest to (x, z)."""
         (cx, _, cz), (hx, _, hz) = self.centre, self.half
         return min(max(x, cx - hx), cx + hx), min(max(z, cz - hz), cz + hz)

@@ -1,4 +1,4 @@
-"""Scene files: fields, round trips, numbers that are left out, and the real rooms."""
+"""Scene files: fields, round trips and missing numbers."""
 
 import collections
 import dataclasses

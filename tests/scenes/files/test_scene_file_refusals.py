@@ -1,4 +1,4 @@
-"""Scene files that cannot be read: every refusal names its place, and mutated files raise nothing else."""
+"""Scene files that cannot be read."""
 
 import functools
 import gzip

@@ -1,4 +1,4 @@
-"""Walls that a scene file does not name: derived by hand and cell by cell."""
+"""Walls that follow from the standable cells and the boxes."""
 
 import math
 

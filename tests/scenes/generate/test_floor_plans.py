@@ -1,4 +1,4 @@
-"""Floor plans of homes: walls, doors, and the outlines of their rooms."""
+"""Floor plans of homes: walls, doors and outlines of rooms."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The dial of rooms and files: labels are exchanged between categories of like size, and nothing else changes."""
+"""The exchange of labels between categories of like size."""
 
 import collections
 import dataclasses
@@ -30,13 +30,13 @@ SIZED_OBJECTS = st.lists(st.tuples(TYPES, st.tuples(SIZES, SIZES, SIZES)), max_s
 
 
 def scene_of(objects: list[tuple[str, tuple[float, float, float]]], name: str = "den") -> Scene:
-    """Objects (type, size) in a row."""
+    """Return a scene with objects (type, size) in a row."""
     drawn = draw(["..", ".."], *((kind, 0.5 + i, 0.8, 1.0, *size) for i, (kind, size) in enumerate(objects)))
     return dataclasses.replace(drawn, name=name)
 
 
 def sized(types: Sequence[str]) -> list[tuple[str, tuple[float, float, float]]]:
-    """Objects whose volume grows along the vocabulary."""
+    """Return objects whose volume grows along the vocabulary."""
     ids = category_ids(tuple(types), ITHOR_CATEGORIES)
     return [(kind, (0.1 + 0.01 * k, 0.1, 0.1)) for kind, k in zip(types, ids, strict=True)]
 
@@ -46,7 +46,7 @@ def ids_of(scene: Scene) -> list[int]:
 
 
 def becomes(scene: Scene, shift: float, seed: int = 0) -> dict[int, int]:
-    """The category that each becomes."""
+    """Return the category that each becomes."""
     return dict(zip(ids_of(scene), ids_of(relabel(scene, ITHOR_CATEGORIES, shift, seed)), strict=True))
 
 

@@ -1,4 +1,4 @@
-"""The procedural rooms: reproducible, physically sound, and with every target within reach."""
+"""The procedural rooms: reproducible and physically sound."""
 
 import collections
 

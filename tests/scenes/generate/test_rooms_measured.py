@@ -64,7 +64,10 @@ def test_presence_and_height_follow_the_measured_ones(rooms: list[Scene], room_t
 
 
 def lift(scenes: list[Scene], a: str, b: str) -> float:
-    """How much likelier an `a` is than other targets to have a `b` within 1.5 m."""
+    """Return how much likelier an `a` has a `b` near.
+
+    It is the share of those within 1.5 m of one, over that of other targets.
+    """
 
     def near(name: str) -> float:
         shares = []

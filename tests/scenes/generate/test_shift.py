@@ -1,4 +1,4 @@
-"""The dial of layout shift: it changes who stands near whom, and nothing else."""
+"""The dial of layout shift."""
 
 import collections
 import dataclasses
@@ -37,7 +37,7 @@ def scenes_of(world: str, shift: float, part: int = 0) -> list[Scene]:
 
 
 def near(scene: Scene, categories: tuple[str, ...]) -> np.ndarray:
-    """Whether any objects of two categories are within 1.5 m of one another, bool [K, K]."""
+    """Return which categories are within 1.5 m, bool [K, K]."""
     ids = np.array(category_ids(scene.types, categories))
     places = scene.boxes[ids >= 0][:, [0, 2]]
     close = np.linalg.norm(places[:, None] - places, axis=-1) <= 1.5
@@ -46,13 +46,16 @@ def near(scene: Scene, categories: tuple[str, ...]) -> np.ndarray:
 
 
 def both(scene: Scene, categories: tuple[str, ...]) -> np.ndarray:
-    """Whether the scene has both categories, bool [K, K]."""
+    """Return which pairs the scene has, bool [K, K]."""
     has = np.isin(categories, [categories[i] for i in category_ids(scene.types, categories) if i >= 0])
     return has[:, None] & has
 
 
 def lifts(scenes: list[Scene], categories: tuple[str, ...]) -> np.ndarray:
-    """How much likelier a pair of categories is near than other pairs with either of the two, float64 [K, K]."""
+    """Return how much likelier pairs are near, float64 [K, K].
+
+    It is the share of scenes where they are, over that of other pairs with either of the two categories.
+    """
     together = np.sum([both(scene, categories) for scene in scenes], axis=0)
     share = np.sum([near(scene, categories) for scene in scenes], axis=0) / np.maximum(together, 1)
     counted = (together >= len(scenes) // 4) & ~np.eye(len(categories), dtype=bool)
@@ -62,7 +65,10 @@ def lifts(scenes: list[Scene], categories: tuple[str, ...]) -> np.ndarray:
 
 
 def moved_apart(a: list[Scene], b: list[Scene], categories: tuple[str, ...], rng: np.random.Generator) -> float:
-    """p-value of a permutation test that pairs are near as often in `a` as in `b`."""
+    """Return the p-value that pairs are equally often near.
+
+    It is that of a permutation test of `a` against `b`.
+    """
     upper = np.triu_indices(len(categories), 1)
     pairs = np.array([near(scene, categories)[upper] for scene in (*a, *b)], float)
     room_types = np.array([scene.room_type for scene in (*a, *b)])

@@ -1,4 +1,4 @@
-"""From scenes to tables: bytes of detections, the ego-centric view, and banks."""
+"""Scenes to tables: detections, the ego-centric view, and banks."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def test_the_bytes_of_a_detection():
 
 
 def view_of(scene, cell, heading, rules=ROOMS):
-    """The view as a picture, the far edge first."""
+    """Return the view as a picture, the far edge first."""
     place = standable_cells(scene.reach).tolist().index(list(cell))
     pose = place * rules.poses_per_cell + heading * len(rules.horizons)
     cells = ROW_FORMAT.view_cells(table_of(scene, rules).rows[pose]).reshape(11, 11)

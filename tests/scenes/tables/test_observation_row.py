@@ -1,4 +1,4 @@
-"""The packed byte row: what was packed is unpacked, by NumPy and by JAX."""
+"""The packed byte row, by NumPy and by JAX."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Banks of scenes on disk: what is in the shards, and kills, errors and damage on the way there."""
+"""Shards of scenes on disk: content, kills, errors and damage."""
 
 import multiprocessing
 import os

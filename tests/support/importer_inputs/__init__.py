@@ -1,1 +1,1 @@
-"""A small input of every format that the import command reads, made by hand."""
+"""Small inputs, made by hand, of every format."""

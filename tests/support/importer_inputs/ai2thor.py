@@ -1,4 +1,4 @@
-"""Controller metadata of a room of nine places: a table with a drawer and a book, and a fridge."""
+"""Controller metadata of a room of nine places."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def thing(
     yaw: float = 0.0,
     parents: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Return the metadata of an object, centre and pivot at (x, y, z)."""
+    """Return the metadata of an object around (x, y, z)."""
     box = {"center": vector(x, y, z), "size": vector(*size), "cornerPoints": [[0.0] * 3] * 8} if size else None
     return {
         "objectId": f"{kind}|{x:+06.2f}|{y:+06.2f}|{z:+06.2f}",

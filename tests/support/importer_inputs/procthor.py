@@ -1,4 +1,4 @@
-"""A ProcTHOR house of two rooms with a door between them, and a builder of others."""
+"""A ProcTHOR house, and a builder of others."""
 
 import collections
 import itertools

@@ -1,4 +1,4 @@
-"""An offline Scene_Data folder of a 3 x 3 room with a fridge and a sink."""
+"""An offline Scene_Data folder of a 3 x 3 room."""
 
 import json
 from collections.abc import Mapping
@@ -13,7 +13,10 @@ GRID = [{"x": 0.25 * i, "y": 0.9, "z": 0.25 * j} for i, j in PLACES]
 
 
 def state(i: int, j: int, rotation: int, horizon: int) -> str:
-    """Return the key of a state; zero is written as -0.00, as some files do."""
+    """Return the key of a state.
+
+    Zero is written as -0.00, as some files do.
+    """
     return f"{0.25 * i or -0.0:.2f}|{0.25 * j or -0.0:.2f}|{rotation}|{horizon}"
 
 

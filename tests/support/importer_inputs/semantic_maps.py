@@ -1,4 +1,4 @@
-"""Semantic floor maps of a home, pickled as those of Gibson are."""
+"""Semantic floor maps of a home."""
 
 import bz2
 import pickle
@@ -13,9 +13,9 @@ CHAIR, BED = (1 + GIBSON_CATEGORIES.index(name) for name in ("Chair", "Bed"))
 
 
 def l_shaped_floor(height: float = 0.0, **changes: object) -> dict[str, Any]:
-    """Return a map of 3 x 3 m with a chair.
+    """Return a map of a floor with a chair.
 
-    Habitat's x is from 2 to 5 m and z from -1 to 2 m; the quarter of large x and z is no floor.
+    It is 3 x 3 m: Habitat's x is from 2 to 5 m and z from -1 to 2 m; the quarter of large x and z is no floor.
     """
     layers = np.zeros((16, 60, 60))
     layers[0] = 1
@@ -26,7 +26,7 @@ def l_shaped_floor(height: float = 0.0, **changes: object) -> dict[str, Any]:
 
 
 def bedroom(height: float = 2.9) -> dict[str, Any]:
-    """Return the same walls with a bed instead of the chair."""
+    """Return the same walls with a bed, without the chair."""
     floor = l_shaped_floor(height)
     floor["sem_map"][CHAIR] = 0
     floor["sem_map"][BED, 38:52, 2:16] = 1

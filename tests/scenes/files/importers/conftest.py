@@ -38,5 +38,5 @@ def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
 
 @pytest.fixture
 def scene_of(read_house: Callable[..., Scene | InputError]) -> Callable[..., Scene]:
-    """Return a reader of a house that must give a scene."""
+    """Return a reader of houses that must give a scene."""
     return lambda *arguments: as_scene(read_house(*arguments))

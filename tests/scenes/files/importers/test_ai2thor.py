@@ -1,4 +1,4 @@
-"""Controller metadata to scenes: a small room worked out by hand, older releases, and names."""
+"""Controller metadata to scenes, worked out by hand."""
 
 import numpy as np
 import pytest

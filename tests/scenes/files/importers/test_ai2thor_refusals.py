@@ -1,4 +1,4 @@
-"""Controller metadata that cannot be used: refused one by one, and mutated files raise nothing else."""
+"""Controller metadata that cannot be used."""
 
 import collections
 import gzip
@@ -113,7 +113,7 @@ def test_paths_without_any_record_are_refused(tmp_path):
 
 
 def refusal_of(path: Path) -> str:
-    """Return the message of an error that is raised or given."""
+    """Return the message of an error, raised or given."""
     try:
         (result,) = read_ai2thor(path, "train")
     except InputError as error:

@@ -1,4 +1,4 @@
-"""A running simulator to scenes: recorded metadata, replayed by a controller that is none."""
+"""Scenes of a running simulator, which a recording stands for."""
 
 import sys
 import types
@@ -14,7 +14,7 @@ from jaxnav.scenes.files.importers.controller import read_controller
 
 
 class FakeController:
-    """Replays recorded metadata through the methods of `ai2thor.controller.Controller` that are used."""
+    """Replay recorded metadata, as `ai2thor.controller.Controller` gives it."""
 
     def __init__(self, recordings: dict[str, dict], **settings: object):
         self.recordings, self.settings = recordings, settings

@@ -1,4 +1,4 @@
-"""Habitat ObjectNav: floors of a house from episodes and maps, or from episodes alone."""
+"""Habitat ObjectNav episodes, with and without maps, to scenes."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def test_every_way_to_name_a_split(tmp_path, maps):
 
 
 def shifted(dx: float, count: int) -> list[dict]:
-    """STARTS with the first `count` upstairs moved along x."""
+    """Return STARTS with `count` of those upstairs moved along x."""
     return [episode(x + dx * (72 <= i < 72 + count), y, z) for i, (x, y, z) in enumerate(positions())]
 
 

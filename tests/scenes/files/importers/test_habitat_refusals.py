@@ -1,4 +1,4 @@
-"""Habitat ObjectNav files that cannot be used: refused one by one, and mutated files raise nothing else."""
+"""Habitat ObjectNav files that cannot be used."""
 
 import gzip
 import json

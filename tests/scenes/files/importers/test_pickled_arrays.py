@@ -1,4 +1,4 @@
-"""Pickles of others: arrays of numbers are read, everything else is refused before it is looked up."""
+"""Pickles: arrays of numbers are read, all else is refused."""
 
 import bz2
 import io
@@ -40,7 +40,7 @@ def test_pickles_of_numpy_1_are_read(tmp_path):
 
 
 class Touch:
-    """Unpickled freely, it makes a file."""
+    """Make a file when unpickled freely."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -1,4 +1,4 @@
-"""Outlines of rooms and lines of walls: simple polygons, their inside, and openings."""
+"""Polygons of rooms, and openings in lines of walls."""
 
 import numpy as np
 import pytest

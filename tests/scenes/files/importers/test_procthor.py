@@ -1,4 +1,4 @@
-"""ProcTHOR houses to scenes: two rooms worked out by hand, doors, walls and other outlines."""
+"""ProcTHOR houses to scenes: two rooms worked out by hand."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Objects of ProcTHOR houses: types, sizes, and what rests on what."""
+"""Objects of ProcTHOR houses: types, sizes and parents."""
 
 import numpy as np
 import pytest

@@ -14,7 +14,7 @@ from jaxnav.scenes.files.importers.procthor import read_procthor
 
 
 class RandomHouse(NamedTuple):
-    """Describe two rooms with a door and a turned fridge; metres, degrees."""
+    """Describe two rooms, a door and a turned fridge."""
 
     width: float
     depth: float
@@ -27,7 +27,10 @@ class RandomHouse(NamedTuple):
 
     @property
     def start(self) -> tuple[float, float]:
-        """Return the agent's x, z: more than 0.2 m from fridge and walls."""
+        """Return x, z of the agent.
+
+        They are more than 0.2 m from the fridge and the walls.
+        """
         return self.width // 0.25 * 0.25 - 0.25, 0.5
 
     def document(self) -> dict[str, Any]:
@@ -42,14 +45,17 @@ class RandomHouse(NamedTuple):
         )
 
     def fridge_box(self) -> tuple[float, ...]:
-        """Return the box around the fridge, turned clockwise: x to -z at 90 degrees."""
+        """Return the box around the fridge.
+
+        It is turned clockwise: x to -z at 90 degrees.
+        """
         turn = np.deg2rad(self.yaw)
         corners = np.array([(a, b) for a in (-0.5, 0.5) for b in (-0.5, 0.5)]) * self.fridge_size
         turned = self.fridge + corners @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         return *turned.min(axis=0), *turned.max(axis=0)
 
     def wall_lines(self) -> list[tuple[float, ...]]:
-        """Return low x, low z, high x and high z of every wall."""
+        """Return the walls: low x, z and high x, z."""
         width, depth, at, side = self.width, self.depth, self.middle, self.door_start
         outer = [(0, 0, width, 0), (0, depth, width, depth), (0, 0, 0, depth), (width, 0, width, depth)]
         return outer + ([(at, 0, at, depth)] if self.shut else [(at, 0, at, side), (at, side + 1.0, at, depth)])

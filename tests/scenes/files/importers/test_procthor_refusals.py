@@ -1,4 +1,4 @@
-"""ProcTHOR files that cannot be used: refused house by house, and mutated files raise nothing else."""
+"""ProcTHOR files that cannot be used."""
 
 import collections
 import gzip

@@ -1,4 +1,4 @@
-"""Re-placed movable objects: a room worked out by hand, records that cannot be used, and the simulator's own file."""
+"""Rooms whose movable objects the simulator has placed anew."""
 
 import collections
 import gzip
@@ -178,7 +178,10 @@ def test_the_simulators_file_is_ten_sets_of_eighty_rooms():
 
 
 def test_objects_put_back_on_their_pivots_are_where_they_were(tmp_path):
-    """An independent check of the rule for heights: the pivots in the ids of the base file give its own boxes."""
+    """Check the rule for heights against the rooms themselves.
+
+    The pivots in the ids of the base file give its boxes.
+    """
     records = [json.loads(line) for line in gzip.decompress(require(ITHOR).read_bytes()).splitlines()]
     movable = {row[0] for line in gzip.decompress(require(ITHOR_SHUFFLES).read_bytes()).splitlines()
                for row in json.loads(line)["sets"][0]}  # fmt: skip

@@ -1,4 +1,4 @@
-"""Offline Scene_Data folders to scenes: a 3 x 3 room worked out by hand, and folders that cannot be used."""
+"""Offline Scene_Data folders to scenes."""
 
 import collections
 import json

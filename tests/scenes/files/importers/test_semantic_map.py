@@ -1,4 +1,4 @@
-"""Semantic floor maps: pixels to lattice points and boxes, thin walls, damaged maps."""
+"""Semantic floor maps: points, boxes, thin walls and damage."""
 
 import bz2
 import pickle
@@ -59,7 +59,10 @@ def test_l_shaped_floor_with_a_chair(tmp_path):
 
 
 def rooms_parted_by(strip: slice, door: slice) -> dict:
-    """4 x 4 m of floor, parted at the pixels `strip` of x except for the pixels `door` of z."""
+    """Return a floor of two parts with a door.
+
+    The parts are 4 x 4 m in all, and divided at the pixels `strip` of x but for the pixels `door` of z.
+    """
     layers = np.zeros((16, 80, 80), np.uint8)
     layers[0] = 1
     layers[0, strip] = 0
@@ -70,7 +73,10 @@ def rooms_parted_by(strip: slice, door: slice) -> dict:
 
 
 def inner_walls(scene: Scene) -> np.ndarray:
-    """Without the outermost cells, which lie three from every standable one."""
+    """Return the walls without the outermost cells.
+
+    Those lie three from every standable one.
+    """
     inner = np.zeros_like(scene.walls)
     inner[1:-1, 1:-1] = scene.walls[1:-1, 1:-1]
     return inner
