@@ -1,4 +1,4 @@
-"""The files around the code keep their promises: the lock, the Makefile, the README and the citation."""
+"""The files around the code: lock, Makefile, README and citation."""
 
 import re
 import subprocess
@@ -16,12 +16,12 @@ MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|root|home|Users|tmp/venv)/")
 
 
 def _locked() -> dict[str, str]:
-    """Pinned version by distribution name, as the lock spells it."""
+    """Return the pinned versions by name, as the lock spells it."""
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
 
 
 def _files() -> list[Path]:
-    """Every file git tracks or would add."""
+    """Return every file that git tracks or would add."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     try:
         listing = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True).stdout
@@ -57,11 +57,11 @@ def test_citation_carries_the_version() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "matches"),
     [("see /root/notes", True), ("'/home/ann/x'", True), ("https://site.org/home/x", False), ("runs/work/x", False)],
 )
-def test_machine_path_pattern(text: str, found: bool) -> None:
-    assert bool(MACHINE_PATH.search(text)) is found
+def test_machine_path_pattern(text: str, matches: bool) -> None:
+    assert bool(MACHINE_PATH.search(text)) is matches
 
 
 def test_no_machine_paths() -> None:

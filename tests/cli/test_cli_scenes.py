@@ -6,8 +6,8 @@ import json
 import pytest
 from support.commands import refusal
 from support.fuzz_importers import CRASHED, FORMATS, fuzz
-from test_import_ai2thor import METADATA
-from test_import_procthor import HOUSE, door
+from support.importer_inputs.ai2thor import METADATA
+from support.importer_inputs.procthor import HOUSE, door
 
 from jaxnav.__main__ import main
 from jaxnav.env.make import make

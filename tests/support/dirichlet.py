@@ -1,11 +1,14 @@
-"""The Dirichlet divergence in float64, for tests of the float32 one."""
+"""The Dirichlet divergence in float64."""
 
 import numpy as np
 from scipy.special import digamma
 
 
 def exact_kl(prior, counts) -> np.ndarray:
-    """Float64, whole counts: lnGamma(a + n) - lnGamma(a) is the sum of log(a + i), so no large terms cancel."""
+    """Return the divergence of a posterior from its prior.
+
+    lnGamma(a + n) - lnGamma(a) is the sum of log(a + i), so no large terms cancel.
+    """
     a, c = np.asarray(prior, np.float64), np.asarray(counts, np.int64)
     a_0, n = a.sum(-1), c.sum(-1)
 

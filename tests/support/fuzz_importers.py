@@ -1,15 +1,15 @@
-"""Mutated files of every format through the import command: `python tests/fuzz_importers.py [RUNS]` prints the counts.
+"""Mutated files of every format through the import command.
+
+`python -m support.fuzz_importers [RUNS]` in `tests` prints the counts.
 
 A run replaces or deletes up to three values of a fixture at random places, or damages bytes of its files. Whatever
 comes of it, the command must end with code 0 and a whole scene file, or with code 2 and none.
 """
 
-import bz2
 import collections
 import copy
 import gzip
 import json
-import pickle
 import random
 import sys
 import tempfile
@@ -20,21 +20,25 @@ from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
-from test_import_ai2thor import METADATA
-from test_import_habitat import EPISODES, STARTS
-from test_import_procthor import HOUSE
-from test_import_scene_data import FILES
-from test_import_semantic_map import bedroom, l_shaped_floor
 
 from jaxnav.cli.scenes import main
 from jaxnav.scenes.files.scene_file import read_scenes
+from support.importer_inputs.ai2thor import METADATA
+from support.importer_inputs.habitat import EPISODES, STARTS, write_json
+from support.importer_inputs.procthor import HOUSE
+from support.importer_inputs.scene_data import FILES
+from support.importer_inputs.semantic_maps import bedroom, l_shaped_floor, write_maps
+from support.mutations import edited
 
 CRASHED = -1
 NASTY = [None, True, -1, 0, 7, 1e308, -0.13, 10**400, float("nan"), float("inf"), "", "Floor", "\ud800", [], {}, [[]]]
 
 
 class Format(NamedTuple):
-    """A format's fixture: its content, and how it is written; a folder's files are members of the content."""
+    """Describe an input: format, content, and a writer.
+
+    The files of a folder are members of the content.
+    """
 
     name: str
     content: object
@@ -61,9 +65,8 @@ def _scene_folder(folder: Path, content: object) -> Path:
 
 
 def _mapped(folder: Path, content: object) -> Path:
-    path = _text("val.json.gz")(folder, {"episodes": STARTS})
-    (folder / "maps.pbz2").write_bytes(bz2.compress(pickle.dumps(content)))
-    return path
+    write_maps(folder / "maps.pbz2", content)
+    return write_json(folder / "val.json.gz", {"episodes": STARTS})
 
 
 FORMATS = (
@@ -76,26 +79,17 @@ FORMATS = (
 
 
 def mutated(content: object, draw: random.Random) -> object:
-    """A copy with up to three values deleted or replaced."""
-    root = copy.deepcopy(content)
+    """Return a copy with up to three values replaced.
+
+    They may be deleted, too.
+    """
     for _ in range(draw.randint(1, 3)):
-        node, deep = root, draw.random()
-        while node:
-            key = draw.choice(sorted(node, key=str) if isinstance(node, dict) else range(len(node)))
-            if not isinstance(node[key], dict | list) or not node[key] or draw.random() < 0.1 + 0.2 * deep:
-                break
-            node = node[key]
-        if not node:
-            continue
-        if draw.random() < 0.3:
-            del node[key]
-        else:
-            node[key] = copy.deepcopy(draw.choice(NASTY))
-    return root
+        content = edited(content, draw.choice, lambda: copy.deepcopy(draw.choice(NASTY)))
+    return content
 
 
 def damaged(data: bytes, draw: random.Random) -> bytes:
-    """Bytes cut short, or with one of them changed."""
+    """Return bytes without their end, or with one changed."""
     if draw.random() < 0.5:
         return data[: draw.randrange(len(data) + 1)]
     at = draw.randrange(len(data))
@@ -103,7 +97,7 @@ def damaged(data: bytes, draw: random.Random) -> bytes:
 
 
 def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, float]:
-    """Runs by exit code (or CRASHED), and the seconds of the slowest.
+    """Return runs by exit code, and the slowest's seconds.
 
     Raises:
       AssertionError: a run that leaves a file without success, or none with it.

@@ -1,7 +1,10 @@
-"""Scenes drawn by hand or by lot, the rules of the worlds, and the plain-Python twin in tiny scenes.
+"""Scenes drawn by hand or at random, and their twins.
 
 Scenes are drawn with row 0 (the smallest z) first; the origin is (0, 0), so cell [iz, ix] is at x = ix / 4, z = iz / 4.
 """
+
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +12,9 @@ from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Rules
 from support.twin import Twin
+
+#: Type, centre x, y, z and full size sx, sy, sz in metres.
+Object = tuple[str, float, float, float, float, float, float]
 
 CATEGORIES = ("Book", "Chair", "Fridge")
 BOOK, CHAIR, FRIDGE = range(3)
@@ -41,8 +47,13 @@ HOUSES = Rules(
 )
 
 
-def draw(rows, *objects, walls=(), origin=(0.0, 0.0)):
-    """A scene of objects (type, x, y, z, sx, sy, sz) with wall cells (iz, ix)."""
+def draw(
+    rows: Sequence[str | Sequence[str]],
+    *objects: Object,
+    walls: Iterable[tuple[int, int]] = (),
+    origin: tuple[float, float] = (0.0, 0.0),
+) -> Scene:
+    """Return a scene with objects and wall cells (iz, ix)."""
     reach = np.array([[mark == "." for mark in row] for row in rows])
     solid = np.zeros_like(reach)
     for cell in walls:
@@ -51,16 +62,22 @@ def draw(rows, *objects, walls=(), origin=(0.0, 0.0)):
     return _scene("drawn", reach, solid, [item[0] for item in objects], boxes, origin)
 
 
-def coarse_scene(seed):
-    """Cells, walls and boxes at random, all on coarse steps, so that lengths often lie exactly on their limits."""
+def coarse_scene(seed: int) -> Scene:
+    """Draw cells, walls and boxes at random on coarse steps.
+
+    Lengths often lie exactly on their limits.
+    """
     draws = np.random.default_rng(seed)
     reach = draws.random((7, 8)) < 0.6
     walls = draws.random((7, 8)) < 0.1  # some of them under standable cells
     return _scene(f"coarse-{seed}", reach, walls, *_coarse_boxes(draws, 24, 18), (0.5, -0.25))
 
 
-def maze_scene(seed):
-    """Nine chambers with walls of one cell between them, most of them with a door, and boxes on and in the walls."""
+def maze_scene(seed: int) -> Scene:
+    """Draw nine chambers with thin walls, and boxes.
+
+    Walls are one cell wide, and most have a door.
+    """
     draws = np.random.default_rng(seed)
     walls = np.zeros((11, 11), bool)
     for line in (3, 7):
@@ -74,7 +91,7 @@ def maze_scene(seed):
     return _scene(f"maze-{seed}", ~walls, walls, *_coarse_boxes(draws, 24, 22), (-1.0, 0.75))
 
 
-def _coarse_boxes(draws, count, extent):
+def _coarse_boxes(draws: np.random.Generator, count: int, extent: int) -> tuple[list[str], np.ndarray]:
     centres, sides = draws.integers(-2, extent, (count, 3)) / 8, draws.choice([0.05, 0.09, 0.25, 0.3, 0.5], (count, 3))
     boxes = np.concatenate([centres, sides], axis=1)
     tall = draws.random(count) < 0.4  # furniture on the floor, some of it just opaque
@@ -83,7 +100,14 @@ def _coarse_boxes(draws, count, extent):
     return draws.choice((*ITHOR_CATEGORIES[:12], "Stool", "Vase"), count).tolist(), boxes
 
 
-def _scene(name, reach, walls, types, boxes, origin):
+def _scene(
+    name: str,
+    reach: np.ndarray,
+    walls: np.ndarray,
+    types: Sequence[str],
+    boxes: np.ndarray,
+    origin: tuple[float, float],
+) -> Scene:
     return Scene(
         name=name,
         world="drawn",
@@ -99,14 +123,26 @@ def _scene(name, reach, walls, types, boxes, origin):
     )
 
 
-def twin(scene, goal=BOOK, cell=(0, 0), heading=0, horizon=0, step_limit=100, rules=ROOMS):
+def twin(
+    scene: Scene,
+    goal: int = BOOK,
+    cell: tuple[int, int] = (0, 0),
+    heading: int = 0,
+    horizon: int = 0,
+    step_limit: int = 100,
+    rules: Rules = ROOMS,
+) -> Twin:
     return Twin(scene, CATEGORIES, rules, goal, cell, heading, horizon, step_limit)
 
 
-def single(*objects, walls=(), **start):
-    """The twin at the one standable cell [0, 0] of a lattice of 16 x 4 cells."""
+def single(*objects: Object, walls: Iterable[tuple[int, int]] = (), **start: Any) -> Twin:
+    """Return the twin in a lattice with one cell.
+
+    The standable cell is [0, 0] of 16 x 4.
+    """
     return twin(draw([".###"] + ["####"] * 15, *objects, walls=walls), **start)
 
 
-def detected(episode):
+def detected(episode: Twin) -> set[int]:
+    """Return the categories that are detected."""
     return {category for category, row in enumerate(episode.detections()) if row}

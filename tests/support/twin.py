@@ -1,6 +1,6 @@
-"""One ObjectNav episode in plain Python, written from docs/environment.md alone.
+"""An ObjectNav episode in plain Python, from docs/environment.md alone.
 
-It shares no arithmetic with the compiled environment; the best length is found by breadth-first search over poses.
+It shares no arithmetic with the compiled environment; the best length is that of a breadth-first search over poses.
 """
 
 import math
@@ -16,7 +16,7 @@ MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(6)
 
 
 class Twin:
-    """One episode; `reset` starts another one in the same scene."""
+    """Hold one episode; `reset` starts another in the same scene."""
 
     def __init__(
         self,
@@ -56,14 +56,14 @@ class Twin:
         return self.scene.standable
 
     def step(self, action: int) -> tuple[float, bool, bool]:
-        """Returns the reward, `terminated` and `truncated`."""
+        """Take an action; return the reward, `terminated` and `truncated`."""
         if self.over:
             raise RuntimeError("the episode is over")
         self.steps += 1
         terminated = action == DONE
         truncated = self.steps >= self.step_limit and not terminated
         self.over = terminated or truncated
-        reward = 5.0 if terminated and self.goal in self.found() else -0.01
+        reward = 5.0 if terminated and self.goal in self.successes() else -0.01
         self.pose = self._moved(self.pose, action)
         return reward, terminated, truncated
 
@@ -80,7 +80,10 @@ class Twin:
         return pose
 
     def detections(self) -> list[list[tuple[float, float, float]]]:
-        """Per category the acceptable (ahead, right, apparent size): none if not detected, several if equally near."""
+        """Return the acceptable (ahead, right, apparent size) of each category.
+
+        There are none if it is not detected, several if instances are equally near.
+        """
         rows: list[list[tuple[float, float, float, float]]] = [[] for _ in self.categories]
         for box, distance in self.scene.detectable(self.cell):
             ahead, right, in_view = self.scene.offsets(self.cell, self.heading, self.horizon, box)
@@ -91,10 +94,11 @@ class Twin:
     def view(self) -> list[int]:
         return self.scene.view(self.cell, self.heading)
 
-    def found(self) -> set[int]:
-        return {goal for goal in range(len(self.categories)) if self._found(self.pose, goal)}
+    def successes(self) -> set[int]:
+        """Return the goals with which Done would succeed here."""
+        return {goal for goal in range(len(self.categories)) if self._succeeds(self.pose, goal)}
 
-    def _found(self, pose: Pose, goal: int) -> bool:
+    def _succeeds(self, pose: Pose, goal: int) -> bool:
         cell, heading, horizon = pose[:2], *pose[2:]
         limit = self.rules.success_distance + 1e-9
         if self.rules.success == "near":
@@ -106,11 +110,14 @@ class Twin:
         )
 
     def best_length(self) -> int | None:
-        """Number of actions, Done included, of the shortest successful episode from the start, or None."""
+        """Return the least actions from the start to success.
+
+        Done is included.
+        """
         length, queue = {self.start: 1}, deque([self.start])
         while queue:
             pose = queue.popleft()
-            if self._found(pose, self.goal):
+            if self._succeeds(pose, self.goal):
                 return length[pose]
             for action in range(DONE):
                 after = self._moved(pose, action)
@@ -120,7 +127,7 @@ class Twin:
         return None
 
     def goal_distance(self) -> float:
-        """DTS at the present cell, in metres."""
+        """Return the distance to success at this cell, in metres."""
         if self.rules.success == "near":
             return max(self.scene.walk(self.cell, self.goal) - 1.0, 0.0)
         distances = (self.scene.distance(self.cell, box) for box in self.scene.boxes if box.category == self.goal)

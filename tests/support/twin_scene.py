@@ -1,7 +1,7 @@
-"""What a scene offers in plain Python, written from docs/environment.md alone: where one stands, walks and looks.
+"""A scene in plain Python, from docs/environment.md alone.
 
 It shares no arithmetic with the compiled tables: lines of sight are tested object by object with the separating axis
-theorem, and walks are found by Dijkstra's algorithm.
+theorem, and walks are those of Dijkstra's algorithm.
 """
 
 import functools
@@ -49,7 +49,7 @@ def degrees(rules: Rules, heading: int) -> float:
 
 @functools.cache
 def neighbour(rules: Rules, heading: int) -> Cell:
-    """(dz, dx) of the neighbouring cell whose direction is nearest to the heading."""
+    """Return (dz, dx) of the neighbour in a heading's direction."""
 
     def turn(step: Cell) -> float:
         return abs((math.degrees(math.atan2(step[1], step[0])) - degrees(rules, heading) + 180) % 360 - 180)
@@ -58,8 +58,11 @@ def neighbour(rules: Rules, heading: int) -> Cell:
 
 
 @functools.cache
-def looks(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None]:
-    """For each cell of the view its place (dz, dx) and the places that are looked past; None outside the cone."""
+def view_lines(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None]:
+    """Return the place (dz, dx) of each view cell.
+
+    With it come the places that the line to it passes. Both are None outside the cone.
+    """
     yaw = math.radians(degrees(rules, heading))
     view: list[tuple[Cell, set[Cell]] | None] = []
     for ahead in range(VIEW):
@@ -78,7 +81,7 @@ def looks(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None]:
 
 
 class TwinScene:
-    """A scene under some rules; keeps what was found out about it."""
+    """Hold a scene under some rules, with what was computed."""
 
     def __init__(self, scene: Scene, categories: tuple[str, ...], rules: Rules):
         self.rules = rules
@@ -107,7 +110,10 @@ class TwinScene:
         return math.dist(self.position(cell), (box.centre[0], box.centre[2]))
 
     def detectable(self, cell: Cell) -> list[tuple[Box, float]]:
-        """Objects of a category with a clear line of sight from `cell` and within their range, and their distances."""
+        """Return the objects detected from a cell, and their distances.
+
+        They have a category and a clear line of sight, and are within their range.
+        """
         if cell not in self._detectable:
             near = [(box, self.distance(cell, box)) for box in self.boxes if box.category is not None]
             self._detectable[cell] = [
@@ -116,7 +122,7 @@ class TwinScene:
         return self._detectable[cell]
 
     def _clear(self, cell: Cell, target: Box) -> bool:
-        """Whether the line of sight from the camera over `cell` to the centre of `target` is clear."""
+        """Check that the camera over a cell sees a box."""
         x, z = self.position(cell)
         camera, goal = (x, self.rules.camera, z), target.centre
         length = math.dist(camera, goal)
@@ -135,7 +141,10 @@ class TwinScene:
         return not self._walled((x, z), end[::2], goal[::2])  # a wall cell blocks at every height
 
     def _walled(self, start: Sequence[float], end: Sequence[float], target: Sequence[float]) -> bool:
-        """Whether a segment in the plane meets a wall cell other than those that contain its start or the target."""
+        """Check whether a segment in the plane meets walls.
+
+        Those that contain its start or the target do not count.
+        """
         # Only the cells around the segment can meet it.
         columns, rows = (
             range(round((min(a, b) - o) / 0.25) - 1, round((max(a, b) - o) / 0.25) + 2)
@@ -149,7 +158,7 @@ class TwinScene:
         return False
 
     def offsets(self, cell: Cell, heading: int, horizon: int, box: Box) -> tuple[float, float, bool]:
-        """Offsets ahead and to the right of the centre of `box`, and whether it is in view."""
+        """Return metres ahead and right of a box, and visibility."""
         x, z = self.position(cell)
         vx, up, vz = box.centre[0] - x, box.centre[1] - self.rules.camera, box.centre[2] - z
         yaw, pitch = math.radians(degrees(self.rules, heading)), math.radians(self.rules.horizons[horizon])
@@ -161,7 +170,10 @@ class TwinScene:
         return ahead, right, depth > 0 and abs(right) <= across and abs(rise) <= high
 
     def walk(self, cell: Cell, category: int) -> float:
-        """Metres to walk from a cell to the nearest object of a category, infinite if there is no way."""
+        """Return the metres to walk to a category's nearest object.
+
+        They are infinite if there is no way.
+        """
         if category not in self._walks:
             queue = [way for box in self.boxes if box.category == category for way in self._straight(box)]
             heapq.heapify(queue)
@@ -177,7 +189,7 @@ class TwinScene:
         return self._walks[category].get(cell, math.inf)
 
     def _straight(self, box: Box) -> Iterator[tuple[float, Cell]]:
-        """The last parts of walks to a box: their lengths, and the cells where they begin."""
+        """Yield length and first cell of walks' last parts."""
         for cell in self.standable:
             here = self.position(cell)
             end = box.nearest(*here)
@@ -186,10 +198,10 @@ class TwinScene:
                 yield length, cell
 
     def view(self, cell: Cell, heading: int) -> list[int]:
-        """The ego-centric view, row by row from the near edge, each from left to right."""
+        """Return the ego-centric view, near edge and left first."""
         iz, ix = cell
         view = []
-        for look in looks(self.rules, heading):
+        for look in view_lines(self.rules, heading):
             if look is None or any((iz + dz, ix + dx) in self.hiding for dz, dx in look[1]):
                 view.append(UNKNOWN)
             else:

@@ -1,4 +1,4 @@
-"""Boxes and segments of the plain-Python twin: the separating axis theorem, and what follows from a box's size."""
+"""Boxes and segments of the plain-Python twin."""
 
 import math
 from collections.abc import Sequence
@@ -7,10 +7,10 @@ SHRINK = TOLERANCE = 1e-6
 
 
 def meets(start: Sequence[float], end: Sequence[float], centre: Sequence[float], half: Sequence[float]) -> bool:
-    """Whether a segment meets the inside of a box of half sides `half`, in two or three dimensions.
+    """Check whether a segment meets the inside of a box.
 
-    It does unless one of the candidate axes separates the two: those of the box, and their cross products with the
-    segment, one for each pair of coordinates.
+    The box has the half sides `half`, in two or three dimensions. They meet unless one of the candidate axes separates
+    the two: those of the box, and their cross products with the segment, one for each pair of coordinates.
     """
     middle = [(a + b) / 2 - c for a, b, c in zip(start, end, centre, strict=True)]
     along = [(b - a) / 2 for a, b in zip(start, end, strict=True)]
@@ -30,7 +30,7 @@ def contains(point: Sequence[float], centre: Sequence[float], half: Sequence[flo
 
 
 class Box:
-    """An object: its centre, half sides and what follows from its size."""
+    """Describe an object: centre, half sides, and what they imply."""
 
     def __init__(self, values: Sequence[float], category: int | None):
         x, y, z, sx, sy, sz = (float(value) for value in values)
@@ -45,6 +45,6 @@ class Box:
         self.range = min(max(self.size / 0.12, 1.5), 5.0)
 
     def nearest(self, x: float, z: float) -> tuple[float, float]:
-        """The point of the footprint that is nearest to (x, z)."""
+        """Return the point of the footprint nearest to (x, z)."""
         (cx, _, cz), (hx, _, hz) = self.centre, self.half
         return min(max(x, cx - hx), cx + hx), min(max(z, cz - hz), cz + hz)

@@ -1,20 +1,16 @@
-"""The procedural apartments and houses: reproducible, physically sound, connected, and of the measured proportions."""
-
-import dataclasses
+"""The procedural apartments and houses: reproducible, sound, of measured proportions."""
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from support.lattice import EIGHT, FOUR, parts_of
+from support.placement import MILLIMETRES, cell_centres, check_agent_fits, check_form, check_nothing_overlaps, corners
+from support.scene_records import assert_scenes_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, GIBSON_GOALS, ROBOTHOR_GOALS
-from jaxnav.scenes.generate.floor_plans import DOOR_WIDTHS, Rectangle, apartment_plan, house_plan, room_shape
+from jaxnav.scenes.generate.floor_plans import DOOR_WIDTHS
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
-from jaxnav.scenes.generate.room_shapes import make_shape, wall_mask
 from jaxnav.scenes.scene import CELL, Room, Scene
-
-MILLIMETRES = 2e-3  # boxes are rounded to 1 mm
-EIGHT = np.ones((3, 3), int)  # neighbours of a cell
 
 
 @pytest.fixture(scope="module")
@@ -27,27 +23,12 @@ def houses() -> list[Scene]:
     return [generate_house("train", i, seed=0) for i in range(60)]
 
 
-def contents(scene: Scene) -> list[bytes]:
-    """Every field of a scene as bytes."""
-    values = [getattr(scene, field.name) for field in dataclasses.fields(Scene) if field.name != "rooms"]
-    values += [part for room in scene.rooms for part in room]
-    return [value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode() for value in values]
-
-
-def corners(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return boxes[:, :3] - boxes[:, 3:] / 2, boxes[:, :3] + boxes[:, 3:] / 2
-
-
-def cell_centres(scene: Scene, mask: np.ndarray) -> np.ndarray:
-    return np.asarray(scene.origin) + CELL * np.argwhere(mask)[:, ::-1]
-
-
 @pytest.mark.parametrize("generate", [generate_apartment, generate_house])
 @pytest.mark.parametrize("shift", [0.0, 0.5])
 def test_a_scene_depends_on_its_arguments_alone(generate, shift: float):
     scene = generate("val", 3, 7, shift)
     generate("val", 4, 7, shift)  # in between
-    assert contents(generate("val", 3, 7, shift)) == contents(scene)
+    assert_scenes_equal(generate("val", 3, 7, shift), scene)
     for other in (generate("test", 3, 7, shift), generate("val", 4, 7, shift), generate("val", 3, 8, shift)):
         assert other.boxes.tobytes() != scene.boxes.tobytes()
 
@@ -76,45 +57,27 @@ def test_impossible_arguments_are_refused(generate, arguments: tuple, message: s
         generate(*arguments)
 
 
-def test_five_furnishings_share_the_walls_of_a_layout(apartments: list[Scene]):
-    layouts = [scene.walls.tobytes() for scene in apartments]
-    for i, walls in enumerate(layouts):
-        assert walls == layouts[i - i % 5]
-    assert len(set(layouts)) == 12
-    held_out = {generate_apartment("val", 5 * layout, 0).walls.tobytes() for layout in range(3)}
+def test_five_furnishings_share_the_walls_of_a_floor_plan(apartments: list[Scene]):
+    plans = [scene.walls.tobytes() for scene in apartments]
+    for i, walls in enumerate(plans):
+        assert walls == plans[i - i % 5]
+    assert len(set(plans)) == 12
+    held_out = {generate_apartment("val", 5 * plan, 0).walls.tobytes() for plan in range(3)}
     assert len(held_out) == 3
-    assert not held_out & set(layouts)
+    assert not held_out & set(plans)
 
 
 def test_scene_invariants(apartments: list[Scene], houses: list[Scene]):
     for scene in (*apartments, *houses):
-        assert scene.reach.shape == scene.walls.shape
-        assert not (scene.reach & scene.walls).any()
-        rim = np.ones_like(scene.walls)
-        rim[1:-1, 1:-1] = False
-        assert scene.walls[rim].all()
-        assert np.remainder(np.asarray(scene.origin), CELL).tolist() == [0.0, 0.0]
-        n = len(scene.types)
-        assert scene.boxes.shape == (n, 6)
-        assert scene.yaws.shape == scene.parents.shape == (n,)
-        assert ((scene.parents >= -1) & (scene.parents < np.arange(n))).all()
+        check_form(scene)
         assert not {"Doorway", "Partition"} & set(scene.types)
-        assert ndimage.label(scene.reach, EIGHT)[1] == 1  # one connected part
+        assert parts_of(scene.reach, EIGHT).number == 1  # one connected part
 
 
 def test_boxes_meet_neither_walls_nor_each_other_nor_the_agent(apartments: list[Scene], houses: list[Scene]):
     for scene in (*apartments, *houses):
-        low, high = corners(scene.boxes)
-        walls = cell_centres(scene, scene.walls)
-        depth = np.minimum(high[:, None, ::2], walls + CELL / 2) - np.maximum(low[:, None, ::2], walls - CELL / 2)
-        assert not (depth > MILLIMETRES).all(axis=-1).any(), scene.name
-        overlap = (np.minimum(high[:, None], high) - np.maximum(low[:, None], low) > MILLIMETRES).all(axis=-1)
-        related = scene.parents[:, None] == np.arange(len(low))  # what lies on a shelf is inside the shelf's box
-        assert not (overlap & ~related & ~related.T & ~np.eye(len(low), dtype=bool)).any(), scene.name
-        standing = (low[:, 1] < 1.7) & (high[:, 1] > 0.1)
-        cells = cell_centres(scene, scene.reach)[:, None]
-        nearest = np.clip(cells, low[standing][:, [0, 2]], high[standing][:, [0, 2]])
-        assert np.linalg.norm(cells - nearest, axis=-1).min() >= 0.2 - MILLIMETRES
+        check_nothing_overlaps(scene)
+        check_agent_fits(scene, 0.2)
 
 
 def test_an_apartment_has_each_goal_once_within_reach(apartments: list[Scene]):
@@ -140,7 +103,7 @@ def test_all_rooms_of_a_house_can_be_walked_into(houses: list[Scene]):
         assert not (floors.any(axis=0) & scene.walls).any()
         # Reach is one part, so a standable cell in every room and door means that one can walk between them all.
         assert all((scene.reach & floor).sum() >= 5 for floor in floors), scene.name
-        doors, number = ndimage.label(~scene.walls & ~floors.any(axis=0))
+        doors, number = parts_of(~scene.walls & ~floors.any(axis=0), FOUR)
         assert number >= len(scene.rooms) - 1  # a tree at least
         for door in range(1, number + 1):
             assert DOOR_WIDTHS[0] <= (doors == door).sum() <= DOOR_WIDTHS[-1]  # 1 to 2 m
@@ -182,45 +145,3 @@ def test_sizes_and_contents_of_houses(houses: list[Scene]):
     for name, number in expected.items():
         assert np.mean([scene.types.count(name) for scene in houses]) == pytest.approx(number, abs=0.9)
     assert all(any(name in scene.types for scene in houses) for name in GIBSON_CATEGORIES)
-
-
-@pytest.mark.parametrize("high", [(True, True), (True, False), (False, True), (False, False)])
-def test_faces_of_a_wall_mask_are_those_of_the_shape(high: tuple[bool, bool]):
-    expected = make_shape(np.array([4.0, 3.0]), np.array([1.5, 1.0]), np.array(high))
-    shape = room_shape(wall_mask(expected))
-
-    def faces(shape) -> list[tuple[float, ...]]:
-        return sorted((*start, turn, length) for start, turn, length in zip(*shape[2:], strict=True))
-
-    np.testing.assert_allclose(faces(shape), faces(expected))
-
-
-def test_there_is_no_wall_to_put_anything_at_in_a_door_and_a_partition_has_two_faces():
-    # A floor of 8 x 4 cells has walls of 2 (8 + 4) cells; a door of 4 cells leaves 20, in two pieces on its side.
-    walls = np.pad(np.zeros((4, 8), bool), 1, constant_values=True)
-    walls[0, 3:7] = False
-    shape = room_shape(walls)
-    assert shape.lengths.sum() == pytest.approx(20 * CELL)
-    assert sorted(shape.lengths[shape.turns == 0] / CELL) == [2, 2]
-    # A free-standing partition of 3 x 1 cells adds its outline of 8 cells.
-    walls[3, 3:6] = True
-    assert room_shape(walls).lengths.sum() == pytest.approx(28 * CELL)
-
-
-def test_plans_repeat_and_have_the_walls_that_they_list():
-    for seed in range(20):
-        plan, again = (house_plan(np.random.default_rng(seed)) for _ in range(2))
-        assert plan.rooms == again.rooms
-        assert plan.walls.tobytes() == again.walls.tobytes()
-        open_cells = sum(part.area for part in (*plan.rooms, *plan.doors))
-        assert (~plan.walls).sum() == open_cells
-        apartment = apartment_plan(np.random.default_rng(seed))
-        assert all(apartment.walls[wall.cells].all() for wall in apartment.partitions)
-
-
-def test_box_of_a_door():
-    # A door in cells [4, 5) x [2, 6), above a room of rows 1 to 3 and columns 1 to 8: flat, at z = 3 x 0.25 m.
-    room, door = Rectangle(1, 1, 4, 9), Rectangle(4, 2, 5, 6)
-    assert door.within(room.around)
-    assert not door.within(room)
-    assert door.box(room, 2.5).tolist() == [[0.25, 0.0, 0.75], [1.25, 2.5, 0.75]]

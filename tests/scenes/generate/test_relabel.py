@@ -1,16 +1,16 @@
-"""The dial of rooms and files: labels are exchanged between categories of like size, and nothing else changes."""
+"""The exchange of labels between categories of like size."""
 
 import collections
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.real_scenes import ITHOR, require
+from support.scene_records import assert_scenes_equal
 from support.scenes import SMALL, draw
-from test_scene_io import assert_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
@@ -21,7 +21,6 @@ from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.task import ROOMS
 from jaxnav.scenes.worlds import from_file
 
-REAL_FILE = Path(__file__).parents[4] / "shared" / "scenes" / "ithor_train_val.jsonl.gz"
 SHIFTS = st.floats(0, 1)
 SEEDS = st.integers(0, 2**32)
 NAMES = st.text(max_size=12)
@@ -31,13 +30,13 @@ SIZED_OBJECTS = st.lists(st.tuples(TYPES, st.tuples(SIZES, SIZES, SIZES)), max_s
 
 
 def scene_of(objects: list[tuple[str, tuple[float, float, float]]], name: str = "den") -> Scene:
-    """Objects (type, size) in a row."""
+    """Return a scene with objects (type, size) in a row."""
     drawn = draw(["..", ".."], *((kind, 0.5 + i, 0.8, 1.0, *size) for i, (kind, size) in enumerate(objects)))
     return dataclasses.replace(drawn, name=name)
 
 
 def sized(types: Sequence[str]) -> list[tuple[str, tuple[float, float, float]]]:
-    """Objects whose volume grows along the vocabulary."""
+    """Return objects whose volume grows along the vocabulary."""
     ids = category_ids(tuple(types), ITHOR_CATEGORIES)
     return [(kind, (0.1 + 0.01 * k, 0.1, 0.1)) for kind, k in zip(types, ids, strict=True)]
 
@@ -47,7 +46,7 @@ def ids_of(scene: Scene) -> list[int]:
 
 
 def becomes(scene: Scene, shift: float, seed: int = 0) -> dict[int, int]:
-    """The category that each becomes."""
+    """Return the category that each becomes."""
     return dict(zip(ids_of(scene), ids_of(relabel(scene, ITHOR_CATEGORIES, shift, seed)), strict=True))
 
 
@@ -86,7 +85,7 @@ def test_a_share_of_the_categories_exchanges_labels_by_a_derangement(objects, sh
     # What is no category stays none, with its name; so do the names of those that are not exchanged.
     assert new.get(-1, -1) == -1
     assert all(b == a for b, a, k in zip(scene.types, shifted.types, before, strict=True) if new[k] == k)
-    assert_equal(dataclasses.replace(shifted, types=scene.types), scene)  # boxes, cells, walls, name, ...
+    assert_scenes_equal(dataclasses.replace(shifted, types=scene.types), scene)  # boxes, cells, walls, name, ...
     # The nearest number of groups, but at least one; all at full shift.
     exchanged, present = sum(k != v for k, v in new.items()), len(set(before) - {-1})
     groups = present // 2
@@ -179,14 +178,13 @@ def test_scenes_of_a_file_are_relabelled_one_by_one(tmp_path):
     assert from_file(file, "train", 0.0, 5).identity == from_file(file, "train").identity
 
 
-@pytest.mark.skipif(not REAL_FILE.exists(), reason="the real rooms are not here")
 def test_real_rooms_stay_equally_difficult():
-    """Every goal is another one: the same starts and path lengths, in another column."""
-    own, shifted = from_file(REAL_FILE, "val"), from_file(REAL_FILE, "val", 1.0)
+    # Every goal is another one: the same starts and path lengths, in another column.
+    unshifted, shifted = (from_file(require(ITHOR), "val", shift) for shift in (0.0, 1.0))
     moved = 0
-    for i in range(0, len(own), 5):
-        before, after = (compile_scene(scenes[i], ROOMS).best_length for scenes in (own, shifted))
-        for goal, new in becomes(own[i], 1.0).items():
+    for i in range(0, len(unshifted), 5):
+        before, after = (compile_scene(scenes[i], ROOMS).best_length for scenes in (unshifted, shifted))
+        for goal, new in becomes(unshifted[i], 1.0).items():
             if goal >= 0:
                 np.testing.assert_array_equal(before[:, goal], after[:, new])
                 moved += goal != new

@@ -1,4 +1,4 @@
-"""The dial of layout shift: it changes who stands near whom, and nothing else."""
+"""The dial of layout shift."""
 
 import collections
 import dataclasses
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_scene_io import assert_equal
+from support.scene_records import assert_scenes_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, ITHOR_CATEGORIES, ROBOTHOR_CATEGORIES, category_ids
@@ -37,7 +37,7 @@ def scenes_of(world: str, shift: float, part: int = 0) -> list[Scene]:
 
 
 def near(scene: Scene, categories: tuple[str, ...]) -> np.ndarray:
-    """Whether any objects of two categories are within 1.5 m of one another, bool [K, K]."""
+    """Return which categories are within 1.5 m, bool [K, K]."""
     ids = np.array(category_ids(scene.types, categories))
     places = scene.boxes[ids >= 0][:, [0, 2]]
     close = np.linalg.norm(places[:, None] - places, axis=-1) <= 1.5
@@ -46,13 +46,16 @@ def near(scene: Scene, categories: tuple[str, ...]) -> np.ndarray:
 
 
 def both(scene: Scene, categories: tuple[str, ...]) -> np.ndarray:
-    """Whether the scene has both categories, bool [K, K]."""
+    """Return which pairs the scene has, bool [K, K]."""
     has = np.isin(categories, [categories[i] for i in category_ids(scene.types, categories) if i >= 0])
     return has[:, None] & has
 
 
 def lifts(scenes: list[Scene], categories: tuple[str, ...]) -> np.ndarray:
-    """How much likelier a pair of categories is near than other pairs with either of the two, float64 [K, K]."""
+    """Return how much likelier pairs are near, float64 [K, K].
+
+    It is the share of scenes where they are, over that of other pairs with either of the two categories.
+    """
     together = np.sum([both(scene, categories) for scene in scenes], axis=0)
     share = np.sum([near(scene, categories) for scene in scenes], axis=0) / np.maximum(together, 1)
     counted = (together >= len(scenes) // 4) & ~np.eye(len(categories), dtype=bool)
@@ -62,7 +65,10 @@ def lifts(scenes: list[Scene], categories: tuple[str, ...]) -> np.ndarray:
 
 
 def moved_apart(a: list[Scene], b: list[Scene], categories: tuple[str, ...], rng: np.random.Generator) -> float:
-    """p-value of a permutation test that pairs are near as often in `a` as in `b`."""
+    """Return the p-value that pairs are equally often near.
+
+    It is that of a permutation test of `a` against `b`.
+    """
     upper = np.triu_indices(len(categories), 1)
     pairs = np.array([near(scene, categories)[upper] for scene in (*a, *b)], float)
     room_types = np.array([scene.room_type for scene in (*a, *b)])
@@ -110,12 +116,12 @@ def test_rooms_are_the_same_one_by_one():
     places = [("train", 0), ("train", 1), ("train", 2), ("val", 0), ("test", 0)]
     for scene, (split, i) in zip(together, places, strict=True):
         alone = generate_room_at(split, i, 2, 0.5)
-        assert_equal(alone, scene)
+        assert_scenes_equal(alone, scene)
 
 
 def test_a_shifted_room_is_its_twin_with_other_labels():
     for twin, scene in zip(scenes_of("rooms", 0.0), scenes_of("rooms", 1.0), strict=True):
-        assert_equal(dataclasses.replace(scene, types=twin.types), twin)
+        assert_scenes_equal(dataclasses.replace(scene, types=twin.types), twin)
         before, after = (category_ids(s.types, ITHOR_CATEGORIES) for s in (twin, scene))
         assert all(a != b or a == -1 for a, b in zip(before, after, strict=True))
         assert sorted(collections.Counter(before).values()) == sorted(collections.Counter(after).values())
@@ -163,11 +169,11 @@ def test_marginals_stay_put(world: str):
     cells = [np.mean([scene.reach.sum() for scene in scenes]) for scenes in (before, after)]
     assert cells[1] == pytest.approx(cells[0], rel=0.06)
     heights: list[dict[str, list[float]]] = [collections.defaultdict(list), collections.defaultdict(list)]
-    for found, scenes in zip(heights, (before, after), strict=True):
+    for by_category, scenes in zip(heights, (before, after), strict=True):
         for scene in scenes:
             for i, y in zip(category_ids(scene.types, categories), scene.boxes[:, 1], strict=True):
                 if i >= 0:
-                    found[categories[i]].append(y)
+                    by_category[categories[i]].append(y)
     common = [name for name in heights[0] if len(heights[0][name]) >= 15]
     for name in common:  # like footing: a category is at most half a metre higher or lower
         assert np.mean(heights[1][name]) == pytest.approx(np.mean(heights[0][name]), abs=0.5), name
@@ -185,7 +191,7 @@ def test_the_dial_moves_away_from_the_training_distribution(world: str):
 
 
 @pytest.mark.parametrize("world", HOMES)
-def test_placed_anew_by_their_own_rules_objects_stay_in_the_training_distribution(world: str):
+def test_placed_anew_by_their_rules_objects_stay_in_the_training_distribution(world: str):
     assert (
         moved_apart(scenes_of(world, 0.0), scenes_of(world, NEARLY_ZERO, 1), WORLDS[world][1], np.random.default_rng(0))
         > 0.01

@@ -1,4 +1,4 @@
-"""The simulated detector: how often it errs and where, and that its errors are frozen."""
+"""The simulated detector: rates and places of its errors."""
 
 import dataclasses
 
@@ -15,7 +15,10 @@ from jaxnav.scenes.task import Task
 
 
 def detect(detector, seen, distance, half_view=ROOMS.half_view[0], num_poses=40_000):
-    """Detections uint8 [P, 2, 4] of objects of 0.6 m (range 5 m) straight ahead."""
+    """Return detections uint8 [P, 2, 4] of objects straight ahead.
+
+    They are of 0.6 m (range 5 m).
+    """
     shape = (num_poses, 2)
     ahead, size = np.full(shape, float(distance)), np.full(shape, 0.6)
     return detector.detect("room", half_view, np.full(shape, seen), ahead, np.zeros(shape), ahead, size)

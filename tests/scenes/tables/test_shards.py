@@ -1,6 +1,5 @@
-"""Banks of scenes on disk: what is in the shards, and kills, errors and damage on the way there."""
+"""Shards of scenes on disk: content, kills, errors and damage."""
 
-import dataclasses
 import multiprocessing
 import os
 import shutil
@@ -13,62 +12,16 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from support.scenes import CATEGORIES, SMALL, draw
+from support.commands import contents
+from support.corridors import TASK, Corridors, FaultyCorridors, GatedCorridors, build
+from support.scenes import CATEGORIES
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.tables import shards as module
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.tables.shards import Shards, compile_shards
 from jaxnav.scenes.task import Rules, Task
 
-TASK = Task(CATEGORIES)
 ARRAYS = ("ahead", "rows", "best_length", "goal_distance", "first_cell", "num_cells", "goals", "num_goals")
-
-
-@dataclasses.dataclass(frozen=True)
-class Rooms:
-    """Corridors of different lengths with a book at the end, but for those of `without`."""
-
-    count: int = 7
-    without: tuple[int, ...] = ()
-    identity: str = "corridors"
-
-    def __len__(self):
-        return self.count
-
-    def __getitem__(self, index):
-        length = 4 + index % 5
-        objects = [] if index in self.without else [("Book", 0.25, 1.5, length / 4, *SMALL)]
-        scene = draw(["..", "#."] + [".."] * (length - 2), *objects)
-        return dataclasses.replace(scene, name=f"corridor-{index}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Slow(Rooms):
-    """Rooms from `slow` on are there only when the gate is."""
-
-    gate: str = "/nonexistent"
-    slow: tuple[int, ...] = ()
-
-    def __getitem__(self, index):
-        while index in self.slow and not Path(self.gate).exists():
-            time.sleep(0.01)
-        return super().__getitem__(index)
-
-
-class Faulty(Slow):
-    def __getitem__(self, index):
-        if index == 3:
-            raise InputError("corridor 3: has no end; give it one")
-        return super().__getitem__(index)
-
-
-def build(cache, scenes=Rooms(), task=TASK, shard_scenes=2, workers=1, report=lambda done, total: None) -> Shards:
-    return compile_shards(scenes, task, shard_scenes, Path(cache), report, workers)
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def times(folder):
@@ -80,8 +33,8 @@ def times(folder):
 
 @pytest.mark.parametrize("without", [(), (1, 4, 5)])
 def test_shards_end_to_end_are_the_bank_of_all_scenes(tmp_path, without):
-    rooms = Rooms(without=without)
-    shards, bank = build(tmp_path, rooms), compile_bank([rooms[i] for i in range(len(rooms))], TASK)
+    corridors = Corridors(without=without)
+    shards, bank = build(tmp_path, corridors), compile_bank([corridors[i] for i in range(len(corridors))], TASK)
     # Seven scenes in shards of two at most: (0), (1, 2), (3, 4) and (5, 6).
     assert shards.counts == ((1, 1, 1, 1) if without else (1, 2, 2, 2))
     starts = np.cumsum([0] + [len(shard.ahead) for shard in shards], dtype=np.int32)
@@ -108,11 +61,11 @@ def test_arrays_are_memory_mapped_and_the_sizes_are_the_greatest(tmp_path):
 
 
 def test_a_shard_without_a_goal_is_left_out_and_a_bank_without_one_refused(tmp_path):
-    shards = build(tmp_path, Rooms(count=6, without=(2, 3)))
+    shards = build(tmp_path, Corridors(count=6, without=(2, 3)))
     assert (shards.counts, shards.skipped) == ((2, 2), ("corridor-2", "corridor-3"))
     assert [shard.names[0] for shard in shards] == ["corridor-0", "corridor-4"]
     with pytest.raises(InputError, match=r"none of the 3 scenes has a reachable goal: .* Book, Chair, Fridge"):
-        build(tmp_path, Rooms(count=3, without=(0, 1, 2), identity="bare"))
+        build(tmp_path, Corridors(count=3, without=(0, 1, 2), identity="bare"))
     with pytest.raises(InputError, match="shard_scenes is 0; give a number of at least 1"):
         build(tmp_path, shard_scenes=0)
 
@@ -137,7 +90,7 @@ def test_whatever_the_shards_follow_from_is_in_their_folder(tmp_path, monkeypatc
     folder = build(tmp_path).folder
     assert build(tmp_path).folder == folder
     others = [
-        build(tmp_path, Rooms(identity="others")),
+        build(tmp_path, Corridors(identity="others")),
         build(tmp_path, task=Task(CATEGORIES, rules=Rules(success_distance=1.25))),
         build(tmp_path, shard_scenes=3),
     ]
@@ -149,7 +102,7 @@ def test_whatever_the_shards_follow_from_is_in_their_folder(tmp_path, monkeypatc
 def test_only_what_is_missing_is_compiled(tmp_path):
     made, reports = [], []
 
-    class Watched(Rooms):
+    class Watched(Corridors):
         def __getitem__(self, index):
             made.append(index)
             return super().__getitem__(index)
@@ -175,12 +128,13 @@ def test_only_what_is_missing_is_compiled(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_build_that_is_killed_leaves_whole_shards_and_no_process(tmp_path, number):
-    slow = Slow(gate=str(tmp_path / "gate"), slow=(4, 5, 6))
+    gated = GatedCorridors(gate=str(tmp_path / "gate"), gated=(4, 5, 6))
     code = (
-        "from test_shards import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        f"build({str(tmp_path)!r}, {slow!r}, workers=2)"
+        "import signal; from pathlib import Path; from support.corridors import GatedCorridors, build;"
+        "signal.signal(signal.SIGINT, signal.default_int_handler);"
+        f"build(Path({str(tmp_path)!r}), {gated!r}, workers=2)"
     )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, Path(__file__).parents[:4]))}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, Path(__file__).parents[2:4]))}
     process = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE)
     while len(list(tmp_path.glob("*/0*"))) < 2:  # the other two wait for the gate
         assert process.poll() is None
@@ -192,7 +146,7 @@ def test_a_build_that_is_killed_leaves_whole_shards_and_no_process(tmp_path, num
     kept = times(folder)
     assert {path.parent.name for path in kept} == {"00000", "00001"}
     (tmp_path / "gate").touch()
-    shards = build(tmp_path, slow)
+    shards = build(tmp_path, gated)
     assert shards.folder == folder
     assert contents(folder) == contents(build(tmp_path / "whole").folder)
     assert kept.items() <= times(folder).items()
@@ -202,7 +156,7 @@ def test_a_build_that_is_killed_leaves_whole_shards_and_no_process(tmp_path, num
 def test_an_error_in_a_scene_reaches_the_caller_and_ends_the_other_workers(tmp_path, workers):
     # Shards (0, 1, 2) and (3, 4, 5, 6), which fails; with two workers the first waits for ever.
     with pytest.raises(InputError) as caught:
-        build(tmp_path, Faulty(slow=(0,) if workers == 2 else ()), shard_scenes=4, workers=workers)
+        build(tmp_path, FaultyCorridors(gated=(0,) if workers == 2 else ()), shard_scenes=4, workers=workers)
     assert str(caught.value) == "corridor 3: has no end; give it one"
     assert [path.name for path in tmp_path.glob("*/*")] == (["00000"] if workers == 1 else [])
     assert not multiprocessing.active_children()

@@ -1,15 +1,15 @@
-"""Offline Scene_Data folders to scenes: a 3 x 3 room worked out by hand, and folders that cannot be used."""
+"""Offline Scene_Data folders to scenes."""
 
 import collections
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_import_ai2thor import check_outcomes, mutate
-from test_scene_io import assert_equal
+from support.importer_inputs.scene_data import FILES, GRAPH, GRID, NODES, VISIBLE, write_folder
+from support.mutations import mutated
+from support.scene_records import as_scene, assert_scenes_equal, check_outcomes
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.scene_data import read_scene_data
@@ -18,60 +18,12 @@ from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 
-HEADINGS = {0: (0, 1), 45: (1, 1), 90: (1, 0), 135: (1, -1), 180: (0, -1), 225: (-1, -1), 270: (-1, 0), 315: (-1, 1)}
-
-# x 0 to 0.5 and z -0.25 to 0.25 in steps of 0.25; the agent is at 0.9 m, so the floor is at 0.
-PLACES = [(i, j) for i in range(3) for j in (-1, 0, 1)]
-GRID = [{"x": 0.25 * i, "y": 0.9, "z": 0.25 * j} for i, j in PLACES]
-
-
-def state(i: int, j: int, rotation: int, horizon: int) -> str:
-    """Key of a state; zero is written as -0.00, as some files do."""
-    return f"{0.25 * i or -0.0:.2f}|{0.25 * j or -0.0:.2f}|{rotation}|{horizon}"
-
-
-def links() -> list[dict[str, str]]:
-    """What one action leads to, by the action rules."""
-    pairs = []
-    for i, j in PLACES:
-        for rotation, (dx, dz) in HEADINGS.items():
-            for horizon in (0, 30):
-                reached = [
-                    (i, j, (rotation + 45) % 360, horizon),
-                    (i, j, (rotation - 45) % 360, horizon),
-                    (i, j, rotation, 30 - horizon),
-                    *([(i + dx, j + dz, rotation, horizon)] if (i + dx, j + dz) in PLACES else []),
-                ]
-                pairs += [(state(i, j, rotation, horizon), state(*target)) for target in reached]
-    return [{"source": source, "target": target} for source, target in pairs]
-
-
-NODES = [{"id": state(i, j, rotation, horizon)} for i, j in PLACES for rotation in HEADINGS for horizon in (0, 30)]
-GRAPH = {"directed": True, "multigraph": False, "graph": {}, "nodes": NODES, "links": links()}
-VISIBLE = {
-    "Fridge|+01.00|+00.00|-00.25": [state(2, 0, 90, 0), state(2, 0, 90, 30)],
-    "Apple|+00.50|+01.02|00.00": [],
-    "Sink|-01.00|+00.90|+00.25": [state(0, 0, 270, 0)],
-    "Sink|-01.00|+00.90|+00.25|SinkBasin": [state(0, 0, 270, 30)],
-    "Floor|+00.00|+00.00|+00.00": [state(0, 0, 270, 30)],
-}
-FILES = {"grid.json": GRID, "graph.json": GRAPH, "visible_object_map_1.5.json": VISIBLE}
-
-
-def write(folder: Path, files: dict[str, object] = FILES, **others: object) -> Path:
-    """A scene's folder with these files, some of them replaced; None leaves a file out."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, value in (files | {f"{name}.json": value for name, value in others.items()}).items():
-        (folder / name).unlink(missing_ok=True)
-        if value is not None:
-            (folder / name).write_text(value if isinstance(value, str) else json.dumps(value))
-    return folder
-
 
 @pytest.fixture
 def read(tmp_path):
     def read_folder(**others: object) -> Scene | InputError:
-        (result,) = read_scene_data(write(tmp_path / "FloorPlan401", **others), "test")
+        files = FILES | {f"{name}.json": value for name, value in others.items()}
+        (result,) = read_scene_data(write_folder(tmp_path / "FloorPlan401", files), "test")
         return result
 
     return read_folder
@@ -103,7 +55,7 @@ def test_a_scene_survives_its_file(tmp_path, read):
     scene = read()
     write_scenes(tmp_path / "scenes.jsonl.gz", [scene])
     (back,) = read_scenes(tmp_path / "scenes.jsonl.gz")
-    assert_equal(back, scene)
+    assert_scenes_equal(back, scene)
 
 
 @pytest.mark.parametrize(
@@ -119,8 +71,8 @@ def test_a_scene_survives_its_file(tmp_path, read):
     ],
 )
 def test_other_forms_of_a_folder_give_the_same_scene(tmp_path, read, others):
-    (plain,) = read_scene_data(write(tmp_path / "data" / "FloorPlan401"), "test")
-    assert_equal(read(**others), plain)
+    (plain,) = read_scene_data(write_folder(tmp_path / "data" / "FloorPlan401", FILES), "test")
+    assert_scenes_equal(read(**others), plain)
 
 
 def test_heights_are_above_the_floor(read):
@@ -130,13 +82,13 @@ def test_heights_are_above_the_floor(read):
 
 
 def test_all_scenes_of_a_folder_are_read(tmp_path):
-    write(tmp_path / "FloorPlan1_physics")
-    write(tmp_path / "FloorPlan2", grid='[{"x": 0.0')
-    write(tmp_path / "FloorPlan301")
+    write_folder(tmp_path / "FloorPlan1_physics", FILES)
+    write_folder(tmp_path / "FloorPlan2", FILES | {"grid.json": '[{"x": 0.0'})
+    write_folder(tmp_path / "FloorPlan301", FILES)
     (tmp_path / "notes").mkdir()
     (tmp_path / "readme.txt").touch()
     first, broken, last = read_scene_data(tmp_path, "train")
-    assert [(scene.name, scene.room_type) for scene in (first, last)] == [
+    assert [(scene.name, scene.room_type) for scene in map(as_scene, (first, last))] == [
         ("FloorPlan1", "kitchen"),
         ("FloorPlan301", "bedroom"),
     ]
@@ -192,13 +144,13 @@ SMALL = FILES | {
 @pytest.mark.parametrize("file", SMALL)
 def test_mutated_files_are_imported_or_refused(tmp_path, file):
     outcomes = collections.Counter()
-    folder = write(tmp_path / "FloorPlan1", SMALL)
+    folder = write_folder(tmp_path / "FloorPlan1", SMALL)
     if file == "grid.json":  # the nodes of a graph would miss every place that a mutation removes
         (folder / "graph.json").unlink()
 
-    @given(st.data())
-    def check(data):
-        (folder / file).write_text(json.dumps(mutate(data, SMALL[file])))
+    @given(mutated(SMALL[file]))
+    def check(content):
+        (folder / file).write_text(json.dumps(content))
         check_outcomes(list(read_scene_data(folder, "train")), outcomes, folder)
 
     check()
@@ -208,6 +160,6 @@ def test_mutated_files_are_imported_or_refused(tmp_path, file):
 
 @given(st.text("|+-.0123456789eCupN_\u0663 ", max_size=24))
 def test_strange_ids_are_imported_or_refused(tmp_path_factory, text):
-    folder = write(tmp_path_factory.getbasetemp() / "ids" / "FloorPlan1", SMALL)
+    folder = write_folder(tmp_path_factory.getbasetemp() / "ids" / "FloorPlan1", SMALL)
     (folder / "visible_object_map_1.5.json").write_text(json.dumps(VISIBLE | {text: ["a"]}))
     check_outcomes(list(read_scene_data(folder, "train")), collections.Counter(), folder)

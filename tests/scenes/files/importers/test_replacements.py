@@ -1,16 +1,17 @@
-"""Re-placed movable objects: a room worked out by hand, records that cannot be used, and the simulator's own file."""
+"""Rooms whose movable objects the simulator has placed anew."""
 
 import collections
 import gzip
 import json
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_import_ai2thor import check_outcomes, mutate
-from test_scene_io import write_records
+from support.mutations import mutated
+from support.real_scenes import ITHOR, ITHOR_SHUFFLES, require
+from support.scene_records import as_scene, check_outcomes, write_records
 
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
@@ -21,12 +22,8 @@ from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.task import ROOMS
 
-REAL = Path(__file__).parents[4] / "shared" / "scenes"
-ROOM_FILE, SETS_FILE = REAL / "ithor_train_val.jsonl.gz", REAL / "ithor_shuffles_train.jsonl.gz"
-real = pytest.mark.skipif(not SETS_FILE.exists(), reason="the real rooms are not here")
-
 MUG, PEN, CUP = 4, 5, 7
-ROOM = {
+ROOM: dict[str, Any] = {
     "name": "den",
     "world": "ithor",
     "room_type": "bedroom",
@@ -49,7 +46,12 @@ ROOM = {
 }
 ROOM["objects"][PEN][8] = MUG
 ROWS = [["Book", 0.0, 0.8, 0.9], ["Book", 0.1, 0.0, 0.0], ["BasketBall", 0.3, 0.92, 1.0], ["Mug", 0.25, 0.0, 0.5]]
-SETS = {"name": "den", "n_sets": 2, "columns": ["type", "x", "y", "z"], "sets": [ROWS, [["Cup", 0.2, 0.8, 1.1]]]}
+SETS: dict[str, Any] = {
+    "name": "den",
+    "n_sets": 2,
+    "columns": ["type", "x", "y", "z"],
+    "sets": [ROWS, [["Cup", 0.2, 0.8, 1.1]]],
+}
 
 
 @pytest.fixture
@@ -59,7 +61,7 @@ def base(tmp_path):
 
 def test_every_set_is_a_scene_with_its_objects_there(tmp_path, base):
     path = write_records(tmp_path / "sets.jsonl.gz", SETS)
-    first, second = read_replacements(path, base)
+    first, second = map(as_scene, read_replacements(path, base))
     (room,) = read_scenes(base)
     assert [first.name, second.name] == ["den-replaced-0", "den-replaced-1"]
     assert first.types == room.types == ("Desk", "Book", "Book", "BasketBall", "Mug", "Pen", "Cup")
@@ -125,9 +127,9 @@ def test_files_that_cannot_be_read_at_all(tmp_path, base):
 def test_mutated_records_are_imported_or_refused(tmp_path, base):
     outcomes = collections.Counter()
 
-    @given(st.data())
-    def check(data):
-        path = write_records(tmp_path / "sets.jsonl.gz", mutate(data, SETS), SETS)
+    @given(mutated(SETS))
+    def check(sets):
+        path = write_records(tmp_path / "sets.jsonl.gz", sets, SETS)
         results = list(read_replacements(path, base))
         check_outcomes(results[:-2], outcomes, path)
         assert [type(result) for result in results[-2:]] == [Scene, Scene]
@@ -159,10 +161,9 @@ def test_the_command_writes_a_scene_file(tmp_path, base, capsys):
     assert "2 scenes imported, 0 refused" in capsys.readouterr().err
 
 
-@real
 def test_the_simulators_file_is_ten_sets_of_eighty_rooms():
-    scenes = list(read_replacements(SETS_FILE, ROOM_FILE))
-    rooms = {scene.name: scene for scene in read_scenes(ROOM_FILE)}
+    scenes = list(map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))))
+    rooms = {scene.name: scene for scene in read_scenes(ITHOR)}
     assert [type(scene) for scene in scenes] == [Scene] * 800
     assert collections.Counter(scene.name.split("-")[0] for scene in scenes) == dict.fromkeys(
         (name for name, room in rooms.items() if room.split == "train"), 10
@@ -176,11 +177,13 @@ def test_the_simulators_file_is_ten_sets_of_eighty_rooms():
     assert 9700 <= moved <= 9830  # rows of the file; a few stay where they were
 
 
-@real
 def test_objects_put_back_on_their_pivots_are_where_they_were(tmp_path):
-    """An independent check of the rule for heights: the pivots in the ids of the base file give its own boxes."""
-    records = [json.loads(line) for line in gzip.decompress(ROOM_FILE.read_bytes()).splitlines()]
-    movable = {row[0] for line in gzip.decompress(SETS_FILE.read_bytes()).splitlines()
+    """Check the rule for heights against the rooms themselves.
+
+    The pivots in the ids of the base file give its boxes.
+    """
+    records = [json.loads(line) for line in gzip.decompress(require(ITHOR).read_bytes()).splitlines()]
+    movable = {row[0] for line in gzip.decompress(require(ITHOR_SHUFFLES).read_bytes()).splitlines()
                for row in json.loads(line)["sets"][0]}  # fmt: skip
     sets = [
         {
@@ -190,10 +193,10 @@ def test_objects_put_back_on_their_pivots_are_where_they_were(tmp_path):
         }
         for record in records
     ]
-    scenes = list(read_replacements(write_records(tmp_path / "sets.jsonl.gz", *sets), ROOM_FILE))
+    scenes = list(read_replacements(write_records(tmp_path / "sets.jsonl.gz", *sets), ITHOR))
     off = [
         np.abs(scene.boxes[i, 1] - room.boxes[i, 1])
-        for scene, room in zip(scenes, read_scenes(ROOM_FILE), strict=True)
+        for scene, room in zip(scenes, read_scenes(ITHOR), strict=True)
         if isinstance(scene, Scene)
         for i in np.flatnonzero(np.isin(room.types, list(movable)))
     ]
@@ -201,13 +204,11 @@ def test_objects_put_back_on_their_pivots_are_where_they_were(tmp_path):
     assert np.mean(np.array(off) <= 0.02) >= 0.95
 
 
-@real
 @pytest.mark.slow
-def test_nearly_everything_can_be_found_in_the_simulators_rooms():
-    present = found = 0
-    for scene in read_replacements(SETS_FILE, ROOM_FILE):
-        assert isinstance(scene, Scene)
+def test_nearly_every_object_can_be_reached_in_the_simulators_rooms():
+    present = reachable = 0
+    for scene in map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))):
         present += len(set(category_ids(scene.types, ITHOR_CATEGORIES)) - {-1})
-        found += (compile_scene(scene, ROOMS).best_length > 0).any(axis=0).sum()
+        reachable += (compile_scene(scene, ROOMS).best_length > 0).any(axis=0).sum()
     assert present == 6700
-    assert found / present >= 0.97
+    assert reachable / present >= 0.97

@@ -1,58 +1,18 @@
-"""Habitat ObjectNav: floors of a house from episodes and maps, or from episodes alone."""
+"""Habitat ObjectNav episodes, with and without maps, to scenes."""
 
-import gzip
-import json
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_import_semantic_map import bedroom, l_shaped_floor, write_maps
+from support.importer_inputs.habitat import EPISODES, STARTS, episode, goal, write_json
+from support.importer_inputs.semantic_maps import bedroom, l_shaped_floor, write_maps
+from support.scene_records import scenes_and_errors
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.habitat import read_habitat
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
-
-
-def write_json(path: Path, content: object) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(gzip.compress(json.dumps(content).encode(), mtime=0))
-    return path
-
-
-def episode(x: float, y: float, z: float, **more: object) -> dict:
-    return {"episode_id": "0", "scene_id": "gibson/Home.glb", "start_position": [x, y, z], "goals": []} | more
-
-
-def goal(category: str, identity: int | str, position: list[float], points: list[list[float]]) -> dict:
-    views = [{"agent_state": {"position": point, "rotation": [0, 0, 0, 1]}, "iou": 0.2} for point in points]
-    return {"object_id": identity, "object_category": category, "position": position, "view_points": views}
-
-
-#: Starts all over both floors of `l_shaped_floor` and `bedroom` where x is at most 3.4 m.
-STARTS = [episode(2.05 + 0.25 * i, y, -0.95 + 0.25 * j) for y in (0.02, 2.88) for i in range(6) for j in range(12)]
-
-#: A ground floor with a row of starts from x = 0 to 2 m (z = -1), an L of view points at its end, and a bed upstairs.
-EPISODES = {
-    "episodes": [
-        *[episode(0.25 * i + 0.03, 0.1, -1.02) for i in range(9)],
-        *[episode(0.25 * i, 3.1, 0.0) for i in range(8)],
-        episode(1.0, 1.6, 0.0),  # on the stairs
-    ],
-    "goals_by_category": {
-        "Home.glb_chair": [goal("chair", 7, [2.5, 0.6, -1.5], [[2.0, 0.1, -1.25], [2.0, 0.1, -1.5]])],
-        "Home.glb_bed": [goal("bed", "bed_3", [1.0, 3.5, 1.0], [[1.0, 3.1, 0.25]])] * 2,
-        "Other.glb_sofa": [goal("sofa", 1, [0.0, 0.0, 0.0], [])],
-    },
-}
-EPISODES["episodes"] += EPISODES["episodes"][:9]  # 27 starts: the one on the stairs is less than a twentieth
-
-
-def split_of(results: Iterable[Scene | InputError]) -> tuple[list[Scene], list[str]]:
-    results = list(results)
-    return [r for r in results if isinstance(r, Scene)], [str(r) for r in results if isinstance(r, InputError)]
 
 
 @pytest.fixture
@@ -62,7 +22,7 @@ def maps(tmp_path: Path) -> Path:
 
 def test_floors_of_a_mapped_house(tmp_path, maps):
     write_json(tmp_path / "val" / "content" / "Home_episodes.json.gz", {"episodes": STARTS})
-    scenes, errors = split_of(read_habitat(tmp_path / "val", "val", maps))
+    scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val", maps))
     assert not errors
     assert [(scene.name, scene.world, scene.split, scene.types) for scene in scenes] == [
         ("Home_floor0", "gibson", "val", ("Chair",)),
@@ -84,16 +44,19 @@ def test_every_way_to_name_a_split(tmp_path, maps):
     write_json(folder / "content" / "Home.json.gz", {"episodes": [episode(99.0, 0.0, 99.0)]})  # Habitat's, not SemExp's
     whole = write_json(folder / "val.json.gz", {"episodes": []})
     for path in (folder, folder / "content", whole, file):
-        assert [scene.name for scene in split_of(read_habitat(path, "val", maps))[0]] == ["Home_floor0", "Home_floor1"]
+        assert [scene.name for scene in scenes_and_errors(read_habitat(path, "val", maps))[0]] == [
+            "Home_floor0",
+            "Home_floor1",
+        ]
     alone = write_json(tmp_path / "train" / "train.json.gz", {"episodes": []})
     for path in (alone, alone.parent):  # no episode: all that the map has
-        assert len(split_of(read_habitat(path, "train", maps))[0]) == 2
+        assert len(scenes_and_errors(read_habitat(path, "train", maps))[0]) == 2
         with pytest.raises(InputError, match="holds no episode; give the folder of a split, or a semantic floor map"):
             list(read_habitat(path, "train"))
 
 
 def shifted(dx: float, count: int) -> list[dict]:
-    """STARTS with the first `count` upstairs moved along x."""
+    """Return STARTS with `count` of those upstairs moved along x."""
     return [episode(x + dx * (72 <= i < 72 + count), y, z) for i, (x, y, z) in enumerate(positions())]
 
 
@@ -111,20 +74,24 @@ def positions() -> list[list[float]]:
 )
 def test_a_map_must_fit_the_starts(tmp_path, maps, dx, count, fits):
     path = write_json(tmp_path / "e.json.gz", {"episodes": shifted(dx, count)})
-    scenes, errors = split_of(read_habitat(path, "val", maps))
+    scenes, errors = scenes_and_errors(read_habitat(path, "val", maps))
     assert len(scenes) == 1 + fits
     assert fits or "val_info.pbz2, scene 'Home': floor 1: sem_map has 57 of 72 starts" in errors[0]
 
 
 def test_floor_id_tells_the_floor_of_a_start(tmp_path, maps):
     episodes = [start | {"floor_id": 0} for start in shifted(-3.0, 72)[72:]]  # by height they are upstairs
-    scenes, errors = split_of(read_habitat(write_json(tmp_path / "e.json.gz", {"episodes": episodes}), "val", maps))
+    scenes, errors = scenes_and_errors(
+        read_habitat(write_json(tmp_path / "e.json.gz", {"episodes": episodes}), "val", maps)
+    )
     assert [scene.name for scene in scenes] == ["Home_floor1"]
     assert "floor 0: sem_map has 0 of 72 starts" in errors[0]
 
 
 def test_floors_from_episodes_alone(tmp_path):
-    (ground, upstairs), errors = split_of(read_habitat(write_json(tmp_path / "Home.json.gz", EPISODES), "train"))
+    (ground, upstairs), errors = scenes_and_errors(
+        read_habitat(write_json(tmp_path / "Home.json.gz", EPISODES), "train")
+    )
     assert not errors
     assert (ground.name, ground.world, ground.room_type) == ("Home_floor0", "habitat", "house")
     # z is negated. Starts at x = 0.03 .. 2.03 m go to 0 .. 2 m; the view points add (2, 1.25) and (2, 1.5).

@@ -1,4 +1,4 @@
-"""Pickles of others: arrays of numbers are read, everything else is refused before it is looked up."""
+"""Pickles: arrays of numbers are read, all else is refused."""
 
 import bz2
 import io
@@ -25,11 +25,11 @@ def write(path: Path, data: bytes) -> Path:
 def test_arrays_are_read_in_every_protocol(tmp_path, protocol, dtype):
     values = np.arange(24).reshape(2, 3, 4).astype(dtype)
     for array in (values, np.asfortranarray(values)):
-        found = read_pickle(write(tmp_path / "a.pbz2", pickle.dumps([array, array, np.float32(1.5)], protocol)))
-        assert found[0].values.dtype == values.dtype
-        np.testing.assert_array_equal(found[0].values, values)
-        assert found[0] is found[1]
-        assert found[2] == 1.5
+        values_read = read_pickle(write(tmp_path / "a.pbz2", pickle.dumps([array, array, np.float32(1.5)], protocol)))
+        assert values_read[0].values.dtype == values.dtype
+        np.testing.assert_array_equal(values_read[0].values, values)
+        assert values_read[0] is values_read[1]
+        assert values_read[2] == 1.5
 
 
 def test_pickles_of_numpy_1_are_read(tmp_path):
@@ -40,7 +40,7 @@ def test_pickles_of_numpy_1_are_read(tmp_path):
 
 
 class Touch:
-    """Unpickled freely, it makes a file."""
+    """Make a file when unpickled freely."""
 
     def __init__(self, path: Path):
         self.path = path

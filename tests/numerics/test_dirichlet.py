@@ -1,4 +1,4 @@
-"""The divergence of equation 5 in float32, against float64 and closed forms."""
+"""The divergence of equation 5 in float32."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,10 @@ from jaxnav.numerics.dirichlet import presence_kl, update_kl
 
 
 def draws(seed: int, k: int, n: int = 4000):
-    """Priors 0.01..2e4 of several kinds with counts 0..3, as (name, prior [n, k], counts [n, k])."""
+    """Yield name, prior [n, k] and counts [n, k].
+
+    Priors are from 0.01 to 2e4, counts from 0 to 3.
+    """
     rng = np.random.default_rng(seed)
     scale = np.exp(rng.uniform(np.log(1e-2), np.log(2e4), (n, 1)))
     sparse = rng.integers(0, 4, (n, k)) * (rng.random((n, k)) < rng.random((n, 1)))
@@ -45,7 +48,10 @@ def test_update_kl_is_accurate_in_float32(k):
 
 
 def test_lgamma_differences_are_not():
-    """Negative control: the textbook formula in float32 misses the bound by orders of magnitude."""
+    """Check that the textbook formula in float32 misses the bound.
+
+    It does by orders of magnitude: the negative control.
+    """
     from jax.scipy.special import digamma as psi
     from jax.scipy.special import gammaln as lgamma
 

@@ -1,4 +1,4 @@
-"""The plain-Python twin against tiny scenes worked by hand: moves, the course of an episode, its measures, the view."""
+"""The twin by hand: moves, endings, measures and the view."""
 
 import math
 
@@ -39,7 +39,7 @@ def test_of_twelve_headings_two_lead_to_each_diagonal_cell(headings, cell):
         assert episode.pose == (*cell, heading, 0)
 
 
-def test_a_diagonal_move_needs_only_its_own_cell():
+def test_a_diagonal_move_needs_only_the_cell_it_leads_to():
     episode = twin(draw([".#", "#."]), heading=1)
     episode.step(MOVE_AHEAD)
     assert episode.cell == (1, 1)
@@ -60,7 +60,7 @@ def test_standable_is_the_largest_component_and_the_first_of_equal_ones():
         twin(draw(["..#..", "..#.."]), cell=(0, 3))
 
 
-def test_rotations_wrap_and_looks_stop_at_their_limits():
+def test_rotations_wrap_and_horizons_stop_at_their_limits():
     episode = twin(draw(["."]))
     poses = []
     for action in (ROTATE_LEFT, ROTATE_RIGHT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, LOOK_DOWN, LOOK_UP):
@@ -78,7 +78,7 @@ def test_twelve_headings_go_around_and_a_single_horizon_stays():
     assert poses == [(11, 0), (11, 0), (11, 0), (0, 0), (1, 0)]
 
 
-def test_done_ends_the_episode_and_pays_where_the_goal_is_found():
+def test_done_ends_the_episode_and_pays_where_it_succeeds():
     book = ("Book", 0, 1.5, 1, *SMALL)
     assert single(book).step(DONE) == (5.0, True, False)
     assert single(book, heading=4).step(DONE) == (-0.01, True, False)
@@ -139,11 +139,11 @@ def test_goal_distance_is_to_the_nearest_goal_less_a_metre():
 CHEST = (0.5, 0.5, 0.5)  # its footprint reaches 0.25 m to every side
 
 
-@pytest.mark.parametrize(("z", "found"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
-def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, found):
+@pytest.mark.parametrize(("z", "goals"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
+def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, goals):
     for heading in range(12):
-        assert single(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).found() == found
-    assert single(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).found() == {BOOK}  # in its footprint: no way at all
+        assert single(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).successes() == goals
+    assert single(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).successes() == {BOOK}  # in its footprint: no way at all
 
 
 def walk_to_the_book(rows, *place, walls=(), cell=(0, 0)):
@@ -197,7 +197,7 @@ def test_measures_of_walks():
 
 
 def picture(episode):
-    """The view, the far edge first."""
+    """Return the view, the far edge first."""
     cells = episode.view()
     return ["".join("?.#"[value] for value in cells[i : i + 11]) for i in range(110, -1, -11)]
 
@@ -222,6 +222,6 @@ def test_what_hides_the_floor():
     # What stands beyond the lattice hides nothing.
     scene = draw(["." * 9] * 5, chest)
     assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 5 + ["#"] * 6
-    # Neither does the own cell, nor that which is looked at.
+    # Neither does the cell of the agent, nor that which is looked at.
     scene = draw(["." * 9] * 5, walls=[(0, 4), (3, 4)])
     assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 4 + ["?"] * 7

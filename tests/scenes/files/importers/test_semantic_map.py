@@ -1,4 +1,4 @@
-"""Semantic floor maps: pixels to lattice points and boxes, thin walls, damaged maps."""
+"""Semantic floor maps: points, boxes, thin walls and damage."""
 
 import bz2
 import pickle
@@ -6,51 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.ndimage
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
+from support.importer_inputs.semantic_maps import CHAIR, l_shaped_floor, write_maps
+from support.lattice import points_of
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.categories import GIBSON_CATEGORIES
 from jaxnav.scenes.files.importers.semantic_map import floor_map, read_maps, scene_of_map
-from jaxnav.scenes.lattice import connected_parts, standable_cells
+from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
-
-CHAIR, BED = (1 + GIBSON_CATEGORIES.index(name) for name in ("Chair", "Bed"))
-
-
-def l_shaped_floor(height: float = 0.0, **changes: object) -> dict:
-    """3 x 3 m, Habitat's x from 2 to 5 m and z from -1 to 2 m; floor without the quarter of large x and z."""
-    layers = np.zeros((16, 60, 60))
-    layers[0] = 1
-    layers[0, 30:, 30:] = 0
-    layers[0, 36:54, :18] = 0  # around the chair
-    layers[CHAIR, 40:50, 4:14] = 1
-    return {"floor_height": height, "sem_map": layers, "origin": np.array([-100, 200])} | changes
-
-
-def bedroom(height: float = 2.9) -> dict:
-    """The same walls; a bed instead of the chair."""
-    floor = l_shaped_floor(height)
-    floor["sem_map"][CHAIR] = 0
-    floor["sem_map"][BED, 38:52, 2:16] = 1
-    return floor
-
-
-def write_maps(path: Path, maps: object, protocol: int = 4) -> Path:
-    path.write_bytes(bz2.compress(pickle.dumps(maps, protocol)))
-    return path
 
 
 def scene_of(tmp_path: Path, floor: dict) -> Scene:
     record = read_maps(write_maps(tmp_path / "maps.pbz2", {"Home": {0: floor}}))["Home"][0]
     return scene_of_map(record, "Home_floor0", "val", floor_map(record))
-
-
-def standable(scene: Scene) -> set[tuple[float, float]]:
-    """Points (x, z)."""
-    return {(scene.origin[0] + 0.25 * ix, scene.origin[1] + 0.25 * iz) for iz, ix in np.argwhere(scene.reach).tolist()}
 
 
 @pytest.mark.parametrize(
@@ -67,11 +36,12 @@ def test_the_pixel_under_a_lattice_point_decides(tmp_path, origin, pixel, points
     floor["sem_map"][0] = 0
     floor["sem_map"][0][pixel] = 1
     try:
-        found = standable(scene_of(tmp_path, floor))
+        scene = scene_of(tmp_path, floor)
     except InputError as error:
         assert "floor 0: sem_map has no standable point" in str(error)  # noqa: PT017  (reading may also succeed)
-        found = set()
-    assert found == points
+        assert not points
+    else:
+        assert points_of(scene, scene.reach) == points
 
 
 def test_l_shaped_floor_with_a_chair(tmp_path):
@@ -80,7 +50,7 @@ def test_l_shaped_floor_with_a_chair(tmp_path):
     points = {(2 + 0.25 * i, 1 - 0.25 * j) for i in range(12) for j in range(12) if i < 6 or j < 6}
     # Around the chair pixels 36-53 and 0-17: x 3.80 to 4.70 m is 4.00, 4.25, 4.50; z -1.00 to -0.10 is -1.00 to -0.25.
     points -= {(x, z) for x in (4.0, 4.25, 4.5) for z in (1.0, 0.75, 0.5, 0.25)}
-    assert standable(scene) == points
+    assert points_of(scene, scene.reach) == points
     assert len(standable_cells(scene.reach)) == len(points) == 96
     # Chair: pixels 40-49 and 4-13, so x 4.00 to 4.50 and Habitat's z -0.80 to -0.30 m; a chair is 0.95 m high.
     assert (scene.world, scene.room_type, scene.types) == ("gibson", "house", ("Chair",))
@@ -89,7 +59,10 @@ def test_l_shaped_floor_with_a_chair(tmp_path):
 
 
 def rooms_parted_by(strip: slice, door: slice) -> dict:
-    """4 x 4 m of floor, parted at the pixels `strip` of x except for the pixels `door` of z."""
+    """Return a floor of two parts with a door.
+
+    The parts are 4 x 4 m in all, and divided at the pixels `strip` of x but for the pixels `door` of z.
+    """
     layers = np.zeros((16, 80, 80), np.uint8)
     layers[0] = 1
     layers[0, strip] = 0
@@ -100,7 +73,10 @@ def rooms_parted_by(strip: slice, door: slice) -> dict:
 
 
 def inner_walls(scene: Scene) -> np.ndarray:
-    """Without the outermost cells, which lie three from every standable one."""
+    """Return the walls without the outermost cells.
+
+    Those lie three from every standable one.
+    """
     inner = np.zeros_like(scene.walls)
     inner[1:-1, 1:-1] = scene.walls[1:-1, 1:-1]
     return inner
@@ -126,21 +102,6 @@ def test_a_long_thin_strip_between_floors_is_a_wall(tmp_path):
 )
 def test_wide_short_or_narrow_strips_are_no_walls(tmp_path, strip, door):
     assert not inner_walls(scene_of(tmp_path, rooms_parted_by(strip, door))).any()
-
-
-@given(hnp.arrays(bool, (7, 9)))
-def test_connected_parts_are_those_of_scipy(mask):
-    labels, count = scipy.ndimage.label(mask, np.ones((3, 3)))
-    parts = connected_parts(mask)
-    expected = [np.argwhere(labels == k + 1) for k in range(count)]
-    assert sorted(part.tolist() for part in parts) == sorted(part.tolist() for part in expected)
-
-
-def test_connected_parts_of_a_long_snake():
-    snake = np.zeros((40, 41), bool)
-    snake[::4] = snake[2::8, -1] = snake[6::8, 0] = True
-    snake[1::8, -1] = snake[3::8, -1] = snake[5::8, 0] = snake[7::8, 0] = True
-    assert [len(part) for part in connected_parts(snake)] == [snake.sum()]
 
 
 @pytest.mark.parametrize(

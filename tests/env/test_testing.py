@@ -1,0 +1,71 @@
+"""The public check of the contract, with broken environments."""
+
+import jax.numpy as jnp
+import pytest
+from support.real_scenes import ITHOR, require
+
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import ObjectNav
+from jaxnav.env.testing import check_environment
+from jaxnav.scenes.files.scene_file import read_scenes
+from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import Task
+
+BANK = compile_bank(generate_rooms(4, 0, 0), Task())  # one of each type
+
+
+def test_contract_on_generated_rooms():
+    check_environment(*build(BANK, {}, 5))
+
+
+def test_contract_on_real_rooms():
+    check_environment(*build(compile_bank(read_scenes(require(ITHOR))[::25], Task()), {}, 100))
+
+
+class EndsTwice(ObjectNav):
+    """Truncate the last step, whatever it was."""
+
+    def advance(self, state, action, params):
+        after, reward, terminated, _ = super().advance(state, action, params)
+        return after, reward, terminated, after.time >= params.step_limit[state.scene]
+
+
+class NeverStartsAnew(ObjectNav):
+    """Let time go on after an ending."""
+
+    def step(self, key, state, action, params):
+        observation, after, reward, terminated, truncated, info = super().step(key, state, action, params)
+        return observation, after.replace(time=state.time + 1), reward, terminated, truncated, info
+
+
+class AsksForTooMuch(ObjectNav):
+    """Seek a category that does not exist."""
+
+    def observe(self, state, params):
+        return super().observe(state, params).replace(goal=state.goal + len(self.categories))
+
+
+class Lies(ObjectNav):
+    """Call every step a success."""
+
+    def step(self, key, state, action, params):
+        observation, after, reward, terminated, truncated, info = super().step(key, state, action, params)
+        info |= {"success": jnp.ones_like(info["success"])}
+        return observation, after, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize(
+    ("broken", "promise"),
+    [
+        (EndsTwice, "terminated and truncated at once"),
+        (NeverStartsAnew, "not followed by a new episode"),
+        (AsksForTooMuch, "a goal that is no category"),
+        (Lies, "a success that is not an ending"),
+    ],
+)
+def test_contract_refuses_broken_environments(broken, promise):
+    env, params = build(BANK, {}, 5)
+    check_environment(env, params, num_steps=1)
+    with pytest.raises(AssertionError, match=promise):
+        check_environment(broken(env.task), params)

@@ -1,0 +1,64 @@
+"""Moves on the lattice: connected parts and shortest action counts."""
+
+from collections import deque
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis.extra import numpy as hnp
+from support.lattice import EIGHT, parts_of
+from support.scenes import HOUSES, ROOMS
+
+from jaxnav.scenes.lattice import ahead_of, best_lengths, connected_parts, standable_cells, successors
+
+
+@given(hnp.arrays(bool, (7, 9)))
+def test_connected_parts_are_those_of_scipy(mask):
+    labels, count = parts_of(mask, EIGHT)
+    parts = connected_parts(mask)
+    expected = [np.argwhere(labels == k + 1) for k in range(count)]
+    assert sorted(part.tolist() for part in parts) == sorted(part.tolist() for part in expected)
+
+
+def test_connected_parts_of_a_long_snake():
+    snake = np.zeros((40, 41), bool)
+    snake[::4] = snake[2::8, -1] = snake[6::8, 0] = True
+    snake[1::8, -1] = snake[3::8, -1] = snake[5::8, 0] = snake[7::8, 0] = True
+    assert [len(part) for part in connected_parts(snake)] == [snake.sum()]
+
+
+def test_standable_cells_are_the_largest_part_and_the_first_of_equal_ones():
+    def cells(*rows):
+        return [tuple(cell) for cell in standable_cells(np.array([[c == "." for c in row] for row in rows])).tolist()]
+
+    assert cells(".#..", "##..", "####") == [(0, 2), (0, 3), (1, 2), (1, 3)]
+    assert cells("#.#..", "#.###") == [(0, 1), (1, 1)]
+    assert cells("##..", ".###", ".###") == [(0, 2), (0, 3)]  # [0, 2] comes before [1, 0] in row order
+    assert cells(".#.", "#.#", ".#.") == [(0, 0), (0, 2), (1, 1), (2, 0), (2, 2)]  # diagonals connect
+    assert cells("##") == []
+
+
+@pytest.mark.parametrize("rules", [ROOMS, HOUSES])
+def test_best_lengths_are_those_of_a_breadth_first_search(rules):
+    draws = np.random.default_rng(0)
+    successor = successors(ahead_of(standable_cells(draws.random((9, 9)) < 0.55), rules), rules)
+    succeeds = draws.random((len(successor), 3)) < [0.002, 0.02, 0.0]
+    lengths = best_lengths(successor, succeeds)
+
+    def search(start, goal):
+        length, queue = {start: 1}, deque([start])
+        while queue:
+            pose = queue.popleft()
+            if succeeds[pose, goal]:
+                return length[pose]
+            for after in successor[pose, :5].tolist():
+                if after not in length:
+                    length[after] = length[pose] + 1
+                    queue.append(after)
+        return 0
+
+    starts = range(0, len(successor), 7)
+    assert [[search(start, goal) for goal in range(3)] for start in starts] == lengths[::7].tolist()
+    assert lengths[:, 0].max() > 8
+    assert not lengths[:, 2].any()
+    np.testing.assert_array_equal(lengths == 1, succeeds)

@@ -1,0 +1,65 @@
+"""The run log: rows, torn lines, and resuming."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxnav.errors import InputError
+from jaxnav.store.runlog import append_row, read_rows, truncate_after
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    for step in (10, 20, 30):
+        append_row(path, {"step": step, "loss": step / 4})
+    return path
+
+
+def test_rows_are_one_json_object_per_line(log):
+    assert log.read_text() == '{"step": 10, "loss": 2.5}\n{"step": 20, "loss": 5.0}\n{"step": 30, "loss": 7.5}\n'
+    append_row(log, {"step": 40, "loss": float("nan"), "spl": float("inf"), "note": None})
+    assert read_rows(log)[-1] == {"step": 40, "loss": None, "spl": None, "note": None}
+
+
+@pytest.mark.parametrize(("step", "kept"), [(0, 0), (10, 1), (25, 2), (30, 3), (99, 3)])
+def test_rows_after_the_restored_step_are_dropped(log, step, kept):
+    lines = log.read_bytes().splitlines(keepends=True)
+    truncate_after(log, step)
+    assert log.read_bytes() == b"".join(lines[:kept])  # what stays, stays to the byte
+
+
+@pytest.mark.parametrize("lost", range(1, 27))
+def test_a_torn_last_line_is_dropped(log, lost):
+    # The last line has 26 bytes with its line end; without only the line end the row is whole and kept.
+    lines = log.read_bytes().splitlines(keepends=True)
+    assert len(lines[-1]) == 26
+    log.write_bytes(log.read_bytes()[:-lost])
+    assert len(read_rows(log)) == (3 if lost == 1 else 2)
+    truncate_after(log, 30)
+    assert log.read_bytes() == b"".join(lines[: 3 if lost == 1 else 2])
+
+
+def test_a_bad_line_in_the_middle_is_refused_and_kept(log):
+    log.write_text('{"step": 1}\n{"loss": 2}\n{"step": 3}\n')
+    before = log.read_bytes()
+    with pytest.raises(InputError, match=r"metrics.jsonl, line 2: not a JSON object with a whole number `step`"):
+        truncate_after(log, 1)
+    assert log.read_bytes() == before
+
+
+def test_a_missing_log_has_no_rows(tmp_path):
+    truncate_after(tmp_path / "none.jsonl", 3)
+    assert read_rows(tmp_path / "none.jsonl") == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@given(st.dictionaries(st.text(), st.none() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)))
+def test_any_row_reads_back_and_survives_truncation_to_the_byte(tmp_path_factory, row):
+    path = tmp_path_factory.getbasetemp() / "any.jsonl"
+    path.unlink(missing_ok=True)
+    append_row(path, row | {"step": 1})
+    before = path.read_bytes()
+    assert read_rows(path) == [row | {"step": 1}]
+    truncate_after(path, 1)
+    assert path.read_bytes() == before

@@ -1,0 +1,1 @@
+"""Small inputs, made by hand, of every format."""
