@@ -59,3 +59,30 @@ class Scene:
     yaws: np.ndarray
     parents: np.ndarray
     rooms: tuple[Room, ...] = ()
+
+
+def extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest (x, z) of a scene.
+
+    Args:
+      scene: whose objects count.
+      cells: bool [nz, nx], the cells that count; None for all.
+
+    Returns:
+      float64 [2] each, metres.
+    """
+    iz, ix = np.nonzero(np.ones_like(scene.reach) if cells is None else cells)
+    points = np.asarray(scene.origin) + CELL * np.stack([ix, iz], axis=-1)
+    centre, half = scene.boxes[:, [0, 2]], scene.boxes[:, [3, 5]] / 2
+    low = np.minimum(points.min(axis=0) - CELL / 2, (centre - half).min(axis=0, initial=np.inf))
+    high = np.maximum(points.max(axis=0) + CELL / 2, (centre + half).max(axis=0, initial=-np.inf))
+    return low, high
+
+
+def scene_size(scene: Scene) -> np.ndarray:
+    """Return width and depth of a scene, float64 [2], metres.
+
+    They are those of the rectangle around the objects and the cells that are no wall.
+    """
+    low, high = extent(scene, scene.reach | ~scene.walls)
+    return high - low

@@ -10,6 +10,34 @@ VIEW_UNKNOWN, VIEW_FREE, VIEW_BLOCKED = range(3)
 AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE = 51.0, 25.4, 127.5
 
 
+def relative_position(detections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return metres ahead and to the right of detections.
+
+    Args:
+      detections: [..., 4], confidence, ahead, right and apparent size in bytes.
+
+    Returns:
+      float64 [...] each.
+    """
+    return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - 128.0) / RIGHT_SCALE
+
+
+def detected_places(detections: np.ndarray, place: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return where detections from one pose lie, world (x, z).
+
+    Args:
+      detections: [..., 4], see `relative_position`.
+      place: float64 [2], world (x, z) of the agent.
+      forward: float64 [2], unit vector (x, z) of its heading.
+
+    Returns:
+      float64 [..., 2].
+    """
+    ahead, right = relative_position(detections)
+    rightward = np.array([forward[1], -forward[0]])
+    return place + ahead[..., None] * forward + right[..., None] * rightward
+
+
 @dataclasses.dataclass(frozen=True)
 class RowFormat:
     """Where things stand in a row of uint8; works on NumPy and JAX arrays alike.
