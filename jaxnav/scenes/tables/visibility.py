@@ -1,7 +1,5 @@
 """Lines of sight: which boxes and walls hide what, and what lies in the camera's view."""
 
-import functools
-
 import numpy as np
 
 from jaxnav.scenes.scene import CELL, Scene
@@ -146,48 +144,3 @@ def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tu
     across, high = rules.half_view
     in_view = (depth > 0) & (np.abs(right)[..., None] <= across * depth) & (np.abs(rise) <= high * depth)
     return ahead, right, in_view
-
-
-def view_known(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Which floor cells around each cell can be seen past walls and opaque boxes as high as the camera.
-
-    Args:
-      scene: the scene.
-      rules: the camera's height.
-      cells: int [C, 2], the cells (iz, ix) to look from.
-      offsets: int [O, 2], the cells (dz, dx) to look at.
-
-    Returns:
-      bool [C, O].
-    """
-    x, y, z, sx, sy, sz = scene.boxes[opaque(scene.boxes)].T
-    tall = y + sy / 2 >= rules.camera - TOLERANCE
-    grid = np.argwhere(np.ones_like(scene.walls))
-    distance = np.abs(cell_centres(scene, grid)[:, None] - np.stack([x, z], axis=-1)[tall])
-    covered = (distance <= np.stack([sx, sz], axis=-1)[tall] / 2 + TOLERANCE).all(axis=-1).any(axis=-1)
-    radius = int(np.abs(offsets).max())
-    clear = ~np.pad(scene.walls | covered.reshape(scene.walls.shape), radius)
-    # On the flattened lattice a displacement is one shift, whatever the cell.
-    stride, flat = clear.shape[1], clear.ravel()
-    margin = radius * (stride + 1)
-    length = flat.size - 2 * margin
-    at = (cells + radius) @ (stride, 1) - margin
-    known = np.ones((len(offsets), len(cells)), bool)
-    seen = np.empty(length, bool)
-    for row, offset in zip(known, offsets.tolist(), strict=True):
-        seen[:] = True
-        for dz, dx in _between(*offset, radius):
-            shift = margin + dz * stride + dx
-            seen &= flat[shift : shift + length]
-        row[:] = seen[at]
-    return known.T
-
-
-@functools.lru_cache(maxsize=4096)
-def _between(dz: int, dx: int, radius: int) -> list[tuple[int, int]]:
-    """The cells that a look from (0, 0) to (dz, dx) passes through, its ends left out."""
-    steps = np.arange(1, 2 * radius)  # half-cell steps along the longest line
-    # Rounding is symmetric about 0, so that a mirrored room has a mirrored view.
-    z, x = (np.rint(d * steps / (2 * radius)).astype(int).tolist() for d in (dz, dx))
-    passed = set(zip(z, x, strict=True))
-    return sorted(passed - {(0, 0), (dz, dx)})

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.scenes.files.record import Record
-from jaxnav.scenes.files.scene_file import derive_walls
+from jaxnav.scenes.files.walls import derive_walls
 from jaxnav.scenes.scene import CELL, Room, Scene
 
 SNAP = 0.02  # metres that a standable point may be off the lattice
