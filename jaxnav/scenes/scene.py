@@ -1,5 +1,6 @@
-"""What a scene is: standable cells, walls and boxes of objects, on a 0.25 m lattice.
+"""Scenes on a 0.25 m lattice.
 
+A scene has standable cells, walls and boxes of objects.
 Coordinates are metres, y up, x right and z forward; yaw is in degrees clockwise seen from above and yaw 0
 looks along +z. The floor is at y = 0.
 """
@@ -17,11 +18,11 @@ SPLITS = ("train", "val", "test")
 
 
 class Room(NamedTuple):
-    """A room of a home.
+    """Hold a room of a home.
 
     Attributes:
       type: `kitchen`, `living_room`, `bedroom`, `bathroom`, ...
-      cells: bool [nz, nx], its floor.
+      cells: bool [nz, nx], True on its floor.
     """
 
     type: str
@@ -30,7 +31,7 @@ class Room(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One room, apartment or house.
+    """Hold one room, apartment or house.
 
     Attributes:
       name: unique name of the scene.
@@ -39,12 +40,12 @@ class Scene:
       split: `train`, `val` or `test`.
       origin: world (x, z) in metres of the centre of cell [0, 0], a multiple of 0.25.
       reach: bool [nz, nx], True where the agent's centre can stand; row 0 has the smallest z.
-      walls: bool [nz, nx], True where a cell blocks every line of sight from floor to ceiling.
+      walls: bool [nz, nx], True where a cell blocks every line of sight, from floor to ceiling.
       types: [N] object type names.
       boxes: float64 [N, 6], centre x, y, z and full size sx, sy, sz in metres of each axis-aligned box.
       yaws: float64 [N], degrees.
       parents: int [N], index of the object that an object rests on or in, or -1.
-      rooms: of a home, where they are known.
+      rooms: the rooms of a home, where they are known.
     """
 
     name: str

@@ -48,7 +48,9 @@ class SceneSource:
         return from_file(self.file, self.split, self.shift, self.seed, (task or self.task).categories)
 
     def select(self, name: str | None = None, index: int | None = None) -> Scene:
-        """Return the scene of a name or an index, else the first.
+        """Return the scene of a name or an index.
+
+        Without either it is the first.
 
         Raises:
           InputError: there is no such scene, or both are given.

@@ -60,7 +60,7 @@ def read_format(
     from_controller: bool = False,
     base: Path | None = None,
 ) -> Imported:
-    """Yield the scenes of a source in one of the formats.
+    """Yield the scenes of a source.
 
     Args:
       form: the format.
@@ -106,7 +106,7 @@ def import_scenes(
     categories: tuple[str, ...] | None = None,
     report: Callable[[InputError], None] = print,
 ) -> ImportSummary:
-    """Write the scenes that can be used to a scene file.
+    """Write usable scenes to a scene file.
 
     Args:
       scenes: see `read_format`.
@@ -122,29 +122,14 @@ def import_scenes(
     """
     if not out.name.endswith(".jsonl.gz"):
         raise InputError(f"{out}: give a name that ends in .jsonl.gz")
-    patterns: dict[Split, tuple[str, ...]] = {"val": val, "test": test}
-    kept: dict[str, Scene] = {}
-    unknown: Counter[str] = Counter()
-    refused = 0
-    for scene in scenes:
-        try:
-            if isinstance(scene, InputError):
-                raise scene
-            vocabulary = categories or WORLDS[DEFAULT_WORLDS.get(scene.world, "rooms")].task.categories
-            _check(scene, kept, vocabulary, source)
-        except InputError as error:
-            refused += 1
-            report(error)
-        else:
-            kept[scene.name] = dataclasses.replace(scene, split=_split(scene.name, patterns, split))
-            unknown += unknown_types([scene], vocabulary)
+    kept, refused, unknown = _usable(scenes, source, categories, report)
     if not kept:
         raise InputError(f"{source}: none of its {refused} scenes can be used; mend what is said of them above")
     for pattern in (*val, *test):
         if not fnmatch.filter(kept, pattern):
             raise InputError(f"pattern {pattern!r}: fits no scene; there are {reprlib.repr(sorted(kept))}")
     try:
-        write_scenes(out, kept.values())
+        write_scenes(out, [_with_split(scene, {"val": val, "test": test}, split) for scene in kept.values()])
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another name") from error
     return ImportSummary(len(kept), refused, unknown)
@@ -158,8 +143,33 @@ def _check_options(form: Format, options: dict[str, Path | bool | None]) -> None
             raise InputError(f"--{name}: is for the format {usable}, not for {form}; leave it out")
 
 
+def _usable(
+    scenes: Iterable[Scene | InputError],
+    source: str,
+    categories: tuple[str, ...] | None,
+    report: Callable[[InputError], None],
+) -> tuple[dict[str, Scene], int, Counter[str]]:
+    """Return usable scenes, the number of others, and unknown types."""
+    kept: dict[str, Scene] = {}
+    unknown: Counter[str] = Counter()
+    refused = 0
+    for scene in scenes:
+        try:
+            if isinstance(scene, InputError):
+                raise scene
+            vocabulary = categories or WORLDS[DEFAULT_WORLDS.get(scene.world, "rooms")].task.categories
+            _check(scene, kept, vocabulary, source)
+        except InputError as error:
+            refused += 1
+            report(error)
+        else:
+            kept[scene.name] = scene
+            unknown += unknown_types([scene], vocabulary)
+    return kept, refused, unknown
+
+
 def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> None:
-    """Refuse a second scene of one name and one without goals."""
+    """Refuse a scene without categories, or of an earlier name."""
     where = f"{source}, scene {scene.name!r}"
     if scene.name in kept:
         raise InputError(f"{where}: name is that of an earlier scene; import them to two files")
@@ -169,9 +179,7 @@ def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], so
         )
 
 
-def _split(name: str, patterns: dict[Split, tuple[str, ...]], default: Split) -> Split:
-    """Return the first split with a pattern that fits."""
-    for split, names in patterns.items():
-        if any(fnmatch.fnmatchcase(name, pattern) for pattern in names):
-            return split
-    return default
+def _with_split(scene: Scene, patterns: dict[Split, tuple[str, ...]], default: Split) -> Scene:
+    """Set the first split with a pattern that fits."""
+    fits = (split for split, names in patterns.items() if any(fnmatch.fnmatchcase(scene.name, name) for name in names))
+    return dataclasses.replace(scene, split=next(fits, default))

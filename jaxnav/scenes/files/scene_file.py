@@ -1,4 +1,4 @@
-"""Reading and writing scene files; `docs/scene_format.md` is the contract."""
+"""Reading and writing of scene files, see docs/scene_format.md."""
 
 import gzip
 import json
@@ -19,11 +19,11 @@ from jaxnav.store.files import write_atomic
 _POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
 _REQUIRED = ("type", *_POSITION, *_SIZE)
 _COLUMNS = (*_REQUIRED, "yaw", "parent")
-_SNAP = 0.02  # metres that an origin may be off the lattice
+_SNAP = 0.02  # metres; an origin may be this far off the lattice
 
 
 def read_scenes(path: str | Path) -> list[Scene]:
-    """Reads a scene file.
+    """Read a scene file.
 
     Cells of `episode_starts` count as standable; `walls` are derived where the file has none (`derive_walls`). An
     object whose x, y and z are all null is left out, and what rests on it rests on nothing.
@@ -50,7 +50,10 @@ def read_scenes(path: str | Path) -> list[Scene]:
 
 
 def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
-    """The scenes of a file line by line, or why one cannot be used; see `read_scenes`.
+    """Read a scene file line by line; see `read_scenes`.
+
+    Yields:
+      A scene, or why it cannot be used.
 
     Raises:
       InputError: the file is missing or damaged.
@@ -70,7 +73,9 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
 
 
 def write_scenes(path: str | Path, scenes: Iterable[Scene]) -> None:
-    """Writes a scene file whole or not at all; equal scenes give equal bytes.
+    """Write a scene file, whole or not at all.
+
+    Equal scenes give equal bytes.
 
     Raises:
       ValueError: a number is NaN or infinite.
@@ -128,7 +133,7 @@ def _origin(record: Record) -> tuple[float, float]:
 
 
 def _mask(record: Record, field: str, shape: Sequence[int]) -> np.ndarray:
-    """Bool [nz, nx], True where the mask has '.'."""
+    """Read a mask, bool [nz, nx], True at '.'."""
     rows = record.sequence(field, record.get(field), shape[0])
     for i, row in enumerate(rows):
         if not isinstance(row, str) or len(row) != shape[1] or not set(row) <= {".", "#"}:

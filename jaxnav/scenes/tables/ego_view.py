@@ -1,4 +1,4 @@
-"""The ego-centric view: which floor cells an agent sees around it."""
+"""The ego-centric view: floor cells seen around the agent."""
 
 import functools
 

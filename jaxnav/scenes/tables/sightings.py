@@ -11,7 +11,7 @@ from jaxnav.scenes.task import Rules, Task
 
 
 class Targets(NamedTuple):
-    """Hold the N objects of a scene that are of categories.
+    """Hold the N objects of categories in a scene.
 
     Attributes:
       objects: int [N], indices into the scene.
@@ -25,9 +25,9 @@ class Targets(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """Hold the M pairs of a cell and an object with a clear line.
+    """Hold which objects have a clear line to which cells.
 
-    They are sorted by distance, the nearest object (then the first in the scene) last.
+    There are M pairs, sorted by distance: the nearest object (then the first in the scene) is last.
 
     Attributes:
       cell: int [M].
@@ -47,13 +47,13 @@ class Sightings(NamedTuple):
     in_view: np.ndarray
 
     def expand(self, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return pair, heading and pose wherever the chosen pairs are in view.
+        """Return where pairs are in view.
 
         Args:
           pairs: bool [M], the pairs to choose.
 
         Returns:
-          int [...] each, in the order of the pairs.
+          Pair, heading and pose, int [...] each, in the order of the pairs.
         """
         _, headings, horizons = self.in_view.shape
         pair, heading, horizon = np.nonzero(self.in_view & pairs[:, None, None])
@@ -76,7 +76,7 @@ class Sightings(NamedTuple):
 
 
 def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Targets) -> Sightings:
-    """Find the pairs of a cell and an object with a clear line.
+    """Find which objects have a clear line to which cells.
 
     Pairs count up to the detection range of the object or the success distance, whichever is greater.
 
