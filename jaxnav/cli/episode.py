@@ -1,4 +1,4 @@
-"""The episode command: one evaluation episode of a trained run as a picture."""
+"""The episode command: one evaluation episode as a picture."""
 
 import dataclasses
 from pathlib import Path

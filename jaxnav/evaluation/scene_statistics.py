@@ -101,7 +101,7 @@ class PairSummary(NamedTuple):
 
 
 class PriorFit(NamedTuple):
-    """Hold how well the scenes of one room type fit their prior.
+    """Hold the fit of one room type to its prior.
 
     Attributes:
       room_type: its name, or `all`.
@@ -206,7 +206,7 @@ def prior_fits(statistics: Sequence[SceneStatistics], priors: np.ndarray) -> lis
 
 
 def _by_room_type(statistics: Sequence[SceneStatistics]) -> Iterator[tuple[str, list[SceneStatistics]]]:
-    """Yield the scenes of each room type, then all of several types."""
+    """Yield scenes by room type, then all of several types."""
     types = sorted({s.scene.room_type for s in statistics})
     yield from ((name, [s for s in statistics if s.scene.room_type == name]) for name in types)
     if len(types) > 1:

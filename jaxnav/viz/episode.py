@@ -86,7 +86,10 @@ def draw_episode(episode: Episode, path: Path) -> None:
 
 
 def _write_gif(images: list[Image.Image], path: Path) -> None:
-    """Write frames with one palette, so that equal pixels stay equal."""
+    """Write frames with one palette.
+
+    Equal pixels stay equal from frame to frame, which keeps the file small.
+    """
     richest = max(images, key=lambda image: len(image.getcolors(2**20) or ()))
     palette = richest.quantize(NUM_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -106,7 +109,7 @@ def _status(episode: Episode, step: int) -> str:
 
 
 def _draw_agent(axes: Axes, episode: Episode, step: int) -> list[Artist]:
-    """Draw the path so far, the agent and what is detected."""
+    """Draw the path, the agent and what is detected."""
     rules = episode.task.rules
     place, heading = episode.places[step], episode.trace.pose[step] // len(rules.horizons) % rules.headings
     agent = draw_agent(axes, episode.scene, rules, place, 360.0 / rules.headings * heading)

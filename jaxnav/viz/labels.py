@@ -43,7 +43,9 @@ class Labels:
         self._put(text, dot + np.array(spots), size)
 
     def among(self, name: str, places: np.ndarray, colour: str) -> None:
-        """Write the name of an area, centred on one of its `places` [N, 2].
+        """Write an area's name on one of its places.
+
+        The name is centred on the place; `places` is float [N, 2], world (x, z).
 
         Places near the middle of the area are preferred.
         """
@@ -56,7 +58,7 @@ class Labels:
         return self._axes.text(0, 0, name, color=colour, va="bottom", path_effects=[self._halo], zorder=7, **font)
 
     def _put(self, text: Text, corners: np.ndarray, size: np.ndarray) -> None:
-        """Move a text to the best of the low corners [N, 2]."""
+        """Move a text to the best of corners [N, 2]."""
         boxes = np.stack([corners, corners + size], axis=1)
         low = np.maximum(boxes[:, None, 0], self._taken[:, 0])
         high = np.minimum(boxes[:, None, 1], self._taken[:, 1])

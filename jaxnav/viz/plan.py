@@ -115,7 +115,7 @@ def _draw_boxes(axes: Axes, scene: Scene) -> None:
 
 
 def _draw_objects(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int | None) -> Labels:
-    """Mark and name the objects of categories, those of `goal` first."""
+    """Mark and name objects of categories, those of `goal` first."""
     ids, places = category_ids(scene.types, categories), scene.boxes[:, [0, 2]]
     objects = sorted((i for i, category in enumerate(ids) if category >= 0), key=lambda i: ids[i] != goal)
     corner = np.asarray(scene.origin) - CELL / 2

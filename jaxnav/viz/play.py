@@ -1,4 +1,4 @@
-"""One evaluation episode of a finished run, played for its picture."""
+"""One evaluation episode of a finished run, step by step."""
 
 from pathlib import Path
 from typing import Literal
@@ -85,7 +85,7 @@ def _trace(
     epsilon: float | None,
     num_seeds: int,
 ) -> Trace:
-    """Play an episode of the first bank with the first seed."""
+    """Play an episode of the first bank, first seed."""
     pose, scene, goal = episodes.pose[index], episodes.scene[index], episodes.goal[index]
     row = table_row(variant, epsilon, policies.setting.form, "argmax")
     inference = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], num_seeds))

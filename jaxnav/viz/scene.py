@@ -1,4 +1,4 @@
-"""The picture of one scene, with a view from one pose."""
+"""The picture of one scene, with a view."""
 
 import dataclasses
 import io
@@ -51,7 +51,7 @@ def draw_scene(scene: Scene, task: Task, path: Path, pose: tuple[float, float, f
 
 
 def scene_figure(scene: Scene, task: Task, view: View) -> Figure:
-    """Draw a plan, a view in it and a panel with numbers."""
+    """Draw a plan, a view and a panel with numbers."""
     low, high = extent(scene)
     plan = (high - low) * np.min(_LARGEST / (high - low))
     detections = _detections(view)
@@ -96,7 +96,7 @@ def _draw_cells(axes: Axes, scene: Scene) -> list[Artist]:
 
 
 def _draw_view(axes: Axes, scene: Scene, rules: Rules, view: View) -> list[Artist]:
-    """Draw the view cone, the agent and rings around detected objects."""
+    """Draw the view cone, the agent and detected objects."""
     cone, _ = draw_agent(axes, scene, rules, view.place, view.yaw)
     cone.set_label("in view")
     points = np.reshape([point for *_, point in view.seen], (-1, 2))

@@ -45,7 +45,7 @@ def scene_tables(
 
 
 def scene_remarks(statistics: Sequence[SceneStatistics], task: Task) -> list[str]:
-    """Name absent categories, unknown types and scenes without a goal."""
+    """List absent categories, unknown types and scenes without a goal."""
     present = np.any([s.objects for s in statistics], axis=0)
     unknown = unknown_types((s.scene for s in statistics), task.categories).most_common()
     remarks = {

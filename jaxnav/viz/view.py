@@ -58,7 +58,7 @@ def view_from(scene: Scene, task: Task, pose: tuple[float, float, float] | None 
 
 
 def _pose(centres: np.ndarray, rules: Rules, x: float, z: float, yaw: float) -> int:
-    """Return the index `cell * H + heading` of a level pose."""
+    """Return a level pose as cell * H + heading."""
     distance = np.linalg.norm(centres - (x, z), axis=1)
     cell, turn = int(np.argmin(distance)), 360.0 / rules.headings
     if not np.abs(centres[cell] - (x, z)).max() <= CELL / 2:

@@ -32,13 +32,13 @@ def ego_views(scene: Scene, rules: Rules, cells: np.ndarray, view: int) -> np.nd
     mask[tuple((cells + radius).T)] = True
     around = cells[:, None] + radius + seen  # [C, O, 2]
     standable = np.where(mask[around[..., 0], around[..., 1]], VIEW_FREE, VIEW_BLOCKED)
-    known = np.where(view_known(scene, rules, cells, seen), standable, VIEW_UNKNOWN).astype(np.uint8)
+    known = np.where(_view_known(scene, rules, cells, seen), standable, VIEW_UNKNOWN).astype(np.uint8)
     views = np.full((len(cells), rules.headings, view, view), VIEW_UNKNOWN, np.uint8)
     views[:, :, in_cone] = known[:, which.reshape(rules.headings, -1)]
     return np.repeat(views.reshape(-1, view, view), len(rules.horizons), axis=0)
 
 
-def view_known(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def _view_known(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Return which floor cells around each cell can be seen.
 
     Walls and opaque boxes as high as the camera hide what is behind them.

@@ -42,7 +42,7 @@ def episode_files(path: Path) -> list[Path]:
     elif folder != path:
         return [path]
     files = sorted(folder.glob("*.json.gz"))
-    # SemExp keeps its episodes beside Habitat's own, which it does not use.
+    # SemExp keeps its episodes beside those of Habitat, which it does not use.
     replaced = {file.name.replace("_episodes.json.gz", ".json.gz") for file in files if "_episodes.json" in file.name}
     return [file for file in files if file.name not in replaced]
 
