@@ -39,7 +39,7 @@ class EpisodeConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and return its exit code."""
+    """Run the command; return 0, or 2 after bad input."""
     config = tyro.cli(EpisodeConfig, args=arguments, prog="jaxnav episode", description="Draw one episode.")
     return exit_code(lambda console: draw(config, console))
 

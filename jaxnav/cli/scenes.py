@@ -85,7 +85,7 @@ class StatsConfig(SceneSource):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and return its exit code."""
+    """Run the command; return 0, or 2 after bad input."""
     config = tyro.extras.subcommand_cli_from_dict(
         {"import": ImportConfig, "show": ShowConfig, "stats": StatsConfig},
         args=arguments,

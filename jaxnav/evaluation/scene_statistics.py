@@ -214,7 +214,10 @@ def _by_room_type(statistics: Sequence[SceneStatistics]) -> Iterator[tuple[str, 
 
 
 def _percentiles(lengths: np.ndarray) -> tuple[int, int] | None:
-    """Return median and 95th percentile of counted L*, int [...]."""
+    """Return median and 95th percentile of L*.
+
+    `lengths` is int [...], the number of starts by L*; None if no start has a path.
+    """
     up_to = np.cumsum(lengths[1:])
     if not up_to[-1]:
         return None

@@ -1,4 +1,4 @@
-"""FurnishedRoom of rooms by rules."""
+"""Furnishing of rooms by rules."""
 
 from collections.abc import Mapping
 
