@@ -1,6 +1,7 @@
-"""Sets of cells as whole numbers, so that a search over thousands of poses is a few shifts, and a body's moves in them.
+"""Sets of cells as whole numbers.
 
-A set has bit z SIDE + x for the cell (z, x) of a square with the start in the middle; a displacement is a shift.
+A set has bit z SIDE + x for the cell (z, x) of a square with the start in the middle. A displacement is a shift, so
+that a search over thousands of poses takes a few shifts.
 """
 
 import functools
@@ -15,21 +16,23 @@ from jaxnav.scenes.tables.detector import MIN_RANGE
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NEIGHBOURS, Rules
 
-#: Cells from the start to the edge of what counts as standable, and from there to the edge of the square: room for
-#: what is in view from there, so that no shift runs over the edge.
+#: Cells from the start to the edge of what counts as standable, and from there to the edge of the square. The margin
+#: holds what is in view from there, so that no shift crosses the edge.
 MEMORY, MARGIN = 64, 16
 SIDE = 2 * (MEMORY + MARGIN) + 1
 START = (SIDE + 1) * (MEMORY + MARGIN)
 
 
 class Body(NamedTuple):
-    """What a searcher knows of its own body; displacements are those of a shift.
+    """Describe how a searcher moves and sees, by heading.
+
+    Displacements are those of a shift.
 
     Attributes:
-      steps: by heading, of MoveAhead.
-      view: int [H, V V], cells of the view around `START`, by heading.
-      near: by heading, cells of the view in which everything is in the detector's range.
-      offsets: by heading, the displacements to those cells.
+      steps: displacement of MoveAhead.
+      view: int [H, V V], cells of the view around `START`.
+      near: set of the cells of the view in which everything is in the detector's range.
+      offsets: displacements to those cells.
     """
 
     steps: list[int]
@@ -40,7 +43,7 @@ class Body(NamedTuple):
 
 @functools.lru_cache
 def body(rules: Rules) -> Body:
-    """How it moves and sees under the rules (docs/environment.md)."""
+    """Return the body under the rules of docs/environment.md."""
     view = RowFormat(0).view
     ahead, right = np.arange(view).repeat(view), np.tile(np.arange(view) - view // 2, view)
     offsets = rules.view_offsets(view).reshape(rules.headings, -1, 2)
@@ -49,13 +52,19 @@ def body(rules: Rules) -> Body:
     return Body(
         steps=(rules.steps() @ (SIDE, 1)).tolist(),
         view=START + flat,
-        near=[cell_set(START + own[mask]) for own, mask in zip(flat, near, strict=True)],
-        offsets=[np.unique(own[mask]).tolist() for own, mask in zip(flat, near, strict=True)],
+        near=[cell_set(START + cells[mask]) for cells, mask in zip(flat, near, strict=True)],
+        offsets=[np.unique(cells[mask]).tolist() for cells, mask in zip(flat, near, strict=True)],
     )
 
 
 def facing(rules: Rules, at: np.ndarray, distance: float) -> list[int]:
-    """For each heading, the cells at most a distance (metres) from a place (x, z) that have it in view."""
+    """Return the cells with a place in view, by heading.
+
+    Args:
+      rules: headings and field of view.
+      at: float [2], (x, z) of the place from the start, metres.
+      distance: of the cells from the place at most, metres.
+    """
     around = np.rint(at / CELL).astype(int) + np.stack(np.meshgrid(*[np.arange(-MARGIN, MARGIN + 1)] * 2), axis=-1)
     v = at - CELL * around  # [N, N, (x, z)]
     close = (np.hypot(v[..., 0], v[..., 1]) <= distance) & (np.abs(around) <= MEMORY).all(axis=-1)
@@ -63,23 +72,23 @@ def facing(rules: Rules, at: np.ndarray, distance: float) -> list[int]:
     directions = rules.directions()
     ahead, right = v[close] @ directions.T, v[close] @ np.stack([directions[:, 1], -directions[:, 0]])
     in_view = (ahead > 0) & (np.abs(right) <= rules.half_view[0] * ahead)  # [cells, H]
-    return [cell_set(cells[own]) for own in in_view.T]
+    return [cell_set(cells[mask]) for mask in in_view.T]
 
 
 def cell_set(indices: np.ndarray) -> int:
-    """The set of cells with these indices."""
+    """Return the set of cells with these indices."""
     bits = np.zeros(SIDE * SIDE, bool)
     bits[indices] = True
     return int.from_bytes(np.packbits(bits, bitorder="little").tobytes(), "little")
 
 
 def union(sets: Iterable[int]) -> int:
-    """The cells that are in any of the sets."""
+    """Return the cells that are in any of the sets."""
     return functools.reduce(operator.or_, sets, 0)
 
 
 def moved(cells: int, by: int) -> int:
-    """A set displaced."""
+    """Return a set displaced by a shift."""
     return cells << by if by >= 0 else cells >> -by
 
 

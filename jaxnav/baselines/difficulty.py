@@ -1,28 +1,35 @@
-"""How hard scenes are for one who knows everything and for one who knows nothing: exact, over all their episodes."""
+"""Exact difficulty of scenes: shortest paths and random success."""
 
 import numpy as np
 
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
-#: Actions after which a random episode counts as over: it is still going on with probability (5 / 6)^100 = 1.2e-8.
+#: Actions after which a random episode counts as over; it still runs with probability (5 / 6)^100 = 1.2e-8.
 LONGEST = 100
 
 
 def expected_length(bank: Bank) -> np.ndarray:
-    """Mean L* over the episodes of each scene, as `episode_list` draws them: float64 [S], actions with Done."""
+    """Return the mean L* over the episodes of each scene.
+
+    Goals and starts are weighted as `episode_list` draws them.
+
+    Returns:
+      float64 [S], actions, Done included.
+    """
     every = [_lengths(bank, scene) for scene in _scenes(bank)]
     return np.array([_mean_over_episodes(lengths, lengths) for lengths in every])
 
 
 def random_success(bank: Bank, step_limit: np.ndarray) -> np.ndarray:
-    """Success rate of uniformly random actions in the episodes of each scene.
+    """Return the success rate of uniformly random actions.
 
-    With t actions left, p_t(pose) = (found(pose) + sum over the other five actions of p_{t-1}(pose after it)) / 6.
+    With t actions left, p_t(pose) = (1 if Done succeeds at the pose + sum over the other five actions of
+    p_{t-1}(pose after it)) / 6.
 
     Args:
       bank: the scenes.
-      step_limit: int [S], of each scene.
+      step_limit: int [S], actions of an episode in each scene.
 
     Returns:
       float64 [S], in [0, 1].
@@ -32,9 +39,9 @@ def random_success(bank: Bank, step_limit: np.ndarray) -> np.ndarray:
         lengths = _lengths(bank, scene)
         first = bank.first_cell[scene] * bank.task.rules.poses_per_cell
         after = successor[first : first + len(lengths), :DONE] - first
-        found, success = (lengths == 1).astype(np.float64), np.zeros(lengths.shape)
+        done, success = (lengths == 1).astype(np.float64), np.zeros(lengths.shape)
         for _ in range(min(int(step_limit[scene]), LONGEST)):
-            success = (found + sum(success[own] for own in after.T)) / NUM_ACTIONS
+            success = (done + sum(success[poses] for poses in after.T)) / NUM_ACTIONS
         rates.append(_mean_over_episodes(success, lengths))
     return np.array(rates)
 
@@ -44,12 +51,19 @@ def _scenes(bank: Bank) -> range:
 
 
 def _lengths(bank: Bank, scene: int) -> np.ndarray:
-    """L* from each pose of a scene to each of its possible goals, [poses, goals], 0 where there is no way."""
+    """Return L* from each pose to each possible goal.
+
+    Returns:
+      uint16 [poses, goals], 0 where there is no way.
+    """
     poses_per_cell = bank.task.rules.poses_per_cell
     first, goals = bank.first_cell[scene] * poses_per_cell, bank.goals[scene, : bank.num_goals[scene]]
     return bank.best_length[first : first + bank.num_cells[scene] * poses_per_cell, goals]
 
 
 def _mean_over_episodes(values: np.ndarray, lengths: np.ndarray) -> float:
-    """Mean with goals equally likely, and for each of them the poses that it can be reached from."""
+    """Average over goals, and for each over its starts.
+
+    A start is a pose from which the goal can be reached.
+    """
     return float(np.mean(values, axis=0, where=lengths > 0).mean())

@@ -1,9 +1,9 @@
-"""A systematic searcher without any prior: frontier exploration from what is perceived alone.
+"""Frontier exploration: a systematic searcher without any prior.
 
-It remembers which cells it perceived as standable, which as blocked, and which it has looked at from near by. Frontiers
-are poses on known standable cells with something in view and near that has not been looked at. It always takes the
+It remembers which cells it perceived as standable, which as blocked, and which it has inspected from a short distance.
+Frontiers are poses on known standable cells with a near cell in view that has not been inspected. It always takes the
 first action of a shortest known way, turns included, to the nearest frontier, or, where the goal has been detected, to
-the nearest pose with the perceived place in view and near enough. There it says Done if the goal has been detected at
+the nearest pose with the detected place in view and near enough. There it says Done if the goal has been detected at
 that place from two poses: false alarms are placed at random and seldom agree.
 """
 
@@ -19,27 +19,27 @@ from jaxnav.evaluation.grid import Outcome
 from jaxnav.scenes.scene import CELL
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import (
-    AHEAD_SCALE,
-    RIGHT_SCALE,
     SIZE_SCALE,
     VIEW_BLOCKED,
     VIEW_FREE,
     RowFormat,
+    detected_places,
+    relative_position,
 )
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, Rules
 
 SAME_PLACE = 0.25  # metres between detections of one object from different poses
-SLACK = 0.05  # metres by which the goal must be nearer than it need be, since offsets are rounded
-PATIENCE = 2  # poses, per sighting, at which the goal should be detected but is not, until its place is given up
+SLACK = 0.05  # metres by which the goal must be nearer than required, since offsets are rounded
+PATIENCE = 2  # misses per sighting until a place is given up
 
 
 def frontier_outcome(bank: Bank, episodes: EpisodeList, step_limit: np.ndarray) -> Outcome:
-    """How the searcher fares in episodes.
+    """Run the searcher in episodes.
 
     Args:
       bank: the scenes.
       episodes: E of them.
-      step_limit: int [S], of each scene.
+      step_limit: int [S], actions of an episode in each scene.
 
     Returns:
       Leaves [E]; the weight is 0.
@@ -48,11 +48,11 @@ def frontier_outcome(bank: Bank, episodes: EpisodeList, step_limit: np.ndarray) 
     starts = zip(episodes.pose.tolist(), episodes.goal.tolist(), limits.tolist(), strict=True)
     walks = [list(walk(bank, successor, *start)) for start in starts]
     last, action = np.array([steps[-1] for steps in walks], np.int32).T
-    found = bank.best_length[last, episodes.goal] == 1
+    reached = bank.best_length[last, episodes.goal] == 1
     end = successor[last, action] // bank.task.rules.poses_per_cell
     moves = [sum(action == MOVE_AHEAD for _, action in steps) for steps in walks]
     return Outcome(
-        success=jnp.asarray((action == DONE) & found),
+        success=jnp.asarray((action == DONE) & reached),
         length=jnp.asarray([len(steps) for steps in walks], jnp.int32),
         moves=jnp.asarray(moves, jnp.int32),
         distance=jnp.asarray(bank.goal_distance[end, episodes.goal]),
@@ -61,9 +61,16 @@ def frontier_outcome(bank: Bank, episodes: EpisodeList, step_limit: np.ndarray) 
 
 
 def walk(bank: Bank, successor: np.ndarray, pose: int, goal: int, limit: int) -> Iterator[tuple[int, int]]:
-    """The searcher's poses and the actions it takes there, until it says Done or `limit` actions are taken.
+    """Yield the searcher's poses and its actions there.
 
-    The bank takes it from pose to pose (by `successor`, int [P, 6]); of it the searcher gets view and detection alone.
+    The episode ends with Done or after `limit` actions. The searcher gets nothing but view and detection from the bank.
+
+    Args:
+      bank: the scenes.
+      successor: int [P, 6], pose after every action.
+      pose: start of the episode.
+      goal: index of the category to search for.
+      limit: actions at most.
     """
     rules, row_format = bank.task.rules, RowFormat(len(bank.task.categories))
     horizons = len(rules.horizons)
@@ -79,13 +86,13 @@ def walk(bank: Bank, successor: np.ndarray, pose: int, goal: int, limit: int) ->
 
 @dataclasses.dataclass
 class _Place:
-    """Where the goal was detected.
+    """Hold a place where the goal was detected.
 
     Attributes:
       at: (x, z) from the start, metres.
-      poses: for each heading, the cells from which the place is in view and near enough.
-      sightings: poses at which the goal was detected here.
-      misses: poses of `poses` that the searcher came to without detecting it, since the last sighting.
+      poses: by heading, the cells from which the place is in view and near enough.
+      sightings: poses from which the goal was detected here.
+      misses: poses of `poses` without a detection since the last sighting.
     """
 
     at: np.ndarray
@@ -95,19 +102,24 @@ class _Place:
 
 
 class Searcher:
-    """The searcher in one episode: `act` takes what is perceived and answers with an action."""
+    """Search for a goal in one episode, action by action."""
 
     def __init__(self, rules: Rules, heading: int, horizon: int):
-        """Start with a heading and a horizon (both indices of the rules); the start's place is its origin."""
+        """Start an episode; its first cell is the origin.
+
+        Args:
+          rules: of the task.
+          heading, horizon: of the start, indices of the rules.
+        """
         self._rules, self._body = rules, body(rules)
         self._cell, self._heading, self._horizon = START, heading, horizon
-        self._free = self._blocked = self._looked_at = 0
+        self._free = self._blocked = self._inspected = 0
         self._taken = [[0] * rules.headings for _ in rules.horizons]
         self._places: list[_Place] = []
-        self._sweep = len(rules.horizons) - 1  # the horizon to search with, at first the one that sees most things near
+        self._sweep = len(rules.horizons) - 1  # the horizon to search with, the lowest first
 
     def act(self, view: np.ndarray, detection: np.ndarray) -> int:
-        """Perceive, and choose the next action.
+        """Take in what is perceived, and choose an action.
 
         Args:
           view: uint8 [V V], see `RowFormat.view_cells`.
@@ -129,10 +141,10 @@ class Searcher:
         )
         self._free |= free & WITHIN
         self._blocked |= blocked
-        self._looked_at |= (free | blocked) & moved(body.near[heading], self._cell - START)
+        self._inspected |= (free | blocked) & moved(body.near[heading], self._cell - START)
 
     def _sees_goal(self, detection: np.ndarray) -> bool:
-        """Take a detection in; whether the goal is believed to be found here."""
+        """Take in a detection, and return whether to say Done."""
         taken, here = self._taken[self._horizon], 1 << self._cell
         new = not taken[self._heading] & here
         taken[self._heading] |= here
@@ -143,16 +155,14 @@ class Searcher:
         return seen is not None and near and len(seen.sightings) > 1
 
     def _perceived(self, detection: np.ndarray) -> tuple[_Place, bool]:
-        """The place of a detection, and whether it is near enough."""
-        ahead, right, apparent = detection[1] / AHEAD_SCALE, (detection[2] - 128.0) / RIGHT_SCALE, detection[3]
-        away, rules = float(np.hypot(ahead, right)), self._rules
+        """Return a detection's place, and whether it is near enough."""
+        away, rules = float(np.hypot(*relative_position(detection))), self._rules
         enough = rules.success_distance - SLACK
-        if rules.success == "near":  # to walk to its edge
-            enough += apparent / SIZE_SCALE * max(away, CELL) / 4
+        if rules.success == "near":  # the walk ends at its edge
+            enough += detection[3] / SIZE_SCALE * max(away, CELL) / 4
         z, x = divmod(self._cell, SIDE)
-        forward = rules.directions()[self._heading]
-        rightward = np.array([forward[1], -forward[0]])
-        at = CELL * (np.array([x, z]) - START // SIDE) + ahead * forward + right * rightward
+        here = CELL * (np.array([x, z]) - START // SIDE)
+        at = detected_places(detection, here, rules.directions()[self._heading])
         for place in self._places:
             if np.hypot(*(place.at - at)) <= SAME_PLACE:
                 break
@@ -164,32 +174,39 @@ class Searcher:
         return place, away <= enough
 
     def _next(self) -> int:
-        """The next action on the way to the goal's places, or else to frontiers; where there are none, it begins anew.
+        """Choose an action towards the goal or a frontier.
 
-        Each new search is with the next higher horizon, and keeps away from poses that were taken with it before.
+        Where there is neither, a new search begins with the next higher horizon. It avoids the poses that were taken
+        with that horizon before.
         """
         if self._horizon != self._sweep:
             return LOOK_DOWN if self._horizon < self._sweep else LOOK_UP
         places = [place.poses for place in self._places if place.misses < PATIENCE * len(place.sightings)]
-        action = self._towards([union(own) for own in zip(*places, strict=True)])
+        action = self._towards([union(sets) for sets in zip(*places, strict=True)])
         if action is None:
             action = self._towards(self._frontiers())
         if action is None:
-            self._looked_at, self._sweep = 0, (self._sweep - 1) % len(self._rules.horizons)
+            self._inspected, self._sweep = 0, (self._sweep - 1) % len(self._rules.horizons)
             return ROTATE_RIGHT
         return action
 
     def _frontiers(self) -> list[int]:
-        """For each heading, the cells from which a near cell that has not been looked at would be in view."""
+        """Return the frontiers, a set of cells by heading.
+
+        From them a near cell that has not been inspected would be in view.
+        """
         edge = union(moved(self._free, step) for step in AROUND)
-        wanted = (self._free | self._blocked | edge) & ~self._looked_at
+        wanted = (self._free | self._blocked | edge) & ~self._inspected
         return [union(moved(wanted, -offset) for offset in offsets) for offsets in self._body.offsets]
 
     def _towards(self, targets: list[int]) -> int | None:
-        """First action on a shortest known way to the nearest of the poses that have not been taken."""
+        """Return the first action on a shortest known way.
+
+        It leads to the nearest of the targets that have not been taken; None if there is no way.
+        """
         free, steps, headings = self._free, self._body.steps, self._rules.headings
         taken = self._taken[self._horizon]
-        reached = [cells & free & ~own for cells, own in zip(targets, taken, strict=False)]
+        reached = [cells & free & ~visited for cells, visited in zip(targets, taken, strict=False)]
         if not any(reached):
             return None
         here, heading = 1 << self._cell, self._heading

@@ -1,4 +1,7 @@
-"""The shortest-path oracle: it knows the way, walks it in the environment, and so checks environment and metrics."""
+"""The shortest-path oracle, an upper bound and a check.
+
+It walks a shortest path in the environment, which checks environment and metrics.
+"""
 
 import functools
 from collections.abc import Iterable, Sequence
@@ -17,7 +20,11 @@ from jaxnav.scenes.task import DONE
 
 
 def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
-    """A shortest sequence of actions for each episode, int32 [T, E], its Done repeated up to the longest one."""
+    """Return a shortest sequence of actions for each episode.
+
+    Returns:
+      int32 [T, E], each sequence filled up with Done to the longest one.
+    """
     successor, goal = bank.successor, episodes.goal
     pose, left, actions = episodes.pose, episodes.best_length, []
     while (left > 0).any():
@@ -32,27 +39,40 @@ def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
 def oracle_outcome(
     banks: Iterable[Bank], lists: Sequence[EpisodeList], params: Iterable[EnvParams], env: ObjectNav
 ) -> Outcome:
-    """What the environment makes of the oracle's actions, leaves [E] over the episodes of all banks.
+    """Run the oracle in the environment.
 
     Args:
       banks: of scenes.
       lists: episodes in each.
       params: the environment's, bank by bank.
       env: the environment.
+
+    Returns:
+      Leaves [E], over the episodes of all banks.
     """
     actions = [oracle_actions(bank, episodes) for bank, episodes in zip(banks, lists, strict=True)]
     longest = max(map(len, actions))
     padded = [np.pad(steps, ((0, longest - len(steps)), (0, 0)), constant_values=DONE) for steps in actions]
     outcomes = [
-        replay(jnp.asarray(steps), first_states(episodes), own, env)
-        for steps, episodes, own in zip(padded, lists, params, strict=True)
+        replay(jnp.asarray(steps), first_states(episodes), bank_params, env)
+        for steps, episodes, bank_params in zip(padded, lists, params, strict=True)
     ]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *outcomes)
 
 
 @functools.partial(jax.jit, static_argnums=3)
 def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) -> Outcome:
-    """What the environment makes of fixed actions int32 [T, E] from states [E]; leaves [E]."""
+    """Run fixed actions in the environment.
+
+    Args:
+      actions: int32 [T, E].
+      state: the first states, leaves [E].
+      params: the environment's.
+      env: the environment.
+
+    Returns:
+      Leaves [E].
+    """
 
     acting, nothing = Acting(env), jnp.zeros(state.pose.shape)
 

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav
+from jaxnav.env.objectnav import ObjectNav, prior_index
 from jaxnav.env.types import EnvParams, Tables
-from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.compile import Bank
 
 
@@ -28,7 +27,7 @@ def build(
         one compilation: with cells that no episode gets to, and with its own scenes again from the first.
       shaping: see `ObjectNav`.
     """
-    rooms = [ROOM_TYPES.index(room) if room in ROOM_TYPES else OTHER_ROOM for room in bank.room_types]
+    rooms = [prior_index(room) for room in bank.room_types]
     limits = [step_limits.get(room, default_limit) for room in bank.room_types]
     poses_per_cell = bank.task.rules.poses_per_cell
     more_cells = max(num_cells - len(bank.ahead), 0)

@@ -20,6 +20,11 @@ OTHER_ROOM = len(ROOM_TYPES)
 NUM_PRIORS = OTHER_ROOM + 1
 
 
+def prior_index(room_type: str) -> int:
+    """Return the index of a room type's layout prior."""
+    return ROOM_TYPES.index(room_type) if room_type in ROOM_TYPES else OTHER_ROOM
+
+
 @dataclasses.dataclass(frozen=True)
 class ObjectNav:
     """Hold an environment; hashable.

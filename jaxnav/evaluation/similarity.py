@@ -1,4 +1,4 @@
-"""How well the layout of a scene fits a layout prior: divergence and likeness of what is detected together."""
+"""Fit of a scene's layout to a layout prior."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ UNIFORM = 0.05
 
 
 def seen_together(rows: np.ndarray, num_categories: int) -> np.ndarray:
-    """Poses at which two categories are detected together, n_ij.
+    """Count poses at which two categories are detected together.
 
     Args:
       rows: uint8 [P, R], see `RowFormat`.
       num_categories: K.
 
     Returns:
-      float64 [K, K], symmetric, whole numbers, 0 on the diagonal.
+      float64 [K, K], n_ij, symmetric, whole numbers, 0 on the diagonal.
     """
     presence = RowFormat(num_categories).presence(rows).astype(np.float64)
     together = presence.T @ presence
@@ -26,7 +26,9 @@ def seen_together(rows: np.ndarray, num_categories: int) -> np.ndarray:
 
 
 def scene_counts(bank: Bank) -> np.ndarray:
-    """Each scene's own co-occurrence, every pose counted once (as in `explore`, which sees a part of the poses).
+    """Count the co-occurrence of each scene.
+
+    Every pose counts once, as in `explore`, which visits a part of the poses.
 
     Returns:
       float64 [S, K, K], see `seen_together`.
@@ -36,7 +38,9 @@ def scene_counts(bank: Bank) -> np.ndarray:
 
 
 def expected(counts: np.ndarray) -> np.ndarray:
-    """Expected co-occurrence w_ij = n_ij / sum_k n_ik over j, k != i (equation 6 with counts for alpha).
+    """Return the expected co-occurrence of counts.
+
+    w_ij = n_ij / sum_k n_ik over j, k != i (equation 6 with counts for alpha).
 
     Args:
       counts: real [..., K, K], counts or concentrations, >= 0; the diagonal is ignored.
@@ -50,10 +54,11 @@ def expected(counts: np.ndarray) -> np.ndarray:
 
 
 def layout_gap(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Divergence of scenes from a prior: mean over i of KL(p_i || q_i) = sum_{j != i} p_ij ln(p_ij / q_ij).
+    """Return the divergence of scenes from a prior.
 
-    p_ij = 0.95 w_ij + 0.05 / (K - 1) with w = `expected(counts)`, and q is made of the prior in the same way; the mean
-    is over the categories i that the scene shows together with others.
+    It is the mean over i of KL(p_i || q_i) = sum_{j != i} p_ij ln(p_ij / q_ij), where p_ij = 0.95 w_ij + 0.05 / (K - 1)
+    with w = `expected(counts)`, and q follows from the prior in the same way. The mean is over the categories i that
+    are seen together with others in the scene.
 
     Args:
       counts: real [S, K, K], see `scene_counts`.
@@ -70,10 +75,10 @@ def layout_gap(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
 
 
 def layout_similarity(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Cosine similarity of scenes and a prior: sum_ij w_ij v_ij / sqrt(sum_ij w_ij^2 sum_ij v_ij^2).
+    """Return the cosine similarity of scenes and a prior.
 
-    w = `expected(counts)`, v = `expected(prior)`; the sums are over j != i and over the categories i that the scene
-    shows together with others.
+    It is sum_ij w_ij v_ij / sqrt(sum_ij w_ij^2 sum_ij v_ij^2) with w = `expected(counts)` and v = `expected(prior)`.
+    The sums are over j != i and over the categories i that are seen together with others in the scene.
 
     Args:
       counts: real [S, K, K], see `scene_counts`.
@@ -87,10 +92,10 @@ def layout_similarity(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
 
 
 def _present(counts: np.ndarray) -> np.ndarray:
-    """Categories that a scene shows together with others, bool [..., K]."""
+    """Return the categories seen with others, bool [..., K]."""
     return expected(counts).sum(axis=-1) > 0
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    """NaN where the denominator is 0."""
+    """Divide, with NaN where the denominator is 0."""
     return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator > 0)

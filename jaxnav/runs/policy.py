@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.causal import do, stde
-from jaxnav.env.objectnav import OTHER_ROOM
+from jaxnav.env.objectnav import OTHER_ROOM, prior_index
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
 from jaxnav.layout import LayoutEstimator, LayoutState, Setting
@@ -66,7 +66,7 @@ class LoadedPolicy(struct.PyTreeNode):
         """
         if room_type is not None and room_type not in ROOM_TYPES:
             raise InputError(f"room_type {room_type!r}: choose one of {', '.join(ROOM_TYPES)}, or None")
-        room = jnp.int32(OTHER_ROOM if room_type is None else ROOM_TYPES.index(room_type))
+        room = jnp.int32(OTHER_ROOM if room_type is None else prior_index(room_type))
         tracker = find_method(self.spec.method).tracker
         layout = None if self.setting is None else LayoutEstimator(self.knowledge.layout[room], self.setting).init()
         note = None if tracker is None else tracker.init(self.knowledge)

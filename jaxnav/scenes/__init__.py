@@ -1,1 +1,1 @@
-"""What a scene is: generated rooms, scene files, and compilation to flat tables (NumPy, on the host)."""
+"""Scenes: generated worlds, scene files and compiled tables (NumPy, host)."""

@@ -1,4 +1,4 @@
-"""What can be looked for: the ordered vocabulary of detectable object categories."""
+"""Ordered vocabularies of the object categories."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ ITHOR_CATEGORIES: tuple[str, ...] = (
     "RemoteControl", "Sink", "StoveBurner", "Television", "Toaster",
 )  # fmt: skip
 
-#: What the RoboTHOR challenge looks for, and furniture that stands near it.
+#: The goals of the RoboTHOR challenge, and furniture that stands near them.
 ROBOTHOR_GOALS: tuple[str, ...] = (
     "AlarmClock", "Apple", "BaseballBat", "BasketBall", "Bowl", "GarbageCan", "HousePlant", "Laptop", "Mug",
     "SprayBottle", "Television", "Vase",
@@ -23,7 +23,7 @@ ROBOTHOR_CATEGORIES: tuple[str, ...] = (
     "TVStand",
 )  # fmt: skip
 
-#: The 15 classes of the Gibson setting (SemExp), of which the first six are looked for.
+#: The 15 classes of the Gibson setting (SemExp), of which the first six are goals.
 GIBSON_CATEGORIES: tuple[str, ...] = (
     "Chair", "Sofa", "HousePlant", "Bed", "Toilet", "Television", "DiningTable", "Oven", "Sink", "Fridge", "Book",
     "Clock", "Vase", "Cup", "Bottle",
@@ -45,13 +45,19 @@ ALIASES = MappingProxyType({
 
 
 def category_ids(types: tuple[str, ...], categories: tuple[str, ...]) -> tuple[int, ...]:
-    """Index of each object type in `categories`, by its name or else by its alias; -1 where the type is no category."""
+    """Return the index of each object type in `categories`.
+
+    A type is found by its name or else by its alias; -1 where it is no category.
+    """
     index = {name: i for i, name in enumerate(categories)}
     return tuple(index.get(name, index.get(ALIASES.get(name, name), -1)) for name in types)
 
 
 def unknown_types(scenes: Iterable[Scene], categories: tuple[str, ...]) -> Counter[str]:
-    """Objects of the types that are no category, counted by type; they only block the sight."""
+    """Count the objects of types that are no category.
+
+    Such objects only block the sight.
+    """
     types = Counter(name for scene in scenes for name in scene.types)
     known = category_ids(tuple(types), categories)
     return Counter({name: types[name] for name, category in zip(types, known, strict=True) if category < 0})

@@ -1,4 +1,4 @@
-"""Moves on the lattice: the standable part of a scene, neighbours, and shortest action counts and walks."""
+"""Moves on the lattice, and shortest paths."""
 
 import numpy as np
 
@@ -7,15 +7,23 @@ from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
 
 
 def standable_cells(reach: np.ndarray) -> np.ndarray:
-    """Cells (iz, ix) of the largest 8-connected part of `reach` [nz, nx], int [C, 2] in row order.
+    """Return the cells of the largest 8-connected part.
 
-    Of equally large parts it takes the one that comes first in row order.
+    Args:
+      reach: bool [nz, nx], where one can stand. Of equally large parts the first in row order counts.
+
+    Returns:
+      int [C, 2], (iz, ix) in row order.
     """
     return max(connected_parts(reach), key=len, default=np.zeros((0, 2), np.int64))
 
 
 def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
-    """Parts of a mask [n, m] whose cells touch, be it at corners: int [P, 2] each, parts and cells in row order."""
+    """Return the 8-connected parts of a mask [n, m].
+
+    Returns:
+      int [P, 2] each, the cells of a part; parts and cells are in row order.
+    """
     cells = np.argwhere(mask)
     if not len(cells):
         return []
@@ -38,7 +46,9 @@ def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:
-    """Cell that MoveAhead leads to from every cell and heading, the own one where the way is barred.
+    """Return the cell after MoveAhead from every cell and heading.
+
+    Where the way is blocked the agent stays.
 
     Args:
       cells: int [C, 2], the standable cells (iz, ix).
@@ -55,7 +65,7 @@ def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:
 
 
 def successors(ahead: np.ndarray, rules: Rules) -> np.ndarray:
-    """Pose after every action from every pose.
+    """Return the pose after every action from every pose.
 
     Args:
       ahead: int32 [C, H], see `ahead_of`.
@@ -81,19 +91,21 @@ def successors(ahead: np.ndarray, rules: Rules) -> np.ndarray:
     return np.stack(table, axis=-1).reshape(-1, NUM_ACTIONS).astype(np.int32)
 
 
-def best_lengths(successor: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Shortest number of actions to success, Done included (L*).
+def best_lengths(successor: np.ndarray, success: np.ndarray) -> np.ndarray:
+    """Return L*, the least number of actions to success.
+
+    Done counts as an action.
 
     Args:
       successor: int [P, 6].
-      found: bool [P, K], whether Done would succeed at a pose.
+      success: bool [P, K], whether Done would succeed at a pose.
 
     Returns:
-      uint16 [P, K]; 1 where the goal is found at the pose itself, 0 where it cannot be reached.
+      uint16 [P, K]; 1 where Done succeeds at the pose itself, 0 where the goal cannot be reached.
     """
-    lengths = found.astype(np.uint16)
+    lengths = success.astype(np.uint16)
     # The goals reached so far are the bits of a word, so that one pass over the moves serves them all.
-    bits = np.packbits(found, axis=1, bitorder="little")
+    bits = np.packbits(success, axis=1, bitorder="little")
     reached = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)  # [P, words]
     moves = np.ascontiguousarray(successor[:, :DONE].T)
     length = 1
@@ -105,26 +117,26 @@ def best_lengths(successor: np.ndarray, found: np.ndarray) -> np.ndarray:
         if not len(new):
             return lengths
         length += 1
-        fresh = np.unpackbits((spread ^ reached)[new].view(np.uint8), axis=1, bitorder="little", count=found.shape[1])
+        fresh = np.unpackbits((spread ^ reached)[new].view(np.uint8), axis=1, bitorder="little", count=success.shape[1])
         pose, goal = np.nonzero(fresh)
         lengths[new[pose], goal] = length
         reached = spread
 
 
-def walking_distances(ahead: np.ndarray, rules: Rules, start: np.ndarray) -> np.ndarray:
-    """Shortest walks over neighbouring cells, after some distance to begin with.
+def walking_distances(ahead: np.ndarray, rules: Rules, direct: np.ndarray) -> np.ndarray:
+    """Return the shortest walks from each cell to goals.
 
     Args:
       ahead: int32 [C, H], see `ahead_of`.
       rules: the headings.
-      start: float64 [C, G], metres from each cell to a goal directly, inf where there is no direct way.
+      direct: float64 [C, G], metres straight from each cell to a goal, inf where there is no straight way.
 
     Returns:
-      float64 [C, G], the least over all cells of the walk there and the direct way from there, metres.
+      float64 [C, G], metres: the least, over all cells, of the walk there and the straight way from there.
     """
     ways, first = np.unique(rules.steps(), axis=0, return_index=True)
     costs = CELL * np.hypot(*ways.T)
-    distance = start
+    distance = direct
     while True:
         nearer = distance
         for heading, cost in zip(first, costs, strict=True):

@@ -1,5 +1,6 @@
-"""What a scene is: standable cells, walls and boxes of objects, on a 0.25 m lattice.
+"""Scenes on a 0.25 m lattice.
 
+A scene has standable cells, walls and boxes of objects.
 Coordinates are metres, y up, x right and z forward; yaw is in degrees clockwise seen from above and yaw 0
 looks along +z. The floor is at y = 0.
 """
@@ -17,11 +18,11 @@ SPLITS = ("train", "val", "test")
 
 
 class Room(NamedTuple):
-    """A room of a home.
+    """Hold a room of a home.
 
     Attributes:
       type: `kitchen`, `living_room`, `bedroom`, `bathroom`, ...
-      cells: bool [nz, nx], its floor.
+      cells: bool [nz, nx], True on its floor.
     """
 
     type: str
@@ -30,7 +31,7 @@ class Room(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One room, apartment or house.
+    """Hold one room, apartment or house.
 
     Attributes:
       name: unique name of the scene.
@@ -39,12 +40,12 @@ class Scene:
       split: `train`, `val` or `test`.
       origin: world (x, z) in metres of the centre of cell [0, 0], a multiple of 0.25.
       reach: bool [nz, nx], True where the agent's centre can stand; row 0 has the smallest z.
-      walls: bool [nz, nx], True where a cell blocks every line of sight from floor to ceiling.
+      walls: bool [nz, nx], True where a cell blocks every line of sight, from floor to ceiling.
       types: [N] object type names.
       boxes: float64 [N, 6], centre x, y, z and full size sx, sy, sz in metres of each axis-aligned box.
       yaws: float64 [N], degrees.
       parents: int [N], index of the object that an object rests on or in, or -1.
-      rooms: of a home, where they are known.
+      rooms: the rooms of a home, where they are known.
     """
 
     name: str
@@ -59,3 +60,30 @@ class Scene:
     yaws: np.ndarray
     parents: np.ndarray
     rooms: tuple[Room, ...] = ()
+
+
+def extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest (x, z) of a scene.
+
+    Args:
+      scene: whose objects count.
+      cells: bool [nz, nx], the cells that count; None for all.
+
+    Returns:
+      float64 [2] each, metres.
+    """
+    iz, ix = np.nonzero(np.ones_like(scene.reach) if cells is None else cells)
+    points = np.asarray(scene.origin) + CELL * np.stack([ix, iz], axis=-1)
+    centre, half = scene.boxes[:, [0, 2]], scene.boxes[:, [3, 5]] / 2
+    low = np.minimum(points.min(axis=0) - CELL / 2, (centre - half).min(axis=0, initial=np.inf))
+    high = np.maximum(points.max(axis=0) + CELL / 2, (centre + half).max(axis=0, initial=-np.inf))
+    return low, high
+
+
+def scene_size(scene: Scene) -> np.ndarray:
+    """Return width and depth of a scene, float64 [2], metres.
+
+    They are those of the rectangle around the objects and the cells that are no wall.
+    """
+    low, high = extent(scene, scene.reach | ~scene.walls)
+    return high - low

@@ -1,4 +1,4 @@
-"""What is asked of an agent: what it may look for, how it moves and sees, and when it has found it."""
+"""Tasks: categories, goals and the rules of an episode."""
 
 import dataclasses
 from typing import Literal
@@ -23,16 +23,16 @@ NEIGHBOURS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -
 
 @dataclasses.dataclass(frozen=True)
 class Rules:
-    """How an agent moves and sees, and when Done is a success.
+    """Describe motion, view and success.
 
     Attributes:
       headings: H; heading h looks 360 h / H degrees clockwise from +z.
-      horizons: degrees downwards, the first of which every episode starts with.
+      horizons: degrees downwards; every episode starts with the first.
       field_of_view: horizontal and vertical, degrees.
       camera: height above the floor, metres.
-      success: `seen`, a visible goal object whose centre is near enough horizontally; or `near`, a goal object whose
-        footprint is near enough to walk to.
-      success_distance: how near that is, metres.
+      success: when Done succeeds: `seen`, a visible goal object whose centre is within the success distance
+        horizontally; or `near`, a goal object whose footprint is within the success distance on foot.
+      success_distance: metres.
     """
 
     headings: int = 8
@@ -44,41 +44,60 @@ class Rules:
 
     @property
     def poses_per_cell(self) -> int:
-        """Poses of one cell; pose = (cell * headings + heading) * horizons + horizon."""
+        """Return the number of poses of one cell.
+
+        pose = (cell * headings + heading) * horizons + horizon, each an index.
+        """
         return self.headings * len(self.horizons)
 
     @property
     def half_view(self) -> tuple[float, float]:
-        """Tangents of half the field of view, horizontal and vertical."""
+        """Return the tangents of half the field of view.
+
+        Horizontal, then vertical.
+        """
         across, up = np.tan(np.deg2rad(self.field_of_view) / 2)
         return float(across), float(up)
 
     def directions(self) -> np.ndarray:
-        """Unit vectors (x, z) of the headings, float64 [H, 2]; rounded so that equal lengths are equal numbers."""
+        """Return the unit vectors of the headings.
+
+        They are float64 [H, 2], (x, z), rounded so that equal lengths are equal numbers.
+        """
         angles = np.deg2rad(360.0 / self.headings * np.arange(self.headings))
         return np.round(np.stack([np.sin(angles), np.cos(angles)], axis=-1), 12)
 
     def view_offsets(self, view: int) -> np.ndarray:
-        """(dz, dx) from the agent of the cells of the ego-centric view, `view` V cells a side: int [H, V, V, 2]."""
+        """Return the cells of the ego-centric view.
+
+        Args:
+          view: V, cells along each side of the view.
+
+        Returns:
+          int [H, V, V, 2], (dz, dx) from the agent's cell, by heading; row 0 nearest to the agent, column 0 leftmost.
+        """
         ahead, side = np.arange(view), np.arange(view) - view // 2
         forward = self.directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
         rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
         return np.rint(forward * ahead[:, None, None] + rightward * side[:, None]).astype(int)
 
     def steps(self) -> np.ndarray:
-        """(dz, dx) of MoveAhead for each heading, to the neighbouring cell in the nearest direction: int [H, 2]."""
+        """Return the displacement of MoveAhead for each heading.
+
+        It is int [H, 2], (dz, dx), and leads to the neighbouring cell in the nearest direction.
+        """
         return NEIGHBOURS[np.rint(8 / self.headings * np.arange(self.headings)).astype(int) % 8]
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What is asked of an agent; hashable.
+    """Describe what an agent is asked to do; hashable.
 
     Attributes:
-      categories: [K] what can be detected.
-      goals: what can be looked for, some of `categories`; () for all.
-      rules: of moving, seeing and success.
-      detector: error rates.
+      categories: [K] names of what can be detected.
+      goals: names of what can be searched for, some of `categories`; () for all.
+      rules: of motion, view and success.
+      detector: its error rates.
     """
 
     categories: tuple[str, ...] = ITHOR_CATEGORIES
@@ -87,11 +106,11 @@ class Task:
     detector: Detector = Detector()
 
     def is_goal(self) -> np.ndarray:
-        """Which categories can be looked for, bool [K]."""
+        """Return which categories can be goals, bool [K]."""
         return np.array([not self.goals or name in self.goals for name in self.categories])
 
 
-#: What is asked in AI2-THOR rooms, in RoboTHOR apartments and in Gibson houses.
+#: The tasks of AI2-THOR rooms, RoboTHOR apartments and Gibson houses.
 ROOMS = Task()
 APARTMENTS = Task(
     ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS, Rules(headings=12, field_of_view=(79.0, 63.5), success_distance=1.0)

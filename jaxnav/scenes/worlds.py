@@ -1,4 +1,4 @@
-"""The worlds of the paper, generated scene by scene, and scenes as sequences that know what they are."""
+"""The worlds of the paper, and scenes as sequences."""
 
 import dataclasses
 import hashlib
@@ -19,16 +19,16 @@ from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """What the scenes of a world have in common.
+    """Describe what the scenes of a world have in common.
 
     Attributes:
       generate: a scene from (split, index, seed, shift).
       counts: usual number of scenes of each split.
-      task: what is asked there.
+      task: categories, goals and rules.
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
-      shaping: reward in training for every metre nearer to the goal; what is far away is hardly ever found by chance.
+      shaping: reward in training for every metre nearer to the goal, needed where goals are rarely reached by chance.
     """
 
     generate: Callable[[str, int, int, float], Scene]
@@ -73,11 +73,14 @@ WORLDS = {
 
 
 class Scenes(Protocol):
-    """The scenes of one split, in order; a scene is made when it is asked for."""
+    """Provide the scenes of one split, in order.
+
+    A scene is made on access.
+    """
 
     @property
     def identity(self) -> str:
-        """Text that differs wherever the scenes differ."""
+        """Return a text that differs wherever the scenes differ."""
         ...
 
     def __len__(self) -> int: ...
@@ -87,7 +90,7 @@ class Scenes(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class GeneratedScenes:
-    """Scenes of a generated world.
+    """Generate the scenes of a world on access.
 
     Attributes:
       world: its name, a key of `WORLDS`.
@@ -106,7 +109,7 @@ class GeneratedScenes:
 
     @property
     def identity(self) -> str:
-        """The arguments of the generator."""
+        """Return the arguments of the generator."""
         return repr(self)
 
     def __len__(self) -> int:
@@ -120,7 +123,7 @@ class GeneratedScenes:
 
 @dataclasses.dataclass(frozen=True)
 class FileScenes:
-    """Scenes of a scene file.
+    """Hold the scenes of a file.
 
     Attributes:
       scenes: as read, or relabelled.
@@ -138,7 +141,7 @@ class FileScenes:
 
 
 def generated(world: str, split: str, count: int | None = None, seed: int = 0, shift: float = 0.0) -> GeneratedScenes:
-    """The scenes of one split of a generated world.
+    """Describe the scenes of one split of a generated world.
 
     Args:
       world: a key of `WORLDS`.
@@ -168,7 +171,7 @@ def from_file(
     seed: int = 0,
     categories: tuple[str, ...] = ITHOR_CATEGORIES,
 ) -> FileScenes:
-    """The scenes of one split of a scene file.
+    """Read the scenes of one split of a scene file.
 
     Args:
       path: the scene file.

@@ -1,42 +1,41 @@
-"""Picture of one episode: the room from above, what is detected, and the layout gap; a moving GIF or its last frame."""
+"""The picture of one episode, moving or still."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.markers import MarkerStyle
-from matplotlib.path import Path as Outline
-from matplotlib.transforms import Affine2D
 from PIL import Image
 
 from jaxnav.evaluation.playback import Trace
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, RowFormat
+from jaxnav.scenes.tables.observation_row import RowFormat, detected_places
 from jaxnav.scenes.task import DONE, Task
-from jaxnav.viz.plan import GOAL, INK, draw_room, view_cone
+from jaxnav.viz.plan import AGENT, GOAL, INK, PALE, SEEN, draw_agent, draw_room
 
-AGENT, SEEN, REMOVED, PALE = "#0072B2", "#009E73", "#E69F00", "#8a8a8a"
+REMOVED = "#E69F00"
 ACTIONS = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")
-ARROW = Outline([(0, 1), (-0.75, -0.9), (0, -0.45), (0.75, -0.9), (0, 1)], closed=True)
 MAX_FRAMES, STEP_MS, LAST_MS, NUM_COLOURS = 60, 220, 2500, 128
 
 
 class Episode(NamedTuple):
-    """An episode with everything that its picture shows; T steps, K categories.
+    """Hold one episode and everything its picture shows.
+
+    There are T steps; a row has R bytes.
 
     Attributes:
       trace: what was done.
       scene: where.
       places: float64 [T, 2], world (x, z) of the agent at each step.
       rows: uint8 [T, R], what was perceived.
-      task: what was asked.
-      goal: index of the category that is sought.
+      task: categories and rules.
+      goal: index of the category to search for.
       best_length: L*.
       epsilon: threshold of sTDE; infinite where experience is kept.
-      title: what acts.
+      title: names the agent and the scene.
     """
 
     trace: Trace
@@ -51,23 +50,26 @@ class Episode(NamedTuple):
 
 
 def draw_episode(episode: Episode, path: Path) -> None:
-    """Write the episode as a GIF, a frame per step but at most 60, or, if the name ends otherwise, its last frame."""
+    """Write the picture of an episode.
+
+    A path that ends in .gif gets a frame per step, evenly spaced ones of an episode with more than 60 steps; another
+    path gets the last frame.
+    """
     figure = Figure(figsize=(9.6, 5.4), dpi=100)
     canvas = FigureCanvasAgg(figure)
     room = figure.add_axes((0.015, 0.03, 0.6, 0.85))
     detected = figure.add_axes((0.76, 0.49, 0.22, 0.35))
     gap = figure.add_axes((0.68, 0.1, 0.3, 0.26))
     figure.text(0.02, 0.945, episode.title, color=PALE, fontsize=9.5)
-    figure.text(
-        0.02, 0.9, f"Looking for {episode.task.categories[episode.goal]}", color=GOAL, fontsize=14, weight="bold"
-    )
+    goal = episode.task.categories[episode.goal]
+    figure.text(0.02, 0.9, f"Looking for {goal}", color=GOAL, fontsize=14, weight="bold")
     status = figure.text(0.98, 0.935, "", color=INK, fontsize=10.5, ha="right")
     draw_room(room, episode.scene, episode.task.categories, episode.goal)
 
     last = len(episode.trace.pose) - 1
-    frames = range(0, last + 1, -(-(last + 1) // MAX_FRAMES)) if path.suffix == ".gif" else []
+    steps = range(0, last + 1, -(-(last + 1) // MAX_FRAMES)) if path.suffix == ".gif" else []
     images = []
-    for step in [*(step for step in frames if step != last), last]:
+    for step in [*(step for step in steps if step != last), last]:
         status.set_text(_status(episode, step))
         moving = _draw_agent(room, episode, step)
         _draw_detected(detected, episode, step)
@@ -77,11 +79,18 @@ def draw_episode(episode: Episode, path: Path) -> None:
         for artist in moving:
             artist.remove()
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix != ".gif":
+    if path.suffix == ".gif":
+        _write_gif(images, path)
+    else:
         images[-1].save(path, optimize=True)
-        return
-    # One palette for all frames: what stands still stays equal from frame to frame and costs nothing.
-    richest = max(images, key=lambda image: len(image.getcolors(2**20)))
+
+
+def _write_gif(images: list[Image.Image], path: Path) -> None:
+    """Write frames with one palette.
+
+    Equal pixels stay equal from frame to frame, which keeps the file small.
+    """
+    richest = max(images, key=lambda image: len(image.getcolors(2**20) or ()))
     palette = richest.quantize(NUM_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [STEP_MS] * (len(images) - 1) + [LAST_MS]
@@ -99,33 +108,27 @@ def _status(episode: Episode, step: int) -> str:
     return f"{text}; " + (f"found (best: {episode.best_length} steps)" if trace.success else "not found")
 
 
-def _draw_agent(axes: Axes, episode: Episode, step: int) -> list:
-    """The path so far, the view cone, the agent and where it perceives objects; returns what to take away again."""
+def _draw_agent(axes: Axes, episode: Episode, step: int) -> list[Artist]:
+    """Draw the path, the agent and what is detected."""
     rules = episode.task.rules
     place, heading = episode.places[step], episode.trace.pose[step] // len(rules.horizons) % rules.headings
-    yaw = 360.0 / rules.headings * heading
-    cone = axes.fill(*view_cone(episode.scene, rules, place, yaw).T, color=AGENT, alpha=0.16, lw=0, zorder=3)
+    agent = draw_agent(axes, episode.scene, rules, place, 360.0 / rules.headings * heading)
     path = axes.plot(*episode.places[: step + 1].T, color=AGENT, lw=2, solid_joinstyle="round", zorder=4)
     start = axes.plot(*episode.places[0], "o", color="white", markeredgecolor=AGENT, markersize=6, zorder=4)
-    marker = MarkerStyle(ARROW, transform=Affine2D().rotate_deg(-yaw))
-    agent = axes.plot(*place, marker=marker, color=AGENT, markersize=15, markeredgecolor="white", zorder=8)
-
-    confidence, ahead, right, _ = _detections(episode, step).T
-    forward = rules.directions()[heading]
-    offsets = np.outer(ahead / AHEAD_SCALE, forward)
-    offsets += np.outer((right - 128.0) / RIGHT_SCALE, (forward[1], -forward[0]))
-    seen = np.flatnonzero(confidence)
+    detections = _detections(episode, step)
+    seen = np.flatnonzero(detections[:, 0])
+    points = detected_places(detections[seen], place, rules.directions()[heading])
     colours = [GOAL if category == episode.goal else SEEN for category in seen]
-    rings = axes.scatter(*(place + offsets[seen]).T, s=110, facecolor="none", edgecolor=colours, lw=1.6, zorder=6)
-    return [*cone, *path, *start, *agent, rings]
+    rings = axes.scatter(*points.T, s=110, facecolor="none", edgecolor=colours, lw=1.6, zorder=6)
+    return [*agent, *path, *start, rings]
 
 
 def _detections(episode: Episode, step: int) -> np.ndarray:
-    return RowFormat(len(episode.task.categories)).detections(episode.rows[step]).astype(np.float64)
+    return RowFormat(len(episode.task.categories)).detections(episode.rows[step])
 
 
 def _draw_detected(axes: Axes, episode: Episode, step: int) -> None:
-    """Bars of confidence, the greatest on top."""
+    """Draw bars of confidence, the greatest on top."""
     axes.clear()
     confidence = _detections(episode, step)[:, 0] / 255.0
     seen = [i for i in np.argsort(-confidence)[:8] if confidence[i] > 0]
@@ -133,11 +136,14 @@ def _draw_detected(axes: Axes, episode: Episode, step: int) -> None:
     axes.set_yticks(range(len(seen)), [episode.task.categories[i] for i in seen])
     axes.set(xlim=(0, 1), ylim=(7.6, -0.6), xticks=(0, 0.5, 1))
     axes.set_title("Detected now, confidence", loc="right", fontsize=10, color=INK)
-    _plain(axes)
+    _draw_plain_axes(axes)
 
 
 def _draw_gap(axes: Axes, episode: Episode, step: int) -> None:
-    """The gap up to now; what exceeds the threshold is the weight with which experience is taken out."""
+    """Draw the layout gap so far.
+
+    What exceeds the threshold, filled, is the weight with which experience is removed.
+    """
     axes.clear()
     gap, epsilon = episode.trace.gap[: step + 1], episode.epsilon
     steps = np.arange(1, step + 2)
@@ -152,10 +158,10 @@ def _draw_gap(axes: Axes, episode: Episode, step: int) -> None:
     axes.set_title("Layout gap D", loc="right", fontsize=10, color=INK)
     axes.set_xlabel("step", fontsize=8.5, color=PALE)
     axes.locator_params(axis="x", integer=True, nbins=6)
-    _plain(axes)
+    _draw_plain_axes(axes)
 
 
-def _plain(axes: Axes) -> None:
+def _draw_plain_axes(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(PALE)
     axes.tick_params(labelcolor=INK, labelsize=8.5, color=PALE)

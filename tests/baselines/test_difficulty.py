@@ -31,7 +31,7 @@ def test_both_are_means_over_the_episodes_that_are_drawn():
         running &= action != 5
         pose = successor[pose, action]
     for scene in range(2):
-        own = episodes.scene == scene
+        chosen = episodes.scene == scene
         for values, expected in ((episodes.best_length, lengths[scene]), (success, random[scene])):
-            error = values[own].std() / np.sqrt(own.sum())
-            assert abs(values[own].mean() - expected) < 4 * error
+            error = values[chosen].std() / np.sqrt(chosen.sum())
+            assert abs(values[chosen].mean() - expected) < 4 * error

@@ -32,9 +32,9 @@ def pose(cell, heading, rules=ROOMS):
     return (cell * rules.headings + heading) * len(rules.horizons)
 
 
-def outcome(bank, episodes=60, limit=200):
-    own = episode_list(bank, episodes)
-    return frontier_outcome(bank, own, np.full(len(bank.names), limit)), own
+def outcome(bank, count=60, limit=200):
+    episodes = episode_list(bank, count)
+    return frontier_outcome(bank, episodes, np.full(len(bank.names), limit)), episodes
 
 
 def test_it_walks_straight_to_what_it_sees():
@@ -72,19 +72,19 @@ def test_every_goal_in_an_open_room_is_found(rules):
         ("Fridge", 2.25, 0.9, 0.0, 0.7, 1.8, 0.7),
     )
     bank = compiled(draw(["........"] * 8, *objects), rules=rules)
-    result, own = outcome(bank, 90)
-    assert set(own.goal.tolist()) == {0, 1, 2}
+    result, episodes = outcome(bank, 90)
+    assert set(episodes.goal.tolist()) == {0, 1, 2}
     assert np.asarray(result.success).all()
-    assert (np.asarray(result.length) >= own.best_length).all()
+    assert (np.asarray(result.length) >= episodes.best_length).all()
     assert (np.asarray(result.moves) < np.asarray(result.length)).all()
 
 
 def test_a_blind_searcher_goes_on_to_the_step_limit():
     bank = compiled(maze_scene(3), coarse_scene(1), detector=BLIND)
-    result, own = outcome(bank, 20, limit=60)
+    result, episodes = outcome(bank, 20, limit=60)
     assert not np.asarray(result.success).any()
     assert (np.asarray(result.length) == 60).all()
-    assert own.best_length.max() < 60
+    assert episodes.best_length.max() < 60
 
 
 def test_a_single_false_alarm_is_not_believed():
@@ -101,9 +101,9 @@ def test_a_single_false_alarm_is_not_believed():
 
 def test_done_at_the_step_limit_counts():
     bank = compiled(draw([".###"] + ["####"] * 3, BOOK_BEHIND))
-    own = episode_list(bank, 1)._replace(pose=np.array([pose(0, 0)], np.int32))
+    episodes = episode_list(bank, 1)._replace(pose=np.array([pose(0, 0)], np.int32))
     for limit, success in ((6, True), (5, False)):
-        result = frontier_outcome(bank, own, np.array([limit]))
+        result = frontier_outcome(bank, episodes, np.array([limit]))
         assert (bool(result.success[0]), int(result.length[0])) == (success, limit)
 
 
@@ -133,7 +133,7 @@ def test_it_never_walks_in_vain(seed, rules):
     scene = maze_scene(seed)
     bank = compiled(dataclasses.replace(scene, types=("Book",) * len(scene.types)), rules=rules, detector=BLIND)
     steps = list(walk(bank, bank.successor, 0, CHAIR, 150))
-    cells = [own // rules.poses_per_cell for own, _ in steps]
+    cells = [at // rules.poses_per_cell for at, _ in steps]
     assert all(
         (after != before) == (action == MOVE_AHEAD)
         for before, after, (_, action) in zip(cells[:-1], cells[1:], steps[:-1], strict=True)

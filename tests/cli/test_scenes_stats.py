@@ -81,7 +81,7 @@ def test_pairs_seen_together(file, capsys):
     row_format, names = RowFormat(len(Task().categories)), Task().categories
     rows = np.concatenate([compile_scene(scene, Task()).rows for scene in (KITCHEN, BEDROOM)])
     seen = np.array(
-        [[bool(found[names.index(name)]) for name in ("Book", "Chair")] for found in row_format.presence(rows)]
+        [[bool(present[names.index(name)]) for name in ("Book", "Chair")] for present in row_format.presence(rows)]
     )
     rare, other = sorted((0, 1), key=lambda k: seen[:, k].sum())
     given, base = seen[seen[:, rare], other].mean(), seen[:, other].mean()
@@ -116,9 +116,9 @@ def test_the_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
     counts = scene_counts(compile_bank([kitchen, apartment, bath], run.task))
     gaps, likeness = layout_gap(counts, priors), layout_similarity(counts, priors)
     for name, which in {"kitchen": [0], "apartment": [1], "bathroom": [2], "all": [0, 1, 2]}.items():
-        own = [gaps[which], likeness[which]]
+        measured = [gaps[which], likeness[which]]
         means, quartiles = (
-            [f(values) for values in own] for f in (np.mean, lambda v: np.quantile(v, (0.25, 0.5, 0.75)))
+            [f(values) for values in measured] for f in (np.mean, lambda v: np.quantile(v, (0.25, 0.5, 0.75)))
         )
         texts = [" ".join(f"{q:.2f}" for q in three) for three in quartiles]
         expected = [str(len(which)), f"{means[0]:.2f}", texts[0], f"{means[1]:.2f}", texts[1]]
@@ -143,10 +143,10 @@ def test_scenes_in_which_nothing_is_seen_together_have_no_gap(tmp_path_factory, 
 
 
 def test_a_shift_exchanges_labels_in_a_file(file, capsys):
-    own, shifted = (stats(capsys, file, *options) for options in ((), ("--shift", "1")))
+    plain, shifted = (stats(capsys, file, *options) for options in ((), ("--shift", "1")))
     # Two books and a chair: who is in half of the scenes, how many, how high.
-    assert row(own, "Book")[:3] == row(shifted, "Chair")[:3] == ["50%", "2.00", "0.90 m"]
-    assert row(own, "Chair")[:3] == row(shifted, "Book")[:3] == ["50%", "1.00", "0.50 m"]
+    assert row(plain, "Book")[:3] == row(shifted, "Chair")[:3] == ["50%", "2.00", "0.90 m"]
+    assert row(plain, "Chair")[:3] == row(shifted, "Book")[:3] == ["50%", "1.00", "0.50 m"]
 
 
 def test_what_is_refused(tmp_path, tmp_path_factory, file, capsys):

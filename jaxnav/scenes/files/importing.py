@@ -1,15 +1,12 @@
-"""The import of scenes: from users' files, in the formats that there are, to a scene file."""
+"""Import of scenes from the formats of simulators and datasets."""
 
 import dataclasses
 import fnmatch
 import reprlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
-from rich.console import Console
+from typing import Literal, NamedTuple
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids, unknown_types
@@ -23,11 +20,12 @@ from jaxnav.scenes.files.scene_file import iterate_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
 
+Format = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
 Split = Literal["train", "val", "test"]
 Imported = Iterator[Scene | InputError]
 
 #: World whose vocabulary scenes are compared with, by the world that they come from; `rooms` for others.
-USUAL_WORLDS = {
+DEFAULT_WORLDS = {
     "robothor": "apartments",
     "apartments": "apartments",
     "procthor": "houses",
@@ -35,112 +33,143 @@ USUAL_WORLDS = {
     "gibson": "houses",
     "houses": "houses",
 }
-#: Options that only one format has.
-OWN_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor", "base": "replacements"}
+#: Format that each option of `read_format` is for.
+FORMAT_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor", "base": "replacements"}
 
 
-@dataclasses.dataclass(frozen=True)
-class ImportConfig:
-    """Import scenes to a scene file.
+class ImportSummary(NamedTuple):
+    """Summarize an import.
 
     Attributes:
-      format: `procthor`: houses as JSON or JSON lines; `ai2thor`: metadata of the controller with reachable positions,
-        a file or a folder of files; `scene-data`: the offline folders of SAVN, ORG and L-sTDE; `habitat`: an ObjectNav
-        split or one of its files; `replacements`: places of movable objects in the rooms of `--base`; `scenes`: a scene
-        file, to divide it into splits.
-      source: what to read; with `--from-controller` names of scenes with commas between them.
-      out: scene file to write (`*.jsonl.gz`).
-      split: of the scenes that none of the following patterns fits.
-      val, test: patterns of scene names, such as `FloorPlan_Train11_*`, that make up these splits.
-      world: world whose vocabulary the types are compared with; default: that which the scenes stand for.
-      categories: vocabulary to compare with instead.
-      assets: asset database of ProcTHOR (JSON), for types and sizes.
-      maps: semantic floor maps for Habitat episodes (`*_info.pbz2`).
-      from_controller: read from an installed `ai2thor` simulator instead of from files.
-      base: scene file with the rooms that re-placements are of.
+      imported: number of scenes that were written.
+      refused: number of scenes that could not be used.
+      unknown: number of objects of each type that is in no vocabulary.
     """
 
-    format: Annotated[
-        Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"], tyro.conf.Positional
-    ]
-    source: Annotated[str, tyro.conf.Positional]
-    out: Annotated[Path, tyro.conf.Positional]
-    split: Split = "train"
-    val: tuple[str, ...] = ()
-    test: tuple[str, ...] = ()
-    world: Literal["rooms", "apartments", "houses"] | None = None
-    categories: tuple[str, ...] | None = None
-    assets: Path | None = None
-    maps: Path | None = None
-    from_controller: bool = False
-    base: Path | None = None
+    imported: int
+    refused: int
+    unknown: Counter[str]
 
 
-def import_scenes(config: ImportConfig, console: Console) -> None:
-    """Import, write the scene file, and tell what was refused and which types are unknown.
+def read_format(
+    form: Format,
+    source: str,
+    split: Split = "train",
+    assets: Path | None = None,
+    maps: Path | None = None,
+    from_controller: bool = False,
+    base: Path | None = None,
+) -> Imported:
+    """Yield the scenes of a source.
+
+    Args:
+      form: the format.
+      source: path of a file or folder; with `from_controller` names of scenes with commas between them.
+      split: split of the scenes; scenes of a scene file keep theirs.
+      assets: asset database of ProcTHOR.
+      maps: semantic floor maps for Habitat episodes.
+      from_controller: whether to read from an installed AI2-THOR simulator.
+      base: scene file with the rooms that re-placements are of.
+
+    Yields:
+      A scene, or why it cannot be used.
 
     Raises:
-      InputError: nothing could be imported, or the file cannot be written.
+      InputError: the source cannot be read, or an option is missing or is for another format.
     """
-    if not config.out.name.endswith(".jsonl.gz"):
-        raise InputError(f"{config.out}: give a name that ends in .jsonl.gz")
-    for option, owner in OWN_OPTIONS.items():
-        if getattr(config, option) and config.format != owner:
-            name = option.replace("_", "-")
-            raise InputError(f"--{name}: is for the format {owner}, not for {config.format}; leave it out")
-    kept: dict[str, Scene] = {}
-    unknown: Counter[str] = Counter()
-    refused = 0
-    for scene in _read(config):
-        try:
-            if isinstance(scene, InputError):
-                raise scene
-            categories = _vocabulary(scene, config)
-            _check(scene, kept, categories, config.source)
-        except InputError as error:
-            refused += 1
-            console.print(f"refused: {error}", style="yellow", markup=False, soft_wrap=True)
-        else:
-            kept[scene.name] = _with_split(scene, config)
-            unknown += unknown_types([scene], categories)
+    _check_options(form, {"assets": assets, "maps": maps, "from_controller": from_controller, "base": base})
+    path = Path(source)
+    match form:
+        case "procthor":
+            yield from read_procthor(path, split, assets)
+        case "ai2thor":
+            yield from read_controller(source.split(","), split) if from_controller else read_ai2thor(path, split)
+        case "scene-data":
+            yield from read_scene_data(path, split)
+        case "habitat":
+            yield from read_habitat(path, split, maps)
+        case "replacements":
+            if base is None:
+                raise InputError("--base: is missing; replacements need the scene file of their rooms")
+            yield from read_replacements(path, base)
+        case "scenes":
+            yield from iterate_scenes(path)
+
+
+def import_scenes(
+    scenes: Iterable[Scene | InputError],
+    source: str,
+    out: Path,
+    split: Split = "train",
+    val: tuple[str, ...] = (),
+    test: tuple[str, ...] = (),
+    categories: tuple[str, ...] | None = None,
+    report: Callable[[InputError], None] = print,
+) -> ImportSummary:
+    """Write usable scenes to a scene file.
+
+    Args:
+      scenes: see `read_format`.
+      source: what they were read from, for error messages.
+      out: scene file to write (`*.jsonl.gz`).
+      split: of the scenes whose names no pattern fits.
+      val, test: patterns of scene names, such as `FloorPlan_Train11_*`, of these splits.
+      categories: vocabulary that the types are compared with; None for that of the world that a scene stands for.
+      report: called with the reason why a scene is refused.
+
+    Raises:
+      InputError: no scene can be used, a pattern fits none, or the file cannot be written.
+    """
+    if not out.name.endswith(".jsonl.gz"):
+        raise InputError(f"{out}: give a name that ends in .jsonl.gz")
+    kept, refused, unknown = _usable(scenes, source, categories, report)
     if not kept:
-        raise InputError(f"{config.source}: none of its {refused} scenes can be used; mend what is said of them above")
-    for pattern in (*config.val, *config.test):
+        raise InputError(f"{source}: none of its {refused} scenes can be used; mend what is said of them above")
+    for pattern in (*val, *test):
         if not fnmatch.filter(kept, pattern):
             raise InputError(f"pattern {pattern!r}: fits no scene; there are {reprlib.repr(sorted(kept))}")
     try:
-        write_scenes(config.out, kept.values())
+        write_scenes(out, [_with_split(scene, {"val": val, "test": test}, split) for scene in kept.values()])
     except OSError as error:
-        raise InputError(f"{config.out}: cannot be written ({error.strerror}); give another name") from error
-    for name, count in unknown.most_common():
-        console.print(f"unknown type, only blocks the sight: {name} x {count}", markup=False, soft_wrap=True)
-    console.print(f"{len(kept)} scenes imported, {refused} refused; written to {config.out}", soft_wrap=True)
+        raise InputError(f"{out}: cannot be written ({error.strerror}); give another name") from error
+    return ImportSummary(len(kept), refused, unknown)
 
 
-def _read(config: ImportConfig) -> Imported:
-    path, split = Path(config.source), config.split
-    if config.from_controller:
-        return read_controller(config.source.split(","), split)
-    if config.format == "replacements":
-        if config.base is None:
-            raise InputError("--base: is missing; replacements need the scene file of their rooms")
-        return read_replacements(path, config.base)
-    readers: dict[str, Callable[[], Imported]] = {
-        "procthor": lambda: read_procthor(path, split, config.assets),
-        "ai2thor": lambda: read_ai2thor(path, split),
-        "scene-data": lambda: read_scene_data(path, split),
-        "habitat": lambda: read_habitat(path, split, config.maps),
-        "scenes": lambda: iterate_scenes(path),
-    }
-    return readers[config.format]()
+def _check_options(form: Format, options: dict[str, Path | bool | None]) -> None:
+    """Refuse options that are for another format."""
+    for option, usable in FORMAT_OPTIONS.items():
+        if options[option] and form != usable:
+            name = option.replace("_", "-")
+            raise InputError(f"--{name}: is for the format {usable}, not for {form}; leave it out")
 
 
-def _vocabulary(scene: Scene, config: ImportConfig) -> tuple[str, ...]:
-    world = config.world or USUAL_WORLDS.get(scene.world, "rooms")
-    return config.categories or WORLDS[world].task.categories
+def _usable(
+    scenes: Iterable[Scene | InputError],
+    source: str,
+    categories: tuple[str, ...] | None,
+    report: Callable[[InputError], None],
+) -> tuple[dict[str, Scene], int, Counter[str]]:
+    """Return usable scenes, the number of others, and unknown types."""
+    kept: dict[str, Scene] = {}
+    unknown: Counter[str] = Counter()
+    refused = 0
+    for scene in scenes:
+        try:
+            if isinstance(scene, InputError):
+                raise scene
+            vocabulary = categories or WORLDS[DEFAULT_WORLDS.get(scene.world, "rooms")].task.categories
+            _check(scene, kept, vocabulary, source)
+        except InputError as error:
+            refused += 1
+            report(error)
+        else:
+            kept[scene.name] = scene
+            unknown += unknown_types([scene], vocabulary)
+    return kept, refused, unknown
 
 
 def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> None:
+    """Refuse a scene without categories, or of an earlier name."""
     where = f"{source}, scene {scene.name!r}"
     if scene.name in kept:
         raise InputError(f"{where}: name is that of an earlier scene; import them to two files")
@@ -150,7 +179,7 @@ def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], so
         )
 
 
-def _with_split(scene: Scene, config: ImportConfig) -> Scene:
-    patterns: tuple[tuple[Split, tuple[str, ...]], ...] = (("val", config.val), ("test", config.test))
-    fits = [split for split, names in patterns if any(fnmatch.fnmatchcase(scene.name, name) for name in names)]
-    return dataclasses.replace(scene, split=fits[0] if fits else config.split)
+def _with_split(scene: Scene, patterns: dict[Split, tuple[str, ...]], default: Split) -> Scene:
+    """Set the first split with a pattern that fits."""
+    fits = (split for split, names in patterns.items() if any(fnmatch.fnmatchcase(scene.name, name) for name in names))
+    return dataclasses.replace(scene, split=next(fits, default))

@@ -1,4 +1,7 @@
-"""Checked access to the JSON of users' files: every error says where the value stands and how to mend it."""
+"""Checked access to the JSON of users' files.
+
+Every error says where the value is and how to mend it.
+"""
 
 import dataclasses
 import gzip
@@ -10,12 +13,12 @@ from typing import Any
 
 from jaxnav.errors import InputError
 
-_LIMIT = 1e6  # a number beyond it (metres, degrees) is a mistake
+_LIMIT = 1e6  # metres or degrees; a number beyond it is a mistake
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """A JSON object, and how errors name it.
+    """Hold a JSON object and its name in errors.
 
     Attributes:
       where: for example `rooms.jsonl.gz, line 3, scene 'FloorPlan1'`.
@@ -26,23 +29,23 @@ class Record:
     fields: dict[str, Any]
 
     def error(self, field: str, problem: str) -> InputError:
-        """An error about one field, to be raised."""
+        """Return an error about one field, to be raised."""
         return InputError(f"{self.where}: {field} {problem}")
 
     def get(self, field: str) -> Any:
-        """A required member."""
+        """Return a required member."""
         if field not in self.fields:
             raise self.error(field, "is missing; add it")
         return self.fields[field]
 
     def text(self, field: str, value: Any) -> str:
-        """`value`, if it is a text that is not empty."""
+        """Return a value that must be a text, not empty."""
         if not isinstance(value, str) or not value:
             raise self.error(field, f"is {reprlib.repr(value)}; give a text")
         return value
 
     def number(self, field: str, value: Any) -> float:
-        """`value` as a float, if it is a finite number."""
+        """Return a value that must be a finite number."""
         if value is None:
             raise self.error(field, "is null; give the number or leave the object out")
         if type(value) not in (int, float) or not abs(value) <= _LIMIT:  # also refuses NaN
@@ -50,26 +53,32 @@ class Record:
         return float(value)
 
     def sequence(self, field: str, value: Any, length: int | None = None) -> list[Any]:
-        """`value`, if it is a list (of `length`)."""
+        """Return a value that must be a list (of `length`)."""
         if not isinstance(value, list) or length not in (None, len(value)):
             expected = "a list" if length is None else f"a list of {length}"
             raise self.error(field, f"is {reprlib.repr(value)}; give {expected}")
         return value
 
     def record(self, field: str, value: Any) -> "Record":
-        """`value` as a record whose errors name `field` too, if it is an object."""
+        """Return an object as a record.
+
+        Its errors name `field` too.
+        """
         if not isinstance(value, dict):
             raise self.error(field, f"is {reprlib.repr(value)}; give an object")
         return Record(f"{self.where}: {field}", value)
 
     def vector(self, field: str, value: Any, names: str = "xyz") -> list[float]:
-        """The members `names` of an object of numbers such as {"x": 0, "y": 0, "z": 0}."""
+        """Return the numbers `names` of an object.
+
+        Such an object is {"x": 0, "y": 0, "z": 0}.
+        """
         inner = self.record(field, value)
         return [inner.number(name, inner.get(name)) for name in names]
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a file, decompressed if it is gzip.
+    """Read a file, and decompress it if it is gzip.
 
     Raises:
       InputError: the file is missing or damaged.
@@ -84,10 +93,10 @@ def read_bytes(path: Path) -> bytes:
 
 
 def parse_json(where: str, text: bytes) -> Any:
-    """JSON of some bytes.
+    """Parse JSON.
 
     Raises:
-      InputError: it is none.
+      InputError: the bytes are not JSON.
     """
     try:
         return json.loads(text.decode())

@@ -1,4 +1,4 @@
-"""Reading and writing scene files; `docs/scene_format.md` is the contract."""
+"""Reading and writing of scene files, see docs/scene_format.md."""
 
 import gzip
 import json
@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.record import Record, parse_json, read_bytes
+from jaxnav.scenes.files.walls import derive_walls
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.scene import CELL, SPLITS, Room, Scene
 from jaxnav.store.files import write_atomic
@@ -18,13 +19,11 @@ from jaxnav.store.files import write_atomic
 _POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
 _REQUIRED = ("type", *_POSITION, *_SIZE)
 _COLUMNS = (*_REQUIRED, "yaw", "parent")
-_SNAP = 0.02  # metres that an origin may be off the lattice
-_WALL_DISTANCE = 3  # cells
-_BOX_DISTANCE = 0.25 + 1e-9  # metres
+_SNAP = 0.02  # metres; an origin may be this far off the lattice
 
 
 def read_scenes(path: str | Path) -> list[Scene]:
-    """Reads a scene file.
+    """Read a scene file.
 
     Cells of `episode_starts` count as standable; `walls` are derived where the file has none (`derive_walls`). An
     object whose x, y and z are all null is left out, and what rests on it rests on nothing.
@@ -51,7 +50,10 @@ def read_scenes(path: str | Path) -> list[Scene]:
 
 
 def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
-    """The scenes of a file line by line, or why one cannot be used; see `read_scenes`.
+    """Read a scene file line by line; see `read_scenes`.
+
+    Yields:
+      A scene, or why it cannot be used.
 
     Raises:
       InputError: the file is missing or damaged.
@@ -71,38 +73,15 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
 
 
 def write_scenes(path: str | Path, scenes: Iterable[Scene]) -> None:
-    """Writes a scene file whole or not at all; equal scenes give equal bytes.
+    """Write a scene file, whole or not at all.
+
+    Equal scenes give equal bytes.
 
     Raises:
       ValueError: a number is NaN or infinite.
     """
     lines = [json.dumps(_fields(scene), allow_nan=False, separators=(",", ":")) + "\n" for scene in scenes]
     write_atomic(Path(path), gzip.compress("".join(lines).encode(), mtime=0))
-
-
-def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarray) -> np.ndarray:
-    """Walls of a scene without them: the cells that can be neither floor nor furniture.
-
-    Args:
-      reach: bool [nz, nx], standable cells.
-      origin: world (x, z) in metres of the centre of cell [0, 0].
-      boxes: float [N, 6], centre and full size of the objects in metres.
-
-    Returns:
-      bool [nz, nx], True where every standable cell is three or more cells away in x or in z, and every box more than
-      0.25 m (horizontally) from the cell's centre.
-    """
-    reachable = _WALL_DISTANCE - 1
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(reach, reachable), (2 * reachable + 1,) * 2)
-    walls = np.logical_not(windows.any(axis=(2, 3)))
-    x = origin[0] + CELL * np.arange(reach.shape[1])
-    z = origin[1] + CELL * np.arange(reach.shape[0])
-    for box in boxes:
-        dx = np.maximum(np.abs(x - box[0]) - box[3] / 2, 0.0)
-        dz = np.maximum(np.abs(z - box[2]) - box[5] / 2, 0.0)
-        near = np.ix_(dz <= _BOX_DISTANCE, dx <= _BOX_DISTANCE)
-        walls[near] &= np.hypot(dz[near[0]], dx[near[1]]) > _BOX_DISTANCE
-    return walls
 
 
 def _parse(path: Path, line: int, text: bytes) -> Record:
@@ -154,7 +133,7 @@ def _origin(record: Record) -> tuple[float, float]:
 
 
 def _mask(record: Record, field: str, shape: Sequence[int]) -> np.ndarray:
-    """Bool [nz, nx], True where the mask has '.'."""
+    """Read a mask, bool [nz, nx], True at '.'."""
     rows = record.sequence(field, record.get(field), shape[0])
     for i, row in enumerate(rows):
         if not isinstance(row, str) or len(row) != shape[1] or not set(row) <= {".", "#"}:

@@ -1,17 +1,18 @@
-"""Floor plans of homes: the partitions of an apartment, the rooms and doors of a house, the faces of their walls."""
+"""Floor plans of apartments and houses."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxnav.scenes.generate.furnish import FORWARD, RIGHT
+from jaxnav.scenes.generate.furnished_room import FORWARD, RIGHT
+from jaxnav.scenes.generate.rectangle import Rectangle
 from jaxnav.scenes.generate.room_shapes import Shape
 from jaxnav.scenes.generate.rooms import away_from_walls
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL
 
 APARTMENT = (17, 37)  # cells of floor within its outer walls, (nz, nx)
-APARTMENT_CELLS = (395, 445)  # that can be stood on without furniture
+APARTMENT_CELLS = (395, 445)  # standable cells without furniture
 PASSAGE = 4  # cells between a partition and the outer wall, if they do not touch
 
 ROOM_SIDE = 9  # cells, at least
@@ -25,41 +26,8 @@ BATHROOMS = {4: 1, 5: 1, 6: 2, 7: 2, 8: 2, 10: 3}
 LIVING_ROOMS = {4: 1, 5: 1, 6: 1, 7: 2, 8: 2, 10: 2}
 
 
-class Rectangle(NamedTuple):
-    """Cells [z0, z1) x [x0, x1)."""
-
-    z0: int
-    x0: int
-    z1: int
-    x1: int
-
-    @property
-    def cells(self) -> tuple[slice, slice]:
-        """As an index into an array [nz, nx]."""
-        return slice(self.z0, self.z1), slice(self.x0, self.x1)
-
-    @property
-    def area(self) -> int:
-        """Number of cells."""
-        return (self.z1 - self.z0) * (self.x1 - self.x0)
-
-    @property
-    def around(self) -> "Rectangle":
-        """With the ring of cells around it."""
-        return Rectangle(self.z0 - 1, self.x0 - 1, self.z1 + 1, self.x1 + 1)
-
-    def within(self, other: "Rectangle") -> bool:
-        """Whether all its cells belong to the other one."""
-        return other.z0 <= self.z0 and self.z1 <= other.z1 and other.x0 <= self.x0 and self.x1 <= other.x1
-
-    def box(self, frame: "Rectangle", height: float) -> np.ndarray:
-        """Low and high corners (x, y, z) [2, 3] in metres from the low corner of `frame`, cut to `frame`."""
-        z, x = np.clip([self.z0, self.z1], frame.z0, frame.z1), np.clip([self.x0, self.x1], frame.x0, frame.x1)
-        return np.stack([CELL * (x - frame.x0), np.array([0.0, height]), CELL * (z - frame.z0)], axis=-1)
-
-
 class FloorPlan(NamedTuple):
-    """Walls and rooms of a home.
+    """Hold the walls and rooms of a home.
 
     Attributes:
       walls: bool [nz, nx], with a ring of walls around.
@@ -77,9 +45,13 @@ class FloorPlan(NamedTuple):
 
 
 def room_shape(walls: np.ndarray) -> Shape:
-    """The shape of a rectangular room from its walls, bool [nz, nx], with the ring of cells around it.
+    """Return the shape of a rectangular room.
 
-    A cell of the ring that is no wall is a door: there is no wall to put anything at. Partitions have two faces.
+    A partition in the room is a wall with two faces. At a door there is no wall to put anything at.
+
+    Args:
+      walls: bool [nz, nx], of the room and of the ring of cells around it; a cell of the ring that is no wall is a
+        door.
     """
     floor = ~walls[1:-1, 1:-1]
     nz, nx = floor.shape
@@ -98,7 +70,10 @@ def room_shape(walls: np.ndarray) -> Shape:
 
 
 def apartment_plan(rng: np.random.Generator) -> FloorPlan:
-    """One open space with partitions: straight, L-shaped, U-shaped or nearly closed ones."""
+    """Draw the plan of an apartment.
+
+    It is one open space with straight, L-shaped, U-shaped or nearly closed partitions.
+    """
     nz, nx = APARTMENT
     while True:
         middle = int(rng.integers(nx // 3, 2 * nx // 3))
@@ -115,7 +90,10 @@ def apartment_plan(rng: np.random.Generator) -> FloorPlan:
 
 
 def _partition(low: int, high: int, rng: np.random.Generator) -> list[Rectangle]:
-    """Some sides of a rectangle between the columns `low` and `high` of the floor; one may go on to the outer wall."""
+    """Draw some sides of a rectangle as walls.
+
+    It lies between the columns `low` and `high` of the floor; one side may go on to the outer wall.
+    """
     nz, nx = APARTMENT
     first, last = low + 1 + (PASSAGE if low == 0 else 1), high + 1 - (PASSAGE if high == nx else 1)
     width = int(rng.integers(6, min(18, last - first) + 1))
@@ -140,7 +118,10 @@ def _partition(low: int, high: int, rng: np.random.Generator) -> list[Rectangle]
 
 
 def house_plan(rng: np.random.Generator) -> FloorPlan:
-    """Rectangular rooms, half of the time along a corridor, and doors that lead into every one of them."""
+    """Draw the plan of a house.
+
+    It has rectangular rooms, half of the time along a corridor, and doors that connect all of them.
+    """
     while True:
         number = int(rng.choice(list(ROOM_COUNTS), p=list(ROOM_COUNTS.values())))
         median, spread = ROOM_CELLS
@@ -164,7 +145,7 @@ def house_plan(rng: np.random.Generator) -> FloorPlan:
 
 
 def _corridor(nz: int, nx: int, rng: np.random.Generator) -> tuple[list[Rectangle], list[Rectangle]]:
-    """A corridor through the length of the house, and the floor on its two sides."""
+    """Draw a corridor, and return it and its two sides."""
     width = int(rng.choice(CORRIDOR_WIDTHS))
     breadth = min(nz, nx)
     low = 1 + int(np.round((breadth - width) * rng.uniform(0.4, 0.6)))
@@ -177,29 +158,39 @@ def _corridor(nz: int, nx: int, rng: np.random.Generator) -> tuple[list[Rectangl
 
 
 def _divided(parts: list[Rectangle], number: int, rng: np.random.Generator) -> list[Rectangle] | None:
-    """Divides the largest part across until there are `number`; None if a room would be too narrow."""
+    """Divide the largest part until there are `number` parts.
+
+    Returns:
+      The parts, or None if a room would be too narrow.
+    """
     parts = list(parts)
     while len(parts) < number:
         z0, x0, z1, x1 = parts.pop(int(np.argmax([part.area for part in parts])))
         length = max(z1 - z0, x1 - x0)
-        cut = int(np.round(length * rng.uniform(0.36, 0.64)))
+        first = int(np.round(length * rng.uniform(0.36, 0.64)))
         if z1 - z0 >= x1 - x0:
-            parts += [Rectangle(z0, x0, z0 + cut, x1), Rectangle(z0 + cut + 1, x0, z1, x1)]
+            parts += [Rectangle(z0, x0, z0 + first, x1), Rectangle(z0 + first + 1, x0, z1, x1)]
         else:
-            parts += [Rectangle(z0, x0, z1, x0 + cut), Rectangle(z0, x0 + cut + 1, z1, x1)]
+            parts += [Rectangle(z0, x0, z1, x0 + first), Rectangle(z0, x0 + first + 1, z1, x1)]
     sides = [side for z0, x0, z1, x1 in parts for side in (z1 - z0, x1 - x0)]
     return parts if min(sides) >= ROOM_SIDE else None
 
 
 def _room_types(number: int, rng: np.random.Generator) -> list[str]:
-    """Types of rooms from the largest to the smallest."""
+    """Draw room types, from the largest room to the smallest."""
     living, baths = LIVING_ROOMS[number], BATHROOMS[number]
     between = ["kitchen"] + ["bedroom"] * (number - living - baths - 1)
     return ["living_room"] * living + [str(name) for name in rng.permutation(between)] + ["bathroom"] * baths
 
 
 def _doors(rooms: list[Rectangle], types: list[str], rng: np.random.Generator) -> list[Rectangle] | None:
-    """Doors that connect all rooms, by way of corridors and living rooms rather than bathrooms, and some more."""
+    """Draw doors that connect all rooms, and some more.
+
+    Connections by way of corridors and living rooms are preferred to those by way of bathrooms.
+
+    Returns:
+      The doors, or None if they cannot connect all rooms.
+    """
     rank = {"corridor": 0, "living_room": 1, "kitchen": 2, "bedroom": 3, "bathroom": 8}
     pairs = [(a, b) for b in range(len(rooms)) for a in range(b) if _shared_wall(rooms[a], rooms[b])]
     pairs.sort(key=lambda pair: rank[types[pair[0]]] + rank[types[pair[1]]] + rng.random())
@@ -222,7 +213,11 @@ def _doors(rooms: list[Rectangle], types: list[str], rng: np.random.Generator) -
 
 
 def _shared_wall(a: Rectangle, b: Rectangle) -> Rectangle | None:
-    """Where a door between two rooms can be: their common wall without a cell at each end; None if it is too short."""
+    """Return where a door between two rooms can be.
+
+    Returns:
+      Their common wall without a cell at each end, or None if it is too short.
+    """
     z0, x0, z1, x1 = max(a.z0, b.z0) + 1, max(a.x0, b.x0) + 1, min(a.z1, b.z1) - 1, min(a.x1, b.x1) - 1
     if z1 - z0 >= DOOR_WIDTHS[0] and max(a.x0, b.x0) - min(a.x1, b.x1) == 1:
         return Rectangle(z0, min(a.x1, b.x1), z1, max(a.x0, b.x0))

@@ -1,4 +1,4 @@
-"""The dial of single rooms and of scene files: categories of like size exchange their labels, and nothing moves."""
+"""The layout shift of single rooms and of scene files."""
 
 import dataclasses
 import zlib
@@ -11,16 +11,17 @@ from jaxnav.scenes.scene import Scene
 
 
 def relabel(scene: Scene, categories: tuple[str, ...], shift: float, seed: int) -> Scene:
-    """Exchanges the labels of categories of like size: all objects of one become objects of another.
+    """Exchange the labels of categories of similar size.
 
-    The categories present, ordered by the mean volume of their boxes, fall into pairs of neighbours; if their number is
-    odd, the three largest are one group. In a random order of these groups, the first `shift` of them, rounded, and at
-    least one, exchange: each category of a group becomes the next larger one, and the largest the smallest. Boxes stay,
-    and with them what hides what, how far an object is detected, and how far from any start there is something to find.
+    All objects of one category become objects of another. The categories present, ordered by the mean volume of their
+    boxes, form pairs of neighbours; if their number is odd, the three largest form one group. In a random order of the
+    groups, the first `shift` of them, rounded, and at least one, exchange: each category of a group becomes the next
+    larger one, and the largest the smallest. Boxes stay, and with them occlusion, the ranges of detection, and the
+    distances from any start to the nearest objects.
 
     Args:
-      scene: any.
-      categories: [K] the vocabulary; objects of other types keep them.
+      scene: the scene.
+      categories: [K] the vocabulary; objects of other types keep their types.
       shift: share of the groups, from 0 to 1.
       seed: at least 0; with the scene's name it fixes the order of the groups.
 
@@ -44,11 +45,13 @@ def relabel(scene: Scene, categories: tuple[str, ...], shift: float, seed: int) 
 
 
 def _like_sized(ids: np.ndarray, volumes: np.ndarray) -> list[list[int]]:
-    """The categories present, two by two from the smallest; the last three together if their number is odd.
+    """Group the categories present by size.
+
+    Two by two from the smallest; the last three together if their number is odd.
 
     Args:
-      ids: int [N] category of each object, -1 for none.
-      volumes: float [N] of the objects' boxes.
+      ids: int [N], category of each object, -1 for none.
+      volumes: float [N], of the objects' boxes.
     """
     present = sorted(set(ids.tolist()) - {-1})
     ordered = sorted(present, key=lambda k: volumes[ids == k].mean())  # ties in the order of the vocabulary

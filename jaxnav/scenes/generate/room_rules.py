@@ -1,4 +1,4 @@
-"""What stands in a room and where it is put: the measured statistics of `rooms.yaml` as typed values."""
+"""Statistics of rooms: what stands there, and where."""
 
 import dataclasses
 import functools
@@ -13,12 +13,14 @@ FURNITURE_GAP = 0.01  # between a piece of furniture and its wall, metres
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """Where objects of a type are put; it says nothing of the object, so that types can exchange their rules.
+    """Describe where objects of a type are put.
+
+    It does not depend on the object, so that types can exchange their rules.
 
     Attributes:
       at: weight of each place: `wall`, `corner`, `middle`, or one of `on`, `in` (let into its surface), `above`,
         `beside`, `before`, `around` and a type. Places of types that the room does not have are left out.
-      near: probability that the spot nearest to an object of a type is taken of those drawn; the rest takes any.
+      near: probability, by type, that of the drawn spots the nearest to an object of that type is taken; else any is.
       bottom: height of the underside in metres, of what is not `on` or `in` another object.
       gap: distance to what it is `beside`, `before` or `around`, metres.
     """
@@ -31,7 +33,7 @@ class Rule:
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """What there is of a type in a room.
+    """Describe the objects of a type in a room.
 
     Attributes:
       size: width, height and depth in metres; the depth is along where it faces.
@@ -56,7 +58,7 @@ class Item:
 
 @dataclasses.dataclass(frozen=True)
 class RoomStatistics:
-    """The layout statistics of one room type.
+    """Hold the statistics of one room type.
 
     Attributes:
       cells: minimum, quartiles and maximum of the number of standable cells, which is drawn from them.
@@ -77,11 +79,11 @@ class RoomStatistics:
 
 @dataclasses.dataclass(frozen=True)
 class HomeStatistics:
-    """What stands in the rooms of a home.
+    """Hold the statistics of the rooms of a home.
 
     Attributes:
       rooms: by room type, what stands there by type, in the order in which it is put.
-      exchange: groups of types of like size and footing that exchange their rules, room included, under a shift.
+      exchange: groups of types of similar size and support that exchange their rules, room included, under a shift.
     """
 
     rooms: Mapping[str, Mapping[str, Item]]
@@ -90,7 +92,7 @@ class HomeStatistics:
 
 @functools.cache
 def room_statistics() -> dict[str, RoomStatistics]:
-    """The statistics of `rooms.yaml` by room type."""
+    """Read the statistics of `rooms.yaml` by room type."""
     return {
         room_type: RoomStatistics(**{**entry, "items": _items(entry["items"])})
         for room_type, entry in _read("rooms.yaml").items()
@@ -99,7 +101,7 @@ def room_statistics() -> dict[str, RoomStatistics]:
 
 @functools.cache
 def home_statistics(world: str) -> HomeStatistics:
-    """The statistics of the world's file, `apartments.yaml` or `houses.yaml`."""
+    """Read the statistics of `apartments.yaml` or `houses.yaml`."""
     raw = _read(f"{world}.yaml")
     return HomeStatistics({room_type: _items(items) for room_type, items in raw["rooms"].items()}, raw["exchange"])
 

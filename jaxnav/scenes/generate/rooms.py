@@ -1,4 +1,4 @@
-"""A procedural world of single rooms whose layouts follow the measured statistics of AI2-THOR."""
+"""Procedural single rooms by the measured statistics of AI2-THOR."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,8 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
-from jaxnav.scenes.generate.furnish import Furnishing, draw_contents, furnish
+from jaxnav.scenes.generate.furnish import draw_contents, furnish
+from jaxnav.scenes.generate.furnished_room import FurnishedRoom
 from jaxnav.scenes.generate.relabel import relabel
 from jaxnav.scenes.generate.room_rules import room_statistics
 from jaxnav.scenes.generate.room_shapes import draw_shape, wall_mask
@@ -16,10 +17,10 @@ from jaxnav.scenes.scene import CELL, SPLITS, Scene
 
 AGENT_RADIUS = 0.2  # metres
 OBSTACLE_HEIGHTS = (0.1, 1.7)  # boxes that reach into this range are in the agent's way, metres
-FIND_DISTANCE = 1.2  # from every target to the nearest standable cell at most, metres
+FIND_DISTANCE = 1.2  # from every target to the nearest standable cell, at most, metres
 CELLS_TOLERANCE = 0.15  # of the number of standable cells that was drawn for a room
-CONNECTED_SHARE = 0.9  # of the cells that are free must be connected
-ATTEMPTS = 40  # at a room of the drawn size
+CONNECTED_SHARE = 0.9  # of the free cells must be connected
+ATTEMPTS = 40  # to furnish a room with the drawn contents
 
 TARGETS = frozenset(ITHOR_CATEGORIES)
 
@@ -27,7 +28,9 @@ TARGETS = frozenset(ITHOR_CATEGORIES)
 def generate_rooms(
     num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0, shift: float = 0.0
 ) -> list[Scene]:
-    """Generates single rooms; a scene depends on the seed, its split, its index and the shift alone.
+    """Generate single rooms.
+
+    A scene depends on the seed, its split, its index and the shift alone.
 
     Args:
       num_train: number of training scenes, at least 0; room types take turns.
@@ -53,7 +56,9 @@ def generate_rooms(
 
 
 def generate_room_at(split: str, index: int, seed: int, shift: float = 0.0) -> Scene:
-    """The scene of `generate_rooms` with the given split and index, from 0; room types take turns.
+    """Generate the scene of one split and index.
+
+    It is that of `generate_rooms`; indices begin at 0, and room types take turns.
 
     Raises:
       InputError: unknown split, negative index or seed, or a shift that is not in [0, 1].
@@ -67,50 +72,63 @@ def generate_room_at(split: str, index: int, seed: int, shift: float = 0.0) -> S
 
 
 class DrawnRoom(NamedTuple):
-    """A furnished room and its standable cells, bool [nz, nx]."""
+    """Hold a furnished room.
 
-    furniture: Furnishing
+    Attributes:
+      furniture: the room.
+      reach: bool [nz, nx], its standable cells.
+    """
+
+    furniture: FurnishedRoom
     reach: np.ndarray
 
 
 def _draw_room(room_type: str, rng: np.random.Generator) -> DrawnRoom:
-    """Draws rooms of the given type until one can be walked through and everything in it can be found."""
+    """Draw a room of a type.
+
+    It can be walked through, and a standable cell is near every target.
+    """
     statistics = room_statistics()[room_type]
     while True:
         # Between the measured quartiles the logarithm of the number of cells is uniform.
         cells = np.exp(np.interp(rng.random(), np.linspace(0.0, 1.0, 5), np.log(statistics.cells)))
         contents = draw_contents(statistics.items, rng)
-        size = cells  # what the room is laid out for: corrected by what its furniture leaves
+        size = cells  # that the room is drawn for: corrected by how many the furniture leaves
         for _ in range(ATTEMPTS):
             notched = rng.random() < statistics.l_shape
             shape = draw_shape(size, statistics.fill, statistics.margin, statistics.aspect, notched, rng)
-            room = furnish(Furnishing(shape), statistics.items, contents, rng)
+            room = furnish(FurnishedRoom(shape), statistics.items, contents, rng)
             if room is None:
                 size *= 1.05
                 continue
             reach, whole = _standable(room)
             ratio = reach.sum() / cells
-            if abs(ratio - 1.0) < CELLS_TOLERANCE and whole and _everything_found(reach, room):
+            if abs(ratio - 1.0) < CELLS_TOLERANCE and whole and _all_near(reach, room):
                 return DrawnRoom(room, reach)
             size *= np.clip(ratio, 0.7, 1.4) ** -0.7
 
 
-def _standable(room: Furnishing) -> tuple[np.ndarray, bool]:
-    """The standable cells, bool [nz, nx], and whether they are nearly all that is free."""
+def _standable(room: FurnishedRoom) -> tuple[np.ndarray, bool]:
+    """Return the standable cells, bool [nz, nx].
+
+    Also return whether they are nearly all free cells.
+    """
     free = free_cells(wall_mask(room.shape), room.boxes)
     reach = connected(free)
     return reach, bool(reach.sum() >= CONNECTED_SHARE * free.sum())
 
 
 def connected(free: np.ndarray) -> np.ndarray:
-    """The largest connected part of the free cells, bool [nz, nx]."""
+    """Return the largest connected part of cells, bool [nz, nx]."""
     reach = np.zeros_like(free)
     reach[tuple(standable_cells(free).T)] = True
     return reach
 
 
 def free_cells(walls: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Cells with room for a disc of the agent's radius.
+    """Return the cells where the agent can stand.
+
+    There is room for a disc of its radius.
 
     Args:
       walls: bool [nz, nx].
@@ -123,14 +141,25 @@ def free_cells(walls: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 
 def away_from_walls(walls: np.ndarray) -> np.ndarray:
-    """Cells that are far enough from every wall, bool [nz, nx]; outside there are walls."""
+    """Return the cells far enough from walls, bool [nz, nx].
+
+    Everything outside is wall.
+    """
     # Cell centres are 0.125 m from a neighbouring wall, 0.177 m from a diagonal one and 0.375 m from the next.
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(walls, 1, constant_values=True), (3, 3))
     return np.logical_not(windows.any(axis=(2, 3)))
 
 
 def away_from_boxes(free: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Those of the cells `free` [nz, nx] that are far enough from every box as well."""
+    """Return the free cells far enough from boxes.
+
+    Args:
+      free: bool [nz, nx].
+      boxes: float64 [N, 2, 3], see `free_cells`.
+
+    Returns:
+      bool [nz, nx].
+    """
     free = free.copy()
     iz, ix = np.nonzero(free)
     centres = CELL * (np.stack([ix, iz], axis=-1) - 0.5)
@@ -141,8 +170,8 @@ def away_from_boxes(free: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return free
 
 
-def _everything_found(reach: np.ndarray, room: Furnishing) -> bool:
-    """Whether a standable cell is near enough to the centre of every target."""
+def _all_near(reach: np.ndarray, room: FurnishedRoom) -> bool:
+    """Return whether a standable cell is near every target."""
     targets = room.boxes[[name in TARGETS for name in room.types]].mean(axis=1)[:, [0, 2]]
     centres = CELL * (np.argwhere(reach)[:, ::-1] - 0.5)
     distances = np.linalg.norm(targets[:, None] - centres, axis=-1)
@@ -150,9 +179,12 @@ def _everything_found(reach: np.ndarray, room: Furnishing) -> bool:
 
 
 def make_scene(
-    name: str, world: str, room_type: str, split: str, walls: np.ndarray, reach: np.ndarray, furniture: Furnishing
+    name: str, world: str, room_type: str, split: str, walls: np.ndarray, reach: np.ndarray, furniture: FurnishedRoom
 ) -> Scene:
-    """The scene of a furnished room, with the world's origin at a cell in its middle."""
+    """Build the scene of a furnished room.
+
+    The world's origin is at a cell in its middle.
+    """
     nz, nx = walls.shape
     origin = (-CELL * (nx // 2), -CELL * (nz // 2))
     low, high = furniture.boxes[:, 0], furniture.boxes[:, 1]

@@ -1,8 +1,9 @@
-"""The dial of homes: with some probability an object is placed by the rule of another type.
+"""The layout shift of homes.
 
-Types of like size and footing exchange their rules by a fixed derangement: each takes the rule of the next of its
-group, the last that of the first. A scene is first furnished by the types' own rules; then the very same objects are
-placed anew, so that a shift changes neither what there is nor how large it is, but only what stands near what.
+With some probability an object is placed by the rule of another type. Types of similar size and support exchange their
+rules by a fixed derangement: each takes the rule of the next of its group, the last that of the first. A scene is first
+furnished without a shift; then the same objects are placed again. So a shift changes neither the objects nor their
+sizes, but only what stands near what.
 """
 
 import copy
@@ -13,15 +14,20 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.generate.furnish import Furnishing, Placed, put
+from jaxnav.scenes.generate.furnish import put
+from jaxnav.scenes.generate.furnished_room import FurnishedRoom, Placed
 from jaxnav.scenes.generate.room_rules import Item, Rule
 from jaxnav.scenes.scene import SPLITS
 
-ATTEMPTS = 20  # at a room with the objects that it was given
+ATTEMPTS = 20  # to place the objects of a room
 
 
 def check_scene_arguments(function: str, split: str, index: int, seed: int, shift: float) -> None:
-    """Refuses what no scene can be generated from with an `InputError`."""
+    """Check the arguments of a generator.
+
+    Raises:
+      InputError: unknown split, negative index or seed, or a shift that is not in [0, 1].
+    """
     if split not in SPLITS:
         raise InputError(f"{function}: split is {split!r}; choose one of {', '.join(SPLITS)}")
     for name, number in {"index": index, "seed": seed}.items():
@@ -32,7 +38,9 @@ def check_scene_arguments(function: str, split: str, index: int, seed: int, shif
 
 
 def derangement(groups: Iterable[Sequence[str]]) -> dict[str, str]:
-    """The type whose rule each type takes: the next of its group, cyclically.
+    """Return the type whose rule each type takes.
+
+    It is the next of its group, cyclically.
 
     Raises:
       InputError: a group has fewer than two types, or a type is listed twice.
@@ -49,12 +57,12 @@ def derangement(groups: Iterable[Sequence[str]]) -> dict[str, str]:
 
 
 class Move(NamedTuple):
-    """An object that is to be placed anew.
+    """Describe an object to be placed again.
 
     Attributes:
       object: what it is, with the rule that it was placed by.
       owner: the type whose rule it takes.
-      room: the room that it was in, then the one that it is meant for.
+      room: index of the room to place it in.
     """
 
     object: Placed
@@ -62,18 +70,19 @@ class Move(NamedTuple):
     room: int
 
 
-def place_anew(
-    bare: Sequence[Furnishing],
+def shift_objects(
+    bare: Sequence[FurnishedRoom],
     rules: Sequence[Mapping[str, Item]],
-    before: Sequence[Furnishing],
+    before: Sequence[FurnishedRoom],
     partners: Mapping[str, str],
     shift: float,
     rng: np.random.Generator,
-) -> list[Furnishing] | None:
-    """Places the objects of a furnished home anew, each by its own rule or with probability `shift` by its partner's.
+) -> list[FurnishedRoom] | None:
+    """Place the objects of a furnished home again.
 
-    The rule of a type includes its room. Where a rule has no place in the room, for its support is elsewhere, the
-    object goes to another support, a wall or the middle of the room, and failing that to another room.
+    Each is placed by the rule of its type or, with probability `shift`, by that of its partner. The rule of a type
+    includes its room. Where a rule has no place in the room, because its support is elsewhere, the object goes to
+    another support, a wall or the middle of the room, and failing that to another room.
 
     Args:
       bare: the rooms without furniture.
@@ -84,46 +93,63 @@ def place_anew(
       rng: source of randomness.
 
     Returns:
-      The rooms with the same objects of the same sizes; None if one of them found no place.
+      The rooms with the same objects of the same sizes, or None if one of them has no place.
     """
     rooms = [copy.deepcopy(room) for room in bare]
     moves = [Move(placed, placed.name, k) for k, room in enumerate(before) for placed in room.placed]
     exchanged = rng.random(len(moves)) < shift
     moves = [
-        _meant_for(move, partners[move.object.name], rules, rng) if swaps and move.object.name in partners else move
+        _draw_room(move, partners[move.object.name], rules, rng) if swaps and move.object.name in partners else move
         for move, swaps in zip(moves, exchanged, strict=True)
     ]
     rank = [{name: i for i, name in enumerate(items)} for items in rules]
-    # What others are put on or near comes early, by whatever rule it is put itself.
+    # What others are put on or near comes early, whichever rule it is put by.
     moves.sort(key=lambda move: min(rank[move.room].get(name, np.inf) for name in (move.owner, move.object.name)))
     return rooms if all(_place(rooms, rules, move, rng) for move in moves) else None
 
 
-def place_again(bare: Furnishing, placed: Sequence[Placed], rng: np.random.Generator) -> Furnishing | None:
-    """Places objects of one room anew by the rules that they were placed by; None if one of them finds no place."""
-    room = copy.deepcopy(bare)
-    return room if all(put(room, name, item, size, rng) for name, item, size in placed) else None
-
-
 def settle(
-    bare: Sequence[Furnishing],
-    rooms: Sequence[Furnishing],
-    sound: Callable[[int, Furnishing], bool],
+    bare: Sequence[FurnishedRoom],
+    rooms: Sequence[FurnishedRoom],
+    usable: Callable[[int, FurnishedRoom], bool],
     rng: np.random.Generator,
-) -> list[Furnishing] | None:
-    """Places the objects of each room again until it is `sound` (its index, the room); None if one room never is."""
+) -> list[FurnishedRoom] | None:
+    """Place the objects of unusable rooms again.
+
+    Args:
+      bare: the rooms without furniture.
+      rooms: the same rooms, furnished.
+      usable: whether a room (its index, the room) can stay as it is.
+      rng: source of randomness.
+
+    Returns:
+      The rooms, or None if one of them does not become usable.
+    """
     settled = []
     for k, room in enumerate(rooms):
-        tries = (place_again(bare[k], room.placed, rng) for _ in range(ATTEMPTS))
-        good = room if sound(k, room) else next((again for again in tries if again and sound(k, again)), None)
+        tries = (_place_again(bare[k], room.placed, rng) for _ in range(ATTEMPTS))
+        good = room if usable(k, room) else next((again for again in tries if again and usable(k, again)), None)
         if good is None:
             return None
         settled.append(good)
     return settled
 
 
-def _meant_for(move: Move, owner: str, rules: Sequence[Mapping[str, Item]], rng: np.random.Generator) -> Move:
-    """The move into a room that has the rule of `owner`, likelier where there are more of its objects."""
+def _place_again(bare: FurnishedRoom, placed: Sequence[Placed], rng: np.random.Generator) -> FurnishedRoom | None:
+    """Place the objects of a room by the same rules.
+
+    Returns:
+      The room, or None if one of them has no place.
+    """
+    room = copy.deepcopy(bare)
+    return room if all(put(room, name, item, size, rng) for name, item, size in placed) else None
+
+
+def _draw_room(move: Move, owner: str, rules: Sequence[Mapping[str, Item]], rng: np.random.Generator) -> Move:
+    """Draw the room for an object that takes another rule.
+
+    Rooms with more objects of the type `owner` are likelier.
+    """
     usual = np.array([_expected(items[owner]) if owner in items else 0.0 for items in rules])
     if not usual.any():  # no room of such a type: any will do
         usual += 1.0
@@ -135,24 +161,33 @@ def _expected(item: Item) -> float:
 
 
 def _place(
-    rooms: Sequence[Furnishing], rules: Sequence[Mapping[str, Item]], move: Move, rng: np.random.Generator
+    rooms: Sequence[FurnishedRoom], rules: Sequence[Mapping[str, Item]], move: Move, rng: np.random.Generator
 ) -> bool:
-    """Puts the object of one move into the room that it is meant for, or else into another, where it is strange."""
+    """Put an object into its room, or else into another.
+
+    Of the other rooms those with the rule of `owner` come first, and then those that do not have the object's type.
+
+    Returns:
+      Whether there is a place for it.
+    """
     (name, item, size), owner = move.object, move.owner
     order = [int(k) for k in rng.permutation(len(rooms))]
     order.sort(key=lambda k: (k != move.room, owner not in rules[k], name in rules[k]))
     for k in order:
-        at_home = [rules[k][owner].rule] if owner in rules[k] else []
-        for rule in (*at_home, _elsewhere(rooms[k], rules, item.rule)):
+        usual = [rules[k][owner].rule] if owner in rules[k] else []
+        for rule in (*usual, _elsewhere(rooms[k], rules, item.rule)):
             if put(rooms[k], name, dataclasses.replace(item, rule=rule), size, rng):
                 return True
     return False
 
 
-def _elsewhere(room: Furnishing, rules: Sequence[Mapping[str, Item]], own: Rule) -> Rule:
-    """Any support that the own rule does not name, if there is one, or the floor for what stands on it."""
-    if not any(place.startswith("on ") for place in own.at):
-        return Rule({"wall": 1.0, "middle": 0.2}, bottom=own.bottom)
+def _elsewhere(room: FurnishedRoom, rules: Sequence[Mapping[str, Item]], usual: Rule) -> Rule:
+    """Return a rule for unusual places.
+
+    They are the supports that the usual rule does not name, or the floor for objects that stand on it.
+    """
+    if not any(place.startswith("on ") for place in usual.at):
+        return Rule({"wall": 1.0, "middle": 0.2}, bottom=usual.bottom)
     named = {place for items in rules for item in items.values() for place in item.rule.at if place.startswith("on ")}
-    supports = [place for place in sorted(named - set(own.at)) if place[3:] in room.types]
-    return Rule(dict.fromkeys(supports, 1.0), bottom=own.bottom)
+    supports = [place for place in sorted(named - set(usual.at)) if place[3:] in room.types]
+    return Rule(dict.fromkeys(supports, 1.0), bottom=usual.bottom)

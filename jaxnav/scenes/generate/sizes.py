@@ -1,4 +1,4 @@
-"""Typical sizes of objects, for files that leave them out."""
+"""Typical sizes of objects, for files without sizes."""
 
 import functools
 import pathlib
@@ -7,12 +7,16 @@ import yaml
 
 from jaxnav.scenes.categories import ALIASES
 
-#: Width, height, depth and height of the centre in metres of a type that nothing is known of.
+#: Width, height, depth and height of the centre in metres of an unknown type.
 UNKNOWN = (0.3, 0.3, 0.3, 0.8)
 
 
 def typical_box(name: str) -> tuple[float, float, float, float]:
-    """Width, height and depth of a type, and the height of its centre above the floor, in metres (`sizes.yaml`)."""
+    """Return the typical size of a type, from `sizes.yaml`.
+
+    Returns:
+      Width, height and depth, and the height of the centre above the floor, metres.
+    """
     sizes = _sizes()
     return sizes.get(name) or sizes.get(ALIASES.get(name, name), UNKNOWN)
 

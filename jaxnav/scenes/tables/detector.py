@@ -1,4 +1,4 @@
-"""The simulated object detector: how far it sees, and errors that are frozen per pose."""
+"""The simulated object detector, with errors fixed per pose."""
 
 import dataclasses
 import zlib
@@ -14,12 +14,12 @@ SMALLEST_APPARENT_SIZE = 0.12  # about 15 pixels of a 300 x 300 picture with a f
 
 @dataclasses.dataclass(frozen=True)
 class Detector:
-    """Error rates of the detector, each in [0, 1].
+    """Describe a detector by error rates in [0, 1].
 
     Attributes:
       miss_near: probability of missing an object right in front.
       miss_far: probability of missing an object at the end of its range.
-      false_alarm: probability per pose and undetected category of reporting it all the same.
+      false_alarm: probability per pose and undetected category of reporting it anyway.
       seed: draws the errors, together with the scene's name.
     """
 
@@ -38,12 +38,12 @@ class Detector:
         distance: np.ndarray,
         size: np.ndarray,
     ) -> np.ndarray:
-        """Detections of one scene with the detector's errors.
+        """Return the detections of one scene, with errors.
 
         Args:
           name: the scene's name; its errors do not depend on the other scenes of a bank.
           half_view: tangent of half the horizontal field of view.
-          seen: bool [P, K], whether a category is detected by a detector without errors.
+          seen: bool [P, K], whether a detector without errors detects a category.
           ahead, right, distance, size: float [P, K], metres, of the nearest detected object.
 
         Returns:
@@ -65,26 +65,40 @@ class Detector:
         apparent = np.where(alarm, ALARM_SIZE, size) / np.maximum(np.hypot(ahead, right), 0.25)
 
         reported = (seen & ~missed) | alarm
-        channels = (
-            np.maximum(np.rint(255.0 * np.clip(confidence, 0.0, 1.0)), 1.0),
-            np.rint(AHEAD_SCALE * ahead),
-            128.0 + np.rint(RIGHT_SCALE * right),
-            np.rint(SIZE_SCALE * apparent),
-        )
-        packed = np.clip(np.stack(channels, axis=-1), 0.0, 255.0)
-        return np.where(reported[..., None], packed, 0.0).astype(np.uint8)
+        return np.where(reported[..., None], _bytes(confidence, ahead, right, apparent), 0.0).astype(np.uint8)
 
 
-#: A detector that never errs.
+#: A detector without errors.
 PERFECT = Detector(miss_near=0.0, miss_far=0.0, false_alarm=0.0)
 
 
 def object_size(boxes: np.ndarray) -> np.ndarray:
-    """Size in metres of boxes [N, 6]: root of the product of the two largest sides, float64 [N]."""
+    """Return the size of boxes [N, 6], float64 [N], metres.
+
+    It is the root of the product of the two largest sides.
+    """
     sides = np.sort(boxes[:, 3:], axis=1)
     return np.sqrt(sides[:, 1] * sides[:, 2])
 
 
 def detection_range(size: np.ndarray | float) -> np.ndarray:
-    """Greatest distance in metres at which objects of a size in metres are detected."""
+    """Return the greatest distance at which objects are detected.
+
+    Args:
+      size: of the objects, metres, see `object_size`.
+
+    Returns:
+      Of the shape of `size`, metres.
+    """
     return np.clip(size / SMALLEST_APPARENT_SIZE, MIN_RANGE, MAX_RANGE)
+
+
+def _bytes(confidence: np.ndarray, ahead: np.ndarray, right: np.ndarray, apparent: np.ndarray) -> np.ndarray:
+    """Scale detections to the range of bytes, float64 [..., 4]."""
+    channels = (
+        np.maximum(np.rint(255.0 * np.clip(confidence, 0.0, 1.0)), 1.0),
+        np.rint(AHEAD_SCALE * ahead),
+        128.0 + np.rint(RIGHT_SCALE * right),
+        np.rint(SIZE_SCALE * apparent),
+    )
+    return np.clip(np.stack(channels, axis=-1), 0.0, 255.0)

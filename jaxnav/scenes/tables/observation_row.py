@@ -1,4 +1,4 @@
-"""The packed byte row of one pose: what an agent perceives there, in as few bytes as it takes."""
+"""The packed row of a pose: what an agent perceives."""
 
 import dataclasses
 from typing import Any
@@ -10,9 +10,39 @@ VIEW_UNKNOWN, VIEW_FREE, VIEW_BLOCKED = range(3)
 AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE = 51.0, 25.4, 127.5
 
 
+def relative_position(detections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return metres ahead and to the right of detections.
+
+    Args:
+      detections: [..., 4], confidence, ahead, right and apparent size in bytes.
+
+    Returns:
+      float64 [...] each.
+    """
+    return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - 128.0) / RIGHT_SCALE
+
+
+def detected_places(detections: np.ndarray, place: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return where detections from one pose lie, world (x, z).
+
+    Args:
+      detections: [..., 4], see `relative_position`.
+      place: float64 [2], world (x, z) of the agent.
+      forward: float64 [2], unit vector (x, z) of its heading.
+
+    Returns:
+      float64 [..., 2].
+    """
+    ahead, right = relative_position(detections)
+    rightward = np.array([forward[1], -forward[0]])
+    return place + ahead[..., None] * forward + right[..., None] * rightward
+
+
 @dataclasses.dataclass(frozen=True)
 class RowFormat:
-    """Where things stand in a row of uint8; works on NumPy and JAX arrays alike.
+    """Describe the bytes of a row.
+
+    Its methods take NumPy and JAX arrays.
 
     Attributes:
       num_categories: K.
@@ -24,7 +54,7 @@ class RowFormat:
 
     @property
     def num_bytes(self) -> int:
-        """Length of a row, padded to whole 32-byte lines."""
+        """Return the length of a row, padded to 32-byte lines."""
         return -(-(self._view_at + self._view_bytes) // 32) * 32
 
     @property
@@ -36,7 +66,15 @@ class RowFormat:
         return -(-self.view * self.view // 4)
 
     def pack(self, detections: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Pack detections uint8 [P, K, 4] and view uint8 [P, V, V] into rows [P, num_bytes]."""
+        """Pack detections and views into rows.
+
+        Args:
+          detections: uint8 [P, K, 4], confidence, ahead, right and apparent size.
+          view: uint8 [P, V, V], ego-centric views.
+
+        Returns:
+          uint8 [P, num_bytes].
+        """
         num_poses = len(view)
         rows = np.zeros((num_poses, self.num_bytes), np.uint8)
         rows[:, : self._view_at] = detections.reshape(num_poses, self._view_at)
@@ -47,15 +85,21 @@ class RowFormat:
         return rows
 
     def detections(self, rows: Any) -> Any:
-        """Detections of rows uint8 [..., num_bytes]: uint8 [..., K, 4] confidence, ahead, right, size."""
+        """Return the detections of rows uint8 [..., num_bytes].
+
+        They are uint8 [..., K, 4], confidence, ahead, right and apparent size.
+        """
         return rows[..., : self._view_at].reshape(*rows.shape[:-1], self.num_categories, 4)
 
     def presence(self, rows: Any) -> Any:
-        """Which categories are detected, bool [..., K]."""
+        """Return which categories are detected, bool [..., K]."""
         return rows[..., 0 : self._view_at : 4] > 0
 
     def view_cells(self, rows: Any) -> Any:
-        """The ego-centric view, uint8 [..., V * V], row 0 nearest to the agent, column 0 leftmost."""
+        """Return the ego-centric view, uint8 [..., V * V].
+
+        Row 0 is nearest to the agent, column 0 leftmost.
+        """
         packed = rows[..., self._view_at : self._view_at + self._view_bytes]
         shifts = np.array([0, 2, 4, 6], np.uint8).reshape((1,) * packed.ndim + (4,))
         cells = (packed[..., None] >> shifts) & np.uint8(3)

@@ -1,6 +1,4 @@
-"""Lines of sight: which boxes and walls hide what, and what lies in the camera's view."""
-
-import functools
+"""Lines of sight, and what lies in the camera's view."""
 
 import numpy as np
 
@@ -9,36 +7,57 @@ from jaxnav.scenes.task import Rules
 
 SIGHT_MARGIN = 0.3  # a line of sight ends this far before the target's centre
 GRAZE = 1e-6  # touching a surface by less than this does not block
-TOLERANCE = 1e-9  # on lengths that decide something, so that rounding errors do not; always on the side of yes
+TOLERANCE = 1e-9  # metres; added to limits, so that rounding errors do not decide
 
 
 def cell_centres(scene: Scene, cells: np.ndarray) -> np.ndarray:
-    """World (x, z) of cells (iz, ix), float64 [C, 2]."""
+    """Return the centres of cells.
+
+    Args:
+      scene: the scene.
+      cells: int [C, 2], (iz, ix).
+
+    Returns:
+      float64 [C, 2], world (x, z), metres.
+    """
     return np.asarray(scene.origin) + CELL * cells[:, ::-1]
 
 
 def opaque(boxes: np.ndarray) -> np.ndarray:
-    """Which boxes [N, 6] block the sight: bulky furniture that stands on the floor, bool [N]."""
+    """Return which boxes [N, 6] block the sight, bool [N].
+
+    They are those of bulky furniture that stands on the floor.
+    """
     _, y, _, sx, sy, sz = boxes.T
     bulky, low, high = np.minimum(sx, sz) - 0.3, 0.3 - (y - sy / 2), y + sy / 2 - 0.85
     return np.minimum(np.minimum(bulky, low), high) >= -TOLERANCE
 
 
 def rectangles(mask: np.ndarray) -> np.ndarray:
-    """Disjoint rectangles that cover a mask [nz, nx]: z0, x0, z1, x1 of each, the latter two excluded, int [R, 4]."""
+    """Return disjoint rectangles that cover a mask [nz, nx].
+
+    Returns:
+      int [R, 4], z0, x0, z1, x1 of each, the latter two excluded.
+    """
     open_runs: dict[tuple[int, int], int] = {}
-    found = []
+    closed = []
     for z, row in enumerate(np.diff(np.pad(mask, ((0, 1), (1, 1))).astype(np.int8), axis=1)):
         runs = list(zip(np.flatnonzero(row == 1).tolist(), np.flatnonzero(row == -1).tolist(), strict=True))
-        found += [(z0, x0, z, x1) for (x0, x1), z0 in open_runs.items() if (x0, x1) not in runs]
+        closed += [(z0, x0, z, x1) for (x0, x1), z0 in open_runs.items() if (x0, x1) not in runs]
         open_runs = {run: open_runs.get(run, z) for run in runs}
-    return np.array(found, int).reshape(-1, 4)
+    return np.array(closed, int).reshape(-1, 4)
 
 
 def clear_of_walls(scene: Scene, start: np.ndarray, end: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Whether segments from `start` to `end` [M, 2], world (x, z), meet no wall cell; bool [M].
+    """Return whether segments meet no wall cell.
 
-    Wall cells that contain `start` or `target` [M, 2] do not count.
+    Args:
+      scene: whose walls count.
+      start, end: float64 [M, 2], world (x, z) of the ends.
+      target: float64 [M, 2]; wall cells that contain `start` or `target` do not count.
+
+    Returns:
+      bool [M].
     """
     clear = np.ones(len(start), bool)
     exempt = np.concatenate([_walls_at(scene, start), _walls_at(scene, target)], axis=1)
@@ -58,7 +77,11 @@ def clear_of_walls(scene: Scene, start: np.ndarray, end: np.ndarray, target: np.
 
 
 def _walls_at(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Flat indices of the wall cells that contain points [M, 2], up to four each, -1 for none: int [M, 4]."""
+    """Return the wall cells that contain points [M, 2].
+
+    Returns:
+      int [M, 4], flat indices, up to four for each point, -1 for none.
+    """
     place = (points - scene.origin) / CELL
     reach = GRAZE / CELL
     columns, rows = np.moveaxis(np.rint([place - reach, place + reach]).astype(int), -1, 0)  # [2, M] each
@@ -70,7 +93,10 @@ def _walls_at(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def _blocked(start: np.ndarray, end: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Whether segments [M, D] enter any of the boxes [R, 2, D], each shrunk by the graze: bool [M]."""
+    """Return whether segments [M, D] enter any box, bool [M].
+
+    The boxes [R, 2, D] are shrunk by `GRAZE`.
+    """
     line = end - start
     low, high = np.minimum(start, end), np.maximum(start, end)
     blocked = np.zeros(len(start), bool)
@@ -81,7 +107,10 @@ def _blocked(start: np.ndarray, end: np.ndarray, boxes: np.ndarray) -> np.ndarra
 
 
 def _meets(start: np.ndarray, line: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Whether segments start + t line [M, D], 0 <= t <= 1, enter the open box (low, high) [D]: bool [M]."""
+    """Return whether segments enter an open box, bool [M].
+
+    The segments are start + t line [M, D], 0 <= t <= 1; the box is (low, high) [D].
+    """
     moving = line != 0.0
     slope = np.where(moving, line, 1.0)
     t0, t1 = (low - start) / slope, (high - start) / slope
@@ -92,7 +121,7 @@ def _meets(start: np.ndarray, line: np.ndarray, low: np.ndarray, high: np.ndarra
 
 
 def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Whether cameras have a clear line to target objects.
+    """Return whether cameras have a clear line to target objects.
 
     Args:
       scene: the scene whose walls and opaque boxes hide things.
@@ -109,15 +138,15 @@ def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.n
     length = np.linalg.norm(line, axis=-1, keepdims=True)
     end = camera + line * np.maximum(1.0 - SIGHT_MARGIN / np.maximum(length, SIGHT_MARGIN), 0.0)
     clear = clear_of_walls(scene, cameras, end[:, [0, 2]], points[:, [0, 2]])
-    for owner in np.flatnonzero(opaque(scene.boxes)):
-        centre, half = scene.boxes[owner, :3], scene.boxes[owner, 3:] / 2
+    for blocker in np.flatnonzero(opaque(scene.boxes)):
+        centre, half = scene.boxes[blocker, :3], scene.boxes[blocker, 3:] / 2
         low, high = centre - half, centre + half
         near = np.flatnonzero(
             clear
             & (np.minimum(cameras, end[:, [0, 2]]) < high[[0, 2]]).all(axis=1)
             & (np.maximum(cameras, end[:, [0, 2]]) > low[[0, 2]]).all(axis=1)
         )
-        exempt = (np.abs(points[near] - centre) <= half + GRAZE).all(axis=1) | (targets[near] == owner)
+        exempt = (np.abs(points[near] - centre) <= half + GRAZE).all(axis=1) | (targets[near] == blocker)
         exempt |= (np.abs(cameras[near] - centre[[0, 2]]) <= half[[0, 2]] + GRAZE).all(axis=1)
         near = near[~exempt]
         clear[near] = ~_meets(camera[near], end[near] - camera[near], low + GRAZE, high - GRAZE)
@@ -125,7 +154,7 @@ def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.n
 
 
 def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where points lie relative to the headings of cameras, and whether they are in the view.
+    """Return offsets of points, and whether they are in view.
 
     Args:
       rules: headings, horizons and the camera.
@@ -133,7 +162,7 @@ def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tu
       points: float64 [M, 3].
 
     Returns:
-      ahead, right: float64 [M, H] metres; in_view: bool [M, H, horizons].
+      ahead, right: float64 [M, H], metres; in_view: bool [M, H, T], by heading and horizon.
     """
     directions = rules.directions()
     v = points[:, [0, 2]] - cameras
@@ -146,48 +175,3 @@ def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tu
     across, high = rules.half_view
     in_view = (depth > 0) & (np.abs(right)[..., None] <= across * depth) & (np.abs(rise) <= high * depth)
     return ahead, right, in_view
-
-
-def view_known(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Which floor cells around each cell can be seen past walls and opaque boxes as high as the camera.
-
-    Args:
-      scene: the scene.
-      rules: the camera's height.
-      cells: int [C, 2], the cells (iz, ix) to look from.
-      offsets: int [O, 2], the cells (dz, dx) to look at.
-
-    Returns:
-      bool [C, O].
-    """
-    x, y, z, sx, sy, sz = scene.boxes[opaque(scene.boxes)].T
-    tall = y + sy / 2 >= rules.camera - TOLERANCE
-    grid = np.argwhere(np.ones_like(scene.walls))
-    distance = np.abs(cell_centres(scene, grid)[:, None] - np.stack([x, z], axis=-1)[tall])
-    covered = (distance <= np.stack([sx, sz], axis=-1)[tall] / 2 + TOLERANCE).all(axis=-1).any(axis=-1)
-    radius = int(np.abs(offsets).max())
-    clear = ~np.pad(scene.walls | covered.reshape(scene.walls.shape), radius)
-    # On the flattened lattice a displacement is one shift, whatever the cell.
-    stride, flat = clear.shape[1], clear.ravel()
-    margin = radius * (stride + 1)
-    length = flat.size - 2 * margin
-    at = (cells + radius) @ (stride, 1) - margin
-    known = np.ones((len(offsets), len(cells)), bool)
-    seen = np.empty(length, bool)
-    for row, offset in zip(known, offsets.tolist(), strict=True):
-        seen[:] = True
-        for dz, dx in _between(*offset, radius):
-            shift = margin + dz * stride + dx
-            seen &= flat[shift : shift + length]
-        row[:] = seen[at]
-    return known.T
-
-
-@functools.lru_cache(maxsize=4096)
-def _between(dz: int, dx: int, radius: int) -> list[tuple[int, int]]:
-    """The cells that a look from (0, 0) to (dz, dx) passes through, its ends left out."""
-    steps = np.arange(1, 2 * radius)  # half-cell steps along the longest line
-    # Rounding is symmetric about 0, so that a mirrored room has a mirrored view.
-    z, x = (np.rint(d * steps / (2 * radius)).astype(int).tolist() for d in (dz, dx))
-    passed = set(zip(z, x, strict=True))
-    return sorted(passed - {(0, 0), (dz, dx)})

@@ -1,7 +1,7 @@
-"""Importer of AI2-THOR metadata: `event.metadata` after the action GetReachablePositions, saved as JSON.
+"""Importer of AI2-THOR metadata.
 
-A record is the metadata object itself, or {"metadata": ..., "reachablePositions": [...]} where the positions were kept
-apart.
+It is `event.metadata` after the action GetReachablePositions, saved as JSON. A record is the metadata object itself, or
+{"metadata": ..., "reachablePositions": [...]} where the positions were saved separately.
 """
 
 import re
@@ -20,15 +20,15 @@ from jaxnav.scenes.scene import Scene
 
 #: Height of the agent's position above the floor, metres.
 AGENT_HEIGHT = 0.9
-#: Types that are the shell of a room. Doorways and windows are kept, they can be found.
+#: Types that are the shell of a room. Doorways and windows are objects.
 STRUCTURE = frozenset({"Floor", "Wall", "Ceiling", "Room"})
 
 _ENDINGS = (".json", ".json.gz", ".jsonl", ".jsonl.gz")
-_ITHOR_ROOMS = {0: "kitchen", 2: "living_room", 3: "bedroom", 4: "bathroom"}  # by the hundreds of the number
+_ITHOR_ROOMS = {0: "kitchen", 2: "living_room", 3: "bedroom", 4: "bathroom"}  # by the hundreds of the scene number
 
 
 def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
-    """Scenes of saved controller metadata.
+    """Read saved metadata of the controller.
 
     Object types keep the names of the file. Boxes come from `axisAlignedBoundingBox` or the older `bounds3D`; an object
     without one, or of size 0, gets a typical size. Walls are derived: the metadata has none.
@@ -38,7 +38,7 @@ def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
       split: split of the scenes.
 
     Yields:
-      A scene per record, or why it cannot be used; of a folder also why a file cannot be read.
+      A scene per record, or why it cannot be used; for a folder also why a file cannot be read.
 
     Raises:
       InputError: the file cannot be read, or there is no record at all.
@@ -61,15 +61,15 @@ def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
 
 
 def scene_of_metadata(where: str, value: Any, split: str) -> Scene:
-    """The scene of one record.
+    """Build the scene of one record.
 
     Args:
       where: how errors name the record.
-      value: the record; see the module.
+      value: the record, see the module.
       split: split of the scene.
 
     Raises:
-      InputError: it cannot be used; names the scene, the field and the mend.
+      InputError: it cannot be used; names the scene, the field and how to mend it.
     """
     outer = Record(where, {}).record("record", value)
     metadata = outer.record("metadata", outer.fields.get("metadata", outer.fields)).fields | outer.fields
@@ -85,12 +85,12 @@ def scene_of_metadata(where: str, value: Any, split: str) -> Scene:
 
 
 def scene_name(text: str) -> str:
-    """Name of a scene without the suffix `_physics` that some releases add."""
+    """Remove the suffix `_physics` that some releases add."""
     return re.sub(r"(?<=.)_physics\Z", "", text)
 
 
 def world_and_room_type(name: str) -> tuple[str, str]:
-    """World and room type of an AI2-THOR scene by its name."""
+    """Return world and room type by a scene's name."""
     if match := re.fullmatch(r"FloorPlan([0-9]{1,3})", name):
         hundreds, number = divmod(int(match[1]), 100)
         if hundreds in _ITHOR_ROOMS and 1 <= number <= 30:
@@ -101,7 +101,7 @@ def world_and_room_type(name: str) -> tuple[str, str]:
 
 
 def standable(record: Record, field: str, points: Sequence[Any]) -> tuple[np.ndarray, float]:
-    """Where the agent can stand.
+    """Return the standable cells and the height of the floor.
 
     Args:
       record: the scene's record.
@@ -109,8 +109,8 @@ def standable(record: Record, field: str, points: Sequence[Any]) -> tuple[np.nda
       points: objects with x, y and z in metres: positions of the agent's body.
 
     Returns:
-      Lattice indices (iz, ix), int [N, 2], and the height of the floor in metres. It comes from the agent because the
-      box of `Floor` reaches far below the ground in many rooms.
+      Lattice indices (iz, ix), int [N, 2], and metres. The height comes from the agent because the box of `Floor`
+      reaches far below the ground in many rooms.
     """
     xyz = np.array([record.vector(f"{field}[{i}]", point) for i, point in enumerate(points)]).reshape(-1, 3)
     cells = lattice_cells(record, field, xyz[:, [0, 2]].tolist())
@@ -118,13 +118,23 @@ def standable(record: Record, field: str, points: Sequence[Any]) -> tuple[np.nda
 
 
 def pivot_box(kind: str, x: float, y: float, z: float) -> list[float]:
-    """A box of typical size around the pivot of an object, lifted out of the floor, for pivots may be at the bottom."""
+    """Return a box of typical size around an object's pivot.
+
+    It is raised out of the floor, because pivots may be at the bottom of objects.
+
+    Args:
+      kind: type of the object.
+      x, y, z: the pivot, metres, y above the floor.
+
+    Returns:
+      Centre and full size, metres.
+    """
     width, height, depth, _ = typical_box(kind)
     return [x, max(y, height / 2), z, width, height, depth]
 
 
 def _records(path: Path) -> list[tuple[str, bytes]]:
-    """Places and texts of the records of a file."""
+    """Return the places and texts of a file's records."""
     content = read_bytes(path)
     if ".jsonl" not in path.suffixes:
         return [(str(path), content)]
@@ -142,7 +152,10 @@ def _scene_or_error(where: str, text: bytes, split: str) -> Scene | InputError:
 
 
 def _things(record: Record, floor: float) -> list[Thing]:
-    """The objects but for the shell of the room; `objects` is a list, or an object keyed by id."""
+    """Read the objects without the shell of the room.
+
+    The field `objects` is a list, or an object keyed by id.
+    """
     objects = record.get("objects")
     items = objects.items() if isinstance(objects, dict) else enumerate(record.sequence("objects", objects))
     rows = [record.record(f"objects[{reprlib.repr(key)}]", value) for key, value in items]
@@ -163,16 +176,19 @@ def _kind(row: Record) -> str:
     return row.text("objectType", row.get("objectType"))
 
 
-def _parent(row: Record, own: int, index: Mapping[str, int], volumes: Sequence[float]) -> int:
-    """The smallest of the receptacles that an object is in, since a drawer says more than its desk; -1 for none."""
+def _parent(row: Record, position: int, index: Mapping[str, int], volumes: Sequence[float]) -> int:
+    """Return the smallest receptacle of an object, or -1.
+
+    A drawer is more specific than its desk. `position` is the object's index.
+    """
     ids = row.fields.get("parentReceptacles")
     ids = [] if ids is None else row.sequence("parentReceptacles", ids)
-    parents = [index[key] for key in ids if isinstance(key, str) and index.get(key, own) != own]
+    parents = [index[key] for key in ids if isinstance(key, str) and index.get(key, position) != position]
     return min(parents, key=volumes.__getitem__, default=-1)
 
 
 def _box(row: Record, floor: float) -> list[float]:
-    """Centre and size, metres above the floor."""
+    """Return centre and size, metres, y above the floor."""
     field = next((field for field in ("axisAlignedBoundingBox", "bounds3D") if row.fields.get(field) is not None), None)
     centre, size = [0.0] * 3, [0.0] * 3
     if field == "axisAlignedBoundingBox":

@@ -1,4 +1,4 @@
-"""The last step of every importer: standable points and objects become a scene."""
+"""Scenes from standable points and objects."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.scenes.files.record import Record
-from jaxnav.scenes.files.scene_file import derive_walls
+from jaxnav.scenes.files.walls import derive_walls
 from jaxnav.scenes.scene import CELL, Room, Scene
 
-SNAP = 0.02  # metres that a standable point may be off the lattice
+SNAP = 0.02  # metres; a standable point may be this far off the lattice
 MAX_SIDE = 2000  # cells; a larger extent is a mistake
-MARGIN = 3  # cells around the standable ones; what lies beyond cannot be told from a wall
+MARGIN = 3  # cells around the standable ones; what lies beyond is indistinguishable from a wall
 
 
 class Thing(NamedTuple):
-    """An object of a scene.
+    """Describe an object of a scene.
 
     Attributes:
       type: name of its type.
@@ -31,7 +31,15 @@ class Thing(NamedTuple):
 
 
 def lattice_cells(record: Record, field: str, points: Sequence[Sequence[float]]) -> np.ndarray:
-    """Lattice indices (iz, ix) of points (x, z) in metres, int [N, 2].
+    """Return the lattice indices of points.
+
+    Args:
+      record: the scene's record, for errors.
+      field: name of the field that holds the points.
+      points: (x, z) in metres.
+
+    Returns:
+      int [N, 2], (iz, ix).
 
     Raises:
       InputError: there is no point, one is not on the lattice, or they lie too far apart.
@@ -52,7 +60,9 @@ def lattice_cells(record: Record, field: str, points: Sequence[Sequence[float]])
 def scene_of_cells(
     name: str, world: str, room_type: str, split: str, cells: np.ndarray, things: Sequence[Thing]
 ) -> Scene:
-    """A scene whose walls are derived from what is neither standable nor furniture.
+    """Build a scene and derive its walls.
+
+    Walls are what can be neither standable nor furniture, see `derive_walls`.
 
     Args:
       name, world, room_type, split: see `Scene`.
@@ -78,7 +88,7 @@ def scene(
     things: Sequence[Thing],
     rooms: tuple[Room, ...] = (),
 ) -> Scene:
-    """A scene of these objects; the other arguments are its attributes."""
+    """Build a scene of objects from its other attributes."""
     return Scene(
         name=name,
         world=world,

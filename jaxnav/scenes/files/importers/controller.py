@@ -1,4 +1,4 @@
-"""Importer that asks an installed AI2-THOR: drives its controller through scenes and reads their metadata."""
+"""Importer from an installed AI2-THOR simulator."""
 
 import importlib
 from collections.abc import Callable, Iterator, Sequence
@@ -12,12 +12,12 @@ from jaxnav.scenes.scene import CELL, Scene
 def read_controller(
     scenes: Sequence[str], split: str, controller_factory: Callable[..., Any] | None = None
 ) -> Iterator[Scene | InputError]:
-    """Scenes of a running simulator.
+    """Read the metadata of scenes from a simulator.
 
     Args:
       scenes: names such as `FloorPlan1` or `FloorPlan_Train1_1`.
       split: split of the scenes.
-      controller_factory: makes the controller; `ai2thor.controller.Controller` if it is None.
+      controller_factory: makes the controller; None for `ai2thor.controller.Controller`.
 
     Yields:
       A scene per name, or why it cannot be used. Failures of the simulator itself are not caught.
@@ -42,12 +42,12 @@ def _controller_class() -> Callable[..., Any]:
 
 def _scene_or_error(controller: Any, name: str, split: str) -> Scene | InputError:
     where = f"controller, {name!r}"
-    # The apartments are made for another robot than the rooms, and the controller warns if they get the wrong one.
+    # The apartments are made for another robot than the rooms; the controller warns of a wrong one.
     robot = "locobot" if world_and_room_type(name)[0] == "robothor" else "default"
     try:
         controller.reset(scene=name, agentMode=robot)
         metadata = controller.step(action="GetReachablePositions").metadata
-    except ValueError as error:  # the simulator has no such scene; the lines after the first list those that it has
+    except ValueError as error:  # there is no such scene; the lines after the first list those that there are
         problem = str(error).strip().partition("\n")[0]
         return InputError(f"{where}: {problem} Give the name of a scene of the simulator")
     if not metadata["lastActionSuccess"]:

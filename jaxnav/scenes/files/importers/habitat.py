@@ -1,4 +1,4 @@
-"""Scenes of Habitat's ObjectNav, one per floor: from episode files, with semantic floor maps or without."""
+"""Importer of Habitat's ObjectNav, one scene per floor."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,19 +22,19 @@ from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL, Scene
 
 _FLOOR_REACH = 0.5  # metres above or below a floor's height that still belong to it
-_FLOOR_SHARE = 0.05  # of all starts; fewer are on stairs
-_UNDER_FLOOR = 0.25  # metres that the centre of an object may lie under its floor
-_STOREY = 3.0  # metres that it may lie above
-_ON_MAP = 0.8  # share of the starts; fewer tell of a map of something else
-_CONNECTED = 0.5  # share of the known cells; fewer tell of a floor that is hardly known
+_FLOOR_SHARE = 0.05  # least share of all starts on a floor; with fewer they are on stairs
+_UNDER_FLOOR = 0.25  # metres that the centre of an object may lie below its floor
+_STOREY = 3.0  # metres that it may lie above it
+_ON_MAP = 0.8  # least share of the starts on the map; with fewer the map is of another scene
+_CONNECTED = 0.5  # least share of the known cells that are connected; with fewer the floor is hardly known
 
 
 def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[Scene | InputError]:
-    """Scenes of a split of Habitat's ObjectNav.
+    """Read a split of Habitat's ObjectNav.
 
     With `maps`, floor and objects come from the map (`scene_of_map`), and the episodes of a floor must start on it.
-    Without, only the places that episodes name are known to be standable: starts, view points of goals and shortest
-    paths, each moved to the nearest lattice point; objects are the goals, in typical sizes. Few files name enough.
+    Without, the standable cells are the lattice points nearest to the places in the episodes (`standable_points`), and
+    the objects are the goals, in typical sizes. Few files have enough such places.
 
     Args:
       path: the folder of a split, its `<split>.json.gz` beside `content/`, or one file of `content/`.
@@ -67,9 +67,8 @@ def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[S
                 yield InputError(f"{scene.record.where}: is not in {maps}; give the map of this split")
     if empty and floors is None:
         raise InputError(f"{path}: holds no episode; give the folder of a split, or a semantic floor map (--maps)")
-    if empty and floors is not None:
-        for name in floors:
-            yield from _mapped_floors(name, split, floors[name], [])
+    for name, records in floors.items() if empty and floors else ():
+        yield from _mapped_floors(name, split, records, [])
 
 
 def _mapped_floors(
@@ -92,7 +91,13 @@ def _mapped_floors(
 
 
 def _starts_on(number: int, floors: dict[int, FloorMap], episodes: Sequence[Record]) -> np.ndarray:
-    """Starts on the episode's `floor_id` or else on the nearest floor: float64 [N, 2], x and z."""
+    """Return the starts on a floor.
+
+    The floor of an episode is its `floor_id`, or else the nearest.
+
+    Returns:
+      float64 [N, 2], (x, z), metres.
+    """
     starts = []
     for episode in episodes:
         x, y, z = position(episode, "start_position")
@@ -103,7 +108,10 @@ def _starts_on(number: int, floors: dict[int, FloorMap], episodes: Sequence[Reco
 
 
 def _check_starts(record: Record, scene: Scene, starts: np.ndarray) -> None:
-    """Refuses a map that does not fit its episodes: a start must lie on a standable cell or beside one."""
+    """Refuse a map that does not fit its episodes.
+
+    A start must lie on a standable cell or beside one.
+    """
     cells = np.argwhere(scene.reach).tolist()
     near = {(z + dz, x + dx) for z, x in cells for dz in (-1, 0, 1) for dx in (-1, 0, 1)}
     index = np.rint((starts - scene.origin) / CELL).astype(int)
@@ -133,15 +141,18 @@ def _unmapped_floors(scene: SceneEpisodes, split: str) -> Iterator[Scene | Input
         ]
         on_floor = points[np.abs(points[:, 1] - height) <= _FLOOR_REACH]
         try:
-            found = _scene_of_points(record, f"{scene.name}_floor{number}", split, on_floor[:, ::2], things)
+            floor_scene = _scene_of_points(record, f"{scene.name}_floor{number}", split, on_floor[:, ::2], things)
         except InputError as error:
             yield error
         else:
-            yield found
+            yield floor_scene
 
 
 def _scene_of_points(record: Record, name: str, split: str, points: np.ndarray, things: Sequence[Thing]) -> Scene:
-    """A scene where the lattice points nearest to `points` [N, 2] (x, z) are standable."""
+    """Build a scene from standable points [N, 2], (x, z).
+
+    The lattice points nearest to them are standable.
+    """
     if not things:
         raise record.error("goals", "has no object on this floor; give a semantic floor map (--maps)")
     cells = np.unique(lattice_cells(record, "start_position", (CELL * np.rint(points / CELL)).tolist()), axis=0)
@@ -154,7 +165,7 @@ def _scene_of_points(record: Record, name: str, split: str, points: np.ndarray, 
 
 
 def _floor_heights(y: np.ndarray) -> list[float]:
-    """Heights of the floors that these starts stand on, in ascending order."""
+    """Return the heights of floors by those of starts, ascending."""
     heights, left = [], np.sort(y)
     while len(left):
         ends = np.searchsorted(left, left + 2 * _FLOOR_REACH, side="right")

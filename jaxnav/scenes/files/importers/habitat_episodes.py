@@ -1,6 +1,7 @@
-"""Habitat's ObjectNav episode files: where episodes start, what they look for, and places known to be standable.
+"""Episode files of Habitat's ObjectNav.
 
-Habitat is right-handed with -z forward; positions are given in the frame of scenes, with z negated.
+They have the starts of episodes, their goals, and places that are known to be standable. Habitat is right-handed with
+-z forward; positions are given in the frame of scenes, with z negated.
 """
 
 import reprlib
@@ -15,12 +16,12 @@ from jaxnav.scenes.files.record import Record, parse_json, read_bytes
 
 
 class SceneEpisodes(NamedTuple):
-    """The episodes of one scene in one file.
+    """Hold the episodes of one scene in one file.
 
     Attributes:
       record: the whole file; its errors name file and scene.
-      name: of the scene, `Collierville`.
-      mesh: name of the scene's file, `Collierville.glb`.
+      name: of the scene, for example `Collierville`.
+      mesh: name of the scene's file, for example `Collierville.glb`.
       episodes: at least one.
     """
 
@@ -31,20 +32,23 @@ class SceneEpisodes(NamedTuple):
 
 
 def episode_files(path: Path) -> list[Path]:
-    """Episode files of a split: those of its `content` folder, or else the file or the files of the folder itself."""
+    """Return the episode files of a split.
+
+    They are those of its `content` folder, or else the file itself or the files of the folder.
+    """
     folder = path if path.is_dir() else path.parent
     if (folder / "content").is_dir():
         folder = folder / "content"
     elif folder != path:
         return [path]
     files = sorted(folder.glob("*.json.gz"))
-    # SemExp keeps its episodes beside Habitat's own, which it does not use.
+    # SemExp keeps its episodes beside those of Habitat, which it does not use.
     replaced = {file.name.replace("_episodes.json.gz", ".json.gz") for file in files if "_episodes.json" in file.name}
     return [file for file in files if file.name not in replaced]
 
 
 def read_episodes(file: Path) -> list[SceneEpisodes]:
-    """The episodes of a file, scene by scene.
+    """Read the episodes of a file, scene by scene.
 
     Raises:
       InputError: the file cannot be read, or an episode has no scene.
@@ -65,13 +69,16 @@ def read_episodes(file: Path) -> list[SceneEpisodes]:
 
 
 def position(record: Record, field: str = "position") -> list[float]:
-    """A position x, y, z in metres, with z negated."""
+    """Read a position (x, y, z), metres, with z negated."""
     x, y, z = (record.number(field, value) for value in record.sequence(field, record.get(field), 3))
     return [x, y, 0.0 - z]
 
 
 def goals(scene: SceneEpisodes) -> list[Record]:
-    """The goal objects, each once: those of the scene's categories, or else those of its episodes."""
+    """Return the goal objects, each once.
+
+    They are those of the scene's categories, or else those of its episodes.
+    """
     by_category = scene.record.fields.get("goals_by_category")
     if by_category is None:
         lists = [(episode, "goals", episode.fields.get("goals") or []) for episode in scene.episodes]
@@ -79,16 +86,22 @@ def goals(scene: SceneEpisodes) -> list[Record]:
         members = scene.record.record("goals_by_category", by_category)
         lists = [(members, key, value) for key, value in members.fields.items() if key.startswith(f"{scene.mesh}_")]
     unique: dict[Any, Record] = {}
-    for owner, field, values in lists:
-        for i, value in enumerate(owner.sequence(field, values)):
-            goal = owner.record(f"{field}[{i}]", value)
+    for record, field, values in lists:
+        for i, value in enumerate(record.sequence(field, values)):
+            goal = record.record(f"{field}[{i}]", value)
             identity = goal.fields.get("object_id")
             unique.setdefault(identity if isinstance(identity, int | str) else tuple(position(goal)), goal)
     return list(unique.values())
 
 
 def standable_points(scene: SceneEpisodes, goals: list[Record]) -> np.ndarray:
-    """Starts, view points and points of shortest paths: float64 [N, 3], x, y, z in metres."""
+    """Return the places that are known to be standable.
+
+    They are starts, view points and points of shortest paths.
+
+    Returns:
+      float64 [N, 3], (x, y, z), metres, the starts first.
+    """
     points = [position(episode, "start_position") for episode in scene.episodes]
     points += [point for goal in goals for point in _view_points(goal)]
     points += [point for episode in scene.episodes for point in _path_points(episode)]

@@ -1,4 +1,7 @@
-"""Pickles of others, read without running them: dicts, lists, texts, numbers and arrays of numbers."""
+"""Pickles read without running code.
+
+They may hold dicts, lists, texts, numbers and arrays of numbers.
+"""
 
 import bz2
 import pickle
@@ -15,7 +18,7 @@ _LIMIT = 2**32  # bytes of a file when decompressed
 
 
 class PickledArray:
-    """Stands for a NumPy array, whose own way of unpickling trusts what it reads.
+    """Replace a NumPy array, whose unpickling trusts its input.
 
     Attributes:
       values: the array, of booleans, integers or floats.
@@ -29,7 +32,9 @@ class PickledArray:
 
 
 def read_pickle(path: Path) -> Any:
-    """What a pickle compressed by bz2 holds, with `PickledArray` for arrays; a part may be any of these or be missing.
+    """Read a pickle compressed by bz2.
+
+    Arrays are `PickledArray`. Nothing else is known of the content: any part may be of any of these types or missing.
 
     Raises:
       InputError: the file is missing, damaged or too large, or asks for anything but arrays of numbers.
@@ -48,18 +53,21 @@ def read_pickle(path: Path) -> Any:
             raise InputError(f"{path}: {problem}; fetch or write it again") from error
 
 
-class _Reader(pickle._Unpickler):  # the one in Python: to that in C, ten bytes can be a request for 64 GiB
-    """An unpickler that looks up nothing but what arrays of numbers are made of."""
+class _Reader(pickle._Unpickler):  # in Python: ten bytes can make the one in C allocate 64 GiB
+    """Unpickle arrays of numbers and no other classes."""
 
     dispatch = pickle._Unpickler.dispatch.copy()
-    dispatch[pickle.BYTEARRAY8[0]] = dispatch[pickle.BINBYTES8[0]]  # for the former allocates before it reads
+    dispatch[pickle.BYTEARRAY8[0]] = dispatch[pickle.BINBYTES8[0]]  # the former allocates before it reads
 
     def __init__(self, path: Path, stream: IO[bytes]):
         super().__init__(_Limited(path, stream))
         self._path = path
 
     def find_class(self, module: str, name: str) -> Any:
-        """Bound methods and a text, since a pickle could change the attributes of a class or a function."""
+        """Return a bound method or a text.
+
+        A pickle could change the attributes of a class or a function.
+        """
         known = {
             "numpy.ndarray": "ndarray",
             "numpy.dtype": self._dtype,
@@ -67,13 +75,13 @@ class _Reader(pickle._Unpickler):  # the one in Python: to that in C, ten bytes 
             "numpy.multiarray.scalar": self._scalar,
             "numpy.numeric._frombuffer": self._from_buffer,
         }
-        found = known.get(re.sub(r"^numpy\._?core\.", "numpy.", module) + "." + name)
-        if found is None:
+        replacement = known.get(re.sub(r"^numpy\._?core\.", "numpy.", module) + "." + name)
+        if replacement is None:
             asked = reprlib.repr(f"{module}.{name}")
             raise InputError(
                 f"{self._path}: asks for {asked}, which could run code; give NumPy arrays of numbers alone"
             )
-        return found
+        return replacement
 
     def _dtype(self, code: str, *_: object) -> "_Dtype":
         return _Dtype(code)
@@ -93,7 +101,7 @@ class _Reader(pickle._Unpickler):  # the one in Python: to that in C, ten bytes 
 
 
 class _Dtype:
-    """Stands for `numpy.dtype`; numbers only."""
+    """Replace `numpy.dtype`, for numbers only."""
 
     def __init__(self, code: str):
         if not re.fullmatch("[biuf][1248]", code):
@@ -109,7 +117,7 @@ def _array(data: bytes, dtype: _Dtype, shape: tuple[int, ...], order: Literal["C
 
 
 class _Limited:
-    """A stream that gives `_LIMIT` bytes at most."""
+    """Read `_LIMIT` bytes of a stream at most."""
 
     def __init__(self, path: Path, stream: IO[bytes]):
         self._path, self._stream, self._left = path, stream, _LIMIT

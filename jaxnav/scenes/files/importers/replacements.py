@@ -1,7 +1,8 @@
-"""Importer of re-placements: the rooms of a scene file with their movable objects where a simulator put them anew.
+"""Importer of re-placements: rooms with their movable objects moved.
 
-A record is one room: {"name": ..., "columns": ["type", "x", "y", "z"], "sets": [[["Book", 0.217, 1.099, -0.001], ...],
-...]}. A set places the movable objects once; x, y, z in metres is an object's pivot, not the centre of its box.
+A simulator put the movable objects of known rooms to new places. A record is one room: {"name": ..., "columns":
+["type", "x", "y", "z"], "sets": [[["Book", 0.217, 1.099, -0.001], ...], ...]}. A set has one place of each movable
+object; x, y, z in metres is an object's pivot, not the centre of its box.
 """
 
 import dataclasses
@@ -26,16 +27,16 @@ _ROUNDING = 0.01  # metres; ids have two decimals
 
 
 def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
-    """One scene for every set of every room, in the order of the file, named `<room>-replaced-<number of the set>`.
+    """Read one scene for every set of every room.
 
-    The rows of a type go to the objects of this type in the order of the base scene; those that are left over stay
-    where they are. Sizes, yaws, cells and walls are those of the base scene. The pivot is the middle of the underside,
-    unless the object's `id` in the base file tells that it is higher up in the box. Moved objects, and what rested on
-    them, rest on nothing.
+    Scenes are in the order of the file and named `<room>-replaced-<number of the set>`. The rows of a type go to the
+    objects of this type in the order of the base scene; those that are left over stay where they are. Sizes, yaws,
+    cells and walls are those of the base scene. The pivot is the middle of the underside, unless the object's `id` in
+    the base file tells that it is higher up in the box. Moved objects, and what rested on them, rest on nothing.
 
     Args:
       path: the re-placements, one JSON object per line, plain or gzip.
-      base: scene file of the rooms as they were.
+      base: scene file of the original rooms.
 
     Yields:
       A scene, or why a room or one of its sets cannot be used.
@@ -65,7 +66,10 @@ def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
 
 
 def _rooms(base: Path) -> dict[str, tuple[Scene, np.ndarray]]:
-    """The scenes by name, and how far the centre of each object's box is above its pivot: float64 [N], metres."""
+    """Return the scenes by name, with lifts of their objects.
+
+    A lift is how far the centre of an object's box is above its pivot: float64 [N], metres.
+    """
     scenes = read_scenes(base)  # also checks the fields that are read below
     lines = [json.loads(line) for line in read_bytes(base).splitlines()]
     return {scene.name: (scene, _lifts(scene, fields)) for scene, fields in zip(scenes, lines, strict=True)}
@@ -77,7 +81,7 @@ def _lifts(scene: Scene, fields: dict[str, Any]) -> np.ndarray:
     ids = [_ID.fullmatch(str(row.get("id"))) for row in rows]
     heights, half = scene.boxes[:, 1], scene.boxes[:, 4] / 2
     lifts = np.array([y - float(match[1]) if match else np.inf for y, match in zip(heights, ids, strict=True)])
-    # Ids tell where an object was before it fell into place, sometimes far from its box.
+    # An id has the place of an object before it fell, sometimes far from its box.
     return np.where(np.abs(lifts) < half - _ROUNDING, lifts, half)
 
 
@@ -89,15 +93,15 @@ def _replaced_or_error(record: Record, i: int, scene: Scene, lifts: np.ndarray) 
 
 
 def _replaced(record: Record, i: int, scene: Scene, lifts: np.ndarray) -> Scene:
-    left = {name: [k for k, own in enumerate(scene.types) if own == name] for name in scene.types}
+    left = {name: [k for k, other in enumerate(scene.types) if other == name] for name in scene.types}
     boxes, moved = scene.boxes.copy(), np.zeros(len(scene.types), bool)
     for j, row in enumerate(record.sequence(f"sets[{i}]", record.get("sets")[i])):
         field = f"sets[{i}][{j}]"
         kind, *place = record.sequence(field, row, len(_COLUMNS))
-        own = left.get(record.text(field, kind))
-        if not own:
+        candidates = left.get(record.text(field, kind))
+        if not candidates:
             raise record.error(field, f"is one {reprlib.repr(kind)} more than the room has; leave it out")
-        k = own.pop(0)
+        k = candidates.pop(0)
         x, y, z = (record.number(field, value) for value in place)
         boxes[k, :3] = x, y + lifts[k], z
         moved[k] = True

@@ -1,6 +1,7 @@
-"""Importer of the offline `Scene_Data` folders that SAVN, ORG, VTNet, HOZ and the paper's released code share.
+"""Importer of the offline folders `Scene_Data`.
 
-A scene is a folder with `grid.json` (or `graph.json`) and `visible_object_map_1.5.json` (or `visible_object_map.json`).
+SAVN, ORG, VTNet, HOZ and the paper's released code share them. A scene is a folder with `grid.json` (or `graph.json`)
+and `visible_object_map_1.5.json` (or `visible_object_map.json`).
 """
 
 import re
@@ -26,11 +27,11 @@ _OBJECT = re.compile(rf"([A-Za-z0-9]+)\|{_NUMBER}\|{_NUMBER}\|{_NUMBER}(?:\|([A-
 
 
 def read_scene_data(path: Path, split: str) -> Iterator[Scene | InputError]:
-    """Scenes of an offline folder.
+    """Read an offline folder.
 
-    Cells come from `grid.json`, or else from the nodes of `graph.json`; objects from the ids in the visibility map, but
-    for those that are visible from nowhere. The files have no sizes, so objects get typical ones. Other files are not
-    opened.
+    Cells come from `grid.json`, or else from the nodes of `graph.json`; objects from the ids in the visibility map,
+    except those that are visible from nowhere. The files have no sizes, so objects get typical ones. Other files are
+    not opened.
 
     Args:
       path: the folder `Scene_Data`, or that of one scene.
@@ -65,13 +66,17 @@ def _scene_or_error(folder: Path, split: str) -> Scene | InputError:
 
 
 def _load(file: Path, name: str) -> tuple[Record, Any]:
-    """How errors name a file of a scene, and its content."""
+    """Return a record that names a file, and its content."""
     where = f"{file}, scene {name!r}"
     return Record(where, {}), parse_json(where, read_bytes(file))
 
 
 def _cells(folder: Path, name: str) -> tuple[np.ndarray, float]:
-    """Standable lattice indices (iz, ix) and the height of the floor in metres."""
+    """Read standable lattice indices and the height of the floor.
+
+    Returns:
+      int [N, 2], (iz, ix), and metres.
+    """
     grid, graph = folder / _GRID, folder / _GRAPH
     nodes = _node_cells(*_load(graph, name)) if graph.is_file() else None
     if nodes is not None and not grid.is_file():
@@ -85,7 +90,10 @@ def _cells(folder: Path, name: str) -> tuple[np.ndarray, float]:
 
 
 def _node_cells(record: Record, value: Any) -> np.ndarray:
-    """Lattice indices (iz, ix) of the states of a networkx node-link graph; its edges are not needed."""
+    """Read the lattice indices of a graph's nodes, (iz, ix).
+
+    It is a networkx node-link graph, whose edges are not needed.
+    """
     graph = record.record("graph", value)
     points = []
     for i, node in enumerate(graph.sequence("nodes", graph.get("nodes"))):
@@ -99,7 +107,7 @@ def _node_cells(record: Record, value: Any) -> np.ndarray:
 
 
 def _things(folder: Path, name: str, floor: float) -> list[Thing]:
-    """The objects that are visible from somewhere, by their ids."""
+    """Read the visible objects from their ids."""
     file = next((folder / file for file in _MAPS if (folder / file).is_file()), folder / _MAPS[0])
     record, value = _load(file, name)
     things = []

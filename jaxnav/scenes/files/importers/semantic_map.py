@@ -1,6 +1,6 @@
-"""Semantic floor maps of the SemExp kind (`*_info.pbz2`), and the scenes that they show.
+"""Semantic floor maps of SemExp (`*_info.pbz2`), and their scenes.
 
-A map gives what episode files lack, the free floor, in layers of 0 and 1 at 5 cm. Its pixel [i, j] covers Habitat's x
+A map has what episode files lack, the free floor, in layers of 0 and 1 at 5 cm. Its pixel [i, j] covers Habitat's x
 from `origin[1] + 5 i` to `+ 5` cm, and Habitat's z from `origin[0] + 5 j` to `+ 5` cm.
 """
 
@@ -24,17 +24,17 @@ from jaxnav.scenes.scene import Scene
 _LAYERS = 1 + len(GIBSON_CATEGORIES)  # navigable floor, then the categories in this order
 _MAX_SIDE = 2000  # pixels, 100 m
 _PIXEL, _CELL = 5, 25  # centimetres
-_FAR = 10**7  # centimetres of an origin, or pixels; what lies beyond is a mistake
+_FAR = 10**7  # centimetres of an origin, or pixels; a greater number is a mistake
 _MIN_PIXELS = 3  # of an object; less is noise
 
 # A strip this wide (pixels) between floor on both sides, and this long (cells), is a wall. The floor of a map ends 0.1
-# to 0.2 m before an obstacle, so what makes the strip is at most 0.4 m thick, yet 1 m long: no usual furniture.
+# to 0.2 m before an obstacle, so the obstacle is at most 0.4 m thick, yet 1 m long, unlike usual furniture.
 _STRIP_WIDTH = (4, 12)
 _STRIP_LENGTH = 4
 
 
 class FloorMap(NamedTuple):
-    """The map of one floor.
+    """Hold the map of one floor.
 
     Attributes:
       height: of the floor, metres, Habitat's y.
@@ -48,7 +48,9 @@ class FloorMap(NamedTuple):
 
 
 def read_maps(path: Path) -> dict[str, dict[int, Record]]:
-    """The floors of every scene by their numbers, each to be checked by `floor_map`.
+    """Read the floors of every scene by their numbers.
+
+    Each is to be checked by `floor_map`.
 
     Raises:
       InputError: the file cannot be read (`read_pickle`) or holds something else.
@@ -68,7 +70,7 @@ def read_maps(path: Path) -> dict[str, dict[int, Record]]:
 
 
 def floor_map(record: Record) -> FloorMap:
-    """The checked map of a floor.
+    """Check the map of a floor.
 
     Raises:
       InputError: a field is missing or wrong.
@@ -90,11 +92,12 @@ def floor_map(record: Record) -> FloorMap:
 
 
 def scene_of_map(record: Record, name: str, split: str, floor: FloorMap) -> Scene:
-    """The scene of one floor; its x is Habitat's, its z is minus Habitat's.
+    """Build the scene of one floor.
 
-    A lattice point is standable if the pixel under it is navigable, for navigable floor already keeps the agent's
-    radius clear of obstacles. An object is what touches within a category's layer, at the typical height. Walls are the
-    cells far from everything (`derive_walls`) and thin strips that part the floor.
+    Its x is Habitat's, its z is minus Habitat's. A lattice point is standable if the pixel under it is navigable,
+    because navigable floor already keeps the agent's radius clear of obstacles. An object is a connected part of a
+    category's layer, at the typical height. Walls are the cells far from everything (`derive_walls`) and thin strips
+    that divide the floor.
 
     Raises:
       InputError: the floor has no standable point or no object.
@@ -109,14 +112,14 @@ def scene_of_map(record: Record, name: str, split: str, floor: FloorMap) -> Scen
 
 
 def _standable(floor: FloorMap) -> np.ndarray:
-    """Lattice indices (iz, ix), int [N, 2]."""
+    """Return standable lattice indices (iz, ix), int [N, 2]."""
     (x, i), (z, j) = (_lattice(low, count) for low, count in zip(floor.origin, floor.layers.shape[1:], strict=True))
     at_x, at_z = np.nonzero(floor.layers[0][np.ix_(i, j)])
     return np.stack([-z[at_z], x[at_x]], axis=1)
 
 
 def _lattice(low: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lattice indices on one axis of a map, and their pixels."""
+    """Return lattice indices and pixels along one axis."""
     index = np.arange(-(-low // _CELL), -(-(low + _PIXEL * count) // _CELL))
     return index, (_CELL * index - low) // _PIXEL
 
@@ -133,7 +136,10 @@ def _things(floor: FloorMap) -> Iterator[Thing]:
 
 
 def _thin_walls(floor: FloorMap, scene: Scene) -> np.ndarray:
-    """Bool [nz, nx], cells in the middle of long thin strips between floor on both sides."""
+    """Return the cells of thin walls, bool [nz, nx].
+
+    They are in the middle of long thin strips between floor on both sides.
+    """
     free, objects = floor.layers[0], floor.layers[1:].any(axis=0)
     middles = (_strip_middles(free) | _strip_middles(free.T).T) & ~objects
     x, z = (floor.origin + _PIXEL * (np.argwhere(middles) + 0.5)).T / 100
@@ -148,7 +154,10 @@ def _thin_walls(floor: FloorMap, scene: Scene) -> np.ndarray:
 
 
 def _strip_middles(free: np.ndarray) -> np.ndarray:
-    """Pixels in the middle of a thin gap between free pixels of their row."""
+    """Return the pixels in the middle of a thin gap.
+
+    The gap lies between free pixels of their row. bool, of the shape of `free` [H, W].
+    """
     column = np.arange(free.shape[1])
     before = np.maximum.accumulate(np.where(free, column, -_FAR), axis=1)
     after = np.minimum.accumulate(np.where(free, column, _FAR)[:, ::-1], axis=1)[:, ::-1]
