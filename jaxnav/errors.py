@@ -2,4 +2,7 @@
 
 
 class InputError(ValueError):
-    """Bad input: a config, a scene file, a checkpoint or an argument. The message names the place and the mend."""
+    """Refuse bad input that a user can mend.
+
+    A config, a scene file, a checkpoint or an argument; the message names the place and the mend.
+    """

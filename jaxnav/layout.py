@@ -59,10 +59,9 @@ class Setting:
     form: Literal["paper", "residual"] = "residual"
 
     def __post_init__(self):
-        choices = typing.get_type_hints(type(self))
-        literals = {name: typing.get_args(hint) for name, hint in choices.items() if typing.get_origin(hint) is Literal}
-        for name, options in literals.items():
-            if getattr(self, name) not in options:
+        for name, hint in typing.get_type_hints(type(self)).items():
+            options = typing.get_args(hint)
+            if typing.get_origin(hint) is Literal and getattr(self, name) not in options:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: choose one of {', '.join(options)}")
         for name, valid, mend in (
             ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
@@ -187,10 +186,7 @@ class LayoutEstimator(struct.PyTreeNode):
         named_setting(self.setting)
 
     def init(self) -> LayoutState:
-        """Return the belief at an episode's start.
-
-        alpha = alpha*, nothing accepted, D = 0.
-        """
+        """Return the belief at an episode's start: alpha*, D = 0."""
         return LayoutState(
             alpha=self.prior, last=jnp.zeros(self.prior.shape[-1], dtype=bool), gap=jnp.zeros((), dtype=jnp.float32)
         )
@@ -251,13 +247,5 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """Return w x g (eq. 7): each category's word for a goal.
-
-        Args:
-          state: the belief.
-          goal: int [], the category that is sought.
-
-        Returns:
-          float32 [K].
-        """
+        """Return w x g of eq. 7, float32 [K], for a goal int []."""
         return LayoutEstimator.expectation(state, goal)

@@ -18,7 +18,8 @@ from jaxnav.evaluation.metrics import episode_metrics
 from jaxnav.evaluation.report import Form, build_difference, build_report, build_row, write_report
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.runs.directory import Run, settings
-from jaxnav.runs.worlds import evaluation_shift, evaluation_world, read_ahead
+from jaxnav.runs.policies import Policies
+from jaxnav.runs.worlds import CompiledWorld, evaluation_shift, evaluation_world, read_ahead
 from jaxnav.store.files import write_atomic
 
 
@@ -93,19 +94,8 @@ def evaluate(
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows(epsilon, form, policies.arms)
     world = evaluation_world(config, split, scenes, shift, console)
-    everything = range(len(world.banks))
-    each = -(-episodes // len(world.banks))
-    lists = [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
-    evaluator = Evaluator(policies.acting(world.env))
-    outcome = evaluator(
-        inference_grid(rows, policies.arms, policies.seeds),
-        policies.params,
-        zip(lists, read_ahead(world, everything), strict=True),
-        policies.knowledge,
-        jax.random.key(seed),
-    )
-    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
-    shortest = oracle_outcome(world.banks, lists, read_ahead(world, everything), world.env)
+    lists, outcome, compilations = run_rows(rows, policies, world, episodes, seed)
+    shortest = oracle_outcome(world.banks, lists, read_ahead(world, range(len(world.banks))), world.env)
     rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)
     about = settings(config) | {
         "steps_per_policy": config.total_updates * config.update_steps,
@@ -117,7 +107,36 @@ def evaluate(
     results = Results(rows, outcome, together(lists), world.env.categories, {})
     names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
     table, differences = _table(results, names, seed), _differences(results, seed)
-    return results._replace(report=build_report(table, differences, evaluator.compilations, about))
+    return results._replace(report=build_report(table, differences, compilations, about))
+
+
+def run_rows(
+    rows: Sequence[Row], policies: Policies, world: CompiledWorld, episodes: int, seed: int
+) -> tuple[list[EpisodeList], Outcome, int]:
+    """Run rows of a table in one compiled call.
+
+    Args:
+      rows: R of them; their arms must be among those of the policies.
+      policies: S seeds of each arm.
+      world: the scenes.
+      episodes: in all, drawn anew in every bank.
+      seed: of the episode lists and the sampled actions.
+
+    Returns:
+      The episodes of each bank, outcomes with leaves [R, S, E], and the number of compilations.
+    """
+    each = -(-episodes // len(world.banks))
+    lists = [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
+    evaluator = Evaluator(policies.acting(world.env))
+    outcome = evaluator(
+        inference_grid(rows, policies.arms, policies.seeds),
+        policies.params,
+        zip(lists, read_ahead(world, range(len(world.banks))), strict=True),
+        policies.knowledge,
+        jax.random.key(seed),
+    )
+    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
+    return lists, outcome, evaluator.compilations
 
 
 def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:

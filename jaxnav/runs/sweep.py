@@ -10,13 +10,14 @@ import numpy as np
 from rich.console import Console
 
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import episode_list, together
-from jaxnav.evaluation.grid import Evaluator, Outcome
+from jaxnav.evaluation.episodes import together
+from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.metrics import episode_metrics
 from jaxnav.evaluation.report import Decoding, Form
-from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.evaluation.variants import table_row
 from jaxnav.runs.directory import Run
-from jaxnav.runs.worlds import evaluation_world, read_ahead
+from jaxnav.runs.evaluate import run_rows
+from jaxnav.runs.worlds import evaluation_world
 
 
 class Sweep(NamedTuple):
@@ -72,17 +73,7 @@ def sweep(
     policies = policies if params is None else policies._replace(params=jax.tree.map(jnp.asarray, params))
     rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilon]
     world = evaluation_world(run.config, split, scenes, shift, Console(quiet=True))
-    each = -(-episodes // len(world.banks))
-    lists = [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
-    evaluator = Evaluator(policies.acting(world.env))
-    outcome = evaluator(
-        inference_grid(rows, policies.arms, policies.seeds),
-        policies.params,
-        zip(lists, read_ahead(world, range(len(world.banks))), strict=True),
-        policies.knowledge,
-        jax.random.key(seed),
-    )
-    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
+    lists, outcome, compilations = run_rows(rows, policies, world, episodes, seed)
     metrics = episode_metrics(outcome, together(lists).best_length)
     sr, spl, dts = (metrics[name] for name in ("sr", "spl", "dts"))
-    return Sweep(np.asarray(epsilon, np.float64), sr, spl, dts, outcome, evaluator.compilations)
+    return Sweep(np.asarray(epsilon, np.float64), sr, spl, dts, outcome, compilations)

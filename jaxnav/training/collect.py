@@ -163,9 +163,21 @@ def collect(
 
     last = truncation.agent
     last = acting.perceive(last, carried(last).action, truncation.moved, knowledge, params)
-    _, after_truncation = decide(last)
-    _, after_rollout = decide(agent)
-    next_value = jnp.concatenate([transitions.value[1:], after_rollout.value[None]])
-    at_truncation = jnp.arange(length)[:, None] == truncation.time[None, :]
-    next_value = jnp.where(at_truncation, after_truncation.value[None, :], next_value)
-    return agent, Rollout(transitions, memory, jnp.where(transitions.terminated, 0.0, next_value))
+    values = decide(last)[1].value, decide(agent)[1].value
+    return agent, Rollout(transitions, memory, _next_values(transitions, truncation.time, *values))
+
+
+def _next_values(
+    transitions: Transition, truncated_at: jax.Array, after_truncation: jax.Array, after_rollout: jax.Array
+) -> jax.Array:
+    """Return the values that returns go on with, float32 [T, B].
+
+    Args:
+      transitions: leaves [T, B].
+      truncated_at: int32 [B], step of a truncation; -1 without one.
+      after_truncation, after_rollout: float32 [B], values of the states there.
+    """
+    next_value = jnp.concatenate([transitions.value[1:], after_rollout[None]])
+    at_truncation = jnp.arange(len(next_value))[:, None] == truncated_at[None, :]
+    next_value = jnp.where(at_truncation, after_truncation[None, :], next_value)
+    return jnp.where(transitions.terminated, 0.0, next_value)
