@@ -1,11 +1,9 @@
 """The layout estimator, equations 3 to 6.
 
-It holds a Dirichlet belief about which categories are seen together.
-
-Row i of `alpha` [K, K] parametrises a Dirichlet over the categories j != i seen together with category i. The belief
-starts at the prior alpha*, gains counts as the episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5, or
-`evidence_gap`) and the expected co-occurrence w (eq. 6). There are no learned parameters. Functions take one episode;
-callers `vmap`.
+It holds a Dirichlet belief about which categories are seen together. Row i of `alpha` [K, K] parametrises a Dirichlet
+over the categories j != i seen together with category i. The belief starts at the prior alpha*, gains counts as the
+episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5, or `evidence_gap`) and the expected co-occurrence w
+(eq. 6). There are no learned parameters. Functions take one episode; callers `vmap`.
 """
 
 import dataclasses

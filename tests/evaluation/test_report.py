@@ -10,6 +10,7 @@ from rich.console import Console
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation import report as reports
+from jaxnav.evaluation import report_tables
 
 STRATA = np.array([0, 0, 1, 1])
 LENGTHS = np.array([1, 4, 5, 9])
@@ -186,7 +187,7 @@ def test_markdown_table_with_the_label_of_every_variant():
         fixed_row(variant="stde", form="residual", epsilon=0.5),
         fixed_row(variant="stde", form="paper", epsilon=0.25),
     )
-    assert reports.markdown_table(report) == (
+    assert report_tables.markdown_table(report) == (
         "| Variant | SR (%) | SPL (%) | DTS (m) |\n"
         "| --- | ---: | ---: | ---: |\n"
         "| **ithor test, argmax decoding** |  |  |  |\n"
@@ -201,7 +202,7 @@ def test_markdown_table_with_the_label_of_every_variant():
 
 def test_rows_are_grouped_by_decoding():
     report = fixed_report(fixed_row(), fixed_row(decoding="sample"), fixed_row(variant="layout"))
-    first_cells = [line.split(" | ")[0].strip("| ") for line in reports.markdown_table(report).splitlines()[2:]]
+    first_cells = [line.split(" | ")[0].strip("| ") for line in report_tables.markdown_table(report).splitlines()[2:]]
     assert first_cells == [
         "**ithor test, argmax decoding**",
         "ORG (baseline)",
@@ -214,7 +215,7 @@ def test_rows_are_grouped_by_decoding():
 def test_console_table():
     report = fixed_report(fixed_row(method="[bold]X[/bold]"), fixed_row(decoding="sample", method="VTNet"))
     console = Console(width=120, record=True, file=io.StringIO())
-    console.print(reports.console_table(report))
+    console.print(report_tables.console_table(report))
     lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines()]
     assert [cells for cells in lines if cells] == [
         ["ithor test, argmax decoding", "", "", ""],
@@ -228,7 +229,7 @@ def test_difference_table_has_a_line_per_comparison():
     entry = {"from": "layout", "to": "stde", "epsilon": 0.5, "form": "residual", "decoding": "argmax"}
     values = [("sr", 25.0, [10.0, 40.0]), ("spl", -1.25, [-2.0, 0.5]), ("dts", -0.031, [-0.1, 0.0])]
     report = {"differences": [{**entry, "metric": name, "mean": mean, "ci95": ci} for name, mean, ci in values]}
-    table = reports.difference_table(report)
+    table = report_tables.difference_table(report)
     cells = [str(next(iter(column.cells))) for column in table.columns]
     expected = [
         "+ w + sTDE (eps=0.5) - + w",
