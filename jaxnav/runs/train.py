@@ -1,0 +1,5 @@
+"""Training of a run."""
+
+from jaxnav.cli.train import train
+
+__all__ = ["train"]
