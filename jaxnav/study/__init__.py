@@ -1,1 +1,1 @@
-"""The study of the paper's claims; nothing outside it depends on it."""
+"""The study of the paper's claims, which nothing else imports."""

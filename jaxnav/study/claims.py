@@ -1,136 +1,124 @@
-"""The paper's claims as effects with intervals, and whether they hold: from the study's results alone."""
+"""The paper's claims as effects with intervals."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-#: Results by the name of their part, see `jaxnav.cli.study`.
-Results = Mapping[str, dict[str, Any]]
+from jaxnav.study.curves import GapCourse
+from jaxnav.study.intervals import Interval
+from jaxnav.study.results import StudyResults
+from jaxnav.study.trials import NO_THRESHOLD, THRESHOLD, Trial
+
+LAYOUT, TDE = Trial("layout"), Trial("tde")
+STDE, FULL_STDE = (Trial("stde", "argmax", *use) for use in (THRESHOLD, NO_THRESHOLD))
 
 
 class Claim(NamedTuple):
-    """One claim put to the test.
+    """Hold one claim put to the test.
 
     Attributes:
       text: the claim, as an effect above 0.
       unit: of the effect.
-      mean, low, high: the effect and its 95 % interval.
+      effect: its size.
       least: the least effect that would matter.
     """
 
     text: str
     unit: str
-    mean: float
-    low: float
-    high: float
+    effect: Interval
     least: float
 
     @property
     def verdict(self) -> str:
-        """`holds` if the interval lies above 0; if not, `does not hold` if it lies below what would matter."""
-        if self.low > 0:
-            return "holds" if self.high >= self.least else "holds, but is small"
-        return "does not hold" if self.high < self.least else "cannot be told here"
+        """Return whether the claim holds.
+
+        It holds if the interval lies above 0; it does not if the interval lies below what would matter.
+        """
+        if self.effect.low > 0:
+            return "holds" if self.effect.high >= self.least else "holds, but is small"
+        return "does not hold" if self.effect.high < self.least else "cannot be told here"
 
 
-def select(part: Mapping[str, Any], **wanted: Any) -> list[dict[str, Any]]:
-    """The rows of a part's table with these entries; best actions, no control, the run's own gap unless named."""
-    wanted = {"gap": "novelty", "decoding": "argmax", "control": None, **wanted}
-    return [row for row in part["rows"] if all(row[key] == value for key, value in wanted.items())]
+def claims(results: StudyResults, world: str = "main") -> list[Claim]:
+    """Return what the paper claims of one world, best actions."""
+    in_world = results.worlds[world]
+    first, last = in_world.conditions[0], in_world.conditions[-1]
+    slope = last.gains.stde.slope
+    return [
+        *_effects_of_weights(results, world),
+        *_effects_of_stde(results, world),
+        _points("Hard TDE loses to the weights where the layout is as trained", -first.effect(TDE)),
+        Claim("Success follows the layout's similarity (Fig. 4)", "r", first.similarity.pearson, 0.1),
+        Claim("Gains over the baseline are larger where similarity is low (Fig. 5)", "points per -0.1", -slope, 1.0),
+        *_gap_claims(in_world.course, first.shift, last.shift),
+    ]
 
 
-def pick(part: Mapping[str, Any], **wanted: Any) -> dict[str, Any]:
-    """The first of `select`."""
-    return next(iter(select(part, **wanted)))
+def _effects_of_weights(results: StudyResults, world: str) -> list[Claim]:
+    in_world = results.worlds[world]
+    first, last = in_world.conditions[0], in_world.conditions[-1]
+    loss = in_world.instrument.discriminating[0].change  # best actions
+    return [
+        _points(f"The baseline loses from shift {first.shift:g} to {last.shift:g}", loss),
+        _points("The layout's weights help where the layout is as trained", first.effect(LAYOUT)),
+        _points(f"The layout's weights help at shift {last.shift:g}", last.effect(LAYOUT)),
+    ]
 
 
-def claims(results: Results, world: str = "main") -> list[Claim]:
-    """What the paper claims of one world, `main` or `real`, best actions."""
-    parts = [results[f"{world}-shift{shift:g}"] for shift in _shifts(results)]
-    first, last = parts[0], parts[-1]
-    at = f"at shift {last['shift']:g}"
-    paper = {"variant": "stde", "epsilon": 0.5, "form": "residual"}
-    full = {"variant": "stde", "epsilon": 0.0, "form": "paper"}
-    mismatch = full | {"gap": "evidence"}
+def _effects_of_stde(results: StudyResults, world: str) -> list[Claim]:
+    conditions = results.worlds[world].conditions
+    first, last = conditions[0], conditions[-1]
+    at = f"at shift {last.shift:g}"
+    goal = results.runs.get("goal", ()) if world == "main" else ()
+    return [
+        _points(f"sTDE (epsilon 0.5) gains on the weights {at}", last.effect(STDE)),
+        _points(f"sTDE (paper's form, epsilon 0) gains on the weights {at}", last.effect(FULL_STDE)),
+        *(
+            _points(
+                f"The same at shift {condition.shift:g} where the direct pathway sees the goal's detection alone",
+                condition.effect(FULL_STDE),
+            )
+            for condition in (*goal[:1], *goal[-1:])
+        ),
+        _points(
+            f"sTDE with the `evidence` gap (paper's form, epsilon 0) gains on the weights {at}",
+            last.effect(FULL_STDE, "evidence"),
+        ),
+        _points(
+            "The gain of sTDE (epsilon 0.5) grows with the shift",
+            _independent_difference(last.effect(STDE), first.effect(STDE)),
+        ),
+    ]
 
-    def gain(name: str, part: Mapping[str, Any], **wanted: Any) -> Claim:
-        return _claim(name, "SR points", pick(part, **wanted)["difference"]["sr"], least=2.0)
 
-    loss = results[f"instrument-{world}"]["discriminating"][0]  # best actions
-    course = results[f"gap-{world}"]
-    late = min(20, len(course["steps"]) - 1)
-    lines = {line["setting"]: line for line in course["auc"][-1]["lines"]}
-    own = next(panel for panel in course["panels"] if panel["setting"] == "calibrated")["lines"]
-    updated, frozen = (
-        next(line for line in own if line["shift"] == first["shift"] and line["belief"] == belief)
-        for belief in ("updated", "frozen")
-    )
-    hard = pick(first, variant="tde")["difference"]["sr"]
+def _gap_claims(course: GapCourse, first_shift: float, last_shift: float) -> list[Claim]:
+    late = min(20, len(course.steps) - 1)
+    updated, frozen = (course.gap("calibrated", first_shift, belief).at(late) for belief in ("updated", "frozen"))
+    calibrated, evidence = (course.auc[-1].curve(setting) for setting in ("calibrated", "evidence"))
     rows = [
-        _claim(f"The baseline loses from shift {first['shift']:g} to {last['shift']:g}", "SR points", loss, least=2.0),
-        gain("The layout's weights help where the layout is as trained", first, variant="layout"),
-        gain(f"The layout's weights help {at}", last, variant="layout"),
-        gain(f"sTDE (epsilon 0.5) gains on the weights {at}", last, **paper),
-        gain(f"sTDE (paper's form, epsilon 0) gains on the weights {at}", last, **full),
-        gain(f"sTDE with the `evidence` gap (paper's form, epsilon 0) gains on the weights {at}", last, **mismatch),
-        _difference("The gain of sTDE (epsilon 0.5) grows with the shift", *(_gain(p, paper) for p in (last, first))),
-        _claim("Hard TDE loses to the weights where the layout is as trained", "SR points", _negated(hard), least=2.0),
-        _claim("Success follows the layout's similarity (Fig. 4)", "r", first["similarity"]["pearson"], least=0.1),
-        _claim(
-            "Gains over the baseline are larger where similarity is low (Fig. 5)",
-            "points per -0.1",
-            _negated(last["gains"]["stde"]["slope"]),
-            least=1.0,
+        (f"The gap is below 0.5 at step {late} (Fig. 6b; it was calibrated to be)", "D", 0.5 - updated),
+        (f"Without updates it is above 0.5 at step {late} (Fig. 6b)", "D", frozen - 0.5),
+        *(
+            (
+                f"Eq. 5's gap tells shift {last_shift:g} from none at step {step}",
+                "AUC - 0.5",
+                calibrated.at(step) - 0.5,
+            )
+            for step in (0, late)
         ),
-        _line(
-            f"The gap is below 0.5 at step {late} (Fig. 6b; it was calibrated to be)",
-            updated,
-            late,
-            lambda gap: 0.5 - gap,
-        ),
-        _line(f"Without updates it is above 0.5 at step {late} (Fig. 6b)", frozen, late, lambda gap: gap - 0.5),
+        (f"The `evidence` gap does at step {late}", "AUC - 0.5", evidence.at(late) - 0.5),
     ]
-    for part in (results.get(f"goal-shift{part['shift']:g}") for part in (last, first) if world == "main"):
-        if part:
-            what = f"The same at shift {part['shift']:g} where the direct pathway sees the goal's detection alone"
-            rows.insert(5, gain(what, part, **full))
-    rows += [
-        _line(f"Eq. 5's gap tells shift {last['shift']:g} from none at step {step}", lines["calibrated"], step, _above)
-        for step in (0, late)
-    ]
-    return [*rows, _line(f"The `evidence` gap does at step {late}", lines["evidence"], late, _above)]
+    return [Claim(*row, least=0.05) for row in rows]
 
 
-def _shifts(results: Results) -> list[float]:
-    return next(iter(results.values()))["study"]["shifts"]
+def _points(text: str, effect: Interval) -> Claim:
+    return Claim(text, "SR points", effect, 2.0)
 
 
-def _gain(part: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
-    return pick(part, **wanted)["difference"]["sr"]
+def _independent_difference(a: Interval, b: Interval) -> Interval:
+    """Return a - b, taken for independent normal variables.
 
-
-def _claim(text: str, unit: str, effect: Mapping[str, Any], least: float) -> Claim:
-    if effect["mean"] is None:  # what is compared does not vary
-        return Claim(text, unit, math.nan, math.nan, math.nan, least)
-    return Claim(text, unit, effect["mean"], effect["ci95"][0], effect["ci95"][1], least)
-
-
-def _negated(effect: Mapping[str, Any]) -> Mapping[str, Any]:
-    low, high = effect["ci95"]
-    return effect if effect["mean"] is None else {"mean": -effect["mean"], "ci95": [-high, -low]}
-
-
-def _difference(text: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Claim:
-    """a - b, their intervals taken for those of independent normal variables, which they are only nearly."""
-    half = math.hypot(*((effect["ci95"][1] - effect["ci95"][0]) / 2 for effect in (a, b)))
-    mean = a["mean"] - b["mean"]
-    return Claim(text, "SR points", mean, mean - half, mean + half, 2.0)
-
-
-def _above(auc: float) -> float:
-    return auc - 0.5
-
-
-def _line(text: str, line: Mapping[str, Sequence[float]], step: int, effect: Callable[[float], float]) -> Claim:
-    low, high = sorted(effect(line[name][step]) for name in ("low", "high"))
-    return Claim(text, "AUC - 0.5" if effect is _above else "D", effect(line["mean"][step]), low, high, 0.05)
+    They are so only nearly.
+    """
+    half = math.hypot(*((effect.high - effect.low) / 2 for effect in (a, b)))
+    mean = a.mean - b.mean
+    return Interval(mean, mean - half, mean + half)

@@ -1,37 +1,33 @@
-"""The training runs of the study."""
+"""Settings of the study."""
 
 import dataclasses
 import itertools
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.console import Console
-
-from jaxnav.cli.options import parse
-from jaxnav.cli.train import train
 from jaxnav.errors import InputError
-from jaxnav.runs.config import RunConfig, WorldConfig, check
-from jaxnav.runs.directory import load_run, settings
-from jaxnav.runs.policies import load_policies
+from jaxnav.runs.config import RunConfig, WorldConfig
 
 
 @dataclasses.dataclass(frozen=True)
 class StudyConfig:
-    """The study; what is finished is kept, so it goes on where it was interrupted.
+    """Describe a study; finished runs and results are kept.
 
     Attributes:
       results: folder of the results, one JSON file for each part.
-      document: what they say, made from them alone; figures go into a folder beside it.
+      document: Markdown file written from the results; figures go into a folder beside it.
       runs: folder of the training runs.
-      trainings: which runs; `main` is always there.
+      trainings: names of the training runs; `main` is always there.
       real: scene file with `train` and `val`; one more run is trained on it and relabelled.
-      split: scenes to evaluate on. `test` takes the epsilon that `val` chose; use it once.
-      shifts: of the layout; the first is the training layout.
+      split: scenes to evaluate on. `test` takes the epsilon chosen on `val`; use it once.
+      shifts: layout shifts; the first is the training layout.
       epsilon: thresholds of sTDE.
-      episodes: at each shift.
-      steps: of the gap's course.
+      episodes: number at each shift.
+      steps: length of the gap curves.
       seed: of episode lists, sampled actions and bootstraps.
-      base: the runs' common settings.
+      base: settings that all runs share.
     """
 
     results: Path = Path("results")
@@ -48,8 +44,8 @@ class StudyConfig:
     base: RunConfig = RunConfig(seeds=5, worlds=WorldConfig(num_val=80, num_test=80))
 
 
-#: What each run changes. Runs with the layout arm alone are compared with their own layout's weights.
-CHANGES: dict[str, dict[str, Any]] = {
+#: Settings that each run changes. Runs of the layout arm alone are compared with their plain layout weights.
+CHANGES: Mapping[str, Mapping[str, Any]] = {
     "main": {},
     "none": {"counterfactual": "none", "arms": ("layout",)},
     "coin": {"counterfactual": "coin", "arms": ("layout",)},
@@ -62,14 +58,12 @@ CHANGES: dict[str, dict[str, Any]] = {
 }
 
 
-def parse_study(arguments: list[str] | None) -> StudyConfig:
-    """Settings of a study: defaults, then the file of `--config`, then the other options.
+def check_study(config: StudyConfig) -> StudyConfig:
+    """Return the same config if every setting is possible.
 
     Raises:
-      InputError: bad config file or setting.
-      SystemExit: with code 2 after a bad option, 0 after --help.
+      InputError: names the first impossible setting.
     """
-    config = parse(StudyConfig(), arguments, "eval.py study", "Put the paper's claims to the test.")
     if unknown := set(config.trainings) - set(CHANGES):
         raise InputError(f"trainings: {sorted(unknown)[0]!r} is unknown; choose from {', '.join(CHANGES)}")
     shifts = config.shifts
@@ -90,23 +84,14 @@ def parse_study(arguments: list[str] | None) -> StudyConfig:
     return config
 
 
-def training(config: StudyConfig, name: str) -> RunConfig:
-    """The settings of one of the study's runs."""
-    changes = {"scenes": config.real} if name == "real" else CHANGES[name]
-    nested = {
-        key: dataclasses.replace(getattr(config.base, key), **value) if isinstance(value, dict) else value
-        for key, value in changes.items()
-    }
-    return check(dataclasses.replace(config.base, run_dir=config.runs / name, **nested))
+def study_identity(config: StudyConfig) -> dict[str, Any]:
+    """Return as JSON the settings that decide a part's numbers.
 
-
-def ensure(run: RunConfig, console: Console) -> None:
-    """Train a run unless it is finished."""
-    try:
-        load_policies(run, run.arms)
-        finished = settings(load_run(run.run_dir)) == settings(run)
-    except InputError:
-        finished = False
-    if not finished:
-        console.print(f"training {run.run_dir}")
-        train(run, console)
+    File places, the split and the list of other runs are left out.
+    """
+    settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    for name in ("results", "document", "runs", "split", "trainings", "real"):
+        settings.pop(name)
+    for name in ("run_dir", "save_every", "cache", "devices"):
+        settings["base"].pop(name)
+    return settings

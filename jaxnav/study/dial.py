@@ -1,134 +1,99 @@
-"""What the layout shift changes, from measures scene by scene: who stands near whom, or also the difficulty."""
+"""What the layout shift changes, from measures scene by scene."""
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from jaxnav.errors import InputError
-
-#: Difficulty is matched where it changes by at most so many percent; the baseline must lose at least so many points.
-TOLERANCE, LOSS = 5.0, 8.0
-RESAMPLES = 2000
-
-#: Rows of the table: name and decimals. The first three must not depend on the dial.
-MEASURES = {
-    "best_length": ("Shortest path L* (actions)", 2),
-    "random_sr": ("Random SR (%)", 2),
-    "frontier_sr": ("Frontier search SR (%)", 1),
-    "frontier_steps": ("Frontier search, actions", 1),
-    "layout_gap": ("Layout gap to the prior, KL (nats)", 3),
-    "layout_similarity": ("Layout similarity to the prior, cosine", 3),
-    "baseline_argmax_sr": ("Baseline SR, argmax (%)", 1),
-    "baseline_sample_sr": ("Baseline SR, sampled (%)", 1),
-}
-MATCHED, BASELINES = tuple(MEASURES)[:3], tuple(MEASURES)[-2:]
+from jaxnav.study.bootstrap import stratified_draws
+from jaxnav.study.instrument_report import (
+    BASELINES,
+    LOSS,
+    MATCHED,
+    MEASURES,
+    TOLERANCE,
+    Change,
+    InstrumentReport,
+    Measure,
+    MeasuredShift,
+)
+from jaxnav.study.intervals import percentile_interval
 
 
 class Totals(NamedTuple):
-    """What was measured in the N scenes at one shift.
+    """Hold what is measured in N scenes at one shift.
 
     Attributes:
-      values: by name of the measure, float64 [S, N]: sums over the scene's episodes by seed (S = 1 without seeds).
-      weights: by name of the measure, float64 [N]: over how many they are; a mean is sum of values / sum of weights.
+      values: float64 [S, N], sums over the scene's episodes by seed; S = 1 where there are no seeds.
+      weights: float64 [N], numbers of episodes; a mean is sum of values / sum of weights.
       rooms: [N] room types.
       names: [N] of the scenes.
     """
 
-    values: dict[str, np.ndarray]
-    weights: dict[str, np.ndarray]
+    values: Mapping[Measure, np.ndarray]
+    weights: Mapping[Measure, np.ndarray]
     rooms: tuple[str, ...]
     names: tuple[str, ...]
 
 
-def compare(shifts: list[float], totals: list[Totals], seed: int) -> dict[str, Any]:
-    """The table, and what it shows of the dial, with 95 % bootstrap intervals.
+def compare(shifts: Sequence[float], totals: Sequence[Totals], seed: int) -> InstrumentReport:
+    """Compare all shifts with the first.
 
-    A resample draws scenes within each room type and training seeds; a drawn scene is there at all shifts, with its
-    twins, and so is a drawn seed.
+    Intervals are 95 % bootstrap ones. A resample draws scenes within each room type and training seeds; a drawn scene
+    is there at all shifts, with its twins, and so is a drawn seed.
+
+    Args:
+      shifts: layout shifts, rising.
+      totals: measures at each.
+      seed: of the resamples.
+
+    Raises:
+      InputError: a measure of difficulty is 0 at the first shift.
     """
-    names = sorted({name for own in totals for name in own.names})
-    rooms = {name: room for own in totals for name, room in zip(own.names, own.rooms, strict=True)}
+    means = _means(totals, seed)
+    table = tuple(
+        MeasuredShift(
+            shift=shift,
+            scenes=len(at_shift.names),
+            episodes=int(at_shift.weights["frontier_sr"].sum()),
+            measures={measure: percentile_interval(means[measure][i]) for measure in MEASURES},
+        )
+        for i, (shift, at_shift) in enumerate(zip(shifts, totals, strict=True))
+    )
+    matched = tuple(change for measure in MATCHED for change in _changes(measure, shifts, means[measure]))
+    losses = []
+    for measure in BASELINES:
+        loss = percentile_interval(means[measure][0] - means[measure][-1])
+        losses.append(Change(measure, shifts[0], shifts[-1], loss, holds=loss.mean >= LOSS and loss.low > 0))
+    return InstrumentReport(shifts=table, matched=matched, discriminating=tuple(losses))
+
+
+def _means(totals: Sequence[Totals], seed: int) -> dict[Measure, list[np.ndarray]]:
+    """Return means [1 + R] by measure and shift."""
+    names = sorted({name for at_shift in totals for name in at_shift.names})
+    rooms = {name: room for at_shift in totals for name, room in zip(at_shift.names, at_shift.rooms, strict=True)}
     seeds = len(totals[0].values[BASELINES[0]])
     generator = np.random.default_rng(seed)
-    scene_draws = _draws(np.array([rooms[name] for name in names]), generator)
-    seed_draws = _draws(np.zeros(seeds), generator) / seeds
+    scene_draws = stratified_draws(np.array([rooms[name] for name in names]), generator)
+    seed_draws = stratified_draws(np.zeros(seeds), generator).T / seeds
 
-    def means(measure: str, own: Totals) -> np.ndarray:
-        """The mean [0] and its resamples [1:]."""
-        place, values = np.searchsorted(names, own.names), own.values[measure]
-        scenes = np.concatenate([np.ones((1, len(place))), scene_draws[:, place]])
-        drawn = np.concatenate([np.full((1, seeds), 1 / seeds), seed_draws])
+    def mean(measure: Measure, at_shift: Totals) -> np.ndarray:
+        values = at_shift.values[measure]
+        scenes = np.ascontiguousarray(scene_draws[np.searchsorted(names, at_shift.names)].T)
         sums = scenes @ values.T
-        return (sums * (drawn if len(values) > 1 else 1.0)).sum(axis=1) / (scenes @ own.weights[measure])
+        return (sums * (seed_draws if len(values) > 1 else 1.0)).sum(axis=1) / (scenes @ at_shift.weights[measure])
 
-    every = {measure: [means(measure, own) for own in totals] for measure in MEASURES}
-    table = [
-        {"shift": shift, "scenes": len(own.names), "episodes": int(own.weights["frontier_sr"].sum())}
-        | {measure: _summary(every[measure][i]) for measure in MEASURES}
-        for i, (shift, own) in enumerate(zip(shifts, totals, strict=True))
-    ]
-    matched = []
-    for measure in MATCHED:
-        first, *others = every[measure]
-        for shift, own in zip(shifts[1:], others, strict=True):
-            if not first[0]:
-                raise InputError(
-                    f"{measure} is 0 at shift {shifts[0]:g}: nothing to compare with; give more --episodes"
-                )
-            change = 100.0 * (own - first) / first[0]
-            holds = bool(abs(change[0]) <= TOLERANCE)
-            matched.append({"measure": measure, "from": shifts[0], "to": shift, **_summary(change), "holds": holds})
-    discriminating = []
-    for measure in BASELINES:
-        loss = _summary(every[measure][0] - every[measure][-1])
-        holds = loss["mean"] >= LOSS and loss["ci95"][0] > 0
-        discriminating.append({"measure": measure, "from": shifts[0], "to": shifts[-1], **loss, "holds": holds})
-    return {"shifts": table, "matched": matched, "discriminating": discriminating}
+    return {measure: [mean(measure, at_shift) for at_shift in totals] for measure in MEASURES}
 
 
-def _draws(strata: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """How often each item comes up in a resample: int [RESAMPLES, N]; strata keep their sizes."""
-    counts = np.zeros((RESAMPLES, len(strata)))
-    for stratum in np.unique(strata):
-        members = np.flatnonzero(strata == stratum)
-        counts[:, members] = generator.multinomial(len(members), np.full(len(members), 1 / len(members)), RESAMPLES)
-    return counts
-
-
-def _summary(means: np.ndarray) -> dict[str, Any]:
-    return {"mean": float(means[0]), "ci95": np.percentile(means[1:], (2.5, 97.5)).tolist()}
-
-
-def console_table(report: dict[str, Any]) -> Table:
-    """A column per shift, `mean [95 % interval]`."""
-    table = Table("Layout shift", *(f"{own['shift']:g}" for own in report["shifts"]))
-    for name in ("scenes", "episodes"):
-        table.add_row(name.capitalize(), *(str(own[name]) for own in report["shifts"]))
-    for measure, (title, digits) in MEASURES.items():
-        cells = [_cell(own[measure], f".{digits}f") for own in report["shifts"]]
-        table.add_row(*map(Text, (title, *cells)))  # Text: brackets are not markup
-    return table
-
-
-def verdicts(report: dict[str, Any]) -> list[str]:
-    """What the table shows, line by line."""
-
-    def line(own: dict[str, Any], what: str) -> str:
-        return f"  {'yes' if own['holds'] else 'NO':3}  {MEASURES[own['measure']][0]}, {what}"
-
-    return [
-        f"Difficulty matched (within {TOLERANCE:g} % of shift {report['shifts'][0]['shift']:g})?",
-        *(line(own, f"shift {own['to']:g}: {_cell(own, '+.1f')} %") for own in report["matched"]),
-        f"Discriminating (at least {LOSS:g} points lost, the interval clear of 0)?",
-        *(
-            line(own, f"shift {own['from']:g} to {own['to']:g}: {_cell(own, '.1f')} points lost")
-            for own in report["discriminating"]
-        ),
-    ]
-
-
-def _cell(own: dict[str, Any], form: str) -> str:
-    low, high = own["ci95"]
-    return f"{own['mean']:{form}} [{low:{form}}, {high:{form}}]"
+def _changes(measure: Measure, shifts: Sequence[float], means: Sequence[np.ndarray]) -> list[Change]:
+    """Return the changes in percent from the first shift."""
+    first, *others = means
+    if not first[0]:
+        raise InputError(f"{measure} is 0 at shift {shifts[0]:g}: nothing to compare with; give more --episodes")
+    changes = []
+    for shift, mean in zip(shifts[1:], others, strict=True):
+        change = percentile_interval(100.0 * (mean - first) / first[0])
+        changes.append(Change(measure, shifts[0], shift, change, holds=abs(change.mean) <= TOLERANCE))
+    return changes

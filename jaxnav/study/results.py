@@ -1,112 +1,125 @@
-"""The study's results, its Table 1 and its figures."""
+"""Result files of a study, one for each part."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from jaxnav.study.claims import Results, pick, select
-from jaxnav.study.figures import (
-    auc_figure,
-    effects_figure,
-    epsilon_figure,
-    gain_figure,
-    gap_figure,
-    save,
-    similarity_figure,
-)
-from jaxnav.study.trials import USES
+from jaxnav.evaluation.report import FORMAT, versions
+from jaxnav.store.files import write_atomic
+from jaxnav.study.codec import from_json, to_json
+from jaxnav.study.curves import GapCourse
+from jaxnav.study.instrument_report import InstrumentReport
+from jaxnav.study.records import Condition, FullCondition
 
-NAMED_USES = dict(zip(("sTDE (eps 0.5)", "sTDE (eps 0, paper's form)"), USES, strict=True))
+#: Runs whose worlds are measured as instruments, and whose gaps are followed.
+WORLDS = ("main", "real")
+Kind = TypeVar("Kind", bound=Condition)
 
 
-def load(folder: Path) -> Results:
-    """The parts of the study in a folder, by name; those of another study, left behind there, are not read."""
+@dataclass(frozen=True)
+class WorldResults:
+    """Hold what is known of one world.
+
+    Attributes:
+      conditions: one for each shift.
+      instrument: what the shift changes.
+      course: of the gap.
+    """
+
+    conditions: tuple[FullCondition, ...]
+    instrument: InstrumentReport
+    course: GapCourse
+
+
+@dataclass(frozen=True)
+class StudyResults:
+    """Hold the results of a study on one split.
+
+    Attributes:
+      shifts: of the layout.
+      episodes: number at each shift.
+      seeds: number of training seeds.
+      total_steps: environment steps of each policy.
+      worlds: `main`, and `real` where it was studied.
+      runs: conditions of each run, one for each shift; `main` comes first.
+    """
+
+    shifts: tuple[float, ...]
+    episodes: int
+    seeds: int
+    total_steps: int
+    worlds: Mapping[str, WorldResults]
+    runs: Mapping[str, tuple[Condition, ...]]
+
+
+def condition_name(run: str, shift: float) -> str:
+    """Return the name of the part that holds a condition."""
+    return f"{run}-shift{shift:g}"
+
+
+def load_results(folder: Path) -> StudyResults | None:
+    """Load the results in a folder, if there are any.
+
+    Parts of another study than that of `gap-main` are ignored.
+    """
     parts = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
-    own = parts["gap-main"]["study"] if parts else None
-    return {name: part for name, part in parts.items() if part["study"] == own}
+    if not parts:
+        return None
+    study = parts["gap-main"]["study"]
+    parts = {name: part for name, part in parts.items() if part["study"] == study}
+    worlds = {
+        world: WorldResults(
+            _conditions(parts, world, study["shifts"], FullCondition),
+            from_json(InstrumentReport, parts[f"instrument-{world}"]),
+            from_json(GapCourse, parts[f"gap-{world}"]),
+        )
+        for world in WORLDS
+        if f"gap-{world}" in parts
+    }
+    names = {name.partition("-shift")[0] for name in parts if "-shift" in name}
+    runs = {
+        name: _conditions(parts, name, study["shifts"], Condition)
+        for name in sorted(names, key=lambda name: (name != "main", name))
+        if all(condition_name(name, shift) in parts for shift in study["shifts"])
+    }
+    base = study["base"]
+    return StudyResults(tuple(study["shifts"]), study["episodes"], base["seeds"], base["total_steps"], worlds, runs)
 
 
-def draw(folder: Path, images: Path) -> None:
-    """Draw every figure of the results in a folder."""
-    results = load(folder)
-    images.mkdir(parents=True, exist_ok=True)
-    for world in worlds(results):
-        parts = conditions(results, world)
-        ends = [parts[0], parts[-1]]
-        points = ({"shift": p["shift"], **p["similarity"]} for p in parts)
-        save(similarity_figure({"panels": list(points)}), images / f"{world}-fig4.png")
-        gains = [{"shift": p["shift"], "variant": "+ w + sTDE", **p["gains"]["stde"]} for p in ends]
-        save(gain_figure({"panels": gains}), images / f"{world}-fig5.png")
-        save(epsilon_figure(_sweep(parts)), images / f"{world}-fig6a.png")
-        course = results[f"gap-{world}"]
-        save(gap_figure(_ends(course)), images / f"{world}-fig6b.png")
-        save(auc_figure({"steps": course["steps"], **course["auc"][-1]}), images / f"{world}-auc.png")
-        save(effects_figure(_effects(parts)), images / f"{world}-effects.png")
+def load_condition(path: Path) -> Condition:
+    """Load the condition in a file."""
+    return from_json(Condition, json.loads(path.read_text()))
 
 
-def worlds(results: Results) -> list[str]:
-    """`main`, and `real` where it was studied."""
-    return [world for world in ("main", "real") if f"gap-{world}" in results]
+def write_part(path: Path, study: Mapping[str, Any], record: Condition | InstrumentReport | GapCourse) -> None:
+    """Write a part of a study, numbers to six digits.
+
+    Raises:
+      OSError: the file cannot be written.
+      ValueError: a curve holds NaN or an infinity.
+    """
+    part = {"study": study, "versions": versions(), "format": FORMAT, **to_json(record)}
+    write_atomic(path, (json.dumps(_rounded(part), allow_nan=False) + "\n").encode())
 
 
-def conditions(results: Results, world: str) -> list[dict[str, Any]]:
-    """The parts of a world in the order of their shifts."""
-    return [results[f"{world}-shift{shift:g}"] for shift in results[f"gap-{world}"]["study"]["shifts"]]
+def is_written(path: Path, study: Mapping[str, Any]) -> bool:
+    """Return whether an undamaged part of this study is there."""
+    try:
+        return json.loads(path.read_text())["study"] == study
+    except (FileNotFoundError, ValueError, KeyError):
+        return False
 
 
-def _ends(course: Mapping[str, Any]) -> dict[str, Any]:
-    """Fig. 6b at the first and the last shift."""
-    shifts = [line["shift"] for line in course["panels"][0]["lines"]]
-    panels = [
-        {**panel, "lines": [line for line in panel["lines"] if line["shift"] in (shifts[0], shifts[-1])]}
-        for panel in course["panels"]
-    ]
-    return {"steps": course["steps"], "panels": panels}
+def _conditions(parts: Mapping[str, Any], run: str, shifts: list[float], kind: type[Kind]) -> tuple[Kind, ...]:
+    return tuple(from_json(kind, parts[condition_name(run, shift)]) for shift in shifts)
 
 
-def _sweep(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Fig. 6a, best actions."""
-    lines, epsilons = [], []
-    for part in parts:
-        for form in ("residual", "paper"):
-            own = sorted(select(part, variant="stde", form=form), key=lambda row: row["epsilon"])
-            epsilons = [row["epsilon"] for row in own]
-            lines.append({"shift": part["shift"], "form": form, **{m: _band(own, m) for m in ("sr", "spl", "dts")}})
-    return {"epsilon": epsilons, "lines": lines}
-
-
-def _band(rows: Sequence[Mapping[str, Any]], metric: str) -> dict[str, Any]:
-    low, high = zip(*(row[metric]["ci95"] for row in rows), strict=True)
-    seeds = zip(*(row[metric]["seeds"] for row in rows), strict=True)
-    return {"mean": [row[metric]["mean"] for row in rows], "low": low, "high": high, "seeds": list(map(list, seeds))}
-
-
-def _effects(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Differences of SR to the layout's weights, by shift."""
-    groups = []
-    for part in parts:
-        rows = []
-        for name, row in table_1(part):
-            if row["variant"] == "stde" and row["control"] is None:
-                effect = row["difference"]["sr"]
-                rows.append({"name": name.replace("`", ""), "mean": effect["mean"], "ci95": effect["ci95"]})
-        groups.append({"title": f"shift {part['shift']:g}", "rows": rows})
-    return {"groups": groups}
-
-
-def table_1(part: Mapping[str, Any], decoding: str = "argmax") -> list[tuple[str, dict[str, Any]]]:
-    """Table 1: names and rows."""
-    rows = [
-        ("baseline", {"variant": "baseline"}),
-        ("+ w", {"variant": "layout"}),
-        ("+ w + TDE", {"variant": "tde"}),
-    ]
-    for name, (epsilon, form) in NAMED_USES.items():
-        own = {"variant": "stde", "epsilon": epsilon, "form": form}
-        rows += [(f"+ w + {name}", own), (f"+ w + {name}, `evidence`", own | {"gap": "evidence"})]
-        rows += [(f"+ w + {name}, random intervention", own | {"control": "random"})] if decoding == "argmax" else []
-    if "chosen" in part and decoding == "argmax":
-        own = {"variant": "stde", "epsilon": part["chosen"], "form": "residual"}
-        rows.append((f"+ w + sTDE (eps {part['chosen']:g}, chosen)", own))
-    return [(name, pick(part, decoding=decoding, **wanted)) for name, wanted in rows]
+def _rounded(value: Any) -> Any:
+    """Return JSON with six digits of each number."""
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

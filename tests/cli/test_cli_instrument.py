@@ -1,4 +1,4 @@
-"""The instrument command end to end, and all that it refuses."""
+"""The instrument command end to end, and what it refuses."""
 
 import json
 import runpy
@@ -18,7 +18,7 @@ from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import ROOMS
 from jaxnav.scenes.worlds import generated
-from jaxnav.study.dial import MEASURES
+from jaxnav.study.instrument_report import MEASURES
 
 
 @pytest.fixture(scope="module")
@@ -38,27 +38,27 @@ def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
     printed = capsys.readouterr().out
     report = json.loads((run_dir / "instrument-val.json").read_text())
     assert list(report) == ["run", "shifts", "matched", "discriminating", "versions", "format"]
-    assert [own["shift"] for own in report["shifts"]] == [0.0, 1.0]
+    assert [column["shift"] for column in report["shifts"]] == [0.0, 1.0]
     for title, _ in MEASURES.values():
         assert title in printed
     assert evaluate(run_dir, "--episodes", 12, "--shift", 1, "--json", run_dir / "eval.json") == 0
     rows = json.loads((run_dir / "eval.json").read_text())["rows"]
     baseline = {row["decoding"]: row["sr"]["mean"] for row in rows if row["variant"] == "baseline"}
-    for own in report["shifts"]:
-        assert (own["scenes"], own["episodes"]) == (4, 12)
+    for column in report["shifts"]:
+        assert (column["scenes"], column["episodes"]) == (4, 12)
         # Three episodes in each scene: means over scenes are means over episodes.
-        scenes = generated("rooms", "val", 4, 0, own["shift"])
+        scenes = generated("rooms", "val", 4, 0, column["shift"])
         bank = compile_bank((scenes[i] for i in range(4)), ROOMS)
         limits = np.array([14 if room == "living_room" else 12 for room in bank.room_types])
         searched = frontier_outcome(bank, episode_list(bank, 12), limits)
-        assert own["best_length"]["mean"] == pytest.approx(expected_length(bank).mean())
-        assert own["random_sr"]["mean"] == pytest.approx(100 * random_success(bank, limits).mean())
-        assert own["frontier_sr"]["mean"] == pytest.approx(100 * np.asarray(searched.success).mean())
-        assert own["frontier_steps"]["mean"] == pytest.approx(np.asarray(searched.length).mean())
-        assert own["layout_gap"]["mean"] > 0
-        assert 0 < own["layout_similarity"]["mean"] < 1
+        assert column["best_length"]["mean"] == pytest.approx(expected_length(bank).mean())
+        assert column["random_sr"]["mean"] == pytest.approx(100 * random_success(bank, limits).mean())
+        assert column["frontier_sr"]["mean"] == pytest.approx(100 * np.asarray(searched.success).mean())
+        assert column["frontier_steps"]["mean"] == pytest.approx(np.asarray(searched.length).mean())
+        assert column["layout_gap"]["mean"] > 0
+        assert 0 < column["layout_similarity"]["mean"] < 1
         # One scene of each room type: no scene is drawn anew.
-        assert own["best_length"]["ci95"] == pytest.approx(2 * [own["best_length"]["mean"]])
+        assert column["best_length"]["ci95"] == pytest.approx(2 * [column["best_length"]["mean"]])
     last = report["shifts"][-1]
     assert last["baseline_argmax_sr"]["mean"] == pytest.approx(baseline["argmax"])
     assert last["baseline_sample_sr"]["mean"] == pytest.approx(baseline["sample"])
@@ -68,7 +68,7 @@ def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
 def test_other_scenes_of_another_split(run_dir):
     assert instrument(run_dir, "--shift", 0, 1, "--episodes", 4, "--split", "test", "--scenes-per-split", 6) == 0
     report = json.loads((run_dir / "instrument-test.json").read_text())
-    assert [own["scenes"] for own in report["shifts"]] == [6, 6]
+    assert [column["scenes"] for column in report["shifts"]] == [6, 6]
     assert report["run"]["worlds"]["num_test"] == 6
     assert report["run"]["evaluation_split"] == "test"
 

@@ -1,4 +1,4 @@
-"""The study command end to end on runs of a few small rooms, and all that it refuses."""
+"""The study command end to end, and what it refuses."""
 
 import json
 import runpy
@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import study_results as made_up
+from support import study_results
 from support.commands import CONFIG, contents, refusal
 
 from jaxnav import __main__ as commands
 from jaxnav.cli import study as command
-from jaxnav.runs.directory import load_run
-from jaxnav.runs.policies import load_policies
-from jaxnav.study.config import CHANGES, StudyConfig, parse_study, training
+from jaxnav.runs.directory import load_policies, load_run
+from jaxnav.study import run as study_run
 from jaxnav.study.document import READING
+from jaxnav.study.runs import run_config
 from jaxnav.study.trials import USES
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, layout_priors
 
@@ -31,9 +31,9 @@ base:
 {"".join(f"  {line}{chr(10)}" for line in CONFIG.strip().splitlines())}
 """
 
-#: Variant, decoding, epsilon and form of what is told of a run of the layout's arm alone.
+#: Variant, decoding, epsilon and form of the rows of a run of the layout arm alone.
 LAYOUT_ARM = [(variant, "argmax", None, None) for variant in ("layout", "tde")]
-LAYOUT_ARM += [("stde", "argmax", *use) for use in USES]
+LAYOUT_ARM += [("stde", "argmax", *use) for use in USES.values()]
 
 
 def study(folder, *options):
@@ -41,18 +41,18 @@ def study(folder, *options):
     config = folder / "study.yaml"
     config.write_text(STUDY)
     places = {"results": "results", "document": "docs/study.md", "runs": "runs"}
-    own = [part for name, place in places.items() for part in (f"--{name}", str(folder / place))]
-    return command.main(["--config", str(config), *own, *map(str, options)])
+    given = [part for name, place in places.items() for part in (f"--{name}", str(folder / place))]
+    return command.main(["--config", str(config), *given, *map(str, options)])
 
 
 @pytest.fixture
 def untrained(monkeypatch):
-    """Fails a study that gets as far as training."""
+    """Fail a study that gets as far as training."""
 
-    def ensure(run, console):
+    def ensure_trained(run, console):
         pytest.fail(f"{run.run_dir} is trained before the request is refused")
 
-    monkeypatch.setattr(command, "ensure", ensure)
+    monkeypatch.setattr(study_run, "ensure_trained", ensure_trained)
 
 
 @pytest.mark.slow
@@ -69,7 +69,9 @@ def test_a_study_from_training_to_document(tmp_path):
         policies = load_policies(run, run.arms)
         assert (policies.spec.direct, policies.spec.done_gate) == ("goal", True)
         # The priors are those of the exported counts, and the setting is the calibrated one.
-        np.testing.assert_allclose(policies.priors, layout_priors(policies.counts, policies.setting), rtol=1e-6)
+        np.testing.assert_allclose(
+            policies.knowledge.layout, layout_priors(policies.counts, policies.setting), rtol=1e-6
+        )
         assert policies.setting.strength in STRENGTHS
         assert policies.setting.reduction in REDUCTIONS
 
@@ -77,14 +79,14 @@ def test_a_study_from_training_to_document(tmp_path):
     for shift in SHIFTS:
         main, coin = (json.loads((results / f"{run}-shift{shift:g}.json").read_text()) for run in ("main", "coin"))
         rows, others = ({tuple(row[key] for key in keys): row for row in part["rows"]} for part in (main, coin))
-        for part, own in ((main, rows), (coin, others)):
+        for part, by_key in ((main, rows), (coin, others)):
             assert (part["shift"], part["episodes"], part["scenes"]) == (shift, 24, 4)
-            assert len(own) == len(part["rows"])
+            assert len(by_key) == len(part["rows"])
         assert main["parameters"] == coin["parameters"] > 1000
         assert {row["gap"] for row in rows.values()} == {"novelty", "evidence", "clock"}
         for gap in ("novelty", "evidence"):
-            own, constant = (rows[gap, "stde", "argmax", 0.0, "paper", c] for c in (None, "constant"))
-            assert constant["mean_weight"] == pytest.approx(own["mean_weight"], rel=1e-5) != 0
+            plain, constant = (rows[gap, "stde", "argmax", 0.0, "paper", c] for c in (None, "constant"))
+            assert constant["mean_weight"] == pytest.approx(plain["mean_weight"], rel=1e-5) != 0
         # Where nothing is taken out, everything is as with the weights.
         still = rows["novelty", "stde", "argmax", 1.0, "residual", None]
         assert still["difference"]["sr"] == {"mean": 0.0, "std": 0.0, "ci95": [0.0, 0.0]}
@@ -99,29 +101,30 @@ def test_a_study_from_training_to_document(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")} == written
 
 
-# The command alone, on results made up
+# The command alone, on given results
 
 
 @pytest.fixture
-def made(monkeypatch):
-    """Nothing is trained, evaluated or drawn; the names of what would be, in order."""
-    parts = []
+def steps(monkeypatch):
+    """Replace all work; return the names of its steps."""
+    names = []
 
-    def make(name, result):
-        parts.append(name)
-        return result
+    def measured(name, record):
+        names.append(name)
+        return record
 
-    def table(run, full, shift, bench, console):
+    def measure_condition(run, full, shift, bench, console):
         name = run.run_dir.name
         assert full == (name in ("main", "real"))
-        return make(f"{name}-shift{shift:g}", made_up.part(shift, "main" if full else name) | {"chosen": 0.5})
+        condition = study_results.full_condition(shift, chosen=0.5) if full else study_results.condition(shift, name)
+        return measured(f"{name}-shift{shift:g}", condition)
 
-    monkeypatch.setattr(command, "ensure", lambda run, console: parts.append(run.run_dir.name))
-    monkeypatch.setattr(command, "instrument_report", lambda *_: make("instrument", made_up.instrument()))
-    monkeypatch.setattr(command, "table", table)
-    monkeypatch.setattr(command, "gaps", lambda *_: make("gap", made_up.course()))
-    monkeypatch.setattr(command, "draw", lambda folder, images: parts.append(f"figures of {folder.name}"))
-    return parts
+    monkeypatch.setattr(study_run, "ensure_trained", lambda run, console: names.append(run.run_dir.name))
+    monkeypatch.setattr(study_run, "instrument_report", lambda *_: measured("instrument", study_results.instrument()))
+    monkeypatch.setattr(study_run, "measure_condition", measure_condition)
+    monkeypatch.setattr(study_run, "gap_course", lambda *_: measured("gap", study_results.course()))
+    monkeypatch.setattr(study_run, "draw_figures", lambda folder, images: names.append(f"figures of {folder.name}"))
+    return names
 
 
 ASKED = ["main", "coin"]  # whether they are finished
@@ -129,11 +132,11 @@ MAIN, COIN = ["main-shift0", "main-shift1", "instrument", "gap"], ["coin-shift0"
 DRAWN = ["figures of val"]
 
 
-def test_only_what_is_missing_or_of_another_study_is_done(made, tmp_path):
+def test_only_what_is_missing_or_of_another_study_is_done(steps, tmp_path):
     def again(*options):
-        made.clear()
+        steps.clear()
         assert study(tmp_path, *options) == 0
-        return made
+        return steps
 
     assert again() == ASKED + MAIN + COIN + DRAWN
     document = tmp_path / "docs" / "study.md"
@@ -153,11 +156,11 @@ def test_only_what_is_missing_or_of_another_study_is_done(made, tmp_path):
     assert again("--episodes", 30) == ASKED + MAIN + COIN + DRAWN
 
 
-def test_test_is_a_section_of_its_own_and_leaves_the_figures(made, tmp_path):
+def test_test_is_a_separate_section_and_leaves_the_figures(steps, tmp_path):
     assert study(tmp_path) == 0
-    made.clear()
+    steps.clear()
     assert study(tmp_path, "--split", "test") == 0
-    assert made == ASKED + MAIN + COIN
+    assert steps == ASKED + MAIN + COIN
     names = [{path.name for path in (tmp_path / "results" / split).iterdir()} for split in ("val", "test")]
     assert names[0] == names[1]
     assert len(names[0]) == 6
@@ -192,7 +195,7 @@ def test_bad_requests_are_refused_before_any_training(untrained, tmp_path, capsy
     assert set(contents(tmp_path)) == {"study.yaml"}
 
 
-def test_a_document_of_ones_own_is_refused_before_any_training(untrained, tmp_path, capsys):
+def test_another_document_is_refused_before_any_training(untrained, tmp_path, capsys):
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "study.md").write_text("My own notes.")
     assert study(tmp_path) == 2
@@ -200,27 +203,11 @@ def test_a_document_of_ones_own_is_refused_before_any_training(untrained, tmp_pa
     assert set(contents(tmp_path)) == {"study.yaml", "docs/study.md"}
 
 
-def test_every_training_changes_what_it_is_called_after():
-    config = StudyConfig(runs=Path("somewhere"))
-    main = training(config, "main")
-    assert main.run_dir == Path("somewhere/main")
-    for name in CHANGES:
-        run = training(config, name)
-        assert run.run_dir == Path("somewhere") / name
-        assert (run == main) == (name == "main")
-        assert (run.seeds, run.total_steps, run.worlds.num_val) == (5, 2_000_000, 80)
-    assert training(config, "coin").arms == ("layout",)
-    assert training(config, "released").layout.setting == "released"
-    assert training(config, "shaping").worlds.shaping == 1.0
-    assert training(config, "shaping").worlds.num_test == 80
-    assert training(StudyConfig(real=Path("file.jsonl")), "real").scenes == Path("file.jsonl")
-
-
 @pytest.mark.parametrize("name", ["study", "study_quick"])
 def test_the_configs_that_come_with_it(name):
-    config = parse_study(["--config", str(Path(__file__).parents[2] / "configs" / f"{name}.yaml")])
+    config = command.parse_study(["--config", str(Path(__file__).parents[2] / "configs" / f"{name}.yaml")])
     assert config.shifts == (0.0, 0.5, 1.0)
-    assert training(config, "main").worlds.num_val == 80
+    assert run_config(config, "main").worlds.num_val == 80
     assert {0.0, 0.5, 1.0} <= set(config.epsilon)
     assert (config.document == Path("docs/study.md")) == (name == "study")
 

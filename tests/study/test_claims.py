@@ -1,11 +1,12 @@
-"""The claims: what is taken from the results, with which sign, and when a claim holds."""
+"""Claims: their effects, signs and verdicts."""
 
-import math
+import dataclasses
 
 import pytest
-from support import study_results as made_up
+from support import study_results
 
-from jaxnav.study.claims import Claim, claims, pick
+from jaxnav.study.claims import Claim, claims
+from jaxnav.study.intervals import UNDEFINED, Interval
 
 
 @pytest.mark.parametrize(
@@ -21,37 +22,18 @@ from jaxnav.study.claims import Claim, claims, pick
     ],
 )
 def test_verdicts(low, high, verdict):
-    assert Claim("", "SR points", (low + high) / 2, low, high, least=2.0).verdict == verdict
-
-
-# The row of a claim
-
-
-def test_a_row_is_picked_by_all_that_is_named_and_else_is_the_main_one():
-    part = made_up.part(1.0)
-    found = pick(part, variant="stde", epsilon=0.0, form="paper")
-    assert found["difference"]["sr"]["mean"] == 5.0  # best actions: 100 more when sampled
-    assert [found[name] for name in ("gap", "decoding", "control")] == ["novelty", "argmax", None]
-    assert pick(part, variant="stde", epsilon=0.0, form="paper", gap="evidence")["difference"]["sr"]["mean"] == 4.0
-    assert pick(part, variant="layout", decoding="sample")["difference"]["sr"]["mean"] == 101.0
-    control = pick(part, variant="stde", epsilon=0.0, form="paper", control="noise")
-    assert control["control"] == "noise"
-    with pytest.raises(StopIteration):
-        pick(made_up.part(1.0, "coin"), variant="baseline")
-
-
-# Effects
+    assert Claim("", "SR points", Interval((low + high) / 2, low, high), least=2.0).verdict == verdict
 
 
 @pytest.fixture(scope="module")
-def found():
-    return {claim.text: claim for claim in claims(made_up.results())}
+def by_text():
+    return {claim.text: claim for claim in claims(study_results.results())}
 
 
-def effect(found, text):
-    """Mean, low, high of the claim that contains a text."""
-    (claim,) = [claim for name, claim in found.items() if text in name]
-    return (claim.mean, claim.low, claim.high), claim.verdict
+def claim_about(by_text, text) -> Claim:
+    """Return the claim that contains a text."""
+    (claim,) = [claim for name, claim in by_text.items() if text in name]
+    return claim
 
 
 @pytest.mark.parametrize(
@@ -81,43 +63,58 @@ def effect(found, text):
         ("The `evidence` gap does at step 20", 0.25, 0.01, "holds"),
     ],
 )
-def test_effects_and_signs(found, text, mean, half, verdict):
-    assert effect(found, text) == (pytest.approx((mean, mean - half, mean + half)), verdict)
+def test_effects_and_signs(by_text, text, mean, half, verdict):
+    claim = claim_about(by_text, text)
+    assert dataclasses.astuple(claim.effect)[:3] == pytest.approx((mean, mean - half, mean + half))
+    assert claim.verdict == verdict
 
 
-def test_every_claim_is_an_interval_around_its_mean(found):
-    assert len(found) == 15
-    for claim in found.values():
-        assert claim.low <= claim.mean <= claim.high
+def test_every_claim_is_an_interval_around_its_mean(by_text):
+    assert len(by_text) == 15
+    for claim in by_text.values():
+        assert claim.effect.low <= claim.effect.mean <= claim.effect.high
         assert claim.least > 0
 
 
-def test_the_real_rooms_have_claims_of_their_own():
-    results = made_up.results(("main", "real"))
-    results["instrument-real"] = results["instrument-real"] | {"discriminating": [made_up.interval(-3.0)]}
+def test_the_run_with_the_goal_alone_adds_two_claims_after_those_of_stde():
+    texts = [claim.text for claim in claims(study_results.results(runs=(*study_results.RUNS, "goal")))]
+    without = [claim.text for claim in claims(study_results.results())]
+    added = [
+        f"The same at shift {shift} where the direct pathway sees the goal's detection alone" for shift in ("0", "1")
+    ]
+    assert texts == without[:5] + added + without[5:]
+
+
+def test_the_real_rooms_have_other_claims():
+    results = study_results.results(("main", "real"))
+    real_rooms = dataclasses.replace(results.worlds["real"], instrument=study_results.instrument(loss=-3.0))
+    results = dataclasses.replace(results, worlds={**results.worlds, "real": real_rooms})
     (main, *rest), (real, *others) = (claims(results, world) for world in ("main", "real"))
-    assert (main.mean, real.mean) == (9.0, -3.0)
+    assert (main.effect.mean, real.effect.mean) == (9.0, -3.0)
     assert (main.verdict, real.verdict) == ("holds", "does not hold")
     assert rest == others
 
 
-def test_what_is_undefined_is_told_by_no_verdict_of_its_own():
-    results = made_up.results()
-    undefined = {"mean": None, "ci95": [None, None]}
-    results["main-shift0"]["similarity"]["pearson"] = undefined
-    results["main-shift1"]["gains"]["stde"]["slope"] = undefined
-    found = {claim.text: claim for claim in claims(results)}
+def test_what_is_undefined_has_no_verdict():
+    world = study_results.world_results()
+    first, last = world.conditions
+    first = dataclasses.replace(first, similarity=dataclasses.replace(first.similarity, pearson=UNDEFINED))
+    stde = dataclasses.replace(last.gains.stde, slope=UNDEFINED)
+    last = dataclasses.replace(last, gains=dataclasses.replace(last.gains, stde=stde))
+    world = dataclasses.replace(world, conditions=(first, last))
+    results = dataclasses.replace(study_results.results(), worlds={"main": world})
+    by_text = {claim.text: claim for claim in claims(results)}
     for text in ("Success follows", "Gains over the baseline"):
-        (mean, low, high), verdict = effect(found, text)
-        assert all(map(math.isnan, (mean, low, high)))
-        assert verdict == "cannot be told here"
+        claim = claim_about(by_text, text)
+        assert not claim.effect.defined
+        assert claim.verdict == "cannot be told here"
 
 
 def test_a_short_course_is_read_at_its_last_step():
-    results = made_up.results()
-    course = results["gap-main"]
-    course["steps"] = course["steps"][:11]
-    found = {claim.text: claim for claim in claims(results)}
+    world = study_results.world_results()
+    course = dataclasses.replace(world.course, steps=world.course.steps[:11])
+    results = dataclasses.replace(study_results.results(), worlds={"main": dataclasses.replace(world, course=course)})
+    by_text = {claim.text: claim for claim in claims(results)}
     # Half way from 0.9 to 0.2.
-    assert effect(found, "The gap is below 0.5 at step 10")[0][0] == pytest.approx(0.5 - 0.55)
-    assert "The `evidence` gap does at step 10" in found
+    assert claim_about(by_text, "The gap is below 0.5 at step 10").effect.mean == pytest.approx(0.5 - 0.55)
+    assert "The `evidence` gap does at step 10" in by_text

@@ -1,140 +1,143 @@
-"""The study's figures draw the numbers they are given, name them with their units, and are saved byte for byte."""
+"""The figures draw and name the numbers they are given."""
 
-import copy
+import dataclasses
+import io
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-from matplotlib.collections import FillBetweenPolyCollection
+from matplotlib.axes import Axes
+from matplotlib.collections import FillBetweenPolyCollection, LineCollection, PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from PIL import Image
+from support.study_results import band, estimate, interval, row
 
+from jaxnav.evaluation.report import Form
 from jaxnav.study import figures
+from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
+from jaxnav.study.records import GainBySimilarity, SuccessBySimilarity, TrialRow
+from jaxnav.study.style import DPI, WIDTH, save_figure
+from jaxnav.study.trials import Trial
+
+FORMS: tuple[Form, ...] = ("residual", "paper")
+BELIEFS: tuple[Belief, ...] = ("updated", "frozen")
 
 
-def interval(mean, half):
-    return {"mean": mean, "ci95": [mean - half, mean + half]}
+def trial_row(epsilon: float, form: Form, sr: float, spl: float, dts: float) -> TrialRow:
+    plain = row(Trial("stde", "argmax", epsilon, form), 0.0)
+    return dataclasses.replace(plain, sr=estimate(sr), spl=estimate(spl), dts=estimate(dts))
 
 
-def band(mean, half=0.05):
-    return {"mean": mean, "low": [x - half for x in mean], "high": [x + half for x in mean]}
-
-
-def metric(mean):
-    return band(mean, 1.0) | {"seeds": [[x - 0.5 for x in mean], [x + 0.5 for x in mean]]}
-
-
-FIG4 = {
-    "panels": [
-        {
-            "shift": shift,
-            "similarity": [0.9, 0.1, 0.5, 0.3],
-            "success": [1.0, 0.25, 0.5, 0.75],
-            "episodes": [4, 8, 2, 4],
-            "pearson": interval(0.5, 0.1),
-            "spearman": interval(-0.25, 0.5),
-        }
-        for shift in (0.0, 1.0)
-    ]
+SUCCESS = {
+    shift: SuccessBySimilarity(
+        category=np.arange(4),
+        scene=np.arange(4),
+        episodes=np.array([4, 8, 2, 4]),
+        similarity=np.array([0.9, 0.1, 0.5, 0.3]),
+        success=np.array([1.0, 0.25, 0.5, 0.75]),
+        left_out=0,
+        pearson=interval(0.5, 0.1),
+        spearman=interval(-0.25, 0.5),
+    )
+    for shift in (0.0, 1.0)
 }
-FIG5 = {
-    "panels": [
-        {
-            "shift": 1.0,
-            "variant": "+ w + sTDE",
-            "categories": ["Sink", "Book", "Pan"],
-            "similarity": [0.8, 0.4, 0.6],
-            "baseline": [70.0, 40.0, 50.0],
-            "gain": [-2.0, 6.0, 1.0],
-            "slope": interval(-2.0, 0.5),
-            "pearson": interval(-0.75, 0.25),
-        }
-    ]
+GAIN = GainBySimilarity(
+    category=np.arange(3),
+    episodes=np.array([4, 4, 4]),
+    similarity=np.array([0.8, 0.4, 0.6]),
+    baseline=np.array([70.0, 40.0, 50.0]),
+    gain=np.array([-2.0, 6.0, 1.0]),
+    left_out=0,
+    slope=interval(-2.0, 0.5),
+    pearson=interval(-0.75, 0.25),
+    categories=("Sink", "Book", "Pan"),
+)
+SWEEPS: dict[tuple[float, Form], dict[float, TrialRow]] = {
+    (shift, form): {
+        0.0: trial_row(0.0, form, 60.0 - 10 * shift, 30.0 - 10 * shift, 1.5 + shift),
+        0.5: trial_row(0.5, form, 64.0, 34.0, 1.25),
+        1.0: trial_row(1.0, form, 61.0, 31.0, 1.5),
+    }
+    for form in FORMS
+    for shift in (0.0, 1.0)
 }
-FIG6A = {
-    "epsilon": [0.0, 0.5, 1.0],
-    "lines": [
-        {
-            "shift": shift,
-            "form": form,
-            "sr": metric([60.0 - 10 * shift, 64.0, 61.0]),
-            "spl": metric([30.0 - 10 * shift, 34.0, 31.0]),
-            "dts": metric([1.5 + shift, 1.25, 1.5]),
-        }
-        for form in ("residual", "paper")
-        for shift in (0.0, 1.0)
-    ],
-}
-FIG6B = {
-    "steps": [0, 1, 2, 3],
-    "panels": [
-        {
-            "setting": setting,
-            "lines": [
-                {"shift": shift, "belief": belief, **band([0.7, 0.5 + 0.1 * shift, 0.4, 0.3])}
-                for shift in (0.0, 1.0)
-                for belief in ("updated", "frozen")
-            ],
-        }
-        for setting in ("paper", "released", "calibrated")
-    ],
-}
-AUC = {
-    "steps": [0, 1, 2],
-    "lines": [{"setting": "calibrated", **band([0.5, 0.6, 0.7])}, {"setting": "evidence", **band([0.6, 0.7, 0.8])}],
-}
+LINES = tuple(
+    GapLine(shift, belief, band(np.array([0.7, 0.5 + 0.1 * shift, 0.4, 0.3]), 0.05))
+    for shift in (0.0, 1.0)
+    for belief in BELIEFS
+)
+AUC = AucPanel(
+    1.0,
+    (
+        AucLine("calibrated", band(np.array([0.5, 0.6, 0.7, 0.7]), 0.05)),
+        AucLine("evidence", band(np.array([0.6, 0.7, 0.8, 0.8]), 0.05)),
+    ),
+)
+COURSE = GapCourse(
+    steps=(0, 1, 2, 3),
+    running=np.ones((2, 4)),
+    panels=tuple(GapPanel(setting, LINES) for setting in ("paper", "released", "calibrated")),
+    auc=(AUC,),
+)
 EFFECTS = {
-    "groups": [
-        {"title": "Shift 0", "rows": [{"name": "+ w", **interval(3.0, 1.0)}, {"name": "sTDE", **interval(-1.0, 2.0)}]},
-        {"title": "Shift 1", "rows": [{"name": "+ w", **interval(-4.0, 1.5)}]},
-    ]
+    "Shift 0": {"+ w": interval(3.0, 1.0), "sTDE": interval(-1.0, 2.0)},
+    "Shift 1": {"+ w": interval(-4.0, 1.5)},
 }
-DRAWN = {
-    figures.similarity_figure: FIG4,
-    figures.gain_figure: FIG5,
-    figures.epsilon_figure: FIG6A,
-    figures.gap_figure: FIG6B,
-    figures.auc_figure: AUC,
-    figures.effects_figure: EFFECTS,
+DRAWINGS: dict[str, Callable[[], Figure]] = {
+    "similarity": lambda: figures.similarity_figure(SUCCESS),
+    "gain": lambda: figures.gain_figure({1.0: GAIN}, "+ w + sTDE"),
+    "epsilon": lambda: figures.epsilon_figure(SWEEPS),
+    "gap": lambda: figures.gap_figure(COURSE),
+    "auc": lambda: figures.auc_figure(COURSE.steps, AUC),
+    "effects": lambda: figures.effects_figure(EFFECTS),
 }
 
 
-def lines(axes):
-    """Data [T, 2] of every line with markers, in the order drawn."""
-    return [line.get_xydata() for line in axes.get_lines() if line.get_marker() != "None"]
+def lines(axes: Axes) -> list[np.ndarray]:
+    """Return data [T, 2] of every line with markers."""
+    return [np.asarray(line.get_xydata()) for line in axes.get_lines() if line.get_marker() != "None"]
 
 
-def bands(axes):
-    """(low, high) of every band, in the order drawn."""
+def bands(axes: Axes) -> list[np.ndarray]:
+    """Return (low, high) of every band, in the order drawn."""
     polygons = [artist for artist in axes.collections if isinstance(artist, FillBetweenPolyCollection)]
     return [artist.get_datalim(axes.transData).get_points()[:, 1] for artist in polygons]
 
 
-def assert_line(axes, index, x, line):
-    np.testing.assert_allclose(lines(axes)[index], np.stack([x, line["mean"]], axis=1))
-    np.testing.assert_allclose(bands(axes)[index], [min(line["low"]), max(line["high"])])
+def assert_line(axes: Axes, index: int, x, curve: Curve) -> None:
+    np.testing.assert_allclose(lines(axes)[index], np.stack([x, curve.mean], axis=1))
+    np.testing.assert_allclose(bands(axes)[index], [curve.low.min(), curve.high.max()])
 
 
-def keys(figure):
+def assert_level(axes: Axes, level: float) -> None:
+    """Assert that the first line is a level."""
+    np.testing.assert_array_equal(np.asarray(axes.get_lines()[0].get_ydata()), [level, level])
+
+
+def keys(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_similarity_points_sizes_and_means(monkeypatch):
     monkeypatch.setattr(figures, "BINS", 2)
-    own = figures.similarity_figure(FIG4).axes[0]
-    (points,) = own.collections
-    np.testing.assert_allclose(points.get_offsets(), [[0.9, 100], [0.1, 25], [0.5, 50], [0.3, 75]])
+    axes = DRAWINGS["similarity"]().axes[0]
+    (points,) = axes.collections
+    assert isinstance(points, PathCollection)
+    np.testing.assert_allclose(np.asarray(points.get_offsets()), [[0.9, 100], [0.1, 25], [0.5, 50], [0.3, 75]])
     # Areas are in the ratio of the episodes, 4 : 8 : 2 : 4.
     np.testing.assert_allclose(points.get_sizes(), figures.MAX_AREA * np.array([0.5, 1.0, 0.25, 0.5]))
     # Halves by similarity, weighted by episodes: (0.1 * 8 + 0.3 * 4) / 12 = 1/6 and (25 * 8 + 75 * 4) / 12 = 125/3;
     # (0.5 * 2 + 0.9 * 4) / 6 = 23/30 and (50 * 2 + 100 * 4) / 6 = 250/3.
-    np.testing.assert_allclose(lines(own)[0], [[1 / 6, 125 / 3], [23 / 30, 250 / 3]])
-    assert (own.get_xlabel(), own.get_ylabel()) == ("Layout similarity (cosine)", "SR (%)")
-    title = own.get_title(loc="left").split("\n")
+    np.testing.assert_allclose(lines(axes)[0], [[1 / 6, 125 / 3], [23 / 30, 250 / 3]])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Layout similarity (cosine)", "SR (%)")
+    title = axes.get_title(loc="left").split("\n")
     assert title == ["Shift 0", "Pearson r 0.50 [0.40, 0.60]", "Spearman r −0.25 [−0.75, 0.25]"]  # noqa: RUF001
 
 
 def test_gain_is_sorted_by_similarity():
-    above, below = figures.gain_figure(FIG5).axes
-    assert [bar.get_height() for bar in above.patches] == [40, 50, 70]
+    above, below = DRAWINGS["gain"]().axes
+    assert [bar.get_height() for bar in above.patches if isinstance(bar, Rectangle)] == [40, 50, 70]
     np.testing.assert_allclose(lines(below)[0], [[0, 6], [1, 1], [2, -2]])
     assert [text.get_text() for text in below.get_xticklabels()] == ["Book 0.40", "Pan 0.60", "Sink 0.80"]
     assert (above.get_ylabel(), below.get_ylabel()) == ("Baseline SR (%)", "Gain (SR points)")
@@ -144,50 +147,51 @@ def test_gain_is_sorted_by_similarity():
 
 
 def test_epsilon_has_a_row_per_form_and_a_column_per_metric():
-    figure = figures.epsilon_figure(FIG6A)
-    axes = np.reshape(figure.axes, (2, 3))
-    for i, line in enumerate(FIG6A["lines"]):
-        for own, name in zip(axes[i // 2], ("sr", "spl", "dts"), strict=True):
-            assert_line(own, i % 2, FIG6A["epsilon"], line[name])
-            thin = [drawn.get_ydata() for drawn in own.get_lines() if drawn.get_marker() == "None"]
-            np.testing.assert_allclose(thin[2 * (i % 2) : 2 * (i % 2) + 2], line[name]["seeds"])
-    assert [own.get_ylabel() for own in axes[0]] == ["SR (%)", "SPL (%)", "DTS (m)"]
+    figure = DRAWINGS["epsilon"]()
+    for i, by_epsilon in enumerate(SWEEPS.values()):
+        for axes, metric in zip(figure.axes[3 * (i // 2) :][:3], ("sr", "spl", "dts"), strict=True):
+            estimates = [each.metric(metric) for each in by_epsilon.values()]
+            assert_line(axes, i % 2, list(by_epsilon), Curve.of(estimates))
+            thin = [np.asarray(line.get_ydata()) for line in axes.get_lines() if line.get_marker() == "None"]
+            seeds = np.transpose([each.seeds for each in estimates])
+            np.testing.assert_allclose(thin[3 * (i % 2) : 3 * (i % 2) + 3], seeds)
+    assert [axes.get_ylabel() for axes in figure.axes[:3]] == ["SR (%)", "SPL (%)", "DTS (m)"]
     assert keys(figure) == ["shift 0", "shift 1", "one training seed"]
 
 
 def test_gap_has_a_panel_per_setting():
-    figure = figures.gap_figure(FIG6B)
-    assert [own.get_title(loc="left") for own in figure.axes] == [
+    figure = DRAWINGS["gap"]()
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [
         "Setting paper",
         "Setting released",
         "Setting calibrated",
     ]
-    for own, panel in zip(figure.axes, FIG6B["panels"], strict=True):
-        for i, line in enumerate(panel["lines"]):
-            assert_line(own, i, FIG6B["steps"], line)
-        drawn = [line for line in own.get_lines() if line.get_marker() != "None"]
+    for axes in figure.axes:
+        for i, line in enumerate(LINES):
+            assert_line(axes, i, COURSE.steps, line.curve)
+        drawn = [line for line in axes.get_lines() if line.get_marker() != "None"]
         assert [line.get_linestyle() for line in drawn] == ["-", "--", "-", "--"]  # updated, frozen
         assert drawn[0].get_marker() == drawn[1].get_marker() != drawn[2].get_marker() == drawn[3].get_marker()
-        assert list(own.get_lines()[0].get_ydata()) == [0.5, 0.5]
+        assert_level(axes, 0.5)
     assert keys(figure)[:2] == ["shift 0, belief updated", "shift 0, belief frozen"]
 
 
 def test_auc_has_a_line_per_setting_and_chance():
-    figure = figures.auc_figure(AUC)
-    (own,) = figure.axes
-    for i, line in enumerate(AUC["lines"]):
-        assert_line(own, i, AUC["steps"], line)
-    assert list(own.get_lines()[0].get_ydata()) == [0.5, 0.5]
+    figure = DRAWINGS["auc"]()
+    (axes,) = figure.axes
+    for i, line in enumerate(AUC.lines):
+        assert_line(axes, i, COURSE.steps, line.curve)
+    assert_level(axes, 0.5)
     assert keys(figure) == ["calibrated", "evidence", "chance"]
-    assert own.get_xlabel() == "Step"
+    assert axes.get_xlabel() == "Step"
 
 
 def test_effects_are_filled_where_the_interval_excludes_0():
-    first, second = figures.effects_figure(EFFECTS).axes
+    first, second = DRAWINGS["effects"]().axes
     np.testing.assert_allclose(np.concatenate(lines(first)), [[3, 0], [-1, 1]])
-    drawn = [(segment[0][0], segment[1][0]) for artist in first.collections for segment in artist.get_segments()]
-    assert drawn == [(2, 4), (-3, 1)]
-    filled = [line.get_markerfacecolor() != "white" for own in (first, second) for line in own.get_lines()[1:]]
+    bars = [artist for artist in first.collections if isinstance(artist, LineCollection)]
+    assert [(start[0], end[0]) for bar in bars for start, end in bar.get_segments()] == [(2, 4), (-3, 1)]
+    filled = [line.get_markerfacecolor() != "white" for axes in (first, second) for line in axes.get_lines()[1:]]
     assert filled == [True, False, True]
     assert [text.get_text() for text in first.get_yticklabels()] == ["+ w", "sTDE"]
     assert first.yaxis_inverted()  # the first row is on top
@@ -195,33 +199,24 @@ def test_effects_are_filled_where_the_interval_excludes_0():
     assert second.get_xlabel().startswith("Difference in SR (points)")
 
 
-@pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
-def test_equal_data_gives_equal_bytes(draw, tmp_path):
-    data = copy.deepcopy(DRAWN[draw])
-    figure = draw(data)
-    assert data == DRAWN[draw]
-    paths = [tmp_path / "new" / name for name in ("a.png", "b.png", "c.png")]
-    figures.save(figure, paths[0])
-    figures.save(figure, paths[1])
-    figures.save(draw(data), paths[2])
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_equal_data_gives_equal_bytes(name, tmp_path):
+    figure = DRAWINGS[name]()
+    paths = [tmp_path / "new" / file for file in ("a.png", "b.png", "c.png")]
+    save_figure(figure, paths[0])
+    save_figure(figure, paths[1])
+    save_figure(DRAWINGS[name](), paths[2])
     assert len({path.read_bytes() for path in paths}) == 1
-    with Image.open(paths[0]) as png:
-        assert png.width == figures.WIDTH * figures.DPI
-        assert not png.text
+    with Image.open(io.BytesIO(paths[0].read_bytes())) as png:
+        assert png.width == WIDTH * DPI
+        assert not set(png.info) - {"dpi"}  # no text
 
 
-@pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
-def test_all_text_is_inside_the_figure(draw):
-    figure = draw(DRAWN[draw])
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_all_text_is_inside_the_figure(name):
+    figure = DRAWINGS[name]()
     box = figure.get_tightbbox()  # inches
     assert box.x0 >= 0
     assert box.y0 >= 0
-    assert box.x1 <= figures.WIDTH
+    assert box.x1 <= WIDTH
     assert box.y1 <= figure.get_figheight()
-
-
-def test_neighbouring_styles_differ_in_grey():
-    rgb = [[int(style["color"][i : i + 2], 16) for i in (1, 3, 5)] for style in figures.STYLES]
-    grey = np.array(rgb) @ (0.299, 0.587, 0.114)
-    assert (np.abs(np.diff(grey[:4])) > 35).all()
-    assert len({style["marker"] for style in figures.STYLES}) == len(figures.STYLES)

@@ -1,126 +1,221 @@
-"""Made-up results of a study: all that the claims and the document read, with numbers that are easy to tell apart."""
+"""Results of a study with numbers that differ plainly."""
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
-from jaxnav.study.dial import BASELINES, MATCHED, MEASURES
-from jaxnav.study.trials import USES
+import numpy as np
+
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.study.codec import to_json
+from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
+from jaxnav.study.instrument_report import BASELINES, MATCHED, MEASURES, Change, InstrumentReport, MeasuredShift
+from jaxnav.study.intervals import Effect, Estimate, Interval
+from jaxnav.study.records import (
+    Condition,
+    Difference,
+    FullCondition,
+    GainBySimilarity,
+    Gains,
+    SuccessBySimilarity,
+    TrialRow,
+)
+from jaxnav.study.results import StudyResults, WorldResults, condition_name
+from jaxnav.study.trials import USES, Control, Gap, Trial
 
 RUNS = ("main", "coin", "gate")
 SHIFTS, EPSILONS = (0.0, 1.0), (0.0, 0.5, 1.0)
 STEPS = 30
-BASE = {"seeds": 3, "total_steps": 1_000_000}
+STUDY = {"shifts": list(SHIFTS), "episodes": 1000, "base": {"seeds": 3, "total_steps": 1_000_000}}
+Part = Condition | InstrumentReport | GapCourse
 
 
-def interval(mean, half=1.0):
-    return {"mean": mean, "ci95": [mean - half, mean + half]}
+def interval(mean: float, half: float = 1.0) -> Interval:
+    return Interval(mean, mean - half, mean + half)
 
 
-def metric(mean):
-    return interval(mean) | {"std": 0.5, "seeds": [mean - 1, mean, mean + 1]}
+def effect(mean: float) -> Effect:
+    return Effect(mean, mean - 1.0, mean + 1.0, 0.5)
 
 
-def row(effect, *, gap="novelty", variant="stde", decoding="argmax", control=None, **use):
-    """A row of the table; `effect` is its difference in SR, None for the baseline."""
-    own = {"gap": gap, "variant": variant, "decoding": decoding, "control": control}
-    own |= {"epsilon": None, "form": None, "mean_weight": 0.25} | use
-    own |= {"sr": metric(60.0 + (effect or 0.0)), "spl": metric(30.0), "dts": metric(1.5)}
-    if effect is not None:
-        own["difference"] = {"to": "baseline" if variant == "layout" else "layout", "sr": interval(effect)}
-    return own
+def estimate(mean: float) -> Estimate:
+    return Estimate(mean, mean - 1.0, mean + 1.0, 0.5, (mean - 1.0, mean, mean + 1.0))
 
 
-def rows(shift, run="main"):
-    """Every row of a run at one shift; `main` gains nothing by sTDE at shift 0, 2 points at shift 1, 5 in full.
+def row(trial: Trial, gain: float | None, gap: Gap = "novelty") -> TrialRow:
+    """Return a row with this difference in SR."""
+    to = "baseline" if trial.variant == "layout" else "layout"
+    return TrialRow(
+        gap=gap,
+        trial=trial,
+        mean_weight=0.25,
+        sr=estimate(60.0 + (gain or 0.0)),
+        spl=estimate(30.0),
+        dts=estimate(1.5),
+        difference=None if gain is None else Difference(to, effect(gain), effect(0.0), effect(0.0)),
+    )
 
-    `coin` has the layout's arm alone. Sampled effects are 100 more, to tell them apart.
+
+def rows(shift: float, run: str = "main") -> list[TrialRow]:
+    """Return every row of a run at one shift.
+
+    `main` gains nothing by sTDE at shift 0, 2 points at shift 1, 5 without a threshold. `coin` has the layout arm
+    alone. Sampled effects are 100 more, to tell them apart.
     """
-    found = [] if run == "coin" else [row(None, variant="baseline")]
-    found += [row(3.0 - 2 * shift, variant="layout"), row(-6.0 + shift, variant="tde")]
+    table = [] if run == "coin" else [row(Trial("baseline"), None)]
+    table += [row(Trial("layout"), 3.0 - 2 * shift), row(Trial("tde"), -6.0 + shift)]
     if run != "main":
-        return found + [row(2.0 * shift, epsilon=epsilon, form=form) for epsilon, form in USES]
-    found += [row(None, variant="baseline", decoding="sample")]
-    found += [row(effect + 100.0, variant=name, decoding="sample") for name, effect in (("layout", 1.0), ("tde", -5.0))]
-    for form, effect in (("residual", 2.0 * shift), ("paper", 5.0 * shift)):
-        found += [row(effect, epsilon=epsilon, form=form) for epsilon in EPSILONS]
-    for epsilon, form in USES:
-        use = {"epsilon": epsilon, "form": form}
-        found += [row(100.0, **use, decoding="sample"), row(0.5 * shift, **use, gap="clock")]
-        found += [
-            row(4.0 * shift + off, **use, gap="evidence", decoding=d) for d, off in (("argmax", 0), ("sample", 100))
-        ]
-        for gap in ("novelty", "evidence"):
-            found += [row(0.25, **use, gap=gap, control=name) for name in ("constant", "shuffled", "noise", "random")]
-            found.append(row(100.25, **use, gap=gap, control="zeros", decoding="sample"))
-    return found
+        return table + [row(Trial("stde", "argmax", *use), 2.0 * shift) for use in USES.values()]
+    table += [row(Trial("baseline", "sample"), None)]
+    table += [row(Trial("layout", "sample"), 101.0), row(Trial("tde", "sample"), 95.0)]
+    for epsilon in EPSILONS:
+        table.append(row(Trial("stde", "argmax", epsilon, "residual"), 2.0 * shift))
+        table.append(row(Trial("stde", "argmax", epsilon, "paper"), 5.0 * shift))
+    controls: tuple[Control, ...] = ("constant", "shuffled", "noise", "random")
+    gaps: tuple[Gap, ...] = ("novelty", "evidence")
+    for use in USES.values():
+        table.append(row(Trial("stde", "sample", *use), 100.0))
+        table.append(row(Trial("stde", "argmax", *use), 0.5 * shift, "clock"))
+        table.append(row(Trial("stde", "argmax", *use), 4.0 * shift, "evidence"))
+        table.append(row(Trial("stde", "sample", *use), 4.0 * shift + 100.0, "evidence"))
+        for gap in gaps:
+            table += [row(Trial("stde", "argmax", *use, control), 0.25, gap) for control in controls]
+            table.append(row(Trial("stde", "sample", *use, "zeros"), 100.25, gap))
+    return table
 
 
-def similarity(pearson):
-    own = {"category": [0, 1], "scene": [0, 1], "episodes": [4, 6], "similarity": [0.4, 0.8], "success": [0.5, 0.75]}
-    return own | {"left_out": 1, "pearson": interval(pearson, 0.1), "spearman": interval(pearson, 0.2)}
+def success(pearson: float) -> SuccessBySimilarity:
+    return SuccessBySimilarity(
+        category=np.array([0, 1]),
+        scene=np.array([0, 1]),
+        episodes=np.array([4, 6]),
+        similarity=np.array([0.4, 0.8]),
+        success=np.array([0.5, 0.75]),
+        left_out=1,
+        pearson=interval(pearson, 0.1),
+        spearman=interval(pearson, 0.2),
+    )
 
 
-def gains(slope):
-    own = {"category": [0, 1], "categories": ["Book", "Chair"], "episodes": [4, 6], "similarity": [0.4, 0.8]}
-    own |= {"baseline": [50.0, 70.0], "gain": [6.0, 1.0], "left_out": 1}
-    return own | {"slope": interval(slope, 0.25), "pearson": interval(-0.5, 0.1)}
+def gain(slope: float) -> GainBySimilarity:
+    return GainBySimilarity(
+        category=np.array([0, 1]),
+        episodes=np.array([4, 6]),
+        similarity=np.array([0.4, 0.8]),
+        baseline=np.array([50.0, 70.0]),
+        gain=np.array([6.0, 1.0]),
+        left_out=1,
+        slope=interval(slope, 0.25),
+        pearson=interval(-0.5, 0.1),
+        categories=("Book", "Chair"),
+    )
 
 
-def part(shift, run="main"):
-    found = {"shift": shift, "world": "rooms", "scenes": 80, "episodes": 1000, "rows": rows(shift, run)}
-    found["parameters"] = 12_345
-    if run != "main":
-        return found
-    own = {name: gains(-1.5 - shift) for name in ("layout", "stde")}
-    return found | {"similarity": similarity(0.3 - 0.2 * shift), "gains": own}
+def condition(shift: float, run: str = "main") -> Condition:
+    table = tuple(rows(shift, run))
+    return Condition(shift=shift, world="rooms", scenes=80, rows=table, episodes=1000, parameters=12_345)
 
 
-def line(start, end, half=0.01):
-    """A straight line from step 0 to step 20, and on."""
-    mean = [start + (end - start) * step / 20 for step in range(STEPS)]
-    return {"mean": mean, "low": [x - half for x in mean], "high": [x + half for x in mean]}
+def full_condition(shift: float, chosen: float | None = None) -> FullCondition:
+    return FullCondition(
+        shift=shift,
+        world="rooms",
+        scenes=80,
+        rows=tuple(rows(shift)),
+        episodes=1000,
+        parameters=12_345,
+        chosen=chosen,
+        similarity=success(0.3 - 0.2 * shift),
+        gains=Gains(gain(-1.5 - shift), gain(-1.5 - shift)),
+    )
 
 
-def course():
-    """The gap falls from 0.9 to 0.2 at step 20, to 0.8 if frozen; `evidence` tells the shift, eq. 5 does not."""
+def band(mean: np.ndarray, half: float = 0.01) -> Curve:
+    return Curve(mean, mean - half, mean + half)
+
+
+def line(start: float, end: float) -> Curve:
+    """Return a line from step 0 through step 20."""
+    return band(start + (end - start) * np.arange(STEPS) / 20)
+
+
+def course() -> GapCourse:
+    """Return a gap that falls from 0.9 at step 0.
+
+    It is 0.2 at step 20, or 0.8 if frozen.
+    `evidence` shows the shift, eq. 5 does not.
+    """
     settings = ("paper", "released", "calibrated", "evidence")
-    panels = [
-        {
-            "setting": setting,
-            "lines": [
-                {"shift": shift, "belief": belief, **line(0.9 - 0.1 * shift, end)}
-                for shift in SHIFTS
-                for belief, end in (("updated", 0.2), ("frozen", 0.8))
-            ],
-        }
-        for setting in settings
-    ]
-    tells = {name: line(0.5, 0.75 if name == "evidence" else 0.5) for name in settings}
-    auc = [{"shift": shift, "lines": [{"setting": n, **own} for n, own in tells.items()]} for shift in SHIFTS[1:]]
-    running = [[1.0 - step / STEPS for step in range(STEPS)] for _ in SHIFTS]
-    return {"steps": list(range(STEPS)), "running": running, "panels": panels, "auc": auc}
+    ends: dict[Belief, float] = {"updated": 0.2, "frozen": 0.8}
+    lines = [GapLine(shift, belief, line(0.9 - 0.1 * shift, end)) for shift in SHIFTS for belief, end in ends.items()]
+    aucs = [AucLine(setting, line(0.5, 0.75 if setting == "evidence" else 0.5)) for setting in settings]
+    return GapCourse(
+        steps=tuple(range(STEPS)),
+        running=np.stack([1.0 - np.arange(STEPS) / STEPS for _ in SHIFTS]),
+        panels=tuple(GapPanel(setting, tuple(lines)) for setting in settings),
+        auc=tuple(AucPanel(shift, tuple(aucs)) for shift in SHIFTS[1:]),
+    )
 
 
-def instrument():
-    """The baseline loses 9 points with its best actions and 12 with sampled ones."""
-    table = [{"shift": shift} | {name: interval(10.0 + shift, 0.5) for name in MEASURES} for shift in SHIFTS]
-    ends = {"from": SHIFTS[0], "to": SHIFTS[-1], "holds": True}
-    matched = [{"measure": name, **ends, **interval(0.5, 0.25)} for name in MATCHED]
-    losses = [{"measure": name, **ends, **interval(loss)} for name, loss in zip(BASELINES, (9.0, 12.0), strict=True)]
-    return {"shifts": table, "matched": matched, "discriminating": losses}
+def instrument(loss: float = 9.0) -> InstrumentReport:
+    """Return a report in which sampled actions lose 12 points."""
+    measures = {shift: dict.fromkeys(MEASURES, interval(10.0 + shift, 0.5)) for shift in SHIFTS}
+    losses = zip(BASELINES, (loss, 12.0), strict=True)
+    return InstrumentReport(
+        shifts=tuple(MeasuredShift(shift, 80, 1000, measures[shift]) for shift in SHIFTS),
+        matched=tuple(Change(name, SHIFTS[0], SHIFTS[-1], interval(0.5, 0.25), True) for name in MATCHED),
+        discriminating=tuple(Change(name, SHIFTS[0], SHIFTS[-1], interval(loss), True) for name, loss in losses),
+    )
 
 
-def results(worlds=("main",), runs=RUNS):
-    """The parts by name."""
-    about = {"study": {"shifts": list(SHIFTS), "episodes": 1000, "base": BASE}}
-    found = {f"{run}-shift{shift:g}": about | part(shift, run) for run in runs for shift in SHIFTS}
+def world_results() -> WorldResults:
+    return WorldResults(tuple(full_condition(shift) for shift in SHIFTS), instrument(), course())
+
+
+def results(worlds: tuple[str, ...] = ("main",), runs: tuple[str, ...] = RUNS) -> StudyResults:
+    """Return the results of some worlds and runs."""
+    names = sorted({*runs, *worlds}, key=lambda name: (name != "main", name))
+    conditions = {
+        name: tuple(condition(shift, "main" if name in worlds else name) for shift in SHIFTS) for name in names
+    }
+    return StudyResults(SHIFTS, 1000, 3, 1_000_000, {world: world_results() for world in worlds}, conditions)
+
+
+def parts(worlds: tuple[str, ...] = ("main",), runs: tuple[str, ...] = RUNS) -> dict[str, Part]:
+    """Return the parts of the results by name."""
+    records: dict[str, Part] = {condition_name(run, shift): condition(shift, run) for run in runs for shift in SHIFTS}
     for world in worlds:
-        found |= {f"{world}-shift{shift:g}": about | part(shift) for shift in SHIFTS}
-        found |= {f"instrument-{world}": about | instrument(), f"gap-{world}": about | course()}
-    return found
+        records |= {condition_name(world, shift): full_condition(shift) for shift in SHIFTS}
+        records |= {f"instrument-{world}": instrument(), f"gap-{world}": course()}
+    return records
 
 
-def write(folder, worlds=("main",), runs=RUNS):
-    """The parts as files."""
-    folder.mkdir(parents=True)
-    for name, own in results(worlds, runs).items():
-        (folder / f"{name}.json").write_text(json.dumps(own))
+def write(folder: Path, records: Mapping[str, Part], study: Mapping = STUDY) -> None:
+    """Write parts as files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, record in records.items():
+        (folder / f"{name}.json").write_text(json.dumps({"study": study, **to_json(record)}))
+
+
+def episodes_in(
+    scene: list[int] | np.ndarray,
+    goal: list[int] | np.ndarray | None = None,
+    room: list[int] | None = None,
+    names: tuple[str, ...] | None = None,
+    best_length: int = 1,
+) -> EpisodeList:
+    """Return episodes in these scenes.
+
+    Scenes are of one room type unless `room` [N] says otherwise.
+    """
+    scene = np.asarray(scene, np.int32)
+    rooms = np.zeros(scene.max() + 1, int) if room is None else np.array(room)
+    return EpisodeList(
+        scene=scene,
+        goal=np.zeros(len(scene), np.int32) if goal is None else np.asarray(goal, np.int32),
+        pose=np.ones(len(scene), np.int32),
+        best_length=np.full(len(scene), best_length, np.int32),
+        room=rooms[scene],
+        rooms=("bedroom", "kitchen"),
+        scenes=tuple(f"room{i:02}" for i in range(scene.max() + 1)) if names is None else names,
+    )

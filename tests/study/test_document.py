@@ -1,25 +1,26 @@
-"""The study's document and figures, from made-up results."""
+"""The document and its figures follow the results."""
 
-import json
+import dataclasses
 import re
 from typing import get_args
 
 import pytest
-from support import study_results as made_up
+from support import study_results
 
 from jaxnav.errors import InputError
 from jaxnav.study.claims import claims
-from jaxnav.study.document import CONTROLS, READING, check_document, write_document
-from jaxnav.study.results import draw, load
+from jaxnav.study.document import READING, check_document, write_document
+from jaxnav.study.draw import draw_figures
+from jaxnav.study.tables import CONTROLS
 from jaxnav.study.trials import Control
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Results of both worlds on val, the document and its images."""
+    """Return a folder with results of both worlds, written up."""
     folder = tmp_path_factory.mktemp("study")
-    made_up.write(folder / "results" / "val", ("main", "real"))
-    draw(folder / "results" / "val", folder / "docs" / "images" / "study")
+    study_results.write(folder / "results" / "val", study_results.parts(("main", "real")))
+    draw_figures(folder / "results" / "val", folder / "docs" / "images" / "study")
     write_document(folder / "results", folder / "docs" / "study.md")
     return folder
 
@@ -30,21 +31,16 @@ def text(folder):
 
 
 def section(text, title):
-    """The lines of the first section of this title, up to the next one."""
+    """Return the lines of the first section of this title."""
     return text.split(f"# {title}\n", 1)[1].split("\n#", 1)[0]
 
 
 def table(lines):
-    """Cells by the first cell of their row, the last of equal ones."""
+    """Return cells by the first cell of their row."""
     rows = [
         [cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines() if line.startswith("|")
     ]
     return {first: rest for first, *rest in rows}
-
-
-def test_parts_are_loaded_by_name(folder):
-    assert load(folder / "results" / "val") == made_up.results(("main", "real"))
-    assert load(folder / "results" / "test") == {}
 
 
 def test_every_image_that_is_named_is_drawn_and_no_other(folder, text):
@@ -64,11 +60,12 @@ def test_a_document_that_is_none_of_the_studys_is_not_written_over(folder, tmp_p
     assert document.read_text() == text
 
 
-def test_parts_of_another_study_are_not_read(folder, tmp_path):
-    made_up.write(tmp_path / "val")
-    left = made_up.results()["coin-shift0"] | {"study": {}}
-    (tmp_path / "val" / "left-shift0.json").write_text(json.dumps(left))
-    assert load(tmp_path / "val") == made_up.results()
+def test_without_results_nothing_is_written(tmp_path):
+    with pytest.raises(InputError, match=r"val: holds no results; run the study first"):
+        write_document(tmp_path, tmp_path / "study.md")
+    with pytest.raises(InputError, match=r"val: holds no results; run the study first"):
+        draw_figures(tmp_path / "val", tmp_path / "images")
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_written_by_hand_stays(folder, tmp_path):
@@ -82,10 +79,11 @@ def test_what_is_written_by_hand_stays(folder, tmp_path):
     write_document(folder / "results", document)
     assert document.read_text() == by_hand
     # Numbers follow the results, the text by hand does not.
-    made_up.write(tmp_path / "results" / "val", runs=("main",))
-    changed = made_up.results()["main-shift1"]
-    changed["rows"] = [row | {"sr": made_up.metric(12.5)} for row in changed["rows"]]
-    (tmp_path / "results" / "val" / "main-shift1.json").write_text(json.dumps(changed))
+    parts = study_results.parts(runs=("main",))
+    changed = study_results.full_condition(1.0)
+    rows = tuple(dataclasses.replace(row, sr=study_results.estimate(12.5)) for row in changed.rows)
+    parts["main-shift1"] = dataclasses.replace(changed, rows=rows)
+    study_results.write(tmp_path / "results" / "val", parts)
     write_document(tmp_path / "results", document)
     assert "\nAs found:\n\n* | a table |\n" in document.read_text()
     assert "| 12.5 ± 0.5 |" in document.read_text()
@@ -103,9 +101,9 @@ def test_both_worlds_have_their_sections(text):
 
 def test_the_claims_are_those_of_the_results(text):
     rows = table(section(text, "Claims"))
-    found = claims(made_up.results())
-    assert list(rows)[2:] == [claim.text for claim in found]
-    assert [rows[claim.text][1] for claim in found] == [claim.verdict for claim in found]
+    expected = claims(study_results.results())
+    assert list(rows)[2:] == [claim.text for claim in expected]
+    assert [rows[claim.text][1] for claim in expected] == [claim.verdict for claim in expected]
     assert rows["The baseline loses from shift 0 to 1"] == ["+9.0 [+8.0, +10.0] SR points", "holds"]
     assert rows["The `evidence` gap does at step 20"] == ["+0.25 [+0.24, +0.26] AUC - 0.5", "holds"]
 
@@ -121,7 +119,7 @@ def test_table_1_holds_both_decodings_at_every_shift(text):
     assert table(sampled)["+ w"][3] == "+101.0 [+100.0, +102.0]"
 
 
-def test_every_control_is_told(text):
+def test_every_control_is_there(text):
     assert set(CONTROLS) == {None, *get_args(Control)}
     rows = table(section(text, "Controls"))
     # Two uses: two gaps with five controls and none each, and the clock; no zeros in the paper's form; header and rule.
@@ -134,9 +132,9 @@ def test_every_control_is_told(text):
     assert rows["sTDE (eps 0.5), the released code's novelty clock"][1] == "+0.5 [-0.5, +1.5] (0.25)"
 
 
-def test_other_trainings_have_the_rows_they_have(text):
-    found = section(text, "How the parts are made: settings, counterfactual branch, one factor at a time")
-    rows = table(found)
+def test_other_runs_have_the_rows_they_have(text):
+    lines = section(text, "How the parts are made: settings, counterfactual branch, one factor at a time")
+    rows = table(lines)
     assert list(rows)[2] == "`main` baseline"  # the one to compare with comes first
     assert [cell.split(" (")[0] for cell in rows["`gate` + w"]] == ["63.0 ± 0.5", "61.0 ± 0.5"]
     assert rows["`gate` + w"][0].endswith("(+3.0 [+2.0, +4.0])")
@@ -144,23 +142,22 @@ def test_other_trainings_have_the_rows_they_have(text):
     assert "`coin` baseline" not in rows
     assert "`coin` TDE" in rows
     assert not any("real" in name for name in rows)
-    assert "All policies have 12,345 parameters." in found
+    assert "All policies have 12,345 parameters." in lines
 
 
-def test_the_gap_is_told_at_the_steps_that_there_are(text):
-    found = section(text, "Does the gap track the layout?")
-    assert table(found)["setting"] == ["0", "1", "5", "10", "20"]  # 30 steps
-    assert table(found)["`evidence`"][-1] == "0.75 [0.74, 0.76]"
+def test_the_gap_is_there_at_the_steps_that_there_are(text):
+    lines = section(text, "Does the gap track the layout?")
+    assert table(lines)["setting"] == ["0", "1", "5", "10", "20"]  # 30 steps
+    assert table(lines)["`evidence`"][-1] == "0.75 [0.74, 0.76]"
     # 1 - step / 30.
-    assert "Episodes that still run at these steps, shift 0: 100, 97, 83, 67, 33 %." in found
+    assert "Episodes that still run at these steps, shift 0: 100, 97, 83, 67, 33 %." in lines
 
 
 def test_results_on_test_are_appended(tmp_path):
-    made_up.write(tmp_path / "val")
-    made_up.write(tmp_path / "test")
-    for path in (tmp_path / "test").glob("main-shift*.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"chosen": 1.0}))
+    study_results.write(tmp_path / "val", study_results.parts())
+    chosen = {f"main-shift{shift:g}": study_results.full_condition(shift, chosen=1.0) for shift in study_results.SHIFTS}
+    study_results.write(tmp_path / "test", study_results.parts() | chosen)
     write_document(tmp_path, tmp_path / "study.md")
-    own = section((tmp_path / "study.md").read_text(), "Test, touched once")
-    assert table(own)["+ w + sTDE (eps 0.5)"][0] == "62.0 ± 0.5"
-    assert table(own)["+ w + sTDE (eps 1, chosen)"][0] == "62.0 ± 0.5"
+    rows = table(section((tmp_path / "study.md").read_text(), "Test, touched once"))
+    assert rows["+ w + sTDE (eps 0.5)"][0] == "62.0 ± 0.5"
+    assert rows["+ w + sTDE (eps 1, chosen)"][0] == "62.0 ± 0.5"

@@ -1,0 +1,115 @@
+"""Frozen dataclasses as JSON.
+
+Keys are the names of the fields. Metadata of a field changes this: `INLINE` puts the keys of its value among those of
+the record, `OPTIONAL` leaves out None, and `key("from")` gives another name. An `Interval` is
+`{"mean": m, "ci95": [low, high], ...}`, with null for what is undefined.
+"""
+
+import dataclasses
+import functools
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar, Union
+
+import numpy as np
+
+from jaxnav.study.intervals import Interval
+
+Record = TypeVar("Record")
+
+INLINE = types.MappingProxyType({"inline": True})
+OPTIONAL = types.MappingProxyType({"optional": True})
+_INTERVAL_KEYS = ("mean", "std", "ci95", "seeds")
+
+
+def key(name: str) -> dict[str, str]:
+    """Return the metadata that gives a field another key."""
+    return {"key": name}
+
+
+def to_json(value: Any) -> Any:
+    """Return a record, or what it holds, as JSON."""
+    if isinstance(value, Interval):
+        return _interval_to_json(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _record_to_json(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: to_json(item) for name, item in value.items()}
+    return [to_json(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def from_json(kind: type[Record], data: Mapping[str, Any]) -> Record:
+    """Return the record that JSON holds.
+
+    Other keys are ignored.
+
+    Raises:
+      KeyError: a key is missing.
+    """
+    return _decoded(kind, data)
+
+
+def _record_to_json(record: Any) -> dict[str, Any]:
+    data: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if field.metadata.get("inline"):
+            data |= to_json(value)
+        elif not (value is None and field.metadata.get("optional")):
+            data[_key(field)] = to_json(value)
+    return data
+
+
+def _interval_to_json(interval: Interval) -> dict[str, Any]:
+    mean, *bounds = (value if interval.defined else None for value in (interval.mean, interval.low, interval.high))
+    rest = {field.name: to_json(getattr(interval, field.name)) for field in dataclasses.fields(interval)[3:]}
+    data = {"mean": mean, "ci95": bounds, **rest}
+    return {name: data[name] for name in _INTERVAL_KEYS if name in data}
+
+
+def _decoded(kind: Any, value: Any) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if value is None or kind is Any:
+        return value
+    if origin in (Union, types.UnionType):
+        return _decoded(arguments[0], value)  # X | None
+    if origin is tuple:
+        return tuple(_decoded(arguments[0], item) for item in value)
+    if origin is Mapping:
+        return {name: _decoded(arguments[1], item) for name, item in value.items()}
+    if kind is np.ndarray:
+        return np.asarray(value)
+    if isinstance(kind, type) and issubclass(kind, Interval):
+        return _interval(kind, value)
+    return _record(kind, value) if dataclasses.is_dataclass(kind) else value
+
+
+def _record(kind: Any, data: Mapping[str, Any]) -> Any:
+    fields, hints = dataclasses.fields(kind), _hints(kind)
+    rest = {name: item for name, item in data.items() if name not in map(_key, fields)}
+    values = {}
+    for field in fields:
+        if field.metadata.get("inline"):
+            values[field.name] = _decoded(hints[field.name], rest)
+        elif _key(field) in data or not field.metadata.get("optional"):
+            values[field.name] = _decoded(hints[field.name], data[_key(field)])
+    return kind(**values)
+
+
+def _interval(kind: type[Interval], data: Mapping[str, Any]) -> Interval:
+    bounds = (math.nan if value is None else value for value in (data["mean"], *data["ci95"]))
+    rest = [field.name for field in dataclasses.fields(kind)[3:]]
+    return kind(*bounds, **{name: _decoded(_hints(kind)[name], data[name]) for name in rest})
+
+
+def _key(field: dataclasses.Field) -> str:
+    return field.metadata.get("key", field.name)
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind)

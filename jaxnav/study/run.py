@@ -1,0 +1,57 @@
+"""The whole study: training, results, figures and document."""
+
+from collections.abc import Callable
+from functools import partial
+
+from rich.console import Console
+
+from jaxnav.study.bench import Bench
+from jaxnav.study.config import StudyConfig, study_identity
+from jaxnav.study.curves import GapCourse
+from jaxnav.study.document import check_document, write_document
+from jaxnav.study.draw import draw_figures
+from jaxnav.study.gap_course import gap_course
+from jaxnav.study.instrument import instrument_report, study_instrument
+from jaxnav.study.instrument_report import InstrumentReport
+from jaxnav.study.measure import chosen_epsilon, measure_condition
+from jaxnav.study.records import Condition
+from jaxnav.study.results import WORLDS, condition_name, is_written, write_part
+from jaxnav.study.runs import ensure_trained, study_runs
+
+#: Runs that have every trial.
+FULL = ("main", "goal", "real")
+
+
+def run_study(config: StudyConfig, console: Console) -> None:
+    """Run what is missing, then write figures and document.
+
+    Finished runs and results are kept, so an interrupted study goes on where it stopped.
+
+    Raises:
+      InputError: the document is another one, epsilon was not chosen on `val`, or a run is impossible.
+    """
+    check_document(config.document)
+    if config.split == "test":
+        chosen_epsilon(config)  # refuses where val is missing
+    runs = study_runs(config)
+    for run in runs.values():
+        ensure_trained(run, console)
+    folder, study, bench = config.results / config.split, study_identity(config), Bench(config)
+
+    def write(name: str, measure: Callable[[], Condition | InstrumentReport | GapCourse]) -> None:
+        path = folder / f"{name}.json"
+        if not is_written(path, study):
+            console.print(f"{path}")
+            write_part(path, study, measure())
+
+    for name, run in runs.items():
+        for shift in config.shifts:
+            write(condition_name(name, shift), partial(measure_condition, run, name in FULL, shift, bench, console))
+        if name in WORLDS:
+            instrument = study_instrument(config, run)
+            write(f"instrument-{name}", partial(instrument_report, instrument, run, console))
+            write(f"gap-{name}", partial(gap_course, run, config, console))
+    if config.split == "val":
+        draw_figures(folder, config.document.parent / "images" / "study")
+    write_document(config.results, config.document)
+    console.print(f"written to {config.document}")

@@ -1,0 +1,45 @@
+"""Rows are picked by their trial and their gap."""
+
+import pytest
+from support import study_results
+
+from jaxnav.evaluation.report import Form
+from jaxnav.study.trials import NO_THRESHOLD, Trial
+
+PAPER = Trial("stde", "argmax", *NO_THRESHOLD)
+
+
+def test_a_row_is_picked_by_its_trial_and_else_is_the_main_one():
+    condition = study_results.condition(1.0)
+    row = condition.row(PAPER)
+    assert (row.gap, row.trial) == ("novelty", PAPER)
+    assert condition.effect(PAPER).mean == 5.0  # best actions: 100 more when sampled
+    assert condition.effect(PAPER, "evidence").mean == 4.0
+    assert condition.effect(Trial("layout", "sample")).mean == 101.0
+    assert condition.row(Trial("stde", "argmax", 0.0, "paper", "noise")).trial.control == "noise"
+
+
+def test_a_constant_is_picked_whatever_its_weight():
+    weighed = Trial("stde", "argmax", 0.0, "paper", "constant", 0.3)
+    assert study_results.condition(1.0).row(weighed).trial.weight == 0.0
+
+
+def test_what_is_missing_is_a_key_error():
+    coin = study_results.condition(1.0, "coin")
+    assert not coin.has(Trial("baseline"))
+    assert coin.has(Trial("layout"))
+    with pytest.raises(KeyError, match=r"no row of Trial.*baseline"):
+        coin.row(Trial("baseline"))
+    with pytest.raises(KeyError, match="compared with nothing"):
+        study_results.condition(1.0).effect(Trial("baseline"))
+
+
+def test_a_sweep_holds_every_epsilon_of_its_form():
+    condition = study_results.condition(1.0)
+    gains: dict[Form, float] = {"residual": 2.0, "paper": 5.0}
+    for form, gain in gains.items():
+        sweep = condition.sweep(form)
+        assert list(sweep) == [0.0, 0.5, 1.0]
+        for epsilon, row in sweep.items():
+            assert row.trial == Trial("stde", "argmax", epsilon, form)
+            assert condition.effect(row.trial).mean == gain

@@ -1,0 +1,100 @@
+"""Result files: the committed ones, and how they are written."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import study_results
+
+from jaxnav.study.codec import from_json, to_json
+from jaxnav.study.curves import GapCourse
+from jaxnav.study.document import READING, write_document
+from jaxnav.study.instrument_report import InstrumentReport
+from jaxnav.study.records import Condition, FullCondition
+from jaxnav.study.results import is_written, load_condition, load_results, write_part
+
+ROOT = Path(__file__).parents[2]
+COMMITTED = sorted((ROOT / "results" / "val").glob("*.json")) + sorted((ROOT / "results" / "quick").rglob("*.json"))
+HEADER = {"study", "versions", "format"}
+
+
+def kind(part: dict[str, Any]) -> type:
+    """Return the type of the record that a part holds."""
+    if "rows" in part:
+        return FullCondition if "gains" in part else Condition
+    return InstrumentReport if "matched" in part else GapCourse
+
+
+# Committed results
+
+
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parents[1].name}-{path.stem}")
+def test_committed_parts_are_read_and_written_with_the_same_keys(path):
+    part = json.loads(path.read_text())
+    assert HEADER | to_json(from_json(kind(part), part)).keys() == part.keys()
+    written = {name: part[name] for name in HEADER} | to_json(from_json(kind(part), part))
+    assert json.dumps({name: written[name] for name in part}) == json.dumps(part)  # in the same order
+
+
+@pytest.mark.parametrize(
+    ("results", "document"), [("results", "docs/study.md"), ("results/quick", "results/quick/study.md")]
+)
+def test_committed_documents_are_those_of_their_results(tmp_path, results, document):
+    write_document(ROOT / results, tmp_path / "study.md")
+    (head, _, tail), (written, _, rest) = (
+        path.read_text(encoding="utf-8").split(READING) for path in (ROOT / document, tmp_path / "study.md")
+    )
+    assert written == head
+    assert rest == tail
+
+
+# Parts
+
+
+def test_parts_are_loaded_by_name(tmp_path):
+    study_results.write(tmp_path / "val", study_results.parts(("main", "real")))
+    assert to_json_of(load_results(tmp_path / "val")) == to_json_of(study_results.results(("main", "real")))
+    assert load_results(tmp_path / "test") is None
+
+
+def to_json_of(results) -> Any:
+    assert results is not None
+    return to_json(results)
+
+
+def test_parts_of_another_study_are_not_read(tmp_path):
+    study_results.write(tmp_path, study_results.parts())
+    study_results.write(tmp_path, {"left-shift0": study_results.condition(0.0, "coin")}, study={})
+    assert to_json_of(load_results(tmp_path)) == to_json_of(study_results.results())
+
+
+def test_a_run_that_misses_a_shift_is_not_read(tmp_path):
+    parts = study_results.parts()
+    del parts["gate-shift1"]
+    study_results.write(tmp_path, parts)
+    results = load_results(tmp_path)
+    assert results is not None
+    assert list(results.runs) == ["main", "coin"]
+
+
+def test_a_part_is_written_with_its_study_and_six_digits(tmp_path):
+    path = tmp_path / "part.json"
+    course = GapCourse((0,), np.array([[1 / 3]]), (), ())
+    assert not is_written(path, {"seed": 0})
+    write_part(path, {"seed": 0}, course)
+    part = json.loads(path.read_text())
+    assert part.keys() > HEADER
+    assert (part["study"], part["running"]) == ({"seed": 0}, [[0.333333]])
+    assert is_written(path, {"seed": 0})
+    assert not is_written(path, {"seed": 1})
+    path.write_text("{")
+    assert not is_written(path, {"seed": 0})
+
+
+def test_a_full_condition_is_read_as_a_plain_one(tmp_path):
+    study_results.write(tmp_path, {"main-shift1": study_results.full_condition(1.0, chosen=0.5)})
+    condition = load_condition(tmp_path / "main-shift1.json")
+    assert condition.chosen == 0.5
+    assert condition.rows == study_results.full_condition(1.0).rows
