@@ -184,7 +184,7 @@ class LayoutEstimator(struct.PyTreeNode):
         named_setting(self.setting)
 
     def init(self) -> LayoutState:
-        """Return the belief at an episode's start: alpha*, D = 0."""
+        """Return the belief at an episode's start."""
         return LayoutState(
             alpha=self.prior, last=jnp.zeros(self.prior.shape[-1], dtype=bool), gap=jnp.zeros((), dtype=jnp.float32)
         )
@@ -245,5 +245,5 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """Return w x g of eq. 7, float32 [K], for a goal int []."""
+        """Return w x g of eq. 7, float32 [K]."""
         return LayoutEstimator.expectation(state, goal)

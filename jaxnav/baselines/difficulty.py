@@ -62,7 +62,7 @@ def _lengths(bank: Bank, scene: int) -> np.ndarray:
 
 
 def _mean_over_episodes(values: np.ndarray, lengths: np.ndarray) -> float:
-    """Average over goals, and for each over its starts.
+    """Return the average over goals and their starts.
 
     A start is a pose from which the goal can be reached.
     """

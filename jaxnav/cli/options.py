@@ -12,7 +12,9 @@ Config = TypeVar("Config")
 
 
 def parse(default: Config, arguments: list[str] | None, prog: str, description: str) -> Config:
-    """Settings of a command: `default`, then the file of `--config`, then the other options.
+    """Parse the settings of a command.
+
+    `default`, then the file of `--config`, then the other options.
 
     Raises:
       InputError: bad config file.

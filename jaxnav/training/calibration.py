@@ -84,38 +84,13 @@ def calibrate(
     Raises:
       InputError: no walk shows two categories together.
     """
-    start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
-    actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
-
-    def gaps(setting: Setting, priors: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
-        """Return mean early gap and late gap, [num_walks].
-
-        The early one is NaN where nothing was accepted.
-        """
-        acting, knowledge = Acting(env, setting=setting), Knowledge(priors)
-
-        def alpha(agent: Agent) -> jax.Array:
-            assert agent.layout is not None
-            return agent.layout.alpha
-
-        def step(agent: Agent, action: jax.Array) -> tuple[Agent, tuple[jax.Array, jax.Array]]:
-            after, _ = acting.step(agent, action, knowledge, params)
-            return after, (acting.gap(after), (alpha(after) != alpha(agent)).any(axis=(1, 2)))
-
-        agent = acting.start(start_key, num_walks, None, knowledge, params)
-        prior = priors[params.room[agent.state.scene]]
-        first = acting.gap(agent), (alpha(agent) != prior).any(axis=(1, 2))
-        _, later = jax.lax.scan(step, agent, actions)
-        gap, accepted = (jnp.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
-        early = accepted & (jnp.cumsum(accepted, axis=0) <= EARLY_VIEWS)
-        return jnp.where(early, gap, 0.0).sum(axis=0) / early.astype(jnp.float32).sum(axis=0), gap[-1]
-
     choices = [dataclasses.replace(setting, strength=strength) for strength in strengths]
     priors = jnp.stack([layout_priors(counts, chosen) for chosen in choices])
     calibrations = []
     for reduction in reductions:
         reduced = dataclasses.replace(setting, reduction=reduction)  # the strength only enters by the priors
-        early, late = jax.jit(jax.vmap(partial(gaps, reduced), (0, None)))(priors, params)
+        gaps = partial(_gaps, reduced, env=env, key=key, num_walks=num_walks)
+        early, late = jax.jit(jax.vmap(gaps, (0, None)))(priors, params)
         calibrations += [
             Calibration(dataclasses.replace(reduced, strength=chosen.strength), _median(e), float(np.median(f)))
             for chosen, e, f in zip(choices, np.asarray(early), np.asarray(late), strict=True)
@@ -123,6 +98,34 @@ def calibrate(
     if all(np.isnan(one.early) for one in calibrations):
         raise InputError("layout: no random walk shows two categories together, so nothing can be calibrated")
     return min(calibrations, key=lambda one: abs(one.early - EARLY) + abs(one.late - LATE))
+
+
+def _gaps(
+    setting: Setting, priors: jax.Array, params: EnvParams, env: ObjectNav, key: jax.Array, num_walks: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return mean early gap and late gap, [num_walks].
+
+    The early one is NaN where nothing was accepted.
+    """
+    start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
+    actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
+    acting, knowledge = Acting(env, setting=setting), Knowledge(priors)
+
+    def alpha(agent: Agent) -> jax.Array:
+        assert agent.layout is not None
+        return agent.layout.alpha
+
+    def step(agent: Agent, action: jax.Array) -> tuple[Agent, tuple[jax.Array, jax.Array]]:
+        after, _ = acting.step(agent, action, knowledge, params)
+        return after, (acting.gap(after), (alpha(after) != alpha(agent)).any(axis=(1, 2)))
+
+    agent = acting.start(start_key, num_walks, None, knowledge, params)
+    prior = priors[params.room[agent.state.scene]]
+    first = acting.gap(agent), (alpha(agent) != prior).any(axis=(1, 2))
+    _, later = jax.lax.scan(step, agent, actions)
+    gap, accepted = (jnp.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
+    early = accepted & (jnp.cumsum(accepted, axis=0) <= EARLY_VIEWS)
+    return jnp.where(early, gap, 0.0).sum(axis=0) / early.astype(jnp.float32).sum(axis=0), gap[-1]
 
 
 def _median(values: np.ndarray) -> float:

@@ -170,7 +170,7 @@ def collect(
 def _next_values(
     transitions: Transition, truncated_at: jax.Array, after_truncation: jax.Array, after_rollout: jax.Array
 ) -> jax.Array:
-    """Return the values that returns go on with, float32 [T, B].
+    """Return the next values of every step, float32 [T, B].
 
     Args:
       transitions: leaves [T, B].

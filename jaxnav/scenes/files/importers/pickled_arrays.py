@@ -54,7 +54,7 @@ def read_pickle(path: Path) -> Any:
 
 
 class _Reader(pickle._Unpickler):  # in Python: ten bytes can make the one in C allocate 64 GiB
-    """Unpickle arrays of numbers and no other classes."""
+    """Read pickled arrays of numbers, and no other classes."""
 
     dispatch = pickle._Unpickler.dispatch.copy()
     dispatch[pickle.BYTEARRAY8[0]] = dispatch[pickle.BINBYTES8[0]]  # the former allocates before it reads
