@@ -110,7 +110,7 @@ def test_the_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
     rows = stats(capsys, tmp_path / "a.jsonl.gz", "--run", run_dir)
     start = next(i for i, cells in enumerate(rows) if cells[0].startswith("Layouts against"))
     run = load_run(run_dir)
-    priors = np.asarray(load_policies(run).priors)[
+    priors = np.asarray(load_policies(run).knowledge.layout)[
         [0, OTHER_ROOM, 3]
     ]  # kitchens are the first room type, baths the last
     counts = scene_counts(compile_bank([kitchen, apartment, bath], run.task))
