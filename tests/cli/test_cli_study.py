@@ -69,11 +69,11 @@ def test_a_study_from_training_to_document(tmp_path):
         policies = load_policies(run, run.arms)
         assert (policies.spec.direct, policies.spec.done_gate) == ("goal", True)
         # The priors are those of the exported counts, and the setting is the calibrated one.
-        np.testing.assert_allclose(
-            policies.knowledge.layout, layout_priors(policies.counts, policies.setting), rtol=1e-6
-        )
-        assert policies.setting.strength in STRENGTHS
-        assert policies.setting.reduction in REDUCTIONS
+        setting = policies.setting
+        assert setting is not None
+        np.testing.assert_allclose(policies.knowledge.layout, layout_priors(policies.counts, setting), rtol=1e-6)
+        assert setting.strength in STRENGTHS
+        assert setting.reduction in REDUCTIONS
 
     keys = ("gap", "variant", "decoding", "epsilon", "form", "control")
     for shift in SHIFTS:

@@ -117,9 +117,8 @@ def test_the_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
     gaps, likeness = layout_gap(counts, priors), layout_similarity(counts, priors)
     for name, which in {"kitchen": [0], "apartment": [1], "bathroom": [2], "all": [0, 1, 2]}.items():
         measured = [gaps[which], likeness[which]]
-        means, quartiles = (
-            [f(values) for values in measured] for f in (np.mean, lambda v: np.quantile(v, (0.25, 0.5, 0.75)))
-        )
+        means = [np.mean(values) for values in measured]
+        quartiles = [np.quantile(values, (0.25, 0.5, 0.75)) for values in measured]
         texts = [" ".join(f"{q:.2f}" for q in three) for three in quartiles]
         expected = [str(len(which)), f"{means[0]:.2f}", texts[0], f"{means[1]:.2f}", texts[1]]
         assert row(rows[start:], name) == expected

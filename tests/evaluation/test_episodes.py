@@ -1,6 +1,8 @@
 """Evaluation episodes: the fixed list, an oracle's full marks on it, and the metrics."""
 
 import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
@@ -86,13 +88,14 @@ def test_an_oracle_has_full_marks(rules):
 
 
 def test_metrics_by_hand():
-    outcome = Outcome(
-        success=np.array([True, True, False, True]),
-        length=np.array([10, 1, 30, 4], np.int32),
-        moves=np.array([6, 0, 20, 3], np.int32),
-        distance=np.array([1.4, 0.3, 3.5, 1.0], np.float32),
-        weight=np.zeros(4, np.float32),
+    leaves = Outcome(
+        success=jnp.array([True, True, False, True]),
+        length=jnp.array([10, 1, 30, 4], jnp.int32),
+        moves=jnp.array([6, 0, 20, 3], jnp.int32),
+        distance=jnp.array([1.4, 0.3, 3.5, 1.0], jnp.float32),
+        weight=jnp.zeros(4),
     )
+    outcome = jax.tree.map(np.asarray, leaves)  # as the evaluator returns it
     metrics = episode_metrics(outcome, np.array([5, 1, 6, 4]))
     np.testing.assert_array_equal(metrics["sr"], [1, 1, 0, 1])
     # Success x L* / length: 5 / 10, 1 / 1, no success, 4 / 4.

@@ -15,7 +15,8 @@ from jaxnav.evaluation.episodes import episode_list, together
 from jaxnav.evaluation.grid import Evaluator, act, first_states
 from jaxnav.evaluation.inference import Branch
 from jaxnav.evaluation.playback import play
-from jaxnav.evaluation.variants import inference_grid, table_row, table_rows
+from jaxnav.evaluation.report import Decoding
+from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.pathways import NO_ACTION, Memory
@@ -83,9 +84,9 @@ def outcome(evaluated):
     return evaluated[0]
 
 
-def pick(outcome, variant, epsilon=None, form=None, decoding="argmax"):
+def pick(outcome, variant, epsilon=None, form=None, decoding: Decoding = "argmax"):
     """The outcome [S, E] of one row."""
-    return tiny.at(outcome, ROWS.index((variant, epsilon, form, decoding)))
+    return tiny.at(outcome, ROWS.index(Row(variant, epsilon, form, decoding)))
 
 
 # Cells
@@ -244,7 +245,7 @@ def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, numbe
 
 
 def test_playing_an_episode_agrees_with_the_grid(outcome):
-    row = ROWS.index(("stde", 0.2, "residual", "argmax"))
+    row = ROWS.index(Row("stde", 0.2, "residual", "argmax"))
     cell = tiny.at(CELLS, row * SEEDS + 1)
     for episode in (0, 17):
         start = tiny.at(first_states(EPISODES), episode)

@@ -1,5 +1,7 @@
 """sTDE and its controls, step by step: what is taken out, with which weight, and which actions follow."""
 
+from typing import Any, cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +13,12 @@ from jaxnav.causal import do
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import act, first_states
 from jaxnav.evaluation.inference import Branch, counterfactual_logits
+from jaxnav.evaluation.report import Decoding, Form, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.pathways import Decision, Memory, Pathways
+from jaxnav.policies.policy import Policy
 from jaxnav.scenes.task import NUM_ACTIONS
 
 EPISODES = 48
@@ -24,14 +28,16 @@ ACTING = Acting(ENV, tiny.SPEC, tiny.SETTING)
 START = first_states(episode_list(tiny.BANK, EPISODES, seed=1))
 
 
-def cell(variant="stde", epsilon=0.0, form="paper", decoding="argmax", **changes):
+def cell(
+    variant: Variant = "stde", epsilon: float = 0.0, form: Form = "paper", decoding: Decoding = "argmax", **changes
+):
     """One cell of the grid, changed."""
     one = tiny.at(inference_grid([table_row(variant, epsilon, form, decoding)], ("baseline", "layout"), 1), 0)
     return one.replace(**{name: jnp.asarray(value, getattr(one, name).dtype) for name, value in changes.items()})
 
 
 LAYOUT = cell("layout")
-CONTROLS = {
+CONTROLS: dict[str, dict[str, Any]] = {
     "none": {},
     "shuffled": {"shuffled": True},
     "zeros": {"branch": Branch.ZEROS},
@@ -112,13 +118,13 @@ class Open:
 
 @pytest.mark.parametrize("highest", [0.25, 2.0])
 def test_a_random_intervention_sets_scene_and_goal_alone(highest):
-    count = 500
+    count, policy = 500, cast(Policy, Open())
     pathways = Pathways(*(jnp.full((count, width), 9.0) for width in (2, 2, 1)), gate=jnp.ones((count, 1)))
     memory = Memory(hidden=jnp.zeros((count, 1)), action=jnp.zeros(count, jnp.int32))
     keys = jax.random.split(jax.random.key(0), (2, count))
 
     def logits(**changes):
-        return np.asarray(counterfactual_logits(cell(**changes), Open(), pathways, memory, *keys))
+        return np.asarray(counterfactual_logits(cell(**changes), policy, pathways, memory, *keys))
 
     found = logits(intervention=highest)
     np.testing.assert_array_equal(found[:, 4], 9.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 from PIL import Image
+from PIL.GifImagePlugin import GifImageFile
 from support import tiny_world as tiny
 
 from jaxnav.evaluation.episodes import episode_list
@@ -35,6 +36,7 @@ def test_a_picture_has_a_frame_per_step(tmp_path):
     draw_episode(episode, tmp_path / "new" / "a.gif")
     draw_episode(episode, tmp_path / "a.png")
     with Image.open(tmp_path / "new" / "a.gif") as gif, Image.open(tmp_path / "a.png") as png:
+        assert isinstance(gif, GifImageFile)
         assert gif.n_frames == len(trace.pose)
         assert gif.size == png.size == (960, 540)
 

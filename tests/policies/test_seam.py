@@ -121,7 +121,7 @@ def test_a_step_by_step_replay_is_the_parallel_one():
     org = dataclasses.replace(SPECS["STEPWISE"], method="org")
     weights = tiny.lively(7, org)
     scalars = PPOConfig(distil=0.5).scalars(1)
-    advantage = np.random.default_rng(0).normal(size=(LENGTH, ENVS)).astype(np.float32)
+    advantage = jnp.asarray(np.random.default_rng(0).normal(size=(LENGTH, ENVS)), jnp.float32)
 
     @functools.partial(jax.jit, static_argnums=1)
     def loss(weights, spec):

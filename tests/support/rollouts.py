@@ -4,11 +4,12 @@ import functools
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.policies.acting import Acting, Agent
+from jaxnav.policies.acting import Acting
 from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.training.collect import Transition, collect
+from jaxnav.training.collect import collect
 from jaxnav.training.loss import replay
 from support import tiny_world as tiny
 
@@ -42,13 +43,23 @@ def decide_again(weights, transitions, memory):
 
 
 class Rolled(NamedTuple):
-    """A rollout that goes on from another, so that its episodes begin at all times; all leaves NumPy."""
+    """Hold a rollout that goes on from another, so that its episodes begin at all times.
+
+    Attributes:
+      weights: of the policy.
+      before, after: the `Agent` before and after it.
+      transitions: `Transition`, leaves [T, B].
+      memory: `Memory` before the first step.
+      next_value: float32 [T, B].
+
+    All leaves are NumPy arrays, which the types of the library do not name.
+    """
 
     weights: dict[str, Any]
-    before: Agent
-    after: Agent
-    transitions: Transition
-    memory: Memory
+    before: Any
+    after: Any
+    transitions: Any
+    memory: Any
     next_value: np.ndarray
 
 
@@ -77,7 +88,8 @@ def retrace(coin: bool) -> Retraced:
     """Walk along the recorded actions, one episode slot after the other."""
     run = rolled(coin)
     shape = (LENGTH, SLOTS)
-    retraced = Retraced(np.zeros((*shape, 3), np.float32), *(np.zeros(shape, np.float32) for _ in range(3)), [], [])
+    value, log_prob, next_value = np.zeros((3, *shape), np.float32)
+    retraced = Retraced(np.zeros((*shape, 3), np.float32), value, log_prob, next_value, [], [])
     for slot in range(SLOTS):
         layout, memory = tiny.at(run.before.layout, slot), tiny.at(run.before.memory, slot)
         for time in range(LENGTH):
@@ -88,14 +100,14 @@ def retrace(coin: bool) -> Retraced:
             retraced.weights[time, slot], retraced.value[time, slot] = weights, decision.value
             retraced.log_prob[time, slot] = jax.nn.log_softmax(decision.logits)[now.action]
 
-            memory = Memory(np.asarray(decision.hidden), np.int32(now.action))
+            memory = decision.memory(jnp.int32(now.action))
             pose, ended = SUCCESSOR[now.pose, now.action], now.terminated | now.truncated
             if now.truncated:  # the value of the cut state, with its own belief and memory
                 last = tiny.believe(PRIORS[PARAMS.room[SCENE[pose]]], layout, ROWS[pose])
                 cut = tiny.decide(run.weights, ROWS[pose], now.goal, tiny.goal_weights(last, now.goal), memory)[0]
                 retraced.next_value[time, slot] = cut.value
             if ended:
-                layout, memory = None, Memory(np.zeros(tiny.SIZES.hidden, np.float32), np.int32(NO_ACTION))
+                layout, memory = None, Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
             next_pose = (
                 run.transitions.pose[time + 1, slot] if time + 1 < LENGTH else run.after.state.pose[slot]
             )  # after an ending, the start of the next episode

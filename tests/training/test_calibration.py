@@ -116,14 +116,14 @@ def test_early_and_late_gap_are_those_of_a_plain_loop(counts, by_hand):
 
 def test_the_pair_nearest_to_the_papers_course_is_chosen(counts, by_hand):
     distance = {pair: abs(early - EARLY) + abs(late - LATE) for pair, (early, late) in by_hand.items()}
-    best, second = sorted(distance, key=distance.get)[:2]
+    best, second = sorted(distance, key=lambda pair: distance[pair])[:2]
     assert distance[second] - distance[best] > 5e-3  # no matter of rounding
     found = choose(counts)
     assert (found.setting.reduction, found.setting.strength) == best
     assert (found.early, found.late) == pytest.approx(by_hand[best], abs=2e-3)
     # Without it, the next; the order in which they are given is of no effect.
     kept = [strength for strength in STRENGTHS if strength != best[1]]
-    nearest = min((pair for pair in PAIRS if pair[1] in kept), key=distance.get)
+    nearest = min((pair for pair in PAIRS if pair[1] in kept), key=lambda pair: distance[pair])
     found = choose(counts, kept[::-1], ("sum", "mean_visible"))
     assert (found.setting.reduction, found.setting.strength) == nearest
 

@@ -73,7 +73,8 @@ def test_the_agent_after_the_rollout_is_that_of_the_plain_loop(coin):
 def test_replay_gives_the_decisions_again(coin):
     run = rolled(coin)
     decisions, _ = decide_again(run.weights, run.transitions, run.memory)
-    log_prob = np.take_along_axis(jax.nn.log_softmax(decisions.logits), run.transitions.action[..., None], axis=-1)
+    log_pi = np.asarray(jax.nn.log_softmax(decisions.logits))
+    log_prob = np.take_along_axis(log_pi, run.transitions.action[..., None], axis=-1)
     np.testing.assert_allclose(log_prob[..., 0], run.transitions.log_prob, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(decisions.value, run.transitions.value, rtol=1e-4, atol=1e-5)
 

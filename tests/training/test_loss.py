@@ -128,8 +128,8 @@ def loss_in_numpy(decisions, counterfactual, transitions, advantage):
 @pytest.mark.parametrize("distil", [False, True])
 def test_the_loss_is_that_of_numpy(distil):
     run, advantage = rolled(True), some_advantage()
-    decisions = decide_again(NEW, run.transitions, run.memory)
-    expected = loss_in_numpy(*jax.tree.map(np.asarray, decisions), run.transitions, advantage)
+    factual, counterfactual = jax.tree.map(np.asarray, decide_again(NEW, run.transitions, run.memory))
+    expected = loss_in_numpy(factual, counterfactual, run.transitions, advantage)
     total = expected["policy_loss"] + 0.7 * expected["value_loss"] - 0.03 * expected["entropy"]
     if distil:
         total += 0.4 * expected["distil_loss"]
@@ -174,9 +174,9 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
         memories.append(memory)
         decision = tiny.decide(NEW, rows[time], now.goal, now.weights, memory)[0 if now.direct else 1]
         log_pi.append(log_softmax(np.asarray(decision.logits)))
-        memory = Memory(np.asarray(decision.hidden), now.action)
+        memory = decision.memory(now.action)
         if now.terminated | now.truncated:
-            memory = Memory(np.zeros(tiny.SIZES.hidden, F), np.int32(NO_ACTION))
+            memory = Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
     target, memories = np.array(log_pi), jax.tree.map(lambda *leaves: np.array(leaves), *memories)
 
     def divergence(weights):

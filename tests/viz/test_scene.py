@@ -57,10 +57,10 @@ def test_what_is_on_the_picture():
     assert names(plan) == ["  1 m", "Book", "Bowl", "Chair"]  # a sofa is no category here
     boxes, cells, crosses, rings = plan.collections
     assert len(boxes.get_paths()) == 4
-    assert len(cells.get_offsets()) == 9
-    assert crosses.get_offsets().tolist() == [[0.75, 0.0]]
-    assert sorted(rings.get_offsets().tolist()) == [[0.0, 2.5], [0.25, 2.5]]
-    bar = plan.lines[-1].get_xdata()
+    assert len(np.asarray(cells.get_offsets())) == 9
+    assert np.asarray(crosses.get_offsets()).tolist() == [[0.75, 0.0]]
+    assert sorted(np.asarray(rings.get_offsets()).tolist()) == [[0.0, 2.5], [0.25, 2.5]]
+    bar = np.asarray(plan.lines[-1].get_xdata())
     assert bar[1] - bar[0] == 1.0
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["standable cell", "cut off from those", "wall", "in view", "detected"]
@@ -96,8 +96,8 @@ def test_rooms_are_tinted_and_named():
     home = dataclasses.replace(HALL, rooms=(Room("living_room", left), Room("bedroom", right)))
     plan = scene_figure(home, TASK, view_from(home, TASK, None)).axes[0]
     assert {"living room", "bedroom"} < set(names(plan))
-    colours = plan.images[0].get_array()
-    plain = scene_figure(HALL, TASK, view_from(HALL, TASK, None)).axes[0].images[0].get_array()
+    untinted = scene_figure(HALL, TASK, view_from(HALL, TASK, None)).axes[0]
+    colours, plain = (np.asarray(axes.images[0].get_array()) for axes in (plan, untinted))
     assert (colours != plain).any(axis=-1).tolist() == (left | right).tolist()
     assert not np.array_equal(colours[0, 0], colours[0, 3])
 
@@ -135,4 +135,4 @@ def test_the_goal_is_a_star():
     axes = figure.add_axes((0, 0, 1, 1))
     draw_room(axes, HALL, TASK.categories, TASK.categories.index("Bowl"))
     stars = [line for line in axes.lines if line.get_marker() == "*"]
-    assert [(line.get_xdata().tolist(), line.get_ydata().tolist()) for line in stars] == [([0.25], [2.5])]
+    assert [np.asarray(line.get_data()).tolist() for line in stars] == [[[0.25], [2.5]]]
