@@ -61,7 +61,7 @@ def evaluate(
     scenes: Path | None = None,
     shift: float | None = None,
     episodes: int = 1000,
-    epsilon: Sequence[float] = (0.5,),
+    epsilon: Sequence[float] | np.ndarray = (0.5,),
     form: Sequence[Form] | None = None,
     seed: int = 0,
     console: Console | None = None,
@@ -88,7 +88,7 @@ def evaluate(
     config, policies = run.config, run.policies()
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
-    rows = table_rows(epsilon, form, policies.arms)
+    rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
     world = evaluation_world(config, split, scenes, shift, console)
     everything = range(len(world.banks))
     each = -(-episodes // len(world.banks))
