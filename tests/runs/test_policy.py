@@ -124,8 +124,6 @@ def test_a_batch_equals_its_singles(drawn_run, world, name):
     singles = stack([act(policy, *pair, 0.1) for pair in zip(observations, memories, strict=True)])
     np.testing.assert_array_equal(batched[0], singles[0])
     chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
-    eager = policy.act(observations[0], memories[0], 0.1)
-    chex.assert_trees_all_close(eager, tiny.at(singles, 0), rtol=1e-5, atol=1e-6)
 
 
 def test_several_policies_act_in_one_call(drawn_run, world):
