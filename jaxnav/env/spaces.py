@@ -22,10 +22,12 @@ class Space(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Discrete:
-    """Hold the numbers from 0 to n - 1.
+    """Hold the whole numbers from 0 to n - 1.
 
     Attributes:
       n: how many.
+      shape: of an array of them.
+      dtype: in which they are drawn; others of whole numbers are contained too.
     """
 
     n: int
@@ -38,7 +40,10 @@ class Discrete:
 
     def contains(self, x: Any) -> jax.Array:
         """Return whether a number is in the space, bool []."""
-        return jnp.all((jnp.asarray(x) >= 0) & (jnp.asarray(x) < self.n))
+        x = jnp.asarray(x)
+        if x.shape != self.shape or not jnp.issubdtype(x.dtype, jnp.integer):
+            return jnp.bool_(False)
+        return jnp.all((x >= 0) & (x < self.n))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +94,7 @@ class Dict:
         Args:
           x: a mapping, or an object with the names as attributes, such as an `Observation`.
         """
-        values = x if isinstance(x, Mapping) else vars(x)
+        values = x if isinstance(x, Mapping) else getattr(x, "__dict__", {})
         if values.keys() != self.spaces.keys():
             return jnp.bool_(False)
         return jnp.stack([space.contains(values[name]) for name, space in self.spaces.items()]).all()

@@ -65,7 +65,7 @@ def evaluate(
     scenes: Path | None = None,
     shift: float | None = None,
     episodes: int = 1000,
-    epsilon: Sequence[float] = (0.5,),
+    epsilon: Sequence[float] | np.ndarray = (0.5,),
     form: Sequence[Form] | None = None,
     seed: int = 0,
     console: Console | None = None,
@@ -92,7 +92,7 @@ def evaluate(
     config, policies = run.config, run.policies()
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
-    rows = table_rows(epsilon, form, policies.arms)
+    rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
     world = evaluation_world(config, split, scenes, shift, console)
     lists, outcome, compilations = run_rows(rows, policies, world, episodes, seed)
     shortest = oracle_outcome(world.banks, lists, read_ahead(world, range(len(world.banks))), world.env)

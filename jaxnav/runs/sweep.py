@@ -70,7 +70,10 @@ def sweep(
     if not len(epsilon):
         raise InputError("epsilon: give at least one number")
     form = policies.setting.form if form is None else form
-    policies = policies if params is None else policies._replace(params=jax.tree.map(jnp.asarray, params))
+    arms, params = run.config.arms, policies.params if params is None else params
+    # Random numbers depend on the place of the parameters: once for every arm, they stand where `evaluate` has them.
+    stacked = jax.tree.map(lambda leaf: jnp.concatenate([jnp.asarray(leaf)] * len(arms)), params)
+    policies = policies._replace(params=stacked, arms=arms)
     rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilon]
     world = evaluation_world(run.config, split, scenes, shift, Console(quiet=True))
     lists, outcome, compilations = run_rows(rows, policies, world, episodes, seed)

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import gzip
 import math
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,10 @@ import pytest
 from support.commands import POLICIES, SEEDS, contents, evaluate, finished_run, refusal, train
 
 from jaxnav.cli import train as train_command
+from jaxnav.cli.options import parse
+from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS, Setting
+from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.store.export import load_params
 from jaxnav.store.runlog import read_rows
@@ -96,6 +100,15 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("ppo: {gamma: [1]}", "ppo.gamma must be float, but is [1] (list)"),
         ("counterfactual: maybe", "counterfactual must be one of 'none', 'coin', 'distil', but is 'maybe'"),
         ("method: orgy", "method 'orgy': is unknown; did you mean 'org'?"),
+        ("method: no_such_package:MINE", "method 'no_such_package:MINE': cannot be imported (ModuleNotFoundError: "),
+        ("method: jaxnav.layout:MINE", "method 'jaxnav.layout:MINE': cannot be imported (AttributeError: "),
+        ("method: jaxnav.layout:SETTINGS", "method 'jaxnav.layout:SETTINGS': is dict, no jaxnav Method"),
+        ("{method: anonymous, arms: [layout]}", "method 'anonymous' cannot host the layout; give baseline alone"),
+        ("method_sizes: {layers: 2}", "method_sizes.layers is 2; is unknown; 'org' has relation_layers"),
+        ("{method: rgb, method_sizes: {layers: 2}}", "'rgb' has no sizes of its own"),
+        ("method_sizes: {relation_layers: 0}", "method_sizes.relation_layers is 0; give at least 1"),
+        ("method_sizes: {relation_layers: two}", "method_sizes must be a mapping of str to int"),
+        ("sizes: {relation_layers: 2}", "unknown key sizes.relation_layers; it is method_sizes.relation_layers now"),
         ("seeds: 0", "seeds is 0; give at least 1"),
         ("sizes: {hidden: -8}", "sizes.hidden is -8; give at least 1"),
         ("worlds: {num_train: 0}", "worlds.num_train is 0; give at least 1"),
@@ -129,6 +142,65 @@ def test_bad_settings_are_refused_before_anything_is_made(tmp_path, capsys, line
     assert train(file, tmp_path / "run", "--cache", tmp_path / "cache") == 2
     assert problem in refusal(capsys)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
+@pytest.mark.parametrize("value", [" 2", "=2"])
+def test_renamed_options_are_refused_with_their_new_name(tmp_path, capsys, option, value):
+    assert train_command.main(["--run-dir", str(tmp_path / "run"), *f"{option}{value}".split()]) == 2
+    assert refusal(capsys) == f"error: {option}: unknown option; it is --method-sizes relation_layers N now"
+    assert not (tmp_path / "run").exists()
+
+
+def test_renamed_options_keep_the_group_they_are_nested_in():
+    with pytest.raises(InputError, match=r"it is --base\.method-sizes relation_layers N now"):
+        parse(RunConfig(), ["--base.sizes.relation-layers", "2"], "study", "")
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "expected"),
+    [
+        ("", ["--method-sizes", "relation_layers", "2"], {"relation_layers": 2}),
+        ("method_sizes: {relation_layers: 3}", [], {"relation_layers": 3}),
+        ("method_sizes: {relation_layers: 3}", ["--method-sizes", "relation_layers", "2"], {"relation_layers": 2}),
+        (
+            "method_sizes: {relation_layers: 3}",
+            ["--method-sizes", "a", "1", "b", "2", "--seeds", "1"],
+            {"a": 1, "b": 2},
+        ),
+        ("method_sizes: {relation_layers: 3}", ["--method-sizes"], {}),
+    ],
+)
+def test_sizes_of_the_method_are_one_option(tmp_path, file, options, expected):
+    path = tmp_path / "config.yaml"
+    path.write_text(file)
+    assert parse(RunConfig(), ["--config", str(path), *options], "train.py", "").method_sizes == expected
+
+
+def test_the_help_names_every_setting(capsys):
+    with pytest.raises(SystemExit) as exit:
+        train_command.main(["--help"])
+    assert exit.value.code == 0
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    for words in ("--method STR how experience is made", "--method-sizes [NAME INT [NAME INT ...]]", "--config FILE"):
+        assert words in text
+    for field in dataclasses.fields(RunConfig):
+        assert f"--{field.name.replace('_', '-')}" in text
+
+
+def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
+    for missing in (tmp_path / "none.yaml", "smoek"):
+        assert train(missing, tmp_path / "run") == 2
+        assert refusal(capsys).startswith(f"error: {missing}: cannot be read (No such file or directory); check the")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("value", [["nonsense"], ["relation_layers"], ["relation_layers", "two"]])
+def test_sizes_without_whole_numbers_are_refused(tmp_path, capsys, value):
+    with pytest.raises(SystemExit) as exit:
+        train_command.main(["--run-dir", str(tmp_path / "run"), "--method-sizes", *value])
+    assert exit.value.code == 2
+    assert "--method-sizes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--ppo.gamma", "--seeds", "--layout.setting"])

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.overlay import apply_yaml
 
 
@@ -120,6 +121,23 @@ def test_unknown_keys_and_other_shapes_are_refused(overlay, text, parts):
         overlay(text)
     for part in ["config.yaml: ", *parts]:
         assert part in str(error.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Nested:
+    base: RunConfig = RunConfig()
+
+
+def test_renamed_keys_are_refused_with_their_new_name(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("sizes: {relation_layers: 2}")
+    with pytest.raises(InputError, match=r"key sizes.relation_layers; it is method_sizes.relation_layers now$"):
+        apply_yaml(RunConfig(), path)
+    path.write_text("base: {sizes: {hidden: 8, relation_layers: 2}}")
+    with pytest.raises(InputError, match=r"key base.sizes.relation_layers; it is method_sizes.relation_layers now$"):
+        apply_yaml(Nested(), path)
+    path.write_text("base: {method_sizes: {relation_layers: 2}}")
+    assert apply_yaml(Nested(), path).base == RunConfig(method_sizes={"relation_layers": 2})
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,253 @@
+"""A loaded policy acts as the evaluation's, step by step and in batches."""
+
+import dataclasses
+import functools
+import json
+import shutil
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+from support import tiny_world as tiny
+
+import jaxnav
+from jaxnav.env.objectnav import OTHER_ROOM
+from jaxnav.env.types import State
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.grid import first_states
+from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.report import Decoding, Variant
+from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import METHODS, Experience, Method
+from jaxnav.runs.directory import POLICIES
+from jaxnav.runs.policy import LoadedPolicy
+from jaxnav.runs.worlds import evaluation_world
+from jaxnav.scenes.categories import ROOM_TYPES
+
+act = jax.jit(LoadedPolicy.act)
+
+
+@pytest.fixture(scope="module")
+def world(drawn_run):
+    return evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+
+
+def cell_of(variant: Variant, epsilon: float | None, decoding: Decoding = "argmax"):
+    """How the evaluation infers with one set of parameters."""
+    row = table_row(variant, epsilon, "residual", decoding)
+    return tiny.at(inference_grid([row], [row.arm or ""], 1), 0)
+
+
+def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.5, told=True):
+    """The actions of a policy from a start on, in a loop over observations, with heading and moves unless not told."""
+    memory, state, before, actions = policy.init(room_type), start, start, []
+    headings, horizons = env.task.rules.headings, len(env.task.rules.horizons)
+    for time in range(steps):
+        action, memory = act(
+            policy,
+            env.observe(state, params),
+            memory,
+            epsilon,
+            key=None if key is None else jax.random.fold_in(key, time),
+            heading=state.pose // horizons % headings if told else 0,
+            moved=env.cell(state.pose) != env.cell(before.pose) if told else False,
+        )
+        actions.append(int(action))
+        before, (state, *_) = state, env.advance(state, action, params)
+    return actions
+
+
+@pytest.mark.parametrize(
+    ("variant", "epsilon", "decoding"),
+    [
+        ("stde", 0.0, "argmax"),
+        ("stde", 0.2, "argmax"),
+        ("stde", 1.0, "argmax"),
+        ("stde", 0.0, "sample"),
+        ("baseline", None, "argmax"),
+    ],
+)
+def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsilon, decoding):
+    arm, seed, key = "baseline" if variant == "baseline" else "layout", 1, jax.random.key(0)  # the key is play's
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / f"{arm}-{seed}")
+    policies, params, bank = drawn_run.policies(), world.params(0), world.banks[0]
+    episodes = episode_list(bank, 8)
+    for episode in range(0, 8, 2):  # one of each room type
+        start = tiny.at(first_states(episodes), episode)
+        weights = tiny.at(policies.of(arm), seed)
+        cell = cell_of(variant, epsilon, decoding)
+        trace = play(cell, weights, start, policies.acting(world.env), params, policies.knowledge)
+        room = bank.room_types[episodes.scene[episode]]
+        steps, sampled = len(trace.action), key if decoding == "sample" else None
+        actions = follow(policy, world.env, params, start, room, steps, key=sampled, epsilon=epsilon or 0.0)
+        assert actions == trace.action.tolist()
+
+
+def test_removal_and_keys_change_actions(drawn_run, world):
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1")
+    starts, bank = first_states(episode_list(world.banks[0], 8)), world.banks[0]
+    room = bank.room_types[int(starts.scene[0])]
+    walk = functools.partial(follow, policy, world.env, world.params(0), tiny.at(starts, 0), room, 12)
+    assert walk(epsilon=0.0) == walk(epsilon=0.0)
+    key = jax.random.key(0)
+    assert len({tuple(actions) for actions in (walk(epsilon=1.0), walk(key=key), walk(key=jax.random.key(1)))}) == 3
+    assert walk(key=key) == walk(key=key)
+
+
+def batch_of(policy, env, params, size=6):
+    """Observations of random poses and memories in the middle of episodes, one by one."""
+    keys = jax.random.split(jax.random.key(2), size)
+    states = [env.reset(key, params)[1] for key in keys]
+    observations, memories = [], []
+    for number, state in enumerate(states):
+        _, memory = act(policy, env.observe(state, params), policy.init([*ROOM_TYPES, None][number % 5]))
+        moved = env.advance(state, memory.memory.action, params)[0]
+        observations.append(env.observe(moved, params))
+        memories.append(memory)
+    return observations, memories
+
+
+def stack(trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+@pytest.mark.parametrize("name", ["layout-0", "baseline-0"])
+def test_a_batch_equals_its_singles(drawn_run, world, name):
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / name)
+    observations, memories = batch_of(policy, world.env, world.params(0))
+    batched = jax.jit(jax.vmap(policy.act, (0, 0, None)))(stack(observations), stack(memories), 0.1)
+    singles = stack([act(policy, *pair, 0.1) for pair in zip(observations, memories, strict=True)])
+    np.testing.assert_array_equal(batched[0], singles[0])
+    chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
+
+
+def test_several_policies_act_in_one_call(drawn_run, world):
+    folders = [drawn_run.config.run_dir / POLICIES / f"layout-{seed}" for seed in range(2)]
+    policies = [jaxnav.load_policy(folder) for folder in folders]
+    (observation, *_), (memory, *_) = batch_of(policies[0], world.env, world.params(0), 1)
+    together = jax.jit(jax.vmap(LoadedPolicy.act, (0, None, None)))(stack(policies), observation, memory)
+    singles = stack([act(policy, observation, memory) for policy in policies])
+    chex.assert_trees_all_close(together, singles, rtol=1e-5, atol=1e-6)
+
+
+def test_the_room_type_picks_the_prior(drawn_run):
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
+    for number, room in enumerate([*ROOM_TYPES, None]):
+        layout = policy.init(room).layout
+        assert layout is not None
+        np.testing.assert_array_equal(layout.alpha, policy.knowledge.layout[number])
+        assert int(policy.init(room).room) == number
+    assert len(ROOM_TYPES) == OTHER_ROOM
+    with pytest.raises(InputError, match=r"^room_type 'cellar': choose one of kitchen, .*, or None$"):
+        policy.init("cellar")
+
+
+# Methods with a tracker
+
+
+@dataclasses.dataclass(frozen=True)
+class Compass:
+    """Remembers headings, moves and actions, the older the less."""
+
+    def init(self, knowledge):
+        return jnp.zeros(3)
+
+    def update(self, note, knowledge, percept):
+        heard = [jnp.float32(value) for value in (percept.heading, percept.moved, percept.action)]
+        return 0.5 * note + jnp.stack(heard)
+
+    def read(self, note, knowledge, goal):
+        return note
+
+
+class Steered(Experience):
+    width = 3
+
+    def __init__(self, spec, rngs):
+        pass
+
+    def encode(self, features, appearance, weights, reading):
+        return reading
+
+
+def test_a_tracker_takes_in_every_step(monkeypatch):
+    monkeypatch.setitem(METHODS, "steered", Method(Steered, tracker=Compass()))
+    spec = dataclasses.replace(tiny.SPEC, method="steered", method_sizes=())
+    env, params = tiny.world()
+    weights, knowledge = tiny.lively(2, spec), tiny.knowledge()
+    weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
+    policy = LoadedPolicy(weights, knowledge, spec, tiny.SETTING)
+    start = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(1), time=jnp.int32(0))
+    trace = play(cell_of("stde", 0.1), weights, start, Acting(env, spec, tiny.SETTING), params, knowledge)
+    assert len(trace.action) == tiny.LIMITS[0]
+    walk = functools.partial(follow, policy, env, params, start, "kitchen", len(trace.action), epsilon=0.1)
+    assert walk() == trace.action.tolist()
+    assert walk(told=False) != trace.action.tolist()
+
+
+# Refusals
+
+
+@pytest.fixture
+def export(drawn_run, tmp_path):
+    return shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
+
+
+def refused(folder):
+    """The message of the refusal, one line that begins with the path."""
+    with pytest.raises(InputError) as error:
+        jaxnav.load_policy(folder)
+    message = str(error.value)
+    assert message.startswith(str(folder))
+    assert "\n" not in message
+    return message
+
+
+def respecified(export, **changes):
+    """The export with something changed in its spec."""
+    policy = json.loads((export / "policy.json").read_text())
+    policy["spec"] |= changes
+    (export / "policy.json").write_text(json.dumps(policy))
+    return export
+
+
+def test_folders_without_an_export_are_refused(tmp_path, drawn_run):
+    for folder in (tmp_path, tmp_path / "none", drawn_run.config.run_dir, str(tmp_path)):
+        assert "not an exported policy (No such file or directory: " in refused(folder)
+
+
+def test_damaged_exports_are_refused(export):
+    data = bytearray((export / "params.safetensors").read_bytes())
+    data[-1] ^= 1
+    (export / "params.safetensors").write_bytes(data)
+    assert "does not belong to policy.json or is damaged; export the policy again" in refused(export)
+    (export / "policy.json").write_text((export / "policy.json").read_text()[:-9])
+    assert "not JSON" in refused(export)
+    (export / "policy.json").unlink()
+    assert "not an exported policy" in refused(export)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (
+            {"method": "no_such_package:MINE"},
+            "cannot be imported (ModuleNotFoundError: No module named ",
+        ),
+        ({"method": "jaxnav.layout:MINE"}, "cannot be imported (AttributeError: module 'jaxnav.layout' "),
+        ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, org, rgb"),
+        ({"sizes": {"depth": 3}}, "its spec does not fit this code (TypeError: "),
+        ({"layout": {"rows": "some"}}, "its spec does not fit this code (ValueError: rows is 'some'"),
+        ({"method_sizes": None}, "its spec does not fit this code (AttributeError: "),
+    ],
+)
+def test_exports_of_other_code_are_refused(export, changes, problem):
+    assert jaxnav.load_policy(export).spec.method == "org"
+    message = refused(respecified(export, **changes))
+    assert problem in message
+    assert any(mend in message for mend in ("install or mend its package", "choose one of", "train the run anew"))

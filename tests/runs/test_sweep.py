@@ -1,0 +1,95 @@
+"""The sweep is the evaluation's rows of sTDE, to the bit, in one compilation."""
+
+import dataclasses
+
+import chex
+import jax
+import numpy as np
+import pytest
+from support.commands import SEEDS
+
+import jaxnav
+from jaxnav.errors import InputError
+from jaxnav.evaluation.variants import Row
+from jaxnav.runs.directory import Run
+
+EPSILON, EPISODES = np.linspace(0, 1, 11), 12
+DECODINGS = ("argmax", "sample")
+
+
+def _row(outcome, row):
+    return jax.tree.map(lambda leaf: leaf[row], outcome)
+
+
+@pytest.fixture(scope="module")
+def swept(drawn_run):
+    return {name: jaxnav.sweep(drawn_run, EPSILON, episodes=EPISODES, decoding=name) for name in DECODINGS}
+
+
+@pytest.fixture(scope="module")
+def evaluated(drawn_run):
+    return jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES)
+
+
+@pytest.mark.parametrize("decoding", DECODINGS)
+def test_a_sweep_equals_the_rows_of_an_evaluation(swept, evaluated, decoding):
+    sweep, metrics = swept[decoding], evaluated.metrics()
+    assert sweep.compilations == 1
+    np.testing.assert_array_equal(sweep.epsilon, EPSILON)
+    rows = np.array([evaluated.rows.index(Row("stde", epsilon, "residual", decoding)) for epsilon in EPSILON])
+    chex.assert_trees_all_equal(sweep.outcome, _row(evaluated.outcome, rows))
+    for name in ("sr", "spl", "dts"):
+        assert getattr(sweep, name).shape == (len(EPSILON), SEEDS, EPISODES)
+        np.testing.assert_array_equal(getattr(sweep, name), metrics[name][rows])
+
+
+@pytest.mark.parametrize("decoding", DECODINGS)
+def test_from_epsilon_1_on_nothing_is_removed(swept, evaluated, decoding):
+    weights = swept[decoding].outcome.weight.mean((1, 2))
+    assert weights[-1] == 0
+    assert (np.diff(weights) < 0).all()
+    layout = evaluated.rows.index(Row("layout", None, None, decoding))
+    row = _row(evaluated.outcome, layout)
+    chex.assert_trees_all_equal(_row(swept[decoding].outcome, -1), row)
+    assert (swept[decoding].outcome.length[0] != row.length).any()  # what is removed at epsilon 0 matters here
+
+
+def test_parameters_of_ones_own_are_what_is_evaluated(swept, drawn_run):
+    params = drawn_run.policies(("layout",)).params
+    again = {
+        name: jaxnav.sweep(drawn_run, EPSILON, own, episodes=EPISODES).outcome
+        for name, own in {
+            "same": params,
+            "reversed": jax.tree.map(lambda leaf: np.asarray(leaf)[::-1], params),
+            "other": jax.tree.map(lambda leaf: leaf + 0.1, params),
+        }.items()
+    }
+    outcome = swept["argmax"].outcome
+    chex.assert_trees_all_equal(again["same"], outcome)
+    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[:, ::-1], again["reversed"]), outcome)
+    assert (again["other"].length != outcome.length).any()
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "problem"),
+    [
+        ((), "epsilon: give at least one number"),
+        (np.zeros(0), "epsilon: give at least one number"),
+        ((0.5, -0.1), "epsilon -0.1: give numbers from 0"),
+        ((float("nan"),), "epsilon nan: give numbers from 0"),
+        ((float("inf"),), "epsilon inf: give numbers from 0"),
+    ],
+)
+def test_impossible_thresholds_are_refused(drawn_run, epsilon, problem):
+    for call in (jaxnav.sweep, jaxnav.evaluate):
+        with pytest.raises(InputError, match=problem):
+            call(drawn_run, epsilon=epsilon)
+
+
+def test_runs_without_the_layout_are_refused(drawn_run, tmp_path):
+    baseline = Run(dataclasses.replace(drawn_run.config, arms=("baseline",)))
+    with pytest.raises(InputError, match="was trained without the arm 'layout'; train one with all --arms"):
+        jaxnav.sweep(baseline, EPSILON)
+    unfinished = Run(dataclasses.replace(drawn_run.config, run_dir=tmp_path))
+    with pytest.raises(InputError, match="layout-0: is missing, so training has not finished"):
+        jaxnav.sweep(unfinished, EPSILON)
