@@ -11,7 +11,8 @@ from support.commands import CONFIG, contents, refusal
 
 from jaxnav import __main__ as commands
 from jaxnav.cli import study as command
-from jaxnav.runs.directory import load_policies, load_run
+from jaxnav.runs.directory import load_run
+from jaxnav.runs.policies import load_policies
 from jaxnav.study import run as study_run
 from jaxnav.study.document import READING
 from jaxnav.study.runs import run_config

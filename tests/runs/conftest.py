@@ -12,8 +12,9 @@ from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import POLICIES, Run, claim, export_policy
+from jaxnav.runs.directory import Run, claim
 from jaxnav.runs.overlay import apply_yaml
+from jaxnav.runs.policies import POLICIES, export_policy
 from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import Exploration

@@ -24,7 +24,7 @@ from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import METHODS, Experience, Method
-from jaxnav.runs.directory import POLICIES
+from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.scenes.categories import ROOM_TYPES
