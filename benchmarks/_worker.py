@@ -1,4 +1,4 @@
-"""A trainer as a process of its own: it compiles, says what it is, then trains for one more call per line it reads."""
+"""A trainer as a process that trains when asked."""
 
 import json
 import sys
@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 from _common import peak_resident_gb
-from _phases import matmul_flops
+from _flops import matmul_flops
 from jax.interpreters.partial_eval import dce_jaxpr
 
 #: One call of training: from a state to the state after some updates and the episodes and successes that ended in it.
@@ -15,7 +15,9 @@ Train = Callable[[Any], tuple[Any, tuple[jax.Array, jax.Array]]]
 
 
 def serve(train: Train, state: Any, steps: int, weights: Any) -> None:
-    """Prints what the trainer is as a line of JSON, then one for every line of stdin: the success of one more call.
+    """Print what the trainer is, then train once per line.
+
+    Each answer is one line of JSON; those after a line of stdin hold the success of one more call.
 
     Args:
       train: the call.

@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -12,18 +13,20 @@ ROWS, WIDTH, STEPS = 5, 7, 11
 
 
 @pytest.fixture(scope="module")
-def phases():
-    spec = importlib.util.spec_from_file_location("_phases", BENCHMARKS / "_phases.py")
+def flops() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("_flops", BENCHMARKS / "_flops.py")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def recurrent(weights, inputs, state):
-    """Loss of a linear recurrence: two products a step."""
+    """Return the loss of a linear recurrence: two products a step."""
 
-    def step(state, own):
-        state = jnp.tanh(own @ weights + state @ weights)
+    def step(state, entering):
+        state = jnp.tanh(entering @ weights + state @ weights)
         return state, None
 
     return jax.lax.scan(step, state, inputs)[0].sum()
@@ -33,18 +36,18 @@ ARGUMENTS = (jnp.ones((WIDTH, WIDTH)), jnp.ones((STEPS, ROWS, WIDTH)), jnp.ones(
 PRODUCT = 2 * ROWS * WIDTH * WIDTH
 
 
-def test_a_scan_counts_once_per_iteration(phases):
+def test_a_scan_counts_once_per_iteration(flops):
     jaxpr = jax.make_jaxpr(jax.jit(recurrent))(*ARGUMENTS).jaxpr
-    assert phases.matmul_flops(jaxpr) == 2 * STEPS * PRODUCT
+    assert flops.matmul_flops(jaxpr) == 2 * STEPS * PRODUCT
 
 
-def test_a_gradient_counts_forward_and_backward(phases):
+def test_a_gradient_counts_forward_and_backward(flops):
     # Back: by the weights twice and by the state once per step; nobody asks for the gradient by the inputs.
     jaxpr = jax.make_jaxpr(jax.jit(jax.grad(recurrent)))(*ARGUMENTS).jaxpr
-    assert phases.matmul_flops(jaxpr) == (2 + 3) * STEPS * PRODUCT
+    assert flops.matmul_flops(jaxpr) == (2 + 3) * STEPS * PRODUCT
 
 
-def test_batched_products_count_per_entry(phases):
+def test_batched_products_count_per_entry(flops):
     many = jnp.ones((3, ROWS, WIDTH))
     jaxpr = jax.make_jaxpr(lambda a: jnp.einsum("bij,bkj->bik", a, a))(many).jaxpr
-    assert phases.matmul_flops(jaxpr) == 3 * 2 * ROWS * ROWS * WIDTH
+    assert flops.matmul_flops(jaxpr) == 3 * 2 * ROWS * ROWS * WIDTH
