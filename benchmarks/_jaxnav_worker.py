@@ -1,42 +1,33 @@
-"""jaxnav's trainer as a process: `python benchmarks/_jaxnav_worker.py ARM EPOCHS MINIBATCHES UPDATES`.
+"""jaxnav's trainer as a process.
 
-ARM is `baseline` (the method without layout; its loss is PPO's alone) or `layout` (the layout estimator runs beside the
-rollout, with the gap that `train.py` leaves out, and the counterfactual branch is distilled).
+Started as `python benchmarks/_jaxnav_worker.py ARM EPOCHS MINIBATCHES UPDATES`. ARM is `baseline` (the method without
+layout; its loss is PPO's alone) or `layout` (the layout estimator runs beside the rollout, and the counterfactual
+branch is distilled).
 """
 
 import dataclasses
 import sys
 
-import jax
+from _setup import set_up
 from _worker import serve
 
-from jaxnav.env.make import make
-from jaxnav.layout import SETTINGS
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.spec import PolicySpec
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.config import PPOConfig
-from jaxnav.training.exploration import explore
-from jaxnav.training.learner import Learner
+from jaxnav.runs.config import RunConfig
+
+COUNTERFACTUAL = {"baseline": "none", "layout": "distil"}
 
 
 def main(arm: str, epochs: int, minibatches: int, updates: int) -> None:
-    env, params = make("rooms")
-    counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
-    setting = SETTINGS["calibrated"]
-    priors = layout_priors(counts, setting)
-    config = dataclasses.replace(PPOConfig(), epochs=epochs, minibatches=minibatches)
-    layout = arm == "layout"
-    acting = Acting(env, setting if layout else None)
-    learner = Learner(acting, PolicySpec(), config, "distil" if layout else "none")
-    scalars = config.scalars(10**9)  # so many updates that the learning rate stays as it is
+    ppo = dataclasses.replace(RunConfig().ppo, epochs=epochs, minibatches=minibatches)
+    config = dataclasses.replace(RunConfig(), arms=(arm,), counterfactual=COUNTERFACTUAL[arm], ppo=ppo)
+    setup = set_up(config)
+    learner, (state, _, params, knowledge) = setup.trainer.learners[arm], setup.arguments(arm)
+    scalars = ppo.scalars(10**9)  # so many updates that the learning rate stays as it is
 
     def train(state):
-        state, metrics = learner.train(state, scalars, params, priors, updates)
+        state, metrics = learner.train(state, scalars, params, knowledge, updates)
         return state, (metrics["episodes"], metrics["episodes"] * metrics["success"])
 
-    state = jax.jit(learner.init)(jax.random.key(0), params, priors)
-    serve(train, state, updates * config.num_envs * config.rollout, state.params)
+    serve(train, state, updates * config.update_steps, state.params)
 
 
 if __name__ == "__main__":

@@ -1,27 +1,22 @@
-"""One update of the learner and its rollout as compiled programs that know their floating-point operations.
+"""One update and its rollout as compiled programs.
 
-What learns, forward and backward, is not a program of its own: it is the update less the rollout, in operations and in
-seconds of the same turn.
+Learning, forward and backward, is no program: it is the update less the rollout, in operations and in seconds of the
+same turn.
 """
 
-import math
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from _flops import matmul_flops
+from _setup import Setup
 
-from jaxnav.env.types import EnvParams
-from jaxnav.policies.policy import bind
-from jaxnav.runs.config import RunConfig
-from jaxnav.training.collect import rollout
-from jaxnav.training.learner import Learner
-from jaxnav.training.trainer import Arms
+from jaxnav.training.collect import collect
 
 
 class Program(NamedTuple):
-    """A compiled program with its arguments.
+    """Hold a compiled program with its arguments.
 
     Attributes:
       call: runs it once.
@@ -36,25 +31,8 @@ class Program(NamedTuple):
     temp_gb: float | None
 
 
-def matmul_flops(jaxpr: Jaxpr) -> int:
-    """Floating-point operations of all matrix products, those of a scan once per iteration, branches all together."""
-    total = 0
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            (contracted, _), _ = equation.params["dimension_numbers"]
-            left: Any = equation.invars[0].aval
-            result: Any = equation.outvars[0].aval
-            total += 2 * result.size * math.prod(left.shape[axis] for axis in contracted)
-        times = equation.params["length"] if equation.primitive.name == "scan" else 1
-        inner = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: isinstance(x, Jaxpr | ClosedJaxpr))
-        for part in inner:
-            if isinstance(part, Jaxpr | ClosedJaxpr):
-                total += times * matmul_flops(part.jaxpr if isinstance(part, ClosedJaxpr) else part)
-    return total
-
-
 def program(function: Callable[..., Any], *arguments: Any) -> Program:
-    """A function compiled for these arguments."""
+    """Compile a function for these arguments."""
     began = time.perf_counter()
     traced = jax.jit(function).trace(*arguments)
     compiled = traced.lower().compile()
@@ -64,27 +42,26 @@ def program(function: Callable[..., Any], *arguments: Any) -> Program:
     return Program(lambda: compiled(*arguments), matmul_flops(traced.jaxpr.jaxpr), round(taken, 2), temp_gb)
 
 
-def update(learner: Learner, config: RunConfig, params: EnvParams, priors: jax.Array) -> Program:
-    """One update of a fresh seed: rollout and learning."""
-    state = jax.jit(learner.init)(jax.random.key(config.seed), params, priors)
-    return program(learner.update, state, config.ppo.scalars(config.total_updates), params, priors)
+def update(setup: Setup, arm: str) -> Program:
+    """Compile one update of a fresh seed: rollout and learning."""
+    return program(setup.trainer.learners[arm].update, *setup.arguments(arm))
 
 
-def acting(learner: Learner, config: RunConfig, params: EnvParams, priors: jax.Array) -> Program:
-    """The rollout of the same update."""
-    state = jax.jit(learner.init)(jax.random.key(config.seed), params, priors)
+def rollout(setup: Setup, arm: str) -> Program:
+    """Compile the rollout of the same update."""
+    learner, (state, _, params, knowledge) = setup.trainer.learners[arm], setup.arguments(arm)
 
-    def act(state: Any, params: EnvParams, priors: jax.Array) -> Any:
-        policy, coin = bind(learner.spec, state.params), learner.counterfactual == "coin"
-        return rollout(learner.acting, policy, state.agent, state.key, config.ppo.rollout, coin, params, priors)
+    def act(state: Any, params: Any, knowledge: Any) -> Any:
+        policy, coin = learner.acting.bind(state.params), learner.counterfactual == "coin"
+        return collect(learner.acting, policy, state.agent, state.key, learner.config.rollout, coin, params, knowledge)
 
-    return program(act, state, params, priors)
+    return program(act, state, params, knowledge)
 
 
-def phases(arms: Arms, config: RunConfig, params: EnvParams, priors: jax.Array) -> dict[str, Program]:
-    """`ARM update` and `ARM rollout` of every arm."""
+def phases(setup: Setup) -> dict[str, Program]:
+    """Compile `ARM update` and `ARM rollout` of every arm."""
     return {
-        f"{name} {what}": make(learner, config, params, priors)
-        for name, learner in arms.learners.items()
-        for what, make in (("update", update), ("rollout", acting))
+        f"{arm} {what}": compile_part(setup, arm)
+        for arm in setup.trainer.learners
+        for what, compile_part in (("update", update), ("rollout", rollout))
     }

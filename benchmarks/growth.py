@@ -1,11 +1,11 @@
-"""Speed, memory and compile time as the problem grows: `python benchmarks/growth.py`.
+"""Speed, memory and compile time as the problem grows.
 
-Each axis is varied alone around the default configuration, every point in a process of its own: random steps of the
-environment alone, the row consumed and not stored, and whole updates of the arm with the layout. Peaks are of resident
-memory, with Python, JAX, its compiler and the scenes. Scenes beyond the default are copies of the default bank's tables
-under indices of their own, which the host holds besides; categories beyond it are names that nothing has. `chunks`
-trains on in one process, whose memory must not grow. Runs stop after three, or once they have taken a few seconds: the
-largest points are timed once, without warm-up.
+`python benchmarks/growth.py` varies each axis alone around the default configuration, every point in a process of its
+own: random steps of the environment alone, the row consumed and not stored, and whole updates of the arm with the
+layout. Peaks are of resident memory, with Python, JAX, its compiler and the scenes. Scenes beyond the default are
+copies of the default bank's tables under indices of their own, which the host holds besides; categories beyond it are
+names that nothing has. `chunks` trains on in one process, whose memory must not grow. Runs stop after three, or once
+they have taken a few seconds: the largest points are timed once, without warm-up.
 """
 
 import dataclasses
@@ -18,16 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from _common import peak_resident_gb, report, seconds, spread
 from _phases import Program, program, update
+from _setup import set_up
 
-from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav, build
+from jaxnav.env.objectnav import ObjectNav, build
 from jaxnav.env.types import EnvParams
-from jaxnav.layout import SETTINGS
 from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
-from jaxnav.scenes.tables.compile import Bank, compile_bank
-from jaxnav.scenes.worlds import generated
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.trainer import Arms
+from jaxnav.scenes.tables.compile import Bank
 
 ARM = "layout"
 AXES = {
@@ -42,17 +39,17 @@ RUNS, ENOUGH_S = 3, 4.0
 
 
 def main() -> None:
-    found = {}
+    points = {}
     for axis, values in AXES.items():
         for value in values:
             print(f"{axis} {value}", file=sys.stderr, flush=True)
             done = subprocess.run([sys.executable, __file__, axis, str(value)], stdout=subprocess.PIPE, check=True)
-            found.setdefault(axis, {})[str(value)] = json.loads(done.stdout)
-    report({"arm": ARM, "episodes_of_the_environment_alone": ENVIRONMENTS, **found})
+            points.setdefault(axis, {})[str(value)] = json.loads(done.stdout)
+    report({"arm": ARM, "episodes_of_the_environment_alone": ENVIRONMENTS, **points})
 
 
 def point(axis: str, value: int) -> dict:
-    """The figures of one point."""
+    """Return the figures of one point."""
     config = dataclasses.replace(RunConfig(), arms=(ARM,), seeds=1, chunk=1)
     categories = (*ITHOR_CATEGORIES, *(f"Unseen{i}" for i in range(len(ITHOR_CATEGORIES), 200)))
     match axis:
@@ -62,29 +59,31 @@ def point(axis: str, value: int) -> dict:
             config = dataclasses.replace(config, worlds=WorldConfig(categories=categories[:value]))
         case "hidden":
             config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, hidden=value))
-    scenes = generated(config.world, "train")
-    bank = compile_bank((scenes[i] for i in range(len(scenes))), config.task)
-    env, params = build(tiled(bank, value) if axis == "scenes" else bank, {}, config.train_step_limit)
-    setting, size = SETTINGS[config.layout.setting], len(env.categories)
-    priors = layout_priors(jnp.zeros((NUM_PRIORS, size, size)), setting)
-    arms = Arms(config, env, setting, priors)
+    setup = set_up(config, explore=False)
+    if axis == "scenes":
+        bank = tiled(setup.world.banks[0], value)
+        setup = setup._replace(params=build(bank, {}, config.train_step_limit)[1])
     if axis == "chunks":
-        states = arms.init(params)
+        states = setup.trainer.init(setup.params)
         for _ in range(value):
-            states, _ = arms.train(states, params)
+            states, _ = setup.trainer.train(states, setup.params)
         return {"peak_resident_gb": peak_resident_gb()}
 
-    found = {"tables_gb": round(sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)) / 2**30, 3)}
+    env, params = setup.world.env, setup.params
+    measured = {"tables_gb": round(sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)) / 2**30, 3)}
     if axis != "hidden":
         episodes = value if axis == "environments" else ENVIRONMENTS
-        found |= figures("environment", walking(env, params, episodes), STEPS)
-    learning = update(arms.learners[ARM], config, params, priors)
-    found |= figures("training", learning, config.update_steps)
-    return found | {"gflop_per_update": round(learning.flops / 1e9, 1)}
+        measured |= figures("environment", walking(env, params, episodes), STEPS)
+    learning = update(setup, ARM)
+    measured |= figures("training", learning, config.update_steps)
+    return measured | {"gflop_per_update": round(learning.flops / 1e9, 1)}
 
 
 def tiled(bank: Bank, scenes: int) -> Bank:
-    """The bank's scenes over and over, to so many; what the environment does not read is left as it is."""
+    """Repeat a bank's scenes, to so many.
+
+    What the environment does not read is left as it is.
+    """
     copies = scenes // len(bank.names)
     shift = (np.arange(copies, dtype=np.int32) * len(bank.ahead)).reshape(-1, 1, 1)
     names = ("rows", "goal_distance", "num_cells", "goals", "num_goals")
@@ -98,7 +97,7 @@ def tiled(bank: Bank, scenes: int) -> Bank:
 
 
 def walking(env: ObjectNav, params: EnvParams, episodes: int) -> Program:
-    """Random steps of parallel episodes with auto-reset, each row kept only until the next."""
+    """Compile random steps that keep a row until the next."""
     key = jax.random.key(0)
     actions = jax.random.randint(key, (STEPS // episodes, episodes), 0, env.num_actions)
     observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, episodes), params)
@@ -116,7 +115,7 @@ def walking(env: ObjectNav, params: EnvParams, episodes: int) -> Program:
 
 
 def figures(name: str, program: Program, steps: int) -> dict:
-    """Steps per second of a program, its compile time, and the memory so far."""
+    """Return speed, compile time and memory of a program."""
     taken = [seconds(program.call)]
     while len(taken) <= RUNS and sum(taken) < ENOUGH_S:
         taken.append(seconds(program.call))

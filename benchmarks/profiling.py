@@ -1,8 +1,9 @@
-"""Where the time of one training update goes, operation by operation: `python benchmarks/profiling.py [ARM]`.
+"""Where the time of one training update goes.
 
-A compiled chunk of updates of one seed runs under JAX's profiler. Every XLA operation of the trace is looked up in the
-compiled program for its kind, its shape and the part of the program it comes from. Milliseconds are of an update: the
-median of an operation's runs times their number, so that a disturbance of some does not count.
+`python benchmarks/profiling.py [ARM]` runs a compiled chunk of updates of one seed under JAX's profiler. Every XLA
+operation of the trace is looked up in the compiled program for its kind, its shape and the part of the program it comes
+from. Milliseconds are of an update: the median of an operation's runs times their number, so that a disturbance of some
+does not count.
 """
 
 import collections
@@ -17,13 +18,9 @@ from pathlib import Path
 
 import jax
 from _common import report, seconds, spread
+from _setup import set_up
 
-from jaxnav.env.make import make
-from jaxnav.layout import SETTINGS
 from jaxnav.runs.config import RunConfig
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.exploration import explore
-from jaxnav.training.trainer import Arms
 
 CHUNK, RUNS, LONGEST = 4, 5, 15
 OPERATION = re.compile(r"\s*(?:ROOT )?%?([\w.\-]+) = (\S+) ([\w\-]+)\(")
@@ -33,13 +30,8 @@ METADATA = re.compile(r'op_name="([^"]*)"')
 def main() -> None:
     arm = sys.argv[1] if len(sys.argv) > 1 else "layout"
     config = RunConfig(chunk=CHUNK, seeds=1)
-    env, params = make(config.world)
-    counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
-    setting = SETTINGS[config.layout.setting]
-    priors = layout_priors(counts, setting)
-    learner = Arms(config, env, setting, priors).learners[arm]
-    state = jax.jit(learner.init)(jax.random.key(0), params, priors)
-    inputs = state, config.ppo.scalars(config.total_updates), params, priors
+    setup = set_up(config)
+    learner, inputs = setup.trainer.learners[arm], setup.arguments(arm)
     compiled = jax.jit(partial(learner.train, num_updates=CHUNK)).lower(*inputs).compile()
     wall = [1e3 * seconds(lambda: compiled(*inputs)) / CHUNK for _ in range(RUNS + 1)][1:]
     with tempfile.TemporaryDirectory() as folder:
@@ -47,22 +39,22 @@ def main() -> None:
             jax.block_until_ready(compiled(*inputs))
         (trace,) = Path(folder).rglob("*.trace.json.gz")
         events = json.loads(gzip.decompress(trace.read_bytes()))["traceEvents"]
-    found = operations(compiled.as_text() or "", events, config)
+    rows = operations(compiled.as_text() or "", events, config)
     kinds: collections.Counter[str] = collections.Counter()
-    for one in found:
+    for one in rows:
         kinds[one["kind"]] += one["ms"]
     report(
         {
             "arm": arm,
             "wall_ms_per_update": spread(wall),
             "ms_by_kind": {kind: round(ms, 1) for kind, ms in kinds.most_common()},
-            "longest": found[:LONGEST],
+            "longest": rows[:LONGEST],
         }
     )
 
 
 def operations(program: str, events: list[dict], config: RunConfig) -> list[dict]:
-    """The operations of a trace, the longest first, with what the program's text says of each."""
+    """List the operations of a trace, the longest first."""
     known = {}
     for line in program.splitlines():
         if match := OPERATION.match(line):
@@ -74,21 +66,24 @@ def operations(program: str, events: list[dict], config: RunConfig) -> list[dict
         # Loops and conditions hold other operations, which are there themselves.
         if event.get("ph") == "X" and known.get(event["name"], ("", "while", ""))[1] not in ("while", "conditional"):
             runs[event["name"]].append(event["dur"])
-    found = [
+    rows = [
         {
             "operation": name,
             "shape": known[name][0],
-            "kind": kind(known[name][1], name, known[name][2], len(own) / CHUNK, config),
-            "calls": round(len(own) / CHUNK),
-            "ms": round(statistics.median(own) * len(own) / CHUNK / 1e3, 3),
+            "kind": kind(known[name][1], name, known[name][2], len(durations) / CHUNK, config),
+            "calls": round(len(durations) / CHUNK),
+            "ms": round(statistics.median(durations) * len(durations) / CHUNK / 1e3, 3),
         }
-        for name, own in runs.items()
+        for name, durations in runs.items()
     ]
-    return sorted(found, key=lambda one: -one["ms"])
+    return sorted(rows, key=lambda one: -one["ms"])
 
 
 def kind(operation: str, name: str, origin: str, calls: float, config: RunConfig) -> str:
-    """What an operation is for; how often it runs tells the loop that it is in."""
+    """Say what an operation is for.
+
+    How often it runs tells the loop that it is in.
+    """
     backward = "backward" if "transpose(jvp" in origin else "forward"
     if calls >= config.ppo.minibatches * config.ppo.rollout:
         return f"loop over steps, {backward}"

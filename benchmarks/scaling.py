@@ -1,4 +1,6 @@
-"""Training on several devices and processes: `python benchmarks/scaling.py`, on two cores or more, in 3 minutes.
+"""Training on several devices and processes.
+
+`python benchmarks/scaling.py` takes two cores or more, and 3 minutes.
 
 Weak scaling: every device brings as many episodes (half of the default run's), of one seed of the arm with the layout.
 
@@ -33,18 +35,18 @@ BYTES = [2**9, 2**12, 2**14, 2**16, 2**20, 2**24]
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        found = pair("process", folder)
-    found["all_reduce"]["free"] = pair("network")
+        results = pair("process", folder)
+    results["all_reduce"]["free"] = pair("network")
     simulated = start(["simulated"], flags="--xla_force_host_platform_device_count=4")
-    found["simulated"] = json.loads(simulated.communicate()[0])
+    results["simulated"] = json.loads(simulated.communicate()[0])
 
     from _common import report
 
-    report({"episodes_per_device": EPISODES, "updates_per_call": CALL, **found})
+    report({"episodes_per_device": EPISODES, "updates_per_call": CALL, **results})
 
 
 def pair(role: str, *arguments: str) -> dict:
-    """What the first of two processes finds."""
+    """Return what the first of two processes measures."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -61,7 +63,7 @@ def start(arguments: list, address: str = "", flags: str = "") -> subprocess.Pop
 
 
 def process(address: str, index: str, core: str, folder: str) -> None:
-    """One of two processes; the first one prints."""
+    """Be one of two processes; the first one prints."""
     os.sched_setaffinity(0, {int(core)})  # before JAX counts the cores
     began = time.perf_counter()
     from _common import in_turns, rates, ratios, spread
@@ -100,7 +102,7 @@ def process(address: str, index: str, core: str, folder: str) -> None:
     update = {name: statistics.median(times) for name, times in taken.items()}
     as_one = ("shared_seeds", "shared_episodes")
     steps = {name: trainings[name].steps * (2 if name == "apart" else 1) for name in ("alone", "apart", *as_one)}
-    found = {
+    results = {
         "processes": {
             "steps_per_s": {name: rates(taken[name], count) for name, count in steps.items()},
             "to_apart": {name: ratios(taken["apart"], taken[name]) for name in as_one},
@@ -119,11 +121,11 @@ def process(address: str, index: str, core: str, folder: str) -> None:
         },
         "jitter": {"seconds": spread(jitter), "log_standard_deviation": log_spread(jitter)},
     }
-    print(json.dumps(found))
+    print(json.dumps(results))
 
 
 def means(mesh) -> dict:
-    """Seconds of means over a mesh."""
+    """Return the seconds of means over a mesh."""
     from _common import spread
     from _scaling import all_reduce, line
 
@@ -132,7 +134,7 @@ def means(mesh) -> dict:
 
 
 def network(address: str, index: str, _: str) -> None:
-    """One of two processes on any core that only take means."""
+    """Be one of two processes that only take means."""
     from jaxnav.training.devices import Devices
 
     devices = Devices(address=address, process=int(index), processes=2)
@@ -141,7 +143,7 @@ def network(address: str, index: str, _: str) -> None:
 
 
 def simulated() -> None:
-    """1, 2 and 4 devices of one process."""
+    """Train on 1, 2 and 4 devices of one process."""
     from _common import in_turns, rates, ratios
     from _scaling import Training
 
@@ -149,10 +151,10 @@ def simulated() -> None:
 
     trainings = {n: Training(Devices(count=n).mesh(1, n * EPISODES // 2, 1), n * EPISODES // 2) for n in (1, 2, 4)}
     taken = in_turns({str(n): training.train for n, training in trainings.items()}, TURNS)
-    found = {name: {"steps_per_s": rates(times, trainings[int(name)].steps)} for name, times in taken.items()}
+    results = {name: {"steps_per_s": rates(times, trainings[int(name)].steps)} for name, times in taken.items()}
     for name in ("2", "4"):
-        found[name]["efficiency_of_the_same_cores"] = ratios([int(name) * one for one in taken["1"]], taken[name])
-    print(json.dumps(found))
+        results[name]["efficiency_of_the_same_cores"] = ratios([int(name) * one for one in taken["1"]], taken[name])
+    print(json.dumps(results))
 
 
 if __name__ == "__main__":

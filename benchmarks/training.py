@@ -1,7 +1,8 @@
-"""Steps per second of training with the default policy, learning included: `python benchmarks/training.py`.
+"""Steps per second of training, learning included.
 
-All seeds of both arms, as `train.py` runs them, in turns with one seed of each arm. The program of a chunk of updates
-is compared with that of a training a hundred times as long: equal programs need equal memory.
+`python benchmarks/training.py` times all seeds of both arms, as `train.py` runs them with the default policy, in turns
+with one seed of each arm. The program of a chunk of updates is compared with that of a training a hundred times as
+long: equal programs need equal memory.
 """
 
 from functools import partial
@@ -9,41 +10,34 @@ from functools import partial
 import jax
 from _common import in_turns, peak_resident_gb, rates, report
 from _phases import program
+from _setup import set_up
 
-from jaxnav.env.make import make
-from jaxnav.layout import SETTINGS
 from jaxnav.runs.config import RunConfig
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.exploration import explore
-from jaxnav.training.trainer import Arms
 
 CHUNK, TURNS = 4, 5
 
 
 def main() -> None:
     config = RunConfig(chunk=CHUNK)
-    env, params = make(config.world)
-    counts = jax.jit(explore, static_argnums=0)(env, params, jax.random.key(0)).counts
-    setting = SETTINGS[config.layout.setting]
-    priors = layout_priors(counts, setting)
-    arms = Arms(config, env, setting, priors)
-    kept = {"states": arms.init(params)}
+    setup = set_up(config)
+    trainer, params = setup.trainer, setup.params
+    kept = {"states": trainer.init(params)}
 
     def everything():
-        kept["states"], _ = arms.train(kept["states"], params)
+        kept["states"], _ = trainer.train(kept["states"], params)
 
     calls, steps = {"all arms and seeds": everything}, CHUNK * config.update_steps
     temporary, same = {}, {}
-    for name, learner in arms.learners.items():
-        state = jax.jit(learner.init)(jax.random.key(0), params, priors)
+    for name, learner in trainer.learners.items():
         train = partial(learner.train, num_updates=CHUNK)
-        inputs = state, config.ppo.scalars(config.total_updates), params, priors
-        own = program(train, *inputs)
-        calls[name], temporary[name] = own.call, own.temp_gb
-        longer = state, config.ppo.scalars(100 * config.total_updates), params, priors
-        same[name] = jax.jit(train).lower(*inputs).as_text() == jax.jit(train).lower(*longer).as_text()
+        state, scalars, *rest = setup.arguments(name)
+        chunk = program(train, state, scalars, *rest)
+        calls[name], temporary[name] = chunk.call, chunk.temp_gb
+        longer = config.ppo.scalars(100 * config.total_updates)
+        texts = {jax.jit(train).lower(state, each, *rest).as_text() for each in (scalars, longer)}
+        same[name] = len(texts) == 1
     taken = in_turns(calls, TURNS)
-    many = config.seeds * len(arms.learners)
+    many = config.seeds * len(trainer.learners)
     report(
         {
             "episodes": config.ppo.num_envs,
