@@ -1,4 +1,4 @@
-"""What every benchmark shares: calls timed in turns, spreads, and a report with the machine and the versions."""
+"""Calls timed in turns, spreads, and a benchmark's report."""
 
 import importlib.metadata
 import json
@@ -24,14 +24,17 @@ TUNED_ALLOCATOR = {
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Wall seconds of one call, its arrays waited for."""
+    """Return the wall seconds until a call's arrays are there."""
     began = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - began
 
 
 def in_turns(calls: Mapping[str, Callable[[], Any]], turns: int = 9) -> dict[str, list[float]]:
-    """Wall seconds of several calls taken in turns (A B A B ...) after a warm-up of each: load hits all alike."""
+    """Time calls in turns (A B A B ...).
+
+    Load hits all alike. Returns wall seconds, after a warm-up of each.
+    """
     for call in calls.values():
         seconds(call)
     rounds = [{name: seconds(call) for name, call in calls.items()} for _ in range(turns)]
@@ -39,28 +42,28 @@ def in_turns(calls: Mapping[str, Callable[[], Any]], turns: int = 9) -> dict[str
 
 
 def spread(values: Sequence[float], digits: int = 4) -> Spread:
-    """Median, least and greatest, rounded to so many significant digits."""
-    found = {"median": statistics.median(values), "min": min(values), "max": max(values)}
-    return {name: float(f"{value:.{digits}g}") for name, value in found.items()}
+    """Return median, least and greatest to some significant digits."""
+    statistics_of = {"median": statistics.median(values), "min": min(values), "max": max(values)}
+    return {name: float(f"{value:.{digits}g}") for name, value in statistics_of.items()}
 
 
 def rates(taken: Sequence[float], steps: int) -> Spread:
-    """Steps per second of calls of `steps` steps that took these seconds."""
+    """Return steps per second of calls of so many steps."""
     return spread([steps / one for one in taken])
 
 
 def ratios(above: Sequence[float], below: Sequence[float]) -> Spread:
-    """Ratios turn by turn of what was timed in the same turns."""
+    """Return ratios turn by turn of what was timed together."""
     return spread([a / b for a, b in zip(above, below, strict=True)])
 
 
 def peak_resident_gb() -> float:
-    """Most memory that this process has held so far."""
+    """Return the most memory that this process has held."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3)
 
 
 def machine() -> dict[str, Any]:
-    """The processor, the devices, the settings and the versions that figures depend on."""
+    """Return the processor, devices, settings and versions."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -76,5 +79,5 @@ def machine() -> dict[str, Any]:
 
 
 def report(results: dict[str, Any]) -> None:
-    """Prints the machine and the results as one JSON object."""
+    """Print the machine and the results as one JSON object."""
     print(json.dumps({"machine": machine(), **results}, indent=2))

@@ -1,26 +1,23 @@
-"""Homes by the ten thousand: `python benchmarks/streaming.py [HOUSES]` compiles, streams and trains on them.
+"""Homes by the ten thousand: compiled, streamed and trained on.
 
-It prints the time and the disk that compiling takes, and steps per second of training (both arms, one seed each) from
-the stream against the same training within one bank, chunk by chunk in turns. Resident memory is the peak of the whole
-process. 1,000 houses by default; the compiled houses stay in the cache.
+`python benchmarks/streaming.py [HOUSES]` prints the time and the disk that compiling takes, and steps per second of
+training (both arms, one seed each) from the stream against the same training within one bank, chunk by chunk in turns.
+Resident memory is the peak of the whole process. 1,000 houses by default; the compiled houses stay in the cache.
 """
 
 import dataclasses
-import resource
-import statistics
 import sys
 import time
-from pathlib import Path
 
-from _common import report
+import jax
+from _common import in_turns, peak_resident_gb, rates, ratios, report
 from rich.console import Console
 
-from jaxnav.cli.train import explored
 from jaxnav.layout import SETTINGS
 from jaxnav.runs.config import RunConfig, WorldConfig
+from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.worlds import bank_order, read_ahead, training_world
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.trainer import Arms
+from jaxnav.scenes.tables.shards import Shards
 
 TURNS, CHUNK = 7, 8
 
@@ -32,29 +29,28 @@ def main() -> None:
     began = time.perf_counter()
     world = training_world(config, Console(stderr=True))
     compiling = time.perf_counter() - began
-    disk = sum(file.stat().st_size for path in world.banks.paths for file in Path(path).rglob("*"))
+    assert isinstance(world.banks, Shards)
+    disk = sum(file.stat().st_size for path in world.banks.paths for file in path.rglob("*"))
     rooms = sum(len(world.scenes[i].rooms) for i in range(min(houses, 200))) / min(houses, 200)
 
     began = time.perf_counter()
-    found = explored(config, world)
+    explored = jax.block_until_ready(explore_world(config, world))
     exploring = time.perf_counter() - began
     setting = SETTINGS[config.layout.setting]
-    arms = Arms(config, world.env, setting, layout_priors(found.counts, setting))
-    still, coming = world.params(0), read_ahead(world, bank_order(world, config.seed, TURNS))
-    memory, streamed = arms.init(still), arms.init(still)
-    memory, _ = arms.train(memory, still)  # compiles
-    streamed = arms.restart(streamed, still)
-    seconds = {"in_memory": [], "streamed": []}
-    for _ in range(TURNS):
-        began = time.perf_counter()
-        memory, _ = arms.train(memory, still)
-        seconds["in_memory"].append(time.perf_counter() - began)
-        began = time.perf_counter()
+    trainer = make_trainer(config, world.env, setting, learn_knowledge(config, world, explored, setting))
+    still = world.params(0)
+    coming = read_ahead(world, bank_order(world, config.seed, TURNS + 1))  # one more for the warm-up
+    states = {name: trainer.init(still) for name in ("in_memory", "streamed")}
+
+    def in_memory() -> None:
+        states["in_memory"], _ = trainer.train(states["in_memory"], still)
+
+    def streamed() -> None:
         params = next(coming)
-        streamed, _ = arms.train(arms.restart(streamed, params), params)
-        seconds["streamed"].append(time.perf_counter() - began)
-    steps = CHUNK * config.update_steps * len(arms.learners)
-    rates = {name: round(steps / statistics.median(values)) for name, values in seconds.items()}
+        states["streamed"], _ = trainer.train(trainer.restart(states["streamed"], params), params)
+
+    taken = in_turns({"in_memory": in_memory, "streamed": streamed}, TURNS)
+    steps = CHUNK * config.update_steps * len(trainer.learners)
     report(
         {
             "houses": houses,
@@ -66,9 +62,9 @@ def main() -> None:
             "disk_kb_per_house": round(disk / 1e3 / houses),
             "disk_kb_per_room": round(disk / 1e3 / houses / rooms),
             "explore_s": round(exploring, 1),
-            "steps_per_s": rates,
-            "streamed_over_in_memory": round(rates["streamed"] / rates["in_memory"], 3),
-            "peak_resident_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, 2),
+            "steps_per_s": {name: rates(seconds, steps) for name, seconds in taken.items()},
+            "streamed_over_in_memory": ratios(taken["in_memory"], taken["streamed"]),
+            "peak_resident_gb": peak_resident_gb(),
         }
     )
 
