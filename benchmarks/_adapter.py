@@ -1,4 +1,7 @@
-"""The environment behind gymnax's interface, and the policy's layers as flax.linen modules, for other trainers."""
+"""The environment and the policy's layers for other trainers.
+
+The environment has gymnax's interface with auto-reset, the layers are flax.linen modules.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,6 +13,7 @@ from flax import linen as nn
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, Observation, State
 from jaxnav.policies.features import NUM_FEATURES, features
+from jaxnav.policies.methods.org import ORG
 from jaxnav.policies.policy import SELDOM
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import RowFormat
@@ -17,7 +21,7 @@ from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 
 class Slot(NamedTuple):
-    """An episode, its previous action, and how many of this slot's episodes ended and succeeded so far."""
+    """Hold an episode, its last action and its slot's counts."""
 
     state: State
     action: jax.Array
@@ -26,9 +30,10 @@ class Slot(NamedTuple):
 
 
 class Adapter:
-    """gymnax's `reset` and `step` with auto-reset; an observation is one array, the previous action part of it.
+    """Offer gymnax's `reset` and `step` with auto-reset.
 
-    As in jaxnav's own policy, that action is `NUM_ACTIONS` at the start of an episode.
+    An observation is one array, the previous action part of it. As in jaxnav's policy, that action is `NUM_ACTIONS` at
+    the start of an episode.
     """
 
     def __init__(self, env: ObjectNav, encode: Callable[[Observation, jax.Array], jax.Array]) -> None:
@@ -50,31 +55,31 @@ class Adapter:
 
 
 def ended(before: Slot, after: Slot) -> tuple[jax.Array, jax.Array]:
-    """Episodes and successes between two batches of slots."""
+    """Count episodes and successes between two batches of slots."""
     return (after.episodes - before.episodes).sum(), (after.successes - before.successes).sum()
 
 
 def packed(observation: Observation, action: jax.Array) -> jax.Array:
-    """The row, the goal and the previous action as bytes."""
+    """Pack row, goal and previous action as bytes."""
     return jnp.concatenate([observation.row, jnp.stack([observation.goal, action]).astype(jnp.uint8)])
 
 
 def unpacked(array: jax.Array, row_format: RowFormat) -> jax.Array:
-    """From batches of `packed` arrays to what `Torso` reads."""
+    """Turn batches of `packed` arrays into what `Torso` reads."""
     array = array.astype(jnp.uint8)  # a trainer may build its parameters with an array of floats
     observation = Observation(array[..., :-2], array[..., -2].astype(jnp.int32))
     return vector(observation, array[..., -1].astype(jnp.int32), row_format)
 
 
 def vector(observation: Observation, action: jax.Array, row_format: RowFormat) -> jax.Array:
-    """The policy's features as one float32 vector: view, table, previous action."""
+    """Join view, table and previous action, float32."""
     seen = features(observation.row, observation.goal, row_format)
     table = seen.table.reshape(*seen.table.shape[:-2], -1)
     return jnp.concatenate([seen.view, table, jax.nn.one_hot(action, NUM_ACTIONS)], axis=-1)
 
 
 class CategoryMaps(nn.Module):
-    """The perceptron of every category's row, [..., K, M] -> [..., K m]."""
+    """Map all rows, [..., K, M] -> [..., K m]."""
 
     sizes: Sizes
 
@@ -86,7 +91,7 @@ class CategoryMaps(nn.Module):
 
 
 class Torso(nn.Module):
-    """The policy with method `org` up to its recurrent cell, [..., N] -> [..., H], with its layers and widths."""
+    """Embed an observation as `org`, [..., N] -> [..., H]."""
 
     spec: PolicySpec
 
@@ -102,7 +107,7 @@ class Torso(nn.Module):
             self.param(name, embedding, (num_categories, sizes.appearance)) for name in ("appearance", "sought")
         )
         mixing = nn.initializers.lecun_normal(batch_axis=0)
-        mix = self.param("mix", mixing, (sizes.relation_layers, num_categories, num_categories))
+        mix = self.param("mix", mixing, (ORG.experience.sizes["relation_layers"], num_categories, num_categories))
 
         detections = CategoryMaps(sizes)(jnp.concatenate([visible[..., None] * appearance, table], axis=-1))
         relation = jnp.swapaxes(nn.relu(nn.Dense(num_categories)(table)), -1, -2)
@@ -116,7 +121,7 @@ class Torso(nn.Module):
 
 
 def action_head() -> nn.Dense:
-    """The last layer of the policy: first logits close to equal, but Done seldom."""
+    """Return the layer of logits, which choose Done seldom."""
     small = nn.initializers.variance_scaling(1e-4, "fan_in", "normal")
     return nn.Dense(NUM_ACTIONS, kernel_init=small, bias_init=_seldom_done)
 

@@ -1,7 +1,8 @@
-"""Recurrent PPO in purejaxrl's style as a process: `python benchmarks/_purejaxrl_style.py EPOCHS MINIBATCHES UPDATES`.
+"""Recurrent PPO in purejaxrl's style as a process.
 
-Written here in the usual way: everything in one jitted function, a flax.linen cell scanned over time with resets,
-observations kept in the trajectory as float32 vectors, minibatches of whole sequences. The network is jaxnav's.
+Started as `python benchmarks/_purejaxrl_style.py EPOCHS MINIBATCHES UPDATES`. Written here in the usual way: everything
+in one jitted function, a flax.linen cell scanned over time with resets, observations kept in the trajectory as float32
+vectors, minibatches of whole sequences. The network is jaxnav's.
 """
 
 import functools
@@ -25,7 +26,7 @@ SPEC = PolicySpec()
 
 
 class ScannedGRU(nn.Module):
-    """A recurrent cell over time whose memory is cleared where a new episode starts."""
+    """Scan a recurrent cell that each episode starts anew."""
 
     @functools.partial(nn.scan, variable_broadcast="params", split_rngs={"params": False})
     @nn.compact
@@ -38,7 +39,10 @@ class ScannedGRU(nn.Module):
 class ActorCritic(nn.Module):
     @nn.compact
     def __call__(self, hidden: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
-        """Memory [B, H], observations [T, B, N] and starts [T, B] to memory, logits [T, B, A] and values [T, B]."""
+        """Map memory and inputs to memory, logits and values.
+
+        Memory [B, H], observations [T, B, N] and starts [T, B] to memory, logits [T, B, A] and values [T, B].
+        """
         obs, starts = inputs
         hidden, outputs = ScannedGRU()(hidden, (Torso(SPEC)(obs), starts))
         return hidden, action_head()(outputs), nn.Dense(1)(outputs)[..., 0]
@@ -82,9 +86,9 @@ def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, updat
 
     def advantages(trajectory: Transition, last_value: jax.Array) -> jax.Array:
         def back(carry, step: Transition):
-            advantage, following = carry
+            advantage, next_value = carry
             going_on = 1.0 - step.done
-            delta = step.reward + config.gamma * following * going_on - step.value
+            delta = step.reward + config.gamma * next_value * going_on - step.value
             advantage = delta + config.gamma * config.gae_lambda * going_on * advantage
             return (advantage, step.value), advantage
 

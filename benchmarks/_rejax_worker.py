@@ -1,8 +1,10 @@
-"""rejax's PPO on this environment as a process: `python benchmarks/_rejax_worker.py CRITIC EPOCHS MINIBATCHES UPDATES`.
+# pyright: reportMissingImports=false
+"""rejax's PPO on this environment as a process.
 
-rejax's actor and critic are two networks without memory. The actor has the layers of jaxnav's policy, its recurrent
-cell run from a zero state. CRITIC is `torso` (the same layers again, as rejax is meant to be used) or `linear` (one
-linear layer, so that rejax does no more floating-point work per observation than jaxnav).
+Started as `python benchmarks/_rejax_worker.py CRITIC EPOCHS MINIBATCHES UPDATES`. rejax's actor and critic are two
+networks without memory. The actor has the layers of jaxnav's policy, its recurrent cell run from a zero state. CRITIC
+is `torso` (the same layers again, as rejax is meant to be used) or `linear` (one linear layer, so that rejax does no
+more floating-point work per observation than jaxnav).
 """
 
 import sys
@@ -22,7 +24,7 @@ from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 
 SPEC = PolicySpec()
-LAYOUT = RowFormat(SPEC.num_categories)
+ROW_FORMAT = RowFormat(SPEC.num_categories)
 
 
 class GymnaxObjectNav(Adapter):
@@ -30,16 +32,16 @@ class GymnaxObjectNav(Adapter):
         return spaces.Discrete(NUM_ACTIONS)
 
     def observation_space(self, params) -> spaces.Box:
-        return spaces.Box(0, 255, (LAYOUT.num_bytes + 2,), "uint8")
+        return spaces.Box(0, 255, (ROW_FORMAT.num_bytes + 2,), "uint8")
 
 
 class FeedForward(nn.Module):
-    """The policy's layers with no memory: the recurrent cell starts from zero at every step."""
+    """Apply the policy's layers without any memory."""
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
         cell = nn.GRUCell(SPEC.sizes.hidden)
-        fused = Torso(SPEC)(unpacked(obs, LAYOUT))
+        fused = Torso(SPEC)(unpacked(obs, ROW_FORMAT))
         return cell(cell.initialize_carry(jax.random.key(0), fused.shape), fused)[0]
 
 
@@ -58,7 +60,7 @@ class TorsoCritic(nn.Module):
 class LinearCritic(nn.Module):
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        return nn.Dense(1)(unpacked(obs, LAYOUT)).squeeze(1)
+        return nn.Dense(1)(unpacked(obs, ROW_FORMAT)).squeeze(1)
 
 
 CRITICS = {"torso": TorsoCritic, "linear": LinearCritic}

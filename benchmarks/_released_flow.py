@@ -1,10 +1,11 @@
-"""The released per-step flow in PyTorch, written from the equations: the worker that `inference.py` starts.
+# pyright: reportMissingImports=false
+"""The released per-step flow in PyTorch, for `inference.py`.
 
-Every step makes two whole passes of the network, the second with both direct embeddings set to zero, and each pass asks
-the estimator first: 5 counts for every visible category in every row, the divergence summed over rows by
-`torch.distributions` when the visible set is new, decayed by 0.8 when it is not (so always at the second pass). The
-logits are (1 + s) a - s a_bar, s = D - 0.5, with the gate on Done. Two networks: of the released sizes (7 x 7 image
-features, two LSTM layers of 512), and of jaxnav's own layers and sizes.
+It is written from the equations. Every step makes two whole passes of the network, the second with both direct
+embeddings set to zero, and each pass asks the estimator first: 5 counts for every visible category in every row, the
+divergence summed over rows by `torch.distributions` when the visible set is new, decayed by 0.8 when it is not (so
+always at the second pass). The logits are (1 + s) a - s a_bar, s = D - 0.5, with the gate on Done. Two networks: of the
+released sizes (7 x 7 image features, two LSTM layers of 512), and of jaxnav's layers and sizes.
 
 It reads lines `network threads walks` and answers each with the walk's gaps in JSON, gradients off.
 """
@@ -24,19 +25,19 @@ Memory = tuple[torch.Tensor, ...]
 
 
 class Estimator:
-    """Layout belief of one episode, as released."""
+    """Hold the layout belief of one episode, as released."""
 
     def __init__(self, prior: torch.Tensor) -> None:
         self.alpha, self.gap = prior, torch.zeros(())
         self.memory = torch.zeros(20, len(prior))
 
     def __call__(self, presence: torch.Tensor) -> torch.Tensor:
-        """Take in what is visible; the expected co-occurrence w."""
+        """Take in what is visible; return the expected co-occurrence w."""
         novelty = (self.memory - presence).square().mean(dim=-1).min()
         if novelty > 1e-4 and presence.sum() > 1:
             self.memory = torch.cat([presence[None], self.memory[1:]])
-            posterior, own = self.alpha + 5.0 * presence, torch.eye(len(presence))
-            divergence = kl_divergence(Dirichlet(posterior + own), Dirichlet(self.alpha + own)).sum()
+            posterior, identity = self.alpha + 5.0 * presence, torch.eye(len(presence))
+            divergence = kl_divergence(Dirichlet(posterior + identity), Dirichlet(self.alpha + identity)).sum()
             self.gap, self.alpha = torch.tanh(divergence.abs()), posterior
         else:
             self.gap = 0.8 * self.gap
@@ -44,28 +45,28 @@ class Estimator:
 
 
 def perceptron(*widths: int, last: bool = True) -> nn.Sequential:
-    """Linear layers, each followed by a ReLU, the last one if asked."""
+    """Stack linear layers and ReLUs; `last` keeps the final ReLU."""
     layers = [layer for pair in itertools.pairwise(widths) for layer in (nn.Linear(*pair), nn.ReLU())]
     return nn.Sequential(*(layers if last else layers[:-1]))
 
 
 class Relations(nn.Module):
-    """R^T X: relations between categories by their boxes and the goal, applied to what they look like."""
+    """Relate the appearances of categories by their boxes, R^T X."""
 
     def __init__(self, inputs: int, categories: int, layers: int, bias: bool) -> None:
         super().__init__()
         self.edges = nn.Linear(inputs, categories)
         self.mix = nn.ModuleList(nn.Linear(categories, categories, bias=bias) for _ in range(layers))
 
-    def forward(self, table: torch.Tensor, looks: torch.Tensor) -> torch.Tensor:
+    def forward(self, table: torch.Tensor, appearance: torch.Tensor) -> torch.Tensor:
         relation = torch.relu(self.edges(table)).T
         for layer in self.mix:
             relation = torch.relu(layer(relation))
-        return relation @ looks
+        return relation @ appearance
 
 
 class Released(nn.Module):
-    """The released network on ready image and box features."""
+    """Run the released network on ready image and box features."""
 
     def __init__(self, categories: int) -> None:
         super().__init__()
@@ -82,12 +83,12 @@ class Released(nn.Module):
 
     def forward(self, seen: Seen, weights: torch.Tensor, memory: Memory, direct: bool) -> tuple[torch.Tensor, Memory]:
         hidden, cell, previous = memory
-        boxes, looks = seen["boxes"], seen["looks"]
+        boxes, appearance = seen["boxes"], seen["appearance"]
         scene = torch.relu(self.image(seen["image"]))[0]
-        sought = self.direct_maps(torch.cat([self.direct(boxes, looks), boxes], dim=-1)).view(-1, 7, 7)
+        sought = self.direct_maps(torch.cat([self.direct(boxes, appearance), boxes], dim=-1)).view(-1, 7, 7)
         if not direct:
             scene, sought = torch.zeros_like(scene), torch.zeros_like(sought)
-        table = torch.cat([self.relations(boxes, looks), boxes], dim=-1)
+        table = torch.cat([self.relations(boxes, appearance), boxes], dim=-1)
         experience = self.maps(table * weights[:, None]).view(-1, 7, 7)
         action = self.previous(previous)[:, None, None].expand(-1, 7, 7)
         fused = torch.relu(self.fuse(torch.cat([scene, experience, sought, action])[None]))
@@ -100,17 +101,17 @@ class Released(nn.Module):
 
 
 class Equal(nn.Module):
-    """jaxnav's layers and sizes (`ORG` with its defaults)."""
+    """Run jaxnav's layers and sizes (`ORG` with its defaults)."""
 
     def __init__(self, categories: int, view: int, features: int, sizes: dict[str, int]) -> None:
         super().__init__()
-        looks, hidden = sizes["appearance"], sizes["hidden"]
-        rows = (looks + features, sizes["row_hidden"], sizes["row_outputs"])
-        self.appearance, self.sought = (nn.Parameter(torch.randn(categories, looks)) for _ in range(2))
+        width, hidden = sizes["appearance"], sizes["hidden"]
+        rows = (width + features, sizes["row_hidden"], sizes["row_outputs"])
+        self.appearance, self.sought = (nn.Parameter(torch.randn(categories, width)) for _ in range(2))
         self.view = perceptron(view, sizes["view_outputs"])
         self.direct_maps, self.maps = perceptron(*rows), perceptron(*rows)
         self.relations = Relations(features, categories, sizes["relation_layers"], bias=False)
-        fused = sizes["view_outputs"] + 2 * categories * sizes["row_outputs"] + looks + ACTIONS
+        fused = sizes["view_outputs"] + 2 * categories * sizes["row_outputs"] + width + ACTIONS
         self.fuse, self.core = perceptron(fused, hidden), nn.GRUCell(hidden, hidden)
         self.actor, self.critic = nn.Linear(hidden, ACTIONS), nn.Linear(hidden, 1)
 
@@ -119,13 +120,13 @@ class Equal(nn.Module):
 
     def forward(self, seen: Seen, weights: torch.Tensor, memory: Memory, direct: bool) -> tuple[torch.Tensor, Memory]:
         hidden, previous = memory
-        table, looks = seen["table"], seen["table"][:, :1] * self.appearance
+        table, appearance = seen["table"], seen["table"][:, :1] * self.appearance
         scene = self.view(seen["view"])
-        maps = self.direct_maps(torch.cat([looks, table], dim=-1)).flatten()
+        maps = self.direct_maps(torch.cat([appearance, table], dim=-1)).flatten()
         sought = torch.cat([maps, table[:, GOAL] @ self.sought])
         if not direct:
             scene, sought = torch.zeros_like(scene), torch.zeros_like(sought)
-        table = torch.cat([self.relations(table, looks), table], dim=-1)
+        table = torch.cat([self.relations(table, appearance), table], dim=-1)
         experience = self.maps(table * weights[:, None]).flatten()
         hidden = self.core(self.fuse(torch.cat([scene, sought, experience, previous])), hidden)
         logits, _ = self.actor(hidden), self.critic(hidden)
@@ -136,7 +137,7 @@ class Equal(nn.Module):
 
 
 def decide(network: Released | Equal, estimator: Estimator, seen: Seen, memory: Memory) -> tuple[int, Memory]:
-    """One step of the released flow: the action and what is remembered."""
+    """Take one step: return the action and what is remembered."""
     presence, goal = seen["table"][:, 0], int(seen["table"][:, GOAL].argmax())
     gate = 0.58 * seen["table"][goal, CONFIDENCE]
     passes = []
@@ -150,7 +151,7 @@ def decide(network: Released | Equal, estimator: Estimator, seen: Seen, memory: 
 
 
 def walk(network: Released | Equal, prior: torch.Tensor, views: list[Seen]) -> list[float]:
-    """The gaps of one episode's steps."""
+    """Return the gaps of one episode's steps."""
     estimator, memory, gaps = Estimator(prior), network.start(), []
     for seen in views:
         _, memory = decide(network, estimator, seen, memory)
@@ -167,10 +168,10 @@ def main() -> None:
         "released": Released(categories).eval(),
         "equal": Equal(categories, view.shape[1], features, json.loads(sys.argv[2])).eval(),
     }
-    # Random numbers stand for images and for what a detected category looks like; only their number matters.
-    boxes, looks = table[:, :, [2, 3, 4, 7, CONFIDENCE, GOAL]], torch.randn(categories, 512)
+    # Random numbers stand for images and for the appearance of detected categories; only their number matters.
+    boxes, detected = table[:, :, [2, 3, 4, 7, CONFIDENCE, GOAL]], table[:, :, :1] * torch.randn(categories, 512)
     views = [
-        {"table": table[t], "view": view[t], "boxes": boxes[t], "looks": table[t, :, :1] * looks, "image": image}
+        {"table": table[t], "view": view[t], "boxes": boxes[t], "appearance": detected[t], "image": image}
         for t, image in enumerate(torch.rand(len(table), 1, 512, 7, 7))
     ]
     counts = {name: sum(p.numel() for p in network.parameters()) for name, network in networks.items()}
