@@ -1,4 +1,4 @@
-"""The charts of the performance document, drawn from the benchmarks' results by `table.py`."""
+"""The charts of the performance document, for `table.py`."""
 
 import json
 from pathlib import Path
@@ -48,7 +48,7 @@ def draw(results: Path, images: Path) -> None:
 
 
 def time_to_result(runs: dict[str, Any]) -> Figure:
-    """Where the seconds of a run go, one bar for every result."""
+    """Draw where the seconds of runs go, a bar each."""
     figure, axes = plt.subplots(figsize=(9, 1.7 + 0.6 * len(runs)), layout="constrained")
     longest = max(run["wall_s"]["both"] for run in runs.values())
     for at, run in enumerate(runs.values()):
@@ -73,10 +73,10 @@ def time_to_result(runs: dict[str, Any]) -> Figure:
     return figure
 
 
-def curves(found: dict[str, Any]) -> Figure:
-    """Training success by steps, before and after, with 95 % intervals."""
-    figure, panels = plt.subplots(1, len(found), figsize=(9, 3.2), sharey=True, layout="constrained")
-    for axes, (arm, points) in zip(panels, found.items(), strict=True):
+def curves(results: dict[str, Any]) -> Figure:
+    """Draw training success by steps with 95 % intervals."""
+    figure, panels = plt.subplots(1, len(results), figsize=(9, 3.2), sharey=True, layout="constrained")
+    for axes, (arm, points) in zip(panels, results.items(), strict=True):
         millions = [int(steps) / 1e6 for steps in points]
         for version, colour in (("before", ALONE), ("after", TRAINED)):
             low, mean, high = zip(*(point[version] for point in points.values()), strict=True)
@@ -90,8 +90,8 @@ def curves(found: dict[str, Any]) -> Figure:
     return figure
 
 
-def growth(found: dict[str, Any]) -> Figure:
-    """Steps per second and peak memory along every axis."""
+def growth(results: dict[str, Any]) -> Figure:
+    """Draw steps per second and peak memory along every axis."""
     names = {
         "environments": "parallel episodes",
         "scenes": "scenes",
@@ -101,13 +101,13 @@ def growth(found: dict[str, Any]) -> Figure:
     figure, panels = plt.subplots(2, len(names), figsize=(11, 5), sharey="row", layout="constrained")
     for (axis, label), (above, below) in zip(names.items(), panels.T, strict=True):
         for what, colour in (("environment", ALONE), ("training", TRAINED)):
-            own = {int(x): point for x, point in found[axis].items() if f"{what}_steps_per_s" in point}
-            _line(above, own, f"{what}_steps_per_s", what, colour)
-            _line(below, own, f"{what}_peak_resident_gb", what, colour)
+            points = {int(x): point for x, point in results[axis].items() if f"{what}_steps_per_s" in point}
+            _line(above, points, f"{what}_steps_per_s", what, colour)
+            _line(below, points, f"{what}_peak_resident_gb", what, colour)
         below.set_xlabel(label)
         for axes in (above, below):
             axes.set(xscale="log", yscale="log")
-            values = [int(value) for value in found[axis]]
+            values = [int(value) for value in results[axis]]
             axes.set_xticks(values, [f"{value:,}" for value in values] if axes is below else [""] * len(values))
             axes.set_xticks([], minor=True)
             axes.tick_params(axis="x", labelsize=8, rotation=30)

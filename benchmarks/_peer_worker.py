@@ -1,10 +1,10 @@
-"""One environment in a process of its own, run once for every line on stdin: started by `peers.py`.
+"""One environment in a process of its own, for `peers.py`.
 
-It runs in the virtual environment of the package it measures, so it stands alone and imports that package only. The
-first line on stdout describes what was compiled; every further one is the wall seconds of one call. A call is
-`lax.scan` over steps of all episodes with auto-reset, from where the last call ended. Actions are drawn beforehand.
-What a step delivers (every element of every observation, rewards, endings) is added to arrays in the carry: consumed,
-not stored. Episodes are divided over the devices that XLA shows.
+It is run once for every line on stdin. It runs in the virtual environment of the package it measures, so it stands
+alone and imports that package only. The first line on stdout describes what was compiled; every further one is the wall
+seconds of one call. A call is `lax.scan` over steps of all episodes with auto-reset, from where the last call ended.
+Actions are drawn beforehand. What a step delivers (every element of every observation, rewards, endings) is added to
+arrays in the carry: consumed, not stored. Episodes are divided over the devices that XLA shows.
 """
 
 import importlib
@@ -22,7 +22,10 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 
 class Environment(NamedTuple):
-    """One episode: `reset(key, params) -> state`, `step(key, state, action, params) -> delivered, state`."""
+    """Hold the functions of one episode.
+
+    `reset(key, params) -> state` and `step(key, state, action, params) -> delivered, state`.
+    """
 
     reset: Callable[..., Any]
     step: Callable[..., Any]
@@ -95,11 +98,11 @@ def jaxmarl(name: str) -> Environment:
     return Environment(lambda key, _: env.reset(key)[1], step, per_agent**env.num_agents)
 
 
-PACKAGES = {made.__name__: made for made in (jaxnav, gymnax, xminigrid, navix, jumanji, jaxmarl)}
+PACKAGES = {package.__name__: package for package in (jaxnav, gymnax, xminigrid, navix, jumanji, jaxmarl)}
 
 
 def compiled(env: Environment, episodes: int, steps: int) -> tuple[Callable[[], None], dict[str, Any]]:
-    """A call that takes the steps, and what was compiled."""
+    """Return a call of these steps, and what was compiled."""
     mesh = jax.make_mesh((jax.device_count(),), ("episodes",), axis_types=(jax.sharding.AxisType.Auto,))
     everywhere, divided, per_step = PartitionSpec(), PartitionSpec("episodes"), PartitionSpec(None, "episodes")
     key = jax.random.key(0)

@@ -1,7 +1,8 @@
-"""Learning curves of two versions of the trainer: `python benchmarks/curves.py BEFORE_RUN AFTER_RUN`.
+"""Learning curves of two versions of the trainer.
 
-Both are folders that `train.py` wrote with the same settings. For every arm and chunk of updates: the training success
-rate in percent as mean over seeds, with its 95 % interval (Student's t) in both, and whether the intervals overlap.
+Run with `python benchmarks/curves.py BEFORE_RUN AFTER_RUN`. Both are folders that `train.py` wrote with the same
+settings. For every arm and chunk of updates: the training success rate in percent as mean over seeds, with its 95 %
+interval (Student's t) in both, and whether the intervals overlap.
 """
 
 import json
@@ -18,31 +19,31 @@ ARMS = ("baseline", "layout")
 
 def main(before: Path, after: Path) -> None:
     curves = {"before": curve(before), "after": curve(after)}
-    found, overlaps = {}, []
+    success, overlaps = {}, []
     for arm in ARMS:
         for steps in sorted(curves["after"][arm]):
             low_high = {}
-            for version, own in curves.items():
-                mean, half = interval(own[arm][steps])
+            for version, points in curves.items():
+                mean, half = interval(points[arm][steps])
                 low_high[version] = [round(mean - half, 1), round(mean, 1), round(mean + half, 1)]
             one, other = low_high.values()
             overlaps.append(one[0] <= other[2] and other[0] <= one[2])
-            found.setdefault(arm, {})[steps] = low_high | {"overlap": overlaps[-1]}
-    seeds = {version: len(next(iter(own[ARMS[0]].values()))) for version, own in curves.items()}
-    report({"seeds": seeds, "points": len(overlaps), "points_that_overlap": sum(overlaps), "success": found})
+            success.setdefault(arm, {})[steps] = low_high | {"overlap": overlaps[-1]}
+    seeds = {version: len(next(iter(points[ARMS[0]].values()))) for version, points in curves.items()}
+    report({"seeds": seeds, "points": len(overlaps), "points_that_overlap": sum(overlaps), "success": success})
 
 
 def curve(run: Path) -> dict[str, dict[int, list[float]]]:
-    """Training success of every seed in percent, by arm and steps of a policy."""
-    found: dict[str, dict[int, list[float]]] = {arm: defaultdict(list) for arm in ARMS}
+    """Return success in percent of seeds, by arm and steps."""
+    points: dict[str, dict[int, list[float]]] = {arm: defaultdict(list) for arm in ARMS}
     for line in (run / "metrics.jsonl").read_text().splitlines():
         row = json.loads(line)
-        found[row["arm"]][row["env_steps"]].append(100 * row["success"])
-    return found
+        points[row["arm"]][row["env_steps"]].append(100 * row["success"])
+    return points
 
 
 def interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval."""
+    """Return mean and half its 95 % interval."""
     deviation = statistics.stdev(values) / len(values) ** 0.5
     return statistics.mean(values), float(t.ppf(0.975, len(values) - 1)) * deviation
 

@@ -1,8 +1,8 @@
-"""Steps per second of the environment alone, and its limit: `python benchmarks/environment.py`.
+"""Steps per second of the environment alone, and its limit.
 
-2,048 parallel episodes take random actions with auto-reset. They deliver poses (by which an update gathers rows
-again), the last rows, their sum, or all. The limit is a loop that gathers the same rows and does nothing else. Keys are
-split at every step, or all before the first.
+In `python benchmarks/environment.py` 2,048 parallel episodes take random actions with auto-reset. They deliver poses
+(by which an update gathers rows again), the last rows, their sum, or all. The limit is a loop that gathers the same
+rows and does nothing else. Keys are split at every step, or all before the first.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,7 @@
-"""Cost of one step of the layout estimator for many episodes: `python benchmarks/estimator.py`.
+"""Cost of one step of the layout estimator.
 
-Every setting, and the default one without its gap, as in training. Processor time counts all threads.
+`python benchmarks/estimator.py` times it for many episodes: every setting, and the default one without its gap, as in
+training. Processor time counts all threads.
 """
 
 import dataclasses
@@ -27,17 +28,17 @@ def main() -> None:
         estimator = LayoutEstimator(prior_from_counts(counts, setting), setting)
         state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (EPISODES, *leaf.shape)), estimator.init())
         calls[name] = partial(jax.jit(jax.vmap(estimator.update)), state, presence)
-    wall, found = in_turns(calls, CALLS), {}
+    wall, results = in_turns(calls, CALLS), {}
     for name, call in calls.items():
         began = time.process_time()
         for _ in range(CALLS):
             jax.block_until_ready(call())
         processor = (time.process_time() - began) / CALLS
-        found[name] = {
+        results[name] = {
             "wall_us_per_step": spread([1e6 * one / EPISODES for one in wall[name]]),
             "processor_us_per_step": round(1e6 * processor / EPISODES, 3),
         }
-    report({"episodes": EPISODES, "categories": CATEGORIES, "visible_share": VISIBLE, "settings": found})
+    report({"episodes": EPISODES, "categories": CATEGORIES, "visible_share": VISIBLE, "settings": results})
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""The environment alone beside its peers: `python benchmarks/peers.py`, for each the steps per second and our ratio.
+"""The environment alone beside its peers.
 
-Every peer is installed into a virtual environment of its own under `.cache/peers` and runs there in a process that
-waits between its calls (`_peer_worker.py`, which says what one call is); calls are taken in turns, ours among them. A
-peer that does not install or does not run is named with its error. *Like for like*: one device and the default
-allocator on all sides. *Tuned*: two host devices and the allocator's variables on all sides. Peers work out their view
-and their new layouts at every step; ours are looked up in tables, whose compilation is not counted.
+`python benchmarks/peers.py` prints for each the steps per second and our ratio. Every peer is installed into a virtual
+environment of its own under `.cache/peers` and runs there in a process that waits between its calls (`_peer_worker.py`,
+which says what one call is); calls are taken in turns, ours among them. A peer that does not install or does not run is
+named with its error. *Like for like*: one device and the default allocator on all sides. *Tuned*: two host devices and
+the allocator's variables on all sides. Peers work out their view and their new layouts at every step; ours are looked
+up in tables, whose compilation is not counted.
 """
 
 import json
@@ -38,7 +39,10 @@ KINDS = {
 
 
 class Case(NamedTuple):
-    """An environment, how many steps one call takes so that it lasts about a second, and our goal over it."""
+    """Describe an environment and our goal over it.
+
+    The `steps` of one call last about a second.
+    """
 
     package: str
     name: str
@@ -72,7 +76,7 @@ def python(package: str) -> Path:
 
 
 def install(package: str, pins: Iterable[str]) -> dict[str, Any]:
-    """The package with our version of jax in a virtual environment, unless it is there; its versions or its error."""
+    """Install a package with our jax; return versions or error."""
     if not python(package).exists():
         venv.create(HOME / package, with_pip=True)
     pip = [str(python(package)), "-m", "pip", "--disable-pip-version-check"]
@@ -89,16 +93,16 @@ def last_line(text: str) -> str:
 
 
 class Worker:
-    """A process that holds one compiled environment and sleeps between its calls."""
+    """Run one compiled environment that sleeps between its calls."""
 
     def __init__(self, case: Case, settings: dict[str, str]) -> None:
-        own = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "XLA_", "JAX_"))}
-        own["JAX_PLATFORMS"] = "cpu"
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "XLA_", "JAX_"))}
+        kept["JAX_PLATFORMS"] = "cpu"
         log_path = HOME / f"{case.package}-{case.name}-{case.episodes}.log"
         command = [str(python(case.package)), str(WORKER), case.package, case.name, str(case.episodes), str(case.steps)]
         with log_path.open("w") as log:
             self.process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=own | settings
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=kept | settings
             )
         self.described = json.loads(self.answer() or "{}")
         if not self.described:
@@ -106,7 +110,7 @@ class Worker:
             self.described["error"] = f"no result in {PATIENCE_S} s" if killed else last_line(log_path.read_text())
 
     def answer(self) -> str:
-        """The next line, or an empty one if the process ends or is out of patience."""
+        """Return the next line, empty if none comes in time."""
         assert self.process.stdout
         timer = threading.Timer(PATIENCE_S, self.process.kill)
         timer.start()
@@ -115,7 +119,7 @@ class Worker:
         return line
 
     def seconds(self) -> float:
-        """Wall seconds of one call."""
+        """Return the wall seconds of one call."""
         assert self.process.stdin
         print(file=self.process.stdin, flush=True)
         return float(self.answer())
@@ -126,7 +130,7 @@ class Worker:
 
 
 def race(cases: Iterable[Case], settings: dict[str, str]) -> dict[str, Any]:
-    """All cases in turns; rates, and the ratio of ours with as many episodes."""
+    """Time all cases in turns, and compare ours with each."""
     workers = {case: started(case, settings) for case in cases}
     running = {case: worker for case, worker in workers.items() if "error" not in worker.described}
     for worker in running.values():
@@ -134,14 +138,14 @@ def race(cases: Iterable[Case], settings: dict[str, str]) -> dict[str, Any]:
     turns = [{case: worker.seconds() for case, worker in running.items()} for _ in range(TURNS)]
     for worker in workers.values():
         worker.close()
-    found = {case.title: {"steps_per_call": case.steps, **workers[case].described} for case in workers}
+    results = {case.title: {"steps_per_call": case.steps, **workers[case].described} for case in workers}
     per_step = {case: [turn[case] / case.steps for turn in turns] for case in running}
     for case, taken in per_step.items():
-        found[case.title]["steps_per_s"] = rates(taken, case.episodes)
+        results[case.title]["steps_per_s"] = rates(taken, case.episodes)
         if case.package != "jaxnav":
             ours = OURS if case.episodes == EPISODES else OURS_FEW
-            found[case.title]["ours_over_it"] = ratios(taken, per_step[ours])
-    return found
+            results[case.title]["ours_over_it"] = ratios(taken, per_step[ours])
+    return results
 
 
 def started(case: Case, settings: dict[str, str]) -> Worker:
@@ -149,11 +153,11 @@ def started(case: Case, settings: dict[str, str]) -> Worker:
     return Worker(case, settings)
 
 
-def goals(cases: Iterable[Case], found: dict[str, Any]) -> list[dict[str, Any]]:
-    """What was asked of the median ratio, and whether it is reached."""
+def goals(cases: Iterable[Case], results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Compare the median ratios with what was asked of them."""
     rows = []
     for case in cases:
-        ratio = found.get(case.title, {}).get("ours_over_it", {}).get("median")
+        ratio = results.get(case.title, {}).get("ours_over_it", {}).get("median")
         if case.goal and ratio is not None:
             rows.append({"over": case.title, "asked": case.goal, "found": ratio, "reached": ratio >= case.goal})
     return rows

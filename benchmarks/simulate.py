@@ -1,9 +1,10 @@
-"""The cost of 10^11 environment steps on 1 to 1,000 hosts: `python benchmarks/simulate.py [--document]`.
+"""The cost of 10^11 environment steps on many hosts.
 
-From the constants that benchmarks/scaling.py measured (results/performance/scaling.json) and those stated in `NETWORKS`
-and `Assumed`, it adds up an update, term by term, and simulates a run: noise that makes every sum over the hosts wait
-for the slowest of them, and hosts that fail, after which all start again from the last checkpoint. A host is one
-process on one core. `--document` puts the tables into docs/scaling.md instead of printing JSON.
+`python benchmarks/simulate.py [--document]` computes it for 1 to 1,000 hosts. From the constants that
+benchmarks/scaling.py measured (results/performance/scaling.json) and those stated in `NETWORKS` and `Assumed`, it adds
+up an update, term by term, and simulates a run: noise that makes every sum over the hosts wait for the slowest of them,
+and hosts that fail, after which all start again from the last checkpoint. A host is one process on one core.
+`--document` puts the tables into docs/scaling.md instead of printing JSON.
 """
 
 import dataclasses
@@ -25,7 +26,11 @@ SAMPLES = 2000  # waits that are drawn
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """Seconds of one message, bytes per second, how a sum goes around, and whether arrays go together or one by one."""
+    """Describe a network.
+
+    Seconds of one message, bytes per second, whether a sum goes around in a tree or a ring, and whether its arrays go
+    together or one by one.
+    """
 
     message_s: float
     bytes_per_s: float
@@ -33,14 +38,14 @@ class Network:
     grouped: bool = False
 
     def all_reduce(self, hosts: int, size: float) -> tuple[float, float]:
-        """Seconds of latency and of transfer of one sum: a ring, or a tree up and down."""
+        """Return the seconds of latency and transfer of a sum."""
         rounds = 2 * math.ceil(math.log2(hosts)) if self.tree else 2 * (hosts - 1)
         return rounds * self.message_s, 2 * (hosts - 1) / hosts * size / self.bytes_per_s
 
 
 @dataclasses.dataclass(frozen=True)
 class Assumed:
-    """What cannot be measured on one machine.
+    """Hold what cannot be measured on one machine.
 
     Attributes:
       days_between_failures: of one host, in the mean.
@@ -54,7 +59,10 @@ class Assumed:
 
 
 def networks(measured: dict) -> dict[str, Network]:
-    """The loopback of this machine, as measured, and two that are stated: Ethernet of 25 Gb/s, and what GPUs have."""
+    """Return the networks: one measured, the others stated.
+
+    The loopback of this machine, Ethernet of 25 Gb/s, and what GPUs have.
+    """
     line = measured["all_reduce"]["free"]
     return {
         "loopback, ring": Network(line["latency_s"] / 2, line["bytes_per_s"]),
@@ -65,17 +73,20 @@ def networks(measured: dict) -> dict[str, Network]:
 
 
 def update(measured: dict, network: Network, hosts: int, share: float, generator: np.random.Generator) -> dict:
-    """Seconds of each part of an update whose hosts have `share` of the default run's episodes each."""
-    own = measured["update"]
-    rollout, learning = share * own["rollout_s"], share * own["learning_s"]
+    """Return the seconds of each part of an update.
+
+    Every host has `share` of the default run's episodes.
+    """
+    alone = measured["update"]
+    rollout, learning = share * alone["rollout_s"], share * alone["learning_s"]
     sigma = measured["jitter"]["log_standard_deviation"]
-    # Between two minibatches every host is slowed by noise of its own, and all wait for the slowest.
+    # Between two minibatches noise slows every host independently, and all wait for the slowest.
     noise = np.exp(sigma * generator.standard_normal((SAMPLES, hosts)) - sigma**2 / 2)
     slowest = noise.max(axis=1).mean() / noise.mean()
     exchanged = measured["exchanged"]["shared_episodes"]["all-reduce"]
     sums = exchanged["calls" if network.grouped else "arrays"]
     latency, transfer = network.all_reduce(hosts, exchanged["bytes"] / sums) if hosts > 1 else (0, 0)
-    saving = own["save_s"] + hosts * share * own["agent_bytes"] / Assumed().disk_bytes_per_s
+    saving = alone["save_s"] + hosts * share * alone["agent_bytes"] / Assumed().disk_bytes_per_s
     return {
         "rollout": rollout,
         "learning": learning,
@@ -83,12 +94,12 @@ def update(measured: dict, network: Network, hosts: int, share: float, generator
         "latency": sums * latency,
         "transfer": sums * transfer,
         "checkpoint": saving / UPDATES_PER_SAVE,
-        "log": own["log_s"],
+        "log": alone["log_s"],
     }
 
 
 def run(parts: dict, updates: int, hosts: int, restart_s: float, generator: np.random.Generator) -> tuple[float, int]:
-    """Seconds of a run of so many updates, and how often a host failed and all went back to the last checkpoint."""
+    """Return the seconds and the failures of a run."""
     stretch = UPDATES_PER_SAVE * sum(parts.values())  # from checkpoint to checkpoint
     between = Assumed().days_between_failures * 86400 / hosts
     stretches = math.ceil(updates / UPDATES_PER_SAVE)
@@ -100,7 +111,7 @@ def run(parts: dict, updates: int, hosts: int, restart_s: float, generator: np.r
 
 
 def simulate(measured: dict, network: Network, shared_batch: bool) -> list[dict]:
-    """A row for every number of hosts: with the default run's episodes on each, or with one batch shared by all."""
+    """Return a row for every number of hosts."""
     generator = np.random.default_rng(0)
     episodes = measured["episodes_per_device"]
     restart_s = Assumed().detect_s + measured["update"]["join_s"] + measured["update"]["compile_s"]
@@ -133,18 +144,18 @@ def simulate(measured: dict, network: Network, shared_batch: bool) -> list[dict]
 
 def results() -> dict:
     measured = json.loads((ROOT / MEASURED).read_text())
-    found = networks(measured)
+    known = networks(measured)
     return {
         "steps": STEPS,
-        "networks": {name: dataclasses.asdict(network) for name, network in found.items()},
+        "networks": {name: dataclasses.asdict(network) for name, network in known.items()},
         "assumed": dataclasses.asdict(Assumed()),
-        "batch_grows": {name: simulate(measured, network, False) for name, network in found.items()},
-        "batch_shared": {name: simulate(measured, network, True) for name, network in found.items()},
+        "batch_grows": {name: simulate(measured, network, False) for name, network in known.items()},
+        "batch_shared": {name: simulate(measured, network, True) for name, network in known.items()},
     }
 
 
 def table(rows: list[dict]) -> str:
-    """A table in Markdown of what an update's time goes to, in per cent, and what a run takes."""
+    """Return a Markdown table of updates and runs."""
     names = ("rollout", "learning", "waiting", "latency", "transfer", "checkpoint")
     head = ["hosts", "steps an update", *(f"{name} %" for name in names), "failures", "days", "efficiency"]
     lines = [" | ".join(head), " | ".join("--:" for _ in head)]
@@ -156,8 +167,8 @@ def table(rows: list[dict]) -> str:
 
 
 def measured_table(measured: dict) -> str:
-    """The same of what was measured."""
-    processes, simulated, own = measured["processes"], measured["simulated"], measured["update"]
+    """Return Markdown tables of what was measured."""
+    processes, simulated, alone = measured["processes"], measured["simulated"], measured["update"]
     rates, to_apart, to_alone = (processes[name] for name in ("steps_per_s", "to_apart", "to_alone"))
 
     def row(name: str, rate: dict, efficiency: dict | None) -> str:
@@ -189,26 +200,26 @@ def measured_table(measured: dict) -> str:
             "",
             "| constant | measured |",
             "| :-- | --: |",
-            f"| an update alone: rollout, learning | {own['rollout_s']:.3f} s, {own['learning_s']:.3f} s |",
-            f"| parameters | {own['parameter_bytes']:,} bytes |",
+            f"| an update alone: rollout, learning | {alone['rollout_s']:.3f} s, {alone['learning_s']:.3f} s |",
+            f"| parameters | {alone['parameter_bytes']:,} bytes |",
             f"| sums in an update of one seed | {sums['calls']}, of {sums['arrays']} arrays, {sums['bytes']:,} bytes |",
             f"| exchanges in {measured['updates_per_call']} updates of a seed each | {calls}, of {arrays} arrays |",
             f"| a sum of an array (gloo), each process held to one core | {1e6 * pinned['latency_s']:,.0f} us |",
             f"| the same, free to use both; bandwidth | {1e6 * free['latency_s']:.0f} us, {megabytes:,.0f} MB/s |",
             f"| noise between two minibatches, log-normal sigma | {jitter:.3f} |",
-            f"| join, compile, save | {own['join_s']:.1f} s, {own['compile_s']:.1f} s, {own['save_s']:.2f} s |",
+            f"| join, compile, save | {alone['join_s']:.1f} s, {alone['compile_s']:.1f} s, {alone['save_s']:.2f} s |",
         ]
     )
 
 
-def document(found: dict) -> None:
-    """Replaces every table of docs/scaling.md that a comment names."""
+def document(computed: dict) -> None:
+    """Replace every table of docs/scaling.md that a comment names."""
     path = ROOT / "docs/scaling.md"
     measured = json.loads((ROOT / MEASURED).read_text())
 
     def fill(match: re.Match) -> str:
         kind, _, network = match[2].partition(": ")
-        return f"{match[1]}\n{table(found[kind][network]) if network else measured_table(measured)}\n"
+        return f"{match[1]}\n{table(computed[kind][network]) if network else measured_table(measured)}\n"
 
     named = r"(<!-- (measured|batch_\w+: .+?) -->)\n(?:\|.*\n|\n(?=\| constant))*"
     path.write_text(re.sub(named, fill, path.read_text()))

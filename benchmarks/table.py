@@ -1,8 +1,9 @@
-"""Fills the document's tables from the benchmarks' results: `python benchmarks/table.py [RESULTS [DOCUMENT]]`.
+"""Tables of the performance document, from the benchmarks' results.
 
-Between `<!-- table NAME -->` and `<!-- end -->` goes what RESULTS/NAME.json holds, or with `NAME.key.key` a part of it;
-a result that is missing is named there. By default from results/performance into docs/performance.md; a document that
-does not exist is made, with a table of every result. Charts go to docs/images/performance, or beside such a document.
+`python benchmarks/table.py [RESULTS [DOCUMENT]]` fills them. Between `<!-- table NAME -->` and `<!-- end -->` goes what
+RESULTS/NAME.json holds, or with `NAME.key.key` a part of it; a result that is missing is named there. By default from
+results/performance into docs/performance.md; a document that does not exist is made, with a table of every result.
+Charts go to docs/images/performance, or beside such a document.
 """
 
 import json
@@ -29,24 +30,27 @@ def main(results: Path = RESULTS, document: Path = DOCUMENT) -> None:
 
 
 def filled(name: str, results: Path) -> str:
-    """One table between its marks."""
+    """Return one table between its marks."""
     file, *keys = name.split(".")
     path = results / f"{file}.json"
     if not path.exists():
         body = f"*{path} is missing: this benchmark has not been run.*"
     else:
-        found = json.loads(path.read_text())
+        part = json.loads(path.read_text())
         for key in keys:
-            found = found[key]
+            part = part[key]
         if not keys:
-            found = {key: value for key, value in found.items() if key != "machine"}
-        body = table(found)
+            part = {key: value for key, value in part.items() if key != "machine"}
+        body = table(part)
     return f"<!-- table {name} -->\n{body}\n<!-- end -->"
 
 
-def table(found: Any) -> str:
-    """Entries that have parts of their own as rows with a column for each part, else one entry a row."""
-    rows = {str(i): row for i, row in enumerate(found, start=1)} if isinstance(found, list) else found
+def table(part: Any) -> str:
+    """Return a Markdown table of a result.
+
+    Entries that all have parts are rows with a column for each part, else an entry is a row.
+    """
+    rows = {str(i): row for i, row in enumerate(part, start=1)} if isinstance(part, list) else part
     if all(isinstance(row, Mapping) and not is_spread(row) for row in rows.values()):
         flat = {name: dict(leaves(row)) for name, row in rows.items()}
         columns = list(dict.fromkeys(column for row in flat.values() for column in row))
@@ -60,9 +64,9 @@ def table(found: Any) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def leaves(found: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Entries by path, spreads and lists as they are."""
-    for name, value in found.items():
+def leaves(part: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield entries by path, spreads and lists as they are."""
+    for name, value in part.items():
         if isinstance(value, Mapping) and not is_spread(value):
             yield from leaves(value, f"{before}{name}: ")
         else:
@@ -70,12 +74,12 @@ def leaves(found: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, An
 
 
 def is_spread(value: Any) -> bool:
-    """Whether this is a median with its least and greatest."""
+    """Return whether this is a median with its bounds."""
     return isinstance(value, Mapping) and {"median", "min", "max"} <= set(value)
 
 
 def shown(value: Any) -> str:
-    """One cell; a spread as `median (least to greatest)`."""
+    """Return one cell; a spread as `median (least to greatest)`."""
     if is_spread(value):
         return f"{shown(value['median'])} ({shown(value['min'])} to {shown(value['max'])})"
     if isinstance(value, bool) or value is None:

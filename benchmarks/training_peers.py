@@ -1,10 +1,10 @@
-"""Training against other trainers on this environment, steps per second: `python benchmarks/training_peers.py`.
+"""Training against other trainers on this environment.
 
-jaxnav's learner, rejax's PPO (feed-forward) and a recurrent PPO in purejaxrl's style train the same network on the same
-rooms with the same episodes, rollout, epochs, minibatches and losses. Each is a process of its own that compiles first
-and then trains for some whole updates when its turn comes (A B A B), going on from where it was; the success of the
-episodes of its last turn shows that it learns. rejax lives in a virtual environment of its own, made on first use.
-Takes about four minutes.
+`python benchmarks/training_peers.py` prints steps per second. jaxnav's learner, rejax's PPO (feed-forward) and a
+recurrent PPO in purejaxrl's style train the same network on the same rooms with the same episodes, rollout, epochs,
+minibatches and losses. Each is a process of its own that compiles first and then trains for some whole updates when its
+turn comes (A B A B), going on from where it was; the success of the episodes of its last turn shows that it learns.
+rejax lives in a virtual environment of its own, made on first use. Takes about four minutes.
 
 jaxnav and purejaxrl's style also differentiate through time, rejax does not. rejax wants two networks: `rejax, two
 torsos` uses it as it is meant, `rejax, linear critic` gives it no more floating-point work than jaxnav has.
@@ -44,7 +44,7 @@ GOAL = 1.5
 
 
 class Trainer:
-    """A trainer in its process; `words` is what it last said."""
+    """Run a trainer as a process that answers with `words`."""
 
     def __init__(self, name: str, allocator: str, *settings: int) -> None:
         script, *kind = SCRIPTS[name]
@@ -60,12 +60,12 @@ class Trainer:
         self.words = {}
 
     def train(self) -> None:
-        """One turn."""
+        """Train for one turn."""
         print("train", file=self._process.stdin, flush=True)
         self.listen()
 
     def listen(self) -> None:
-        """Waits for its next words."""
+        """Wait for its next words."""
         assert self._process.stdout is not None
         self.words |= json.loads(self._process.stdout.readline())
 
@@ -81,7 +81,7 @@ def main() -> None:
         print(case, file=sys.stderr, flush=True)
         cases[case] = compare(allocator, epochs, minibatches, updates, names)
     by_what = {
-        what: {case: found[what] for case, found in cases.items()} for what in ("steps_per_s", "ratios", "trainers")
+        what: {case: results[what] for case, results in cases.items()} for what in ("steps_per_s", "ratios", "trainers")
     }
     reached = {
         case: {peer: ratio[f"{OURS} / {peer}"]["median"] >= GOAL for peer in (REJAX, LEAN)}
@@ -110,7 +110,7 @@ def main() -> None:
 
 
 def compare(allocator: str, epochs: int, minibatches: int, updates: int, names: tuple[str, ...]) -> dict:
-    """Steps per second of some trainers in turns, what they are, and how many times as fast the first is."""
+    """Time trainers in turns, and compare the first with each."""
     trainers = {name: Trainer(name, allocator, epochs, minibatches, updates) for name in names}
     for trainer in trainers.values():
         trainer.listen()  # until it has compiled
@@ -128,7 +128,7 @@ def compare(allocator: str, epochs: int, minibatches: int, updates: int, names: 
 
 
 def install() -> None:
-    """rejax, in a virtual environment that jaxnav's own packages know nothing of."""
+    """Install rejax in a virtual environment of its own."""
     home = PEERS / "rejax"
     if not home.exists():
         venv.create(home, with_pip=True)
