@@ -20,7 +20,8 @@ from _common import peak_resident_gb, report, seconds, spread
 from _phases import Program, program, update
 from _setup import set_up
 
-from jaxnav.env.objectnav import ObjectNav, build
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
