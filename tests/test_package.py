@@ -1,6 +1,8 @@
 """What a newcomer meets first: the package's names, the commands, and the examples of the README."""
 
 import dataclasses
+import json
+import os
 import re
 import subprocess
 import sys
@@ -11,15 +13,21 @@ import jax
 import jax.numpy as jnp
 import pytest
 from support import tiny_world as tiny
+from support.commands import write_config
 
 import jaxnav
 from jaxnav.__main__ import main
 from jaxnav.env.types import Observation
-from jaxnav.policies import methods
+from jaxnav.errors import InputError
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.policy import bind, init_params
+from jaxnav.scenes.task import NUM_ACTIONS
 
 ROOT = Path(__file__).parent.parent
-EXAMPLE, METHOD = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+README = (ROOT / "README.md").read_text()
+EXAMPLE, *_ = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+METHOD_SECTION = re.split(r"^## ", README.partition("\n## A method of your own\n")[2], flags=re.MULTILINE)[0]
+(METHOD,) = re.findall(r"```python\n(.*?)```", METHOD_SECTION, re.DOTALL)
 
 
 def test_importing_jaxnav_is_light():
@@ -54,13 +62,90 @@ def test_the_example_of_the_readme_runs(capsys):
     assert capsys.readouterr().out
 
 
-def test_the_method_of_the_readme_makes_a_policy(monkeypatch):
-    names = vars(methods).copy()
-    exec(METHOD, names)
-    assert names["METHODS"].keys() - methods.METHODS.keys() == {"mine"}
-    monkeypatch.setitem(methods.METHODS, "mine", names["Mine"])
-    spec = dataclasses.replace(tiny.SPEC, method="mine")
+# The method of the README
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with the README's module, and nothing else."""
+    (tmp_path / "module").mkdir()
+    (tmp_path / "module" / "my_method.py").write_text(METHOD)
+    return tmp_path / "module"
+
+
+def test_the_method_of_the_readme_is_short_and_clean(folder):
+    assert METHOD.count("\n") <= 25
+    file, types = folder / "my_method.py", folder / "pyrightconfig.json"
+    types.write_text(json.dumps({"include": ["."], "extraPaths": [str(ROOT)], "typeCheckingMode": "standard"}))
+    checks = [
+        ["ruff", "check", "--no-cache", "--config", ROOT / "pyproject.toml", file],
+        ["ruff", "format", "--no-cache", "--check", "--config", ROOT / "pyproject.toml", file],
+        ["pyright", "-p", types, "--pythonpath", sys.executable],
+    ]
+
+    def clean(check):
+        return subprocess.run([sys.executable, "-m", *check], cwd=ROOT, capture_output=True).returncode == 0
+
+    assert [clean(check) for check in checks] == [True] * 3
+    file.write_text(METHOD.replace("MINE = Method(MyExperience)", "MINE = Method( 'MyExperience', undefined)"))
+    assert [clean(check) for check in checks] == [False] * 3
+
+
+def test_the_method_of_the_readme_makes_experience(folder, monkeypatch):
+    monkeypatch.syspath_prepend(folder)
+    spec = dataclasses.replace(tiny.SPEC, method="my_method:MINE", method_sizes=())
     policy = bind(spec, init_params(spec, jax.random.key(0)))
     observation = Observation(row=jnp.asarray(tiny.BANK.rows[:4]), goal=jnp.zeros(4, jnp.int32))
-    experience = policy.pathways(observation, jnp.ones((4, len(tiny.CATEGORIES)))).experience
+    weights = jnp.ones((4, len(tiny.CATEGORIES)))
+    experience, other = (policy.pathways(observation, w).experience for w in (weights, 2 * weights))
     assert experience.shape == (4, policy.method.width)
+    assert (experience != other).any()  # it hosts the layout
+
+
+def test_an_entry_point_names_a_method(folder, monkeypatch):
+    assert "an entry point `mine` in the group `jaxnav.methods`" in METHOD_SECTION
+    with pytest.raises(InputError, match=r"method 'mine': is unknown; .* Others go by package\.module:NAME"):
+        find_method("mine")
+    (folder / "mine-1.0.dist-info").mkdir()
+    (folder / "mine-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (folder / "mine-1.0.dist-info" / "entry_points.txt").write_text("[jaxnav.methods]\nmine = my_method:MINE\n")
+    monkeypatch.syspath_prepend(folder)
+    assert find_method("mine") is find_method("my_method:MINE")
+
+
+ACT = """
+import jax, jaxnav
+policy = jaxnav.load_policy("runs/mine/policies/layout-0")
+env, params = jaxnav.make("rooms", "val")
+observation, state = env.reset(jax.random.key(0), params)
+print(policy.act(observation, policy.init())[0])
+"""
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_readme_train_and_evaluate_the_method(folder, tmp_path):
+    run_dir = tmp_path / "run"
+
+    def run(*arguments, **more):
+        arguments = [str(argument).replace("runs/mine", str(run_dir)) for argument in arguments]
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | more
+        return subprocess.run([sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True)
+
+    train, evaluate = (
+        line.split() for line in re.findall(r"^    python (.*?)(?: +#.*)?$", METHOD_SECTION, re.MULTILINE)
+    )
+    small = ["--config", write_config(tmp_path), "--method-sizes", "--seeds", 1, "--total-steps", 256]
+    outputs = []
+    for command in ([*train, *small], [*evaluate, "--episodes", 4], ["-c", ACT]):
+        done = run(*command, PYTHONPATH=str(folder))
+        assert done.returncode == 0, done.stderr
+        outputs.append(done.stdout)
+    assert int(outputs[-1]) in range(NUM_ACTIONS)
+    rows = json.loads((run_dir / "eval-val.json").read_text())["rows"]
+    assert {row["variant"] for row in rows} == {"baseline", "layout", "tde", "stde", "random", "oracle"}
+
+    done = run(*evaluate)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: method 'my_method:MINE': cannot be imported (ModuleNotFoundError: ")
+    assert done.stderr.endswith("install or mend its package\n")
