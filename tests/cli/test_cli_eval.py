@@ -113,6 +113,19 @@ def test_a_run_that_is_not_finished_is_refused(tmp_path, run_dir, capsys):
     assert not list(tmp_path.glob("eval*"))
 
 
+def test_a_run_whose_method_is_not_there_is_refused(tmp_path, run_dir, capsys):
+    run = shutil.copytree(run_dir, tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    for name, problem in {
+        "no_such_package:MINE": "cannot be imported (ModuleNotFoundError: No module named 'no_such_package'); inst",
+        "orgy": "is unknown; did you mean 'org'?",
+    }.items():
+        (run / "config.json").write_text(json.dumps(config | {"method": name}))
+        assert evaluate(run) == 2
+        assert f"method {name!r}: {problem}" in refusal(capsys)
+    assert not list(run.glob("eval*"))
+
+
 @pytest.mark.slow
 def test_evaluations_are_equal_byte_for_byte(run_dir, evaluated, tmp_path):
     for seed, equal in ((0, True), (1, False)):

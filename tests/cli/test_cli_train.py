@@ -144,6 +144,38 @@ def test_bad_settings_are_refused_before_anything_is_made(tmp_path, capsys, line
     assert not (tmp_path / "run").exists()
 
 
+BROKEN = """
+import jax.numpy as jnp
+from jaxnav import Experience, Method
+
+class Width(Experience):
+    def __init__(self, spec, rngs):
+        self.width = 3
+
+    def encode(self, features, appearance, weights, reading):
+        return jnp.zeros((*weights.shape[:-1], 4))
+
+class Raising(Width):
+    def encode(self, features, appearance, weights, reading):
+        raise RuntimeError("first line\\nsecond line")
+
+WIDTH, RAISING = Method(Width), Method(Raising)
+"""
+
+
+@pytest.mark.parametrize(("name", "reason"), [("WIDTH", "TypeError: "), ("RAISING", "RuntimeError: first line); mend")])
+def test_methods_that_break_their_contract_are_refused(tmp_path, monkeypatch, capsys, name, reason):
+    (tmp_path / "broken_method.py").write_text(BROKEN)
+    monkeypatch.syspath_prepend(tmp_path)
+    options = ["--method", f"broken_method:{name}", "--run-dir", str(tmp_path / "run")]
+    assert train_command.main(options) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: method 'broken_method:{name}': fails check_method ({reason}")
+    assert error.endswith("; mend it\n")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
 @pytest.mark.parametrize("value", [" 2", "=2"])
 def test_renamed_options_are_refused_with_their_new_name(tmp_path, capsys, option, value):
