@@ -1,6 +1,7 @@
 """The anonymous agent knows the view and the goal's detection, and nothing else."""
 
 import dataclasses
+import functools
 
 import chex
 import jax
@@ -18,13 +19,23 @@ ROW_FORMAT = RowFormat(3)
 BOOK_SEEN, CHAIR_SEEN, NOTHING = (204, 102, 128, 38), (150, 51, 140, 60), (0, 0, 0, 0)
 
 
-def logits(method, detections, goal, view=0):
+@functools.cache
+def deciding(method):
+    """Return a compiled first decision of a lively policy."""
     spec = dataclasses.replace(tiny.SPEC, method=method, method_sizes=())
     policy = bind(spec, tiny.lively(0, spec))
+
+    @jax.jit
+    def decide(observation):
+        return policy.decide(policy.pathways(observation, jnp.ones(3)), policy.initial_memory()).logits
+
+    return decide
+
+
+def logits(method, detections, goal, view=0):
     cells = np.full((1, 11, 11), view, np.uint8)
     row = ROW_FORMAT.pack(np.array([detections], np.uint8), cells)[0]
-    observation = Observation(row=jnp.asarray(row), goal=jnp.int32(goal))
-    return policy.decide(policy.pathways(observation, jnp.ones(3)), policy.initial_memory()).logits
+    return deciding(method)(Observation(row=jnp.asarray(row), goal=jnp.int32(goal)))
 
 
 def test_which_goal_it_is_does_not_matter():
