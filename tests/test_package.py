@@ -71,6 +71,7 @@ def folder(tmp_path):
     return tmp_path / "module"
 
 
+@pytest.mark.slow
 def test_the_method_of_the_readme_is_short_and_clean(folder):
     assert METHOD.count("\n") <= 25
     file, types = folder / "my_method.py", folder / "pyrightconfig.json"
