@@ -29,7 +29,13 @@ from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.scenes.categories import ROOM_TYPES
 
-act = jax.jit(LoadedPolicy.act)
+_compiled = jax.jit(LoadedPolicy.act)
+
+
+def act(policy, observation, memory, epsilon=0.1, *, key=None, heading=0, moved=False):
+    """One step, by as few compilations as there are kinds of policies."""
+    told = {"heading": jnp.int32(heading), "moved": jnp.bool_(moved)}
+    return _compiled(policy, observation, memory, jnp.float32(epsilon), key=key, **told)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +127,7 @@ def test_a_batch_equals_its_singles(drawn_run, world, name):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / name)
     observations, memories = batch_of(policy, world.env, world.params(0))
     batched = jax.jit(jax.vmap(policy.act, (0, 0, None)))(stack(observations), stack(memories), 0.1)
-    singles = stack([act(policy, *pair, 0.1) for pair in zip(observations, memories, strict=True)])
+    singles = stack([act(policy, *pair) for pair in zip(observations, memories, strict=True)])
     np.testing.assert_array_equal(batched[0], singles[0])
     chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
 
@@ -130,7 +136,7 @@ def test_several_policies_act_in_one_call(drawn_run, world):
     folders = [drawn_run.config.run_dir / POLICIES / f"layout-{seed}" for seed in range(2)]
     policies = [jaxnav.load_policy(folder) for folder in folders]
     (observation, *_), (memory, *_) = batch_of(policies[0], world.env, world.params(0), 1)
-    together = jax.jit(jax.vmap(LoadedPolicy.act, (0, None, None)))(stack(policies), observation, memory)
+    together = jax.jit(jax.vmap(LoadedPolicy.act, (0, None, None, None)))(stack(policies), observation, memory, 0.1)
     singles = stack([act(policy, observation, memory) for policy in policies])
     chex.assert_trees_all_close(together, singles, rtol=1e-5, atol=1e-6)
 

@@ -13,7 +13,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
 from jaxnav.runs.directory import Run
 
-EPSILON, EPISODES = np.linspace(0, 1, 11), 12
+EPSILON, EPISODES = np.linspace(0, 1, 11), 12  # those of `evaluated`
 DECODINGS = ("argmax", "sample")
 
 
@@ -24,11 +24,6 @@ def _row(outcome, row):
 @pytest.fixture(scope="module")
 def swept(drawn_run):
     return {name: jaxnav.sweep(drawn_run, EPSILON, episodes=EPISODES, decoding=name) for name in DECODINGS}
-
-
-@pytest.fixture(scope="module")
-def evaluated(drawn_run):
-    return jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES)
 
 
 @pytest.mark.parametrize("decoding", DECODINGS)
