@@ -82,8 +82,7 @@ def evaluate(
     Raises:
       InputError: no finished run, or an impossible argument.
     """
-    if not 0 <= seed < 2**32:
-        raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
+    check_seed(seed)
     console = console or Console(quiet=True)
     config, policies = run.config, run.policies()
     if form is None:
@@ -115,6 +114,16 @@ def evaluate(
     names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
     table, differences = _table(results, names, seed), _differences(results, seed)
     return results._replace(report=build_report(table, differences, evaluator.compilations, about))
+
+
+def check_seed(seed: int) -> None:
+    """Check that a seed can be drawn from.
+
+    Raises:
+      InputError: it cannot.
+    """
+    if not 0 <= seed < 2**32:
+        raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
 
 
 def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
