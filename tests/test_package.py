@@ -93,11 +93,12 @@ def test_the_method_of_the_readme_is_short_and_clean(folder):
 def test_the_method_of_the_readme_makes_experience(folder, monkeypatch):
     monkeypatch.syspath_prepend(folder)
     spec = dataclasses.replace(tiny.SPEC, method="my_method:MINE", method_sizes=())
-    policy = bind(spec, init_params(spec, jax.random.key(0)))
+    params = jax.jit(init_params, static_argnums=0)(spec, jax.random.key(0))
     observation = Observation(row=jnp.asarray(tiny.BANK.rows[:4]), goal=jnp.zeros(4, jnp.int32))
+    pathways = jax.jit(lambda params, weights: bind(spec, params).pathways(observation, weights))
     weights = jnp.ones((4, len(tiny.CATEGORIES)))
-    experience, other = (policy.pathways(observation, w).experience for w in (weights, 2 * weights))
-    assert experience.shape == (4, policy.method.width)
+    experience, other = (pathways(params, w).experience for w in (weights, 2 * weights))
+    assert experience.shape == (4, bind(spec, params).method.width)
     assert (experience != other).any()  # it hosts the layout
 
 

@@ -86,8 +86,7 @@ def evaluate(
     Raises:
       InputError: no finished run, or an impossible argument.
     """
-    if not 0 <= seed < 2**32:
-        raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
+    check_seed(seed)
     console = console or Console(quiet=True)
     config, policies = run.config, run.policies()
     if form is None:
@@ -137,6 +136,16 @@ def run_rows(
     )
     outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
     return lists, outcome, evaluator.compilations
+
+
+def check_seed(seed: int) -> None:
+    """Check that a seed can be drawn from.
+
+    Raises:
+      InputError: it cannot.
+    """
+    if not 0 <= seed < 2**32:
+        raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
 
 
 def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:

@@ -16,8 +16,8 @@ from jaxnav.evaluation.metrics import episode_metrics
 from jaxnav.evaluation.report import Decoding, Form
 from jaxnav.evaluation.variants import table_row
 from jaxnav.runs.directory import Run
-from jaxnav.runs.evaluate import run_rows
-from jaxnav.runs.worlds import evaluation_world
+from jaxnav.runs.evaluate import check_seed
+from jaxnav.runs.worlds import evaluation_world, read_ahead
 
 
 class Sweep(NamedTuple):
@@ -64,6 +64,7 @@ def sweep(
     Raises:
       InputError: no finished run, a run without the arm `layout`, or an impossible argument.
     """
+    check_seed(seed)
     policies = run.policies(("layout",))
     if policies.setting is None:
         raise InputError(f"{run.config.run_dir}: its layout arm has no layout setting; train the run anew")

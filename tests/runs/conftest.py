@@ -1,4 +1,4 @@
-"""A run whose policies were drawn instead of trained."""
+"""A run whose policies were drawn instead of trained, and its evaluation."""
 
 import dataclasses
 
@@ -8,6 +8,7 @@ import pytest
 from support.commands import SEEDS, write_config
 from support.tiny_world import lively
 
+import jaxnav
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.methods import Knowledge
@@ -19,6 +20,7 @@ from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import Exploration
 
+EPSILON, EPISODES = np.linspace(0, 1, 11), 12
 #: With weak prior rows a view changes the belief much: large gaps, which sTDE acts on.
 SETTING = dataclasses.replace(SETTINGS["calibrated"], strength=1.0)
 
@@ -49,3 +51,9 @@ def drawn_run(config) -> Run:
             folder = config.run_dir / POLICIES / f"{arm}-{seed}"
             export_policy(folder, config, params, knowledge, setting, explored)
     return Run(config)
+
+
+@pytest.fixture(scope="session")
+def evaluated(drawn_run) -> jaxnav.Results:
+    """Its evaluation, at every epsilon."""
+    return jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES)

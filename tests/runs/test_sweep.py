@@ -13,7 +13,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
 from jaxnav.runs.directory import Run
 
-EPSILON, EPISODES = np.linspace(0, 1, 11), 12
+EPSILON, EPISODES = np.linspace(0, 1, 11), 12  # those of `evaluated`
 DECODINGS = ("argmax", "sample")
 
 
@@ -24,11 +24,6 @@ def _row(outcome, row):
 @pytest.fixture(scope="module")
 def swept(drawn_run):
     return {name: jaxnav.sweep(drawn_run, EPSILON, episodes=EPISODES, decoding=name) for name in DECODINGS}
-
-
-@pytest.fixture(scope="module")
-def evaluated(drawn_run):
-    return jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES)
 
 
 @pytest.mark.parametrize("decoding", DECODINGS)
@@ -71,19 +66,22 @@ def test_parameters_of_ones_own_are_what_is_evaluated(swept, drawn_run):
 
 
 @pytest.mark.parametrize(
-    ("epsilon", "problem"),
+    ("arguments", "problem"),
     [
-        ((), "epsilon: give at least one number"),
-        (np.zeros(0), "epsilon: give at least one number"),
-        ((0.5, -0.1), "epsilon -0.1: give numbers from 0"),
-        ((float("nan"),), "epsilon nan: give numbers from 0"),
-        ((float("inf"),), "epsilon inf: give numbers from 0"),
+        ({"epsilon": ()}, "epsilon: give at least one number"),
+        ({"epsilon": np.zeros(0)}, "epsilon: give at least one number"),
+        ({"epsilon": (0.5, -0.1)}, "epsilon -0.1: give numbers from 0"),
+        ({"epsilon": (float("nan"),)}, "epsilon nan: give numbers from 0"),
+        ({"epsilon": (float("inf"),)}, "epsilon inf: give numbers from 0"),
+        ({"epsilon": (0.5,), "episodes": 0}, "episodes 0: give at least 1"),
+        ({"epsilon": (0.5,), "seed": -1}, "seed -1: give a whole number from 0"),
+        ({"epsilon": (0.5,), "seed": 2**32}, "seed 4294967296: give a whole number from 0"),
     ],
 )
-def test_impossible_thresholds_are_refused(drawn_run, epsilon, problem):
+def test_impossible_arguments_are_refused(drawn_run, arguments, problem):
     for call in (jaxnav.sweep, jaxnav.evaluate):
         with pytest.raises(InputError, match=problem):
-            call(drawn_run, epsilon=epsilon)
+            call(drawn_run, **arguments)
 
 
 def test_runs_without_the_layout_are_refused(drawn_run, tmp_path):

@@ -1,133 +1,124 @@
 """Runs from Python: trained, opened again, evaluated, with some of the arms."""
 
-import csv
 import dataclasses
-import json
+import math
 
 import chex
 import jax
 import numpy as np
 import pytest
-from support.commands import contents
+from support.commands import POLICIES, SEEDS, contents, finished_run
 
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
+from jaxnav.runs.overlay import apply_yaml
 
-EPISODES = 8
-
-
-def small(config, run_dir, **changes):
-    """The smallest run of the config: one seed, one chunk."""
-    changes = {"seeds": 1, "total_steps": 256, "run_dir": run_dir} | changes
-    return dataclasses.replace(config, **changes)
+EPISODES = 4
 
 
 @pytest.fixture(scope="module")
-def anonymous(config, tmp_path_factory):
-    """A finished run of the method that cannot host the layout."""
-    return small(config, tmp_path_factory.mktemp("train") / "run", method="anonymous", method_sizes={})
+def trained(tmp_path_factory):
+    """The settings of a run that the train command has finished."""
+    config_file, run_dir = finished_run(tmp_path_factory)
+    return dataclasses.replace(apply_yaml(jaxnav.RunConfig(), config_file), run_dir=run_dir)
 
 
-@pytest.fixture(scope="module")
-def run(anonymous):
-    return jaxnav.train(anonymous)
+def test_training_a_finished_run_leaves_it_as_it_is(trained, capsys):
+    before = contents(trained.run_dir)
+    assert jaxnav.train(trained) == jaxnav.Run(trained)
+    assert contents(trained.run_dir) == before
+    assert capsys.readouterr() == ("", "")
 
 
-@pytest.fixture(scope="module")
-def results(run):
-    return jaxnav.evaluate(run, episodes=EPISODES)
-
-
-def test_a_method_that_cannot_host_the_layout_trains_the_baseline_alone(run, anonymous):
-    assert anonymous.arms == ("baseline", "layout")
-    assert run.config == dataclasses.replace(anonymous, arms=("baseline",))
-    assert [folder.name for folder in (run.config.run_dir / "policies").iterdir()] == ["baseline-0"]
-    policies = run.policies()
-    assert (policies.arms, policies.seeds, policies.setting) == (("baseline",), 1, None)
-    assert {len(leaf) for leaf in jax.tree.leaves(policies.params)} == {1}
-    assert policies.spec == run.config.policy_spec(len(run.config.task.categories))
-    with pytest.raises(InputError, match="was trained without the arm 'layout'"):
-        run.policies(("layout",))
-
-
-def test_the_log_has_a_row_of_every_chunk_arm_and_seed(run):
-    (row,) = run.log()
-    assert (row["step"], row["arm"], row["seed"], row["env_steps"]) == (2, "baseline", 0, 256)
-    assert np.isfinite(row["success"])
-
-
-def test_what_is_exported_is_what_is_loaded(run):
-    loaded = jaxnav.load_policy(run.config.run_dir / "policies" / "baseline-0")
-    policies = run.policies()
-    chex.assert_trees_all_equal(loaded.params, jax.tree.map(lambda leaf: leaf[0], policies.params))
-    chex.assert_trees_all_equal(loaded.knowledge, policies.knowledge)
-    assert (loaded.spec, loaded.setting) == (policies.spec, None)
-
-
-def test_the_same_run_is_opened_from_its_path(run):
-    for path in (run.config.run_dir, str(run.config.run_dir)):
+def test_a_run_is_opened_from_its_path(trained):
+    # Where it runs and what is kept how often is no part of what a run is.
+    usual = {name: getattr(jaxnav.RunConfig(), name) for name in ("save_every", "cache", "devices")}
+    for path in (trained.run_dir, str(trained.run_dir)):
         opened = jaxnav.Run.open(path)
-        chex.assert_trees_all_equal(opened.policies(), run.policies())
-        assert opened.log() == run.log()
-        elsewhere = {name: getattr(jaxnav.RunConfig(), name) for name in ("save_every", "cache", "devices")}
-        assert opened.config == dataclasses.replace(run.config, **elsewhere)  # no part of what a run is
+        assert opened.config == dataclasses.replace(trained, **usual)
+        chex.assert_trees_all_equal(opened.policies(), jaxnav.Run(trained).policies())
+        assert opened.log() == jaxnav.Run(trained).log()
     with pytest.raises(InputError, match="holds no run"):
-        jaxnav.Run.open(run.config.run_dir / "policies")
+        jaxnav.Run.open(trained.run_dir / "policies")
 
 
-def test_training_a_finished_run_leaves_it_as_it_is(run, anonymous, results):
-    before = contents(run.config.run_dir)
-    assert jaxnav.train(anonymous) == run
-    assert contents(run.config.run_dir) == before
+def test_the_policies_are_stacked_arm_by_arm(trained):
+    policies = jaxnav.Run(trained).policies()
+    assert (policies.arms, policies.seeds) == (("baseline", "layout"), SEEDS)
+    assert policies.spec == trained.policy_spec(len(trained.task.categories))
+    for name in POLICIES:
+        arm, seed = name.split("-")
+        loaded = jaxnav.load_policy(trained.run_dir / "policies" / name)
+        chex.assert_trees_all_equal(loaded.params, jax.tree.map(lambda leaf, i=int(seed): leaf[i], policies.of(arm)))
+        chex.assert_trees_all_equal(loaded.knowledge, policies.knowledge)
+        assert loaded.spec == policies.spec
+        assert loaded.setting == (policies.setting if arm == "layout" else None)
+    layout = jaxnav.Run(trained).policies(("layout",))
+    chex.assert_trees_all_equal(layout.params, policies.of("layout"))
 
 
-def test_an_evaluation_has_the_rows_of_the_arms_there_are(results):
-    assert results.rows == [
-        Row("baseline", None, None, "argmax"),
-        Row("baseline", None, None, "sample"),
-        Row("random", None, None, "sample"),
-        Row("oracle", None, None, "argmax"),
+def test_the_log_has_a_row_of_every_chunk_arm_and_seed(trained):
+    rows = jaxnav.Run(trained).log()
+    identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
+    assert identities == [
+        (step, arm, seed) for step in (2, 4) for arm in ("baseline", "layout") for seed in range(SEEDS)
     ]
-    assert {leaf.shape for leaf in results.outcome} == {(4, 1, EPISODES)}
-    metrics = results.metrics()
-    assert list(metrics) == ["sr", "spl", "dts", "sae"]
-    assert {values.shape for values in metrics.values()} == {(4, 1, EPISODES)}
-    assert len(results.episodes.goal) == EPISODES
-    assert results.report["compilations"] == 1
-    assert results.report["differences"] == []
-    assert [row["sr"]["mean"] for row in results.report["rows"]] == pytest.approx(100 * metrics["sr"].mean((1, 2)))
-
-
-def test_an_evaluation_is_written_as_json_and_csv(results, tmp_path):
-    results.write(tmp_path / "new" / "table.json")
-    assert json.loads((tmp_path / "new" / "table.json").read_text()) == json.loads(json.dumps(results.report))
-    with (tmp_path / "new" / "table.episodes.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 4 * EPISODES
-    assert [int(row["length"]) for row in rows] == results.outcome.length.ravel().tolist()
-    assert [float(row["spl"]) for row in rows] == pytest.approx(results.metrics()["spl"].ravel(), rel=1e-5)
+    assert all(math.isfinite(row["success"]) for row in rows)
 
 
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
         (
-            {"arms": ("layout",)},
-            "config: arms is ('layout',); method 'anonymous' cannot host the layout; give baseline",
+            {"method": "anonymous", "arms": ("layout",)},
+            "config: arms is ('layout',); method 'anonymous' cannot host",
         ),
-        ({"arms": ("layout", "baseline")}, "cannot host the layout; give baseline"),
+        ({"method": "anonymous", "arms": ("layout", "baseline")}, "method 'anonymous' cannot host the layout; give"),
         ({"arms": ()}, "config: arms is (); give some of baseline, layout"),
+        ({"arms": ("layout", "layout")}, "give some of baseline, layout, each once"),
         ({"method": "orgy"}, "method 'orgy': is unknown; did you mean 'org'?"),
-        ({"method_sizes": {"relation_layers": 1}}, "method_sizes.relation_layers is 1; is unknown; 'anonymous' has no"),
+        ({"method_sizes": {"layers": 1}}, "method_sizes.layers is 1; is unknown; 'org' has relation_layers"),
     ],
 )
-def test_impossible_runs_are_refused_before_anything_is_made(anonymous, tmp_path, changes, problem):
-    config = dataclasses.replace(anonymous, run_dir=tmp_path / "run", **changes)
+def test_impossible_runs_are_refused_before_anything_is_made(config, tmp_path, changes, problem):
+    changed = {"method_sizes": {}, "run_dir": tmp_path / "run"} | changes
     with pytest.raises(InputError) as error:
-        jaxnav.train(config)
+        jaxnav.train(dataclasses.replace(config, **changed))
     assert problem in str(error.value)
     assert not (tmp_path / "run").exists()
+
+
+def small(config, run_dir, **changes):
+    """The smallest run of the config: one seed, one chunk."""
+    return dataclasses.replace(config, seeds=1, total_steps=256, run_dir=run_dir, **changes)
+
+
+@pytest.mark.slow
+def test_a_method_that_cannot_host_the_layout_is_trained_without_it(config, tmp_path):
+    anonymous = small(config, tmp_path / "run", method="anonymous", method_sizes={})
+    run = jaxnav.train(anonymous)
+    assert anonymous.arms == ("baseline", "layout")
+    assert run.config == dataclasses.replace(anonymous, arms=("baseline",))
+    assert jaxnav.Run.open(tmp_path / "run").config.arms == ("baseline",)
+    assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["baseline-0"]
+    policies = run.policies()
+    assert (policies.arms, policies.seeds, policies.setting) == (("baseline",), 1, None)
+    (row,) = run.log()
+    assert (row["step"], row["arm"], row["seed"], row["env_steps"]) == (2, "baseline", 0, 256)
+
+    before = contents(tmp_path / "run")
+    assert jaxnav.train(anonymous) == run
+    assert contents(tmp_path / "run") == before
+
+    results = jaxnav.evaluate(run, episodes=EPISODES)
+    baseline = [Row("baseline", None, None, decoding) for decoding in ("argmax", "sample")]
+    assert results.rows == [*baseline, Row("random", None, None, "sample"), Row("oracle", None, None, "argmax")]
+    assert {leaf.shape for leaf in results.outcome} == {(4, 1, EPISODES)}
+    assert results.report["differences"] == []
+    for problem in (lambda: jaxnav.sweep(run, (0.5,)), lambda: run.policies(("layout",))):
+        with pytest.raises(InputError, match="was trained without the arm 'layout'"):
+            problem()
 
 
 @pytest.mark.slow
@@ -136,9 +127,8 @@ def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
     assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["layout-0"]
     assert run.policies().setting is not None
     results = jaxnav.evaluate(run, episodes=EPISODES)
-    names = [(row.variant, row.epsilon) for row in results.rows]
     one = [("layout", None), ("tde", None), ("stde", 0.5)]
-    assert names == [*one, *one, ("random", None), ("oracle", None)]
+    assert [(row.variant, row.epsilon) for row in results.rows] == [*one, *one, ("random", None), ("oracle", None)]
     # The others are compared with the layout's row, which has nothing to be compared with itself.
     assert len(results.report["differences"]) == 2 * 2 * 3
     sweep = jaxnav.sweep(run, (0.5, 1.0), episodes=EPISODES)

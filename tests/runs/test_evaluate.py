@@ -1,0 +1,57 @@
+"""An evaluation from Python: its rows, numbers and files."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from jaxnav.evaluation.variants import Row
+
+
+def test_the_rows_are_those_of_the_table_and_the_oracle(evaluated):
+    rows, epsilon = evaluated.rows, np.linspace(0, 1, 11)
+    assert rows[-2:] == [Row("random", None, None, "sample"), Row("oracle", None, None, "argmax")]
+    for decoding, part in (("argmax", rows[:14]), ("sample", rows[14:28])):
+        assert [row.variant for row in part] == ["baseline", "layout", "tde", *["stde"] * 11]
+        assert [row.epsilon for row in part[3:]] == epsilon.tolist()
+        assert {row.form for row in part[3:]} == {"residual"}  # that of the run's layout setting
+        assert {row.decoding for row in part} == {decoding}
+    assert len(rows) == 30
+
+
+def test_every_row_seed_and_episode_has_its_numbers(evaluated):
+    shape = (30, 2, len(evaluated.episodes.goal))
+    assert {leaf.shape for leaf in evaluated.outcome} == {shape}
+    metrics = evaluated.metrics()
+    assert list(metrics) == ["sr", "spl", "dts", "sae"]
+    for name, values in metrics.items():
+        assert (values.shape, values.dtype) == (shape, np.float64)
+        assert (values >= 0).all()
+        assert name == "dts" or (values <= 1).all()
+    np.testing.assert_array_equal(metrics["sr"], evaluated.outcome.success)
+    assert 0 < metrics["sr"][:-1].mean() < metrics["sr"][-1].mean()  # the oracle's
+
+
+def test_the_report_says_the_same(evaluated):
+    rows, metrics = evaluated.report["rows"], evaluated.metrics()
+    assert [(row["variant"], row["epsilon"], row["form"], row["decoding"]) for row in rows] == [*evaluated.rows]
+    for name, scale in (("sr", 100), ("spl", 100), ("dts", 1)):
+        means = scale * metrics[name].mean((1, 2))
+        assert [row[name]["mean"] for row in rows] == pytest.approx(means, rel=1e-6, abs=1e-9)
+    assert evaluated.report["compilations"] == 1
+
+
+def test_it_is_written_as_json_and_csv(evaluated, tmp_path):
+    target = tmp_path / "new" / "table.json"
+    evaluated.write(target)
+    assert {path.name for path in target.parent.iterdir()} == {"table.json", "table.episodes.csv"}
+    assert json.loads(target.read_text()) == json.loads(json.dumps(evaluated.report))
+    with target.with_name("table.episodes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["length"]) for row in rows] == evaluated.outcome.length.ravel().tolist()
+    assert [float(row["spl"]) for row in rows] == pytest.approx(evaluated.metrics()["spl"].ravel(), rel=1e-5)
+    goals = [evaluated.categories[goal] for goal in evaluated.episodes.goal]
+    assert [row["goal"] for row in rows] == goals * (len(rows) // len(goals))
+    with pytest.raises(OSError, match=r"table\.json"):
+        evaluated.write(target / "table.json")

@@ -1,0 +1,70 @@
+"""What is no exported policy is refused in one line that names it."""
+
+import json
+import shutil
+
+import pytest
+
+import jaxnav
+from jaxnav.errors import InputError
+from jaxnav.runs.directory import POLICIES
+
+
+@pytest.fixture
+def export(drawn_run, tmp_path):
+    return shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
+
+
+def refused(folder):
+    """The message of the refusal, one line that begins with the path."""
+    with pytest.raises(InputError) as error:
+        jaxnav.load_policy(folder)
+    message = str(error.value)
+    assert message.startswith(str(folder))
+    assert "\n" not in message
+    return message
+
+
+def respecified(export, **changes):
+    """The export with something changed in its spec."""
+    policy = json.loads((export / "policy.json").read_text())
+    policy["spec"] |= changes
+    (export / "policy.json").write_text(json.dumps(policy))
+    return export
+
+
+def test_folders_without_an_export_are_refused(tmp_path, drawn_run):
+    for folder in (tmp_path, tmp_path / "none", drawn_run.config.run_dir, str(tmp_path)):
+        assert "not an exported policy (No such file or directory: " in refused(folder)
+
+
+def test_damaged_exports_are_refused(export):
+    data = bytearray((export / "params.safetensors").read_bytes())
+    data[-1] ^= 1
+    (export / "params.safetensors").write_bytes(data)
+    assert "does not belong to policy.json or is damaged; export the policy again" in refused(export)
+    (export / "policy.json").write_text((export / "policy.json").read_text()[:-9])
+    assert "not JSON" in refused(export)
+    (export / "policy.json").unlink()
+    assert "not an exported policy" in refused(export)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (
+            {"method": "no_such_package:MINE"},
+            "cannot be imported (ModuleNotFoundError: No module named ",
+        ),
+        ({"method": "jaxnav.layout:MINE"}, "cannot be imported (AttributeError: module 'jaxnav.layout' "),
+        ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, org, rgb"),
+        ({"sizes": {"depth": 3}}, "its spec does not fit this code (TypeError: "),
+        ({"layout": {"rows": "some"}}, "its spec does not fit this code (ValueError: rows is 'some'"),
+        ({"method_sizes": None}, "its spec does not fit this code (AttributeError: "),
+    ],
+)
+def test_exports_of_other_code_are_refused(export, changes, problem):
+    assert jaxnav.load_policy(export).spec.method == "org"
+    message = refused(respecified(export, **changes))
+    assert problem in message
+    assert any(mend in message for mend in ("install or mend its package", "choose one of", "train the run anew"))
