@@ -16,8 +16,8 @@ from jaxnav.evaluation.metrics import episode_metrics
 from jaxnav.evaluation.report import Decoding, Form
 from jaxnav.evaluation.variants import table_row
 from jaxnav.runs.directory import Run
-from jaxnav.runs.evaluate import check_seed
-from jaxnav.runs.worlds import evaluation_world, read_ahead
+from jaxnav.runs.evaluate import check_seed, run_rows
+from jaxnav.runs.worlds import evaluation_world
 
 
 class Sweep(NamedTuple):

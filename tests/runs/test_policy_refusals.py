@@ -7,7 +7,7 @@ import pytest
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import POLICIES
+from jaxnav.runs.policies import POLICIES
 
 
 @pytest.fixture

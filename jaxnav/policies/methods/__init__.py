@@ -66,7 +66,7 @@ def find_method(name: str) -> Method:
             known = [*METHODS, *points]
             near = difflib.get_close_matches(name, known, n=1)
             mend = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
-            raise InputError(f"method {name!r}: is unknown; {mend} Others go by package.module:NAME")
+            raise InputError(f"method {name!r}: is unknown; {mend} (others go by package.module:NAME)")
         return find_method(points[name].value)
     if not isinstance(method, Method):
         raise InputError(f"method {name!r}: is {type(method).__name__}, no jaxnav Method; make it Method(Experience)")
