@@ -179,6 +179,7 @@ class Steered(Experience):
         return reading
 
 
+@pytest.mark.slow
 def test_a_tracker_takes_in_every_step(monkeypatch):
     monkeypatch.setitem(METHODS, "steered", Method(Steered, tracker=Compass()))
     spec = dataclasses.replace(tiny.SPEC, method="steered", method_sizes=())

@@ -49,6 +49,7 @@ def test_from_epsilon_1_on_nothing_is_removed(swept, evaluated, decoding):
     assert (swept[decoding].outcome.length[0] != row.length).any()  # what is removed at epsilon 0 matters here
 
 
+@pytest.mark.slow
 def test_parameters_of_ones_own_are_what_is_evaluated(swept, drawn_run):
     params = drawn_run.policies(("layout",)).params
     again = {

@@ -24,6 +24,7 @@ def trained(tmp_path_factory):
     return dataclasses.replace(apply_yaml(jaxnav.RunConfig(), config_file), run_dir=run_dir)
 
 
+@pytest.mark.slow
 def test_training_a_finished_run_leaves_it_as_it_is(trained, capsys):
     before = contents(trained.run_dir)
     assert jaxnav.train(trained) == jaxnav.Run(trained)
