@@ -160,11 +160,13 @@ class RunConfig:
 def check(config: RunConfig) -> RunConfig:
     """Return the config, complete and possible.
 
-    A method that cannot host the layout loses the arm `layout`.
+    A method that cannot host the layout loses the arm `layout`; paths may be given as texts.
 
     Raises:
       InputError: names the first impossible setting.
     """
+    paths = {"run_dir": config.run_dir, "scenes": config.scenes, "cache": config.cache}
+    config = dataclasses.replace(config, **{name: Path(path) for name, path in paths.items() if path is not None})
     method = find_method(config.method)
     if not method.hosts_layout and config.arms == ARMS:
         config = dataclasses.replace(config, arms=("baseline",))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import chex
 import jax
@@ -12,6 +13,7 @@ from support.commands import POLICIES, SEEDS, contents, finished_run
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
+from jaxnav.runs.config import RunConfig, check
 from jaxnav.runs.overlay import apply_yaml
 
 EPISODES = 4
@@ -134,3 +136,8 @@ def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
     assert len(results.report["differences"]) == 2 * 2 * 3
     sweep = jaxnav.sweep(run, (0.5, 1.0), episodes=EPISODES)
     np.testing.assert_array_equal(sweep.outcome.length, results.outcome.length[[2, 0]])
+
+
+def test_paths_may_be_texts():
+    config = check(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
+    assert (config.run_dir, config.scenes) == (Path("runs/two"), Path("rooms.jsonl.gz"))
