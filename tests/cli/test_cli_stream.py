@@ -85,6 +85,7 @@ def test_banks_are_read_one_ahead(world, monkeypatch):
     assert list(given) == list(read_ahead(world, [])) == []
 
 
+@pytest.mark.slow
 def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
     config = RunConfig(ppo=PPOConfig(num_envs=32, rollout=4, minibatches=2), seeds=1, sizes=tiny.SIZES)

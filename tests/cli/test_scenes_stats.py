@@ -92,6 +92,7 @@ def test_pairs_seen_together(file, capsys):
     assert all(cells[:2] != pair[::-1] for cells in shown)
 
 
+@pytest.mark.slow
 def test_splits_worlds_and_generated_scenes(file, capsys):
     assert row(stats(capsys, file, "--split", "val"), "bed[room]")[:3] == ["0", "1", "0"]
     # A sofa is what houses look for.

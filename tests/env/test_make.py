@@ -45,6 +45,7 @@ def named_room(room, split, room_type):
     return dataclasses.replace(room, name=f"{split}-{room_type}", split=split, room_type=room_type)
 
 
+@pytest.mark.slow
 def test_make_generates_a_world():
     env, params = make("houses", "val", seed=3)
     check_environment(env, params, num_envs=4, num_steps=16)

@@ -16,6 +16,7 @@ from jaxnav.scenes.worlds import WORLDS, generated
 
 #: Scenes of each world, enough that a perfect predictor differs from the detector beyond chance for most goals.
 NUM_SCENES = {"rooms": 12, "apartments": 8, "houses": 4}
+EACH = ["rooms", "houses", pytest.param("apartments", marks=pytest.mark.slow)]
 
 
 @functools.cache
@@ -25,7 +26,7 @@ def world(name: str) -> tuple[Bank, ObjectNav, EnvParams]:
     return bank, *build(bank, {}, 10)
 
 
-@pytest.mark.parametrize("name", NUM_SCENES)
+@pytest.mark.parametrize("name", EACH)
 def test_no_bit_predicts_success_better_than_the_detection_of_the_goal(name):
     bank, env, params = world(name)
     leaks = find_leaks(env, params, bank)
@@ -33,7 +34,7 @@ def test_no_bit_predicts_success_better_than_the_detection_of_the_goal(name):
     assert len(leaks.goals) >= 0.75 * leaks.num_goals
 
 
-@pytest.mark.parametrize("name", NUM_SCENES)
+@pytest.mark.parametrize("name", EACH)
 def test_success_bits_in_the_rows_are_flagged(name):
     bank, env, params = world(name)
     answers = np.packbits(bank.best_length == 1, axis=1, bitorder="little")
@@ -49,7 +50,7 @@ def test_success_bits_in_the_rows_are_flagged(name):
     assert len(leaks.goals) >= 0.75 * leaks.num_goals
 
 
-@pytest.mark.parametrize("name", NUM_SCENES)
+@pytest.mark.parametrize("name", EACH)
 def test_a_reset_shows_what_a_step_shows(name):
     _, env, params = world(name)
     shown, states = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 500), params)

@@ -87,7 +87,7 @@ def test_starts_are_uniform(rules):
     assert not uniform(np.append(scene, np.zeros(1000, int)), [0, 1])  # the test can tell
 
 
-@pytest.mark.parametrize(("rules", "ahead"), [(ROOMS, 1.0), (HOUSES, 0.75)])
+@pytest.mark.parametrize(("rules", "ahead"), [(ROOMS, 1.0), pytest.param(HOUSES, 0.75, marks=pytest.mark.slow)])
 def test_shaping_rewards_metres_nearer_to_the_goal(rules, ahead):
     # A corridor of 8 cells along z; the book's centre is at z = 2.75, its footprint from 2.5 m on (sight: 2.75 - z to
     # the centre, walk: 2.5 - z to the footprint). Each MoveAhead is 0.25 m, whatever is measured.

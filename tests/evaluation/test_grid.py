@@ -134,6 +134,7 @@ def part(episodes):
     return EPISODES._replace(**{name: getattr(EPISODES, name)[episodes] for name in EPISODES._fields[:5]})
 
 
+@pytest.mark.slow
 def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_others(outcome):
     """Two parts of few episodes, in another order and by some of the cells in another order."""
     parts = [np.array([0, 1, 2, 3, 20, 11]), np.array([12, 5, 4, 23, 8, 17])]

@@ -114,6 +114,7 @@ def test_early_and_late_gap_are_those_of_a_plain_loop(counts, by_hand):
     assert (found.early, found.late) == pytest.approx(by_hand["sum", 6.0], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_pair_nearest_to_the_papers_course_is_chosen(counts, by_hand):
     distance = {pair: abs(early - EARLY) + abs(late - LATE) for pair, (early, late) in by_hand.items()}
     best, second = sorted(distance, key=lambda pair: distance[pair])[:2]

@@ -105,7 +105,8 @@ def distance(a, b):
     return np.abs(np.subtract(a["params"], b["params"])).max()
 
 
-@pytest.mark.parametrize("devices", [4, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", [2, 4])
 def test_any_number_of_devices_trains_the_same_policies(devices):
     found = trained(1, 4) | (trained(devices) if devices != 4 else {})
     for ours, theirs in zip(found["1"], found[str(devices)], strict=True):

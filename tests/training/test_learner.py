@@ -191,6 +191,7 @@ def test_minibatches_differ_between_epochs():
     assert len(orders) == 8
 
 
+@pytest.mark.slow
 def test_a_method_without_experience_trains():
     spec = dataclasses.replace(tiny.SPEC, method="rgb")
     learner = dataclasses.replace(LEARNER, acting=Acting(ACTING.env, spec))

@@ -26,7 +26,7 @@ WORLDS: dict[str, tuple[Callable[..., Scene], tuple[str, ...]]] = {
 NUM_SCENES = {"apartments": 48, "houses": 48, "rooms": 96}  # a room has fewer pairs
 NEARLY_ZERO = 1e-12  # places all objects anew, each by its own rule
 
-HOMES = [pytest.param("apartments", marks=pytest.mark.slow), "houses"]
+HOMES = [pytest.param(world, marks=pytest.mark.slow) for world in ("apartments", "houses")]
 EACH = ["rooms", *HOMES]
 
 
