@@ -129,7 +129,8 @@ def show(config: ShowConfig, console: Console) -> None:
         draw_scene(scene, config.task, path, config.pose)
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written ({error.strerror}); give another name") from error
-    console.print(f"{scene.name} drawn; written to {path}", markup=False, soft_wrap=True)
+    console.print(f"{scene.name} drawn by the rules of {config.world_name}", markup=False, soft_wrap=True)
+    console.print(f"written to {path}", markup=False, soft_wrap=True)
 
 
 def print_statistics(config: StatsConfig, console: Console) -> None:
@@ -144,6 +145,8 @@ def print_statistics(config: StatsConfig, console: Console) -> None:
     bar = track(each, "compiling", len(scenes), console=console, transient=True, disable=not console.is_terminal)
     statistics = [scene_statistics(scene, task) for scene in bar]
     out = result_console()
+    world = run.world if run else config.world_name
+    out.print(f"{config.file}: {len(statistics)} scenes, by the categories and rules of {world}", markup=False)
     for title, table in scene_tables(statistics, task, priors).items():
         out.print(title, style="bold")
         out.print(table, "")

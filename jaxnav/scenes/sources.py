@@ -2,12 +2,15 @@
 
 import dataclasses
 import difflib
+import functools
+from pathlib import Path
 from typing import Literal
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.files.scene_file import iterate_scenes
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
+from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, world_named
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +22,7 @@ class SceneSource:
       split: of the scenes; default: all of a file, `val` of a generated world.
       seed: of a generated world, and of the shift.
       shift: from 0 to 1: layout shift of a generated world, in a file the share of the categories that exchange labels.
-      world: world whose categories and rules count; default: the generated one, and `rooms` for a file.
+      world: world whose categories and rules count; default: the generated one, or what the scenes of a file stand for.
     """
 
     file: str
@@ -28,10 +31,24 @@ class SceneSource:
     shift: float = 0.0
     world: Literal["rooms", "apartments", "houses"] | None = None
 
+    @functools.cached_property
+    def world_name(self) -> str:
+        """Return the name of the world whose rules count.
+
+        In a file without `--world` its first scene decides.
+
+        Raises:
+          InputError: no readable scene file.
+        """
+        if self.world or self.file in WORLDS:
+            return self.world or self.file
+        scenes = (scene for scene in iterate_scenes(Path(self.file)) if isinstance(scene, Scene))
+        return world_named(next((scene.world for scene in scenes), ""))
+
     @property
     def task(self) -> Task:
         """Return the categories and rules of the world."""
-        return WORLDS[self.world or (self.file if self.file in WORLDS else "rooms")].task
+        return WORLDS[self.world_name].task
 
     def open(self, task: Task | None = None, count: int | None = None) -> Scenes:
         """Open the scenes.

@@ -71,6 +71,24 @@ WORLDS = {
     ),
 }
 
+_STAND_FOR = {
+    "robothor": "apartments",
+    "apartments": "apartments",
+    "procthor": "houses",
+    "habitat": "houses",
+    "gibson": "houses",
+    "houses": "houses",
+}
+
+
+def world_named(origin: str) -> str:
+    """Return the name of the world that scenes of an origin stand for.
+
+    Args:
+      origin: the `world` of a scene, such as `robothor`; one that is not known stands for `rooms`.
+    """
+    return _STAND_FOR.get(origin, "rooms")
+
 
 class Scenes(Protocol):
     """Provide the scenes of one split, in order.

@@ -18,21 +18,12 @@ from jaxnav.scenes.files.importers.replacements import read_replacements
 from jaxnav.scenes.files.importers.scene_data import read_scene_data
 from jaxnav.scenes.files.scene_file import iterate_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.worlds import WORLDS
+from jaxnav.scenes.worlds import WORLDS, world_named
 
 Format = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
 Split = Literal["train", "val", "test"]
 Imported = Iterator[Scene | InputError]
 
-#: World whose vocabulary scenes are compared with, by the world that they come from; `rooms` for others.
-DEFAULT_WORLDS = {
-    "robothor": "apartments",
-    "apartments": "apartments",
-    "procthor": "houses",
-    "habitat": "houses",
-    "gibson": "houses",
-    "houses": "houses",
-}
 #: Format that each option of `read_format` is for.
 FORMAT_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor", "base": "replacements"}
 
@@ -157,7 +148,7 @@ def _usable(
         try:
             if isinstance(scene, InputError):
                 raise scene
-            vocabulary = categories or WORLDS[DEFAULT_WORLDS.get(scene.world, "rooms")].task.categories
+            vocabulary = categories or WORLDS[world_named(scene.world)].task.categories
             _check(scene, kept, vocabulary, source)
         except InputError as error:
             refused += 1
