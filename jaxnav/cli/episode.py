@@ -9,6 +9,7 @@ from rich.console import Console
 
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import InputError
+from jaxnav.runs.policies import EstimatorName
 from jaxnav.viz.episode import draw_episode
 from jaxnav.viz.play import play_episode
 
@@ -24,6 +25,7 @@ class EpisodeConfig:
       out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
       variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.
+      setting: layout estimator to use instead of the run's, as of `eval`.
       scenes: scene file to read instead of the run's own world or file.
       shift: layout shift of the scenes, from 0 to 1; default: the run's.
     """
@@ -34,6 +36,7 @@ class EpisodeConfig:
     out: Path | None = None
     variant: Literal["stde", "layout", "baseline"] = "stde"
     epsilon: float = 0.5
+    setting: EstimatorName | None = None
     scenes: Path | None = None
     shift: float | None = None
 
@@ -50,7 +53,15 @@ def draw(config: EpisodeConfig, console: Console) -> None:
     if path.suffix not in (".gif", ".png"):
         raise InputError(f"--out {path}: give a name that ends in .gif or .png")
     episode = play_episode(
-        config.run, config.split, config.index, config.variant, config.epsilon, config.scenes, config.shift, console
+        config.run,
+        config.split,
+        config.index,
+        config.variant,
+        config.epsilon,
+        config.setting,
+        config.scenes,
+        config.shift,
+        console,
     )
     draw_episode(episode, path)
     console.print(f"{len(episode.trace.pose)} steps; written to {path}", soft_wrap=True)

@@ -13,6 +13,7 @@ from jaxnav.evaluation.report import Form
 from jaxnav.evaluation.report_tables import console_table, difference_table
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import evaluate
+from jaxnav.runs.policies import EstimatorName
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,9 @@ class EvalConfig:
         shard, and balanced there.
       epsilon: thresholds of sTDE; all of them in one compiled call.
       form: how sTDE combines the logits; default: the run's layout setting's.
-      seed: of the episode list, the sampled actions and the bootstrap.
+      setting: layout estimator to use instead of the run's: `evidence` and `clock` measure the gap in another way,
+        `paper` and `released` change the layout's weights too.
+      seed: of the episode list and the sampled actions.
       json: where to write the table; default: in the run directory.
     """
 
@@ -40,6 +43,7 @@ class EvalConfig:
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.5,)
     form: tuple[Form, ...] | None = None
+    setting: EstimatorName | None = None
     seed: int = 0
     json: Path | None = None
 
@@ -61,12 +65,15 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         episodes=config.episodes,
         epsilon=config.epsilon,
         form=config.form,
+        setting=config.setting,
         seed=config.seed,
         console=console,
     )
     out.print(console_table(results.report))
     if results.report["differences"]:
         out.print(difference_table(results.report))
+    for note in results.report["notes"]:
+        out.print(note, markup=False)
     try:
         results.write(target)
     except OSError as error:
@@ -81,6 +88,7 @@ def _target(config: EvalConfig) -> Path:
     """Return where the table goes, or refuse early."""
     source = "" if config.scenes is None else f"{config.scenes.name.split('.')[0]}-"
     name = f"eval-{source}{config.split}" + ("" if config.shift is None else f"-shift{config.shift:g}")
+    name += "" if config.setting is None else f"-{config.setting}"
     target = config.json or config.run / f"{name}.json"
     if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
         raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")

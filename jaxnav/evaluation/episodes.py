@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Clusters, scene_clusters
+from jaxnav.scenes.scene import floor_plan
 from jaxnav.scenes.tables.compile import Bank
 
 
@@ -15,7 +17,7 @@ class EpisodeList(NamedTuple):
     Attributes:
       scene, goal, pose: int32 [E], indices into the bank.
       best_length: int32 [E], L* >= 1.
-      room: int [E], index into `rooms`; the strata of the statistics.
+      room: int [E], index into `rooms`.
       rooms: names of the room types.
       scenes: names of the scenes.
     """
@@ -27,6 +29,26 @@ class EpisodeList(NamedTuple):
     room: np.ndarray
     rooms: tuple[str, ...]
     scenes: tuple[str, ...]
+
+    @property
+    def plan(self) -> np.ndarray:
+        """Return the floor plan of each episode, [E]; see `floor_plan`."""
+        return np.array([floor_plan(name) for name in self.scenes])[self.scene]
+
+    def clusters(self) -> Clusters:
+        """Return the floor plans as clusters, within room types."""
+        return scene_clusters(self.plan, self.room)
+
+
+def clusters_of(lists: Sequence[EpisodeList]) -> list[Clusters]:
+    """Return the floor plans of several lists as clusters.
+
+    A floor plan that is in several lists is left out of all at once.
+    """
+    whole = together(lists)
+    clusters = whole.clusters()
+    ends = np.cumsum([len(episodes.scene) for episodes in lists])[:-1]
+    return [clusters._replace(weights=weights) for weights in np.split(clusters.weights, ends)]
 
 
 def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0, part: int = 0) -> EpisodeList:

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.evaluation.statistics import Summary, paired_difference, summary
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.statistics import paired_difference, scene_clusters, summary
 from jaxnav.store.files import write_atomic
 
 #: Version of the JSON layout.
@@ -25,6 +26,8 @@ Form = Literal["residual", "paper"]
 
 #: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
 _SCALES: dict[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0, "sae": 100.0}
+#: Variants without training, whose seeds are repetitions.
+UNTRAINED: tuple[Variant, ...] = ("oracle", "random")
 _BUCKETS = {"L>=1": 1, "L>=5": 5}
 
 
@@ -38,9 +41,7 @@ def build_row(
     decoding: Decoding,
     form: Form | None,
     metrics: dict[str, np.ndarray],
-    best_lengths: np.ndarray,
-    strata: np.ndarray,
-    generator: np.random.Generator,
+    episodes: EpisodeList,
 ) -> dict[str, Any]:
     """Build one row: a variant's metrics.
 
@@ -58,32 +59,31 @@ def build_row(
       decoding: how actions are taken from logits.
       form: how the counterfactual logits are combined, None where there are none.
       metrics: `sr`, `spl`, `sae` (fractions in [0, 1]) and `dts` (metres), each [S, E].
-      best_lengths: int [E], best length L* of each episode, in actions with Done, at least 1.
-      strata: int [E], stratum (room type) of each episode.
-      generator: source of the bootstrap resamples.
+      episodes: the E episodes.
 
     Raises:
       InputError: metrics missing, of unequal or wrong shape, not finite or out of range, or an L* below 1.
     """
-    best_lengths, strata = np.asarray(best_lengths), np.asarray(strata)
     if set(metrics) != set(_SCALES):
         raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_SCALES)}")
     scaled = {name: _to_report_units(name, metrics[name]) for name in _SCALES}
     shape = scaled["sr"].shape
     if len(shape) != 2 or {values.shape for values in scaled.values()} != {shape}:
         raise InputError("metrics differ in shape; give each as [seeds, episodes]")
-    if best_lengths.shape != shape[1:] or strata.shape != shape[1:]:
-        raise InputError(f"best_lengths {best_lengths.shape} and strata {strata.shape} must have shape {shape[1:]}")
-    if (best_lengths < 1).any():
-        raise InputError("best_lengths holds values below 1; drop episodes whose goal no pose can see")
+    if episodes.best_length.shape != shape[1:]:
+        raise InputError(f"metrics have {shape[1]} episodes, and the list {len(episodes.best_length)}; give as many")
+    if (episodes.best_length < 1).any():
+        raise InputError("best_length holds values below 1; drop episodes whose goal no pose can see")
 
     buckets: dict[str, dict[str, Any]] = {}
     for name, shortest in _BUCKETS.items():
-        kept = best_lengths >= shortest
+        kept = episodes.best_length >= shortest
         buckets[name] = {"episodes": int(kept.sum())}
         if kept.any():
+            scenes = scene_clusters(episodes.plan[kept], episodes.room[kept])
             for metric, values in scaled.items():
-                buckets[name][metric] = _plain(summary(values[:, kept], strata[kept], generator))
+                interval = summary(values[:, kept], scenes, trained=variant not in UNTRAINED)
+                buckets[name][metric] = interval.to_json()
     identity = {"variant": variant, "method": method, "world": world, "split": split}
     setting = {"epsilon": epsilon, "decoding": decoding, "form": form}
     return {**identity, **setting, "seeds": shape[0], **buckets["L>=1"], "buckets": buckets}
@@ -97,9 +97,8 @@ def build_difference(
     epsilon: float | None,
     form: Form | None,
     decoding: Decoding,
-    strata: np.ndarray,
-    generator: np.random.Generator,
-    same_seeds: bool = False,
+    episodes: EpisodeList,
+    same_runs: bool = False,
 ) -> dict[str, Any]:
     """Build one paired difference of a metric.
 
@@ -112,31 +111,36 @@ def build_difference(
       epsilon: threshold of the sTDE, None where there is none.
       form: how the compared variant combines counterfactual logits, None where there are none.
       decoding: how actions are taken from logits, in both.
-      strata: int [E], stratum (room type) of each episode.
-      generator: source of the bootstrap resamples.
-      same_seeds: whether equal seed indexes mean the same network (see `paired_difference`).
+      episodes: the E episodes.
+      same_runs: whether equal seed indexes mean the same network (see `paired_difference`).
 
     Raises:
       InputError: results of unequal or wrong shape, not finite or out of range.
     """
     (source, a), (target, b) = reference, compared
     a, b = _to_report_units(metric, a), _to_report_units(metric, b)
-    difference = paired_difference(a, b, strata, generator, same_seeds=same_seeds)
+    difference = paired_difference(a, b, episodes.clusters(), same_runs=same_runs)
     identity = {"metric": metric, "from": source, "to": target, "epsilon": epsilon, "form": form}
-    return {**identity, "decoding": decoding, "mean": difference.mean, "ci95": list(difference.ci95)}
+    return {**identity, "decoding": decoding, **difference.to_json()}
 
 
 def build_report(
-    rows: list[dict[str, Any]], differences: list[dict[str, Any]], compilations: int, run: dict[str, Any]
+    rows: list[dict[str, Any]],
+    differences: list[dict[str, Any]],
+    notes: list[str],
+    compilations: int,
+    run: dict[str, Any],
 ) -> dict[str, Any]:
     """Build the report.
 
-    It holds rows, differences, the number of compilations that the evaluation took, settings, versions and format.
+    It holds rows, differences, notes, the number of compilations that the evaluation took, settings, versions and
+    format.
     """
     return {
         "run": run,
         "rows": rows,
         "differences": differences,
+        "notes": notes,
         "compilations": compilations,
         "versions": versions(),
         "format": FORMAT,
@@ -174,7 +178,3 @@ def _to_report_units(metric: Metric, values: np.ndarray) -> np.ndarray:
         unit = "metres, at least 0" if metric == "dts" else "fractions from 0 to 1"
         raise InputError(f"{metric} holds NaN or values out of range; give {unit}")
     return values * _SCALES[metric]
-
-
-def _plain(result: Summary) -> dict[str, Any]:
-    return {"mean": result.mean, "std": result.std, "ci95": list(result.ci95)}

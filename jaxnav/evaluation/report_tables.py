@@ -5,13 +5,15 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from jaxnav.evaluation.statistics import Interval
+
 _COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
 
 
 def console_table(report: dict[str, Any]) -> Table:
     """Make the table for a terminal.
 
-    A line per row, `mean ± std [95 % interval]`, under a header per world, split and decoding.
+    A line per row, `mean [95 % interval]`, under a header per world, split and decoding.
     """
     table = Table("Variant", *(title for title, _ in _COLUMNS.values()))
     for heading, lines in _groups(report).items():
@@ -32,8 +34,7 @@ def difference_table(report: dict[str, Any]) -> Table:
         compared = _label({**entry, "variant": entry["to"], "method": ""})
         reference = "+ w" if entry["from"] == "layout" else entry["from"]
         _, digits = _COLUMNS[entry["metric"]]
-        low, high = entry["ci95"]
-        cell = f"{entry['mean']:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+        cell = f"{Interval.from_json(entry):+.{digits}f}"
         lines.setdefault((f"{compared} - {reference}", entry["decoding"]), []).append(cell)
     table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in _COLUMNS.values()))
     for names, cells in lines.items():
@@ -42,11 +43,12 @@ def difference_table(report: dict[str, Any]) -> Table:
 
 
 def markdown_table(report: dict[str, Any]) -> str:
-    """Make the table in Markdown, ending with a newline."""
+    """Make the table in Markdown, with its notes, ending with a newline."""
     lines = [("Variant", *(title for title, _ in _COLUMNS.values())), ("---", *("---:" for _ in _COLUMNS))]
     for heading, group in _groups(report).items():
         lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    table = "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return table + "".join(f"\n{note}\n" for note in report["notes"])
 
 
 def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
@@ -54,7 +56,10 @@ def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
     groups: dict[str, list[tuple[str, ...]]] = {}
     for row in report["rows"]:
         heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
-        cells = (_label(row), *(_cell(row[metric], digits) for metric, (_, digits) in _COLUMNS.items()))
+        cells = (
+            _label(row),
+            *(f"{Interval.from_json(row[metric]):.{digits}f}" for metric, (_, digits) in _COLUMNS.items()),
+        )
         groups.setdefault(heading, []).append(cells)
     return groups
 
@@ -74,8 +79,3 @@ def _label(row: dict[str, Any]) -> str:
         case _:
             label = f"+ w + sTDE (eps={row['epsilon']:g})"
     return label + (", paper form" if row["variant"] == "stde" and row["form"] == "paper" else "")
-
-
-def _cell(metric: dict[str, Any], digits: int) -> str:
-    low, high = metric["ci95"]
-    return f"{metric['mean']:.{digits}f} ± {metric['std']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

@@ -61,12 +61,14 @@ class LayoutConfig:
       setting: of the estimator.
       strength, reduction: of the prior's rows, and over rows in the gap; None: whatever makes the gap run as in the
         paper in the training scenes. Of no use to `paper` and `released`.
+      prior: one for each `room` type, which tells the policy the type of the room; or all rooms `pooled` into one.
       walks, steps: random walks and their steps that collect the prior in the training scenes.
     """
 
     setting: Literal["paper", "released", "calibrated"] = "calibrated"
     strength: float | None = None
     reduction: Reduction | None = None
+    prior: Literal["room", "pooled"] = "room"
     walks: int = 2048
     steps: int = 100
 

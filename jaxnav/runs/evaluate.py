@@ -15,10 +15,11 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Evaluator, Outcome
 from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.notes import notes
 from jaxnav.evaluation.report import Form, build_difference, build_report, build_row, write_report
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.runs.directory import Run, settings
-from jaxnav.runs.policies import Policies
+from jaxnav.runs.policies import EstimatorName, Policies
 from jaxnav.runs.worlds import CompiledWorld, evaluation_shift, evaluation_world, read_ahead
 from jaxnav.store.files import write_atomic
 
@@ -67,6 +68,7 @@ def evaluate(
     episodes: int = 1000,
     epsilon: Sequence[float] | np.ndarray = (0.5,),
     form: Sequence[Form] | None = None,
+    setting: EstimatorName | None = None,
     seed: int = 0,
     console: Console | None = None,
 ) -> Results:
@@ -80,7 +82,8 @@ def evaluate(
       episodes: in the fixed list, balanced over room types and scenes.
       epsilon: thresholds of sTDE.
       form: how sTDE combines the logits; None for that of the run's layout setting.
-      seed: of the episode list, the sampled actions and the bootstrap, from 0 to 2**32 - 1.
+      setting: layout estimator to use instead of the run's; see `Policies.estimating`.
+      seed: of the episode list and the sampled actions, from 0 to 2**32 - 1.
       console: to tell of progress on; None for silence.
 
     Raises:
@@ -88,7 +91,7 @@ def evaluate(
     """
     check_seed(seed)
     console = console or Console(quiet=True)
-    config, policies = run.config, run.policies()
+    config, policies = run.config, run.policies().estimating(setting)
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
@@ -102,11 +105,13 @@ def evaluate(
         "evaluation_source": str(scenes or config.source),
         "evaluation_shift": evaluation_shift(config, scenes, shift),
         "evaluation_seed": seed,
+        "evaluation_setting": setting,
     }
     results = Results(rows, outcome, together(lists), world.env.categories, {})
     names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
-    table, differences = _table(results, names, seed), _differences(results, seed)
-    return results._replace(report=build_report(table, differences, compilations, about))
+    table, differences = _table(results, names), _differences(results)
+    told = notes(rows, results.metrics()["sr"], results.episodes, room_prior=config.layout.prior == "room")
+    return results._replace(report=build_report(table, differences, told, compilations, about))
 
 
 def run_rows(
@@ -157,11 +162,8 @@ def _with_oracle(outcome: Outcome, shortest: Outcome) -> Outcome:
     return jax.tree.map(added, outcome, shortest)
 
 
-def _table(results: Results, names: dict[str, str], seed: int) -> list[dict[str, Any]]:
-    """Make the table.
-
-    Resamples are equal for every row, so that equal results get equal intervals.
-    """
+def _table(results: Results, names: dict[str, str]) -> list[dict[str, Any]]:
+    """Make the table."""
     metrics = results.metrics()
     return [
         build_row(
@@ -171,15 +173,13 @@ def _table(results: Results, names: dict[str, str], seed: int) -> list[dict[str,
             decoding=row.decoding,
             form=row.form,
             metrics={name: values[i] for name, values in metrics.items()},
-            best_lengths=results.episodes.best_length,
-            strata=results.episodes.room,
-            generator=np.random.default_rng(seed),
+            episodes=results.episodes,
         )
         for i, row in enumerate(results.rows)
     ]
 
 
-def _differences(results: Results, seed: int) -> list[dict[str, Any]]:
+def _differences(results: Results) -> list[dict[str, Any]]:
     """Make the paired differences of rows that are there."""
     metrics, rows = results.metrics(), results.rows
     differences = []
@@ -198,9 +198,8 @@ def _differences(results: Results, seed: int) -> list[dict[str, Any]]:
                 epsilon=row.epsilon,
                 form=row.form,
                 decoding=row.decoding,
-                strata=results.episodes.room,
-                generator=np.random.default_rng(seed),
-                same_seeds=reference == "layout",
+                episodes=results.episodes,
+                same_runs=reference == "layout",
             )
             for metric in ("sr", "spl", "dts")
         ]

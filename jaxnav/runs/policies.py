@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,17 +12,22 @@ import numpy as np
 
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
-from jaxnav.layout import Setting
+from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.config import RunConfig
 from jaxnav.store.export import export_params, load_params
 from jaxnav.store.manifest import differences
+from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import Exploration
 
 #: Folder of the exported policies in a run directory.
 POLICIES = "policies"
+#: How the gap is measured: as a run's layout setting has it, or in one of two other ways.
+Gap = Literal["novelty", "evidence", "clock"]
+#: Layout estimators that a run can be evaluated with, besides that of its training.
+EstimatorName = Literal["paper", "released", "evidence", "clock"]
 
 
 class Policies(NamedTuple):
@@ -56,9 +61,43 @@ class Policies(NamedTuple):
         first = self.seeds * self.arms.index(arm)
         return jax.tree.map(lambda leaf: leaf[first : first + self.seeds], self.params)
 
+    def estimating(self, name: EstimatorName | None) -> "Policies":
+        """Return these policies beside another layout estimator.
+
+        Args:
+          name: `evidence` and `clock` measure the gap in another way and leave the layout's weights; `paper` and
+            `released` make weights too; None changes nothing.
+
+        Raises:
+          InputError: none of the policies uses the layout.
+        """
+        if name is None:
+            return self
+        if self.setting is None:
+            raise InputError(f"--setting {name}: needs policies with the layout; train a run with the arm `layout`")
+        if name in ("evidence", "clock"):
+            return self._replace(setting=gap_settings(self.setting)[name])
+        setting = SETTINGS[name]
+        return self._replace(
+            setting=setting, knowledge=self.knowledge._replace(layout=layout_priors(self.counts, setting))
+        )
+
     def acting(self, env: ObjectNav) -> Acting:
         """Return how they act in an environment."""
         return Acting(env, self.spec, self.setting)
+
+
+def gap_settings(setting: Setting) -> dict[Gap, Setting]:
+    """Return the settings that measure the gap in each way.
+
+    None changes the layout's weights. `clock` is what the gap of the released code comes to: all at once when something
+    new is seen, then gone in steps.
+    """
+    return {
+        "novelty": setting,
+        "evidence": dataclasses.replace(setting, gap="evidence"),
+        "clock": dataclasses.replace(setting, gap="clock", passes=SETTINGS["released"].passes),
+    }
 
 
 def load_policies(run: RunConfig, arms: Sequence[str] | None = None) -> Policies:

@@ -122,7 +122,10 @@ def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
         walk(world.env, params, jax.random.fold_in(key, bank), walks, config.layout.steps)
         for bank, params in enumerate(read_ahead(world, range(len(world.banks))))
     ]
-    return jax.tree.map(lambda *parts: sum(parts), *explored)
+    whole = jax.tree.map(lambda *parts: sum(parts), *explored)
+    if config.layout.prior == "room":
+        return whole
+    return whole._replace(counts=jax.numpy.broadcast_to(whole.counts.sum(axis=0), whole.counts.shape))
 
 
 def calibrate_setting(config: RunConfig, world: CompiledWorld, explored: Exploration, console: Console) -> Setting:

@@ -6,6 +6,7 @@ looks along +z. The floor is at y = 0.
 """
 
 import dataclasses
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,11 @@ CELL = 0.25
 
 #: What scenes are divided into.
 SPLITS = ("train", "val", "test")
+
+#: Names of scenes that share their walls with others: apartments, and rooms with their objects moved.
+_FURNISHED = re.compile(
+    r"(FloorPlan_[A-Za-z]+[0-9]+)_[0-9]+|((?:train|val|test)-apartment-[0-9]+)-[0-9]+|(.+)-replaced-[0-9]+"
+)
 
 
 class Room(NamedTuple):
@@ -60,6 +66,18 @@ class Scene:
     yaws: np.ndarray
     parents: np.ndarray
     rooms: tuple[Room, ...] = ()
+
+
+def floor_plan(name: str) -> str:
+    """Return the floor plan that a scene's name tells.
+
+    Scenes of one floor plan are alike, and count as one in statistics: `FloorPlan_Train3_1` and `FloorPlan_Train3_5`,
+    `val-apartment-02-0` and `val-apartment-02-4`, `FloorPlan7` and `FloorPlan7-replaced-2`. Any other scene has a floor
+    plan of its own, which has its name.
+    """
+    while match := _FURNISHED.fullmatch(name):
+        name = next(filter(None, match.groups()))
+    return name
 
 
 def extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

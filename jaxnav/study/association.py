@@ -1,8 +1,7 @@
 """Success and gain against layout similarity (Figs. 4 and 5).
 
 Similarity is the cosine of a category's co-occurrence in a scene and in the prior: of rows i of `expected(counts)`.
-Every correlation and slope weighs each point by its number of episodes. Intervals are 95 % percentile bootstrap ones
-over scenes, drawn within room types; training seeds are averaged over and not drawn.
+Every correlation and slope weighs each point by its number of episodes. Intervals are over scenes and training runs.
 """
 
 from collections.abc import Sequence
@@ -12,8 +11,8 @@ import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.similarity import expected
-from jaxnav.study.bootstrap import RESAMPLES, scene_draws, weight_below
-from jaxnav.study.intervals import percentile_interval
+from jaxnav.evaluation.statistics import jackknife, training_runs
+from jaxnav.study.ranks import weight_below
 from jaxnav.study.records import GainBySimilarity, SuccessBySimilarity
 
 
@@ -38,13 +37,8 @@ class SimilarityPoints(NamedTuple):
     episodes: EpisodeList
 
     def means(self, values: np.ndarray) -> np.ndarray:
-        """Return means [P] of values [E]."""
-        return self.member @ values.astype(np.float64) / self.num_episodes
-
-    def weights(self, generator: np.random.Generator, resamples: int) -> np.ndarray:
-        """Return each point's episodes by resample, [P, 1 + R]."""
-        (draws,) = scene_draws([self.episodes], generator, resamples)
-        return self.member @ draws.astype(np.float64)
+        """Return means [P, ...] of values [E, ...]."""
+        return ((self.member @ values.astype(np.float64)).T / self.num_episodes).T
 
 
 def similarity_points(episodes: EpisodeList, counts: np.ndarray, prior: np.ndarray) -> SimilarityPoints:
@@ -73,70 +67,64 @@ def similarity_points(episodes: EpisodeList, counts: np.ndarray, prior: np.ndarr
     )
 
 
-def success_by_similarity(
-    points: SimilarityPoints, success: np.ndarray, generator: np.random.Generator, resamples: int = RESAMPLES
-) -> SuccessBySimilarity:
+def success_by_similarity(points: SimilarityPoints, success: np.ndarray) -> SuccessBySimilarity:
     """Relate success to layout similarity.
 
     Args:
       points: pairs of scene and category.
-      success: bool or float [S, E], by seed and episode.
-      generator: source of the resamples.
-      resamples: their number.
+      success: bool or float [S, E], by training run and episode.
     """
-    rate = points.means(success.mean(axis=0))
-    weights = points.weights(generator, resamples)
-    similarity_ranks, success_ranks = (weight_below(values, values, weights) for values in (points.similarity, rate))
+    scenes, runs = points.episodes.clusters(), training_runs(1, len(success))
+    weights = points.member @ scenes.weights  # [P, 1 + C]
+    rates = points.means(success.T @ runs.weights / len(success))  # [P, 1 + R]
+    similarity_ranks = weight_below(points.similarity, points.similarity, weights)
+    pearson = [_line(points.similarity[:, None], rate[:, None], weights)[1] for rate in rates.T]
+    spearman = [_line(similarity_ranks, weight_below(rate, rate, weights), weights)[1] for rate in rates.T]
     return SuccessBySimilarity(
         category=points.category,
         scene=points.scene,
         episodes=points.num_episodes,
         similarity=points.similarity,
-        success=rate,
+        success=rates[:, 0],
         left_out=points.left_out,
-        pearson=percentile_interval(_line(points.similarity[:, None], rate[:, None], weights)[1]),
-        spearman=percentile_interval(_line(similarity_ranks, success_ranks, weights)[1]),
+        pearson=jackknife(np.stack(pearson), scenes, runs),
+        spearman=jackknife(np.stack(spearman), scenes, runs),
     )
 
 
 def gain_by_similarity(
-    points: SimilarityPoints,
-    baseline: np.ndarray,
-    variant: np.ndarray,
-    categories: Sequence[str],
-    generator: np.random.Generator,
-    resamples: int = RESAMPLES,
+    points: SimilarityPoints, baseline: np.ndarray, variant: np.ndarray, categories: Sequence[str]
 ) -> GainBySimilarity:
     """Relate a variant's gain to layout similarity.
 
     Args:
       points: pairs of scene and category.
-      baseline, variant: bool or float [S, E], success by seed and episode.
+      baseline, variant: bool or float [S, E], success by training run and episode; trained apart.
       categories: [K], names.
-      generator: source of the resamples.
-      resamples: their number.
     """
-    before, after = (100.0 * points.means(success.mean(axis=0)) for success in (baseline, variant))
-    weights = points.weights(generator, resamples)
+    scenes, runs = points.episodes.clusters(), training_runs(2, len(baseline))
+    weights = points.member @ scenes.weights
     category = np.unique(points.category)
     member = (category[:, None] == points.category).astype(np.float64)  # [C, P]
     total = member @ weights
 
     def means(values: np.ndarray) -> np.ndarray:
-        # By category, [C, 1 + R]; 0 where no scene of the category is drawn, at weight 0.
-        return member @ (weights * values[:, None]) / np.maximum(total, 1.0)
+        # By category, [C, 1 + scenes]; 0 where the only scene of a category is left out, at weight 0.
+        return np.divide(member @ (weights * values[:, None]), total, out=np.zeros_like(total), where=total > 0)
 
-    similarity, gain = means(points.similarity), means(after - before)
-    slope, pearson = _line(similarity, gain, total)
+    success = 100.0 * np.concatenate([-baseline.astype(np.float64), variant])  # a sum of both arms is the gain
+    gains = points.means(success.T @ runs.weights / len(baseline))  # [P, 1 + R]
+    similarity = means(points.similarity)
+    slope, pearson = np.stack([_line(similarity, means(gain), total) for gain in gains.T], axis=1)
     return GainBySimilarity(
         category=category,
         episodes=(member @ points.num_episodes).astype(int),
         similarity=similarity[:, 0],
-        baseline=means(before)[:, 0],
-        gain=gain[:, 0],
+        baseline=means(100.0 * points.means(baseline.mean(axis=0)))[:, 0],
+        gain=means(gains[:, 0])[:, 0],
         left_out=points.left_out,
-        slope=percentile_interval(0.1 * slope),
-        pearson=percentile_interval(pearson),
+        slope=jackknife(0.1 * slope, scenes, runs),
+        pearson=jackknife(pearson, scenes, runs),
         categories=tuple(np.asarray(categories)[category].tolist()),
     )
 

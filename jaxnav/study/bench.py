@@ -1,6 +1,5 @@
 """Evaluation of trials with the policies of a run."""
 
-import dataclasses
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -11,13 +10,13 @@ from rich.console import Console
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list
 from jaxnav.evaluation.grid import Evaluator, Outcome
-from jaxnav.layout import SETTINGS, Setting
+from jaxnav.layout import Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.runs.config import ARMS, RunConfig
-from jaxnav.runs.policies import Policies, load_policies
+from jaxnav.runs.policies import Gap, Policies, gap_settings, load_policies
 from jaxnav.runs.worlds import CompiledWorld, evaluation_world
 from jaxnav.study.config import StudyConfig
-from jaxnav.study.trials import Gap, Trial, trial_grid
+from jaxnav.study.trials import Trial, trial_grid
 
 
 class Subject(NamedTuple):
@@ -106,16 +105,3 @@ def layout_setting(policies: Policies) -> Setting:
     if policies.setting is None:
         raise InputError("study: needs policies with the layout; train a run with the arm `layout`")
     return policies.setting
-
-
-def gap_settings(setting: Setting) -> dict[Gap, Setting]:
-    """Return the settings that measure the gap in each way.
-
-    None changes the layout's weights. `clock` is what the gap of the released code comes to: all at once when something
-    new is seen, then gone in steps.
-    """
-    return {
-        "novelty": setting,
-        "evidence": dataclasses.replace(setting, gap="evidence"),
-        "clock": dataclasses.replace(setting, gap="clock", passes=SETTINGS["released"].passes),
-    }

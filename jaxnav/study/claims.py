@@ -3,8 +3,10 @@
 import math
 from typing import NamedTuple
 
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.curves import GapCourse
-from jaxnav.study.intervals import Interval
+from jaxnav.study.design import Design
+from jaxnav.study.records import SceneEffects
 from jaxnav.study.results import StudyResults
 from jaxnav.study.trials import NO_THRESHOLD, THRESHOLD, Trial
 
@@ -31,11 +33,14 @@ class Claim(NamedTuple):
     def verdict(self) -> str:
         """Return whether the claim holds.
 
-        It holds if the interval lies above 0; it does not if the interval lies below what would matter.
+        An interval below 0 refutes it; one below `least` shows that the effect is too small to matter, whatever its
+        sign; one above 0 confirms it; anything else leaves it open.
         """
-        if self.effect.low > 0:
-            return "holds" if self.effect.high >= self.least else "holds, but is small"
-        return "does not hold" if self.effect.high < self.least else "cannot be told here"
+        if self.effect.high < 0:
+            return "refuted"
+        if self.effect.high < self.least:
+            return "too small to matter"
+        return "holds" if self.effect.low > 0 else "cannot be told"
 
 
 def claims(results: StudyResults, world: str = "main") -> list[Claim]:
@@ -85,7 +90,7 @@ def _effects_of_stde(results: StudyResults, world: str) -> list[Claim]:
         ),
         _points(
             "The gain of sTDE (epsilon 0.5) grows with the shift",
-            _independent_difference(last.effect(STDE), first.effect(STDE)),
+            _growth(first.effects, last.effects),
         ),
     ]
 
@@ -114,11 +119,10 @@ def _points(text: str, effect: Interval) -> Claim:
     return Claim(text, "SR points", effect, 2.0)
 
 
-def _independent_difference(a: Interval, b: Interval) -> Interval:
-    """Return a - b, taken for independent normal variables.
-
-    They are so only nearly.
-    """
-    half = math.hypot(*((effect.high - effect.low) / 2 for effect in (a, b)))
-    mean = a.mean - b.mean
-    return Interval(mean, mean - half, mean + half)
+def _growth(first: SceneEffects | None, last: SceneEffects | None) -> Interval:
+    """Return how much an effect grows, scenes and runs shared."""
+    if first is None or last is None:
+        return Interval(math.nan)
+    design = Design.of([(each.scenes, each.rooms) for each in (first, last)], len(first.gain))
+    start, end = (design.means(each.gain, each.episodes, each.scenes) for each in (first, last))
+    return design.interval(end - start)

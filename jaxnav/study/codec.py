@@ -1,13 +1,11 @@
 """Frozen dataclasses as JSON.
 
 Keys are the names of the fields. Metadata of a field changes this: `INLINE` puts the keys of its value among those of
-the record, `OPTIONAL` leaves out None, and `key("from")` gives another name. An `Interval` is
-`{"mean": m, "ci95": [low, high], ...}`, with null for what is undefined.
+the record, `OPTIONAL` leaves out None, and `key("from")` gives another name. An `Interval` has a form of its own.
 """
 
 import dataclasses
 import functools
-import math
 import types
 import typing
 from collections.abc import Mapping
@@ -15,13 +13,12 @@ from typing import Any, TypeVar, Union
 
 import numpy as np
 
-from jaxnav.study.intervals import Interval
+from jaxnav.evaluation.statistics import Interval
 
 Record = TypeVar("Record")
 
 INLINE = types.MappingProxyType({"inline": True})
 OPTIONAL = types.MappingProxyType({"optional": True})
-_INTERVAL_KEYS = ("mean", "std", "ci95", "seeds")
 
 
 def key(name: str) -> dict[str, str]:
@@ -32,11 +29,11 @@ def key(name: str) -> dict[str, str]:
 def to_json(value: Any) -> Any:
     """Return a record, or what it holds, as JSON."""
     if isinstance(value, Interval):
-        return _interval_to_json(value)
+        return value.to_json()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _record_to_json(value)
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return np.where(np.isnan(value), None, value).tolist()
     if isinstance(value, Mapping):
         return {name: to_json(item) for name, item in value.items()}
     return [to_json(item) for item in value] if isinstance(value, list | tuple) else value
@@ -64,13 +61,6 @@ def _record_to_json(record: Any) -> dict[str, Any]:
     return data
 
 
-def _interval_to_json(interval: Interval) -> dict[str, Any]:
-    mean, *bounds = (value if interval.defined else None for value in (interval.mean, interval.low, interval.high))
-    rest = {field.name: to_json(getattr(interval, field.name)) for field in dataclasses.fields(interval)[3:]}
-    data = {"mean": mean, "ci95": bounds, **rest}
-    return {name: data[name] for name in _INTERVAL_KEYS if name in data}
-
-
 def _decoded(kind: Any, value: Any) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if value is None or kind is Any:
@@ -82,9 +72,10 @@ def _decoded(kind: Any, value: Any) -> Any:
     if origin is Mapping:
         return {name: _decoded(arguments[1], item) for name, item in value.items()}
     if kind is np.ndarray:
-        return np.asarray(value)
-    if isinstance(kind, type) and issubclass(kind, Interval):
-        return _interval(kind, value)
+        array = np.asarray(value)
+        return array.astype(np.float64) if array.dtype == object else array  # null is NaN
+    if kind is Interval:
+        return Interval.from_json(value)
     return _record(kind, value) if dataclasses.is_dataclass(kind) else value
 
 
@@ -98,12 +89,6 @@ def _record(kind: Any, data: Mapping[str, Any]) -> Any:
         elif _key(field) in data or not field.metadata.get("optional"):
             values[field.name] = _decoded(hints[field.name], data[_key(field)])
     return kind(**values)
-
-
-def _interval(kind: type[Interval], data: Mapping[str, Any]) -> Interval:
-    bounds = (math.nan if value is None else value for value in (data["mean"], *data["ci95"]))
-    rest = [field.name for field in dataclasses.fields(kind)[3:]]
-    return kind(*bounds, **{name: _decoded(_hints(kind)[name], data[name]) for name in rest})
 
 
 def _key(field: dataclasses.Field) -> str:

@@ -26,7 +26,7 @@ class StudyConfig:
       epsilon: thresholds of sTDE.
       episodes: number at each shift.
       steps: length of the gap curves.
-      seed: of episode lists, sampled actions and bootstraps.
+      seed: of episode lists and sampled actions.
       base: settings that all runs share.
     """
 

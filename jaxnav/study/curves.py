@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.codec import INLINE
-from jaxnav.study.intervals import Interval
 
 #: Whether a belief is updated by what is seen (eq. 4), or left at the prior.
 Belief = Literal["updated", "frozen"]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.study.bootstrap import stratified_draws
+from jaxnav.study.design import Design
 from jaxnav.study.instrument_report import (
     BASELINES,
     LOSS,
@@ -18,7 +18,6 @@ from jaxnav.study.instrument_report import (
     Measure,
     MeasuredShift,
 )
-from jaxnav.study.intervals import percentile_interval
 
 
 class Totals(NamedTuple):
@@ -37,63 +36,48 @@ class Totals(NamedTuple):
     names: tuple[str, ...]
 
 
-def compare(shifts: Sequence[float], totals: Sequence[Totals], seed: int) -> InstrumentReport:
+def compare(shifts: Sequence[float], totals: Sequence[Totals]) -> InstrumentReport:
     """Compare all shifts with the first.
-
-    Intervals are 95 % bootstrap ones. A resample draws scenes within each room type and training seeds; a drawn scene
-    is there at all shifts, with its twins, and so is a drawn seed.
 
     Args:
       shifts: layout shifts, rising.
-      totals: measures at each.
-      seed: of the resamples.
+      totals: measures at each; all share training runs, and scenes of equal floor plan.
 
     Raises:
       InputError: a measure of difficulty is 0 at the first shift.
     """
-    means = _means(totals, seed)
+    design = Design.of([(each.names, each.rooms) for each in totals], len(totals[0].values[BASELINES[0]]))
+    means = {
+        measure: [
+            design.means(each.values[measure], each.weights[measure], each.names, trained=measure in BASELINES)
+            for each in totals
+        ]
+        for measure in MEASURES
+    }
     table = tuple(
         MeasuredShift(
             shift=shift,
             scenes=len(at_shift.names),
             episodes=int(at_shift.weights["frontier_sr"].sum()),
-            measures={measure: percentile_interval(means[measure][i]) for measure in MEASURES},
+            measures={measure: design.interval(means[measure][i]) for measure in MEASURES},
         )
         for i, (shift, at_shift) in enumerate(zip(shifts, totals, strict=True))
     )
-    matched = tuple(change for measure in MATCHED for change in _changes(measure, shifts, means[measure]))
+    matched = tuple(change for measure in MATCHED for change in _changes(measure, shifts, means[measure], design))
     losses = []
     for measure in BASELINES:
-        loss = percentile_interval(means[measure][0] - means[measure][-1])
+        loss = design.interval(means[measure][0] - means[measure][-1])
         losses.append(Change(measure, shifts[0], shifts[-1], loss, holds=loss.mean >= LOSS and loss.low > 0))
     return InstrumentReport(shifts=table, matched=matched, discriminating=tuple(losses))
 
 
-def _means(totals: Sequence[Totals], seed: int) -> dict[Measure, list[np.ndarray]]:
-    """Return means [1 + R] by measure and shift."""
-    names = sorted({name for at_shift in totals for name in at_shift.names})
-    rooms = {name: room for at_shift in totals for name, room in zip(at_shift.names, at_shift.rooms, strict=True)}
-    seeds = len(totals[0].values[BASELINES[0]])
-    generator = np.random.default_rng(seed)
-    scene_draws = stratified_draws(np.array([rooms[name] for name in names]), generator)
-    seed_draws = stratified_draws(np.zeros(seeds), generator).T / seeds
-
-    def mean(measure: Measure, at_shift: Totals) -> np.ndarray:
-        values = at_shift.values[measure]
-        scenes = np.ascontiguousarray(scene_draws[np.searchsorted(names, at_shift.names)].T)
-        sums = scenes @ values.T
-        return (sums * (seed_draws if len(values) > 1 else 1.0)).sum(axis=1) / (scenes @ at_shift.weights[measure])
-
-    return {measure: [mean(measure, at_shift) for at_shift in totals] for measure in MEASURES}
-
-
-def _changes(measure: Measure, shifts: Sequence[float], means: Sequence[np.ndarray]) -> list[Change]:
+def _changes(measure: Measure, shifts: Sequence[float], means: Sequence[np.ndarray], design: Design) -> list[Change]:
     """Return the changes in percent from the first shift."""
     first, *others = means
-    if not first[0]:
+    if not first.flat[0]:
         raise InputError(f"{measure} is 0 at shift {shifts[0]:g}: nothing to compare with; give more --episodes")
     changes = []
     for shift, mean in zip(shifts[1:], others, strict=True):
-        change = percentile_interval(100.0 * (mean - first) / first[0])
+        change = design.interval(100.0 * (mean - first) / first)
         changes.append(Change(measure, shifts[0], shift, change, holds=abs(change.mean) <= TOLERANCE))
     return changes

@@ -64,10 +64,11 @@ def _head(results: StudyResults, reading: str) -> list[str]:
         "# The study: the paper's claims put to the test",
         "",
         f"{results.seeds} seeds, {results.total_steps:,} steps a policy, {results.episodes:,} episodes at each shift, "
-        "split `val`. Intervals are of 95 %, over seeds and scenes, not corrected for their number. Made by "
-        "`python eval.py study`: every number comes from the results; all but the reading is written by the command.",
+        "split `val`. Intervals are of 95 %, over training runs and scenes (statistics.md), not corrected for their "
+        "number. `least` is the least effect that would matter. All but the summary is written by `jaxnav study`, from "
+        "the results.",
         "",
-        "## Reading",
+        "## Summary",
         "",
         READING + reading + READING,
         "",

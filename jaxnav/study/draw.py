@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import Form
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.figures import (
     auc_figure,
     effects_figure,
@@ -15,7 +16,6 @@ from jaxnav.study.figures import (
     gap_figure,
     similarity_figure,
 )
-from jaxnav.study.intervals import Interval
 from jaxnav.study.records import Condition, TrialRow
 from jaxnav.study.results import WorldResults, load_results
 from jaxnav.study.style import save_figure

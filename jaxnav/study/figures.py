@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxnav.evaluation.report import Form
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.curves import AucPanel, Belief, Curve, GapCourse
-from jaxnav.study.intervals import Interval
 from jaxnav.study.records import GainBySimilarity, Metric, SuccessBySimilarity, TrialRow
 from jaxnav.study.style import (
     BAR,

@@ -7,9 +7,9 @@ from rich.console import Console
 
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.policies import Policies, load_policies
+from jaxnav.runs.policies import Policies, gap_settings, load_policies
 from jaxnav.runs.worlds import evaluation_world
-from jaxnav.study.bench import gap_settings, layout_setting, study_episodes
+from jaxnav.study.bench import layout_setting, study_episodes
 from jaxnav.study.config import StudyConfig
 from jaxnav.study.curves import AucLine, AucPanel, Belief, GapCourse, GapLine, GapPanel
 from jaxnav.study.gap_statistics import auc_by_step, mean_by_step
@@ -33,8 +33,8 @@ def gap_course(run: RunConfig, config: StudyConfig, console: Console) -> GapCour
     policies = load_policies(run)
     settings = _settings(layout_setting(policies))
     traces = _shortest([_traces(run, config, shift, policies, settings, console) for shift in config.shifts])
-    means = [mean_by_step(trace, np.random.default_rng(config.seed)) for trace in traces]
-    aucs = [auc_by_step(trace, traces[0], np.random.default_rng(config.seed)) for trace in traces[1:]]
+    means = [mean_by_step(trace) for trace in traces]
+    aucs = [auc_by_step(trace, traces[0]) for trace in traces[1:]]
     panels = [
         GapPanel(
             name,

@@ -4,44 +4,38 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxnav.study.bootstrap import RESAMPLES, scene_draws, stratified_draws, weight_below
+from jaxnav.evaluation.episodes import clusters_of
+from jaxnav.evaluation.statistics import jackknife, training_runs
 from jaxnav.study.curves import Curve
-from jaxnav.study.intervals import percentile_interval
+from jaxnav.study.ranks import weight_below
 from jaxnav.study.tracking import GapTraces
 
 
-def auc_by_step(
-    shifted: GapTraces, unshifted: GapTraces, generator: np.random.Generator, resamples: int = RESAMPLES
-) -> Curve:
+def auc_by_step(shifted: GapTraces, unshifted: GapTraces) -> Curve:
     """Return the AUC of the gap, shifted against unshifted episodes.
 
-    At each step it is over the episodes that still run. A resample draws scenes within each room type, twins together,
-    and policies, which both sides share.
+    At each step it is over the episodes that still run. Both sides share scenes and policies.
 
     Args:
       shifted: traces at the greater shift.
       unshifted: of the same policies, settings and number of steps, at the smaller one.
-      generator: source of the resamples.
-      resamples: their number.
 
     Returns:
       Leaves [settings, 2, T + 1]; NaN where nothing runs.
     """
-    return _by_step(weighted_auc, [shifted, unshifted], generator, resamples)
+    return _by_step(weighted_auc, [shifted, unshifted])
 
 
-def mean_by_step(traces: GapTraces, generator: np.random.Generator, resamples: int = RESAMPLES) -> Curve:
+def mean_by_step(traces: GapTraces) -> Curve:
     """Return the mean gap over the episodes that still run.
 
     Args:
       traces: the gaps.
-      generator: source of the resamples, drawn as in `auc_by_step`.
-      resamples: their number.
 
     Returns:
       Leaves [settings, 2, T + 1]; NaN where nothing runs.
     """
-    return _by_step(_weighted_mean, [traces], generator, resamples)
+    return _by_step(_weighted_mean, [traces])
 
 
 def weighted_auc(positive: np.ndarray, negative: np.ndarray, weights: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -69,24 +63,24 @@ def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
     return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator > 0)
 
 
-def _by_step(
-    statistic: Callable[..., np.ndarray], sides: list[GapTraces], generator: np.random.Generator, resamples: int
-) -> Curve:
+def _by_step(statistic: Callable[..., np.ndarray], sides: list[GapTraces]) -> Curve:
     """Return a statistic of all sides at each step.
 
-    The weight of an episode in a resample is how often its scene is drawn times how often its policy is.
+    An episode walked by a policy counts as its scene does times as the policy does.
     """
-    policies = stratified_draws(np.zeros(len(sides[0].running)), generator, resamples).astype(np.float32)
-    draws = [
-        policies[:, None] * scenes for scenes in scene_draws([side.episodes for side in sides], generator, resamples)
+    runs, clusters = training_runs(1, len(sides[0].running)), clusters_of([side.episodes for side in sides])
+    shape = (runs.weights.shape[1], clusters[0].weights.shape[1])
+    weights = [
+        np.einsum("nr,ec->nerc", runs.weights, scenes.weights).reshape(*side.running.shape[:2], -1)
+        for scenes, side in zip(clusters, sides, strict=True)
     ]
     settings, beliefs, *_, steps = sides[0].gap.shape
     leaves = np.empty((3, settings, beliefs, steps))
     for step in range(steps):
         running = [side.running[..., step] for side in sides]
-        weights = [draw[runs] for draw, runs in zip(draws, running, strict=True)]
+        counted = [weight[now] for weight, now in zip(weights, running, strict=True)]
         for setting, belief in np.ndindex(settings, beliefs):
-            gaps = [side.gap[setting, belief, ..., step][runs] for side, runs in zip(sides, running, strict=True)]
-            interval = percentile_interval(statistic(*gaps, *weights))
+            gaps = [side.gap[setting, belief, ..., step][now] for side, now in zip(sides, running, strict=True)]
+            interval = jackknife(statistic(*gaps, *counted).reshape(shape), clusters[0], runs)
             leaves[:, setting, belief, step] = interval.mean, interval.low, interval.high
     return Curve(*leaves)

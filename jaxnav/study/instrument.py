@@ -30,7 +30,7 @@ class InstrumentConfig:
       split: scenes to evaluate on.
       episodes: number at each shift; see the evaluation.
       scenes_per_split: generated scenes of the split; default: the run's.
-      seed: of the episode lists, the sampled actions and the bootstrap.
+      seed: of the episode lists and the sampled actions.
     """
 
     run: Path
@@ -89,7 +89,7 @@ def instrument_report(config: InstrumentConfig, run: RunConfig, console: Console
         world = evaluation_world(run, config.split, None, shift, console)
         totals.append(measure_scenes(world, policies, config.episodes, config.seed))
     about = settings(run) | {"evaluation_split": config.split, "evaluation_seed": config.seed}
-    return dataclasses.replace(compare(shifts, totals, config.seed), run=about)
+    return dataclasses.replace(compare(shifts, totals), run=about)
 
 
 def _checked_run(config: InstrumentConfig) -> RunConfig:

@@ -7,8 +7,8 @@ from typing import Any, Literal
 from rich.table import Table
 from rich.text import Text
 
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.codec import INLINE, OPTIONAL, key
-from jaxnav.study.intervals import Interval
 
 Measure = Literal[
     "best_length",

@@ -10,13 +10,14 @@ from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.similarity import scene_counts
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.policies import Gap
 from jaxnav.study.association import gain_by_similarity, similarity_points, success_by_similarity
 from jaxnav.study.bench import Bench, Subject
 from jaxnav.study.config import StudyConfig
 from jaxnav.study.outcomes import TrialOutcomes, mean_weight
 from jaxnav.study.records import Condition, FullCondition, GainBySimilarity, Gains, SuccessBySimilarity
 from jaxnav.study.results import load_condition
-from jaxnav.study.trials import FORMS, THRESHOLD, USES, Control, Gap, Trial, Variant
+from jaxnav.study.trials import FORMS, THRESHOLD, USES, Control, Trial, Variant
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 GAPS: tuple[Gap, ...] = ("novelty", "evidence", "clock")
@@ -54,7 +55,7 @@ def measure_condition(run: RunConfig, full: bool, shift: float, bench: Bench, co
         shift=shift,
         world=subject.world.scenes[0].world,
         scenes=len(subject.episodes.scenes),
-        rows=tuple(outcomes.rows(bench.config.seed, "novelty")),
+        rows=tuple(outcomes.rows("novelty")),
         episodes=len(subject.episodes.goal),
         parameters=subject.parameters,
     )
@@ -83,11 +84,11 @@ def _full_condition(subject: Subject, shift: float, bench: Bench, plain: dict[Tr
     outcomes = {
         gap: TrialOutcomes(plain | _stde_outcomes(subject, gap, bench, sorted(epsilons)), episodes) for gap in GAPS
     }
-    rows = outcomes["novelty"].rows(config.seed, "novelty")
+    rows = outcomes["novelty"].rows("novelty")
     for gap in GAPS[1:]:
         # Without sTDE the gap has no effect.
-        rows += [row for row in outcomes[gap].rows(config.seed, gap) if row.trial.variant == "stde"]
-    similarity, gains = _by_similarity(subject, outcomes["novelty"], config.seed)
+        rows += [row for row in outcomes[gap].rows(gap) if row.trial.variant == "stde"]
+    similarity, gains = _by_similarity(subject, outcomes["novelty"])
     return FullCondition(
         shift=shift,
         world=subject.world.scenes[0].world,
@@ -98,6 +99,7 @@ def _full_condition(subject: Subject, shift: float, bench: Bench, plain: dict[Tr
         chosen=chosen,
         similarity=similarity,
         gains=gains,
+        effects=outcomes["novelty"].effects(Trial("stde", "argmax", *THRESHOLD), Trial("layout")),
     )
 
 
@@ -125,7 +127,7 @@ def _stde_outcomes(subject: Subject, gap: Gap, bench: Bench, epsilons: Sequence[
     return outcomes | bench.outcomes(subject, gap, constants)
 
 
-def _by_similarity(subject: Subject, outcomes: TrialOutcomes, seed: int) -> tuple[SuccessBySimilarity, Gains]:
+def _by_similarity(subject: Subject, outcomes: TrialOutcomes) -> tuple[SuccessBySimilarity, Gains]:
     """Relate success and gains to layout similarity."""
     policies, world, episodes = subject
     bank = world.banks[0]
@@ -135,7 +137,8 @@ def _by_similarity(subject: Subject, outcomes: TrialOutcomes, seed: int) -> tupl
 
     def gain(trial: Trial) -> GainBySimilarity:
         success = outcomes.success(trial)
-        return gain_by_similarity(points, baseline, success, world.env.categories, np.random.default_rng(seed))
+        return gain_by_similarity(points, baseline, success, world.env.categories)
 
-    success = success_by_similarity(points, baseline, np.random.default_rng(seed))
-    return success, Gains(gain(Trial("layout")), gain(Trial("stde", "argmax", *THRESHOLD)))
+    return success_by_similarity(points, baseline), Gains(
+        gain(Trial("layout")), gain(Trial("stde", "argmax", *THRESHOLD))
+    )

@@ -7,11 +7,10 @@ import numpy as np
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.statistics import Bootstrap
-from jaxnav.study.bootstrap import scene_draws
-from jaxnav.study.intervals import Effect, Estimate
-from jaxnav.study.records import Difference, Metric, TrialRow
-from jaxnav.study.trials import Gap, Trial, Variant
+from jaxnav.evaluation.statistics import paired_difference, summary
+from jaxnav.runs.policies import Gap
+from jaxnav.study.records import Difference, Metric, SceneEffects, TrialRow
+from jaxnav.study.trials import Trial, Variant
 
 SCALES: Mapping[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
 
@@ -31,55 +30,55 @@ class TrialOutcomes:
     """
 
     def __init__(self, outcomes: Mapping[Trial, Outcome], episodes: EpisodeList) -> None:
-        self._outcomes, self._episodes = outcomes, episodes
+        self._outcomes, self._episodes, self._scenes = outcomes, episodes, episodes.clusters()
         self._metrics = {trial: episode_metrics(each, episodes.best_length) for trial, each in outcomes.items()}
 
     def success(self, trial: Trial) -> np.ndarray:
         """Return the success of a trial, float64 [S, E]."""
         return self._metrics[trial]["sr"]
 
-    def rows(self, seed: int, gap: Gap) -> list[TrialRow]:
-        """Return a row for each trial.
+    def rows(self, gap: Gap) -> list[TrialRow]:
+        """Return a row for each trial, sTDE with this gap.
 
-        Resamples of the intervals draw training seeds, and scenes within room types with all their episodes. The
-        layout's weights are compared with the baseline, all others with the layout's weights.
-
-        Args:
-          seed: of the resamples.
-          gap: of the rows.
+        The layout's weights are compared with the baseline, all others with the layout's weights.
         """
-        generator = np.random.default_rng(seed)
-        (scenes,) = scene_draws([self._episodes], generator)
-        drawn = scenes[:, 1:].T.astype(np.float64)
-        num_seeds = len(next(iter(self._outcomes.values())).length)
-        bootstrap = Bootstrap(drawn / drawn.sum(axis=1, keepdims=True), num_seeds, generator)
-        return [self._row(trial, gap, bootstrap) for trial in self._outcomes]
+        return [
+            TrialRow(
+                gap=gap,
+                trial=trial,
+                mean_weight=mean_weight(outcome),
+                difference=self._difference(trial),
+                **{metric: summary(self._values(trial, metric), self._scenes) for metric in SCALES},
+            )
+            for trial, outcome in self._outcomes.items()
+        ]
 
-    def _row(self, trial: Trial, gap: Gap, bootstrap: Bootstrap) -> TrialRow:
-        return TrialRow(
-            gap=gap,
-            trial=trial,
-            mean_weight=mean_weight(self._outcomes[trial]),
-            difference=self._difference(trial, bootstrap),
-            **{metric: self._estimate(trial, metric, bootstrap) for metric in SCALES},
+    def effects(self, trial: Trial, reference: Trial) -> SceneEffects:
+        """Return the gain in SR of a trial on another, scene by scene."""
+        gain = 100.0 * (self.success(trial) - self.success(reference))
+        episodes = self._episodes
+        drawn, first, scene, count = np.unique(
+            episodes.scene, return_index=True, return_inverse=True, return_counts=True
+        )
+        return SceneEffects(
+            scenes=tuple(episodes.scenes[i] for i in drawn),
+            rooms=tuple(episodes.rooms[room] for room in episodes.room[first]),
+            episodes=count,
+            gain=np.stack([np.bincount(scene, row) for row in gain]),
         )
 
     def _values(self, trial: Trial, metric: Metric) -> np.ndarray:
         return SCALES[metric] * self._metrics[trial][metric]
 
-    def _estimate(self, trial: Trial, metric: Metric, bootstrap: Bootstrap) -> Estimate:
-        values = self._values(trial, metric)
-        return Estimate.of(bootstrap.summary(values), values)
-
-    def _difference(self, trial: Trial, bootstrap: Bootstrap) -> Difference | None:
+    def _difference(self, trial: Trial) -> Difference | None:
         to: Variant = "baseline" if trial.variant == "layout" else "layout"
         other = Trial(to, trial.decoding)
         if trial.variant == "baseline" or other not in self._outcomes:
             return None
-        same_seeds = trial.variant != "layout"
+        same_runs = trial.variant != "layout"
         effects = {
-            metric: Effect.of(
-                bootstrap.difference(self._values(other, metric), self._values(trial, metric), same_seeds)
+            metric: paired_difference(
+                self._values(other, metric), self._values(trial, metric), self._scenes, same_runs=same_runs
             )
             for metric in SCALES
         }

@@ -10,9 +10,10 @@ from typing import Literal
 import numpy as np
 
 from jaxnav.evaluation.report import Form
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.runs.policies import Gap
 from jaxnav.study.codec import INLINE, OPTIONAL
-from jaxnav.study.intervals import Effect, Estimate, Interval
-from jaxnav.study.trials import Gap, Trial, Variant
+from jaxnav.study.trials import Trial, Variant
 
 Metric = Literal["sr", "spl", "dts"]
 
@@ -22,9 +23,9 @@ class Difference:
     """Hold the paired differences of a trial to another variant."""
 
     to: Variant
-    sr: Effect
-    spl: Effect
-    dts: Effect
+    sr: Interval
+    spl: Interval
+    dts: Interval
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,12 +43,12 @@ class TrialRow:
     gap: Gap
     trial: Trial = dataclasses.field(metadata=INLINE)
     mean_weight: float
-    sr: Estimate
+    sr: Interval
     difference: Difference | None = dataclasses.field(default=None, metadata=OPTIONAL)
-    spl: Estimate
-    dts: Estimate
+    spl: Interval
+    dts: Interval
 
-    def metric(self, name: Metric) -> Estimate:
+    def metric(self, name: Metric) -> Interval:
         """Return one of the metrics."""
         return getattr(self, name)
 
@@ -88,7 +89,7 @@ class Condition:
                 return row
         raise KeyError(f"no row of {trial} with gap {gap} at shift {self.shift:g}")
 
-    def effect(self, trial: Trial, gap: Gap = "novelty") -> Effect:
+    def effect(self, trial: Trial, gap: Gap = "novelty") -> Interval:
         """Return the difference in SR of a trial.
 
         Raises:
@@ -170,9 +171,31 @@ class Gains:
     stde: GainBySimilarity
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class SceneEffects:
+    """Hold the gain in SR of one variant on another, scene by scene.
+
+    Attributes:
+      scenes, rooms: [N] names of the scenes that were drawn, and of their room types.
+      episodes: int [N], at least 1.
+      gain: float64 [S, N], points, summed over the scene's episodes, by training run.
+    """
+
+    scenes: tuple[str, ...]
+    rooms: tuple[str, ...]
+    episodes: np.ndarray
+    gain: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FullCondition(Condition):
-    """Hold every trial, and what depends on layout similarity."""
+    """Hold every trial, and what depends on layout similarity.
+
+    Attributes:
+      similarity, gains: Figs. 4 and 5.
+      effects: of sTDE at the paper's threshold on the layout's weights; None in results of version 0.1.
+    """
 
     similarity: SuccessBySimilarity
     gains: Gains
+    effects: SceneEffects | None = dataclasses.field(default=None, metadata=OPTIONAL)

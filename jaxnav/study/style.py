@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.store.files import write_atomic
 from jaxnav.study.curves import Curve
-from jaxnav.study.intervals import Interval
 from jaxnav.viz.plan import INK, PALE
 
 WIDTH, DPI = 7.0, 150  # inches; shown 700 pixels wide, a point of type is 1.4 pixels

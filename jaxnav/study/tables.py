@@ -1,15 +1,17 @@
 """Markdown tables of the study."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from jaxnav.evaluation.report import Decoding
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.runs.policies import Gap
 from jaxnav.study.claims import claims
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.instrument_report import InstrumentReport, table_cells, verdicts
-from jaxnav.study.intervals import Estimate
 from jaxnav.study.records import Condition, TrialRow
 from jaxnav.study.results import StudyResults
-from jaxnav.study.trials import USES, Control, Gap, Trial
+from jaxnav.study.trials import USES, Control, Trial
 
 CONTROLS: Mapping[Control | None, str] = {
     None: "",
@@ -30,9 +32,9 @@ def claims_table(results: StudyResults, world: str) -> list[str]:
     rows = []
     for claim in claims(results, world):
         digits = 1 if "points" in claim.unit else 2
-        effect = f"{claim.effect:+.{digits}f} {claim.unit}" if claim.effect.defined else "undefined"
-        rows.append((claim.text, effect, claim.verdict))
-    return _markdown(("claim", "effect", "verdict"), rows)
+        effect = f"{claim.effect:+.{digits}f}"
+        rows.append((claim.text, effect, f"{claim.least:g} {claim.unit}", claim.verdict))
+    return _markdown(("claim", "effect", "least", "verdict"), rows)
 
 
 def instrument_table(report: InstrumentReport) -> list[str]:
@@ -126,9 +128,10 @@ def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]
     return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] + ["---:"] * (len(header) - 1), *rows)]
 
 
-def _spread(estimate: Estimate, digits: int = 1) -> str:
-    """Return mean and standard deviation over seeds."""
-    return f"{estimate.mean:.{digits}f} ± {estimate.std:.{digits}f}"
+def _spread(metric: Interval, digits: int = 1) -> str:
+    """Return mean and, of several seeds, their standard deviation."""
+    mean = f"{metric.mean:.{digits}f}"
+    return mean if math.isnan(metric.std) else f"{mean} ± {metric.std:.{digits}f}"
 
 
 def _with_difference(row: TrialRow) -> str:

@@ -11,8 +11,6 @@ from jaxnav.evaluation.inference import Branch, Inference
 from jaxnav.evaluation.report import Decoding, Form
 from jaxnav.evaluation.variants import inference_grid, table_row
 
-#: How the gap is measured: as a run's layout setting has it, or in one of two other ways.
-Gap = Literal["novelty", "evidence", "clock"]
 #: What a control changes about sTDE: the weight is its mean at every step, or that of another episode; zeros or noise
 #: are subtracted instead of logits; the intervention is random instead of zero.
 Control = Literal["constant", "shuffled", "zeros", "noise", "random"]

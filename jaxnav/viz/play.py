@@ -14,7 +14,7 @@ from jaxnav.evaluation.episodes import EpisodeList, episode_list
 from jaxnav.evaluation.playback import Trace, play
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.runs.directory import load_run
-from jaxnav.runs.policies import Policies, load_policies
+from jaxnav.runs.policies import EstimatorName, Policies, load_policies
 from jaxnav.runs.worlds import CompiledWorld, evaluation_world
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
@@ -30,6 +30,7 @@ def play_episode(
     index: int = 0,
     variant: Variant = "stde",
     epsilon: float = 0.5,
+    setting: EstimatorName | None = None,
     scenes: Path | None = None,
     shift: float | None = None,
     console: Console | None = None,
@@ -44,6 +45,7 @@ def play_episode(
       index: of the episode in the default list of an evaluation (of the first shard, where scenes are streamed).
       variant: `stde` removes experience where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE, at least 0.
+      setting: layout estimator to use instead of the run's; see `Policies.estimating`.
       scenes: scene file to read instead of the run's world or file.
       shift: layout shift of the scenes, from 0 to 1; None for the run's.
       console: gets messages about the scenes; None for silence.
@@ -53,7 +55,7 @@ def play_episode(
     """
     settings = load_run(run)
     arm = "baseline" if variant == "baseline" else "layout"
-    policies = load_policies(settings, settings.arms if arm in settings.arms else (arm,))
+    policies = load_policies(settings, settings.arms if arm in settings.arms else (arm,)).estimating(setting)
     world = evaluation_world(settings, split, scenes, shift, console or Console(quiet=True))
     bank = world.banks[0]
     episodes = episode_list(bank)

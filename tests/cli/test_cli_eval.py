@@ -1,6 +1,8 @@
 """The eval command end to end, and all that it refuses."""
 
+import contextlib
 import csv
+import io
 import json
 import shutil
 
@@ -21,11 +23,15 @@ def run_dir(tmp_path_factory):
 ROWS = 2 * (2 + 1 + 2) + 2  # of each decoding baseline, layout, TDE and sTDE at two epsilons; Random; the oracle
 
 
+PRINTED = io.StringIO()
+
+
 @pytest.fixture(scope="module")
 def evaluated(run_dir, tmp_path_factory):
     """The report and the episodes of an evaluation, written into a folder that is not there yet."""
     target = tmp_path_factory.mktemp("eval") / "new" / "table.json"
-    assert evaluate(run_dir, "--episodes", 18, "--epsilon", 0, 0.5, "--json", target) == 0
+    with contextlib.redirect_stdout(PRINTED):
+        assert evaluate(run_dir, "--episodes", 18, "--epsilon", 0, 0.5, "--json", target) == 0
     return target
 
 
@@ -36,7 +42,7 @@ def _episodes(report):
 
 def test_the_report_holds_all_rows_and_differences(evaluated):
     report = json.loads(evaluated.read_text())
-    assert list(report) == ["run", "rows", "differences", "compilations", "versions", "format"]
+    assert list(report) == ["run", "rows", "differences", "notes", "compilations", "versions", "format"]
     assert report["run"]["method"] == "org"
     assert report["run"]["steps_per_policy"] == 512
     assert report["run"]["prior_steps"] == 64 * 20
@@ -46,8 +52,10 @@ def test_the_report_holds_all_rows_and_differences(evaluated):
         assert (row["method"], row["world"], row["split"], row["seeds"]) == ("ORG", "rooms", "val", SEEDS)
         assert row["episodes"] == 20  # rounded up to a multiple of the four room types
         for metric in ("sr", "spl", "dts", "sae"):
+            # The only scenes of four room types are one stratum, and two training runs are enough.
             low, high = row[metric]["ci95"]
             assert low <= row[metric]["mean"] <= high
+            assert (row[metric]["std"] is None) == (row["variant"] in ("random", "oracle"))
     settings = [(row["variant"], row["epsilon"], row["decoding"], row["form"]) for row in report["rows"]]
     assert len(set(settings)) == ROWS
     assert ("stde", 0.5, "argmax", "residual") in settings
@@ -56,6 +64,15 @@ def test_the_report_holds_all_rows_and_differences(evaluated):
     assert oracle["sr"]["mean"] == oracle["spl"]["mean"] >= 100 * short.mean()  # all but those beyond the step limit
     # Layout against baseline, the others against layout: four rows of each decoding, three metrics.
     assert len(report["differences"]) == 2 * 4 * 3
+
+
+def test_what_limits_the_table_is_told_below_it(evaluated):
+    notes = json.loads(evaluated.read_text())["notes"]
+    assert any("are told the type of the room by their prior" in note for note in notes)
+    # Four updates are no training.
+    assert any(note.startswith("baseline (argmax) is no better than Random") for note in notes)
+    printed = " ".join(PRINTED.getvalue().split())
+    assert printed.index("Difference, paired") < printed.index(" ".join(notes))
 
 
 def test_the_episodes_are_written_row_by_row(evaluated):
@@ -147,6 +164,7 @@ def test_damaged_files_are_named(tmp_path, run_dir, capsys):
     assert f"{tmp_path}/config.json" in refusal(capsys)
 
 
+@pytest.mark.slow
 def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(run_dir, run)
@@ -160,6 +178,7 @@ def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys
     assert "give a seed of at least 0, a shift from 0 to 1" in refusal(capsys)
 
 
+@pytest.mark.slow
 def test_a_shift_relabels_a_scene_file(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
     shutil.copytree(run_dir, run)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import t
 from support.commands import contents, evaluate, finished_run, refusal
 
 from jaxnav import __main__ as commands
@@ -57,8 +58,10 @@ def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
         assert column["frontier_steps"]["mean"] == pytest.approx(np.asarray(searched.length).mean())
         assert column["layout_gap"]["mean"] > 0
         assert 0 < column["layout_similarity"]["mean"] < 1
-        # One scene of each room type: no scene is drawn anew.
-        assert column["best_length"]["ci95"] == pytest.approx(2 * [column["best_length"]["mean"]])
+        # Only scenes of their room types are one stratum: those of a mean of four.
+        half = t.ppf(0.975, 3) * expected_length(bank).std(ddof=1) / 2
+        low, high = column["best_length"]["ci95"]
+        assert (high - low) / 2 == pytest.approx(half)
     last = report["shifts"][-1]
     assert last["baseline_argmax_sr"]["mean"] == pytest.approx(baseline["argmax"])
     assert last["baseline_sample_sr"]["mean"] == pytest.approx(baseline["sample"])

@@ -90,7 +90,11 @@ def test_a_study_from_training_to_document(tmp_path):
             assert constant["mean_weight"] == pytest.approx(plain["mean_weight"], rel=1e-5) != 0
         # Where nothing is taken out, everything is as with the weights.
         still = rows["novelty", "stde", "argmax", 1.0, "residual", None]
-        assert still["difference"]["sr"] == {"mean": 0.0, "std": 0.0, "ci95": [0.0, 0.0]}
+        assert still["difference"]["sr"] == {"mean": 0.0, "std": None, "ci95": None, "seeds": [0.0]}  # of one run
+        # Effects of sTDE in each scene, of which the mean is that of all.
+        effects, stde = main["effects"], rows["novelty", "stde", "argmax", 0.5, "residual", None]
+        assert (len(effects["scenes"]), sum(effects["episodes"])) == (4, 24)
+        assert np.sum(effects["gain"]) / 24 == pytest.approx(stde["difference"]["sr"]["mean"], abs=1e-4)
         assert ("novelty", "baseline", "argmax", None, None, None) in rows
         assert set(others) == {("novelty", *about, None) for about in LAYOUT_ARM}
 

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
+from support.study_results import episodes_in
 
 from jaxnav.baselines.shortest_path import oracle_actions, oracle_outcome, replay
 from jaxnav.env.build import build
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.episodes import clusters_of, episode_list
 from jaxnav.evaluation.grid import Outcome, first_states
 from jaxnav.evaluation.metrics import episode_metrics
 from jaxnav.scenes.generate.rooms import generate_rooms
@@ -55,6 +56,51 @@ def test_episodes_are_fixed_by_bank_and_seed():
 def test_no_episodes_are_refused():
     with pytest.raises(InputError, match="--episodes 0: give at least 1"):
         episode_list(tiny.BANK, 0)
+
+
+# Floor plans
+
+
+def test_scenes_of_a_floor_plan_are_left_out_together():
+    names = ("FloorPlan_Train1_1", "FloorPlan_Train2_1", "FloorPlan_Train1_5")
+    episodes = episodes_in([0, 1, 2, 1, 1], names=names)
+    assert episodes.plan.tolist() == [f"FloorPlan_Train{number}" for number in (1, 2, 1, 2, 2)]
+    clusters = episodes.clusters()
+    # Two of five are of the first: without them the other three count 5 / 3 each, and else 5 / 2.
+    np.testing.assert_allclose(clusters.weights.T, [[1] * 5, [0, 5 / 3, 0, 5 / 3, 5 / 3], [5 / 2, 0, 5 / 2, 0, 0]])
+    assert (clusters.scale.tolist(), clusters.degrees) == ([1 / 2, 1 / 2], 1)
+
+
+@pytest.mark.parametrize(
+    ("room", "names", "degrees"),
+    [
+        ([0, 0, 1, 1, 1], None, 5 - 2),
+        ([0, 1, 1, 1, 1], None, 5 - 1),  # an only scene of its room type shows no variance there
+        ([0, 0, 1, 1, 1], ("a", "a-replaced-1", "b", "c", "d"), 4 - 1),  # nor do two of one floor plan
+    ],
+)
+def test_room_types_are_strata_where_each_has_two_floor_plans(room, names, degrees):
+    clusters = episodes_in(range(5), room=room, names=names).clusters()
+    assert clusters.degrees == degrees
+    # A stratum keeps its weight.
+    room = np.array(room) if degrees == 3 and names is None else np.zeros(5, int)
+    for kind in set(room):
+        np.testing.assert_allclose(clusters.weights[room == kind].sum(axis=0), (room == kind).sum())
+
+
+def test_a_floor_plan_is_left_out_of_all_lists_at_once():
+    here = episodes_in([0, 1, 1, 2, 3], room=[0, 0, 1, 1], names=("a", "b", "c", "d"))
+    there = episodes_in([0, 0, 1, 2], room=[1, 0, 1], names=("c", "a-replaced-1", "d"))
+    one, other = clusters_of([here, there])
+    assert one.degrees == other.degrees == 4 - 2
+    np.testing.assert_array_equal(one.scale, other.scale)
+    # Bedrooms a (1 here, 1 there) and b (2 here): without one the other two count double. Kitchens c (1 and 2) and d (1
+    # and 1): without c the weight of five is d's two, without d it is c's three. The other room type counts as before.
+    a, b, c, d = [0, 2, 1, 1], [2, 0, 1, 1], [1, 1, 0, 5 / 3], [1, 1, 5 / 2, 0]
+    np.testing.assert_allclose(one.weights[:, 1:], [a, b, b, c, d])
+    np.testing.assert_allclose(other.weights[:, 1:], [c, c, a, d])
+    # By themselves they would not be: each list has its own scenes.
+    assert there.clusters().weights.shape == (4, 1 + 3)
 
 
 # The shortest way in generated rooms

@@ -1,19 +1,19 @@
+"""The report: rows, differences, versions, its file."""
+
 import importlib.metadata
-import io
 import json
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
+from support.intervals import around
+from support.study_results import episodes_in
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation import report as reports
-from jaxnav.evaluation import report_tables
 
-STRATA = np.array([0, 0, 1, 1])
-LENGTHS = np.array([1, 4, 5, 9])
+EPISODES = episodes_in([0, 1, 2, 3], best_length=np.array([1, 4, 5, 9]))
 IDENTITY = {"variant": "baseline", "method": "ORG", "world": "ithor", "split": "test"}
 SETTING = {"epsilon": None, "decoding": "argmax", "form": None}
 
@@ -30,26 +30,16 @@ def results(**changes):
 
 
 def row(**changes: Any):
-    arguments: dict[str, Any] = {"metrics": results(), "best_lengths": LENGTHS, "strata": STRATA}
-    arguments |= {"generator": np.random.default_rng(0), **IDENTITY, **SETTING, **changes}
+    arguments: dict[str, Any] = {"metrics": results(), "episodes": EPISODES, **IDENTITY, **SETTING, **changes}
     return reports.build_row(**arguments)
 
 
-def fixed_row(**changes):
-    """A row with numbers chosen by hand, for the tables."""
-    metrics = {
-        "sr": {"mean": 66.48, "std": 0.22, "ci95": [63.5, 69.44]},
-        "spl": {"mean": 38.42, "std": 0.39, "ci95": [36.0, 40.0]},
-        "dts": {"mean": 0.541, "std": 0.01, "ci95": [0.5, 0.6]},
-    }
-    return IDENTITY | SETTING | metrics | changes
+def with_lengths(*lengths):
+    return EPISODES._replace(best_length=np.array(lengths))
 
 
-def fixed_report(*rows):
-    return {"rows": list(rows)}
-
-
-CELLS = "66.5 ± 0.2 [63.5, 69.4] | 38.4 ± 0.4 [36.0, 40.0] | 0.54 ± 0.01 [0.50, 0.60]"
+def bounds_around(mean, variance, degrees):
+    return pytest.approx([*around(mean, variance, degrees)[1:]])
 
 
 def test_row_has_the_keys_of_the_format():
@@ -60,7 +50,7 @@ def test_row_has_the_keys_of_the_format():
         "L>=1": ["episodes", *metrics],
         "L>=5": ["episodes", *metrics],
     }
-    assert list(built["sr"]) == ["mean", "std", "ci95"]
+    assert list(built["sr"]) == ["mean", "std", "ci95", "seeds"]
     assert (built["seeds"], built["episodes"]) == (2, 4)
 
 
@@ -73,8 +63,27 @@ def test_row_in_percent_and_metres():
     assert built["spl"]["mean"] == pytest.approx(40)
     assert built["dts"]["mean"] == pytest.approx(0.875)
     assert built["sae"]["mean"] == pytest.approx(18.75)
-    low, high = built["sr"]["ci95"]
-    assert 0 <= low < 62.5 < high <= 100
+    assert built["sr"]["seeds"] == [75, 50]
+    # By scene 100, 50, 0 and 100 %, sample variance 6875 / 3, / 4; by run 312.5 / 2; what is left is 12.5 in six of
+    # eight and 37.5 in two, 3750 / 3 / 8, which is as much.
+    by_scene, by_run, both = 6875 / 12, 312.5 / 2, 3750 / 24
+    degrees = by_scene**2 / (by_scene**2 / 3 + by_run**2 + both**2 / 3)
+    assert built["sr"]["ci95"] == bounds_around(62.5, by_scene, degrees)
+
+
+@pytest.mark.parametrize("variant", ["random", "oracle"])
+def test_seeds_of_what_is_untrained_are_repetitions(variant):
+    # Over scenes alone, by the mean of the repetitions; they have no spread that says anything of a training.
+    built = row(variant=variant)
+    assert built["sr"] == {"mean": pytest.approx(62.5), "std": None, "ci95": bounds_around(62.5, 6875 / 12, 3)}
+    assert built["seeds"] == 2
+
+
+def test_scenes_of_a_floor_plan_count_as_one():
+    # Three floor plans: 75 % of two scenes, 0 and 100 %. Without them 50, 83.3 and 50 %: 2 / 3 of the squares.
+    names = ("FloorPlan_Train1_1", "FloorPlan_Train1_2", "FloorPlan_Train2_1", "FloorPlan_Train3_1")
+    built = row(variant="random", episodes=EPISODES._replace(scenes=names))
+    assert built["sr"]["ci95"] == bounds_around(62.5, 2 / 3 * (12.5**2 + (250 / 3 - 62.5) ** 2 + 12.5**2), 2)
 
 
 def test_buckets_by_best_length():
@@ -86,10 +95,11 @@ def test_buckets_by_best_length():
     assert long["sr"]["mean"] == pytest.approx(50)
     assert long["sr"]["std"] == pytest.approx(0)
     assert long["dts"]["mean"] == pytest.approx(1.25)
+    assert long["sr"]["ci95"] is None  # of two scenes
 
 
 def test_empty_bucket_holds_no_metrics():
-    assert row(best_lengths=np.array([1, 2, 3, 4]))["buckets"]["L>=5"] == {"episodes": 0}
+    assert row(episodes=with_lengths(1, 2, 3, 4))["buckets"]["L>=5"] == {"episodes": 0}
 
 
 @pytest.mark.parametrize(
@@ -102,9 +112,8 @@ def test_empty_bucket_holds_no_metrics():
         ({"metrics": results(sae=np.zeros((3, 4)))}, "differ in shape"),
         ({"metrics": {name: values[0] for name, values in results().items()}}, r"\[seeds, episodes\]"),
         ({"metrics": {"sr": np.zeros((2, 4))}}, "exactly"),
-        ({"best_lengths": np.array([0, 4, 5, 9])}, "below 1"),
-        ({"best_lengths": LENGTHS[:3]}, "best_lengths"),
-        ({"strata": STRATA[:3]}, "strata"),
+        ({"episodes": with_lengths(0, 4, 5, 9)}, "below 1"),
+        ({"episodes": with_lengths(1, 4, 5)}, "metrics have 4 episodes, and the list 3"),
     ],
 )
 def test_bad_results_are_refused(changes, message):
@@ -122,11 +131,9 @@ def test_difference_in_report_units():
         epsilon=0.5,
         form="residual",
         decoding="argmax",
-        strata=STRATA,
-        generator=np.random.default_rng(0),
-        same_seeds=True,
+        episodes=EPISODES,
+        same_runs=True,
     )
-    low, high = difference.pop("ci95")
     assert difference == {
         "metric": "sr",
         "from": "layout",
@@ -135,20 +142,23 @@ def test_difference_in_report_units():
         "form": "residual",
         "decoding": "argmax",
         "mean": pytest.approx(25),
+        "std": pytest.approx(1250**0.5),
+        # By run 1250 / 2; by scene 0, 50, 50 and 0 points, 2500 / 3 / 4, as much as what is left: 1 degree of freedom.
+        "ci95": bounds_around(25, 625, 1),
+        "seeds": [0, 50],
     }
-    assert 0 == low < 25 < high <= 100
 
 
 def test_json_round_trip(tmp_path):
     report = reports.build_report(
-        [row(), row(variant="stde", epsilon=0.5, form="residual")], [], compilations=2, run={"method": "org"}
+        [row(), row(variant="stde", epsilon=0.5, form="residual")], [], ["A note."], 2, run={"method": "org"}
     )
     path = tmp_path / "report.json"
     path.write_text("old")
     reports.write_report(path, report)
     assert json.loads(path.read_text(encoding="utf-8")) == report
-    assert list(report) == ["run", "rows", "differences", "compilations", "versions", "format"]
-    assert (report["compilations"], report["format"]) == (2, 1)
+    assert list(report) == ["run", "rows", "differences", "notes", "compilations", "versions", "format"]
+    assert (report["notes"], report["compilations"], report["format"]) == (["A note."], 2, 1)
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
 
 
@@ -156,7 +166,7 @@ def test_nan_never_reaches_the_file(tmp_path):
     path = tmp_path / "report.json"
     path.write_text("old")
     with pytest.raises(ValueError, match="JSON compliant"):
-        reports.write_report(path, reports.build_report([fixed_row(sr=float("nan"))], [], 1, {}))
+        reports.write_report(path, reports.build_report([{"sr": float("nan")}], [], [], 1, {}))
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
 
@@ -176,66 +186,3 @@ def test_version_of_an_installed_package_and_of_a_source_tree(monkeypatch, insta
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     assert reports.versions()["jaxnav"] == expected
-
-
-def test_markdown_table_with_the_label_of_every_variant():
-    report = fixed_report(
-        fixed_row(variant="random", method="random"),
-        fixed_row(),
-        fixed_row(variant="layout"),
-        fixed_row(variant="tde", form="residual"),
-        fixed_row(variant="stde", form="residual", epsilon=0.5),
-        fixed_row(variant="stde", form="paper", epsilon=0.25),
-    )
-    assert report_tables.markdown_table(report) == (
-        "| Variant | SR (%) | SPL (%) | DTS (m) |\n"
-        "| --- | ---: | ---: | ---: |\n"
-        "| **ithor test, argmax decoding** |  |  |  |\n"
-        f"| Random | {CELLS} |\n"
-        f"| ORG (baseline) | {CELLS} |\n"
-        f"| + w (layout) | {CELLS} |\n"
-        f"| + w + TDE | {CELLS} |\n"
-        f"| + w + sTDE (eps=0.5) | {CELLS} |\n"
-        f"| + w + sTDE (eps=0.25), paper form | {CELLS} |\n"
-    )
-
-
-def test_rows_are_grouped_by_decoding():
-    report = fixed_report(fixed_row(), fixed_row(decoding="sample"), fixed_row(variant="layout"))
-    first_cells = [line.split(" | ")[0].strip("| ") for line in report_tables.markdown_table(report).splitlines()[2:]]
-    assert first_cells == [
-        "**ithor test, argmax decoding**",
-        "ORG (baseline)",
-        "+ w (layout)",
-        "**ithor test, sample decoding**",
-        "ORG (baseline)",
-    ]
-
-
-def test_console_table():
-    report = fixed_report(fixed_row(method="[bold]X[/bold]"), fixed_row(decoding="sample", method="VTNet"))
-    console = Console(width=120, record=True, file=io.StringIO())
-    console.print(report_tables.console_table(report))
-    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines()]
-    assert [cells for cells in lines if cells] == [
-        ["ithor test, argmax decoding", "", "", ""],
-        ["[bold]X[/bold] (baseline)", *CELLS.split(" | ")],  # names are text, never markup
-        ["ithor test, sample decoding", "", "", ""],
-        ["VTNet (baseline)", *CELLS.split(" | ")],
-    ]
-
-
-def test_difference_table_has_a_line_per_comparison():
-    entry = {"from": "layout", "to": "stde", "epsilon": 0.5, "form": "residual", "decoding": "argmax"}
-    values = [("sr", 25.0, [10.0, 40.0]), ("spl", -1.25, [-2.0, 0.5]), ("dts", -0.031, [-0.1, 0.0])]
-    report = {"differences": [{**entry, "metric": name, "mean": mean, "ci95": ci} for name, mean, ci in values]}
-    table = report_tables.difference_table(report)
-    cells = [str(next(iter(column.cells))) for column in table.columns]
-    expected = [
-        "+ w + sTDE (eps=0.5) - + w",
-        "argmax",
-        "+25.0 [+10.0, +40.0]",
-        "-1.2 [-2.0, +0.5]",
-        "-0.03 [-0.10, +0.00]",
-    ]
-    assert (cells, table.row_count) == (expected, 1)

@@ -6,7 +6,10 @@ import json
 import numpy as np
 import pytest
 
+from jaxnav.evaluation.notes import notes
 from jaxnav.evaluation.variants import Row
+
+LAYOUT, TDE = Row("layout", None, None, "argmax"), Row("tde", None, "paper", "argmax")
 
 
 def test_the_rows_are_those_of_the_table_and_the_oracle(evaluated):
@@ -40,6 +43,33 @@ def test_the_report_says_the_same(evaluated):
         means = scale * metrics[name].mean((1, 2))
         assert [row[name]["mean"] for row in rows] == pytest.approx(means, rel=1e-6, abs=1e-9)
     assert evaluated.report["compilations"] == 1
+
+
+def test_only_what_is_trained_varies_with_training(evaluated):
+    for row in evaluated.report["rows"]:
+        trained = row["variant"] not in ("random", "oracle")
+        for metric in ("sr", "spl", "dts", "sae"):
+            assert (len(row[metric].get("seeds", [])), row[metric]["std"] is not None) == (2 * trained, trained)
+    for difference in evaluated.report["differences"]:
+        # The baseline was trained apart; the others are the layout's networks, run by run.
+        assert len(difference.get("seeds", [])) == (0 if difference["from"] == "baseline" else 2)
+        assert difference["std"] is not None
+    (tde,) = (
+        each
+        for each in evaluated.report["differences"]
+        if (each["metric"], each["to"], each["decoding"]) == ("sr", "tde", "argmax")
+    )
+    rows, success = evaluated.rows, 100 * evaluated.metrics()["sr"].mean(axis=2)
+    gain = success[rows.index(TDE)] - success[rows.index(LAYOUT)]
+    assert tde["seeds"] == pytest.approx(gain)
+
+
+def test_the_notes_are_those_of_the_rows_and_the_run(evaluated):
+    success = evaluated.metrics()["sr"]
+    expected = notes(evaluated.rows, success, evaluated.episodes, room_prior=True)
+    assert evaluated.report["notes"] == expected
+    assert any("told the type of the room" in note for note in expected)
+    assert expected != notes(evaluated.rows, success, evaluated.episodes, room_prior=False)
 
 
 def test_it_is_written_as_json_and_csv(evaluated, tmp_path):

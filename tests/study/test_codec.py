@@ -2,13 +2,15 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 
 import numpy as np
 import pytest
 
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.codec import INLINE, OPTIONAL, from_json, key, to_json
-from jaxnav.study.intervals import UNDEFINED, Estimate, Interval
+from jaxnav.study.curves import Curve
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,23 +64,39 @@ def test_it_is_read_again_with_its_types():
 
 def test_an_inline_mapping_takes_the_keys_that_are_left():
     measured = Measured(0.5, {"x": Interval(1.0, 0.5, 1.5), "y": Interval(2.0, 1.5, 2.5)})
-    data = {"shift": 0.5, "x": {"mean": 1.0, "ci95": [0.5, 1.5]}, "y": {"mean": 2.0, "ci95": [1.5, 2.5]}}
+    data = {
+        "shift": 0.5,
+        "x": {"mean": 1.0, "std": None, "ci95": [0.5, 1.5]},
+        "y": {"mean": 2.0, "std": None, "ci95": [1.5, 2.5]},
+    }
     assert to_json(measured) == data
-    assert from_json(Measured, data) == measured
+    read = from_json(Measured, data)
+    assert read.shift == 0.5
+    assert {name: f"{each}" for name, each in read.intervals.items()} == {"x": "1.0 [0.5, 1.5]", "y": "2.0 [1.5, 2.5]"}
 
 
-def test_what_is_undefined_is_null():
-    data = {"mean": None, "ci95": [None, None]}
-    assert json.loads(json.dumps(to_json(UNDEFINED), allow_nan=False)) == data
-    assert not from_json(Interval, data).defined
+def test_an_undefined_interval_is_null():
+    data = {"mean": None, "std": None, "ci95": None}
+    assert json.loads(json.dumps(to_json(Interval(math.nan)), allow_nan=False)) == data
+    assert math.isnan(from_json(Interval, data).mean)
 
 
-def test_an_estimate_carries_its_seeds():
-    estimate = Estimate(1.0, 0.5, 1.5, 0.25, (0.75, 1.25))
+def test_what_is_undefined_in_an_array_is_null():
+    # The gap has no interval at a step where too few scenes still run.
+    curve = Curve(np.array([0.5, 0.25]), np.array([0.25, math.nan]), np.array([0.75, math.nan]))
+    data = json.loads(json.dumps(to_json(curve), allow_nan=False))
+    assert data == {"mean": [0.5, 0.25], "low": [0.25, None], "high": [0.75, None]}
+    read = from_json(Curve, data)
+    np.testing.assert_array_equal(read.low, curve.low, strict=True)
+    np.testing.assert_array_equal(read.high, curve.high, strict=True)
+
+
+def test_an_interval_carries_its_seeds():
+    interval = Interval(1.0, 0.5, 1.5, 0.25, (0.75, 1.25))
     data = {"mean": 1.0, "std": 0.25, "ci95": [0.5, 1.5], "seeds": [0.75, 1.25]}
-    assert to_json(estimate) == data
-    assert list(to_json(estimate)) == list(data)
-    assert from_json(Estimate, data) == estimate
+    assert to_json(interval) == data
+    assert list(to_json(interval)) == list(data)
+    assert from_json(Interval, data) == interval
 
 
 def test_a_missing_key_is_refused():

@@ -8,10 +8,11 @@ import pytest
 from support import study_results
 
 from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.claims import claims
 from jaxnav.study.document import READING, check_document, write_document
 from jaxnav.study.draw import draw_figures
-from jaxnav.study.tables import CONTROLS
+from jaxnav.study.tables import CONTROLS, metrics_table
 from jaxnav.study.trials import Control
 
 
@@ -103,9 +104,10 @@ def test_the_claims_are_those_of_the_results(text):
     rows = table(section(text, "Claims"))
     expected = claims(study_results.results())
     assert list(rows)[2:] == [claim.text for claim in expected]
-    assert [rows[claim.text][1] for claim in expected] == [claim.verdict for claim in expected]
-    assert rows["The baseline loses from shift 0 to 1"] == ["+9.0 [+8.0, +10.0] SR points", "holds"]
-    assert rows["The `evidence` gap does at step 20"] == ["+0.25 [+0.24, +0.26] AUC - 0.5", "holds"]
+    assert rows["claim"] == ["effect", "least", "verdict"]
+    assert [rows[claim.text][2] for claim in expected] == [claim.verdict for claim in expected]
+    assert rows["The baseline loses from shift 0 to 1"] == ["+9.0 [+8.0, +10.0]", "2 SR points", "holds"]
+    assert rows["The `evidence` gap does at step 20"] == ["+0.25 [+0.24, +0.26]", "0.05 AUC - 0.5", "holds"]
 
 
 def test_table_1_holds_both_decodings_at_every_shift(text):
@@ -117,6 +119,19 @@ def test_table_1_holds_both_decodings_at_every_shift(text):
     ]  # fmt: skip
     assert table(best)["baseline"][3] == ""
     assert table(sampled)["+ w"][3] == "+101.0 [+100.0, +102.0]"
+
+
+def test_one_training_run_has_neither_spread_nor_interval():
+    of_one = Interval(62.5, seeds=(62.5,))
+    rows = tuple(
+        dataclasses.replace(
+            row, sr=of_one, difference=row.difference and dataclasses.replace(row.difference, sr=of_one)
+        )
+        for row in study_results.rows(1.0)
+    )
+    condition = dataclasses.replace(study_results.full_condition(1.0), rows=rows)
+    cells = table("\n".join(metrics_table([condition], "argmax")))["+ w"]
+    assert cells == ["62.5", "30.0 ± 0.5", "1.50 ± 0.50", "+62.5 [-]", "0.250"]
 
 
 def test_every_control_is_there(text):

@@ -4,8 +4,8 @@ import dataclasses
 
 from support import study_results
 
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.instrument_report import Change, console_table, verdicts
-from jaxnav.study.intervals import Interval
 
 
 def test_the_table_has_a_column_for_each_shift():

@@ -3,10 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.intervals import around, bounds
 from support.study_results import episodes_in
 
+from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome
-from jaxnav.study.intervals import Effect
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.outcomes import TrialOutcomes, mean_weight
 from jaxnav.study.trials import Trial
 
@@ -25,11 +27,14 @@ SUCCESS = [
 ]
 LENGTH = np.array([[2, 4, 4, 10], [2, 4, 4, 10]])
 WEIGHT = np.array([[0.5, 0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 0.0]], np.float32)
+#: Success of both runs in six episodes.
+SIX = [0, 0, 1, 1, 0, 1]
+APARTMENTS = ("val-apartment-00-0", "val-apartment-00-1", "val-apartment-01-0", "val-apartment-02-0")
 
 
-def outcome(success) -> Outcome:
+def outcome(success, length=LENGTH, weight=WEIGHT) -> Outcome:
     """Return an outcome [S, E]."""
-    leaves = np.array(success, bool), LENGTH, np.ones((2, 4), int), np.full((2, 4), 2.5), WEIGHT
+    leaves = np.array(success, bool), length, np.ones_like(length), np.full(length.shape, 2.5), weight
     return Outcome(*map(jnp.asarray, leaves))
 
 
@@ -52,7 +57,7 @@ def test_success_of_a_trial(few):
 
 
 def test_rows_hold_metrics_and_differences(few):
-    baseline, layout, stde, other = few.rows(seed=0, gap="evidence")
+    baseline, layout, stde, other = few.rows("evidence")
     assert (stde.trial, stde.gap) == (FEW[2], "evidence")
     assert stde.mean_weight == pytest.approx(0.05)
     assert layout.sr.mean == 87.5
@@ -74,30 +79,77 @@ def test_rows_hold_metrics_and_differences(few):
     assert other.difference is None
 
 
-def test_equal_results_have_equal_intervals(few):
-    assert few.rows(seed=0, gap="novelty") == few.rows(seed=0, gap="novelty")
+def test_equal_results_have_equal_intervals():
     equal = outcomes([SUCCESS[0], SUCCESS[1], SUCCESS[1]], episodes_in([0, 1, 2, 3], best_length=2))
-    _, layout, stde = equal.rows(seed=0, gap="novelty")
+    _, layout, stde = equal.rows("novelty")
     assert stde.sr == layout.sr
+    assert stde.sr.bounded
     assert stde.difference is not None
-    assert stde.difference.sr == Effect(0.0, 0.0, 0.0, 0.0)
+    assert stde.difference.sr == Interval(0.0, 0.0, 0.0, 0.0, (0.0, 0.0))
+
+
+def test_variants_of_a_network_are_paired_and_those_trained_apart_are_not(few):
+    _, layout, stde, _ = few.rows("novelty")
+    # sTDE less + w: 0, 100, 0, 0 points in the first run, 0, 0, 0, -100 in the second, so 25 and -25. By run
+    # 1250 / 2 = 625; by scene 0, 50, 0 and -50, 5000 / 3 / 4 = 417; what is left is 25 or -25 in all eight,
+    # 8 x 625 / 3 / 8 = 208. In all 417 + 625 - 208 = 833; 833^2 / (417^2 / 3 + 625^2 / 1 + 208^2 / 3) = 1.51 degrees of
+    # freedom.
+    parts = np.array([5000 / 12, 625, 5000 / 24])
+    variance = parts[0] + parts[1] - parts[2]
+    degrees = variance**2 / (parts**2 / [3, 1, 3]).sum()
+    assert bounds(stde.difference.sr) == pytest.approx(around(0, variance, degrees))
+    assert stde.difference.sr.seeds == pytest.approx((25.0, -25.0))
+    # Trained apart there are no gains run by run.
+    assert layout.difference.sr.seeds == ()
+
+
+def interval_of(success, episodes: EpisodeList) -> Interval:
+    """Return the SR of runs that act twice in every episode."""
+    length = np.full((2, len(episodes.scene)), 2)
+    trials = TrialOutcomes({FEW[0]: outcome(success, length, np.zeros(length.shape, np.float32))}, episodes)
+    (row,) = trials.rows("novelty")
+    return row.sr
 
 
 @pytest.mark.parametrize(
-    ("scene", "room", "low", "high"),
+    ("scene", "room", "names", "variance", "degrees"),
     [
-        # Two scenes of two episodes, both seeds alike: 0, 1/2 or 1 with probabilities 1/4, 1/2, 1/4.
-        ([0, 0, 1, 1], [0, 0], 0.0, 100.0),
-        # Scenes with as many of both kinds have the mean whichever are drawn; episodes by themselves would not.
-        ([0, 1, 0, 1], [0, 0], 50.0, 50.0),
-        # Each the only scene of its room type: both are always there.
-        ([0, 0, 1, 1], [0, 1], 50.0, 50.0),
-        # A scene of three episodes, one found, and a scene of one: 2 of 6, 2 of 4 or 2 of 2.
-        ([0, 0, 0, 1], [0, 0], 100 / 3, 100.0),
+        # Three scenes of two episodes: 0, 100 and 50 %, sample variance 2500.
+        ([0, 0, 1, 1, 2, 2], [0, 0, 0], None, 2500 / 3, 2),
+        # Scenes with as many of both kinds are alike; episodes by themselves would not be.
+        ([0, 1, 0, 1, 2, 2], [0, 0, 0], None, 0.0, 2),
+        # Two failures of one room type; of the other four 75 %, sample variance 2500, and 4 / 6 of all.
+        ([0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 1, 1], None, (4 / 6) ** 2 * 2500 / 4, 1 + 3),
+        # An only scene of its room type shows no variance there: all are one stratum.
+        ([0, 0, 1, 1, 2, 2], [0, 1, 1], None, 2500 / 3, 2),
+        # One of three, one of two and one of one: without each 2 / 3, 2 / 4 and 2 / 5 instead of 1 / 2.
+        ([0, 0, 0, 1, 1, 2], [0, 0, 0], None, 2 / 3 * ((50 / 3) ** 2 + 0 + 10**2), 2),
+        # Two scenes of a floor plan are one, so this is the first case again.
+        ([0, 1, 2, 2, 3, 3], [0, 0, 0, 0], APARTMENTS, 2500 / 3, 2),
     ],
 )
-def test_intervals_draw_scenes_with_all_their_episodes(scene, room, low, high):
-    episodes = episodes_in(scene, room=room, best_length=2)
-    (row,) = outcomes([[[0, 0, 1, 1]] * 2], episodes).rows(seed=0, gap="novelty")
-    assert row.sr.mean == 50.0
-    assert (row.sr.low, row.sr.high) == pytest.approx((low, high))
+def test_intervals_are_over_floor_plans_with_all_their_episodes(scene, room, names, variance, degrees):
+    episodes = episodes_in(scene, room=room, names=names, best_length=2)
+    assert bounds(interval_of([SIX] * 2, episodes)) == pytest.approx(around(50, variance, degrees))
+
+
+def test_runs_that_disagree_widen_the_interval():
+    episodes = episodes_in([0, 0, 1, 1, 2, 2], best_length=2)
+    equal, unequal = (interval_of(runs, episodes) for runs in ([SIX] * 2, [[0, 0, 0, 1, 0, 0], [0, 1, 1, 1, 1, 1]]))
+    # Equal runs: that of the scenes alone. Runs of 1 / 6 and 5 / 6: by run 33^2 = 1111 with one degree of freedom.
+    assert bounds(equal) == pytest.approx(around(50, 2500 / 3, 2))
+    assert unequal.mean == 50.0
+    assert unequal.high - 50.0 > 2 * (equal.high - 50.0)
+
+
+def test_effects_are_gains_by_scene_and_run():
+    episodes = episodes_in([2, 0, 2, 0], room=[1, 0, 0], best_length=2)
+    effects = outcomes(SUCCESS, episodes).effects(FEW[2], FEW[1])
+    # sTDE less + w: the second episode in the first run, and -1 at the fourth in the second; both are in scene 0.
+    found = dict(zip(effects.scenes, zip(effects.rooms, effects.episodes, effects.gain.T, strict=True), strict=True))
+    for name, room, gain in (("room00", "kitchen", [100, -100]), ("room02", "bedroom", [0, 0])):
+        assert found[name][:2] == (room, 2)
+        assert found[name][2].tolist() == gain
+    # The other scene was not drawn.
+    assert found.pop("room01", ("", 0))[1] == 0
+    assert len(found) == 2

@@ -27,6 +27,19 @@ def kind(part: dict[str, Any]) -> type:
     return InstrumentReport if "matched" in part else GapCourse
 
 
+def without_nulls(value: Any) -> Any:
+    """Return JSON without spreads and bounds that are null.
+
+    Version 0.1 left out a spread that was undefined, and wrote two bounds.
+    """
+    if isinstance(value, list):
+        return [without_nulls(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    empty = {"std": (None,), "ci95": (None, [None, None])}
+    return {name: without_nulls(item) for name, item in value.items() if item not in empty.get(name, ())}
+
+
 # Committed results
 
 
@@ -35,7 +48,8 @@ def test_committed_parts_are_read_and_written_with_the_same_keys(path):
     part = json.loads(path.read_text())
     assert HEADER | to_json(from_json(kind(part), part)).keys() == part.keys()
     written = {name: part[name] for name in HEADER} | to_json(from_json(kind(part), part))
-    assert json.dumps({name: written[name] for name in part}) == json.dumps(part)  # in the same order
+    # In the same order.
+    assert json.dumps(without_nulls({name: written[name] for name in part})) == json.dumps(without_nulls(part))
 
 
 @pytest.mark.parametrize(

@@ -1,27 +1,29 @@
 """Results of a study with numbers that differ plainly."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.runs.policies import Gap
 from jaxnav.study.codec import to_json
 from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
 from jaxnav.study.instrument_report import BASELINES, MATCHED, MEASURES, Change, InstrumentReport, MeasuredShift
-from jaxnav.study.intervals import Effect, Estimate, Interval
 from jaxnav.study.records import (
     Condition,
     Difference,
     FullCondition,
     GainBySimilarity,
     Gains,
+    SceneEffects,
     SuccessBySimilarity,
     TrialRow,
 )
 from jaxnav.study.results import StudyResults, WorldResults, condition_name
-from jaxnav.study.trials import USES, Control, Gap, Trial
+from jaxnav.study.trials import USES, Control, Trial
 
 RUNS = ("main", "coin", "gate")
 SHIFTS, EPSILONS = (0.0, 1.0), (0.0, 0.5, 1.0)
@@ -34,12 +36,12 @@ def interval(mean: float, half: float = 1.0) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
-def effect(mean: float) -> Effect:
-    return Effect(mean, mean - 1.0, mean + 1.0, 0.5)
+def effect(mean: float) -> Interval:
+    return Interval(mean, mean - 1.0, mean + 1.0, 0.5)
 
 
-def estimate(mean: float) -> Estimate:
-    return Estimate(mean, mean - 1.0, mean + 1.0, 0.5, (mean - 1.0, mean, mean + 1.0))
+def estimate(mean: float) -> Interval:
+    return Interval(mean, mean - 1.0, mean + 1.0, 0.5, (mean - 1.0, mean, mean + 1.0))
 
 
 def row(trial: Trial, gain: float | None, gap: Gap = "novelty") -> TrialRow:
@@ -111,6 +113,19 @@ def gain(slope: float) -> GainBySimilarity:
     )
 
 
+def effects(shift: float) -> SceneEffects:
+    """Return effects of three runs in four scenes.
+
+    They are 1, 2, 2 and 3 points times the shift in every run, over five episodes a scene.
+    """
+    return SceneEffects(
+        scenes=("a", "b", "c", "d"),
+        rooms=("kitchen",) * 4,
+        episodes=np.full(4, 5),
+        gain=np.tile(5.0 * shift * np.array([1.0, 2.0, 2.0, 3.0]), (3, 1)),
+    )
+
+
 def condition(shift: float, run: str = "main") -> Condition:
     table = tuple(rows(shift, run))
     return Condition(shift=shift, world="rooms", scenes=80, rows=table, episodes=1000, parameters=12_345)
@@ -127,6 +142,7 @@ def full_condition(shift: float, chosen: float | None = None) -> FullCondition:
         chosen=chosen,
         similarity=success(0.3 - 0.2 * shift),
         gains=Gains(gain(-1.5 - shift), gain(-1.5 - shift)),
+        effects=effects(shift),
     )
 
 
@@ -198,11 +214,11 @@ def write(folder: Path, records: Mapping[str, Part], study: Mapping = STUDY) -> 
 
 
 def episodes_in(
-    scene: list[int] | np.ndarray,
-    goal: list[int] | np.ndarray | None = None,
-    room: list[int] | None = None,
+    scene: Sequence[int] | np.ndarray,
+    goal: Sequence[int] | np.ndarray | None = None,
+    room: Sequence[int] | None = None,
     names: tuple[str, ...] | None = None,
-    best_length: int = 1,
+    best_length: int | np.ndarray = 1,
 ) -> EpisodeList:
     """Return episodes in these scenes.
 

@@ -1,0 +1,49 @@
+"""What a reader of an evaluation must be told beside its table."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.statistics import LEAST_SCENES, paired_difference
+from jaxnav.evaluation.variants import Row
+
+
+def notes(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, room_prior: bool) -> list[str]:
+    """Return what limits the table, a sentence each.
+
+    Args:
+      rows: R rows.
+      success: float64 [R, S, E].
+      episodes: the E episodes.
+      room_prior: whether the layout's prior is that of the room's own type, not one for all.
+    """
+    found = _missing_intervals(success.shape[1], episodes)
+    if room_prior and any(row.arm == "layout" for row in rows):
+        found.append("Rows with w are told the type of the room by their prior, others are not.")
+    return found + _no_better(rows, success, episodes)
+
+
+def _missing_intervals(seeds: int, episodes: EpisodeList) -> list[str]:
+    found = []
+    if episodes.clusters().degrees < LEAST_SCENES:
+        plans = len(set(episodes.plan))
+        found.append(f"No intervals: {plans} floor plan{'s' * (plans > 1)}; an interval needs at least 3.")
+    if seeds == 1:
+        found.append("No interval for a single training seed: it says nothing of another training; train more seeds.")
+    return found
+
+
+def _no_better(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList) -> list[str]:
+    """Name the policies that no interval over scenes tells from Random."""
+    random = next((success[i] for i, row in enumerate(rows) if row.variant == "random"), None)
+    if random is None:
+        return []
+    clusters, found = episodes.clusters(), []
+    for row, values in zip(rows, success, strict=True):
+        if row.variant not in ("baseline", "layout"):
+            continue
+        gain = paired_difference(random, values, clusters, trained=False)
+        if not (gain.low if gain.bounded else gain.mean) > 0:
+            found.append(f"{row.variant} ({row.decoding}) is no better than Random: train it for longer.")
+    return found

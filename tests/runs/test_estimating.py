@@ -1,0 +1,66 @@
+"""Other layout estimators: at evaluation by name, in training one prior for all rooms."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import jaxnav
+from jaxnav.errors import InputError
+from jaxnav.layout import SETTINGS
+from jaxnav.runs.train import explore_world
+from jaxnav.runs.worlds import training_world
+from jaxnav.training.calibration import layout_priors
+
+EPSILON, EPISODES = (0.0, 0.2), 12
+
+
+@pytest.fixture(scope="module")
+def usual(drawn_run):
+    return jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES)
+
+
+@pytest.mark.parametrize("setting", ["evidence", pytest.param("clock", marks=pytest.mark.slow)])
+def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, usual, setting):
+    other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting=setting)
+    assert other.rows == usual.rows
+    assert other.report["run"]["evaluation_setting"] == setting
+    for i, row in enumerate(usual.rows):
+        same = all(np.array_equal(a[i], b[i]) for a, b in zip(usual.outcome, other.outcome, strict=True))
+        assert same == (row.variant != "stde"), row
+
+
+def test_the_papers_estimator_makes_weights_of_its_own(drawn_run, usual):
+    other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting="paper")
+    by_arm = {"baseline": [], "layout": []}
+    for i, row in enumerate(usual.rows):
+        if row.variant in by_arm:
+            by_arm[row.variant].append(np.array_equal(usual.outcome.length[i], other.outcome.length[i]))
+    assert all(by_arm["baseline"])
+    assert not all(by_arm["layout"])
+
+
+def test_settings_keep_what_they_do_not_name(drawn_run):
+    policies = drawn_run.policies()
+    assert policies.estimating(None) is policies
+    evidence = policies.estimating("evidence")
+    assert evidence.setting == dataclasses.replace(policies.setting, gap="evidence")
+    np.testing.assert_array_equal(evidence.knowledge.layout, policies.knowledge.layout)
+    released = policies.estimating("released")
+    assert released.setting == SETTINGS["released"]
+    np.testing.assert_array_equal(released.knowledge.layout, layout_priors(policies.counts, "released"))
+
+
+def test_policies_without_the_layout_have_no_estimator(drawn_run):
+    with pytest.raises(InputError, match="--setting evidence: needs policies with the layout"):
+        drawn_run.policies(("baseline",))._replace(setting=None).estimating("evidence")
+
+
+def test_a_pooled_prior_is_one_for_all_rooms(config):
+    world = training_world(config, Console(quiet=True))
+    pooled = dataclasses.replace(config, layout=dataclasses.replace(config.layout, prior="pooled"))
+    by_room, whole = (np.asarray(explore_world(each, world).counts) for each in (config, pooled))
+    assert np.abs(by_room - by_room[0]).max() > 0  # rooms differ
+    for room in whole:
+        np.testing.assert_allclose(room, by_room.sum(axis=0))

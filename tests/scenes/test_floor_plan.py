@@ -1,0 +1,56 @@
+"""The floor plan that a scene's name tells."""
+
+import collections
+
+import pytest
+
+from jaxnav.scenes.scene import floor_plan
+from jaxnav.scenes.worlds import generated
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        # RoboTHOR's apartments, furnished five times each.
+        ("FloorPlan_Train3_1", "FloorPlan_Train3"),
+        ("FloorPlan_Train3_5", "FloorPlan_Train3"),
+        ("FloorPlan_Train12_5", "FloorPlan_Train12"),
+        ("FloorPlan_Val1_2", "FloorPlan_Val1"),
+        # Generated apartments.
+        ("val-apartment-02-0", "val-apartment-02"),
+        ("val-apartment-02-4", "val-apartment-02"),
+        ("train-apartment-14-3", "train-apartment-14"),
+        ("test-apartment-00-0", "test-apartment-00"),
+        # Rooms with their objects moved.
+        ("FloorPlan7-replaced-2", "FloorPlan7"),
+        ("val-kitchen-003-replaced-10", "val-kitchen-003"),
+        # All others have a floor plan of their own.
+        ("FloorPlan7", "FloorPlan7"),
+        ("FloorPlan71", "FloorPlan71"),
+        ("FloorPlan201_physics", "FloorPlan201_physics"),
+        ("val-kitchen-003", "val-kitchen-003"),
+        ("val-house-0003", "val-house-0003"),
+        ("val-apartment-02", "val-apartment-02"),
+        ("my-apartment-02-4", "my-apartment-02-4"),
+        ("FloorPlan7-replaced-", "FloorPlan7-replaced-"),
+        ("FloorPlan_Train3_1b", "FloorPlan_Train3_1b"),
+        ("", ""),
+    ],
+)
+def test_the_name_tells_the_floor_plan(name, expected):
+    assert floor_plan(name) == expected
+
+
+@pytest.mark.parametrize("world", ["rooms", "houses"])
+def test_generated_scenes_have_floor_plans_of_their_own(world):
+    names = [generated(world, "val", 4)[i].name for i in range(4)]
+    assert [floor_plan(name) for name in names] == names
+
+
+def test_generated_apartments_of_a_floor_plan_share_their_walls():
+    scenes = [generated("apartments", "val", 10)[i] for i in range(10)]
+    walls = collections.defaultdict(set)
+    for scene in scenes:
+        walls[floor_plan(scene.name)].add((scene.walls.shape, scene.walls.tobytes()))
+    assert [len(kinds) for kinds in walls.values()] == [1, 1]
+    assert len(set.union(*walls.values())) == 2
