@@ -67,5 +67,5 @@ lock:
 	  --upgrade --no-header --no-annotate --generate-hashes --quiet --output-file requirements.lock
 
 clean:
-	rm -rf .venv build *.egg-info .cache .hypothesis .import_linter_cache .pytest_cache .ruff_cache
+	rm -rf .venv build dist *.egg-info .cache .hypothesis .import_linter_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

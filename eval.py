@@ -12,5 +12,5 @@ from jaxnav.cli import instrument, study
 if __name__ == "__main__":
     others = {"instrument": instrument.main, "study": study.main}
     if sys.argv[1:2] and sys.argv[1] in others:
-        sys.exit(others[sys.argv[1]](sys.argv[2:]))
-    sys.exit(evaluation.main())
+        sys.exit(others[sys.argv[1]](sys.argv[2:], prog=f"eval.py {sys.argv[1]}"))
+    sys.exit(evaluation.main(prog="eval.py"))

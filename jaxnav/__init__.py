@@ -4,6 +4,7 @@ The names below are the public interface; everything else is imported from its o
 """
 
 import importlib
+import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -22,7 +23,10 @@ if TYPE_CHECKING:
     from jaxnav.runs.sweep import Sweep, sweep
     from jaxnav.runs.train import train
 
-__version__ = "0.1.0"
+try:
+    __version__ = importlib.metadata.version("jaxnav")
+except importlib.metadata.PackageNotFoundError:  # read from a folder of sources
+    __version__ = "0+source"
 
 __all__ = [
     "METHODS",

@@ -4,6 +4,8 @@ import difflib
 import importlib
 import sys
 
+from jaxnav import __version__
+
 COMMANDS = {
     "train": "train a method with and without the layout estimator",
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
@@ -24,7 +26,10 @@ def main(arguments: list[str] | None = None) -> int:
     """
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
-        print(HELP + "\nEach has its own --help.")
+        print(HELP + "\nEach has its own --help; --version prints the version.")
+        return 0
+    if name == "--version":
+        print(f"jaxnav {__version__}")
         return 0
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)

@@ -11,6 +11,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+DEV = PROJECT["dependency-groups"]["dev"]
 # An absolute path of somebody's machine, not a part of an address or of a relative path.
 MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|root|home|Users|tmp/venv)/")
 
@@ -30,10 +31,14 @@ def _files() -> list[Path]:
     return [path for name in listing.split("\0") if name and (path := ROOT / name).is_file()]
 
 
-@pytest.mark.parametrize("line", PROJECT["project"]["dependencies"] + PROJECT["dependency-groups"]["dev"])
+@pytest.mark.parametrize("line", PROJECT["project"]["dependencies"] + DEV)
 def test_lock_pins_a_version_that_satisfies(line: str) -> None:
     requirement = Requirement(line)
     assert _locked()[requirement.name] in requirement.specifier
+
+
+def test_all_extras_are_there_to_develop() -> None:
+    assert {line for extra in PROJECT["project"]["optional-dependencies"].values() for line in extra} <= set(DEV)
 
 
 def test_lock_names_packages_only() -> None:

@@ -39,6 +39,11 @@ def test_the_version_is_that_of_the_project():
     assert f"version: {jaxnav.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
+def test_the_version_is_printed(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"jaxnav {jaxnav.__version__}\n"
+
+
 @pytest.mark.parametrize(("wrong", "mend"), [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, episode")])
 def test_unknown_commands_are_refused_with_a_hint(wrong, mend, capsys):
     assert main([wrong]) == 2

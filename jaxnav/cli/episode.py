@@ -10,8 +10,7 @@ from rich.console import Console
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import InputError
 from jaxnav.runs.policies import EstimatorName
-from jaxnav.viz.episode import draw_episode
-from jaxnav.viz.play import play_episode
+from jaxnav.viz import require_pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +20,7 @@ class EpisodeConfig:
     Attributes:
       run: the run directory; its first seed acts, with the best action at every step.
       split: scenes to play in.
-      index: of the episode in the list that `eval.py` fixes by default (of the first shard, where scenes are streamed).
+      index: of the episode in the default list of an evaluation (of the first shard, where scenes are streamed).
       out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
       variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.
@@ -49,6 +48,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def draw(config: EpisodeConfig, console: Console) -> None:
     """Play the episode and write its picture."""
+    require_pictures()
+    from jaxnav.viz.episode import draw_episode
+    from jaxnav.viz.play import play_episode
+
     path = config.out or config.run / "episode.gif"
     if path.suffix not in (".gif", ".png"):
         raise InputError(f"--out {path}: give a name that ends in .gif or .png")

@@ -48,9 +48,9 @@ class EvalConfig:
     json: Path | None = None
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, prog: str = "jaxnav eval") -> int:
     """Run the command and return its exit code."""
-    config = tyro.cli(EvalConfig, args=arguments, prog="eval.py", description="Evaluate a training run.")
+    config = tyro.cli(EvalConfig, args=arguments, prog=prog, description="Evaluate a training run.")
     return exit_code(lambda console: _evaluate(config, console, result_console()))
 
 

@@ -1,42 +1,66 @@
 """Command lines to settings."""
 
 import argparse
+import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from jaxnav.errors import InputError
-from jaxnav.runs.overlay import RENAMED, apply_yaml
+from jaxnav.runs.overlay import CONFIGS, RENAMED, apply_yaml
 
 Config = TypeVar("Config")
 
 _REGISTRY = ConstructorRegistry()
 
+_CONFIG = tyro.conf.arg(
+    metavar="NAME|FILE.yaml",
+    help=f"settings to lay over the defaults: a packaged configuration ({', '.join(CONFIGS)}) or a YAML file; "
+    "the other options override them.",
+)
+
 
 def parse(default: Config, arguments: list[str] | None, prog: str, description: str) -> Config:
     """Return the settings of a command.
 
-    They are `default`, then the file of `--config`, then the other options.
+    They are `default`, then the configuration of `--config`, then the other options.
 
     Raises:
-      InputError: bad config file, or an option that has been renamed.
+      InputError: bad configuration, or an option that has been renamed.
       SystemExit: with code 2 after a bad option, 0 after --help.
     """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--config", type=Path)
+    first = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
+    first.add_argument("--config")
     known, rest = first.parse_known_args(arguments)
     _refuse_renamed(rest)
-    return tyro.cli(
-        type(default),
-        default=apply_yaml(default, known.config) if known.config else default,
-        args=rest,
-        prog=prog,
-        description=f"{description} `--config FILE` lays a YAML file over the defaults; the other options override it.",
-        registry=_REGISTRY,
+    if known.config is not None:
+        default = apply_yaml(default, known.config)
+    return parse_options(type(default), rest, prog, description, default)
+
+
+def parse_options(
+    kind: type[Config], arguments: list[str] | None, prog: str, description: str, default: Config | None = None
+) -> Config:
+    """Parse the options of a command, with `--config` in its help.
+
+    Args:
+      kind: dataclass of the settings; what has no default is positional.
+      arguments: the options, without `--config`; None for those of the process.
+      prog: the command, as the help names it.
+      description: of the command, for its help.
+      default: the settings without any option; None for those of the dataclass.
+    """
+    config = ("config", Annotated[str | None, _CONFIG], None)
+    settings = ("settings", Annotated[kind, tyro.conf.arg(name="")])
+    fields = [settings, config] if default is None else [config, (*settings, default)]
+    options = dataclasses.make_dataclass("Options", fields)
+    positional = (tyro.conf.PositionalRequiredArgs,)
+    parsed = tyro.cli(
+        options, args=arguments, prog=prog, description=description, registry=_REGISTRY, config=positional
     )
+    return parsed.settings
 
 
 def _refuse_renamed(arguments: Sequence[str]) -> None:

@@ -18,7 +18,7 @@ from jaxnav.runs.policies import load_policies
 from jaxnav.scenes.files.importing import Format, Split, import_scenes, read_format
 from jaxnav.scenes.sources import SceneSource
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.viz.scene import draw_scene
+from jaxnav.viz import require_pictures
 from jaxnav.viz.scene_tables import scene_remarks, scene_tables
 
 
@@ -121,6 +121,9 @@ def convert(config: ImportConfig, console: Console) -> None:
 
 def show(config: ShowConfig, console: Console) -> None:
     """Draw a scene and write the picture."""
+    require_pictures()
+    from jaxnav.viz.scene import draw_scene
+
     scene = config.select(config.scene, config.index)
     path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + ".png")
     if path.suffix != ".png":

@@ -6,16 +6,16 @@ from jaxnav.study.config import StudyConfig, check_study
 from jaxnav.study.run import run_study
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, prog: str = "jaxnav study") -> int:
     """Run the command; return 0, or 2 after bad input."""
-    return exit_code(lambda console: run_study(parse_study(arguments), console))
+    return exit_code(lambda console: run_study(parse_study(arguments, prog), console))
 
 
-def parse_study(arguments: list[str] | None) -> StudyConfig:
-    """Parse a study: defaults, the file of `--config`, options.
+def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> StudyConfig:
+    """Parse a study: defaults, the configuration of `--config`, options.
 
     Raises:
-      InputError: bad config file or setting.
+      InputError: bad configuration or setting.
       SystemExit: with code 2 after a bad option, 0 after --help.
     """
-    return check_study(parse(StudyConfig(), arguments, "eval.py study", "Put the paper's claims to the test."))
+    return check_study(parse(StudyConfig(), arguments, prog, "Put the paper's claims to the test."))

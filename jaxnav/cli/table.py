@@ -18,7 +18,7 @@ class TableConfig:
     """Choose an evaluation to print.
 
     Attributes:
-      file: JSON that `eval.py` wrote.
+      file: JSON that an evaluation wrote.
     """
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -35,8 +35,8 @@ def _read(path: Path) -> dict:
         report = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path}: no evaluation can be read from it ({error}); give a file that eval.py wrote"
+            f"{path}: no evaluation can be read from it ({error}); give a file that an evaluation wrote"
         ) from error
     if not isinstance(report, dict) or report.get("format") != FORMAT:
-        raise InputError(f"{path}: is no evaluation of format {FORMAT}; give a file that eval.py wrote")
+        raise InputError(f"{path}: is no evaluation of format {FORMAT}; give a file that an evaluation wrote")
     return report

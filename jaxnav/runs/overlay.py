@@ -15,12 +15,15 @@ from jaxnav.errors import InputError
 
 Config = TypeVar("Config")
 
+#: Configurations that come with jaxnav, by name.
+CONFIGS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))}
+
 #: Names of settings that have changed: old to new.
 RENAMED = {"sizes.relation_layers": "method_sizes.relation_layers"}
 
 
-def apply_yaml(default: Config, path: str | Path) -> Config:
-    """Return `default` with the values of a YAML file.
+def apply_yaml(default: Config, source: str | Path) -> Config:
+    """Return `default` with the values of a configuration.
 
     Only what the file names changes, and each value is checked against the annotation of its field. Known annotations:
     `bool`, `int`, `float`, `str`, `Path`, `Literal`, `X | None`, `tuple`, `dict`, nested dataclasses. Where a float is
@@ -28,13 +31,13 @@ def apply_yaml(default: Config, path: str | Path) -> Config:
 
     Args:
       default: instance of a frozen dataclass.
-      path: the YAML file; an empty one changes nothing.
+      source: name of a packaged configuration, see `CONFIGS`, or a YAML file; an empty one changes nothing.
 
     Raises:
       InputError: the file is missing or no YAML mapping, has a key twice, an unknown key or a value of another type;
         names file, line or dotted key, and mend.
     """
-    path = Path(path)
+    path = CONFIGS.get(str(source), Path(source))
     values = _load(path)
     return default if values is None else _overlay(default, values, path, "")
 
@@ -58,6 +61,8 @@ class _Loader(yaml.SafeLoader):
 def _load(path: Path) -> Any:
     try:
         return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such configuration; choose from {', '.join(CONFIGS)}, or give a file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except yaml.MarkedYAMLError as error:

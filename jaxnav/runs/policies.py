@@ -115,7 +115,7 @@ def load_policies(run: RunConfig, arms: Sequence[str] | None = None) -> Policies
         raise InputError(f"{run.run_dir}: was trained without the arm {absent[0]!r}; train one with all --arms")
     folders = {arm: [run.run_dir / POLICIES / f"{arm}-{seed}" for seed in range(run.seeds)] for arm in arms}
     if missing := [folder for paths in folders.values() for folder in paths if not folder.exists()]:
-        raise InputError(f"{missing[0]}: is missing, so training has not finished; run train.py again with this run")
+        raise InputError(f"{missing[0]}: is missing, so training has not finished; train again with this --run-dir")
     loaded = {arm: [load_params(folder) for folder in paths] for arm, paths in folders.items()}
     told = "layout" if "layout" in arms else arms[-1]  # its last seed says what holds for all
     tensors, spec = loaded[told][-1]

@@ -1,6 +1,7 @@
 """Moves on the lattice, and shortest paths."""
 
 import numpy as np
+from scipy import ndimage
 
 from jaxnav.scenes.scene import CELL
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
@@ -24,25 +25,11 @@ def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
     Returns:
       int [P, 2] each, the cells of a part; parts and cells are in row order.
     """
-    cells = np.argwhere(mask)
-    if not len(cells):
-        return []
-    index = np.full(np.add(mask.shape, 2), -1)
-    index[1:-1, 1:-1][mask] = np.arange(len(cells))
-    beside = cells[:, None] + 1 + [(0, 1), (1, -1), (1, 0), (1, 1)]  # [P, 4, 2]; the other four are these reversed
-    other = index[beside[..., 0], beside[..., 1]]
-    a, b = np.nonzero(other >= 0)[0], other[other >= 0]
-    label = np.arange(len(cells))
-    while True:  # neighbours are joined under the smaller label until all of them agree
-        joined, low = label.copy(), np.minimum(label[a], label[b])
-        np.minimum.at(joined, label[a], low)
-        np.minimum.at(joined, label[b], low)
-        joined = joined[joined]
-        if np.array_equal(joined, label):
-            break
-        label = joined
-    counts = np.unique(label, return_counts=True)[1]
-    return np.split(cells[np.argsort(label, kind="stable")], np.cumsum(counts)[:-1])
+    labels = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, np.ones((3, 3)), output=labels)
+    cells, label = np.argwhere(mask), labels[mask]
+    parts = np.split(cells[np.argsort(label, kind="stable")], np.cumsum(np.bincount(label)[1:]))[:-1]
+    return sorted(parts, key=lambda part: part[0].tolist())
 
 
 def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:

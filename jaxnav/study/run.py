@@ -9,7 +9,6 @@ from jaxnav.study.bench import Bench
 from jaxnav.study.config import StudyConfig, study_identity
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.document import check_document, write_document
-from jaxnav.study.draw import draw_figures
 from jaxnav.study.gap_course import gap_course
 from jaxnav.study.instrument import instrument_report, study_instrument
 from jaxnav.study.instrument_report import InstrumentReport
@@ -17,6 +16,7 @@ from jaxnav.study.measure import chosen_epsilon, measure_condition
 from jaxnav.study.records import Condition
 from jaxnav.study.results import WORLDS, condition_name, is_written, write_part
 from jaxnav.study.runs import ensure_trained, study_runs
+from jaxnav.viz import require_pictures
 
 #: Runs that have every trial.
 FULL = ("main", "goal", "real")
@@ -28,8 +28,12 @@ def run_study(config: StudyConfig, console: Console) -> None:
     Finished runs and results are kept, so an interrupted study goes on where it stopped.
 
     Raises:
-      InputError: the document is another one, epsilon was not chosen on `val`, or a run is impossible.
+      InputError: what draws is not installed, the document is another one, epsilon was not chosen on `val`, or a run
+        is impossible.
     """
+    require_pictures()
+    from jaxnav.study.draw import draw_figures
+
     check_document(config.document)
     if config.split == "test":
         chosen_epsilon(config)  # refuses where val is missing

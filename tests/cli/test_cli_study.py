@@ -13,6 +13,7 @@ from jaxnav import __main__ as commands
 from jaxnav.cli import study as command
 from jaxnav.runs.directory import load_run
 from jaxnav.runs.policies import load_policies
+from jaxnav.study import draw
 from jaxnav.study import run as study_run
 from jaxnav.study.document import READING
 from jaxnav.study.runs import run_config
@@ -128,7 +129,7 @@ def steps(monkeypatch):
     monkeypatch.setattr(study_run, "instrument_report", lambda *_: measured("instrument", study_results.instrument()))
     monkeypatch.setattr(study_run, "measure_condition", measure_condition)
     monkeypatch.setattr(study_run, "gap_course", lambda *_: measured("gap", study_results.course()))
-    monkeypatch.setattr(study_run, "draw_figures", lambda folder, images: names.append(f"figures of {folder.name}"))
+    monkeypatch.setattr(draw, "draw_figures", lambda folder, images: names.append(f"figures of {folder.name}"))
     return names
 
 
@@ -210,7 +211,7 @@ def test_another_document_is_refused_before_any_training(untrained, tmp_path, ca
 
 @pytest.mark.parametrize("name", ["study", "study_quick"])
 def test_the_configs_that_come_with_it(name):
-    config = command.parse_study(["--config", str(Path(__file__).parents[2] / "configs" / f"{name}.yaml")])
+    config = command.parse_study(["--config", name])
     assert config.shifts == (0.0, 0.5, 1.0)
     assert run_config(config, "main").worlds.num_val == 80
     assert {0.0, 0.5, 1.0} <= set(config.epsilon)

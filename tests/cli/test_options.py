@@ -2,14 +2,18 @@
 
 import dataclasses
 import re
+import runpy
+from pathlib import Path
 
 import pytest
 from support.commands import refusal, train
 
+from jaxnav.__main__ import main
 from jaxnav.cli import train as train_command
 from jaxnav.cli.options import parse
 from jaxnav.errors import InputError
-from jaxnav.runs.config import RunConfig
+from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.overlay import CONFIGS, apply_yaml
 
 
 @pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
@@ -50,7 +54,11 @@ def test_the_help_names_every_setting(capsys):
         train_command.main(["--help"])
     assert exit.value.code == 0
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
-    for words in ("--method STR how experience is made", "--method-sizes [NAME INT [NAME INT ...]]", "--config FILE"):
+    for words in (
+        "--method STR how experience is made",
+        "--method-sizes [NAME INT [NAME INT ...]]",
+        "--config NAME|FILE.yaml",
+    ):
         assert words in text
     for field in dataclasses.fields(RunConfig):
         assert f"--{field.name.replace('_', '-')}" in text
@@ -59,8 +67,52 @@ def test_the_help_names_every_setting(capsys):
 def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
     for missing in (tmp_path / "none.yaml", "smoek"):
         assert train(missing, tmp_path / "run") == 2
-        assert refusal(capsys).startswith(f"error: {missing}: cannot be read (No such file or directory); check the")
+        mend = "choose from smoke, study, study_quick, or give a file"
+        assert refusal(capsys) == f"error: {missing}: no such configuration; {mend}"
     assert not (tmp_path / "run").exists()
+
+
+def test_a_config_is_the_name_of_a_packaged_one_or_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "smoke").write_text("seeds: 4")  # the name goes first
+
+    def seeds(config):
+        return parse(RunConfig(), ["--config", config], "train.py", "").seeds
+
+    assert list(CONFIGS) == ["smoke", "study", "study_quick"]
+    assert (seeds("smoke"), seeds("./smoke"), seeds(str(CONFIGS["smoke"]))) == (1, 4, 1)
+
+
+def test_the_example_of_a_configuration_is_a_possible_run():
+    (example,) = (Path(__file__).parents[2] / "configs").glob("*.yaml")
+    config = check(apply_yaml(RunConfig(), example))
+    assert config.seeds == 5
+    assert config not in (RunConfig(), apply_yaml(RunConfig(), "smoke"))
+
+
+@pytest.mark.parametrize("command", ["train", "study", "instrument"])
+def test_the_help_lists_the_option_of_the_configuration(capsys, command):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    assert text.startswith(f"usage: jaxnav {command} ")
+    assert "--config NAME|FILE.yaml settings to lay over the defaults: a packaged configuration (smoke, " in text
+
+
+@pytest.mark.parametrize(
+    ("script", "usage"),
+    [
+        ("train.py", "usage: train.py "),
+        ("eval.py", "usage: eval.py "),
+        ("eval.py study", "usage: eval.py study "),
+        ("eval.py instrument", "usage: eval.py instrument "),
+    ],
+)
+def test_the_help_of_a_script_names_the_script(monkeypatch, capsys, script, usage):
+    monkeypatch.setattr("sys.argv", [*script.split(), "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(Path(__file__).parents[2] / script.split()[0]), run_name="__main__")
+    assert capsys.readouterr().out.startswith(usage)
 
 
 @pytest.mark.parametrize("value", [["nonsense"], ["relation_layers"], ["relation_layers", "two"]])

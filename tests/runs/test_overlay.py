@@ -1,6 +1,7 @@
 """YAML over config dataclasses: what is taken, what is refused and how the message helps."""
 
 import dataclasses
+from pathlib import Path
 from typing import Literal
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.overlay import apply_yaml
+from jaxnav.runs.overlay import CONFIGS, apply_yaml
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,9 +162,14 @@ def test_broken_yaml_is_refused_with_its_line(overlay, text, place):
 
 
 def test_missing_file_and_folder_are_refused(tmp_path):
-    for path in (tmp_path / "none.yaml", tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
+    for path, problem in ((tmp_path / "none.yaml", "no such configuration; choose"), (tmp_path, "cannot be read")):
+        with pytest.raises(InputError, match=f"{path}: {problem}"):
             apply_yaml(Config(), path)
+
+
+def test_a_name_is_that_of_a_packaged_configuration():
+    assert apply_yaml(RunConfig(), "smoke") == apply_yaml(RunConfig(), CONFIGS["smoke"])
+    assert apply_yaml(RunConfig(), Path("smoke")).seeds == 1
 
 
 @given(

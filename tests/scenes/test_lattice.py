@@ -6,18 +6,39 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis.extra import numpy as hnp
-from support.lattice import EIGHT, parts_of
 from support.scenes import HOUSES, ROOMS
 
 from jaxnav.scenes.lattice import ahead_of, best_lengths, connected_parts, standable_cells, successors
 
 
-@given(hnp.arrays(bool, (7, 9)))
-def test_connected_parts_are_those_of_scipy(mask):
-    labels, count = parts_of(mask, EIGHT)
-    parts = connected_parts(mask)
-    expected = [np.argwhere(labels == k + 1) for k in range(count)]
-    assert sorted(part.tolist() for part in parts) == sorted(part.tolist() for part in expected)
+def searched_parts(mask):
+    """The 8-connected parts by a breadth-first search; parts and cells in row order."""
+    left, parts = dict.fromkeys(map(tuple, np.argwhere(mask).tolist())), []
+    while left:
+        start = next(iter(left))
+        del left[start]
+        queue, part = deque([start]), []
+        while queue:
+            z, x = queue.popleft()
+            part.append([z, x])
+            for beside in [(z + dz, x + dx) for dz in (-1, 0, 1) for dx in (-1, 0, 1)]:
+                if beside in left:
+                    del left[beside]
+                    queue.append(beside)
+        parts.append(sorted(part))
+    return parts
+
+
+@given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, min_side=0, max_side=9)))
+def test_connected_parts_are_those_of_a_search(mask):
+    assert [part.tolist() for part in connected_parts(mask)] == searched_parts(mask)
+
+
+def test_connected_parts_of_large_masks_are_those_of_a_search():
+    draws = np.random.default_rng(0)
+    for share in (0.2, 0.35, 0.5):
+        mask = draws.random((60, 70)) < share
+        assert [part.tolist() for part in connected_parts(mask)] == searched_parts(mask)
 
 
 def test_connected_parts_of_a_long_snake():

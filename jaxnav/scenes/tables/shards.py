@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from jaxnav.scenes.worlds import Scenes
 
 #: The code that shards follow from, below `_SOURCE`; importers write scene files, whose checksums count instead.
-_CODE = ("*", "generate/**/*", "tables/**/*", "files/scene_file.py", "files/walls.py", "files/record.py")
+_CODE = (
+    *("categories.py", "lattice.py", "scene.py", "task.py", "worlds.py"),
+    *("generate/*.py", "generate/*.yaml", "tables/*.py"),
+    *("files/record.py", "files/scene_file.py", "files/walls.py"),
+)
 _SOURCE = Path(__file__).parents[1]
 
 
@@ -135,8 +139,8 @@ def _open(folder: Path, work: ShardWork) -> Shards:
 def _key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
     """Return a name that differs wherever the shards may differ."""
     key = hashlib.sha256(repr((scenes.identity, task, shard_scenes, np.__version__)).encode())
-    files = {path for pattern in _CODE for path in _SOURCE.glob(pattern) if path.suffix in (".py", ".yaml")}
-    for path in sorted(files):
+    files = {path for pattern in _CODE for path in _SOURCE.glob(pattern)}
+    for path in sorted(path for path in files if path.name != "__init__.py"):
         code = path.read_bytes()
         key.update(f"{path.relative_to(_SOURCE).as_posix()} {len(code)} ".encode() + code)
     return key.hexdigest()[:20]

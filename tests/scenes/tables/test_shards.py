@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -26,6 +27,26 @@ ARRAYS = ("ahead", "rows", "best_length", "goal_distance", "first_cell", "num_ce
 
 def times(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+def copied_code(tmp_path, monkeypatch):
+    """A copy of the code of the scenes, in place of it."""
+    code = tmp_path / "code"
+    shutil.copytree(module._SOURCE, code, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(module, "_SOURCE", code)
+    return code
+
+
+def needed_code(code, *left):
+    """What modules import of the scenes, directly or not, and the data beside them."""
+    found, left = set(), list(left)
+    while left:
+        name = left.pop()
+        found.add(name)
+        found |= {path.relative_to(code).as_posix() for path in (code / name).parent.glob("*.yaml")}
+        imported = re.findall(r"^ *from jaxnav\.scenes\.([\w.]+) import", (code / name).read_text(), re.MULTILINE)
+        left += {f"{each.replace('.', '/')}.py" for each in imported} - found
+    return found
 
 
 # What is in them
@@ -83,10 +104,7 @@ def test_several_workers_write_the_same_bytes_and_report_each_shard(tmp_path):
 
 
 def test_whatever_the_shards_follow_from_is_in_their_folder(tmp_path, monkeypatch):
-    (tmp_path / "code").mkdir()
-    code = tmp_path / "code" / "rules.py"
-    code.write_text("1")
-    monkeypatch.setattr(module, "_SOURCE", code.parent)
+    code = copied_code(tmp_path, monkeypatch) / "lattice.py"
     folder = build(tmp_path).folder
     assert build(tmp_path).folder == folder
     others = [
@@ -94,9 +112,25 @@ def test_whatever_the_shards_follow_from_is_in_their_folder(tmp_path, monkeypatc
         build(tmp_path, task=Task(CATEGORIES, rules=Rules(success_distance=1.25))),
         build(tmp_path, shard_scenes=3),
     ]
-    code.write_text("2")
+    code.write_text("# changed")
     others.append(build(tmp_path))
     assert len({folder, *(shards.folder for shards in others)}) == 5
+
+
+def test_their_folder_follows_from_the_code_that_makes_them_alone(tmp_path, monkeypatch):
+    code = copied_code(tmp_path, monkeypatch)
+    key = module._key(Corridors(), TASK, 2)
+    needed = needed_code(code, "tables/shards.py")
+    assert {"tables/compile.py", "worlds.py", "generate/rooms.yaml", "files/scene_file.py"} <= needed
+    changes = set()
+    for path in [path for path in code.rglob("*.*") if path.is_file()]:
+        content = path.read_text()
+        path.write_text(f"{content}\n# changed\n")
+        if module._key(Corridors(), TASK, 2) != key:
+            changes.add(path.relative_to(code).as_posix())
+        path.write_text(content)
+    assert changes == needed
+    assert not any("importers" in name or "__init__" in name for name in changes)
 
 
 def test_only_what_is_missing_is_compiled(tmp_path):

@@ -1,0 +1,77 @@
+"""What is built: the wheel and the archive of the sources."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("jaxnav", "tests", "benchmarks", "configs", "docs", "results")
+FILES = [path for path in ROOT.iterdir() if path.is_file() and not path.name.startswith(".")]
+BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
+
+
+def build(sources, what, folder):
+    """Build in a folder of sources, without a network, and return the path."""
+    command = [sys.executable, "-c", BUILD, f"build_{what}", folder]
+    done = subprocess.run(command, cwd=sources, capture_output=True, text=True, check=True)
+    return folder / done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The unpacked archive of the sources, and the wheel that is built there."""
+    folder = tmp_path_factory.mktemp("built")
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, folder / "copy" / name)
+    for path in FILES:
+        shutil.copy(path, folder / "copy")
+    with tarfile.open(build(folder / "copy", "sdist", folder)) as archive:
+        archive.extractall(folder / "unpacked", filter="data")
+    (unpacked,) = (folder / "unpacked").iterdir()
+    return unpacked, build(unpacked, "wheel", folder)
+
+
+def files(folder):
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+@pytest.mark.slow
+def test_the_archive_holds_all_that_its_tests_need(built):
+    unpacked, _ = built
+    for folder in FOLDERS:
+        assert files(ROOT / folder) == files(unpacked / folder)
+    assert {path.name for path in FILES} <= files(unpacked)
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_the_package_and_its_data_alone(built):
+    _, wheel = built
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert names == {f"jaxnav/{name}" for name in files(ROOT / "jaxnav")}
+    assert {"jaxnav/py.typed", "jaxnav/configs/smoke.yaml", "jaxnav/scenes/generate/rooms.yaml"} <= names
+
+
+@pytest.mark.slow
+def test_the_readme_of_the_package_leads_to_nothing_that_is_not_there(built):
+    _, wheel = built
+    archive = zipfile.ZipFile(wheel)
+    (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    readme = Parser().parsestr(archive.read(name).decode()).get_payload()
+    assert isinstance(readme, str)
+    assert "# jaxnav" in readme
+    *_, python = re.findall(r"```python\n.*?```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert python in readme
+    assert "![" not in readme
+    prose = re.sub(r"```.*?```", "", readme, flags=re.DOTALL)
+    assert re.findall(r"\]\((?!https?://)", prose) == []
