@@ -6,6 +6,7 @@ the record, `OPTIONAL` leaves out None, and `key("from")` gives another name. An
 
 import dataclasses
 import functools
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -33,7 +34,9 @@ def to_json(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _record_to_json(value)
     if isinstance(value, np.ndarray):
-        return np.where(np.isnan(value), None, value).tolist()
+        return [to_json(item) for item in value.tolist()]
+    if isinstance(value, float) and math.isnan(value):
+        return None
     if isinstance(value, Mapping):
         return {name: to_json(item) for name, item in value.items()}
     return [to_json(item) for item in value] if isinstance(value, list | tuple) else value
