@@ -4,6 +4,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 # JAX reads these when it is imported, here, in the suite's other workers and in the commands that tests start.
 if "PYTEST_XDIST_WORKER" not in os.environ:
@@ -17,6 +18,8 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 import hypothesis
 import jax
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -26,8 +29,15 @@ hypothesis.settings.register_profile("jaxnav", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxnav")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep together what shares fixtures: the tests of a file, and all of `runs`."""
-    for item in items:
-        folder = item.path.parent
-        item.add_marker(pytest.mark.xdist_group(str(folder if folder.name == "runs" else item.path)))
+class ByFixtures(LoadScopeScheduling):
+    """Keep together what shares fixtures: the tests of a file, all of `runs` and all of `cli`."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file, folder = nodeid.partition("::")[0], Path(nodeid.partition("::")[0]).parent
+        return str(folder) if folder.name in ("runs", "cli") else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFixtures:
+    """Divide the tests among workers."""
+    return ByFixtures(config, log)

@@ -40,6 +40,7 @@ def _episodes(report):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_the_report_holds_all_rows_and_differences(evaluated):
     report = json.loads(evaluated.read_text())
     assert list(report) == ["run", "rows", "differences", "notes", "compilations", "versions", "format"]
@@ -66,6 +67,7 @@ def test_the_report_holds_all_rows_and_differences(evaluated):
     assert len(report["differences"]) == 2 * 4 * 3
 
 
+@pytest.mark.slow
 def test_what_limits_the_table_is_told_below_it(evaluated):
     notes = json.loads(evaluated.read_text())["notes"]
     assert any("are told the type of the room by their prior" in note for note in notes)
@@ -75,6 +77,7 @@ def test_what_limits_the_table_is_told_below_it(evaluated):
     assert printed.index("Difference, paired") < printed.index(" ".join(notes))
 
 
+@pytest.mark.slow
 def test_the_episodes_are_written_row_by_row(evaluated):
     rows = _episodes(evaluated)
     assert len(rows) == ROWS * SEEDS * 20

@@ -32,6 +32,7 @@ from jaxnav.scenes.worlds import WORLDS, generated
 
 NUM_ENVS, NUM_STEPS = 20, 150  # 3,000 steps of each source and task
 LIVING_ROOM, OTHERS = 60, 30  # step limits
+SLOW = pytest.mark.slow
 TASKS = {
     "rooms": Task(rules=ROOMS, detector=PERFECT),
     "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT),
@@ -118,7 +119,12 @@ def step_differences(
 
 
 @pytest.mark.parametrize(
-    ("source", "world"), [("rooms", "rooms"), ("ithor", "rooms"), ("rooms", "apartments"), ("rooms", "houses")]
+    ("source", "world"),
+    [
+        ("rooms", "rooms"),
+        ("ithor", "rooms"),
+        *(pytest.param("rooms", home, marks=SLOW) for home in ("apartments", "houses")),
+    ],
 )
 def test_random_steps(source, world):
     task, scenes = TASKS[world], scenes_of(source)
@@ -180,7 +186,10 @@ def differences_of(scene: Scene, guide: Guide, task: Task, every: int = 1) -> co
 
 
 @pytest.mark.parametrize("world", TASKS)
-@pytest.mark.parametrize(("source", "every"), [("coarse", 1), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+@pytest.mark.parametrize(
+    ("source", "every"),
+    [("coarse", 1), pytest.param("maze", 2, marks=SLOW), ("rooms", 3), pytest.param("ithor", 3, marks=SLOW)],
+)
 def test_every_pose(source, every, world):
     task = TASKS[world]
     for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::every]:

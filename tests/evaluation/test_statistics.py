@@ -224,7 +224,7 @@ def test_an_interval_covers_the_truth_as_often_as_it_says(size):
 
 
 def test_episodes_taken_for_independent_cover_far_less():
-    assert coverage(episode_bootstrap, (20, 3), draws=100) < 0.85
+    assert coverage(episode_bootstrap, (20, 3), draws=60) < 0.85
 
 
 def test_runs_of_both_arms_are_left_out_within_their_arm():

@@ -225,6 +225,7 @@ print(json.dumps({"modules": sorted(sys.modules), "logits": decision.logits.toli
 """
 
 
+@pytest.mark.slow
 def test_an_exported_policy_runs_without_the_trainer(tmp_path, org):
     export_params(tmp_path / "policy", lively(0), dataclasses.asdict(SPEC))
     observation, _ = batch()

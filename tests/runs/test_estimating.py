@@ -13,30 +13,30 @@ from jaxnav.runs.train import explore_world
 from jaxnav.runs.worlds import training_world
 from jaxnav.training.calibration import layout_priors
 
-EPSILON, EPISODES = (0.0, 0.2), 12
+EPSILON, EPISODES = np.linspace(0, 1, 11), 12  # those of `evaluated`
 
 
-@pytest.fixture(scope="module")
-def usual(drawn_run):
-    return jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES)
-
-
-@pytest.mark.parametrize("setting", ["evidence", pytest.param("clock", marks=pytest.mark.slow)])
-def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, usual, setting):
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["evidence", "clock"])
+def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, evaluated, setting):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting=setting)
-    assert other.rows == usual.rows
+    assert other.rows == evaluated.rows
     assert other.report["run"]["evaluation_setting"] == setting
-    for i, row in enumerate(usual.rows):
-        same = all(np.array_equal(a[i], b[i]) for a, b in zip(usual.outcome, other.outcome, strict=True))
-        assert same == (row.variant != "stde"), row
+    for i, row in enumerate(evaluated.rows):
+        same = all(np.array_equal(a[i], b[i]) for a, b in zip(evaluated.outcome, other.outcome, strict=True))
+        if row.variant != "stde" or row.epsilon == 1.0:
+            assert same, row
+        elif row.epsilon == 0.0:
+            assert not same, row
 
 
-def test_the_papers_estimator_makes_weights_of_its_own(drawn_run, usual):
+@pytest.mark.slow
+def test_the_papers_estimator_makes_weights_of_its_own(drawn_run, evaluated):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting="paper")
     by_arm = {"baseline": [], "layout": []}
-    for i, row in enumerate(usual.rows):
+    for i, row in enumerate(evaluated.rows):
         if row.variant in by_arm:
-            by_arm[row.variant].append(np.array_equal(usual.outcome.length[i], other.outcome.length[i]))
+            by_arm[row.variant].append(np.array_equal(evaluated.outcome.length[i], other.outcome.length[i]))
     assert all(by_arm["baseline"])
     assert not all(by_arm["layout"])
 

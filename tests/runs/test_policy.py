@@ -70,9 +70,9 @@ def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.
     ("variant", "epsilon", "decoding"),
     [
         ("stde", 0.0, "argmax"),
-        ("stde", 0.2, "argmax"),
-        ("stde", 1.0, "argmax"),
-        ("stde", 0.0, "sample"),
+        pytest.param("stde", 0.2, "argmax", marks=pytest.mark.slow),
+        pytest.param("stde", 1.0, "argmax", marks=pytest.mark.slow),
+        pytest.param("stde", 0.0, "sample", marks=pytest.mark.slow),
         ("baseline", None, "argmax"),
     ],
 )

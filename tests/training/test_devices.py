@@ -115,10 +115,12 @@ def test_any_number_of_devices_trains_the_same_policies(devices):
         assert theirs["metrics"] == pytest.approx(ours["metrics"], rel=1e-3, abs=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_policy():
     assert distance(*trained(1, 4)["1"]) > 100 * TOLERANCE
 
 
+@pytest.mark.slow
 def test_devices_share_episodes_without_gathering_them():
     """Only sums are exchanged; without the mesh made known, the rows are made one axis and gathered."""
     found = trained(1, 4)
@@ -126,6 +128,7 @@ def test_devices_share_episodes_without_gathering_them():
     assert found["without"]["all-gather"]
 
 
+@pytest.mark.slow
 def test_devices_that_cannot_be_shared_out_are_refused():
     assert trained(1, 4)["refused"] == (
         "config: ppo.num_envs is 18; with 4 devices for 2 seeds the episodes of each are shared by 2: "

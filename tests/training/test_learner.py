@@ -202,6 +202,7 @@ def test_a_method_without_experience_trains():
     assert moved["view"]["kernel"] > 0.0
 
 
+@pytest.mark.slow
 def test_ppo_learns():
     """A random policy soon says Done and is right by chance; a trained one finds the goals within 20 steps."""
     params = PARAMS.replace(step_limit=jnp.full(2, 20, jnp.int32))

@@ -57,6 +57,7 @@ def test_impossible_arguments_are_refused(generate, arguments: tuple, message: s
         generate(*arguments)
 
 
+@pytest.mark.slow
 def test_five_furnishings_share_the_walls_of_a_floor_plan(apartments: list[Scene]):
     plans = [scene.walls.tobytes() for scene in apartments]
     for i, walls in enumerate(plans):

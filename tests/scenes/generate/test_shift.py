@@ -119,6 +119,7 @@ def test_rooms_are_the_same_one_by_one():
         assert_scenes_equal(alone, scene)
 
 
+@pytest.mark.slow
 def test_a_shifted_room_is_its_twin_with_other_labels():
     for twin, scene in zip(scenes_of("rooms", 0.0), scenes_of("rooms", 1.0), strict=True):
         assert_scenes_equal(dataclasses.replace(scene, types=twin.types), twin)
@@ -212,6 +213,7 @@ def test_pairs_that_belong_together_meet_by_chance_alone_at_full_shift(world: st
     assert after < halfway < before
 
 
+@pytest.mark.slow
 def test_a_shift_moves_objects_to_the_wrong_room():
     def share(scenes: list[Scene], name: str, room_type: str) -> float:
         inside = []
