@@ -76,6 +76,7 @@ def test_two_rows_by_hand():
 
 
 @given(SEEDS, VIEWS)
+@pytest.mark.slow
 def test_against_scipy(seed, views):
     prior = random_prior(seed)
     estimator = LayoutEstimator(prior, "evidence")

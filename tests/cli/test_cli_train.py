@@ -69,6 +69,7 @@ def test_policies_say_how_they_are_used(run_dir):
     assert len(set(kernels)) == 4
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_left_as_it_is(run_dir, config_file, capsys):
     before = contents(run_dir)
     assert train(config_file, run_dir) == 0

@@ -104,7 +104,7 @@ def test_methods_of_other_packages_are_found_by_entry_point(monkeypatch):
 # Acting and replay agree
 
 
-@pytest.mark.parametrize("name", some(SPECS, quick=("ATTENTIVE",)))
+@pytest.mark.parametrize("name", some(SPECS, quick=()))
 def test_replay_decides_as_the_rollout_did(name):
     weights, _, _, rollout = rolled(name)
     again = jax.jit(lambda: replay(acting_with(name).bind(weights), rollout.transitions, rollout.memory, PARAMS))()

@@ -44,6 +44,7 @@ def table(lines):
     return {first: rest for first, *rest in rows}
 
 
+@pytest.mark.slow
 def test_every_image_that_is_named_is_drawn_and_no_other(folder, text):
     named = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
     assert len(set(named)) == len(named) == 2 * 6

@@ -87,6 +87,7 @@ def follow(n, e, t, pose, logits):
     return action, ENV.after(pose, action, PARAMS)
 
 
+@pytest.mark.slow
 def test_traces_are_those_of_a_plain_loop(traces):
     assert traces.gap.shape == (3, 2, 2, len(EPISODES.pose), STEPS + 1)
     assert traces.gap.dtype == np.float32

@@ -184,6 +184,7 @@ def test_marginals_stay_put(world: str):
 
 
 @pytest.mark.parametrize("world", EACH)
+@pytest.mark.slow
 def test_the_dial_moves_away_from_the_training_distribution(world: str):
     categories, rng = WORLDS[world][1], np.random.default_rng(0)
     before = scenes_of(world, 0.0)
@@ -200,6 +201,7 @@ def test_placed_anew_by_their_rules_objects_stay_in_the_training_distribution(wo
 
 
 @pytest.mark.parametrize("world", EACH)
+@pytest.mark.slow
 def test_pairs_that_belong_together_meet_by_chance_alone_at_full_shift(world: str):
     categories = WORLDS[world][1]
     # Chosen in other scenes, for the highest of many lifts are partly luck.
