@@ -36,6 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
         mend = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(COMMANDS)}"
         print(f"error: unknown command {name!r}; {mend}", file=sys.stderr)
         return 2
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # methods of the working directory are found as by `python -m jaxnav`
     return importlib.import_module(f"jaxnav.cli.{name}").main(rest)
 
 

@@ -120,25 +120,26 @@ print(policy.act(observation, policy.init())[0])
 def test_the_commands_of_the_readme_train_and_evaluate_the_method(folder, tmp_path):
     run_dir = tmp_path / "run"
 
-    def run(*arguments, **more):
+    def run(*arguments, cwd=folder):
         arguments = [str(argument).replace("runs/mine", str(run_dir)) for argument in arguments]
-        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | more
-        return subprocess.run([sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True)
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        return subprocess.run(arguments, cwd=cwd, env=environment, capture_output=True, text=True)
 
+    installed = Path(sys.executable).with_name("jaxnav")
     train, evaluate = (
-        line.split() for line in re.findall(r"^    python (.*?)(?: +#.*)?$", METHOD_SECTION, re.MULTILINE)
+        [installed, *line.split()] for line in re.findall(r"^    jaxnav (.*?)(?: +#.*)?$", METHOD_SECTION, re.MULTILINE)
     )
     small = ["--config", write_config(tmp_path), "--method-sizes", "--seeds", 1, "--total-steps", 256]
     outputs = []
-    for command in ([*train, *small], [*evaluate, "--episodes", 4], ["-c", ACT]):
-        done = run(*command, PYTHONPATH=str(folder))
+    for command in ([*train, *small], [*evaluate, "--episodes", 4], [sys.executable, "-c", ACT]):
+        done = run(*command)
         assert done.returncode == 0, done.stderr
         outputs.append(done.stdout)
     assert int(outputs[-1]) in range(NUM_ACTIONS)
     rows = json.loads((run_dir / "eval-val.json").read_text())["rows"]
     assert {row["variant"] for row in rows} == {"baseline", "layout", "tde", "stde", "random", "oracle"}
 
-    done = run(*evaluate)
+    done = run(*evaluate, cwd=ROOT)  # where the module is not
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: method 'my_method:MINE': cannot be imported (ModuleNotFoundError: ")
