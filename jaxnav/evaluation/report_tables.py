@@ -48,7 +48,7 @@ def markdown_table(report: dict[str, Any]) -> str:
     for heading, group in _groups(report).items():
         lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
     table = "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
-    return table + "".join(f"\n{note}\n" for note in report["notes"])
+    return table + "".join(f"\n{note}\n" for note in report.get("notes", ()))  # version 0.1 had none
 
 
 def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:

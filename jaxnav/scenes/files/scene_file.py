@@ -26,7 +26,7 @@ def read_scenes(path: str | Path) -> list[Scene]:
     """Read a scene file.
 
     Cells of `episode_starts` count as standable; `walls` are derived where the file has none (`derive_walls`). An
-    object whose x, y and z are all null is left out, and what rests on it rests on nothing.
+    object whose x and z are both null is left out, and what rests on it rests on nothing.
 
     Args:
       path: a `*.jsonl.gz` file (or the same without gzip).
