@@ -52,6 +52,7 @@ def frontier_outcome(bank: Bank, episodes: EpisodeList, step_limit: np.ndarray) 
     end = successor[last, action] // bank.task.rules.poses_per_cell
     moves = [sum(action == MOVE_AHEAD for _, action in steps) for steps in walks]
     return Outcome(
+        done=jnp.asarray(action == DONE),
         success=jnp.asarray((action == DONE) & reached),
         length=jnp.asarray([len(steps) for steps in walks], jnp.int32),
         moves=jnp.asarray(moves, jnp.int32),

@@ -79,7 +79,7 @@ def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) 
     def step(carry: tuple[Agent, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
         agent, running, outcome = carry
         agent, taken = acting.step(agent, action, None, params)
-        return (agent, running & ~taken.ended, outcome.after(running, action, taken.success, nothing)), None
+        return (agent, running & ~taken.ended, outcome.after(running, action, taken, nothing)), None
 
     agent = acting.begin(state, None, None, params)
     first = (agent, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))

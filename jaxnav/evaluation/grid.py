@@ -20,6 +20,7 @@ class Outcome(NamedTuple):
     """Hold how episodes went, leaves [C, E].
 
     Attributes:
+      done: bool, ended by Done; False for a time-out.
       success: bool.
       length: int32, actions taken, Done included.
       moves: int32, MoveAheads chosen.
@@ -27,6 +28,7 @@ class Outcome(NamedTuple):
       weight: float32, mean weight of the counterfactual logits over the episode's steps.
     """
 
+    done: jax.Array
     success: jax.Array
     length: jax.Array
     moves: jax.Array
@@ -37,6 +39,7 @@ class Outcome(NamedTuple):
     def start(cls, shape: tuple[int, ...]) -> "Outcome":
         """Return the outcome of episodes before their first step."""
         return cls(
+            done=jnp.zeros(shape, bool),
             success=jnp.zeros(shape, bool),
             length=jnp.zeros(shape, jnp.int32),
             moves=jnp.zeros(shape, jnp.int32),
@@ -44,17 +47,18 @@ class Outcome(NamedTuple):
             weight=jnp.zeros(shape),
         )
 
-    def after(self, running: jax.Array, action: jax.Array, success: jax.Array, weight: jax.Array) -> "Outcome":
+    def after(self, running: jax.Array, action: jax.Array, taken: Taken, weight: jax.Array) -> "Outcome":
         """Return the outcome after one more step.
 
         Args:
           running: bool, before the step.
           action: int32, taken.
-          success: bool, the step ended the episode with success.
+          taken: what came of the step.
           weight: float32, of what was removed.
         """
         return self._replace(
-            success=self.success | (running & success),
+            done=self.done | (running & taken.terminated),
+            success=self.success | (running & taken.success),
             length=self.length + running.astype(jnp.int32),
             moves=self.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
             weight=self.weight + jnp.where(running, weight, 0.0),
@@ -156,7 +160,7 @@ def _run_episodes(
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome, keys = progress
         after, taken, weight = act(cell, policy, agent, running, keys, acting, params, knowledge)
-        outcome = outcome.after(running, carried(taken.agent).action, taken.success, weight)
+        outcome = outcome.after(running, carried(taken.agent).action, taken, weight)
         return _Progress(select(running, after, agent), running & ~taken.ended, outcome, keys)
 
     progress = _Progress(agent, jnp.ones(count, bool), Outcome.start(count), keys)

@@ -8,20 +8,23 @@ GOAL_RADIUS = 1.0  # metres that DTS takes off the distance to the goal
 
 
 def episode_metrics(outcome: Outcome, best_length: np.ndarray) -> dict[str, np.ndarray]:
-    """Return SR, SPL, SAE and DTS of every episode.
+    """Return the metrics of every episode.
 
     Args:
       outcome: leaves [..., E].
       best_length: int [E], L* in actions with Done.
 
     Returns:
-      float64 [..., E] by the names `sr`, `spl`, `sae` (each in [0, 1]) and `dts` (metres).
+      float64 [..., E] by name: `sr`, `spl`, `sae`, `timeout` (no Done before the step limit) and `wrong_done` (Done
+      where it fails), each in [0, 1], and `dts` in metres. Every episode succeeds, times out or ends by a wrong Done.
     """
-    success = np.asarray(outcome.success, np.float64)
+    success, done = np.asarray(outcome.success, np.float64), np.asarray(outcome.done, np.float64)
     length, moves = np.asarray(outcome.length), np.asarray(outcome.moves)
     return {
         "sr": success,
         "spl": success * best_length / length,
         "dts": np.maximum(np.asarray(outcome.distance, np.float64) - GOAL_RADIUS, 0.0),
         "sae": success * moves / np.maximum(length - 1, 1),
+        "timeout": 1.0 - done,
+        "wrong_done": done - success,
     }

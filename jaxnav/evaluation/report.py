@@ -19,13 +19,13 @@ from jaxnav.store.files import write_atomic
 #: Version of the JSON layout.
 FORMAT = 1
 
-Metric = Literal["sr", "spl", "dts", "sae"]
+Metric = Literal["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
 Form = Literal["residual", "paper"]
 
 #: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
-_SCALES: dict[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0, "sae": 100.0}
+_SCALES: dict[Metric, float] = dict.fromkeys(("sr", "spl", "dts", "sae", "timeout", "wrong_done"), 100.0) | {"dts": 1.0}
 #: Variants without training, whose seeds are repetitions.
 UNTRAINED: tuple[Variant, ...] = ("oracle", "random")
 _BUCKETS = {"L>=1": 1, "L>=5": 5}
@@ -58,7 +58,7 @@ def build_row(
       epsilon: threshold of the sTDE, None where there is none.
       decoding: how actions are taken from logits.
       form: how the counterfactual logits are combined, None where there are none.
-      metrics: `sr`, `spl`, `sae` (fractions in [0, 1]) and `dts` (metres), each [S, E].
+      metrics: those of `episode_metrics`, each [S, E].
       episodes: the E episodes.
 
     Raises:
@@ -105,7 +105,7 @@ def build_difference(
     It is `compared - reference` over all episodes, in the report's units.
 
     Args:
-      metric: `sr`, `spl`, `dts` or `sae`.
+      metric: a key of the metrics.
       reference: (name of the variant, its results [S, E] as given to `build_row`).
       compared: the same for the variant compared with it.
       epsilon: threshold of the sTDE, None where there is none.

@@ -8,6 +8,9 @@ from rich.text import Text
 from jaxnav.evaluation.statistics import Interval
 
 _COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
+#: How episodes fail: means without intervals, beside the columns.
+_FAILURES = {"timeout": "Time-out (%)", "wrong_done": "Wrong Done (%)"}
+_TITLES = (*(title for title, _ in _COLUMNS.values()), *_FAILURES.values())
 
 
 def console_table(report: dict[str, Any]) -> Table:
@@ -15,7 +18,7 @@ def console_table(report: dict[str, Any]) -> Table:
 
     A line per row, `mean [95 % interval]`, under a header per world, split and decoding.
     """
-    table = Table("Variant", *(title for title, _ in _COLUMNS.values()))
+    table = Table("Variant", *_TITLES)
     for heading, lines in _groups(report).items():
         table.add_section()
         table.add_row(Text(heading, style="bold"))
@@ -44,9 +47,9 @@ def difference_table(report: dict[str, Any]) -> Table:
 
 def markdown_table(report: dict[str, Any]) -> str:
     """Make the table in Markdown, with its notes, ending with a newline."""
-    lines = [("Variant", *(title for title, _ in _COLUMNS.values())), ("---", *("---:" for _ in _COLUMNS))]
+    lines = [("Variant", *_TITLES), ("---", *("---:" for _ in _TITLES))]
     for heading, group in _groups(report).items():
-        lines += [(f"**{heading}**", *("" for _ in _COLUMNS)), *group]
+        lines += [(f"**{heading}**", *("" for _ in _TITLES)), *group]
     table = "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
     return table + "".join(f"\n{note}\n" for note in report.get("notes", ()))  # version 0.1 had none
 
@@ -59,6 +62,7 @@ def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
         cells = (
             _label(row),
             *(f"{Interval.from_json(row[metric]):.{digits}f}" for metric, (_, digits) in _COLUMNS.items()),
+            *(f"{row[metric]['mean']:.1f}" if metric in row else "" for metric in _FAILURES),  # version 0.2 had none
         )
         groups.setdefault(heading, []).append(cells)
     return groups

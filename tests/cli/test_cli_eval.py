@@ -52,7 +52,7 @@ def test_the_report_holds_all_rows_and_differences(evaluated):
     for row in report["rows"]:
         assert (row["method"], row["world"], row["split"], row["seeds"]) == ("ORG", "rooms", "val", SEEDS)
         assert row["episodes"] == 20  # rounded up to a multiple of the four room types
-        for metric in ("sr", "spl", "dts", "sae"):
+        for metric in ("sr", "spl", "dts", "sae", "timeout", "wrong_done"):
             # The only scenes of four room types are one stratum, and two training runs are enough.
             low, high = row[metric]["ci95"]
             assert low <= row[metric]["mean"] <= high

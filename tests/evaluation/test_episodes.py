@@ -135,6 +135,7 @@ def test_an_oracle_has_full_marks(rules):
 
 def test_metrics_by_hand():
     leaves = Outcome(
+        done=jnp.array([True, True, False, True]),
         success=jnp.array([True, True, False, True]),
         length=jnp.array([10, 1, 30, 4], jnp.int32),
         moves=jnp.array([6, 0, 20, 3], jnp.int32),
@@ -150,3 +151,14 @@ def test_metrics_by_hand():
     np.testing.assert_allclose(metrics["dts"], [0.4, 0, 2.5, 0], atol=1e-6)
     # MoveAheads / (length - 1): 6 / 9; an episode of Done alone has none; no success; 3 / 3.
     np.testing.assert_allclose(metrics["sae"], [2 / 3, 0, 0, 1])
+    np.testing.assert_array_equal(metrics["timeout"], [0, 0, 1, 0])
+    np.testing.assert_array_equal(metrics["wrong_done"], [0, 0, 0, 0])
+
+
+def test_an_episode_fails_by_a_time_out_or_a_wrong_done():
+    zeros = jnp.zeros(3)
+    done, success = jnp.array([True, True, False]), jnp.array([True, False, False])
+    outcome = Outcome(done, success, jnp.ones(3, jnp.int32), jnp.zeros(3, jnp.int32), zeros, zeros)
+    metrics = episode_metrics(jax.tree.map(np.asarray, outcome), np.ones(3, np.int32))
+    np.testing.assert_array_equal(metrics["wrong_done"], [0, 1, 0])
+    np.testing.assert_array_equal(metrics["timeout"], [0, 0, 1])

@@ -25,6 +25,8 @@ def results(**changes):
         "spl": np.array([[1.0, 0.5, 0.0, 0.5], [1.0, 0.0, 0.0, 0.2]]),
         "dts": np.array([[0.0, 0.5, 2.0, 0.5], [0.0, 1.5, 2.0, 0.5]]),
         "sae": np.array([[0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.0, 0.5]]),
+        "timeout": np.array([[0, 0, 1, 0], [0, 1, 0, 0]], bool),
+        "wrong_done": np.array([[0, 0, 0, 0], [0, 0, 1, 0]], bool),
     }
     return metrics | changes
 
@@ -43,7 +45,7 @@ def bounds_around(mean, variance, degrees):
 
 
 def test_row_has_the_keys_of_the_format():
-    metrics = ["sr", "spl", "dts", "sae"]
+    metrics = ["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
     built = row()
     assert list(built) == [*IDENTITY, *SETTING, "seeds", "episodes", *metrics, "buckets"]
     assert {name: list(bucket) for name, bucket in built["buckets"].items()} == {
@@ -88,7 +90,7 @@ def test_scenes_of_a_floor_plan_count_as_one():
 
 def test_buckets_by_best_length():
     built = row()
-    assert built["buckets"]["L>=1"] == {key: built[key] for key in ["episodes", "sr", "spl", "dts", "sae"]}
+    assert built["buckets"]["L>=1"] == {key: built[key] for key in ["episodes", *results()]}
     # L* = 1, 4, 5, 9: the last two episodes have L* >= 5. Success 0, 1 in both seeds; DTS 2.0, 0.5 in both.
     long = built["buckets"]["L>=5"]
     assert long["episodes"] == 2

@@ -27,7 +27,7 @@ def test_every_row_seed_and_episode_has_its_numbers(evaluated):
     shape = (30, 2, len(evaluated.episodes.goal))
     assert {leaf.shape for leaf in evaluated.outcome} == {shape}
     metrics = evaluated.metrics()
-    assert list(metrics) == ["sr", "spl", "dts", "sae"]
+    assert list(metrics) == ["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
     for name, values in metrics.items():
         assert (values.shape, values.dtype) == (shape, np.float64)
         assert (values >= 0).all()
@@ -48,7 +48,7 @@ def test_the_report_says_the_same(evaluated):
 def test_only_what_is_trained_varies_with_training(evaluated):
     for row in evaluated.report["rows"]:
         trained = row["variant"] not in ("random", "oracle")
-        for metric in ("sr", "spl", "dts", "sae"):
+        for metric in ("sr", "spl", "dts", "sae", "timeout", "wrong_done"):
             assert (len(row[metric].get("seeds", [])), row[metric]["std"] is not None) == (2 * trained, trained)
     for difference in evaluated.report["differences"]:
         # The baseline was trained apart; the others are the layout's networks, run by run.

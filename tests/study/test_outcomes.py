@@ -34,7 +34,14 @@ APARTMENTS = ("val-apartment-00-0", "val-apartment-00-1", "val-apartment-01-0", 
 
 def outcome(success, length=LENGTH, weight=WEIGHT) -> Outcome:
     """Return an outcome [S, E]."""
-    leaves = np.array(success, bool), length, np.ones_like(length), np.full(length.shape, 2.5), weight
+    leaves = (
+        np.ones_like(length, bool),
+        np.array(success, bool),
+        length,
+        np.ones_like(length),
+        np.full(length.shape, 2.5),
+        weight,
+    )
     return Outcome(*map(jnp.asarray, leaves))
 
 
