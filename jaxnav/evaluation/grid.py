@@ -83,10 +83,15 @@ class Evaluator:
       compilations: so far.
     """
 
-    def __init__(self, acting: Acting) -> None:
-        """Prepare; `acting` holds environment, policy spec and layout setting."""
+    def __init__(self, acting: Acting, removes: bool = True) -> None:
+        """Prepare.
+
+        Args:
+          acting: environment, policy spec and layout setting.
+          removes: whether experience may be removed; without, the factual decision alone is compiled, in half the time.
+        """
         self.compilations = 0
-        self._acting = acting
+        self._acting, self._removes = acting, removes
         self._compiled = jax.jit(self._run)
 
     def __call__(
@@ -124,7 +129,7 @@ class Evaluator:
 
         def one(cell: Inference) -> Outcome:
             policy = self._acting.bind(jax.tree.map(lambda leaf: leaf[cell.params], weights))
-            return _run_episodes(cell, policy, start, self._acting, params, knowledge, key)
+            return _run_episodes(cell, policy, start, self._acting, self._removes, params, knowledge, key)
 
         return jax.lax.map(one, grid)
 
@@ -144,6 +149,7 @@ def _run_episodes(
     policy: Policy,
     start: State,
     acting: Acting,
+    removes: bool,
     params: EnvParams,
     knowledge: Knowledge,
     key: jax.Array,
@@ -159,7 +165,7 @@ def _run_episodes(
 
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome, keys = progress
-        after, taken, weight = act(cell, policy, agent, running, keys, acting, params, knowledge)
+        after, taken, weight = act(cell, policy, agent, running, keys, acting, params, knowledge, removes)
         outcome = outcome.after(running, carried(taken.agent).action, taken, weight)
         return _Progress(select(running, after, agent), running & ~taken.ended, outcome, keys)
 
@@ -187,6 +193,7 @@ def act(
     acting: Acting,
     params: EnvParams,
     knowledge: Knowledge,
+    removes: bool = True,
 ) -> tuple[Agent, Taken, jax.Array]:
     """Decide, remove experience and act, once in E episodes.
 
@@ -199,6 +206,7 @@ def act(
       acting: how to act.
       params: the environment's.
       knowledge: what was learned before training.
+      removes: whether experience may be removed.
 
     Returns:
       The agent after the step, what came of it, and the weight float32 [E] of what was removed.
@@ -209,8 +217,10 @@ def act(
     pathways = policy.pathways(*view, memory)
     decision = policy.decide(pathways, memory)
     step_keys = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
-    counterfactual = counterfactual_logits(cell, policy, pathways, memory, keys, step_keys)
-    logits, weight = remove(cell, decision.logits, counterfactual, acting.gap(agent), running)
+    logits, weight = decision.logits, jnp.zeros(running.shape)
+    if removes:
+        counterfactual = counterfactual_logits(cell, policy, pathways, memory, keys, step_keys)
+        logits, weight = remove(cell, logits, counterfactual, acting.gap(agent), running)
     logits = jnp.where(cell.uniform, 0.0, logits)
     sampled = jax.vmap(jax.random.categorical)(step_keys, logits)
     choice = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)

@@ -25,7 +25,14 @@ Decoding = Literal["argmax", "sample"]
 Form = Literal["residual", "paper"]
 
 #: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
-_SCALES: dict[Metric, float] = dict.fromkeys(("sr", "spl", "dts", "sae", "timeout", "wrong_done"), 100.0) | {"dts": 1.0}
+_SCALES: dict[Metric, float] = {
+    "sr": 100.0,
+    "spl": 100.0,
+    "dts": 1.0,
+    "sae": 100.0,
+    "timeout": 100.0,
+    "wrong_done": 100.0,
+}
 #: Variants without training, whose seeds are repetitions.
 UNTRAINED: tuple[Variant, ...] = ("oracle", "random")
 _BUCKETS = {"L>=1": 1, "L>=5": 5}

@@ -94,6 +94,9 @@ class RunConfig:
       chunk: updates per compiled call; between calls the run logs, saves (every `save_every` calls) and, where scenes
         are streamed, goes on to the next shard with new episodes.
       save_every: calls between checkpoints.
+      validations: times that policies are measured in val scenes while they are trained, evenly spaced; of each seed
+        the one that succeeds most often, with its best actions, is exported. 0: none, and the last is exported.
+      val_episodes: episodes of such a measurement.
       cache: folder for compiled scenes that are streamed from disk.
       method_sizes: whole-number sizes that only the method has, where they are not the usual ones.
       devices: what to train on, which changes results by rounding only: so many devices of this process, `cluster` for
@@ -115,6 +118,8 @@ class RunConfig:
     done_gate: bool = False
     chunk: int = 8
     save_every: int = 4
+    validations: int = 8
+    val_episodes: int = 200
     cache: Path = Path("~/.cache/jaxnav")
     devices: int | str | None = None
     worlds: WorldConfig = WorldConfig()
@@ -152,6 +157,13 @@ class RunConfig:
     def update_steps(self) -> int:
         """Return the environment steps of a policy between two updates."""
         return self.ppo.num_envs * self.ppo.rollout
+
+    @property
+    def validated(self) -> frozenset[int]:
+        """Return the updates after which policies are measured."""
+        chunks = self.total_updates // self.chunk
+        times = min(self.validations, chunks)
+        return frozenset(-(-chunks * (i + 1) // times) * self.chunk for i in range(times))
 
     @property
     def total_updates(self) -> int:
@@ -197,7 +209,8 @@ def _check_method(config: RunConfig, method: Method) -> None:
 
 
 def _check_numbers(config: RunConfig) -> None:
-    for name in ("seeds", "total_steps", "chunk", "save_every"):
+    _need(config.validations >= 0, "validations", config.validations, "give at least 0")
+    for name in ("seeds", "total_steps", "chunk", "save_every", "val_episodes"):
         _need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
     if config.devices is not None:
         forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"

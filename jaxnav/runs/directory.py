@@ -14,7 +14,7 @@ from jaxnav.store.files import write_atomic
 from jaxnav.store.manifest import differences
 from jaxnav.store.runlog import read_rows
 
-CONFIG_FILE, LOG_FILE = "config.json", "metrics.jsonl"
+CONFIG_FILE, LOG_FILE, TIMES_FILE = "config.json", "metrics.jsonl", "times.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +43,13 @@ class Run:
     def log(self) -> list[dict[str, Any]]:
         """Return the training log, a row per chunk and seed."""
         return read_rows(self.config.run_dir / LOG_FILE)
+
+    def times(self) -> list[dict[str, Any]]:
+        """Return the seconds that training took, a row per chunk.
+
+        `wall_s` and `cpu_s` are since the start, with compilation, validation and what came before an interruption.
+        """
+        return read_rows(self.config.run_dir / TIMES_FILE)
 
 
 def settings(config: RunConfig) -> dict[str, Any]:

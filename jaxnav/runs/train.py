@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -17,10 +17,13 @@ from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import METHODS, Knowledge, find_method
+from jaxnav.policies.policy import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.runs.config import RunConfig, check
-from jaxnav.runs.directory import LOG_FILE, Run, claim, settings
+from jaxnav.runs.directory import LOG_FILE, TIMES_FILE, Run, claim, settings
 from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.stopwatch import Stopwatch
+from jaxnav.runs.validation import SCORE, Validator, write_reach
 from jaxnav.runs.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.manifest import make_manifest
@@ -28,7 +31,7 @@ from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout_priors
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
 from jaxnav.training.exploration import Exploration, explore
-from jaxnav.training.learner import Learner
+from jaxnav.training.learner import Learner, LearnerState
 from jaxnav.training.trainer import ShardedTrainer, States, Trainer, stage_at
 
 _EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
@@ -64,6 +67,7 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     setting = calibrate_setting(config, world, explored, console)
     knowledge = learn_knowledge(config, world, explored, setting)
     trainer = make_trainer(config, world.env, setting, knowledge, mesh)
+    validator = _validator(config, trainer, knowledge, world, console)
     turns = config.total_updates // config.chunk
     order = bank_order(world, config.seed, turns)
     if len(world.banks) > 1:
@@ -73,13 +77,34 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     first = world.params(order[0])
     restored = restore(config.run_dir, trainer.abstract(first), manifest)
     states, done = restored or (trainer.init(first), 0)
-    by_first_process(lambda: truncate_after(config.run_dir / LOG_FILE, done))
+    by_first_process(lambda: [truncate_after(config.run_dir / name, done) for name in (LOG_FILE, TIMES_FILE)])
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
-    states = _do_updates(config, trainer, world, order, states, done, manifest, console)
-    by_first_process(lambda: _export(config, states, setting, knowledge, explored))
+    clock = Stopwatch.resume(config.run_dir / TIMES_FILE, started)
+    states = _do_updates(config, trainer, validator, world, order, states, done, manifest, clock, console)
+    kept = {name: [_exported(state) for state in seeds] for name, seeds in states.items()}
+    by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
+    if validator is not None:
+        reach = validator.reach(kept)
+        by_first_process(lambda: write_reach(config.run_dir, reach))
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
     return Run(config)
+
+
+def _validator(
+    config: RunConfig, trainer: Trainer, knowledge: Knowledge, world: CompiledWorld, console: Console
+) -> Validator | None:
+    """Make what measures the policies, if there are scenes for it."""
+    if not config.validations:
+        return None
+    acting = trainer.learners[config.arms[-1]].acting
+    try:
+        return Validator(config, acting, knowledge, world, console)
+    except InputError as error:
+        if config.scenes is None:
+            raise
+        console.print(f"no val scenes, so the last policies are exported ({error})", soft_wrap=True)
+        return None
 
 
 def _checked(config: RunConfig) -> RunConfig:
@@ -183,16 +208,18 @@ def make_trainer(
 def _do_updates(
     config: RunConfig,
     trainer: Trainer,
+    validator: Validator | None,
     world: CompiledWorld,
     order: Sequence[int],
     states: States,
     done: int,
     manifest: dict[str, Any],
+    clock: Stopwatch,
     console: Console,
 ) -> States:
     """Train chunk by chunk.
 
-    Each is in the next bank of scenes; between chunks the run logs, shows and saves.
+    Each is in the next bank of scenes; between chunks the run measures its policies, logs, shows and saves.
     """
     stages = find_method(config.method).stages
     steps = config.chunk * config.update_steps * config.seeds * len(states)
@@ -206,11 +233,18 @@ def _do_updates(
                 states = trainer.restart(states, params)
             states, metrics = trainer.train(states, params, stage_at(stages, done / config.total_updates))
             done += config.chunk
-            rate, began = steps / (time.monotonic() - began), time.monotonic()
-            for name, seeds in metrics.items():
-                for seed, values in enumerate(seeds if first_process() else ()):
-                    row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
-                    append_row(config.run_dir / LOG_FILE, row | values)
+            rate = steps / (time.monotonic() - began)
+            if validator is not None and done in config.validated:
+                scores = validator.measure({name: [state.params for state in seeds] for name, seeds in states.items()})
+                states = trainer.keep(states, {name: [row[SCORE] for row in rows] for name, rows in scores.items()})
+                metrics = {name: [a | b for a, b in zip(metrics[name], scores[name], strict=True)] for name in metrics}
+            began = time.monotonic()
+            if first_process():
+                for name, seeds in metrics.items():
+                    for seed, values in enumerate(seeds):
+                        row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
+                        append_row(config.run_dir / LOG_FILE, row | values)
+                append_row(config.run_dir / TIMES_FILE, {"step": done} | clock.read())
             if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
                 save(config.run_dir, done, states, manifest)
             success = {name: np.mean([values["success"] for values in seeds]) for name, seeds in metrics.items()}
@@ -224,9 +258,20 @@ def _do_updates(
     return states
 
 
-def _export(config: RunConfig, states: States, setting: Setting, knowledge: Knowledge, explored: Exploration) -> None:
+def _exported(state: LearnerState) -> Params:
+    """Return the policy that was kept, else the last one."""
+    return jax.device_get(state.kept.params if state.kept.score >= 0 else state.params)
+
+
+def _export(
+    config: RunConfig,
+    policies: Mapping[str, Sequence[Params]],
+    setting: Setting,
+    knowledge: Knowledge,
+    explored: Exploration,
+) -> None:
     """Export every seed's policy."""
-    for name, seeds in states.items():
-        for seed, state in enumerate(seeds):
+    for name, seeds in policies.items():
+        for seed, params in enumerate(seeds):
             folder = config.run_dir / POLICIES / f"{name}-{seed}"
-            export_policy(folder, config, state.params, knowledge, setting if name == "layout" else None, explored)
+            export_policy(folder, config, params, knowledge, setting if name == "layout" else None, explored)

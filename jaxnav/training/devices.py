@@ -115,7 +115,7 @@ def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
     whole = NamedSharding(mesh, PartitionSpec(*seeds))
     episodes = NamedSharding(mesh, PartitionSpec(*seeds, _EPISODES))
     state: Any = LearnerState  # holds places here, not arrays
-    return state(params=whole, optimizer=whole, agent=episodes, key=whole, update=whole)
+    return state(params=whole, kept=whole, optimizer=whole, agent=episodes, key=whole, update=whole)
 
 
 def everywhere(mesh: Mesh, tree: Tree) -> Tree:

@@ -23,11 +23,26 @@ _ROLLOUT, _SHUFFLE, _RESTART = range(3)  # purposes of an update's keys
 Metrics = dict[str, jax.Array]
 
 
+class Kept(struct.PyTreeNode):
+    """Hold the best policy of a seed so far.
+
+    Attributes:
+      params: of the policy.
+      score: float32 [], see `Learner.keep`; -1 before anything was measured.
+      update: int32 [], updates done when it was measured.
+    """
+
+    params: Params
+    score: jax.Array
+    update: jax.Array
+
+
 class LearnerState(struct.PyTreeNode):
     """Hold one seed of a run.
 
     Attributes:
       params: of the policy.
+      kept: the policy to export where policies are measured while they are trained.
       optimizer: state of the optimizer.
       agent: the parallel episodes, [B].
       key: typed PRNG key []; update u uses `fold_in(key, u)`.
@@ -35,6 +50,7 @@ class LearnerState(struct.PyTreeNode):
     """
 
     params: Params
+    kept: Kept
     optimizer: Any
     agent: Agent
     key: jax.Array
@@ -64,12 +80,19 @@ class Learner:
         weights = init_params(self.acting.spec, init_key)
         agent = self._start(weights, start_key, params, knowledge)
         optimizer = make_optimizer(self.config).init(weights)
-        return LearnerState(params=weights, optimizer=optimizer, agent=agent, key=update_key, update=jnp.int32(0))
+        kept = Kept(params=weights, score=jnp.float32(-1.0), update=jnp.int32(0))
+        return LearnerState(weights, kept, optimizer, agent, update_key, jnp.int32(0))
 
     def restart(self, state: LearnerState, params: EnvParams, knowledge: Knowledge) -> LearnerState:
         """Give a seed new episodes, in scenes other than before."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.update), _RESTART)
         return state.replace(agent=self._start(state.params, key, params, knowledge))
+
+    def keep(self, state: LearnerState, score: jax.Array) -> LearnerState:
+        """Keep the present policy if none scored higher; the score is float32 []."""
+        present = Kept(state.params, score, state.update)
+        better = score >= state.kept.score
+        return state.replace(kept=jax.tree.map(lambda new, old: jnp.where(better, new, old), present, state.kept))
 
     def train(
         self, state: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge, num_updates: int

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -58,6 +58,7 @@ class Trainer:
         self._compiled: dict[tuple[str, int], Any] = {}
         self._starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
         self._restarts = {name: jax.jit(learner.restart, donate_argnums=0) for name, learner in self.learners.items()}
+        self._keeps = {name: jax.jit(learner.keep, donate_argnums=0) for name, learner in self.learners.items()}
 
     def abstract(self, params: EnvParams) -> States:
         """Return shapes and devices of every seed's state."""
@@ -76,6 +77,15 @@ class Trainer:
         """Give every seed new episodes; donates the states."""
         return {
             name: [self._restarts[name](state, params, self._knowledge) for state in seeds]
+            for name, seeds in states.items()
+        }
+
+    def keep(self, states: States, scores: Mapping[str, Sequence[float]]) -> States:
+        """Keep every policy that none of its seed outscored; donates the states."""
+        return {
+            name: [
+                self._keeps[name](state, jnp.float32(score)) for state, score in zip(seeds, scores[name], strict=True)
+            ]
             for name, seeds in states.items()
         }
 
@@ -137,6 +147,7 @@ class ShardedTrainer(Trainer):
         for name, learner in self.learners.items():
             self._starts[name] = jax.jit(learner.init, out_shardings=self._place)
             self._restarts[name] = jax.jit(learner.restart, out_shardings=self._place, donate_argnums=0)
+            self._keeps[name] = jax.jit(learner.keep, out_shardings=self._place, donate_argnums=0)
 
     def abstract(self, params: EnvParams) -> States:
         """Return shapes and devices of every seed's state."""
