@@ -12,7 +12,7 @@ from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
+from jaxnav.runs.prepare import explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.worlds import CompiledWorld, training_world
 from jaxnav.training.config import PPOScalars
 from jaxnav.training.exploration import Exploration

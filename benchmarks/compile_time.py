@@ -31,7 +31,7 @@ from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.policy import init_params
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.train import make_trainer
+from jaxnav.runs.prepare import make_trainer
 from jaxnav.training.calibration import calibrate
 from jaxnav.training.exploration import explore
 from jaxnav.training.trainer import Trainer

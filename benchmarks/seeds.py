@@ -15,7 +15,7 @@ from _setup import set_up
 
 from jaxnav.env.types import EnvParams
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.train import make_trainer
+from jaxnav.runs.prepare import make_trainer
 from jaxnav.training.trainer import Trainer
 
 ARM, SEEDS, TURNS = "layout", (1, 2, 4, 8), 5

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from jaxnav.layout import SETTINGS
 from jaxnav.runs.config import RunConfig, WorldConfig
-from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
+from jaxnav.runs.prepare import explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.worlds import bank_order, read_ahead, training_world
 from jaxnav.scenes.tables.shards import Shards
 

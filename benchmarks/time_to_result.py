@@ -26,7 +26,8 @@ from rich.console import Console
 import jaxnav.runs.evaluate
 import jaxnav.runs.train
 from jaxnav.evaluation.grid import Evaluator
-from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import Results
 from jaxnav.runs.overlay import apply_yaml

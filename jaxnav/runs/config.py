@@ -1,19 +1,15 @@
-"""The settings of a run and what is possible among them."""
+"""The settings of a run."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from jaxnav.errors import InputError
 from jaxnav.layout import Reduction
-from jaxnav.policies.methods import Method, find_method
 from jaxnav.policies.spec import Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.detector import Detector
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.training.config import Counterfactual, PPOConfig
-from jaxnav.training.devices import Devices
 
 Arm = Literal["baseline", "layout"]
 #: Policies without and with the layout estimator; they differ by its weights alone.
@@ -169,93 +165,3 @@ class RunConfig:
     def total_updates(self) -> int:
         """Return the updates of each policy, in whole chunks."""
         return -(-self.ppo.num_updates(self.total_steps) // self.chunk) * self.chunk
-
-
-def check(config: RunConfig) -> RunConfig:
-    """Return the config, complete and possible.
-
-    A method that cannot host the layout loses the arm `layout`; paths may be given as texts.
-
-    Raises:
-      InputError: names the first impossible setting.
-    """
-    paths = {"run_dir": config.run_dir, "scenes": config.scenes, "cache": config.cache}
-    config = dataclasses.replace(config, **{name: Path(path) for name, path in paths.items() if path is not None})
-    method = find_method(config.method)
-    if not method.hosts_layout and config.arms == ARMS:
-        config = dataclasses.replace(config, arms=("baseline",))
-    _check_method(config, method)
-    _check_numbers(config)
-    _check_layout(config)
-    _check_learning(config)
-    _check_world(config)
-    return config
-
-
-def _need(holds: bool, name: str, value: object, mend: str) -> None:
-    if not holds:
-        raise InputError(f"config: {name} is {value}; {mend}")
-
-
-def _check_method(config: RunConfig, method: Method) -> None:
-    arms, sizes = config.arms, method.experience.sizes
-    _need(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
-    hosted = method.hosts_layout or "layout" not in arms
-    _need(hosted, "arms", arms, f"method {config.method!r} cannot host the layout; give baseline alone")
-    for name, value in config.method_sizes.items():
-        known = f"{config.method!r} has {', '.join(sizes)}" if sizes else f"{config.method!r} has no sizes of its own"
-        _need(name in sizes, f"method_sizes.{name}", value, f"is unknown; {known}")
-        _need(value >= 1, f"method_sizes.{name}", value, "give at least 1")
-
-
-def _check_numbers(config: RunConfig) -> None:
-    _need(config.validations >= 0, "validations", config.validations, "give at least 0")
-    for name in ("seeds", "total_steps", "chunk", "save_every", "val_episodes"):
-        _need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
-    if config.devices is not None:
-        forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
-        _need(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), forms)
-    seeds = {"seed": config.seed, "worlds.seed": config.worlds.seed, "detector.seed": config.detector.seed}
-    for name, seed in seeds.items():
-        _need(0 <= seed < 2**32, name, seed, "give a whole number from 0 to 2**32 - 1")
-    for group in ("worlds", "layout", "sizes", "ppo"):
-        for field in dataclasses.fields(getattr(config, group)):
-            value = getattr(getattr(config, group), field.name)
-            if isinstance(value, int) and field.name != "seed":
-                _need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
-
-
-def _check_layout(config: RunConfig) -> None:
-    layout, strength = config.layout, config.layout.strength
-    fixed = layout.setting != "calibrated" and (strength, layout.reduction) != (None, None)
-    _need(not fixed, "layout.setting", layout.setting, "only `calibrated` takes a strength and a reduction")
-    _need(strength is None or 0.0 < strength < float("inf"), "layout.strength", strength, "give a positive number")
-
-
-def _check_learning(config: RunConfig) -> None:
-    ppo = config.ppo
-    _need_all(ppo, "ppo", ("gamma", "gae_lambda"), lambda x: 0.0 <= x <= 1.0, "give a number from 0 to 1")
-    rates = ("learning_rate", "clip", "max_grad_norm")
-    _need_all(ppo, "ppo", rates, lambda x: 0.0 < x < float("inf"), "give a positive number")
-    _need_all(ppo, "ppo", ("entropy", "value", "distil"), lambda x: 0.0 <= x < float("inf"), "give 0 or more")
-    divided, mend = ppo.num_envs % ppo.minibatches == 0, f"give a multiple of ppo.minibatches ({ppo.minibatches})"
-    _need(divided, "ppo.num_envs", ppo.num_envs, mend)
-    mend = f"give at most worlds.train_step_limit ({config.train_step_limit})"
-    _need(ppo.rollout <= config.train_step_limit, "ppo.rollout", ppo.rollout, mend)
-
-
-def _check_world(config: RunConfig) -> None:
-    rates = ("miss_near", "miss_far", "false_alarm")
-    _need_all(config.detector, "detector", rates, lambda x: 0.0 <= x <= 1.0, "give a probability from 0 to 1")
-    task, shift, shaping = config.task, config.worlds.shift, config.worlds.shaping
-    _need(0.0 <= shift <= 1.0, "worlds.shift", shift, "give a number from 0 to 1")
-    _need(shaping is None or 0.0 <= shaping < float("inf"), "worlds.shaping", shaping, "give 0 or more")
-    _need(len(task.categories) >= 2, "worlds.categories", task.categories, "give at least 2")
-    _need(len(set(task.categories)) == len(task.categories), "worlds.categories", task.categories, "give each once")
-    unknown = [goal for goal in task.goals if goal not in task.categories]
-    _need(not unknown, "worlds.goals", unknown, f"give some of the categories {', '.join(task.categories)}")
-
-
-def _need_all(group: Any, prefix: str, names: tuple[str, ...], valid: Callable[[float], bool], mend: str) -> None:
-    for name in names:
-        _need(valid(getattr(group, name)), f"{prefix}.{name}", getattr(group, name), mend)

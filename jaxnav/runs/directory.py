@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.errors import InputError
-from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.overlay import apply_yaml
 from jaxnav.runs.policies import Policies, load_policies
 from jaxnav.store.files import write_atomic

@@ -1,6 +1,5 @@
 """Training of a run, from the prior to the exported policies."""
 
-import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -12,29 +11,26 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
-from jaxnav.layout import SETTINGS, Setting
-from jaxnav.policies.acting import Acting
+from jaxnav.layout import Setting
 from jaxnav.policies.methods import METHODS, Knowledge, find_method
 from jaxnav.policies.policy import Params
 from jaxnav.policies.testing import check_method
-from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.directory import LOG_FILE, TIMES_FILE, Run, claim, settings
 from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.stopwatch import Stopwatch
 from jaxnav.runs.validation import SCORE, Validator, write_reach
 from jaxnav.runs.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.store.checkpoint import restore, save
 from jaxnav.store.manifest import make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
-from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout_priors
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
-from jaxnav.training.exploration import Exploration, explore
-from jaxnav.training.learner import Learner, LearnerState
-from jaxnav.training.trainer import ShardedTrainer, States, Trainer, stage_at
-
-_EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
+from jaxnav.training.exploration import Exploration
+from jaxnav.training.learner import LearnerState
+from jaxnav.training.trainer import States, Trainer, stage_at
 
 
 def train(config: RunConfig, console: Console | None = None) -> Run:
@@ -133,76 +129,6 @@ def connected(config: RunConfig) -> Mesh | None:
         return None
     devices.connect()
     return devices.mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
-
-
-def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
-    """Walk the training scenes at random.
-
-    The walks are divided among the banks.
-    """
-    key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
-    walks = -(-config.layout.walks // len(world.banks))
-    walk = jax.jit(explore, static_argnums=(0, 3, 4))
-    explored = [
-        walk(world.env, params, jax.random.fold_in(key, bank), walks, config.layout.steps)
-        for bank, params in enumerate(read_ahead(world, range(len(world.banks))))
-    ]
-    whole = jax.tree.map(lambda *parts: sum(parts), *explored)
-    if config.layout.prior == "room":
-        return whole
-    return whole._replace(counts=jax.numpy.broadcast_to(whole.counts.sum(axis=0), whole.counts.shape))
-
-
-def calibrate_setting(config: RunConfig, world: CompiledWorld, explored: Exploration, console: Console) -> Setting:
-    """Return the estimator's setting, complete.
-
-    What the config leaves open is chosen in the training scenes (of the first bank).
-    """
-    setting, layout = SETTINGS[config.layout.setting], config.layout
-    if setting.strength is None:
-        return setting  # rows keep the sums of the counts
-    key = jax.random.fold_in(jax.random.key(config.seed), _CALIBRATE)
-    strengths = STRENGTHS if layout.strength is None else (layout.strength,)
-    reductions = REDUCTIONS if layout.reduction is None else (layout.reduction,)
-    chosen = calibrate(world.env, world.params(0), explored.counts, setting, key, strengths, reductions)
-    console.print(
-        f"layout estimator: prior rows of {chosen.setting.strength:g}, reduction {chosen.setting.reduction}; "
-        f"gap {chosen.early:.2f} in the first views, {chosen.late:.2f} after twenty steps"
-    )
-    return chosen.setting
-
-
-def learn_knowledge(config: RunConfig, world: CompiledWorld, explored: Exploration, setting: Setting) -> Knowledge:
-    """Learn what is known before training.
-
-    That is the layout priors, and what the method learns.
-    """
-    learn, layout = find_method(config.method).learn, layout_priors(explored.counts, setting)
-    if learn is None:
-        return Knowledge(layout)
-    return Knowledge(layout, jax.tree.map(jax.numpy.asarray, learn(world.banks, np.asarray(explored.counts))))
-
-
-def make_trainer(
-    config: RunConfig, env: ObjectNav, setting: Setting, knowledge: Knowledge, mesh: Mesh | None = None
-) -> Trainer:
-    """Make the trainer of a run's arms and seeds.
-
-    Args:
-      config: the run's settings.
-      env: the environment.
-      setting: of the layout estimator; training has no use for its gap, which is left out.
-      knowledge: what was learned before training.
-      mesh: of devices; None for one device.
-    """
-    spec = config.policy_spec(len(env.categories))
-    settings = {"baseline": None, "layout": dataclasses.replace(setting, gap="none")}
-    learners = {
-        name: Learner(Acting(env, spec, settings[name]), config.ppo, config.counterfactual) for name in config.arms
-    }
-    scalars, key = config.ppo.scalars(config.total_updates), jax.random.key(config.seed)
-    arguments = learners, scalars, knowledge, key, config.seeds, config.chunk
-    return Trainer(*arguments) if mesh is None else ShardedTrainer(*arguments, mesh=mesh)
 
 
 def _do_updates(

@@ -5,7 +5,8 @@ import dataclasses
 from rich.console import Console
 
 from jaxnav.errors import InputError
-from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.directory import load_run, settings
 from jaxnav.runs.policies import load_policies
 from jaxnav.runs.train import train

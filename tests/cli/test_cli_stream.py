@@ -18,7 +18,7 @@ from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.layout import Setting
 from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig, WorldConfig
-from jaxnav.runs.train import make_trainer
+from jaxnav.runs.prepare import make_trainer
 from jaxnav.runs.worlds import bank_order, evaluation_world, read_ahead, training_world
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.store.runlog import read_rows

@@ -12,7 +12,8 @@ from jaxnav.__main__ import main
 from jaxnav.cli import train as train_command
 from jaxnav.cli.options import parse
 from jaxnav.errors import InputError
-from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.overlay import CONFIGS, apply_yaml
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS
-from jaxnav.runs.train import explore_world
+from jaxnav.runs.prepare import explore_world
 from jaxnav.runs.worlds import training_world
 from jaxnav.training.calibration import layout_priors
 

@@ -13,7 +13,8 @@ from support.commands import POLICIES, SEEDS, contents, finished_run
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
-from jaxnav.runs.config import RunConfig, check
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.overlay import apply_yaml
 
 EPISODES = 4

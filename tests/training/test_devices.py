@@ -28,7 +28,7 @@ import contextlib, dataclasses, json, sys
 import jax, numpy as np
 from support import tiny_world as tiny
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.train import make_trainer
+from jaxnav.runs.prepare import make_trainer
 from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS
 from jaxnav.numerics.product import product
