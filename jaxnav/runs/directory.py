@@ -16,6 +16,8 @@ from jaxnav.store.manifest import differences
 from jaxnav.store.runlog import read_rows
 
 CONFIG_FILE, LOG_FILE, TIMES_FILE = "config.json", "metrics.jsonl", "times.jsonl"
+#: Success within budgets of actions, of the exported policies; see `Validator.reach`.
+REACH_FILE = "reach.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +46,14 @@ class Run:
     def log(self) -> list[dict[str, Any]]:
         """Return the training log, a row per chunk and seed."""
         return read_rows(self.config.run_dir / LOG_FILE)
+
+    def reach(self) -> dict[str, Any] | None:
+        """Return success within budgets of actions, see `Validator.reach`.
+
+        None where the run had no val scenes.
+        """
+        path = self.config.run_dir / REACH_FILE
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def times(self) -> list[dict[str, Any]]:
         """Return the seconds that training took, a row per chunk.

@@ -18,13 +18,14 @@ from jaxnav.policies.policy import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import LOG_FILE, TIMES_FILE, Run, claim, settings
+from jaxnav.runs.directory import LOG_FILE, REACH_FILE, TIMES_FILE, Run, claim, settings
 from jaxnav.runs.policies import POLICIES, export_policy
 from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.stopwatch import Stopwatch
-from jaxnav.runs.validation import SCORE, Validator, write_reach
+from jaxnav.runs.validation import SCORE, Validator
 from jaxnav.runs.worlds import CompiledWorld, bank_order, read_ahead, training_world
 from jaxnav.store.checkpoint import restore, save
+from jaxnav.store.files import write_atomic
 from jaxnav.store.manifest import make_manifest
 from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
@@ -80,9 +81,9 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     states = _do_updates(config, trainer, validator, world, order, states, done, manifest, clock, console)
     kept = {name: [_exported(state) for state in seeds] for name, seeds in states.items()}
     by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
-    if validator is not None:
+    if validator is not None and not (done == config.total_updates and (config.run_dir / REACH_FILE).exists()):
         reach = validator.reach(kept)
-        by_first_process(lambda: write_reach(config.run_dir, reach))
+        by_first_process(lambda: write_atomic(config.run_dir / REACH_FILE, (json.dumps(reach) + "\n").encode()))
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
     return Run(config)
 

@@ -1,11 +1,9 @@
 """Validation: how policies do on fixed episodes while they are trained."""
 
 import dataclasses
-import json
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -23,14 +21,11 @@ from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.policy import Params
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.worlds import CompiledWorld, evaluation_world
-from jaxnav.store.files import write_atomic
 
 #: Of the episodes; no seed that `evaluate` takes, so these are others.
 _SEED = 2**32
 #: The measure by which policies are chosen.
 SCORE = "val_success"
-#: File in a run directory: success within budgets of actions, of the exported policies.
-REACH_FILE = "reach.json"
 #: Numbers of actions at which success is counted.
 _BUDGETS = (5, 10, 15, 20, 30, 40, 50, 75, 100, 150, 200, 300, 400, 500)
 
@@ -142,8 +137,3 @@ def _within(outcome: Outcome, decoding: int, budgets: Sequence[int]) -> list[flo
     """Return the share of episodes that succeed within each budget."""
     success, length = np.asarray(outcome.success)[decoding], np.asarray(outcome.length)[decoding]
     return [float((success & (length <= budget)).mean()) for budget in budgets]
-
-
-def write_reach(run_dir: Path, reach: Mapping[str, Any]) -> None:
-    """Write success within budgets to the run directory."""
-    write_atomic(run_dir / REACH_FILE, (json.dumps(reach, indent=2) + "\n").encode())

@@ -18,9 +18,9 @@ from jaxnav.study.figures import (
 )
 from jaxnav.study.records import Condition, TrialRow
 from jaxnav.study.results import WorldResults, load_results
-from jaxnav.study.style import save_figure
 from jaxnav.study.tables import table_1
 from jaxnav.study.trials import FORMS
+from jaxnav.viz.figure import save_figure
 
 
 def draw_figures(folder: Path, images: Path) -> None:

@@ -19,12 +19,10 @@ from jaxnav.study.style import (
     STYLES,
     add_legend,
     draw_band,
-    fix_placement,
-    grid,
     interval_text,
     legend_key,
-    set_title,
 )
+from jaxnav.viz.figure import fix_placement, grid, set_title
 from jaxnav.viz.plan import INK, PALE
 
 MAX_AREA = 60.0  # points^2, of the marker with the most episodes

@@ -17,8 +17,8 @@ from jaxnav.evaluation.report import Form
 from jaxnav.study import figures
 from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
 from jaxnav.study.records import GainBySimilarity, SuccessBySimilarity, TrialRow
-from jaxnav.study.style import DPI, WIDTH, save_figure
 from jaxnav.study.trials import Trial
+from jaxnav.viz.figure import DPI, WIDTH, save_figure
 
 FORMS: tuple[Form, ...] = ("residual", "paper")
 BELIEFS: tuple[Belief, ...] = ("updated", "frozen")

@@ -104,6 +104,22 @@ def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, w
         assert found[name] == pytest.approx(sum(part[name] for part in parts) / 2)
 
 
+def test_the_best_policy_is_kept_and_a_later_one_among_equals(first):
+    keep = jax.jit(LEARNER.keep)
+    state = tiny.at(first[0], 0)
+    assert state.kept.score == -1.0
+    chex.assert_trees_all_equal(state.kept.params, init(jax.random.key(0), PARAMS, KNOWLEDGE).params)
+    kept = keep(state, jnp.float32(0.5))
+    for score, update in ((0.4, 1), (0.5, 7), (0.6, 7)):
+        later = keep(
+            kept.replace(update=jnp.int32(7), params=jax.tree.map(jnp.negative, kept.params)), jnp.float32(score)
+        )
+        assert (float(later.kept.score), int(later.kept.update)) == (pytest.approx(max(score, 0.5)), update)
+        chex.assert_trees_all_equal(later.kept.params, later.params if update == 7 else kept.params)
+    # Nothing of training follows from what was kept.
+    chex.assert_trees_all_equal(kept.params, state.params)
+
+
 def test_another_seed_gives_another_policy(first, seeds):
     for states in (seeds, first[0]):
         assert not np.array_equal(kernel(states)[0], kernel(states)[1])

@@ -1,0 +1,108 @@
+"""Validation: what is measured, logged and exported."""
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import jaxnav
+from jaxnav.evaluation.variants import Row
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.evaluate import run_rows
+from jaxnav.runs.train import train
+from jaxnav.runs.validation import DECODINGS, Validator
+from jaxnav.runs.worlds import evaluation_world, training_world
+from jaxnav.scenes.files.scene_file import write_scenes
+from jaxnav.scenes.worlds import generated
+from jaxnav.training.config import PPOConfig
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def validated(drawn_run):
+    """The validator of a run, and its policies as training holds them."""
+    config, policies = dataclasses.replace(drawn_run.config, val_episodes=12), drawn_run.policies()
+    training = training_world(config, QUIET)
+    validator = Validator(config, policies.acting(training.env), policies.knowledge, training, QUIET)
+    held = {
+        arm: [
+            jaxnav.load_policy(drawn_run.config.run_dir / "policies" / f"{arm}-{seed}").params
+            for seed in range(policies.seeds)
+        ]
+        for arm in policies.arms
+    }
+    return config, policies, validator, held
+
+
+def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
+    config, policies, validator, held = validated
+    rows = [Row(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
+    world = evaluation_world(config, "val", None, None, QUIET)
+    _, outcome, _ = run_rows(rows, policies, world, config.val_episodes, 2**32)
+    scores = validator.measure(held)
+    for row, success, done in zip(rows, np.asarray(outcome.success), np.asarray(outcome.done), strict=True):
+        if row.decoding == "sample":
+            continue  # the draws are others
+        for seed, score in enumerate(scores[row.variant]):
+            assert score["val_success"] == success[seed].mean()
+            assert score["val_timeout"] == pytest.approx(1 - done[seed].mean())
+            assert score["val_success"] + score["val_timeout"] + score["val_wrong_done"] == pytest.approx(1)
+    assert 0 < np.asarray(outcome.success).mean() < 1
+
+
+def test_success_within_budgets_grows_to_the_whole(validated):
+    _, policies, validator, held = validated
+    reach, scores = validator.reach(held), validator.measure(held)
+    assert reach["budgets"] == sorted(set(reach["budgets"]))
+    for arm in policies.arms:
+        for split in ("val", "train"):
+            curve = reach[split][arm]["argmax"]
+            assert curve == sorted(curve)
+        success = np.mean([score["val_success"] for score in scores[arm]])
+        assert reach["val"][arm]["argmax"][-1] == pytest.approx(success, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("validations", "after"), [(0, []), (1, [12]), (2, [6, 12]), (5, [4, 6, 8, 10, 12]), (99, [2, 4, 6, 8, 10, 12])]
+)
+def test_measurements_are_evenly_spaced_and_end_with_the_last_chunk(validations, after):
+    ppo = PPOConfig(num_envs=64, rollout=10, minibatches=4)
+    config = RunConfig(chunk=2, total_steps=12 * 640, ppo=ppo, validations=validations)
+    assert sorted(config.validated) == after
+
+
+@pytest.mark.slow
+def test_the_exported_policy_is_the_one_that_succeeded_most(config, tmp_path):
+    config = dataclasses.replace(config, run_dir=tmp_path / "run", total_steps=8 * config.total_steps, val_episodes=40)
+    run = train(dataclasses.replace(config, validations=4))
+    last = train(dataclasses.replace(config, validations=0, run_dir=tmp_path / "last"))
+    rows = [row for row in run.log() if "val_success" in row]
+    assert len({row["step"] for row in rows}) == 4
+    differ = []
+    for arm in config.arms:
+        for seed in range(config.seeds):
+            course = [row["val_success"] for row in rows if (row["arm"], row["seed"]) == (arm, seed)]
+            best = len(course) - 1 - int(np.argmax(course[::-1]))
+            exported, final = (
+                jaxnav.load_policy(each.config.run_dir / "policies" / f"{arm}-{seed}").params for each in (run, last)
+            )
+            same = np.array_equal(exported["fuse"]["kernel"], final["fuse"]["kernel"])
+            assert same == (best == len(course) - 1)  # measuring changes nothing of training
+            differ.append(not same)
+    assert run.reach() is not None
+    assert last.reach() is None
+
+
+@pytest.mark.slow
+def test_a_file_without_val_scenes_exports_the_last_policy(config, tmp_path):
+    scenes = tmp_path / "train_only.jsonl"
+    write_scenes(scenes, [generated("rooms", "train", 2)[i] for i in range(2)])
+    told = io.StringIO()
+    console = Console(file=told, width=400)
+    run = train(dataclasses.replace(config, run_dir=tmp_path / "run", scenes=scenes), console)
+    assert "no val scenes, so the last policies are exported" in told.getvalue()
+    assert run.reach() is None
+    assert not any("val_success" in row for row in run.log())
