@@ -12,6 +12,7 @@ from jaxnav.layout import LayoutEstimator, LayoutState, Setting
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
 from jaxnav.policies.policy import Params, Policy, bind
+from jaxnav.policies.spatial_memory import Explored, SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 
 Tree = TypeVar("Tree")
@@ -23,12 +24,14 @@ class Agent(NamedTuple):
     Attributes:
       state: the episodes, leaves [B].
       layout: the beliefs about their layouts, leaves [B, ...]; None where the policy does not use them.
+      explored: the maps of their spatial memories, leaves [B, ...]; None without one.
       note: the notes of the method's tracker, leaves [B, ...]; None without one.
       memory: the policy's memories, leaves [B, ...]; None where no policy acts.
     """
 
     state: State
     layout: LayoutState | None
+    explored: Explored | None
     note: Any
     memory: Memory | None
 
@@ -40,11 +43,13 @@ class View(NamedTuple):
       observation: leaves [B, ...].
       weights: float32 [B, K], the layout's weights for the goals (eq. 7); ones without the layout.
       reading: what the tracker read of the notes, leaves [B, ...]; None without one.
+      surroundings: uint8 [B, M], what is known of the cells around the agent; None without a spatial memory.
     """
 
     observation: Observation
     weights: jax.Array
     reading: Any
+    surroundings: jax.Array | None
 
 
 class Taken(NamedTuple):
@@ -107,7 +112,10 @@ class Acting:
         reading = None
         if self._tracker is not None:
             reading = jax.vmap(self._tracker.read, (0, None, 0))(agent.note, knowledge, agent.state.goal)
-        return View(observation, weights, reading)
+        surroundings, spatial = None, self._spatial_memory
+        if spatial is not None and agent.explored is not None:
+            surroundings = jax.vmap(spatial.read)(agent.explored)
+        return View(observation, weights, reading, surroundings)
 
     def gap(self, agent: Agent) -> jax.Array:
         """Return the layout gaps D, float32 [B].
@@ -194,16 +202,23 @@ class Acting:
                 return LayoutEstimator(knowledge.layout[params.room[state.scene]], setting).update(layout, presence)
 
             layout = jax.vmap(believe)(layout, agent.state)
+        headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
+        percept = Percept(params.tables.rows[agent.state.pose], agent.state.pose // horizons % headings, action, moved)
         if self._tracker is not None:
-            headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
-            heading = agent.state.pose // horizons % headings
-            percept = Percept(params.tables.rows[agent.state.pose], heading, action, moved)
             note = jax.vmap(self._tracker.update, (0, None, 0))(note, knowledge, percept)
-        return agent._replace(layout=layout, note=note)
+        explored, spatial = agent.explored, self._spatial_memory
+        if spatial is not None and explored is not None:
+            update = jax.vmap(spatial.update, (0, 0, 0, 0, None))
+            explored = update(explored, percept.row, percept.heading, moved, self.env.row_format)
+        return agent._replace(layout=layout, note=note, explored=explored)
 
     @property
     def _tracker(self) -> Any:
         return None if self.method is None else self.method.tracker
+
+    @property
+    def _spatial_memory(self) -> SpatialMemory | None:
+        return None if self.spec is None else self.spec.spatial_memory
 
     def _act(self, state: State, action: jax.Array, keys: jax.Array | None, params: EnvParams) -> tuple[Any, ...]:
         """Take actions in the environment.
@@ -224,10 +239,14 @@ class Acting:
         layout, note, setting = None, None, self.setting
         if setting is not None:
             layout = jax.vmap(lambda s: LayoutEstimator(knowledge.layout[params.room[s.scene]], setting).init())(state)
+
+        def everywhere(first: Tree) -> Tree:
+            return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.pose.shape, *jnp.shape(leaf))), first)
+
         if self._tracker is not None:
-            first = self._tracker.init(knowledge)
-            note = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.pose.shape, *jnp.shape(leaf))), first)
-        return Agent(state, layout, note, memory)
+            note = everywhere(self._tracker.init(knowledge))
+        explored = None if self._spatial_memory is None else everywhere(self._spatial_memory.init())
+        return Agent(state, layout, explored, note, memory)
 
 
 def carried(agent: Agent) -> Memory:

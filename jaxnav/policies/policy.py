@@ -4,7 +4,7 @@ A policy is built once; only its parameters, a nested dict of arrays, are kept i
 
     params = init_params(spec, key)
     policy = bind(spec, params)
-    pathways = policy.pathways(observation, weights, reading, memory)
+    pathways = policy.pathways(observation, weights, reading, surroundings, memory)
     decision = policy.decide(pathways, memory)
     counterfactual = policy.decide(do(pathways, scene=0, goal=0), memory)
 """
@@ -25,6 +25,7 @@ from jaxnav.policies.category_maps import CategoryMaps
 from jaxnav.policies.features import CONFIDENCE, NUM_FEATURES, Features, features
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
+from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
@@ -46,7 +47,8 @@ class Policy(nnx.Module):
         self.hidden, self.direct, self.done_gate = sizes.hidden, spec.direct, spec.done_gate
         seen = dataclasses.replace(spec, num_categories=self._num_perceived())
         self.appearance = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
-        self.view = Linear(2 * self.row_format.view**2, sizes.view_outputs, rngs=rngs)
+        known = 0 if spec.spatial_memory is None else spec.spatial_memory.num_inputs
+        self.view = Linear(2 * self.row_format.view**2 + known, sizes.view_outputs, rngs=rngs)
         self.detections = CategoryMaps(sizes.appearance + NUM_FEATURES, seen, rngs)
         self.sought = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
         self.method = method.experience(seen, rngs)
@@ -62,7 +64,12 @@ class Policy(nnx.Module):
         self.critic = Linear(sizes.hidden, 1, rngs=rngs)
 
     def pathways(
-        self, observation: Observation, weights: jax.Array, reading: Any = None, memory: Memory | None = None
+        self,
+        observation: Observation,
+        weights: jax.Array,
+        reading: Any = None,
+        surroundings: jax.Array | None = None,
+        memory: Memory | None = None,
     ) -> Pathways:
         """Embed what is seen, sought and known by experience.
 
@@ -70,27 +77,37 @@ class Policy(nnx.Module):
           observation: a batch [...] of observations.
           weights: float32 [..., K], the layout's weights for the goal (eq. 7); ones leave the layout out.
           reading: what the method's tracker read, leaves [...]; None without a tracker.
+          surroundings: uint8 [..., M], what the spatial memory read; None without one.
           memory: leaves [...]; needed where the method attends with it.
 
         Raises:
           ValueError: the method attends with its memory, and there is none.
         """
-        encoded = self.encode(observation, weights, reading)
+        encoded = self.encode(observation, weights, reading, surroundings)
         if not self.method.recurrent:
             return encoded
         if memory is None:
             raise ValueError("pathways: the method attends with its memory; give it")
         return self.attend(encoded, memory)
 
-    def encode(self, observation: Observation, weights: jax.Array, reading: Any = None) -> Pathways:
+    def encode(
+        self,
+        observation: Observation,
+        weights: jax.Array,
+        reading: Any = None,
+        surroundings: jax.Array | None = None,
+    ) -> Pathways:
         """Embed without memory; the experience may still have to `attend`."""
         seen = features(observation.row, observation.goal, self.row_format)
         if self.perceive is not None:
             seen = self.perceive(seen)
+        scene = seen.view
+        if surroundings is not None:
+            scene = jnp.concatenate([scene, SpatialMemory.inputs(surroundings)], axis=-1)
         appearance = self.appearance.embedding[...]
         confidence = (seen.table[..., CONFIDENCE] * seen.goal).sum(axis=-1, keepdims=True)
         return Pathways(
-            scene=nnx.relu(self.view(seen.view)),
+            scene=nnx.relu(self.view(scene)),
             goal=self._embed_goal(seen, appearance),
             experience=self.method.encode(seen, appearance, jax.lax.stop_gradient(weights), reading),
             gate=DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence),

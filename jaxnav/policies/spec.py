@@ -3,6 +3,8 @@
 import dataclasses
 from typing import Literal
 
+from jaxnav.policies.spatial_memory import SpatialMemory
+
 #: Which detections the direct pathway G -> A sees: of all categories, of the goal's alone, or none.
 Direct = Literal["all", "goal", "none"]
 
@@ -36,6 +38,7 @@ class PolicySpec:
       sizes: widths that all methods share.
       method_sizes: (name, value) of the method's own sizes that are not the usual ones.
       direct: which detections the direct pathway sees; the number of parameters does not depend on it.
+      spatial_memory: what the scene's direct pathway remembers beside the view; None in the paper.
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
     """
@@ -46,3 +49,4 @@ class PolicySpec:
     method_sizes: tuple[tuple[str, int], ...] = ()
     direct: Direct = "all"
     done_gate: bool = False
+    spatial_memory: SpatialMemory | None = None

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from jaxnav.layout import Reduction
+from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.detector import Detector
 from jaxnav.scenes.task import Task
@@ -86,6 +87,8 @@ class RunConfig:
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
       direct: which detections the direct pathway of the goal sees.
+      spatial_memory: whether policies remember, on the direct pathway of the scene, which cells they have seen and
+        visited; the paper's do not.
       done_gate: multiply the logit of Done by 0.58 times the confidence that the goal is in sight.
       chunk: updates per compiled call; between calls the run logs, saves (every `save_every` calls) and, where scenes
         are streamed, goes on to the next shard with new episodes.
@@ -111,6 +114,7 @@ class RunConfig:
     seed: int = 0
     counterfactual: Counterfactual = "distil"
     direct: Direct = "all"
+    spatial_memory: bool = True
     done_gate: bool = False
     chunk: int = 8
     save_every: int = 4
@@ -142,7 +146,8 @@ class RunConfig:
     def policy_spec(self, num_categories: int) -> PolicySpec:
         """Return what its policies are built from."""
         sizes = tuple(sorted(self.method_sizes.items()))
-        return PolicySpec(self.method, num_categories, self.sizes, sizes, self.direct, self.done_gate)
+        memory = SpatialMemory(self.task.rules.headings) if self.spatial_memory else None
+        return PolicySpec(self.method, num_categories, self.sizes, sizes, self.direct, self.done_gate, memory)
 
     @property
     def train_step_limit(self) -> int:

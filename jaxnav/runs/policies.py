@@ -15,6 +15,7 @@ from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Knowledge, find_method
+from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.config import RunConfig
 from jaxnav.store.export import export_params, load_params
@@ -151,7 +152,9 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
     try:
         find_method(spec["method"])
         sizes, method_sizes = Sizes(**spec["sizes"]), tuple(sorted(spec["method_sizes"].items()))
-        built = spec["method"], len(spec["categories"]), sizes, method_sizes, spec["direct"], spec["done_gate"]
+        spatial = spec.get("spatial_memory")  # version 0.2 had none
+        spatial = None if spatial is None else SpatialMemory(**spatial)
+        built = spec["method"], len(spec["categories"]), sizes, method_sizes, spec["direct"], spec["done_gate"], spatial
         return Policies(
             params=jax.tree.map(jnp.asarray, tensors["policy"]),
             arms=(),
@@ -190,6 +193,7 @@ def export_policy(
       setting: of the layout estimator; None without the layout.
       explored: what the priors were made of.
     """
+    policy = config.policy_spec(len(config.task.categories))
     spec = {
         "method": config.method,
         "categories": list(config.task.categories),
@@ -198,6 +202,7 @@ def export_policy(
         "method_sizes": config.method_sizes,
         "direct": config.direct,
         "done_gate": config.done_gate,
+        "spatial_memory": None if policy.spatial_memory is None else dataclasses.asdict(policy.spatial_memory),
         "layout": None if setting is None else dataclasses.asdict(setting),
         "prior_steps": int(explored.steps),
         "prior_poses": int(explored.poses),

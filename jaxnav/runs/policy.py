@@ -12,9 +12,11 @@ from jaxnav.env.objectnav import OTHER_ROOM, prior_index
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
 from jaxnav.layout import LayoutEstimator, LayoutState, Setting
+from jaxnav.policies.acting import View
 from jaxnav.policies.methods import Knowledge, Percept, find_method
 from jaxnav.policies.pathways import Decision, Memory
 from jaxnav.policies.policy import Params, bind
+from jaxnav.policies.spatial_memory import Explored
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.policies import read_export
 from jaxnav.scenes.categories import ROOM_TYPES
@@ -26,12 +28,14 @@ class EpisodeMemory(NamedTuple):
 
     Attributes:
       memory: of the network.
+      explored: the map of the spatial memory; None without one.
       layout: the belief about the layout; None where the policy does not use it.
       note: of the method's tracker; None without one.
       room: int32 [], index of the room type's layout prior.
     """
 
     memory: Memory
+    explored: Explored | None
     layout: LayoutState | None
     note: Any
     room: jax.Array
@@ -70,7 +74,8 @@ class LoadedPolicy(struct.PyTreeNode):
         tracker = find_method(self.spec.method).tracker
         layout = None if self.setting is None else LayoutEstimator(self.knowledge.layout[room], self.setting).init()
         note = None if tracker is None else tracker.init(self.knowledge)
-        return EpisodeMemory(bind(self.spec, self.params).initial_memory(), layout, note, room)
+        explored = None if self.spec.spatial_memory is None else self.spec.spatial_memory.init()
+        return EpisodeMemory(bind(self.spec, self.params).initial_memory(), explored, layout, note, room)
 
     def act(
         self,
@@ -79,8 +84,8 @@ class LoadedPolicy(struct.PyTreeNode):
         epsilon: jax.Array | float = 0.5,
         *,
         key: jax.Array | None = None,
-        heading: jax.Array | int = 0,
-        moved: jax.Array | bool = False,
+        heading: jax.Array | int | None = None,
+        moved: jax.Array | bool | None = None,
     ) -> tuple[jax.Array, EpisodeMemory]:
         """Take in one observation and choose an action.
 
@@ -92,10 +97,14 @@ class LoadedPolicy(struct.PyTreeNode):
           epsilon: threshold of sTDE; may be traced. At 1 or more nothing is removed.
           key: consumed, to sample the action; None for the best action.
           heading: compass heading, and
-          moved: whether the last action changed the cell; only methods with a tracker read them.
+          moved: whether the last action changed the cell; policies with a spatial memory and methods with a tracker
+            need both.
 
         Returns:
           The action int32 [], and the memory for the next step.
+
+        Raises:
+          InputError: heading or moved is needed and missing.
         """
         method, row_format = find_method(self.spec.method), RowFormat(self.spec.num_categories)
         layout, note, weights = memory.layout, memory.note, jnp.ones(self.spec.num_categories)
@@ -103,28 +112,35 @@ class LoadedPolicy(struct.PyTreeNode):
             estimator = LayoutEstimator(self.knowledge.layout[memory.room], self.setting)
             layout = estimator.update(layout, row_format.presence(observation.row))
             weights = estimator.goal_weights(layout, observation.goal)
-        reading = None
-        if method.tracker is not None:
+        reading, surroundings, explored = None, None, memory.explored
+        if method.tracker is not None or explored is not None:
+            if heading is None or moved is None:
+                raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
             percept = Percept(observation.row, jnp.int32(heading), memory.memory.action, jnp.bool_(moved))
-            note = method.tracker.update(note, self.knowledge, percept)
-            reading = method.tracker.read(note, self.knowledge, observation.goal)
-        decision, logits = self._decide(observation, weights, reading, memory.memory, layout, epsilon)
+            if method.tracker is not None:
+                note = method.tracker.update(note, self.knowledge, percept)
+                reading = method.tracker.read(note, self.knowledge, observation.goal)
+            if self.spec.spatial_memory is not None and explored is not None:
+                explored = self.spec.spatial_memory.update(
+                    explored, percept.row, percept.heading, percept.moved, row_format
+                )
+                surroundings = self.spec.spatial_memory.read(explored)
+        view = View(observation, weights, reading, surroundings)
+        decision, logits = self._decide(view, memory.memory, layout, epsilon)
         choice = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
         action = method.control.act(choice.astype(jnp.int32), note)
-        return action, EpisodeMemory(decision.memory(action), layout, note, memory.room)
+        return action, EpisodeMemory(decision.memory(action), explored, layout, note, memory.room)
 
     def _decide(
         self,
-        observation: Observation,
-        weights: jax.Array,
-        reading: Any,
+        view: View,
         memory: Memory,
         layout: LayoutState | None,
         epsilon: jax.Array | float,
     ) -> tuple[Decision, jax.Array]:
         """Return the factual decision, and logits without experience."""
         policy = bind(self.spec, self.params)
-        pathways = policy.pathways(observation, weights, reading, memory)
+        pathways = policy.pathways(*view, memory)
         decision = policy.decide(pathways, memory)
         if layout is None or self.setting is None:
             return decision, decision.logits

@@ -22,6 +22,7 @@ class Transition(NamedTuple):
       pose, goal: int32 [B].
       weights: float32 [B, K], the layout's weights for the goal.
       reading: what the method's tracker read, leaves [B, ...]; None without one.
+      surroundings: uint8 [B, M], what the spatial memory read; None without one.
       direct: bool [B], False where both direct pathways were zeroed; None if they never are.
       choice: int32 [B], what the policy chose.
       action: int32 [B], what was done.
@@ -34,6 +35,7 @@ class Transition(NamedTuple):
     goal: jax.Array
     weights: jax.Array
     reading: Any
+    surroundings: jax.Array | None
     direct: jax.Array | None
     choice: jax.Array
     action: jax.Array
@@ -143,6 +145,7 @@ def collect(
             goal=agent.state.goal,
             weights=view.weights,
             reading=view.reading,
+            surroundings=view.surroundings,
             direct=direct,
             choice=choice,
             action=carried(taken.agent).action,

@@ -75,7 +75,7 @@ def replay(policy: Policy, transitions: Transition, memory: Memory, params: EnvP
       params: the environment's; observations are gathered from its tables.
     """
     observation = Observation(row=params.tables.rows[transitions.pose], goal=transitions.goal)
-    pathways = policy.encode(observation, transitions.weights, transitions.reading)
+    pathways = policy.encode(observation, transitions.weights, transitions.reading, transitions.surroundings)
     again = _step_by_step if policy.recurrent else _in_parallel
     return Replay(policy, transitions, pathways, *again(policy, pathways, transitions, memory), params)
 

@@ -12,8 +12,10 @@ from jaxnav.viz.plan import INK
 
 #: Colour of an arm's lines.
 _ARMS = {"baseline": "#D55E00", "layout": "#0072B2"}
-_BEST, _SAMPLED, _TRAINING = {"ls": "-", "marker": "o"}, {"ls": "--", "marker": "s"}, {"ls": ":"}
-_LINE = {"lw": 1.4, "ms": 3.5}
+_LINE: dict[str, Any] = {"lw": 1.4, "ms": 3.5}
+_BEST: dict[str, Any] = _LINE | {"ls": "-", "marker": "o"}
+_SAMPLED: dict[str, Any] = _LINE | {"ls": "--", "marker": "s"}
+_TRAINING: dict[str, Any] = _LINE | {"ls": ":"}
 
 
 def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] | None, title: str) -> Figure:
@@ -31,12 +33,12 @@ def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] 
     arms = [arm for arm in _ARMS if any(row["arm"] == arm for row in rows)]
     for arm in arms:
         color = {"color": _ARMS[arm]}
-        panels[0, 0].plot(*_curve(rows, arm, "success"), **color, **_LINE, **_TRAINING)
-        panels[0, 0].plot(*_curve(rows, arm, "val_success"), **color, **_LINE, **_BEST)
-        panels[0, 0].plot(*_curve(rows, arm, "val_success_sampled"), **color, **_LINE, **_SAMPLED)
+        panels[0, 0].plot(*_curve(rows, arm, "success"), **color, **_TRAINING)
+        panels[0, 0].plot(*_curve(rows, arm, "val_success"), **color, **_BEST)
+        panels[0, 0].plot(*_curve(rows, arm, "val_success_sampled"), **color, **_SAMPLED)
         if reach is not None:
-            panels[0, 1].plot(reach["budgets"], _percent(reach["val"][arm]["argmax"]), **color, **_LINE, **_BEST)
-            panels[0, 1].plot(reach["budgets"], _percent(reach["train"][arm]["argmax"]), **color, **_LINE, **_TRAINING)
+            panels[0, 1].plot(reach["budgets"], _percent(reach["val"][arm]["argmax"]), **color, **_BEST)
+            panels[0, 1].plot(reach["budgets"], _percent(reach["train"][arm]["argmax"]), **color, **_TRAINING)
     panels[0, 0].set(xlabel="Environment steps of a policy (million)", ylabel="SR (%)", ylim=(0, 100))
     set_title(panels[0, 0], title, "while training")
     if reach is not None:
@@ -60,7 +62,11 @@ def _percent(shares: Sequence[float]) -> list[float]:
 
 
 def _legend(figure: Figure, arms: Sequence[str]) -> None:
-    styles = {"val, best actions": _BEST, "val, sampled": _SAMPLED, "training scenes": _TRAINING}
+    styles: dict[str, dict[str, Any]] = {
+        "val, best actions": _BEST,
+        "val, sampled": _SAMPLED,
+        "training scenes": _TRAINING,
+    }
     keys = [Line2D([], [], label=arm, color=_ARMS[arm], lw=3) for arm in arms]
-    keys += [Line2D([], [], label=name, color=INK, **_LINE, **style) for name, style in styles.items()]
+    keys += [Line2D([], [], label=name, color=INK, **style) for name, style in styles.items()]
     figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), fontsize=8, frameon=False)
