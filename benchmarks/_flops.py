@@ -5,13 +5,20 @@ from typing import Any
 
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.interpreters import partial_eval
 
 
 def matmul_flops(jaxpr: Jaxpr) -> int:
     """Count the operations of all matrix products.
 
-    Those of a scan count once per iteration, branches all together.
+    Those that no result depends on, which the compiler leaves out, do not count. Those of a scan count once per
+    iteration, branches all together.
     """
+    live, _ = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return _count(live)
+
+
+def _count(jaxpr: Jaxpr) -> int:
     total = 0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
@@ -23,5 +30,5 @@ def matmul_flops(jaxpr: Jaxpr) -> int:
         inner = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: isinstance(x, Jaxpr | ClosedJaxpr))
         for part in inner:
             if isinstance(part, Jaxpr | ClosedJaxpr):
-                total += times * matmul_flops(part.jaxpr if isinstance(part, ClosedJaxpr) else part)
+                total += times * _count(part.jaxpr if isinstance(part, ClosedJaxpr) else part)
     return total

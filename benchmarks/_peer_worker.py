@@ -3,8 +3,9 @@
 It is run once for every line on stdin. It runs in the virtual environment of the package it measures, so it stands
 alone and imports that package only. The first line on stdout describes what was compiled; every further one is the wall
 seconds of one call. A call is `lax.scan` over steps of all episodes with auto-reset, from where the last call ended.
-Actions are drawn beforehand. What a step delivers (every element of every observation, rewards, endings) is added to
-arrays in the carry: consumed, not stored. Episodes are divided over the devices that XLA shows.
+Actions are drawn beforehand. What a step delivers (every element of every observation, rewards, endings) is `consumed`,
+added to arrays in the carry, or `stored` as a rollout does: a call is then rollout after rollout of `ROLLOUT` steps,
+and each returns what its steps have delivered. Episodes are divided over the devices that XLA shows.
 """
 
 import importlib
@@ -19,6 +20,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.sharding import NamedSharding, PartitionSpec
+
+ROLLOUT = 64  # steps
 
 
 class Environment(NamedTuple):
@@ -101,13 +104,14 @@ def jaxmarl(name: str) -> Environment:
 PACKAGES = {package.__name__: package for package in (jaxnav, gymnax, xminigrid, navix, jumanji, jaxmarl)}
 
 
-def compiled(env: Environment, episodes: int, steps: int) -> tuple[Callable[[], None], dict[str, Any]]:
+def compiled(env: Environment, episodes: int, steps: int, stored: bool) -> tuple[Callable[[], None], dict[str, Any]]:
     """Return a call of these steps, and what was compiled."""
+    length = min(steps, ROLLOUT) if stored else steps
     mesh = jax.make_mesh((jax.device_count(),), ("episodes",), axis_types=(jax.sharding.AxisType.Auto,))
     everywhere, divided, per_step = PartitionSpec(), PartitionSpec("episodes"), PartitionSpec(None, "episodes")
     key = jax.random.key(0)
     params = jax.device_put(env.params, NamedSharding(mesh, everywhere))
-    actions = jax.random.randint(key, (steps, episodes), 0, env.num_actions, jnp.int32)
+    actions = jax.random.randint(key, (length, episodes), 0, env.num_actions, jnp.int32)
     actions = jax.device_put(actions, NamedSharding(mesh, per_step))
     states = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(key, episodes), env.params)
     one = jax.eval_shape(env.step, key, jax.tree.map(lambda leaf: leaf[0], states), actions[0, 0], env.params)[0]
@@ -122,29 +126,39 @@ def compiled(env: Environment, episodes: int, steps: int) -> tuple[Callable[[], 
             now, action = inputs
             keys = jax.random.split(jax.random.fold_in(key, now), len(action))
             delivered, states = jax.vmap(env.step, (0, 0, 0, None))(keys, states, action, params)
+            if stored:
+                return (states, totals), delivered
             return (states, jax.tree.map(jnp.add, totals, delivered)), None
 
-        return jax.lax.scan(step, carry, (jnp.arange(len(actions)), actions))[0]
+        return jax.lax.scan(step, carry, (jnp.arange(len(actions)), actions))
 
-    specs = (everywhere, divided, per_step, everywhere)
+    specs, results = (everywhere, divided, per_step, everywhere), (divided, per_step)
     began = time.perf_counter()
-    program = jax.jit(jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=divided, check_vma=False))
+    program = jax.jit(jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=results, check_vma=False))
     program = program.lower(key, carry, actions, params).compile()
     taken = time.perf_counter() - began
 
     def call() -> None:
         nonlocal carry
-        carry = jax.block_until_ready(program(key, carry, actions, params))
+        for _ in range(steps // length):
+            carry, _ = jax.block_until_ready(program(key, carry, actions, params))
 
-    elements = sum(leaf.size for leaf in jax.tree.leaves(one[0]))
-    return call, {"compile_s": round(taken, 2), "observation_elements": elements, "devices": jax.device_count()}
+    leaves = jax.tree.leaves(one[0])
+    described = {
+        "steps_per_call": steps // length * length,
+        "compile_s": round(taken, 2),
+        "observation_elements": sum(leaf.size for leaf in leaves),
+        "observation_bytes": sum(leaf.size * leaf.dtype.itemsize for leaf in leaves),
+        "devices": jax.device_count(),
+    }
+    return call, described
 
 
 def main() -> None:
-    package, name, episodes, steps = sys.argv[1:]
+    package, name, episodes, steps, what = sys.argv[1:]
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # packages print, even while they compile
-    call, described = compiled(PACKAGES[package](name), int(episodes), int(steps))
+    call, described = compiled(PACKAGES[package](name), int(episodes), int(steps), what == "stored")
     print(json.dumps(described), file=answers, flush=True)
     for _ in sys.stdin:
         began = time.perf_counter()

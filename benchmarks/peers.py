@@ -4,7 +4,8 @@
 environment of its own under `.cache/peers` and runs there in a process that waits between its calls (`_peer_worker.py`,
 which says what one call is); calls are taken in turns, ours among them. A peer that does not install or does not run is
 named with its error. *Like for like*: one device and the default allocator on all sides. *Tuned*: two host devices and
-the allocator's variables on all sides. Peers work out their view and their new layouts at every step; ours are looked
+the allocator's variables on all sides. Both are measured with what a step delivers consumed, and with it stored as a
+rollout does. Peers work out their view and their new layouts at every step; ours are looked
 up in tables, whose compilation is not counted.
 """
 
@@ -95,11 +96,12 @@ def last_line(text: str) -> str:
 class Worker:
     """Run one compiled environment that sleeps between its calls."""
 
-    def __init__(self, case: Case, settings: dict[str, str]) -> None:
+    def __init__(self, case: Case, settings: dict[str, str], what: str) -> None:
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "XLA_", "JAX_"))}
         kept["JAX_PLATFORMS"] = "cpu"
         log_path = HOME / f"{case.package}-{case.name}-{case.episodes}.log"
-        command = [str(python(case.package)), str(WORKER), case.package, case.name, str(case.episodes), str(case.steps)]
+        numbers = str(case.episodes), str(case.steps)
+        command = [str(python(case.package)), str(WORKER), case.package, case.name, *numbers, what]
         with log_path.open("w") as log:
             self.process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=kept | settings
@@ -129,17 +131,20 @@ class Worker:
         self.process.wait()
 
 
-def race(cases: Iterable[Case], settings: dict[str, str]) -> dict[str, Any]:
-    """Time all cases in turns, and compare ours with each."""
-    workers = {case: started(case, settings) for case in cases}
+def race(cases: Iterable[Case], settings: dict[str, str], what: str) -> dict[str, Any]:
+    """Time all cases in turns, and compare ours with each.
+
+    What a step delivers is `consumed` or `stored`.
+    """
+    workers = {case: started(case, settings, what) for case in cases}
     running = {case: worker for case, worker in workers.items() if "error" not in worker.described}
     for worker in running.values():
         worker.seconds()
     turns = [{case: worker.seconds() for case, worker in running.items()} for _ in range(TURNS)]
     for worker in workers.values():
         worker.close()
-    results = {case.title: {"steps_per_call": case.steps, **workers[case].described} for case in workers}
-    per_step = {case: [turn[case] / case.steps for turn in turns] for case in running}
+    results = {case.title: worker.described for case, worker in workers.items()}
+    per_step = {case: [turn[case] / results[case.title]["steps_per_call"] for turn in turns] for case in running}
     for case, taken in per_step.items():
         results[case.title]["steps_per_s"] = rates(taken, case.episodes)
         if case.package != "jaxnav":
@@ -148,9 +153,9 @@ def race(cases: Iterable[Case], settings: dict[str, str]) -> dict[str, Any]:
     return results
 
 
-def started(case: Case, settings: dict[str, str]) -> Worker:
-    print("compiling", case.title, file=sys.stderr)
-    return Worker(case, settings)
+def started(case: Case, settings: dict[str, str], what: str) -> Worker:
+    print("compiling", case.title, what, file=sys.stderr)
+    return Worker(case, settings, what)
 
 
 def goals(cases: Iterable[Case], results: dict[str, Any]) -> list[dict[str, Any]]:
@@ -169,17 +174,13 @@ def main() -> None:
     def those(cases: list[Case]) -> list[Case]:
         return [case for case in cases if "error" not in installed.get(case.package, {})]
 
-    like = race([OURS, OURS_FEW, *those(FAST + SLOW)], KINDS["like_for_like"])
-    tuned = race([OURS, *those(FAST)], KINDS["tuned"])
-    report(
-        {
-            "turns": TURNS,
-            "peers": installed,
-            "like_for_like": like,
-            "tuned": tuned,
-            "goals_like_for_like": goals(FAST + SLOW, like),
-        }
-    )
+    raced = {
+        f"{kind}_{what}": race([OURS, *those(cases)], KINDS[kind], what)
+        for kind, cases in (("like_for_like", [OURS_FEW, *FAST, *SLOW]), ("tuned", FAST))
+        for what in ("consumed", "stored")
+    }
+    reached = goals(FAST + SLOW, raced["like_for_like_consumed"])
+    report({"turns": TURNS, "peers": installed, **raced, "goals_like_for_like": reached})
 
 
 if __name__ == "__main__":

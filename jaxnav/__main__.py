@@ -17,6 +17,10 @@ COMMANDS = {
 }
 
 HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {what}\n" for name, what in COMMANDS.items())
+NOTES = """
+Each has its own --help; --version prints the version.
+Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. The environment variable
+JAX_COMPILATION_CACHE_DIR names another folder; with JAX_ENABLE_COMPILATION_CACHE=0 none are kept."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -26,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
-        print(HELP + "\nEach has its own --help; --version prints the version.")
+        print(HELP + NOTES)
         return 0
     if name == "--version":
         print(f"jaxnav {__version__}")

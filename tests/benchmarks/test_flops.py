@@ -51,3 +51,12 @@ def test_batched_products_count_per_entry(flops):
     many = jnp.ones((3, ROWS, WIDTH))
     jaxpr = jax.make_jaxpr(lambda a: jnp.einsum("bij,bkj->bik", a, a))(many).jaxpr
     assert flops.matmul_flops(jaxpr) == 3 * 2 * ROWS * ROWS * WIDTH
+
+
+def test_products_that_nothing_depends_on_do_not_count(flops):
+    @jax.jit
+    def gradients(weights, inputs, state):
+        return jax.grad(recurrent, argnums=(0, 1))(weights, inputs, state)
+
+    jaxpr = jax.make_jaxpr(lambda *arguments: gradients(*arguments)[0])(*ARGUMENTS).jaxpr
+    assert flops.matmul_flops(jaxpr) == (2 + 3) * STEPS * PRODUCT

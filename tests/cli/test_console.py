@@ -1,0 +1,98 @@
+"""What all commands share: where compiled programs are kept, and memory that compilations free."""
+
+import ctypes
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import pytest
+from support.commands import contents
+
+from jaxnav.cli import console
+from jaxnav.cli.console import exit_code
+
+SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch):
+    """A home of one's own, and JAX as it is where nobody has told it of a cache."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    before = {name: jax.config.values[name] for name in SETTINGS}
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield tmp_path
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def folder_of_a_command():
+    """The folder for compiled programs that JAX has while a command runs."""
+    seen = []
+    assert exit_code(lambda _: seen.append(jax.config.values["jax_compilation_cache_dir"])) == 0
+    return seen[0]
+
+
+def test_compiled_programs_are_kept_in_the_cache_of_the_user(home, capsys):
+    folder = folder_of_a_command()
+    assert folder == str(home / ".cache" / "jaxnav" / "xla")
+    assert Path(folder).is_dir()
+    assert jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 0.5
+    assert capsys.readouterr().err == ""
+
+
+def test_another_folder_is_respected(home):
+    jax.config.update("jax_compilation_cache_dir", str(home / "other"))
+    assert folder_of_a_command() == str(home / "other")
+    assert contents(home) == {}
+
+
+def test_nothing_is_kept_where_it_is_turned_off(home):
+    jax.config.update("jax_enable_compilation_cache", False)
+    assert folder_of_a_command() is None
+    assert not any(home.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_a_line(home, capsys):
+    (home / ".cache").write_text("a file")
+    assert folder_of_a_command() is None
+    error = capsys.readouterr().err
+    assert error.startswith("warning: compiled programs are not kept: ")
+    assert error.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_written_is_told_in_a_line(home, capsys, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert folder_of_a_command() is None
+    assert str(home / ".cache" / "jaxnav" / "xla") in capsys.readouterr().err
+
+
+def trims(monkeypatch, library, seconds):
+    """What `malloc_trim` of a C library is called with after a compilation of so many seconds."""
+    calls = []
+    functions = dict.fromkeys(library, calls.append)
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(**functions))
+    heard = []
+    monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", heard.append)
+    console._give_memory_back.__wrapped__()
+    for listener in heard:
+        listener("/jax/core/compile/backend_compile_duration", seconds, fun_name="f")
+        listener("/jax/checkpoint/write/duration_secs", seconds)
+    return calls
+
+
+@pytest.mark.parametrize(("seconds", "expected"), [(2.0, [0]), (0.1, [])])
+def test_a_long_compilation_gives_its_memory_back(monkeypatch, seconds, expected):
+    assert trims(monkeypatch, ["malloc_trim"], seconds) == expected
+
+
+def test_another_c_library_is_left_alone(monkeypatch):
+    assert trims(monkeypatch, [], 2.0) == []
+
+
+def test_jax_tells_of_its_compilations(monkeypatch):
+    told = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=told.append))
+    monkeypatch.setattr(console, "_LONG_S", 0.0)
+    console._give_memory_back.__wrapped__()
+    jax.jit(lambda x: x * 3 + 1)(2)
+    assert set(told) == {0}
