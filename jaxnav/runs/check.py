@@ -51,7 +51,8 @@ def _check_method(config: RunConfig, method: Method) -> None:
 def _check_numbers(config: RunConfig) -> None:
     _need(config.validations >= 0, "validations", config.validations, "give at least 0")
     for name in ("seeds", "total_steps", "chunk", "save_every", "val_episodes"):
-        _need(getattr(config, name) >= 1, name, getattr(config, name), "give at least 1")
+        value = getattr(config, name)
+        _need(value is None or value >= 1, name, value, "give at least 1")
     if config.devices is not None:
         forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
         _need(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), forms)
@@ -77,9 +78,12 @@ def _check_learning(config: RunConfig) -> None:
     _need_all(ppo, "ppo", ("gamma", "gae_lambda"), lambda x: 0.0 <= x <= 1.0, "give a number from 0 to 1")
     rates = ("learning_rate", "clip", "max_grad_norm")
     _need_all(ppo, "ppo", rates, lambda x: 0.0 < x < float("inf"), "give a positive number")
-    _need_all(ppo, "ppo", ("entropy", "value", "distil"), lambda x: 0.0 <= x < float("inf"), "give 0 or more")
-    divided, mend = ppo.num_envs % ppo.minibatches == 0, f"give a multiple of ppo.minibatches ({ppo.minibatches})"
-    _need(divided, "ppo.num_envs", ppo.num_envs, mend)
+    weights = ("entropy", "final_entropy", "value", "distil")
+    _need_all(ppo, "ppo", weights, lambda x: 0.0 <= x < float("inf"), "give 0 or more")
+    fewer = ppo.num_envs // ppo.minibatches * ppo.minibatches
+    nearest = " or ".join(str(count) for count in (fewer, fewer + ppo.minibatches) if count)
+    mend = f"give a multiple of ppo.minibatches ({ppo.minibatches}), such as {nearest}"
+    _need(ppo.num_envs == fewer, "ppo.num_envs", ppo.num_envs, mend)
     mend = f"give at most worlds.train_step_limit ({config.train_step_limit})"
     _need(ppo.rollout <= config.train_step_limit, "ppo.rollout", ppo.rollout, mend)
 

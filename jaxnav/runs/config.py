@@ -82,8 +82,8 @@ class RunConfig:
       scenes: scene file to read instead; its splits are used.
       arms: kinds of policies that are trained; a method that cannot host the layout has the baseline alone.
       seeds: policies trained of each kind.
-      total_steps: environment steps of each policy, rounded up to whole chunks. The layout's policies have seen the
-        prior's random steps (`layout.walks x layout.steps`) besides.
+      total_steps: environment steps of each policy, rounded up to whole chunks; None: as usual in the world. The
+        layout's policies have seen the prior's random steps (`layout.walks x layout.steps`) besides.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
       direct: which detections the direct pathway of the goal sees.
@@ -110,7 +110,7 @@ class RunConfig:
     scenes: Path | None = None
     arms: tuple[Arm, ...] = ARMS
     seeds: int = 3
-    total_steps: int = 2_000_000
+    total_steps: int | None = None
     seed: int = 0
     counterfactual: Counterfactual = "distil"
     direct: Direct = "all"
@@ -169,4 +169,5 @@ class RunConfig:
     @property
     def total_updates(self) -> int:
         """Return the updates of each policy, in whole chunks."""
-        return -(-self.ppo.num_updates(self.total_steps) // self.chunk) * self.chunk
+        steps = self.total_steps or WORLDS[self.world].total_steps
+        return -(-self.ppo.num_updates(steps) // self.chunk) * self.chunk

@@ -42,6 +42,15 @@ def apply_yaml(default: Config, source: str | Path) -> Config:
     return default if values is None else _overlay(default, values, path, "")
 
 
+def apply_values(default: Config, values: dict[str, Any], source: Path) -> Config:
+    """Return `default` with values that were read from a file.
+
+    Raises:
+      InputError: see `apply_yaml`.
+    """
+    return _overlay(default, values, source, "")
+
+
 class _Loader(yaml.SafeLoader):
     """Load YAML safely, and refuse equal keys.
 

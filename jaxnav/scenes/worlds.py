@@ -25,6 +25,7 @@ class World:
       generate: a scene from (split, index, seed, shift).
       counts: usual number of scenes of each split.
       task: categories, goals and rules.
+      total_steps: environment steps that a policy is usually trained for.
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
@@ -34,6 +35,7 @@ class World:
     generate: Callable[[str, int, int, float], Scene]
     counts: dict[str, int]
     task: Task
+    total_steps: int
     train_step_limit: int
     step_limit: int
     large_step_limit: int
@@ -46,15 +48,17 @@ WORLDS = {
         generate=generate_room_at,
         counts={"train": 80, "val": 20, "test": 20},
         task=ROOMS,
-        train_step_limit=30,
+        total_steps=1_500_000,
+        train_step_limit=100,
         step_limit=100,
         large_step_limit=200,
         shaping=0.0,
     ),
     "apartments": World(
         generate=generate_apartment,
-        counts={"train": 60, "val": 15, "test": 15},
+        counts={"train": 120, "val": 15, "test": 15},
         task=APARTMENTS,
+        total_steps=6_000_000,
         train_step_limit=100,
         step_limit=500,
         large_step_limit=500,
@@ -62,8 +66,9 @@ WORLDS = {
     ),
     "houses": World(
         generate=generate_house,
-        counts={"train": 25, "val": 5, "test": 5},
+        counts={"train": 100, "val": 10, "test": 10},
         task=HOUSES,
+        total_steps=6_000_000,
         train_step_limit=100,
         step_limit=500,
         large_step_limit=500,

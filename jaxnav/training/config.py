@@ -21,21 +21,24 @@ class PPOConfig:
       gamma: discount.
       gae_lambda: of generalised advantage estimation.
       clip: of the probability ratio.
-      entropy: weight of the entropy bonus.
+      entropy: weight of the entropy bonus at the start,
+      final_entropy: at the end; linear in between. A policy that is trained as random as at the start acts worse by
+        its best actions than by sampled ones.
       value: weight of the value loss.
       max_grad_norm: global norm to which gradients are clipped.
       distil: weight of the counterfactual branch's loss where it is distilled.
     """
 
-    num_envs: int = 512
+    num_envs: int = 256
     rollout: int = 30
     epochs: int = 1
-    minibatches: int = 16
-    learning_rate: float = 1e-3
+    minibatches: int = 8
+    learning_rate: float = 2e-3
     gamma: float = 0.99
     gae_lambda: float = 0.95
     clip: float = 0.2
     entropy: float = 0.01
+    final_entropy: float = 0.0
     value: float = 0.5
     max_grad_norm: float = 0.5
     distil: float = 0.5
@@ -65,6 +68,7 @@ class PPOScalars(struct.PyTreeNode):
     gae_lambda: jax.Array
     clip: jax.Array
     entropy: jax.Array
+    final_entropy: jax.Array
     value: jax.Array
     distil: jax.Array
     num_updates: jax.Array

@@ -139,7 +139,9 @@ class Learner:
         transitions, config = rollout.transitions, self.config
         returns = transitions.reward, transitions.value, rollout.next_value, transitions.ended
         advantage = advantages(*returns, scalars.gamma, scalars.gae_lambda)
-        rate = scalars.learning_rate * (1.0 - state.update.astype(jnp.float32) / scalars.num_updates)
+        done = state.update.astype(jnp.float32) / scalars.num_updates
+        rate = scalars.learning_rate * (1.0 - done)
+        scalars = scalars.replace(entropy=scalars.entropy + done * (scalars.final_entropy - scalars.entropy))
 
         def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], Metrics]:
             gradient, parts = jax.grad(self._loss, has_aux=True)(carry[0], part, params, scalars)

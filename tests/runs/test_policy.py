@@ -124,7 +124,8 @@ def stack(trees):
 def test_a_batch_equals_its_singles(drawn_run, world, name):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / name)
     observations, memories = batch_of(policy, world.env, world.params(0))
-    batched = jax.jit(jax.vmap(policy.act, (0, 0, None)))(stack(observations), stack(memories), 0.1)
+    standing = functools.partial(policy.act, heading=0, moved=False)
+    batched = jax.jit(jax.vmap(standing, (0, 0, None)))(stack(observations), stack(memories), 0.1)
     singles = stack([act(policy, *pair) for pair in zip(observations, memories, strict=True)])
     np.testing.assert_array_equal(batched[0], singles[0])
     chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
@@ -134,7 +135,8 @@ def test_several_policies_act_in_one_call(drawn_run, world):
     folders = [drawn_run.config.run_dir / POLICIES / f"layout-{seed}" for seed in range(2)]
     policies = [jaxnav.load_policy(folder) for folder in folders]
     (observation, *_), (memory, *_) = batch_of(policies[0], world.env, world.params(0), 1)
-    together = jax.jit(jax.vmap(LoadedPolicy.act, (0, None, None, None)))(stack(policies), observation, memory, 0.1)
+    standing = functools.partial(LoadedPolicy.act, heading=0, moved=False)
+    together = jax.jit(jax.vmap(standing, (0, None, None, None)))(stack(policies), observation, memory, 0.1)
     singles = stack([act(policy, observation, memory) for policy in policies])
     chex.assert_trees_all_close(together, singles, rtol=1e-5, atol=1e-6)
 
@@ -149,6 +151,13 @@ def test_the_room_type_picks_the_prior(drawn_run):
     assert len(ROOM_TYPES) == OTHER_ROOM
     with pytest.raises(InputError, match=r"^room_type 'cellar': choose one of kitchen, .*, or None$"):
         policy.init("cellar")
+
+
+def test_a_policy_with_a_spatial_memory_needs_compass_and_odometry(drawn_run, world):
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
+    start = tiny.at(first_states(episode_list(world.banks[0], 8)), 0)
+    with pytest.raises(InputError, match="goes by compass and odometry; give `heading` and `moved`"):
+        policy.act(world.env.observe(start, world.params(0)), policy.init())
 
 
 # Methods with a tracker

@@ -22,7 +22,7 @@ class ObjectRelations(Experience):
     weights multiply what has passed it, which is the same.
     """
 
-    sizes: ClassVar[Mapping[str, int]] = {"relation_layers": 4}
+    sizes: ClassVar[Mapping[str, int]] = {"relation_layers": 1}
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         self.edges = Linear(NUM_FEATURES, spec.num_categories, rngs=rngs)
