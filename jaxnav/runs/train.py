@@ -29,7 +29,7 @@ from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
 from jaxnav.training.exploration import Exploration, explore
 from jaxnav.training.learner import Learner
-from jaxnav.training.trainer import ShardedTrainer, States, Trainer, stage_at
+from jaxnav.training.trainer import Seeds, ShardedTrainer, States, Trainer, stage_at
 
 _EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
 
@@ -72,12 +72,13 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
         )
     first = world.params(order[0])
     restored = restore(config.run_dir, trainer.abstract(first), manifest)
-    states, done = restored or (trainer.init(first), 0)
+    states, done = (trainer.pack(restored[0]), restored[1]) if restored else (trainer.init(first), 0)
     by_first_process(lambda: truncate_after(config.run_dir / LOG_FILE, done))
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
     states = _do_updates(config, trainer, world, order, states, done, manifest, console)
-    by_first_process(lambda: _export(config, states, setting, knowledge, explored))
+    seeds = trainer.unpack(states)
+    by_first_process(lambda: _export(config, seeds, setting, knowledge, explored))
     console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
     return Run(config)
 
@@ -212,7 +213,7 @@ def _do_updates(
                     row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
                     append_row(config.run_dir / LOG_FILE, row | values)
             if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
-                save(config.run_dir, done, states, manifest)
+                save(config.run_dir, done, trainer.unpack(states), manifest)
             success = {name: np.mean([values["success"] for values in seeds]) for name, seeds in metrics.items()}
             shares = ", ".join(f"{name} SR {100 * share:.0f} %" for name, share in success.items())
             skipped = sum(values["skipped_steps"] for seeds in metrics.values() for values in seeds)
@@ -224,9 +225,9 @@ def _do_updates(
     return states
 
 
-def _export(config: RunConfig, states: States, setting: Setting, knowledge: Knowledge, explored: Exploration) -> None:
+def _export(config: RunConfig, seeds: Seeds, setting: Setting, knowledge: Knowledge, explored: Exploration) -> None:
     """Export every seed's policy."""
-    for name, seeds in states.items():
-        for seed, state in enumerate(seeds):
+    for name, states in seeds.items():
+        for seed, state in enumerate(states):
             folder = config.run_dir / POLICIES / f"{name}-{seed}"
             export_policy(folder, config, state.params, knowledge, setting if name == "layout" else None, explored)

@@ -21,10 +21,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxnav.errors import InputError
 from jaxnav.training.learner import LearnerState
+from jaxnav.training.shares import EPISODES, SEEDS
 
 Tree = TypeVar("Tree")
-
-_SEEDS, _EPISODES = "seeds", "episodes"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +97,7 @@ class Devices:
                 f"config: ppo.num_envs is {num_envs}; with {count} devices for {seeds} seeds the episodes of each are "
                 f"shared by {share}: give a multiple of {share} x ppo.minibatches ({minibatches})"
             )
-        return Mesh(np.array(devices[:count]).reshape(groups, share), (_SEEDS, _EPISODES))
+        return Mesh(np.array(devices[:count]).reshape(groups, share), (SEEDS, EPISODES))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
@@ -111,9 +110,9 @@ def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
 
     Or of `stacked` seeds' states: episodes are divided, stacked seeds as well.
     """
-    seeds = (_SEEDS,) if stacked else ()
+    seeds = (SEEDS,) if stacked else ()
     whole = NamedSharding(mesh, PartitionSpec(*seeds))
-    episodes = NamedSharding(mesh, PartitionSpec(*seeds, _EPISODES))
+    episodes = NamedSharding(mesh, PartitionSpec(*seeds, EPISODES))
     state: Any = LearnerState  # holds places here, not arrays
     return state(params=whole, optimizer=whole, agent=episodes, key=whole, update=whole)
 

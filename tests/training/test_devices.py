@@ -46,7 +46,7 @@ def policies(count):
     mesh = Devices(count=count).mesh(seeds=2, num_envs=16, minibatches=2)
     trainer = make_trainer(*parts, mesh if count > 1 else None)
     states = trainer.init(params)
-    shards = states["layout"][0].agent.state.pose.addressable_shards
+    shards = trainer.unpack(states)["layout"][0].agent.state.pose.addressable_shards
     assert [shard.data.shape[0] for shard in shards] == {1: [16], 2: [16, 16], 4: [8, 8, 8, 8]}[count]
     for _ in range(2):
         states, metrics = trainer.train(states, params)
@@ -56,7 +56,7 @@ def policies(count):
             "poses": np.asarray(state.agent.state.pose).tolist(),
             "metrics": values,
         }
-        for state, values in zip(states["layout"], metrics["layout"])
+        for state, values in zip(trainer.unpack(states)["layout"], metrics["layout"])
     ]
 
 def collectives(within):
