@@ -190,16 +190,13 @@ def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
 def _episode_sums(transitions: Transition, params: EnvParams) -> dict[str, jax.Array]:
     """Return sums over the episodes that ended, float32 [] each."""
     ended = transitions.ended
-
-    def total(values: jax.Array) -> jax.Array:
-        return jnp.where(ended, values.astype(jnp.float32), 0.0).sum()
-
-    success, length = total(transitions.success), total(transitions.length)
+    values = jnp.stack([ended, transitions.success, transitions.length, transitions.truncated]).astype(jnp.float32)
+    episodes, success, length, truncated = jnp.where(ended, values, 0.0).sum(axis=(1, 2))  # devices add one array
     return {
-        "episodes": total(ended),
+        "episodes": episodes,
         "success": success,
         "length": length,
-        "truncated": total(transitions.truncated),
+        "truncated": truncated,
         # Every step but a successful Done costs the same, so the return (without shaping) follows from both.
         "return": params.success_reward * success + params.step_reward * (length - success),
     }

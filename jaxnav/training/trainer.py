@@ -113,7 +113,7 @@ class Trainer:
             metrics[name].append({key: float(value) for key, value in values.items()})
         return after, metrics
 
-    def _compile(self, name: str, stage: int, states: list[LearnerState], params: EnvParams) -> Any:
+    def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
         """Compile the chunk of an arm, unless it is."""
         if (name, stage) not in self._compiled:
             learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
@@ -194,7 +194,7 @@ class ShardedTrainer(Trainer):
             self._given, self._placed = params, everywhere(self._mesh, params)
         return self._placed
 
-    def _compile(self, name: str, stage: int, states: LearnerState, params: EnvParams) -> Any:
+    def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
         """Compile the chunk of an arm, unless it is."""
         if (name, stage) in self._compiled:
             return self._compiled[name, stage]
@@ -204,7 +204,10 @@ class ShardedTrainer(Trainer):
             def one(state: LearnerState) -> Any:
                 return learner.train(state, scalars, params, knowledge, num_updates)
 
-            return jax.vmap(one, spmd_axis_name=SEEDS)(states)
+            after, metrics = jax.vmap(one, spmd_axis_name=SEEDS)(states)
+            table = jnp.stack(list(metrics.values()), axis=-1)  # exchanged as one array
+            table = jax.lax.with_sharding_constraint(table, replicated(self._mesh))
+            return after, dict(zip(metrics, jnp.unstack(table, axis=-1), strict=True))
 
         call = jax.jit(train, out_shardings=(self._stacked, replicated(self._mesh)), donate_argnums=0)
         with jax.set_mesh(self._mesh):
