@@ -29,11 +29,13 @@ from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
 from jaxnav.training.exploration import Exploration, explore
 from jaxnav.training.learner import Learner
+from jaxnav.training.peers import watched
 from jaxnav.training.trainer import Seeds, ShardedTrainer, States, Trainer, stage_at
 
 _EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
 
 
+@watched()
 def train(config: RunConfig, console: Console | None = None) -> Run:
     """Train a run and export its policies.
 
@@ -54,6 +56,7 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     mesh = connected(config)
     if console is None or not first_process():
         console = Console(quiet=True)
+    check_agreement(json.dumps(make_manifest(settings(config))))  # before the scenes, which may take long
     world = training_world(config, console)
     manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
     check_agreement(json.dumps(manifest))

@@ -21,6 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxnav.errors import InputError
 from jaxnav.training.learner import LearnerState
+from jaxnav.training.peers import PATIENCE, watch
 from jaxnav.training.shares import EPISODES, SEEDS
 
 Tree = TypeVar("Tree")
@@ -61,14 +62,23 @@ class Devices:
         """Join the other processes, before anything is computed.
 
         Raises:
-          InputError: no launcher tells of the processes, or the first one cannot be reached.
+          InputError: no launcher tells of the processes. If one is lost, now or later, this one ends; see `peers`.
         """
         if self.count or jax.distributed.is_initialized():
             return
         jax.config.update("jax_enable_preemption_service", False)  # it would ignore a SIGTERM
         detection = "deactivate" if self.address else None
+        watch()
         try:
-            jax.distributed.initialize(self.address, self.processes, self.process, cluster_detection_method=detection)
+            jax.distributed.initialize(
+                self.address,
+                self.processes,
+                self.process,
+                cluster_detection_method=detection,
+                initialization_timeout=PATIENCE,
+                heartbeat_timeout_seconds=PATIENCE,
+                shutdown_timeout_seconds=PATIENCE,
+            )
         except (ValueError, RuntimeError) as error:
             raise InputError(
                 f"config: devices: the processes cannot be joined ({error}); give HOST:PORT,INDEX,PROCESSES to each, "
