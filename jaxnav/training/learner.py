@@ -190,8 +190,9 @@ def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
 def _episode_sums(transitions: Transition, params: EnvParams) -> dict[str, jax.Array]:
     """Return sums over the episodes that ended, float32 [] each."""
     ended = transitions.ended
-    values = jnp.stack([ended, transitions.success, transitions.length, transitions.truncated]).astype(jnp.float32)
-    episodes, success, length, truncated = jnp.where(ended, values, 0.0).sum(axis=(1, 2))  # devices add one array
+    values = ended, transitions.success, transitions.length, transitions.truncated
+    table = jnp.stack([value.astype(jnp.float32) for value in values])  # which devices add as one array
+    episodes, success, length, truncated = jnp.where(ended, table, 0.0).sum(axis=(1, 2))
     return {
         "episodes": episodes,
         "success": success,
