@@ -42,7 +42,7 @@ class Training:
     def save(self, folder: Path) -> float:
         """Return the seconds to save a checkpoint."""
         began = time.perf_counter()
-        save(folder, 1, self._states, {})
+        save(folder, 1, self._trainer.unpack(self._states), {})
         return time.perf_counter() - began
 
     def log(self, folder: Path) -> float:
@@ -55,7 +55,7 @@ class Training:
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of parameters and of a device's episodes."""
-        state = self._states["layout"][0]
+        state = self._trainer.unpack(self._states)["layout"][0]
         agent = sum(leaf.nbytes for leaf in jax.tree.leaves(state.agent))
         return {
             "parameter_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(state.params)),

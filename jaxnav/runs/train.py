@@ -31,9 +31,11 @@ from jaxnav.store.runlog import append_row, truncate_after
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
 from jaxnav.training.exploration import Exploration
 from jaxnav.training.learner import LearnerState
+from jaxnav.training.peers import watched
 from jaxnav.training.trainer import States, Trainer, stage_at
 
 
+@watched()
 def train(config: RunConfig, console: Console | None = None) -> Run:
     """Train a run and export its policies.
 
@@ -54,6 +56,7 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     mesh = connected(config)
     if console is None or not first_process():
         console = Console(quiet=True)
+    check_agreement(json.dumps(make_manifest(settings(config))))  # before the scenes, which may take long
     world = training_world(config, console)
     manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
     check_agreement(json.dumps(manifest))
@@ -73,13 +76,13 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
         )
     first = world.params(order[0])
     restored = restore(config.run_dir, trainer.abstract(first), manifest)
-    states, done = restored or (trainer.init(first), 0)
+    states, done = (trainer.pack(restored[0]), restored[1]) if restored else (trainer.init(first), 0)
     by_first_process(lambda: [truncate_after(config.run_dir / name, done) for name in (LOG_FILE, TIMES_FILE)])
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
     clock = Stopwatch.resume(config.run_dir / TIMES_FILE, started)
     states = _do_updates(config, trainer, validator, world, order, states, done, manifest, clock, console)
-    kept = {name: [_exported(state) for state in seeds] for name, seeds in states.items()}
+    kept = {name: [_exported(state) for state in seeds] for name, seeds in trainer.unpack(states).items()}
     by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
     if validator is not None and not (done == config.total_updates and (config.run_dir / REACH_FILE).exists()):
         reach = validator.reach(kept)
@@ -162,7 +165,8 @@ def _do_updates(
             done += config.chunk
             rate = steps / (time.monotonic() - began)
             if validator is not None and done in config.validated:
-                scores = validator.measure({name: [state.params for state in seeds] for name, seeds in states.items()})
+                present = trainer.unpack(states)
+                scores = validator.measure({name: [state.params for state in seeds] for name, seeds in present.items()})
                 states = trainer.keep(states, {name: [row[SCORE] for row in rows] for name, rows in scores.items()})
                 metrics = {name: [a | b for a, b in zip(metrics[name], scores[name], strict=True)] for name in metrics}
             began = time.monotonic()
@@ -173,7 +177,7 @@ def _do_updates(
                         append_row(config.run_dir / LOG_FILE, row | values)
                 append_row(config.run_dir / TIMES_FILE, {"step": done} | clock.read())
             if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
-                save(config.run_dir, done, states, manifest)
+                save(config.run_dir, done, trainer.unpack(states), manifest)
             success = {name: np.mean([values["success"] for values in seeds]) for name, seeds in metrics.items()}
             shares = ", ".join(f"{name} SR {100 * share:.0f} %" for name, share in success.items())
             skipped = sum(values["skipped_steps"] for seeds in metrics.values() for values in seeds)

@@ -21,10 +21,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxnav.errors import InputError
 from jaxnav.training.learner import LearnerState
+from jaxnav.training.peers import PATIENCE, watch
+from jaxnav.training.shares import EPISODES, SEEDS
 
 Tree = TypeVar("Tree")
-
-_SEEDS, _EPISODES = "seeds", "episodes"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,14 +62,23 @@ class Devices:
         """Join the other processes, before anything is computed.
 
         Raises:
-          InputError: no launcher tells of the processes, or the first one cannot be reached.
+          InputError: no launcher tells of the processes. If one is lost, now or later, this one ends; see `peers`.
         """
         if self.count or jax.distributed.is_initialized():
             return
         jax.config.update("jax_enable_preemption_service", False)  # it would ignore a SIGTERM
         detection = "deactivate" if self.address else None
+        watch()
         try:
-            jax.distributed.initialize(self.address, self.processes, self.process, cluster_detection_method=detection)
+            jax.distributed.initialize(
+                self.address,
+                self.processes,
+                self.process,
+                cluster_detection_method=detection,
+                initialization_timeout=PATIENCE,
+                heartbeat_timeout_seconds=PATIENCE,
+                shutdown_timeout_seconds=PATIENCE,
+            )
         except (ValueError, RuntimeError) as error:
             raise InputError(
                 f"config: devices: the processes cannot be joined ({error}); give HOST:PORT,INDEX,PROCESSES to each, "
@@ -98,7 +107,7 @@ class Devices:
                 f"config: ppo.num_envs is {num_envs}; with {count} devices for {seeds} seeds the episodes of each are "
                 f"shared by {share}: give a multiple of {share} x ppo.minibatches ({minibatches})"
             )
-        return Mesh(np.array(devices[:count]).reshape(groups, share), (_SEEDS, _EPISODES))
+        return Mesh(np.array(devices[:count]).reshape(groups, share), (SEEDS, EPISODES))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
@@ -111,9 +120,9 @@ def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
 
     Or of `stacked` seeds' states: episodes are divided, stacked seeds as well.
     """
-    seeds = (_SEEDS,) if stacked else ()
+    seeds = (SEEDS,) if stacked else ()
     whole = NamedSharding(mesh, PartitionSpec(*seeds))
-    episodes = NamedSharding(mesh, PartitionSpec(*seeds, _EPISODES))
+    episodes = NamedSharding(mesh, PartitionSpec(*seeds, EPISODES))
     state: Any = LearnerState  # holds places here, not arrays
     return state(params=whole, kept=whole, optimizer=whole, agent=episodes, key=whole, update=whole)
 

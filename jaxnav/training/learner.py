@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.sharding import PartitionSpec
 
 from jaxnav.env.types import EnvParams
 from jaxnav.policies.acting import Acting, Agent
@@ -16,6 +17,7 @@ from jaxnav.training.apply import apply_gradient, make_optimizer
 from jaxnav.training.collect import Rollout, Transition, collect
 from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
 from jaxnav.training.loss import advantages, ppo_loss, replay
+from jaxnav.training.shares import EPISODES, averaged
 
 _INIT, _START, _UPDATES = range(3)  # purposes of a seed's keys
 _ROLLOUT, _SHUFFLE, _RESTART = range(3)  # purposes of an update's keys
@@ -143,15 +145,19 @@ class Learner:
         rate = scalars.learning_rate * (1.0 - done)
         scalars = scalars.replace(entropy=scalars.entropy + done * (scalars.final_entropy - scalars.entropy))
 
+        whole, in_time = PartitionSpec(), PartitionSpec(None, EPISODES)
+        places = whole, (in_time, PartitionSpec(EPISODES), in_time), whole, whole
+        differentiate = averaged(jax.grad(self._loss, has_aux=True), *places)
+
         def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], Metrics]:
-            gradient, parts = jax.grad(self._loss, has_aux=True)(carry[0], part, params, scalars)
+            gradient, parts = differentiate(carry[0], part, params, scalars)
             carry = apply_gradient(config, *carry, gradient, rate, self._stage.trainable)
             return carry, parts | {"gradient_norm": optax.tree.norm(gradient)}
 
         def epoch(carry: tuple[Params, Any], key: jax.Array) -> tuple[tuple[Params, Any], Metrics]:
             order = block_order(key, config.num_envs, config.minibatches)
-            in_time = regroup((transitions, advantage), order, axis=1)
-            return jax.lax.scan(learn, carry, (in_time[0], regroup(rollout.memory, order, axis=0), in_time[1]))
+            steps, signal = regroup((transitions, advantage), order, axis=1)
+            return jax.lax.scan(learn, carry, (steps, regroup(rollout.memory, order, axis=0), signal))
 
         return jax.lax.scan(epoch, (state.params, state.optimizer), jax.random.split(key, config.epochs))
 
@@ -209,16 +215,14 @@ def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
 def _episode_sums(transitions: Transition, params: EnvParams) -> dict[str, jax.Array]:
     """Return sums over the episodes that ended, float32 [] each."""
     ended = transitions.ended
-
-    def total(values: jax.Array) -> jax.Array:
-        return jnp.where(ended, values.astype(jnp.float32), 0.0).sum()
-
-    success, length = total(transitions.success), total(transitions.length)
+    values = ended, transitions.success, transitions.length, transitions.truncated
+    table = jnp.stack([value.astype(jnp.float32) for value in values])  # which devices add as one array
+    episodes, success, length, truncated = jnp.where(ended, table, 0.0).sum(axis=(1, 2))
     return {
-        "episodes": total(ended),
+        "episodes": episodes,
         "success": success,
         "length": length,
-        "truncated": total(transitions.truncated),
+        "truncated": truncated,
         # Every step but a successful Done costs the same, so the return (without shaping) follows from both.
         "return": params.success_reward * success + params.step_reward * (length - success),
     }

@@ -14,6 +14,7 @@ from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
 from jaxnav.policies.policy import Policy
 from jaxnav.training.collect import Transition, zero_direct
 from jaxnav.training.config import PPOScalars
+from jaxnav.training.shares import moments
 
 Parts = dict[str, jax.Array]
 
@@ -132,7 +133,8 @@ def ppo_loss(
     log_prob = jnp.take_along_axis(log_pi, transitions.choice[..., None], axis=-1)[..., 0]
     ratio = jnp.exp(log_prob - transitions.log_prob)
     target = advantage + transitions.value
-    scaled = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    mean, deviation = moments(advantage)
+    scaled = (advantage - mean) / (deviation + 1e-8)
     clipped = jnp.clip(ratio, 1.0 - scalars.clip, 1.0 + scalars.clip)
     policy_loss = -jnp.minimum(ratio * scaled, clipped * scaled).mean()
     value_loss = 0.5 * jnp.square(decisions.value - target).mean()

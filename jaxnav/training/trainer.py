@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
 from jaxnav.env.types import EnvParams
@@ -15,9 +16,12 @@ from jaxnav.policies.methods import Knowledge, Stage
 from jaxnav.training.config import PPOScalars
 from jaxnav.training.devices import everywhere, replicated, state_sharding
 from jaxnav.training.learner import Learner, LearnerState
+from jaxnav.training.shares import SEEDS
 
-#: The seeds of every arm.
-States = dict[str, list[LearnerState]]
+#: Of every arm its seeds, as a checkpoint holds them.
+Seeds = dict[str, list[LearnerState]]
+#: The same as a trainer holds them; see `Trainer.unpack`.
+States = dict[str, Any]
 Metrics = dict[str, list[dict[str, float]]]
 
 #: Purposes of the keys of the arms: policies without and with the layout estimator.
@@ -60,9 +64,17 @@ class Trainer:
         self._restarts = {name: jax.jit(learner.restart, donate_argnums=0) for name, learner in self.learners.items()}
         self._keeps = {name: jax.jit(learner.keep, donate_argnums=0) for name, learner in self.learners.items()}
 
-    def abstract(self, params: EnvParams) -> States:
+    def abstract(self, params: EnvParams) -> Seeds:
         """Return shapes and devices of every seed's state."""
         return jax.eval_shape(self.init, params)
+
+    def pack(self, seeds: Seeds) -> States:
+        """Return the states that a checkpoint held."""
+        return seeds
+
+    def unpack(self, states: States) -> Seeds:
+        """Return the states that a checkpoint is to hold."""
+        return states
 
     def init(self, params: EnvParams) -> States:
         """Start every seed."""
@@ -112,7 +124,7 @@ class Trainer:
             metrics[name].append({key: float(value) for key, value in values.items()})
         return after, metrics
 
-    def _compile(self, name: str, stage: int, states: list[LearnerState], params: EnvParams) -> Any:
+    def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
         """Compile the chunk of an arm, unless it is."""
         if (name, stage) not in self._compiled:
             learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
@@ -132,36 +144,54 @@ class Trainer:
 class ShardedTrainer(Trainer):
     """Train on a mesh of devices.
 
-    Arm by arm, all seeds in one call.
-
-    Between calls the states are those of `Trainer` with their episodes divided, so that a run may go on with other
-    devices.
+    Arm by arm, all seeds in one call; between calls the seeds of an arm stay stacked and divided among the devices.
     """
 
     def __init__(self, *arguments: Any, mesh: Mesh, **named: Any) -> None:
         """Prepare as `Trainer`, on a mesh."""
         super().__init__(*arguments, **named)
-        self._mesh, self._place = mesh, state_sharding(mesh)
+        self._mesh, self._place, self._stacked = mesh, state_sharding(mesh), state_sharding(mesh, stacked=True)
         self._key, self._scalars, self._knowledge = everywhere(mesh, (self._key, self._scalars, self._knowledge))
         self._given: EnvParams | None = None
+        self._stack = jax.jit(
+            lambda seeds: jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds), out_shardings=self._stacked
+        )
+        self._unstack = jax.jit(
+            lambda state: [jax.tree.map(lambda leaf, i=i: leaf[i], state) for i in range(self._seeds)],
+            out_shardings=[self._place] * self._seeds,
+        )
         for name, learner in self.learners.items():
+            restart = jax.vmap(learner.restart, in_axes=(0, None, None))
             self._starts[name] = jax.jit(learner.init, out_shardings=self._place)
-            self._restarts[name] = jax.jit(learner.restart, out_shardings=self._place, donate_argnums=0)
-            self._keeps[name] = jax.jit(learner.keep, out_shardings=self._place, donate_argnums=0)
+            self._restarts[name] = jax.jit(restart, out_shardings=self._stacked, donate_argnums=0)
+            self._keeps[name] = jax.jit(jax.vmap(learner.keep), out_shardings=self._stacked, donate_argnums=0)
 
-    def abstract(self, params: EnvParams) -> States:
+    def abstract(self, params: EnvParams) -> Seeds:
         """Return shapes and devices of every seed's state."""
         states = jax.eval_shape(super().init, params)
         places = jax.tree.map(lambda _: self._place, states, is_leaf=lambda node: isinstance(node, LearnerState))
         return jax.tree.map(lambda leaf, place: leaf.update(sharding=place), states, jax.tree.broadcast(places, states))
 
+    def pack(self, seeds: Seeds) -> States:
+        """Stack the seeds of every arm."""
+        return {name: self._stack(states) for name, states in seeds.items()}
+
+    def unpack(self, states: States) -> Seeds:
+        """Copy every seed's state to all groups of devices."""
+        return {name: self._unstack(state) for name, state in states.items()}
+
     def init(self, params: EnvParams) -> States:
         """Start every seed."""
-        return super().init(self._everywhere(params))
+        return self.pack(super().init(self._everywhere(params)))
 
     def restart(self, states: States, params: EnvParams) -> States:
         """Give every seed new episodes; donates the states."""
-        return super().restart(states, self._everywhere(params))
+        params = self._everywhere(params)
+        return {name: self._restarts[name](state, params, self._knowledge) for name, state in states.items()}
+
+    def keep(self, states: States, scores: Mapping[str, Sequence[float]]) -> States:
+        """Keep policies; see `Trainer.keep`."""
+        return {name: self._keeps[name](state, np.array(scores[name], np.float32)) for name, state in states.items()}
 
     def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
         """Do a chunk of updates of every seed; see `Trainer.train`."""
@@ -180,22 +210,22 @@ class ShardedTrainer(Trainer):
             self._given, self._placed = params, everywhere(self._mesh, params)
         return self._placed
 
-    def _compile(self, name: str, stage: int, states: list[LearnerState], params: EnvParams) -> Any:
+    def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
         """Compile the chunk of an arm, unless it is."""
         if (name, stage) in self._compiled:
             return self._compiled[name, stage]
         learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
 
-        def train(states: list[LearnerState], scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
-            stacked = jax.tree.map(lambda *seeds: jnp.stack(seeds), *states)
-            stacked = jax.lax.with_sharding_constraint(stacked, state_sharding(self._mesh, stacked=True))
-            stacked, metrics = jax.vmap(lambda state: learner.train(state, scalars, params, knowledge, num_updates))(
-                stacked
-            )
-            return [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(len(states))], metrics
+        def train(states: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
+            def one(state: LearnerState) -> Any:
+                return learner.train(state, scalars, params, knowledge, num_updates)
 
-        places = [self._place] * len(states), replicated(self._mesh)
-        call = jax.jit(train, out_shardings=places, donate_argnums=0)
+            after, metrics = jax.vmap(one, spmd_axis_name=SEEDS)(states)
+            table = jnp.stack(list(metrics.values()), axis=-1)  # exchanged as one array
+            table = jax.lax.with_sharding_constraint(table, replicated(self._mesh))
+            return after, dict(zip(metrics, jnp.unstack(table, axis=-1), strict=True))
+
+        call = jax.jit(train, out_shardings=(self._stacked, replicated(self._mesh)), donate_argnums=0)
         with jax.set_mesh(self._mesh):
             self._compiled[name, stage] = call.lower(states, self._scalars, params, self._knowledge).compile()
         return self._compiled[name, stage]

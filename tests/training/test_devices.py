@@ -1,37 +1,28 @@
-"""One run on several devices and in several processes is the run of one device, but for the order of sums."""
+"""One run on several devices is the run of one device, but for the order of sums."""
 
 import functools
 import json
 import os
-import shutil
-import socket
-import subprocess
-import sys
-from pathlib import Path
 
-import chex
 import numpy as np
 import pytest
-from support.commands import evaluate, refusal, train, write_config
+from support.commands import refusal, train, write_config
+from support.processes import REPOSITORY, run
 
-from jaxnav.store.export import load_params
-from jaxnav.store.runlog import read_rows
 from jaxnav.training.devices import Devices
 
-REPOSITORY = Path(__file__).parents[2]
 #: Parameters are of the order of 0.1 to 1, and four updates move them by up to 0.04 with this learning rate.
 TOLERANCE = 1e-5
 
 # Two seeds on one device, on two (a seed each) and on four (a pair for each seed, which shares its episodes).
 AGREEMENT = """
-import contextlib, dataclasses, json, sys
+import collections, dataclasses, json, re, sys
 import jax, numpy as np
 from support import tiny_world as tiny
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.prepare import make_trainer
 from jaxnav.errors import InputError
 from jaxnav.layout import SETTINGS
-from jaxnav.numerics.product import product
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.devices import Devices
 
@@ -41,53 +32,41 @@ config = dataclasses.replace(
 )
 env, params = tiny.world()
 
+exchanged = {}
+
 def policies(count):
     parts = config, env, SETTINGS["calibrated"], tiny.knowledge()
     mesh = Devices(count=count).mesh(seeds=2, num_envs=16, minibatches=2)
     trainer = make_trainer(*parts, mesh if count > 1 else None)
     states = trainer.init(params)
-    shards = states["layout"][0].agent.state.pose.addressable_shards
+    shards = trainer.unpack(states)["layout"][0].agent.state.pose.addressable_shards
     assert [shard.data.shape[0] for shard in shards] == {1: [16], 2: [16, 16], 4: [8, 8, 8, 8]}[count]
     for _ in range(2):
         states, metrics = trainer.train(states, params)
+    exchanged[count] = exchanges(trainer._compiled["layout", 0].as_text())
     return [
         {
             "params": np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(state.params)]).tolist(),
             "poses": np.asarray(state.agent.state.pose).tolist(),
             "metrics": values,
         }
-        for state, values in zip(states["layout"], metrics["layout"])
+        for state, values in zip(trainer.unpack(states)["layout"], metrics["layout"])
     ]
 
-def collectives(within):
-    # What a kernel's gradient exchanges whose rows' episodes are shared by two devices.
-    mesh = Devices(count=2).mesh(seeds=1, num_envs=16, minibatches=2)
-    place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "episodes"))
-    rows, kernel = jax.device_put(np.ones((6, 16, 3), np.float32), place), np.ones((3, 5), np.float32)
-    with jax.set_mesh(mesh) if within else contextlib.nullcontext():
-        text = jax.jit(jax.grad(lambda k, r: product(r, k).sum())).lower(kernel, rows).compile().as_text()
-    return {name: name + "(" in text for name in ("all-gather", "all-reduce")}
+def exchanges(text):
+    # How often each stands in a compiled program.
+    found = re.findall(r"= (\\(?).*? (all-reduce|all-gather|all-to-all|collective-permute)\\(", text)
+    assert not any(several for several, _ in found)  # gloo would walk the arrays one by one
+    return collections.Counter(kind for _, kind in found)
 
 found = {count: policies(count) for count in map(int, sys.argv[1:])}
-found |= {"within": collectives(True), "without": collectives(False)}
+found["exchanged"] = exchanged
 try:
     Devices(count=4).mesh(seeds=2, num_envs=18, minibatches=2)
 except InputError as error:
     found["refused"] = str(error)
 print(json.dumps(found))
 """
-
-
-def run(command, **environment):
-    environment = os.environ | {name: str(value) for name, value in environment.items()}
-    return subprocess.Popen(
-        [sys.executable, *map(str, command)],
-        cwd=REPOSITORY,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 @functools.cache
@@ -121,11 +100,10 @@ def test_another_seed_is_another_policy():
 
 
 @pytest.mark.slow
-def test_devices_share_episodes_without_gathering_them():
-    """Only sums are exchanged; without the mesh made known, the rows are made one axis and gathered."""
-    found = trained(1, 4)
-    assert found["within"] == {"all-gather": False, "all-reduce": True}
-    assert found["without"]["all-gather"]
+def test_devices_exchange_a_few_single_arrays():
+    """By seeds the metrics of a call; by episodes also, of a minibatch, moments and gradient, and sums of episodes."""
+    assert trained(2)["exchanged"] == {"2": {"all-gather": 1}}
+    assert trained(1, 4)["exchanged"] == {"1": {}, "4": {"all-gather": 1, "all-reduce": 3}}
 
 
 @pytest.mark.slow
@@ -159,62 +137,3 @@ def test_more_devices_than_there_are_are_refused(tmp_path, capsys):
     assert train(write_config(tmp_path), tmp_path / "run", "--devices", 99) == 2
     assert "devices is 99; there are 1 (on a CPU as many as XLA_FLAGS=" in refusal(capsys)
     assert not (tmp_path / "run").exists()
-
-
-def two_processes(config_file, run_dir, *options):
-    """Exit codes and messages of two processes on this machine that train one run, each given its own options."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{probe.getsockname()[1]}"
-    command = ["train.py", "--config", config_file, "--run-dir", run_dir, "--seeds", 1]
-    processes = [
-        run(
-            [*command, f"--devices={address},{index},2", *(options[index] if options else ())],
-            JAX_COORDINATOR_BIND_ADDRESS=address,
-            XLA_FLAGS="",
-        )
-        for index in range(2)
-    ]
-    try:
-        messages = [process.communicate(timeout=200)[1] for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    return [process.returncode for process in processes], messages
-
-
-@pytest.mark.slow
-def test_two_processes_train_the_run_of_one(tmp_path, capsys):
-    config_file, one, two = write_config(tmp_path), tmp_path / "one", tmp_path / "two"
-    assert train(config_file, one, "--seeds", 1) == 0
-    codes, messages = two_processes(config_file, two)
-    assert codes == [0, 0], messages
-    assert "done in" in messages[0]
-    assert "done in" not in messages[1]
-    assert_same_run(one, two)
-
-    # One process goes on where two stopped, and the run can be evaluated.
-    shutil.rmtree(two / "checkpoints" / "4")
-    shutil.rmtree(two / "policies")
-    assert train(config_file, two, "--seeds", 1) == 0
-    assert "resumed after update 2 of 4" in capsys.readouterr().err
-    assert_same_run(one, two)
-    assert evaluate(two, "--episodes", 10) == 0
-
-
-@pytest.mark.slow
-def test_processes_that_disagree_are_refused(tmp_path):
-    codes, messages = two_processes(write_config(tmp_path), tmp_path / "run", (), ("--seed", 1))
-    assert codes == [2, 2], messages
-    assert "processes [1] have other settings, scenes or versions than process 0" in messages[0]
-    assert not (tmp_path / "run").exists()
-
-
-def assert_same_run(one, two):
-    for name in ("baseline-0", "layout-0"):
-        ours, theirs = (load_params(folder / "policies" / name)[0] for folder in (one, two))
-        chex.assert_trees_all_close(ours, theirs, rtol=0, atol=TOLERANCE)
-    ours, theirs = (read_rows(folder / "metrics.jsonl") for folder in (one, two))
-    for row, other in zip(ours, theirs, strict=True):
-        assert row.pop("arm") == other.pop("arm")
-        assert row == pytest.approx(other, rel=1e-3, abs=TOLERANCE)

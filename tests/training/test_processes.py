@@ -1,0 +1,114 @@
+"""One run in several processes is the run of one, and ends when one of them is lost."""
+
+import re
+import shutil
+import socket
+import time
+
+import chex
+import pytest
+from support.commands import evaluate, train, write_config
+from support.processes import run
+
+from jaxnav.store.export import load_params
+from jaxnav.store.runlog import read_rows
+
+TOLERANCE = 1e-5
+
+
+def free_address():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+def start(address, index, config_file, run_dir, *options):
+    """One of two processes on this machine that train one run."""
+    command = ["train.py", "--config", config_file, "--run-dir", run_dir, "--seeds", 1]
+    devices = f"--devices={address},{index},2"
+    return run([*command, devices, *options], JAX_COORDINATOR_BIND_ADDRESS=address, XLA_FLAGS="")
+
+
+def ends(*processes, timeout=200):
+    """Exit codes and messages of processes."""
+    try:
+        messages = [process.communicate(timeout=timeout)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [process.returncode for process in processes], messages
+
+
+def two_processes(config_file, run_dir, *options):
+    """Exit codes and messages of two processes that train one run, each given its own options."""
+    address = free_address()
+    own = options or ((), ())
+    return ends(*(start(address, index, config_file, run_dir, *own[index]) for index in range(2)))
+
+
+def assert_told(code, message):
+    assert code == 2, message
+    assert message.count("\n") < 10
+    assert message.splitlines()[-1].startswith("error: config: devices: another process of this run ended, cannot be")
+
+
+@pytest.mark.slow
+def test_two_processes_train_the_run_of_one(tmp_path, capsys):
+    config_file, one, two = write_config(tmp_path), tmp_path / "one", tmp_path / "two"
+    assert train(config_file, one, "--seeds", 1) == 0
+    codes, messages = two_processes(config_file, two)
+    assert codes == [0, 0], messages
+    assert "done in" in messages[0]
+    assert "done in" not in messages[1]
+    assert_same_run(one, two)
+
+    # One process goes on where two stopped, and the run can be evaluated.
+    shutil.rmtree(two / "checkpoints" / "4")
+    shutil.rmtree(two / "policies")
+    assert train(config_file, two, "--seeds", 1) == 0
+    assert "resumed after update 2 of 4" in capsys.readouterr().err
+    assert_same_run(one, two)
+    assert evaluate(two, "--episodes", 10) == 0
+
+
+@pytest.mark.slow
+def test_processes_that_disagree_are_refused(tmp_path):
+    codes, messages = two_processes(write_config(tmp_path), tmp_path / "run", (), ("--seed", 1))
+    assert codes == [2, 2], messages
+    assert "processes [1] have other settings, scenes or versions than process 0" in messages[0]
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_other_one(victim, tmp_path, capsys):
+    config_file, run_dir, address = write_config(tmp_path), tmp_path / "run", free_address()
+    sixty = "--total-steps", 60 * 16 * 8  # updates
+    both = [start(address, index, config_file, run_dir, *sixty) for index in range(2)]
+    while not (run_dir / "checkpoints" / "4").exists() and both[0].poll() is None:
+        time.sleep(0.1)
+    both[victim].kill()
+    both[victim].communicate()
+    (code,), (message,) = ends(both[1 - victim], timeout=60)
+    assert_told(code, message)
+    assert train(config_file, run_dir, "--seeds", 1, *sixty) == 0
+    assert re.search(r"resumed after update \d+ of 60", capsys.readouterr().err)
+
+
+@pytest.mark.slow
+def test_a_process_that_stays_alone_ends(tmp_path):
+    config_file = write_config(tmp_path)
+    alone = [start(free_address(), index, config_file, tmp_path / "run") for index in range(2)]  # each waits elsewhere
+    for code, message in zip(*ends(*alone, timeout=60), strict=True):
+        assert_told(code, message)
+    assert not (tmp_path / "run").exists()
+
+
+def assert_same_run(one, two):
+    for name in ("baseline-0", "layout-0"):
+        ours, theirs = (load_params(folder / "policies" / name)[0] for folder in (one, two))
+        chex.assert_trees_all_close(ours, theirs, rtol=0, atol=TOLERANCE)
+    ours, theirs = (read_rows(folder / "metrics.jsonl") for folder in (one, two))
+    for row, other in zip(ours, theirs, strict=True):
+        assert row.pop("arm") == other.pop("arm")
+        assert row == pytest.approx(other, rel=1e-3, abs=TOLERANCE)
