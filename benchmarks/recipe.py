@@ -2,9 +2,9 @@
 
 `python benchmarks/recipe.py SEARCH.yaml [FOLDER]` trains every candidate of the file for the steps of the first rung,
 keeps those with the highest val success (best actions, mean over seeds, of the policies that would be exported), and
-goes on with these in the next rung. The last ones are trained with seeds that no rung has used: their figures are the
-ones to quote, since the others were looked at to choose. Runs are kept in FOLDER, by default a temporary one, where an
-interrupted search goes on. The result goes to stdout as JSON, the tables to stderr.
+goes on with these in the next rung. What is left, and what `also` names, is trained with seeds that no rung has used:
+these figures are the ones to quote, since the others were looked at to choose. Runs are kept in FOLDER, by default a
+temporary one; an interrupted search goes on there. The result goes to stdout as JSON, the tables to stderr.
 """
 
 import dataclasses
@@ -33,10 +33,12 @@ MEASURES = {
 def main(search: Path, folder: Path) -> None:
     given = yaml.safe_load(search.read_text())
     base = apply_values(jaxnav.RunConfig(), given["base"], search)
-    left: dict[str, Any] = {name: apply_values(base, changes, search) for name, changes in given["candidates"].items()}
-    tables = {}
+    candidates = {name: apply_values(base, changes, search) for name, changes in given["candidates"].items()}
+    left, tables = candidates, {}
     for number, rung in enumerate([*given["rungs"], given["confirm"]]):
-        keep, settings = rung.get("keep"), {name: value for name, value in rung.items() if name != "keep"}
+        keep, also = rung.get("keep"), rung.get("also", [])
+        settings = {name: value for name, value in rung.items() if name not in ("keep", "also")}
+        left = left | {name: candidates[name] for name in also}
         stage = "confirm" if keep is None else f"rung {number + 1}"
         rows = {
             name: measured(dataclasses.replace(config, **settings, run_dir=folder / f"{stage}-{name}"))

@@ -1,6 +1,7 @@
 """What a reader of an evaluation must be told beside its table."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,23 @@ def notes(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, ro
     if room_prior and any(row.arm == "layout" for row in rows):
         found.append("Rows with w are told the type of the room by their prior, others are not.")
     return found + _no_better(rows, success, episodes)
+
+
+def trained_out(log: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say how far val success still rose at the end of training.
+
+    Args:
+      log: the rows of a run; those with a measurement on val count.
+    """
+    course: dict[int, list[float]] = {}
+    for row in log:
+        if "val_success" in row:
+            course.setdefault(row["env_steps"], []).append(100.0 * row["val_success"])
+    before = [steps for steps in course if steps <= 0.75 * max(course)]
+    if not before:
+        return []
+    then, now = (float(np.mean(course[max(steps)])) for steps in (before, course))
+    return [f"In the last quarter of training val success (best actions) went from {then:.1f} to {now:.1f} %."]
 
 
 def _missing_intervals(seeds: int, episodes: EpisodeList) -> list[str]:

@@ -15,7 +15,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Evaluator, Outcome
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.notes import notes
+from jaxnav.evaluation.notes import notes, trained_out
 from jaxnav.evaluation.report import Form, build_difference, build_report, build_row, write_report
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.runs.directory import Run, settings
@@ -111,6 +111,7 @@ def evaluate(
     names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
     table, differences = _table(results, names), _differences(results)
     told = notes(rows, results.metrics()["sr"], results.episodes, room_prior=config.layout.prior == "room")
+    told += trained_out(run.log())
     return results._replace(report=build_report(table, differences, told, compilations, about))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.study_results import episodes_in
 
-from jaxnav.evaluation.notes import notes
+from jaxnav.evaluation.notes import notes, trained_out
 from jaxnav.evaluation.variants import Row
 
 BASELINE, LAYOUT = (Row(variant, None, None, "argmax") for variant in ("baseline", "layout"))
@@ -86,3 +86,11 @@ def test_a_gain_in_other_scenes_counts_even_if_training_runs_differ():
     # The interval is of these policies: runs at 40 and 100 % against 0 are both better in every scene.
     success = [[[0.4] * 4, [1.0] * 4], [[0.0] * 4] * 2]
     assert told((BASELINE, RANDOM), success) == []
+
+
+def test_the_last_quarter_of_training_is_told():
+    rows = [{"env_steps": steps, "val_success": success} for steps, success in ((4, 0.2), (6, 0.5), (7, 0.6), (8, 0.7))]
+    rows += [{"env_steps": 6, "val_success": 0.6}, {"env_steps": 8, "val_success": 0.8}, {"env_steps": 8}]
+    told = ["In the last quarter of training val success (best actions) went from 55.0 to 75.0 %."]
+    assert trained_out(rows) == told  # 0.5 and 0.6 at three quarters, 0.7 and 0.8 at the end
+    assert trained_out(rows[:1]) == trained_out([]) == []
