@@ -41,7 +41,7 @@ class StudyConfig:
     episodes: int = 1000
     steps: int = 40
     seed: int = 0
-    base: RunConfig = RunConfig(seeds=5, worlds=WorldConfig(num_val=80, num_test=80))
+    base: RunConfig = RunConfig(seeds=5, total_steps=2_000_000, worlds=WorldConfig(num_val=80, num_test=80))
 
 
 #: Settings that each run changes. Runs of the layout arm alone are compared with their plain layout weights.

@@ -36,7 +36,7 @@ def finish(process):
 @pytest.mark.timeout(900)
 def test_a_killed_and_resumed_run_is_an_uninterrupted_one_bit_for_bit(tmp_path):
     config_file = write_config(tmp_path)
-    cache, long = tmp_path / "cache", ("--total-steps", "7680")  # 60 updates, 30 chunks
+    cache, long = tmp_path / "cache", ("--total-steps", "7680", "--validations", "6")  # 60 updates, 30 chunks
     whole, killed, other = tmp_path / "whole", tmp_path / "killed", tmp_path / "other"
     finish(start(config_file, whole, cache, *long))
     generator = random.Random(0)
@@ -53,7 +53,7 @@ def test_a_killed_and_resumed_run_is_an_uninterrupted_one_bit_for_bit(tmp_path):
         process.communicate()
         assert process.returncode == -signal.SIGKILL
     assert "resumed after update" in finish(start(config_file, killed, cache, *long))
-    names = ["metrics.jsonl", *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES))]
+    names = ["metrics.jsonl", "reach.json", *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES))]
     for name in names:
         assert (killed / name).read_bytes() == (whole / name).read_bytes(), name
     assert len(read_rows(killed / "metrics.jsonl")) == 30 * 2 * SEEDS

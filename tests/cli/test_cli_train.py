@@ -109,8 +109,11 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("seeds: 0", "seeds is 0; give at least 1"),
         ("sizes: {hidden: -8}", "sizes.hidden is -8; give at least 1"),
         ("worlds: {num_train: 0}", "worlds.num_train is 0; give at least 1"),
-        ("ppo: {num_envs: 10, minibatches: 4}", "ppo.num_envs is 10; give a multiple of ppo.minibatches (4)"),
-        ("ppo: {rollout: 31}", "ppo.rollout is 31; give at most worlds.train_step_limit (30)"),
+        (
+            "ppo: {num_envs: 10, minibatches: 4}",
+            "ppo.num_envs is 10; give a multiple of ppo.minibatches (4), such as 8 or 12",
+        ),
+        ("ppo: {rollout: 101}", "ppo.rollout is 101; give at most worlds.train_step_limit (100)"),
         ("ppo: {learning_rate: .inf}", "ppo.learning_rate is inf; give a positive number"),
         ("detector: {miss_far: 1.5}", "detector.miss_far is 1.5; give a probability"),
         ("seed: -1", "seed is -1; give a whole number from 0 to 2**32 - 1"),

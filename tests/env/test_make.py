@@ -21,7 +21,7 @@ from jaxnav.scenes.worlds import WORLDS, generated
 @pytest.mark.parametrize(
     ("world", "categories", "goals", "rules", "limits"),
     [
-        ("rooms", 22, 22, ROOMS, (30, [100, 200, 100, 100])),
+        ("rooms", 22, 22, ROOMS, (100, [100, 200, 100, 100])),
         ("apartments", 22, 12, APARTMENTS, (100, [500])),
         ("houses", 15, 6, HOUSES, (100, [500])),
     ],

@@ -20,7 +20,7 @@ from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exploration import Exploration
 
-EPSILON, EPISODES = np.linspace(0, 1, 11), 12
+EPSILON, EPISODES = np.linspace(0, 1, 11), 24
 #: With weak prior rows a view changes the belief much: large gaps, which sTDE acts on.
 SETTING = dataclasses.replace(SETTINGS["calibrated"], strength=1.0)
 

@@ -10,6 +10,7 @@ total_steps: 512  # 4 updates, 2 chunks
 counterfactual: distil
 chunk: 2
 save_every: 1
+validations: 0
 worlds: {num_train: 4, num_val: 4, num_test: 4, train_step_limit: 10, step_limit: 12, large_step_limit: 14}
 layout: {setting: calibrated, walks: 64, steps: 20}
 sizes: {hidden: 16, view_outputs: 8, appearance: 4, row_hidden: 8, row_outputs: 2}
