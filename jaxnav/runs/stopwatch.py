@@ -19,20 +19,16 @@ class Stopwatch:
     cpu: float
 
     @classmethod
-    def resume(cls, path: Path, started: float) -> "Stopwatch":
-        """Go on from the last row of a file of times.
+    def start(cls) -> "Stopwatch":
+        """Start counting."""
+        return cls(time.monotonic(), time.process_time())
 
-        Args:
-          path: of the file; it may be missing.
-          started: when this process began with the run, by `time.monotonic`.
-        """
+    def resume(self, path: Path) -> "Stopwatch":
+        """Go on from the last row of a file of times; it may be missing."""
         rows = read_rows(path)
-        last = rows[-1] if rows else {"wall_s": 0.0, "cpu_s": 0.0}
-        return cls(started - last["wall_s"], -last["cpu_s"])
+        return Stopwatch(self.wall - rows[-1]["wall_s"], self.cpu - rows[-1]["cpu_s"]) if rows else self
 
     def read(self) -> dict[str, float]:
         """Return `wall_s` and `cpu_s`."""
-        return {
-            "wall_s": round(time.monotonic() - self.wall, 2),
-            "cpu_s": round(time.process_time() - self.cpu, 2),
-        }
+        wall, cpu = time.monotonic() - self.wall, time.process_time() - self.cpu
+        return {"wall_s": round(wall, 2), "cpu_s": round(cpu, 2)}

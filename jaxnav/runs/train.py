@@ -51,7 +51,7 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     Raises:
       InputError: an impossible setting, or a run directory that holds something else.
     """
-    started = time.monotonic()
+    clock = Stopwatch.start()
     config = _checked(config)
     mesh = connected(config)
     if console is None or not first_process():
@@ -80,14 +80,14 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     by_first_process(lambda: [truncate_after(config.run_dir / name, done) for name in (LOG_FILE, TIMES_FILE)])
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
-    clock = Stopwatch.resume(config.run_dir / TIMES_FILE, started)
+    clock = clock.resume(config.run_dir / TIMES_FILE)
     states = _do_updates(config, trainer, validator, world, order, states, done, manifest, clock, console)
     kept = {name: [_exported(state) for state in seeds] for name, seeds in trainer.unpack(states).items()}
     by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
     if validator is not None and not (done == config.total_updates and (config.run_dir / REACH_FILE).exists()):
         reach = validator.reach(kept)
         by_first_process(lambda: write_atomic(config.run_dir / REACH_FILE, (json.dumps(reach) + "\n").encode()))
-    console.print(f"{config.run_dir}: done in {time.monotonic() - started:.0f} s")
+    console.print(f"{config.run_dir}: done in {clock.read()['wall_s']:.0f} s")
     return Run(config)
 
 

@@ -1,0 +1,23 @@
+"""The seconds of a run."""
+
+import json
+import time
+
+import pytest
+
+from jaxnav.runs.stopwatch import Stopwatch
+
+
+def test_it_counts_from_its_start_and_goes_on_after_an_interruption(tmp_path):
+    began = time.monotonic()
+    clock = Stopwatch.start()
+    assert clock.resume(tmp_path / "missing.jsonl") == clock
+    path = tmp_path / "times.jsonl"
+    path.write_text(
+        "".join(json.dumps({"step": step, "wall_s": 10.0 * step, "cpu_s": 4.0 * step}) + "\n" for step in (1, 2))
+    )
+    read, resumed = clock.read(), clock.resume(path).read()
+    assert 0 <= read["wall_s"] <= time.monotonic() - began + 0.01
+    # Twenty and eight seconds were over when it was interrupted.
+    assert resumed["wall_s"] == pytest.approx(read["wall_s"] + 20, abs=1)
+    assert resumed["cpu_s"] == pytest.approx(read["cpu_s"] + 8, abs=1)
