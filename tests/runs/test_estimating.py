@@ -13,7 +13,7 @@ from jaxnav.runs.prepare import explore_world
 from jaxnav.runs.worlds import training_world
 from jaxnav.training.calibration import layout_priors
 
-EPSILON, EPISODES = np.linspace(0, 1, 11), 12  # those of `evaluated`
+EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 
 
 @pytest.mark.slow

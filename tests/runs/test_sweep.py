@@ -13,7 +13,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
 from jaxnav.runs.directory import Run
 
-EPSILON, EPISODES = np.linspace(0, 1, 11), 12  # those of `evaluated`
+EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 DECODINGS = ("argmax", "sample")
 
 
