@@ -1,5 +1,7 @@
 """The training command."""
 
+from pathlib import Path
+
 from rich.console import Console
 
 from jaxnav.cli.console import exit_code
@@ -38,6 +40,6 @@ def _draw(run: Run, console: Console) -> None:
     from jaxnav.viz.learning import learning_figure
 
     config, path = run.config, run.config.run_dir / LEARNING
-    title = f"{config.method.upper()} in {config.source}, {config.seeds} seed{'s' * (config.seeds > 1)}"
+    title = f"{config.method.upper()} in {Path(config.source).name}, {config.seeds} seed{'s' * (config.seeds > 1)}"
     save_figure(learning_figure(run.log(), run.reach(), title), path)
     console.print(f"learning curves: {path}", soft_wrap=True)
