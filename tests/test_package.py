@@ -112,7 +112,7 @@ import jax, jaxnav
 policy = jaxnav.load_policy("runs/mine/policies/layout-0")
 env, params = jaxnav.make("rooms", "val")
 observation, state = env.reset(jax.random.key(0), params)
-print(policy.act(observation, policy.init())[0])
+print(policy.act(observation, policy.init(), heading=0, moved=False)[0])
 """
 
 
