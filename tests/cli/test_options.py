@@ -97,7 +97,7 @@ def test_the_help_lists_the_option_of_the_configuration(capsys, command):
         main([command, "--help"])
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
     assert text.startswith(f"usage: jaxnav {command} ")
-    assert "--config NAME|FILE.yaml settings to lay over the defaults: a packaged configuration (smoke, " in text
+    assert "--config NAME|FILE.yaml settings to lay over the defaults: a packaged configuration (long, " in text
 
 
 @pytest.mark.parametrize(
