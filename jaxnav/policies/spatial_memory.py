@@ -94,10 +94,8 @@ class SpatialMemory:
         Ego-centric: from the farthest cells behind to those ahead, each line from left to right.
         """
         along = self.stride * np.arange(-self.reach, self.reach + 1)
-        forward = self._rules.directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
-        rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
-        offsets = np.rint(forward * along[:, None, None] + rightward * along[:, None]).astype(np.int32)
-        rows, columns = self._at(offsets.reshape(self.headings, -1, 2), explored.place, explored.heading)
+        offsets = self._rules.turned_offsets(along, along).reshape(self.headings, -1, 2)
+        rows, columns = self._at(offsets, explored.place, explored.heading)
         return explored.cells[rows, columns]
 
     @property

@@ -76,10 +76,21 @@ class Rules:
         Returns:
           int [H, V, V, 2], (dz, dx) from the agent's cell, by heading; row 0 nearest to the agent, column 0 leftmost.
         """
-        ahead, side = np.arange(view), np.arange(view) - view // 2
+        return self.turned_offsets(np.arange(view), np.arange(view) - view // 2)
+
+    def turned_offsets(self, ahead: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return cells ahead and to the right of the agent.
+
+        Args:
+          ahead: int [A], cells.
+          right: int [B], cells.
+
+        Returns:
+          int [H, A, B, 2], (dz, dx) from the agent's cell, by heading.
+        """
         forward = self.directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
         rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
-        return np.rint(forward * ahead[:, None, None] + rightward * side[:, None]).astype(int)
+        return np.rint(forward * ahead[:, None, None] + rightward * right[:, None]).astype(int)
 
     def steps(self) -> np.ndarray:
         """Return the displacement of MoveAhead for each heading.

@@ -22,8 +22,7 @@ class PPOConfig:
       gae_lambda: of generalised advantage estimation.
       clip: of the probability ratio.
       entropy: weight of the entropy bonus at the start,
-      final_entropy: at the end; linear in between. A policy that is trained as random as at the start acts worse by
-        its best actions than by sampled ones.
+      final_entropy: at the end; linear in between.
       value: weight of the value loss.
       max_grad_norm: global norm to which gradients are clipped.
       distil: weight of the counterfactual branch's loss where it is distilled.
