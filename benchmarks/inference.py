@@ -73,7 +73,7 @@ def decide(acting: Acting, world: World, agent: Agent, state: State) -> tuple[Ag
     pathways = policy.pathways(*acting.view(agent, world.knowledge, world.params), memory)
     factual = policy.decide(pathways, memory)
     logits = factual.logits
-    if agent.layout is not None:
+    if agent.perceived.layout is not None:
         counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory)
         logits = stde(logits, counterfactual.logits, acting.gap(agent), EPSILON)
     action = jnp.argmax(logits, axis=-1).astype(jnp.int32)

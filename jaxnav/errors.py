@@ -1,4 +1,4 @@
-"""The one exception for input that a user can mend."""
+"""Exceptions for input that a user can mend."""
 
 
 class InputError(ValueError):
@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     A config, a scene file, a checkpoint or an argument; the message names the place and the mend.
     """
+
+
+class MissingSplitError(InputError):
+    """Refuse a scene file that holds no scene of a split."""

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, Observation, State
-from jaxnav.layout import LayoutEstimator, LayoutState, Setting
+from jaxnav.env.types import EnvParams, State
+from jaxnav.layout import Setting
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
+from jaxnav.policies.perception import Perceived, Perception, View
 from jaxnav.policies.policy import Params, Policy, bind
-from jaxnav.policies.spatial_memory import Explored, SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 
 Tree = TypeVar("Tree")
@@ -23,33 +23,13 @@ class Agent(NamedTuple):
 
     Attributes:
       state: the episodes, leaves [B].
-      layout: the beliefs about their layouts, leaves [B, ...]; None where the policy does not use them.
-      explored: the maps of their spatial memories, leaves [B, ...]; None without one.
-      note: the notes of the method's tracker, leaves [B, ...]; None without one.
+      perceived: beliefs, maps and notes, leaves [B, ...].
       memory: the policy's memories, leaves [B, ...]; None where no policy acts.
     """
 
     state: State
-    layout: LayoutState | None
-    explored: Explored | None
-    note: Any
+    perceived: Perceived
     memory: Memory | None
-
-
-class View(NamedTuple):
-    """Hold what a policy gets at one step.
-
-    Attributes:
-      observation: leaves [B, ...].
-      weights: float32 [B, K], the layout's weights for the goals (eq. 7); ones without the layout.
-      reading: what the tracker read of the notes, leaves [B, ...]; None without one.
-      surroundings: uint8 [B, M], what is known of the cells around the agent; None without a spatial memory.
-    """
-
-    observation: Observation
-    weights: jax.Array
-    reading: Any
-    surroundings: jax.Array | None
 
 
 class Taken(NamedTuple):
@@ -105,24 +85,15 @@ class Acting:
     def view(self, agent: Agent, knowledge: Knowledge | None, params: EnvParams) -> View:
         """Return what the policy gets in the present states."""
         observation = jax.vmap(self.env.observe, (0, None))(agent.state, params)
-        if agent.layout is None:
-            weights = jnp.ones((*agent.state.goal.shape, len(self.env.categories)))
-        else:
-            weights = jax.vmap(LayoutEstimator.goal_weights)(agent.layout, agent.state.goal)
-        reading = None
-        if self._tracker is not None:
-            reading = jax.vmap(self._tracker.read, (0, None, 0))(agent.note, knowledge, agent.state.goal)
-        surroundings, spatial = None, self._spatial_memory
-        if spatial is not None and agent.explored is not None:
-            surroundings = jax.vmap(spatial.read)(agent.explored)
-        return View(observation, weights, reading, surroundings)
+        return jax.vmap(self._perception.view, (0, 0, None))(agent.perceived, observation, knowledge)
 
     def gap(self, agent: Agent) -> jax.Array:
         """Return the layout gaps D, float32 [B].
 
         They are 0 without the layout.
         """
-        return jnp.zeros(agent.state.goal.shape) if agent.layout is None else agent.layout.gap
+        layout = agent.perceived.layout
+        return jnp.zeros(agent.state.goal.shape) if layout is None else layout.gap
 
     def start(self, key: jax.Array, count: int, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
         """Start episodes at random; the key is consumed.
@@ -169,7 +140,7 @@ class Acting:
         Returns:
           The agent after the step, in a new episode where one ended and keys are given, and what came of it.
         """
-        action = choice if self.method is None else jax.vmap(self.method.control.act)(choice, agent.note)
+        action = choice if self.method is None else jax.vmap(self.method.control.act)(choice, agent.perceived.note)
         last, reward, terminated, truncated, success, state = self._act(agent.state, action, keys, params)
         moved = self.env.cell(last.pose) != self.env.cell(agent.state.pose)
         memory = None if decision is None else decision.memory(action)
@@ -193,32 +164,15 @@ class Acting:
           moved: bool [B], whether it changed the cell.
           knowledge, params: as in `step`.
         """
-        layout, note = agent.layout, agent.note
-        if layout is not None and self.setting is not None:
-            setting, row_format = self.setting, self.env.row_format
-
-            def believe(layout: LayoutState, state: State) -> LayoutState:
-                presence = row_format.presence(params.tables.rows[state.pose])
-                return LayoutEstimator(knowledge.layout[params.room[state.scene]], setting).update(layout, presence)
-
-            layout = jax.vmap(believe)(layout, agent.state)
         headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
-        percept = Percept(params.tables.rows[agent.state.pose], agent.state.pose // horizons % headings, action, moved)
-        if self._tracker is not None:
-            note = jax.vmap(self._tracker.update, (0, None, 0))(note, knowledge, percept)
-        explored, spatial = agent.explored, self._spatial_memory
-        if spatial is not None and explored is not None:
-            update = jax.vmap(spatial.update, (0, 0, 0, 0, None))
-            explored = update(explored, percept.row, percept.heading, moved, self.env.row_format)
-        return agent._replace(layout=layout, note=note, explored=explored)
+        pose, room = agent.state.pose, params.room[agent.state.scene]
+        percept = Percept(params.tables.rows[pose], pose // horizons % headings, action, moved)
+        update = jax.vmap(self._perception.update, (0, 0, None, 0))
+        return agent._replace(perceived=update(agent.perceived, percept, knowledge, room))
 
     @property
-    def _tracker(self) -> Any:
-        return None if self.method is None else self.method.tracker
-
-    @property
-    def _spatial_memory(self) -> SpatialMemory | None:
-        return None if self.spec is None else self.spec.spatial_memory
+    def _perception(self) -> Perception:
+        return Perception(self.env.row_format, self.spec, self.setting)
 
     def _act(self, state: State, action: jax.Array, keys: jax.Array | None, params: EnvParams) -> tuple[Any, ...]:
         """Take actions in the environment.
@@ -236,17 +190,8 @@ class Acting:
 
     def _fresh(self, state: State, memory: Memory | None, knowledge: Any, params: EnvParams) -> Agent:
         """Return agents before anything is seen."""
-        layout, note, setting = None, None, self.setting
-        if setting is not None:
-            layout = jax.vmap(lambda s: LayoutEstimator(knowledge.layout[params.room[s.scene]], setting).init())(state)
-
-        def everywhere(first: Tree) -> Tree:
-            return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.pose.shape, *jnp.shape(leaf))), first)
-
-        if self._tracker is not None:
-            note = everywhere(self._tracker.init(knowledge))
-        explored = None if self._spatial_memory is None else everywhere(self._spatial_memory.init())
-        return Agent(state, layout, explored, note, memory)
+        perceived = jax.vmap(self._perception.init, (None, 0))(knowledge, params.room[state.scene])
+        return Agent(state, perceived, memory)
 
 
 def carried(agent: Agent) -> Memory:

@@ -16,9 +16,10 @@ from jaxnav.env.build import build
 from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.layout import SETTINGS, prior_from_counts
-from jaxnav.policies.acting import Acting, Agent, View, carried
+from jaxnav.policies.acting import Acting, Agent, carried
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
 from jaxnav.policies.pathways import Memory, Pathways
+from jaxnav.policies.perception import View
 from jaxnav.policies.policy import Params, Policy, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import Bank, compile_bank
@@ -107,7 +108,7 @@ def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge:
             heading = pose // horizons % headings
             percept = Percept(params.tables.rows[pose], heading, carried(agent).action[i], moved)
             note = update(note, percept)
-            kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.note)
+            kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.perceived.note)
             chex.assert_trees_all_equal_shapes_and_dtypes(kept, note)
             chex.assert_trees_all_close(kept, note, rtol=1e-5, atol=1e-6)
 

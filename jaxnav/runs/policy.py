@@ -1,7 +1,7 @@
 """A trained policy that acts on observations, one episode at a time."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,11 @@ from jaxnav.causal import do, stde
 from jaxnav.env.objectnav import OTHER_ROOM, prior_index
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
-from jaxnav.layout import LayoutEstimator, LayoutState, Setting
-from jaxnav.policies.acting import View
+from jaxnav.layout import LayoutState, Setting
 from jaxnav.policies.methods import Knowledge, Percept, find_method
 from jaxnav.policies.pathways import Decision, Memory
+from jaxnav.policies.perception import Perceived, Perception, View
 from jaxnav.policies.policy import Params, bind
-from jaxnav.policies.spatial_memory import Explored
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.policies import read_export
 from jaxnav.scenes.categories import ROOM_TYPES
@@ -28,16 +27,12 @@ class EpisodeMemory(NamedTuple):
 
     Attributes:
       memory: of the network.
-      explored: the map of the spatial memory; None without one.
-      layout: the belief about the layout; None where the policy does not use it.
-      note: of the method's tracker; None without one.
+      perceived: belief, map and note.
       room: int32 [], index of the room type's layout prior.
     """
 
     memory: Memory
-    explored: Explored | None
-    layout: LayoutState | None
-    note: Any
+    perceived: Perceived
     room: jax.Array
 
 
@@ -71,11 +66,9 @@ class LoadedPolicy(struct.PyTreeNode):
         if room_type is not None and room_type not in ROOM_TYPES:
             raise InputError(f"room_type {room_type!r}: choose one of {', '.join(ROOM_TYPES)}, or None")
         room = jnp.int32(OTHER_ROOM if room_type is None else prior_index(room_type))
-        tracker = find_method(self.spec.method).tracker
-        layout = None if self.setting is None else LayoutEstimator(self.knowledge.layout[room], self.setting).init()
-        note = None if tracker is None else tracker.init(self.knowledge)
-        explored = None if self.spec.spatial_memory is None else self.spec.spatial_memory.init()
-        return EpisodeMemory(bind(self.spec, self.params).initial_memory(), explored, layout, note, room)
+        return EpisodeMemory(
+            bind(self.spec, self.params).initial_memory(), self._perception.init(self.knowledge, room), room
+        )
 
     def act(
         self,
@@ -106,30 +99,21 @@ class LoadedPolicy(struct.PyTreeNode):
         Raises:
           InputError: heading or moved is needed and missing.
         """
-        method, row_format = find_method(self.spec.method), RowFormat(self.spec.num_categories)
-        layout, note, weights = memory.layout, memory.note, jnp.ones(self.spec.num_categories)
-        if layout is not None and self.setting is not None:
-            estimator = LayoutEstimator(self.knowledge.layout[memory.room], self.setting)
-            layout = estimator.update(layout, row_format.presence(observation.row))
-            weights = estimator.goal_weights(layout, observation.goal)
-        reading, surroundings, explored = None, None, memory.explored
-        if method.tracker is not None or explored is not None:
-            if heading is None or moved is None:
-                raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
-            percept = Percept(observation.row, jnp.int32(heading), memory.memory.action, jnp.bool_(moved))
-            if method.tracker is not None:
-                note = method.tracker.update(note, self.knowledge, percept)
-                reading = method.tracker.read(note, self.knowledge, observation.goal)
-            if self.spec.spatial_memory is not None and explored is not None:
-                explored = self.spec.spatial_memory.update(
-                    explored, percept.row, percept.heading, percept.moved, row_format
-                )
-                surroundings = self.spec.spatial_memory.read(explored)
-        view = View(observation, weights, reading, surroundings)
-        decision, logits = self._decide(view, memory.memory, layout, epsilon)
+        perception = self._perception
+        if perception.uses_odometry and (heading is None or moved is None):
+            raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
+        odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
+        percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1])
+        perceived = perception.update(memory.perceived, percept, self.knowledge, memory.room)
+        view = perception.view(perceived, observation, self.knowledge)
+        decision, logits = self._decide(view, memory.memory, perceived.layout, epsilon)
         choice = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
-        action = method.control.act(choice.astype(jnp.int32), note)
-        return action, EpisodeMemory(decision.memory(action), explored, layout, note, memory.room)
+        action = find_method(self.spec.method).control.act(choice.astype(jnp.int32), perceived.note)
+        return action, EpisodeMemory(decision.memory(action), perceived, memory.room)
+
+    @property
+    def _perception(self) -> Perception:
+        return Perception(RowFormat(self.spec.num_categories), self.spec, self.setting)
 
     def _decide(
         self,

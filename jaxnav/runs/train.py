@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.layout import Setting
 from jaxnav.policies.methods import METHODS, Knowledge, find_method
 from jaxnav.policies.policy import Params
@@ -67,7 +67,6 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     setting = calibrate_setting(config, world, explored, console)
     knowledge = learn_knowledge(config, world, explored, setting)
     trainer = make_trainer(config, world.env, setting, knowledge, mesh)
-    validator = _validator(config, trainer, knowledge, world, console)
     turns = config.total_updates // config.chunk
     order = bank_order(world, config.seed, turns)
     if len(world.banks) > 1:
@@ -81,10 +80,12 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     if restored:
         console.print(f"resumed after update {done} of {config.total_updates}")
     clock = clock.resume(config.run_dir / TIMES_FILE)
+    finished = done == config.total_updates and (config.run_dir / REACH_FILE).exists()
+    validator = None if finished else _validator(config, trainer, knowledge, world, console)
     states = _do_updates(config, trainer, validator, world, order, states, done, manifest, clock, console)
     kept = {name: [_exported(state) for state in seeds] for name, seeds in trainer.unpack(states).items()}
     by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
-    if validator is not None and not (done == config.total_updates and (config.run_dir / REACH_FILE).exists()):
+    if validator is not None:
         reach = validator.reach(kept)
         by_first_process(lambda: write_atomic(config.run_dir / REACH_FILE, (json.dumps(reach) + "\n").encode()))
     console.print(f"{config.run_dir}: done in {clock.read()['wall_s']:.0f} s")
@@ -100,9 +101,7 @@ def _validator(
     acting = trainer.learners[config.arms[-1]].acting
     try:
         return Validator(config, acting, knowledge, world, console)
-    except InputError as error:
-        if config.scenes is None:
-            raise
+    except MissingSplitError as error:
         console.print(f"no val scenes, so the last policies are exported ({error})", soft_wrap=True)
         return None
 

@@ -63,7 +63,7 @@ class Validator:
           console: to tell of progress on.
 
         Raises:
-          InputError: there are no val scenes.
+          MissingSplitError: the file of scenes has none of val.
         """
         new = evaluation_world(config, "val", None, None, console)
         # Of equal sizes, so that one compilation serves both.

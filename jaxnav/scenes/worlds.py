@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.scenes.files.record import read_bytes
 from jaxnav.scenes.files.scene_file import read_scenes
@@ -204,7 +204,8 @@ def from_file(
       categories: the vocabulary that is relabelled.
 
     Raises:
-      InputError: unknown split, no readable scene file, it holds no scene of the split, or an impossible number.
+      MissingSplitError: the file holds no scene of the split.
+      InputError: unknown split, no readable scene file, or an impossible number.
     """
     if split is not None:
         _check_split(split)
@@ -212,7 +213,7 @@ def from_file(
     chosen = [scene for scene in scenes if split in (None, scene.split)]
     if not chosen:
         held = sorted({scene.split for scene in scenes})
-        raise InputError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(held)}")
+        raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(held)}")
     identity = f"{split or 'all'} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}"
     if shift:
         identity += f", relabelled: {shift=}, {seed=}, {categories=}"

@@ -112,8 +112,8 @@ def _gaps(
     acting, knowledge = Acting(env, setting=setting), Knowledge(priors)
 
     def alpha(agent: Agent) -> jax.Array:
-        assert agent.layout is not None
-        return agent.layout.alpha
+        assert agent.perceived.layout is not None
+        return agent.perceived.layout.alpha
 
     def step(agent: Agent, action: jax.Array) -> tuple[Agent, tuple[jax.Array, jax.Array]]:
         after, _ = acting.step(agent, action, knowledge, params)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 
 from jaxnav.causal import do
 from jaxnav.env.types import EnvParams
-from jaxnav.policies.acting import Acting, Agent, View, carried, select
+from jaxnav.policies.acting import Acting, Agent, carried, select
 from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.pathways import Decision, Memory, Pathways
+from jaxnav.policies.perception import View
 from jaxnav.policies.policy import Policy
 
 

@@ -22,7 +22,7 @@ def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] 
     """Draw success while training, and within numbers of actions.
 
     Left, the mean over seeds against environment steps: of training episodes, and of val episodes with best and with
-    sampled actions. Right, of the exported policies with their best actions: in val scenes and in training scenes.
+    sampled actions. Right, of the exported policies: in val scenes, and with best actions in training scenes.
 
     Args:
       rows: the training log.
@@ -38,12 +38,13 @@ def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] 
         panels[0, 0].plot(*_curve(rows, arm, "val_success_sampled"), **color, **_SAMPLED)
         if reach is not None:
             panels[0, 1].plot(reach["budgets"], _percent(reach["val"][arm]["argmax"]), **color, **_BEST)
+            panels[0, 1].plot(reach["budgets"], _percent(reach["val"][arm]["sample"]), **color, **_SAMPLED)
             panels[0, 1].plot(reach["budgets"], _percent(reach["train"][arm]["argmax"]), **color, **_TRAINING)
     panels[0, 0].set(xlabel="Environment steps of a policy (million)", ylabel="SR (%)", ylim=(0, 100))
     set_title(panels[0, 0], title, "while training")
     if reach is not None:
         panels[0, 1].set(xlabel="Actions")
-        set_title(panels[0, 1], "exported policies, best actions", "success within a number of actions")
+        set_title(panels[0, 1], "exported policies", "success within a number of actions")
     _legend(figure, arms)
     return fix_placement(figure)
 

@@ -78,7 +78,7 @@ def agent():
     agent = begin(WEIGHTS)
     for _ in range(3):
         agent, *_ = take(LAYOUT, WEIGHTS, agent, EVERY, EPISODE_KEYS)
-    assert len(np.unique(agent.layout.gap)) > 3
+    assert len(np.unique(agent.perceived.layout.gap)) > 3
     return agent
 
 
@@ -198,14 +198,19 @@ def test_a_constant_weight_of_one_in_the_papers_form_is_hard_tde(agent):
 @pytest.mark.parametrize("running", [EVERY, np.arange(EPISODES) % 7 != 3, np.arange(EPISODES) == 5])
 def test_a_shuffled_weight_is_that_of_the_next_running_episode(agent, running):
     gap = jnp.arange(EPISODES) / 100  # names the episode
-    named = agent._replace(layout=agent.layout.replace(gap=gap))
+    named = with_gap(agent, gap)
     _, weight = step(named, running, shuffled=True)
     # The last one's next is the first; one that runs alone keeps its own.
     np.testing.assert_array_equal(weight[running], np.roll(gap[running], -1))
 
 
+def with_gap(agent, gap):
+    layout = agent.perceived.layout.replace(gap=gap)
+    return agent._replace(perceived=agent.perceived._replace(layout=layout))
+
+
 def test_shuffling_unequal_ones_changes_actions(agent):
-    apart = agent._replace(layout=agent.layout.replace(gap=(jnp.arange(EPISODES) % 2).astype(jnp.float32)))
+    apart = with_gap(agent, (jnp.arange(EPISODES) % 2).astype(jnp.float32))
     plain, shuffled = (step(apart, shuffled=shuffled)[0] for shuffled in (False, True))
     assert (plain != shuffled).any()
 

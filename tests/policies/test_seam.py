@@ -155,7 +155,7 @@ def test_a_tracker_takes_in_every_view_once():
     """Auto-resets begin a new note, whose first view counts; of the actions the first is `NO_ACTION`."""
     _, before, after, rollout = rolled("COUNTING")
     for agent in (before, after):
-        np.testing.assert_array_equal(agent.note["views"], agent.state.time + 1)
+        np.testing.assert_array_equal(agent.perceived.note["views"], agent.state.time + 1)
     t = rollout.transitions
     # What the network read at each step is the note of that step: views, moves, goal.
     np.testing.assert_allclose(t.reading[..., 0] * 10, t.length, rtol=1e-6)  # the length counts this step's action

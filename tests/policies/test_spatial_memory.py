@@ -43,7 +43,7 @@ def walked(request):
             return agent, env.cell(agent.state.pose)
 
         agent, cells = jax.lax.scan(step, start, jax.random.split(key, STEPS))
-        return agent.explored, jnp.concatenate([env.cell(start.state.pose)[None], cells])
+        return agent.perceived.explored, jnp.concatenate([env.cell(start.state.pose)[None], cells])
 
     explored, cells = jax.tree.map(np.asarray, walk(jax.random.key(0)))
     return scene, memory, env, explored, cells
@@ -125,13 +125,13 @@ def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episod
     assert not np.allclose(*direct)
     chex.assert_trees_all_equal(*alone)
     # A new episode has visited one cell.
-    visited = (np.asarray(after.explored.cells) == VISITED).sum(axis=(1, 2))
+    visited = (np.asarray(after.perceived.explored.cells) == VISITED).sum(axis=(1, 2))
     assert (visited[:2] == 1).all()
-    np.testing.assert_array_equal(np.asarray(after.explored.place)[:2], 32)
+    np.testing.assert_array_equal(np.asarray(after.perceived.explored.place)[:2], 32)
 
 
 def test_a_policy_without_it_has_no_part_of_it():
     policy = bind(tiny.SPEC, tiny.lively(0))
     assert policy.view.kernel.shape[0] == 2 * policy.row_format.view**2
-    assert Acting(ENV, tiny.SPEC).start(jax.random.key(0), 1, None, None, PARAMS).explored is None
+    assert Acting(ENV, tiny.SPEC).start(jax.random.key(0), 1, None, None, PARAMS).perceived.explored is None
     assert jaxnav.RunConfig(spatial_memory=False).policy_spec(22).spatial_memory is None

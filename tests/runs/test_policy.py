@@ -144,7 +144,7 @@ def test_several_policies_act_in_one_call(drawn_run, world):
 def test_the_room_type_picks_the_prior(drawn_run):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
     for number, room in enumerate([*ROOM_TYPES, None]):
-        layout = policy.init(room).layout
+        layout = policy.init(room).perceived.layout
         assert layout is not None
         np.testing.assert_array_equal(layout.alpha, policy.knowledge.layout[number])
         assert int(policy.init(room).room) == number

@@ -91,7 +91,7 @@ def retrace(coin: bool) -> Retraced:
     value, log_prob, next_value = np.zeros((3, *shape), np.float32)
     retraced = Retraced(np.zeros((*shape, 3), np.float32), value, log_prob, next_value, [], [])
     for slot in range(SLOTS):
-        layout, memory = tiny.at(run.before.layout, slot), tiny.at(run.before.memory, slot)
+        layout, memory = tiny.at(run.before.perceived.layout, slot), tiny.at(run.before.memory, slot)
         for time in range(LENGTH):
             now = tiny.at(run.transitions, time, slot)
             weights = tiny.goal_weights(layout, now.goal)

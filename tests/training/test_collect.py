@@ -66,7 +66,7 @@ def test_the_agent_after_the_rollout_is_that_of_the_plain_loop(coin):
     after, plain = rolled(coin).after, retrace(coin)
     for slot in range(SLOTS):
         chex.assert_trees_all_close(tiny.at(after.memory, slot), plain.memory[slot], rtol=1e-4, atol=1e-5)
-        chex.assert_trees_all_close(tiny.at(after.layout, slot), plain.layout[slot], rtol=1e-5)
+        chex.assert_trees_all_close(tiny.at(after.perceived.layout, slot), plain.layout[slot], rtol=1e-5)
 
 
 @COIN
@@ -121,7 +121,7 @@ def test_without_a_setting_no_layout_is_carried_and_its_weights_are_ones():
     acting = dataclasses.replace(ACTING, setting=None)
     key = jax.random.key(0)
     agent, rollout = jax.eval_shape(lambda: act(tiny.lively(0), begin(key, acting), key, False, acting))
-    assert agent.layout is None
+    assert agent.perceived.layout is None
     assert rollout.transitions.weights.shape == (LENGTH, ENVS, 3)
-    weights = acting.view(begin(key)._replace(layout=None), KNOWLEDGE, PARAMS).weights
+    weights = acting.view(begin(key, acting), KNOWLEDGE, PARAMS).weights
     np.testing.assert_array_equal(weights, np.ones((ENVS, 3)))
