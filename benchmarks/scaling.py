@@ -2,7 +2,7 @@
 
 `python benchmarks/scaling.py` takes two cores or more, and 3 minutes.
 
-Weak scaling: every device brings as many episodes (half of the default run's), of one seed of the arm with the layout.
+Weak scaling: every device brings as many episodes (as many as the default run's), of one seed of the arm with the layout.
 
 - `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself),
   as one run that shares out two seeds, and as one that shares the episodes of a seed, in turns. As one against apart is
@@ -29,7 +29,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-EPISODES, CALL, TURNS, SUMS, SHORT = 256, 8, 4, 20, 100  # CALL: updates of a call, as in the default run
+EPISODES, CALL, TURNS, SUMS, SHORT = 256, 16, 4, 20, 100  # CALL: updates of a call, as in the default run
 BYTES = [2**9, 2**12, 2**14, 2**16, 2**20, 2**24]
 
 

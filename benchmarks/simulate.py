@@ -16,10 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxnav.runs.config import RunConfig
+
 ROOT = Path(__file__).parents[1]
 MEASURED = "results/performance/scaling.json"
 STEPS, HOSTS = 10**11, (1, 2, 8, 64, 1000)
-ROLLOUT, MINIBATCHES, UPDATES_PER_SAVE = 30, 16, 32  # of the default run
+DEFAULT = RunConfig()
+UPDATES_PER_SAVE = DEFAULT.chunk * DEFAULT.save_every
 SHARED_EPISODES = 16384  # where the batch does not grow with the hosts
 SAMPLES = 2000  # waits that are drawn
 
@@ -28,14 +31,12 @@ SAMPLES = 2000  # waits that are drawn
 class Network:
     """Describe a network.
 
-    Seconds of one message, bytes per second, whether a sum goes around in a tree or a ring, and whether its arrays go
-    together or one by one.
+    Seconds of one message, bytes per second, and whether a sum goes around in a tree or a ring.
     """
 
     message_s: float
     bytes_per_s: float
     tree: bool = False
-    grouped: bool = False
 
     def all_reduce(self, hosts: int, size: float) -> tuple[float, float]:
         """Return the seconds of latency and transfer of a sum."""
@@ -49,12 +50,12 @@ class Assumed:
 
     Attributes:
       days_between_failures: of one host, in the mean.
-      detect_s: until a lost process is noticed: the heartbeat timeout of jax.distributed.
+      detect_s: until a silent process is noticed.
       disk_bytes_per_s: that all hosts write to the shared file system together.
     """
 
     days_between_failures: float = 100.0
-    detect_s: float = 100.0
+    detect_s: float = 30.0
     disk_bytes_per_s: float = 1e9
 
 
@@ -67,8 +68,8 @@ def networks(measured: dict) -> dict[str, Network]:
     return {
         "loopback, ring": Network(line["latency_s"] / 2, line["bytes_per_s"]),
         "ethernet, ring": Network(30e-6, 2.5e9),
-        "ethernet, tree": Network(30e-6, 2.5e9, tree=True, grouped=True),
-        "infiniband, tree": Network(5e-6, 20e9, tree=True, grouped=True),
+        "ethernet, tree": Network(30e-6, 2.5e9, tree=True),
+        "infiniband, tree": Network(5e-6, 20e9, tree=True),
     }
 
 
@@ -84,7 +85,7 @@ def update(measured: dict, network: Network, hosts: int, share: float, generator
     noise = np.exp(sigma * generator.standard_normal((SAMPLES, hosts)) - sigma**2 / 2)
     slowest = noise.max(axis=1).mean() / noise.mean()
     exchanged = measured["exchanged"]["shared_episodes"]["all-reduce"]
-    sums = exchanged["calls" if network.grouped else "arrays"]
+    sums = exchanged["arrays"]
     latency, transfer = network.all_reduce(hosts, exchanged["bytes"] / sums) if hosts > 1 else (0, 0)
     saving = alone["save_s"] + hosts * share * alone["agent_bytes"] / Assumed().disk_bytes_per_s
     return {
@@ -118,10 +119,10 @@ def simulate(measured: dict, network: Network, shared_batch: bool) -> list[dict]
     rows, alone = [], 0.0
     for hosts in HOSTS:
         share = SHARED_EPISODES / hosts / episodes if shared_batch else 1.0
-        if share * episodes < MINIBATCHES:
+        if share * episodes < DEFAULT.ppo.minibatches:
             break  # less than an episode of each minibatch for a host
         parts = update(measured, network, hosts, share, generator)
-        steps = hosts * share * episodes * ROLLOUT
+        steps = hosts * share * episodes * DEFAULT.ppo.rollout
         updates = math.ceil(STEPS / steps)
         seconds, failures = run(parts, updates, hosts, restart_s, generator)
         alone = alone or seconds

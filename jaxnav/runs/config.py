@@ -116,7 +116,7 @@ class RunConfig:
     direct: Direct = "all"
     spatial_memory: bool = True
     done_gate: bool = False
-    chunk: int = 8
+    chunk: int = 16
     save_every: int = 4
     validations: int = 8
     val_episodes: int = 200

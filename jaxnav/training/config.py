@@ -29,7 +29,7 @@ class PPOConfig:
     """
 
     num_envs: int = 256
-    rollout: int = 30
+    rollout: int = 15
     epochs: int = 1
     minibatches: int = 8
     learning_rate: float = 2e-3
