@@ -2,7 +2,7 @@
 
 `python benchmarks/scaling.py` takes two cores or more, and 3 minutes.
 
-Weak scaling: every device brings as many episodes (as many as the default run's), of one seed of the arm with the layout.
+Weak scaling: every device brings as many episodes as the default run has, of one seed of the arm with the layout.
 
 - `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself),
   as one run that shares out two seeds, and as one that shares the episodes of a seed, in turns. As one against apart is

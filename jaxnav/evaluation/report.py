@@ -6,6 +6,7 @@ A report is a plain dictionary that JSON holds exactly; SR, SPL and SAE are in p
 import importlib.metadata
 import json
 import platform
+import typing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,15 +25,8 @@ Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
 Form = Literal["residual", "paper"]
 
-#: Factor from per-episode results (fractions, metres) to the report's units (percent, metres).
-_SCALES: dict[Metric, float] = {
-    "sr": 100.0,
-    "spl": 100.0,
-    "dts": 1.0,
-    "sae": 100.0,
-    "timeout": 100.0,
-    "wrong_done": 100.0,
-}
+#: What every row has; in percent but for `dts`, which is in metres. `sr@N`, success within N actions, comes besides.
+_METRICS: tuple[Metric, ...] = typing.get_args(Metric)
 #: Variants without training, whose seeds are repetitions.
 UNTRAINED: tuple[Variant, ...] = ("oracle", "random")
 _BUCKETS = {"L>=1": 1, "L>=5": 5}
@@ -71,9 +65,10 @@ def build_row(
     Raises:
       InputError: metrics missing, of unequal or wrong shape, not finite or out of range, or an L* below 1.
     """
-    if set(metrics) != set(_SCALES):
-        raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_SCALES)}")
-    scaled = {name: _to_report_units(name, metrics[name]) for name in _SCALES}
+    within = [name for name in metrics if name.startswith("sr@")]
+    if set(metrics) - set(within) != set(_METRICS):
+        raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_METRICS)}, and any sr@N")
+    scaled = {name: _to_report_units(name, metrics[name]) for name in (*_METRICS, *within)}
     shape = scaled["sr"].shape
     if len(shape) != 2 or {values.shape for values in scaled.values()} != {shape}:
         raise InputError("metrics differ in shape; give each as [seeds, episodes]")
@@ -178,10 +173,11 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     write_atomic(path, (json.dumps(report, indent=2, allow_nan=False) + "\n").encode())
 
 
-def _to_report_units(metric: Metric, values: np.ndarray) -> np.ndarray:
+def _to_report_units(metric: str, values: np.ndarray) -> np.ndarray:
     values = np.asarray(values, np.float64)
-    highest = 1.0 if _SCALES[metric] == 100.0 else np.inf
+    scale = 1.0 if metric == "dts" else 100.0
+    highest = np.inf if metric == "dts" else 1.0
     if not ((values >= 0) & (values <= highest) & np.isfinite(values)).all():
         unit = "metres, at least 0" if metric == "dts" else "fractions from 0 to 1"
         raise InputError(f"{metric} holds NaN or values out of range; give {unit}")
-    return values * _SCALES[metric]
+    return values * scale

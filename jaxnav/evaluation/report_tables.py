@@ -10,7 +10,6 @@ from jaxnav.evaluation.statistics import Interval
 _COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
 #: How episodes fail: means without intervals, beside the columns.
 _FAILURES = {"timeout": "Time-out (%)", "wrong_done": "Wrong Done (%)"}
-_TITLES = (*(title for title, _ in _COLUMNS.values()), *_FAILURES.values())
 
 
 def console_table(report: dict[str, Any]) -> Table:
@@ -18,7 +17,7 @@ def console_table(report: dict[str, Any]) -> Table:
 
     A line per row, `mean [95 % interval]`, under a header per world, split and decoding.
     """
-    table = Table("Variant", *_TITLES)
+    table = Table("Variant", *_titles(report))
     for heading, lines in _groups(report).items():
         table.add_section()
         table.add_row(Text(heading, style="bold"))
@@ -47,21 +46,37 @@ def difference_table(report: dict[str, Any]) -> Table:
 
 def markdown_table(report: dict[str, Any]) -> str:
     """Make the table in Markdown, with its notes, ending with a newline."""
-    lines = [("Variant", *_TITLES), ("---", *("---:" for _ in _TITLES))]
+    titles = _titles(report)
+    lines = [("Variant", *titles), ("---", *("---:" for _ in titles))]
     for heading, group in _groups(report).items():
-        lines += [(f"**{heading}**", *("" for _ in _TITLES)), *group]
+        lines += [(f"**{heading}**", *("" for _ in titles)), *group]
     table = "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
     return table + "".join(f"\n{note}\n" for note in report.get("notes", ()))  # version 0.1 had none
+
+
+def _titles(report: dict[str, Any]) -> list[str]:
+    """Return the headings beside the first."""
+    titles = [title for title, _ in _COLUMNS.values()]
+    if budgets := _budgets(report):
+        titles.append(f"SR within {', '.join(map(str, budgets))} (%)")
+    return [*titles, *_FAILURES.values()]
+
+
+def _budgets(report: dict[str, Any]) -> list[int]:
+    """Return the numbers of actions within which success was counted; none before 0.2."""
+    return sorted(int(name.removeprefix("sr@")) for name in report["rows"][0] if name.startswith("sr@"))
 
 
 def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
     """Group the cells of lines by heading, in order."""
     groups: dict[str, list[tuple[str, ...]]] = {}
+    budgets = _budgets(report)
     for row in report["rows"]:
         heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
         cells = (
             _label(row),
             *(f"{Interval.from_json(row[metric]):.{digits}f}" for metric, (_, digits) in _COLUMNS.items()),
+            *([", ".join(f"{row[f'sr@{budget}']['mean']:.1f}" for budget in budgets)] if budgets else ()),
             *(f"{row[metric]['mean']:.1f}" if metric in row else "" for metric in _FAILURES),  # version 0.2 had none
         )
         groups.setdefault(heading, []).append(cells)

@@ -21,6 +21,7 @@ from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_row
 from jaxnav.runs.directory import Run, settings
 from jaxnav.runs.policies import EstimatorName, Policies
 from jaxnav.runs.worlds import CompiledWorld, evaluation_shift, evaluation_world, read_ahead
+from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import write_atomic
 
 
@@ -32,6 +33,7 @@ class Results(NamedTuple):
       outcome: how the episodes went, leaves [R, S, E].
       episodes: that were run.
       categories: [K] names.
+      budgets: numbers of actions within which success is counted too.
       report: the table, paired differences, settings and versions, as JSON.
     """
 
@@ -39,14 +41,15 @@ class Results(NamedTuple):
     outcome: Outcome
     episodes: EpisodeList
     categories: tuple[str, ...]
+    budgets: tuple[int, ...]
     report: dict[str, Any]
 
     def metrics(self) -> dict[str, np.ndarray]:
         """Return the metrics of every episode, float64 [R, S, E].
 
-        `sr`, `spl` and `sae` are in [0, 1], `dts` in metres.
+        All are in [0, 1] but `dts`, which is in metres; see `episode_metrics`.
         """
-        return episode_metrics(self.outcome, self.episodes.best_length)
+        return episode_metrics(self.outcome, self.episodes.best_length, self.budgets)
 
     def write(self, path: Path) -> None:
         """Write the report, and a CSV row per episode.
@@ -107,7 +110,7 @@ def evaluate(
         "evaluation_seed": seed,
         "evaluation_setting": setting,
     }
-    results = Results(rows, outcome, together(lists), world.env.categories, {})
+    results = Results(rows, outcome, together(lists), world.env.categories, WORLDS[config.world].budgets, {})
     names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
     table, differences = _table(results, names), _differences(results)
     told = notes(rows, results.metrics()["sr"], results.episodes, room_prior=config.layout.prior == "room")

@@ -30,6 +30,7 @@ class World:
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
       shaping: reward in training for every metre nearer to the goal, needed where goals are rarely reached by chance.
+      budgets: actions within which success is counted too: where experience is worth most, and later.
     """
 
     generate: Callable[[str, int, int, float], Scene]
@@ -40,6 +41,7 @@ class World:
     step_limit: int
     large_step_limit: int
     shaping: float
+    budgets: tuple[int, int]
 
 
 #: AI2-THOR, RoboTHOR and Gibson in the paper.
@@ -53,6 +55,7 @@ WORLDS = {
         step_limit=100,
         large_step_limit=200,
         shaping=0.0,
+        budgets=(20, 50),
     ),
     "apartments": World(
         generate=generate_apartment,
@@ -63,6 +66,7 @@ WORLDS = {
         step_limit=500,
         large_step_limit=500,
         shaping=1.0,
+        budgets=(50, 150),
     ),
     "houses": World(
         generate=generate_house,
@@ -73,6 +77,7 @@ WORLDS = {
         step_limit=500,
         large_step_limit=500,
         shaping=1.0,
+        budgets=(50, 150),
     ),
 }
 

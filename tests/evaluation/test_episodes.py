@@ -143,7 +143,7 @@ def test_metrics_by_hand():
         weight=jnp.zeros(4),
     )
     outcome = jax.tree.map(np.asarray, leaves)  # as the evaluator returns it
-    metrics = episode_metrics(outcome, np.array([5, 1, 6, 4]))
+    metrics = episode_metrics(outcome, np.array([5, 1, 6, 4]), budgets=(4, 9))
     np.testing.assert_array_equal(metrics["sr"], [1, 1, 0, 1])
     # Success x L* / length: 5 / 10, 1 / 1, no success, 4 / 4.
     np.testing.assert_array_equal(metrics["spl"], [0.5, 1, 0, 1])
@@ -153,6 +153,9 @@ def test_metrics_by_hand():
     np.testing.assert_allclose(metrics["sae"], [2 / 3, 0, 0, 1])
     np.testing.assert_array_equal(metrics["timeout"], [0, 0, 1, 0])
     np.testing.assert_array_equal(metrics["wrong_done"], [0, 0, 0, 0])
+    # Successes after 10, 1 and 4 actions; Done counts as one.
+    np.testing.assert_array_equal(metrics["sr@4"], [0, 1, 0, 1])
+    np.testing.assert_array_equal(metrics["sr@9"], [0, 1, 0, 1])
 
 
 def test_an_episode_fails_by_a_time_out_or_a_wrong_done():

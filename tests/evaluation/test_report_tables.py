@@ -18,6 +18,8 @@ def fixed_row(**changes):
         "dts": {"mean": 0.541, "std": 0.01, "ci95": [0.5, 0.6]},
         "timeout": {"mean": 30.04, "std": 1.0, "ci95": [28.0, 32.0]},
         "wrong_done": {"mean": 3.48, "std": 1.0, "ci95": [2.0, 5.0]},
+        "sr@20": {"mean": 21.04, "std": 1.0, "ci95": [20.0, 22.0]},
+        "sr@100": {"mean": 55.5, "std": 1.0, "ci95": [50.0, 60.0]},
     }
     return ROW | metrics | changes
 
@@ -26,7 +28,7 @@ def fixed_report(*rows, notes=()):
     return {"rows": list(rows), "notes": list(notes)}
 
 
-CELLS = "66.5 [63.5, 69.4] | 38.4 [36.0, 40.0] | 0.54 [0.50, 0.60] | 30.0 | 3.5"
+CELLS = "66.5 [63.5, 69.4] | 38.4 [36.0, 40.0] | 0.54 [0.50, 0.60] | 21.0, 55.5 | 30.0 | 3.5"
 
 
 def test_markdown_table_with_the_label_of_every_variant():
@@ -40,9 +42,9 @@ def test_markdown_table_with_the_label_of_every_variant():
         notes=["One note.", "Another."],
     )
     assert report_tables.markdown_table(report) == (
-        "| Variant | SR (%) | SPL (%) | DTS (m) | Time-out (%) | Wrong Done (%) |\n"
-        "| --- | ---: | ---: | ---: | ---: | ---: |\n"
-        "| **ithor test, argmax decoding** |  |  |  |  |  |\n"
+        "| Variant | SR (%) | SPL (%) | DTS (m) | SR within 20, 100 (%) | Time-out (%) | Wrong Done (%) |\n"
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+        "| **ithor test, argmax decoding** |  |  |  |  |  |  |\n"
         f"| Random | {CELLS} |\n"
         f"| ORG (baseline) | {CELLS} |\n"
         f"| + w (layout) | {CELLS} |\n"
@@ -74,13 +76,13 @@ def test_a_cell_without_an_interval_says_so():
 
 def test_console_table():
     report = fixed_report(fixed_row(method="[bold]X[/bold]"), fixed_row(decoding="sample", method="VTNet"))
-    console = Console(width=140, record=True, file=io.StringIO())
+    console = Console(width=160, record=True, file=io.StringIO())
     console.print(report_tables.console_table(report))
     lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines()]
     assert [cells for cells in lines if cells] == [
-        ["ithor test, argmax decoding", "", "", "", "", ""],
+        ["ithor test, argmax decoding", "", "", "", "", "", ""],
         ["[bold]X[/bold] (baseline)", *CELLS.split(" | ")],  # names are text, never markup
-        ["ithor test, sample decoding", "", "", "", "", ""],
+        ["ithor test, sample decoding", "", "", "", "", "", ""],
         ["VTNet (baseline)", *CELLS.split(" | ")],
     ]
 
