@@ -1,8 +1,8 @@
 """jaxnav's trainer as a process.
 
 Started as `python benchmarks/_jaxnav_worker.py ARM EPOCHS MINIBATCHES UPDATES`. ARM is `baseline` (the method without
-layout; its loss is PPO's alone) or `layout` (the layout estimator runs beside the rollout, and the counterfactual
-branch is distilled).
+layout and without the spatial memory; its loss is PPO's alone) or `layout` (as in the default run: with the memory, the
+layout estimator beside the rollout, and the counterfactual branch distilled).
 """
 
 import dataclasses
@@ -13,12 +13,11 @@ from _worker import serve
 
 from jaxnav.runs.config import RunConfig
 
-COUNTERFACTUAL = {"baseline": "none", "layout": "distil"}
-
 
 def main(arm: str, epochs: int, minibatches: int, updates: int) -> None:
     ppo = dataclasses.replace(RunConfig().ppo, epochs=epochs, minibatches=minibatches)
-    config = dataclasses.replace(RunConfig(), arms=(arm,), counterfactual=COUNTERFACTUAL[arm], ppo=ppo)
+    plain = {"counterfactual": "none", "spatial_memory": False} if arm == "baseline" else {}
+    config = dataclasses.replace(RunConfig(), arms=(arm,), ppo=ppo, **plain)
     setup = set_up(config)
     learner, (state, _, params, knowledge) = setup.trainer.learners[arm], setup.arguments(arm)
     scalars = ppo.scalars(10**9)  # so many updates that the learning rate stays as it is

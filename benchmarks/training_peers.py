@@ -25,7 +25,7 @@ HERE = Path(__file__).parent
 PEERS = HERE.parent / ".cache" / "peers"
 PINNED = ("rejax==0.1.3", "gymnax==0.0.9", "jax==0.10.2", "jaxlib==0.10.2", "flax==0.12.8")
 TURNS = 5
-OURS, DEFAULT = "jaxnav, baseline", "jaxnav, layout and distillation"
+OURS, DEFAULT = "jaxnav, baseline", "jaxnav, the default run"
 REJAX, LEAN, RECURRENT = "rejax, two torsos", "rejax, linear critic", "purejaxrl style"
 SCRIPTS = {
     OURS: ("_jaxnav_worker.py", "baseline"),
@@ -36,9 +36,9 @@ SCRIPTS = {
 }
 #: Allocator, epochs, minibatches, updates of one turn, trainers.
 CASES = (
-    ("default", 1, 16, 8, tuple(SCRIPTS)),
-    ("tuned", 1, 16, 8, (OURS, REJAX, LEAN, RECURRENT)),
-    ("default", 4, 16, 3, (OURS, REJAX, LEAN, RECURRENT)),
+    ("default", 1, 8, 16, tuple(SCRIPTS)),
+    ("tuned", 1, 8, 16, (OURS, REJAX, LEAN, RECURRENT)),
+    ("default", 4, 8, 6, (OURS, REJAX, LEAN, RECURRENT)),
 )
 GOAL = 1.5
 

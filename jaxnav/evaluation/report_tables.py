@@ -33,7 +33,7 @@ def difference_table(report: dict[str, Any]) -> Table:
     """
     lines: dict[tuple[str, str], list[str]] = {}
     for entry in report["differences"]:
-        compared = _label({**entry, "variant": entry["to"], "method": ""})
+        compared = label({**entry, "variant": entry["to"], "method": ""})
         reference = "+ w" if entry["from"] == "layout" else entry["from"]
         _, digits = _COLUMNS[entry["metric"]]
         cell = f"{Interval.from_json(entry):+.{digits}f}"
@@ -74,7 +74,7 @@ def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
     for row in report["rows"]:
         heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
         cells = (
-            _label(row),
+            label(row),
             *(f"{Interval.from_json(row[metric]):.{digits}f}" for metric, (_, digits) in _COLUMNS.items()),
             *([", ".join(f"{row[f'sr@{budget}']['mean']:.1f}" for budget in budgets)] if budgets else ()),
             *(f"{row[metric]['mean']:.1f}" if metric in row else "" for metric in _FAILURES),  # version 0.2 had none
@@ -83,7 +83,8 @@ def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
     return groups
 
 
-def _label(row: dict[str, Any]) -> str:
+def label(row: dict[str, Any]) -> str:
+    """Return the name of a row of a report."""
     match row["variant"]:
         case "oracle":
             label = "Shortest path (oracle)"

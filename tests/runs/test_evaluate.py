@@ -27,7 +27,7 @@ def test_every_row_seed_and_episode_has_its_numbers(evaluated):
     shape = (30, 2, len(evaluated.episodes.goal))
     assert {leaf.shape for leaf in evaluated.outcome} == {shape}
     metrics = evaluated.metrics()
-    assert list(metrics) == ["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
+    assert list(metrics) == ["sr", "spl", "dts", "sae", "timeout", "wrong_done", "sr@20", "sr@50"]
     for name, values in metrics.items():
         assert (values.shape, values.dtype) == (shape, np.float64)
         assert (values >= 0).all()
