@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import chex
 import jax
@@ -19,6 +19,7 @@ from jaxnav.policies.pathways import Decision, Memory
 from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
+from jaxnav.policies.streams import Streams
 from jaxnav.scenes.task import NUM_ACTIONS
 
 K, BATCH, HIDDEN = len(CATEGORIES), 48, tiny.SIZES.hidden
@@ -162,7 +163,7 @@ def test_each_stream_has_a_core_of_its_own():
     """The hidden states are those of two cells of Flax."""
     generator = np.random.default_rng(0)
     observation, memory, spec = observations(generator), memories(generator), streams("org")
-    policy = bind(spec, tiny.lively(0, spec))
+    policy = cast(Streams, bind(spec, tiny.lively(0, spec)))
     pathways = policy.pathways(observation, jnp.ones((BATCH, K)))
     after = policy.decide(pathways, memory).hidden
     previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
@@ -200,4 +201,4 @@ def test_streams_add_a_view_and_a_stream():
 
 def test_unknown_decisions_are_refused():
     with pytest.raises(ValueError, match=r"^decision is 'both'; choose one of fused, streams$"):
-        PolicySpec(decision="both")
+        PolicySpec(decision="both")  # type: ignore[arg-type]

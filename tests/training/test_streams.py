@@ -12,6 +12,7 @@ from support import tiny_world as tiny
 from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
 
 from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import find_method
 from jaxnav.training.collect import collect
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.learner import Learner
@@ -22,9 +23,12 @@ SHARE, ROLLOUTS = 0.7, 3
 HOSTS = ["org", "support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
 
 
+def spec_of(method):
+    return dataclasses.replace(tiny.STREAMS, method=method, method_sizes=())
+
+
 def acting_with(method):
-    spec = dataclasses.replace(tiny.STREAMS, method=method, method_sizes=())
-    return Acting(ENV, spec, tiny.SETTING)
+    return Acting(ENV, spec_of(method), tiny.SETTING)
 
 
 def learner_with(method, **settings):
@@ -36,7 +40,7 @@ def learner_with(method, **settings):
 def rolled(method):
     """Weights, and rollouts that go on from one another."""
     learner = learner_with(method, experience=SHARE)
-    acting, weights = learner.acting, tiny.lively(3, learner.acting.spec)
+    acting, weights = learner.acting, tiny.lively(3, spec_of(method))
 
     @jax.jit
     def go(agent, key, share):
@@ -124,7 +128,7 @@ def test_episodes_without_experience_teach_the_direct_stream_alone(method):
 
         def loss(weights):
             replayed = replay(acting.bind(weights), given, memory, PARAMS)
-            return ppo_loss(replayed, advantage, scalars, False, acting.method)[0]
+            return ppo_loss(replayed, advantage, scalars, False, find_method(method))[0]
 
         return jax.grad(loss)(weights)
 
