@@ -14,8 +14,8 @@ from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, Observation, State
 from jaxnav.policies.features import NUM_FEATURES, features
 from jaxnav.policies.methods.org import ORG
-from jaxnav.policies.policy import SELDOM
 from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.policies.stream import SELDOM
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 

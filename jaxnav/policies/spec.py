@@ -1,12 +1,14 @@
 """What a policy is built from, beside its parameters."""
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 from jaxnav.policies.spatial_memory import SpatialMemory
 
 #: Which detections the direct pathway G -> A sees: of all categories, of the goal's alone, or none.
 Direct = Literal["all", "goal", "none"]
+#: How pathways become logits: fused before one recurrent core (the paper), or in two streams that are added up.
+Deciding = Literal["fused", "streams"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +43,7 @@ class PolicySpec:
       spatial_memory: what the scene's direct pathway remembers beside the view; None in the paper.
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
+      decision: how pathways become logits.
     """
 
     method: str = "org"
@@ -50,3 +53,8 @@ class PolicySpec:
     direct: Direct = "all"
     done_gate: bool = False
     spatial_memory: SpatialMemory | None = None
+    decision: Deciding = "fused"
+
+    def __post_init__(self) -> None:
+        if self.decision not in get_args(Deciding):
+            raise ValueError(f"decision is {self.decision!r}; choose one of {', '.join(get_args(Deciding))}")

@@ -14,7 +14,9 @@ from jaxnav.training.devices import Devices
 def check(config: RunConfig) -> RunConfig:
     """Return the config, complete and possible.
 
-    A method that cannot host the layout loses the arm `layout`; paths may be given as texts.
+    A method that cannot host the layout loses the arm `layout`; paths may be given as texts. With streams the direct
+    pathway sees the goal's detection alone, and the counterfactual branch needs no training: the stream of experience
+    is on and off by episodes, which trains both streams.
 
     Raises:
       InputError: names the first impossible setting.
@@ -24,6 +26,8 @@ def check(config: RunConfig) -> RunConfig:
     method = find_method(config.method)
     if not method.hosts_layout and config.arms == ARMS:
         config = dataclasses.replace(config, arms=("baseline",))
+    if config.decision == "streams":
+        config = dataclasses.replace(config, direct="goal", counterfactual="none")
     _check_method(config, method)
     _check_numbers(config)
     _check_layout(config)
@@ -76,6 +80,8 @@ def _check_layout(config: RunConfig) -> None:
 def _check_learning(config: RunConfig) -> None:
     ppo = config.ppo
     _need_all(ppo, "ppo", ("gamma", "gae_lambda"), lambda x: 0.0 <= x <= 1.0, "give a number from 0 to 1")
+    between = "give a number between 0 and 1, both excluded"
+    _need_all(ppo, "ppo", ("experience",), lambda x: 0.0 < x < 1.0, between)
     rates = ("learning_rate", "clip", "max_grad_norm")
     _need_all(ppo, "ppo", rates, lambda x: 0.0 < x < float("inf"), "give a positive number")
     weights = ("entropy", "final_entropy", "value", "distil")

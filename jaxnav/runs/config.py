@@ -6,7 +6,7 @@ from typing import Literal
 
 from jaxnav.layout import Reduction
 from jaxnav.policies.spatial_memory import SpatialMemory
-from jaxnav.policies.spec import Direct, PolicySpec, Sizes
+from jaxnav.policies.spec import Deciding, Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.detector import Detector
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
@@ -86,6 +86,9 @@ class RunConfig:
         layout's policies have seen the prior's random steps (`layout.walks x layout.steps`) besides.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
+      decision: how pathways become logits: `fused` before one recurrent core, as in the paper, or as the sum of two
+        `streams`, of which that of experience is off in some training episodes (see `ppo.experience`); with streams
+        `direct` is goal and `counterfactual` none.
       direct: which detections the direct pathway of the goal sees.
       spatial_memory: whether policies remember, on the direct pathway of the scene, which cells they have seen and
         visited; the paper's do not.
@@ -113,6 +116,7 @@ class RunConfig:
     total_steps: int | None = None
     seed: int = 0
     counterfactual: Counterfactual = "distil"
+    decision: Deciding = "fused"
     direct: Direct = "all"
     spatial_memory: bool = True
     done_gate: bool = False
@@ -147,7 +151,8 @@ class RunConfig:
         """Return what its policies are built from."""
         sizes = tuple(sorted(self.method_sizes.items()))
         memory = SpatialMemory(self.task.rules.headings) if self.spatial_memory else None
-        return PolicySpec(self.method, num_categories, self.sizes, sizes, self.direct, self.done_gate, memory)
+        options = self.direct, self.done_gate, memory, self.decision
+        return PolicySpec(self.method, num_categories, self.sizes, sizes, *options)
 
     @property
     def train_step_limit(self) -> int:

@@ -154,7 +154,8 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
         sizes, method_sizes = Sizes(**spec["sizes"]), tuple(sorted(spec["method_sizes"].items()))
         spatial = spec.get("spatial_memory")  # version 0.2 had none
         spatial = None if spatial is None else SpatialMemory(**spatial)
-        built = spec["method"], len(spec["categories"]), sizes, method_sizes, spec["direct"], spec["done_gate"], spatial
+        decision = spec.get("decision", "fused")  # version 0.2 had no other
+        built = spec["method"], len(spec["categories"]), sizes, method_sizes
         return Policies(
             params=jax.tree.map(jnp.asarray, tensors["policy"]),
             arms=(),
@@ -163,7 +164,7 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
                 method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
             ),
             counts=jnp.asarray(tensors["layout"]["counts"]),
-            spec=PolicySpec(*built),
+            spec=PolicySpec(*built, spec["direct"], spec["done_gate"], spatial, decision),
             setting=None if spec["layout"] is None else Setting(**spec["layout"]),
             prior_steps=spec["prior_steps"],
         )
@@ -200,6 +201,7 @@ def export_policy(
         "task": dataclasses.asdict(config.task),
         "sizes": dataclasses.asdict(config.sizes),
         "method_sizes": config.method_sizes,
+        "decision": config.decision,
         "direct": config.direct,
         "done_gate": config.done_gate,
         "spatial_memory": None if policy.spatial_memory is None else dataclasses.asdict(policy.spatial_memory),

@@ -25,6 +25,7 @@ class Transition(NamedTuple):
       reading: what the method's tracker read, leaves [B, ...]; None without one.
       surroundings: uint8 [B, M], what the spatial memory read; None without one.
       direct: bool [B], False where both direct pathways were zeroed; None if they never are.
+      experienced: float32 [B], 0 where experience was zeroed, otherwise 1; None if it never is.
       choice: int32 [B], what the policy chose.
       action: int32 [B], what was done.
       log_prob, value, reward: float32 [B].
@@ -38,6 +39,7 @@ class Transition(NamedTuple):
     reading: Any
     surroundings: jax.Array | None
     direct: jax.Array | None
+    experienced: jax.Array | None
     choice: jax.Array
     action: jax.Array
     log_prob: jax.Array
@@ -98,6 +100,21 @@ def zero_direct(pathways: Pathways, direct: jax.Array | None) -> Pathways:
     return do(pathways, scene=scene, goal=goal)
 
 
+def draw_coins(memory: Memory, begins: jax.Array | bool, key: jax.Array, share: jax.Array | float) -> Memory:
+    """Draw which episodes have the stream of experience.
+
+    Args:
+      memory: leaves [B, ...]; without such a stream it stays as it is.
+      begins: bool [B] or [], episodes to draw for.
+      key: consumed.
+      share: probability of experience.
+    """
+    if memory.experienced is None:
+        return memory
+    coins = jax.random.bernoulli(key, share, memory.experienced.shape).astype(jnp.float32)
+    return memory._replace(experienced=jnp.where(begins, coins, memory.experienced))
+
+
 def collect(
     acting: Acting,
     policy: Policy,
@@ -107,6 +124,7 @@ def collect(
     coin: bool,
     params: EnvParams,
     knowledge: Knowledge,
+    experience: jax.Array | float = 1.0,
 ) -> tuple[Agent, Rollout]:
     """Act for some steps with sampled actions and same-step auto-reset.
 
@@ -119,6 +137,7 @@ def collect(
       coin: zero both direct pathways with probability 1/2 at every step.
       params: the environment's.
       knowledge: what was learned before training.
+      experience: probability that an episode which begins has the stream of experience.
 
     Returns:
       The episodes after the rollout, and the rollout. The values of truncated states and of the state after the
@@ -134,13 +153,14 @@ def collect(
     def step(carry: tuple[Agent, Truncation], inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Transition]:
         agent, truncation = carry
         time, key = inputs
-        coin_key, action_key, env_key = (jax.random.fold_in(key, purpose) for purpose in range(3))
+        coin_key, action_key, env_key, experience_key = (jax.random.fold_in(key, purpose) for purpose in range(4))
         direct = jax.random.bernoulli(coin_key, 0.5, (num_envs,)) if coin else None
         view, decision = decide(agent, direct)
         choice = jax.random.categorical(action_key, decision.logits)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(decision.logits), choice[:, None], axis=-1)[:, 0]
         keys = jax.random.split(env_key, num_envs)
         after, taken = acting.step(agent, choice, knowledge, params, policy=policy, decision=decision, keys=keys)
+        after = after._replace(memory=draw_coins(carried(after), taken.ended, experience_key, experience))
         transition = Transition(
             pose=agent.state.pose,
             goal=agent.state.goal,
@@ -148,6 +168,7 @@ def collect(
             reading=view.reading,
             surroundings=view.surroundings,
             direct=direct,
+            experienced=decision.experienced,
             choice=choice,
             action=carried(taken.agent).action,
             log_prob=log_prob,

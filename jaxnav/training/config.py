@@ -26,6 +26,7 @@ class PPOConfig:
       value: weight of the value loss.
       max_grad_norm: global norm to which gradients are clipped.
       distil: weight of the counterfactual branch's loss where it is distilled.
+      experience: probability that an episode of training has the stream of experience, where there are streams.
     """
 
     num_envs: int = 256
@@ -41,6 +42,7 @@ class PPOConfig:
     value: float = 0.5
     max_grad_norm: float = 0.5
     distil: float = 0.5
+    experience: float = 0.8
 
     def num_updates(self, total_steps: int) -> int:
         """Return the updates that environment steps of a seed take.
@@ -70,6 +72,7 @@ class PPOScalars(struct.PyTreeNode):
     final_entropy: jax.Array
     value: jax.Array
     distil: jax.Array
+    experience: jax.Array
     num_updates: jax.Array
 
 

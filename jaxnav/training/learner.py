@@ -14,13 +14,14 @@ from jaxnav.policies.acting import Acting, Agent
 from jaxnav.policies.methods import Knowledge, Method, Stage
 from jaxnav.policies.policy import Params, init_params
 from jaxnav.training.apply import apply_gradient, make_optimizer
-from jaxnav.training.collect import Rollout, Transition, collect
+from jaxnav.training.collect import Rollout, Transition, collect, draw_coins
 from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
 from jaxnav.training.loss import advantages, ppo_loss, replay
 from jaxnav.training.shares import EPISODES, averaged
 
 _INIT, _START, _UPDATES = range(3)  # purposes of a seed's keys
 _ROLLOUT, _SHUFFLE, _RESTART = range(3)  # purposes of an update's keys
+_EXPERIENCE = 2**31 - 1  # purpose of a start's key; the numbers below are its episodes'
 
 Metrics = dict[str, jax.Array]
 
@@ -65,7 +66,7 @@ class Learner:
 
     Attributes:
       acting: how the episodes are acted.
-      config: of PPO; its scalars are traced, so only the sizes matter here.
+      config: of PPO; its scalars are traced where updates are done, so only the sizes matter there.
       counterfactual: how the counterfactual branch is trained.
       stage: number of the method's stage of training.
     """
@@ -125,9 +126,8 @@ class Learner:
         key = jax.random.fold_in(state.key, state.update)
         rollout_key, shuffle_key = (jax.random.fold_in(key, purpose) for purpose in (_ROLLOUT, _SHUFFLE))
         policy, coin = self.acting.bind(state.params), self.counterfactual == "coin"
-        agent, rollout = collect(
-            self.acting, policy, state.agent, rollout_key, self.config.rollout, coin, params, knowledge
-        )
+        arguments = state.agent, rollout_key, self.config.rollout, coin, params, knowledge, scalars.experience
+        agent, rollout = collect(self.acting, policy, *arguments)
         (weights, optimizer), metrics = self._learn(state, rollout, shuffle_key, scalars, params)
         metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(rollout.transitions, params)
         skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
@@ -172,6 +172,7 @@ class Learner:
 
     def _start(self, weights: Params, key: jax.Array, params: EnvParams, knowledge: Knowledge) -> Agent:
         memory = self.acting.bind(weights).initial_memory((self.config.num_envs,))
+        memory = draw_coins(memory, True, jax.random.fold_in(key, _EXPERIENCE), self.config.experience)
         return self.acting.start(key, self.config.num_envs, memory, knowledge, params)
 
     @property

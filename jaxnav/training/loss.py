@@ -10,7 +10,7 @@ from jaxnav.env.types import EnvParams, Observation
 from jaxnav.numerics.recurrence import gru, unroll
 from jaxnav.policies.acting import select
 from jaxnav.policies.methods import Method
-from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways
+from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways, zero_experience
 from jaxnav.policies.policy import Policy
 from jaxnav.training.collect import Transition, zero_direct
 from jaxnav.training.config import PPOScalars
@@ -52,7 +52,7 @@ class Replay(NamedTuple):
     Attributes:
       policy: with the parameters to differentiate by.
       transitions: of the rollout.
-      pathways: before the direct ones are zeroed, and before the experience attends.
+      pathways: before any is zeroed, and before the experience attends.
       decisions: the factual ones.
       counterfactual: with both direct pathways zeroed, but the same experience and (fixed) memory.
       params: the environment's.
@@ -85,12 +85,14 @@ def _in_parallel(
     policy: Policy, pathways: Pathways, transitions: Transition, memory: Memory
 ) -> tuple[Decision, Decision]:
     """Decide again where only the recurrent core needs the memory."""
+    pathways = zero_experience(pathways, transitions.experienced)
+    factual, counterfactual = zero_direct(pathways, transitions.direct), do(pathways, scene=0.0, goal=0.0)
     previous = jnp.where(transitions.ended, NO_ACTION, transitions.action)
     mediated = policy.mediated_input(pathways, jnp.concatenate([memory.action[None], previous[:-1]]))
-    direct = policy.direct_input(zero_direct(pathways, transitions.direct))
-    run = unroll(policy.recurrent_kernel, policy.drive(direct + mediated), transitions.ended, memory.hidden)
+    drive = policy.drive(policy.direct_input(factual) + mediated)
+    run = unroll(policy.recurrent_kernel, drive, transitions.ended, memory.hidden)
     alone = gru(policy.drive(mediated), run.projected, run.before)
-    return policy.act(run.after, pathways.gate), policy.act(alone, pathways.gate)
+    return policy.act(run.after, factual), policy.act(alone, counterfactual)
 
 
 def _step_by_step(
@@ -99,14 +101,15 @@ def _step_by_step(
     """Decide again where experience or adaptation need the memory."""
     fresh = policy.initial_memory(memory.action.shape)
 
-    def step(memory: Memory, inputs: tuple[Pathways, Any, jax.Array, jax.Array]) -> tuple[Memory, Any]:
-        encoded, direct, action, ended = inputs
+    def step(memory: Memory, inputs: tuple[Pathways, Any, Any, jax.Array, jax.Array]) -> tuple[Memory, Any]:
+        encoded, direct, experienced, action, ended = inputs
+        memory = memory._replace(experienced=experienced)
         decision = policy.decide(zero_direct(policy.attend(encoded, memory), direct), memory)
         fixed = jax.lax.stop_gradient(memory)
         counterfactual = policy.decide(do(policy.attend(encoded, fixed), scene=0.0, goal=0.0), fixed)
         return select(ended, fresh, decision.memory(action)), (decision, counterfactual)
 
-    inputs = pathways, transitions.direct, transitions.action, transitions.ended
+    inputs = pathways, transitions.direct, transitions.experienced, transitions.action, transitions.ended
     return jax.lax.scan(step, memory, inputs)[1]
 
 

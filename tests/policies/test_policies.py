@@ -19,8 +19,9 @@ from jaxnav.causal import do
 from jaxnav.env.types import Observation
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.policies.policy import SELDOM, bind, init_params
+from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import PolicySpec
+from jaxnav.policies.stream import SELDOM
 from jaxnav.scenes.lattice import NUM_ACTIONS
 from jaxnav.store.export import export_params
 

@@ -14,8 +14,9 @@ from support.tiny_world import BANK, SIZES, SPEC, lively
 
 from jaxnav.causal import do
 from jaxnav.env.types import Observation
+from jaxnav.policies.fused import DONE_GATE
 from jaxnav.policies.pathways import Memory, Pathways
-from jaxnav.policies.policy import DONE_GATE, bind, init_params
+from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import Direct
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 

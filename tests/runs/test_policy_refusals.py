@@ -60,6 +60,7 @@ def test_damaged_exports_are_refused(export):
         ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, org, rgb"),
         ({"sizes": {"depth": 3}}, "its spec does not fit this code (TypeError: "),
         ({"layout": {"rows": "some"}}, "its spec does not fit this code (ValueError: rows is 'some'"),
+        ({"decision": "both"}, "its spec does not fit this code (ValueError: decision is 'both'; choose one of fused"),
         ({"method_sizes": None}, "its spec does not fit this code (AttributeError: "),
     ],
 )

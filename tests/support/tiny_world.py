@@ -21,6 +21,7 @@ from support.scenes import CATEGORIES, SMALL, draw
 
 SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
 SPEC = PolicySpec("org", len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),))
+STREAMS = dataclasses.replace(SPEC, decision="streams", direct="goal")
 SETTING = SETTINGS["calibrated"]
 #: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
 LIMITS = (6, 8)
@@ -52,8 +53,14 @@ _init = jax.jit(init_params, static_argnums=0)
 
 def lively(seed, spec=SPEC):
     """Random parameters that act by what they see, unlike those of a fresh policy, which are close to indifferent."""
-    params = _init(spec, jax.random.key(seed))
-    kernel = jax.random.normal(jax.random.key(seed + 1000), params["actor"]["kernel"].shape)
+    params = _loud(_init(spec, jax.random.key(seed)), seed + 1000)
+    if spec.decision == "streams":
+        params["experience_stream"] = _loud(params["experience_stream"], seed + 2000)
+    return params
+
+
+def _loud(params, seed):
+    kernel = jax.random.normal(jax.random.key(seed), params["actor"]["kernel"].shape)
     loud = {
         name: jax.tree.map(lambda leaf: 3 * leaf, node) for name, node in params.items() if name in ("fuse", "method")
     }

@@ -1,0 +1,68 @@
+"""Runs whose policies decide in two streams: their settings, their exports, training and evaluation."""
+
+import dataclasses
+import json
+import shutil
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+from support.tiny_world import lively
+
+import jaxnav
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.worlds import evaluation_world
+from jaxnav.training.exploration import Exploration
+
+
+@pytest.fixture(scope="module")
+def streams(config):
+    return check(dataclasses.replace(config, decision="streams"))
+
+
+def test_streams_need_no_training_of_the_counterfactual_branch(streams):
+    assert (streams.direct, streams.counterfactual) == ("goal", "none")
+    spec = streams.policy_spec(9)
+    assert (spec.decision, spec.direct) == ("streams", "goal")
+    fused = check(RunConfig())
+    assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "all", "distil")
+
+
+def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
+    drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
+    params = lively(0, streams.policy_spec(len(streams.task.categories)))
+    explored = Exploration(jnp.ones_like(drawn.knowledge.layout), jnp.int32(1), jnp.int32(1))
+    export_policy(tmp_path / "policy", streams, params, drawn.knowledge, drawn.setting, explored)
+    policy = jaxnav.load_policy(tmp_path / "policy")
+    assert policy.spec == streams.policy_spec(len(streams.task.categories))
+    chex.assert_trees_all_equal(policy.params, params)
+    world = evaluation_world(streams, "val", None, None, Console(quiet=True))
+    _, state = world.env.reset(jax.random.key(0), world.params(0))
+    observation = world.env.observe(state, world.params(0))
+    action, memory = jax.jit(policy.act)(observation, policy.init(), heading=0, moved=False)
+    assert 0 <= int(action) < world.env.num_actions
+    np.testing.assert_array_equal(memory.memory.experienced, 1.0)
+
+
+def test_exports_that_do_not_name_a_decision_are_fused(drawn_run, tmp_path):
+    folder = shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
+    exported = json.loads((folder / "policy.json").read_text())
+    assert exported["spec"].pop("decision") == "fused"
+    (folder / "policy.json").write_text(json.dumps(exported))
+    assert jaxnav.load_policy(folder).spec == drawn_run.config.policy_spec(len(drawn_run.config.task.categories))
+
+
+@pytest.mark.slow
+def test_streams_are_trained_and_evaluated(config, tmp_path):
+    run = jaxnav.train(dataclasses.replace(config, decision="streams", run_dir=tmp_path / "run"))
+    assert run.config.decision == "streams"
+    policies = run.policies()
+    assert policies.spec.decision == "streams"
+    assert "experience_stream" in policies.params
+    results = jaxnav.evaluate(run, epsilon=np.array([0.0, 1.0]), episodes=8)
+    assert results.rows

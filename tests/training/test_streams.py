@@ -1,0 +1,151 @@
+"""Training in two streams: one coin per episode says whether experience has a part in it."""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
+
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import find_method
+from jaxnav.training.collect import collect
+from jaxnav.training.config import PPOConfig
+from jaxnav.training.learner import Learner
+from jaxnav.training.loss import ppo_loss, replay
+
+SHARE, ROLLOUTS = 0.7, 3
+#: In parallel over time, attending with the memory, and adapting.
+HOSTS = ["org", "support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
+
+
+def spec_of(method):
+    return dataclasses.replace(tiny.STREAMS, method=method, method_sizes=())
+
+
+def acting_with(method):
+    return Acting(ENV, spec_of(method), tiny.SETTING)
+
+
+def learner_with(method, **settings):
+    config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4, **settings)
+    return Learner(acting_with(method), config, "none")
+
+
+@functools.cache
+def rolled(method):
+    """Weights, and rollouts that go on from one another."""
+    learner = learner_with(method, experience=SHARE)
+    acting, weights = learner.acting, tiny.lively(3, spec_of(method))
+
+    @jax.jit
+    def go(agent, key, share):
+        return collect(acting, acting.bind(weights), agent, key, LENGTH, False, PARAMS, KNOWLEDGE, share)
+
+    agent, rollouts = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE).agent, []
+    for number in range(ROLLOUTS):
+        agent, rollout = go(agent, jax.random.key(number), jnp.float32(SHARE))
+        rollouts.append(rollout)
+    return weights, rollouts
+
+
+# The coin
+
+
+def test_the_coin_is_constant_within_an_episode():
+    _, rollouts = rolled("org")
+    coins, ended = (
+        np.concatenate([getattr(rollout.transitions, name) for rollout in rollouts])
+        for name in ("experienced", "ended")
+    )
+    changes = coins[1:] != coins[:-1]
+    assert set(np.unique(coins)) == {0, 1}
+    assert not changes[~ended[:-1]].any()
+    # Of the episodes that follow one another many differ: their coins are their own.
+    expected = 2 * SHARE * (1 - SHARE)
+    assert changes[ended[:-1]].mean() == pytest.approx(expected, abs=0.15)
+    for before, after in itertools.pairwise(rollouts):
+        goes_on = ~before.transitions.ended[-1]
+        np.testing.assert_array_equal(after.memory.experienced[goes_on], before.transitions.experienced[-1][goes_on])
+
+
+@pytest.mark.parametrize("share", [0.25, pytest.param(0.8, marks=pytest.mark.slow)])
+def test_its_share_is_as_configured(share):
+    learner, weights = learner_with("org", experience=share), tiny.lively(3, tiny.STREAMS)
+    learner = dataclasses.replace(learner, config=dataclasses.replace(learner.config, num_envs=1024))
+    state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
+    first = state.agent.memory.experienced
+    assert first.mean() == pytest.approx(share, abs=0.05)
+    again = jax.jit(learner.restart)(state, PARAMS, KNOWLEDGE).agent.memory.experienced
+    assert again.mean() == pytest.approx(share, abs=0.05)
+    assert (again != first).any()
+
+    acting = learner.acting
+    after, rollout = jax.jit(
+        lambda share: collect(
+            acting, acting.bind(weights), state.agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWLEDGE, share
+        )
+    )(jnp.float32(share))
+    fresh = rollout.transitions.ended.any(axis=0)
+    assert fresh.sum() > 500
+    assert after.memory.experienced[fresh].mean() == pytest.approx(share, abs=0.06)
+    np.testing.assert_array_equal(after.memory.experienced[~fresh], first[~fresh])
+
+
+# Replay
+
+
+@pytest.mark.parametrize("method", [HOSTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in HOSTS[1:])])
+def test_replay_decides_as_the_rollout_did(method):
+    weights, rollouts = rolled(method)
+    again = jax.jit(lambda t, memory: replay(acting_with(method).bind(weights), t, memory, PARAMS).decisions)
+    for transitions, memory, _ in rollouts[1:]:
+        assert transitions.ended[:-1].sum() > 20
+        assert 0.5 < transitions.experienced.mean() < 0.9
+        found = again(transitions, memory)
+        log_pi = jax.nn.log_softmax(found.logits)
+        log_prob = jnp.take_along_axis(log_pi, transitions.choice[..., None], axis=-1)[..., 0]
+        error = np.abs(log_prob - transitions.log_prob)
+        assert error.max() < 2.0**-9  # logits are rounded to 2**-10, now and then to the other side
+        assert (error < 1e-5).mean() > 0.98
+        np.testing.assert_allclose(found.value, transitions.value, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", [HOSTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in HOSTS[1:])])
+def test_episodes_without_experience_teach_the_direct_stream_alone(method):
+    weights, rollouts = rolled(method)
+    transitions, memory, _ = rollouts[1]
+    advantage = jnp.asarray(np.random.default_rng(0).normal(size=(LENGTH, ENVS)), jnp.float32)
+    scalars, acting = PPOConfig().scalars(1), acting_with(method)
+
+    @jax.jit
+    def gradient(coin):
+        given = transitions._replace(experienced=jnp.full((LENGTH, ENVS), coin))
+
+        def loss(weights):
+            replayed = replay(acting.bind(weights), given, memory, PARAMS)
+            return ppo_loss(replayed, advantage, scalars, False, find_method(method))[0]
+
+        return jax.grad(loss)(weights)
+
+    for coin in (0.0, 1.0):
+        found = gradient(coin)
+        views = jnp.split(found["view"]["kernel"], 2, axis=-1)
+        found |= {"view": views[0], "experience_view": views[1]}
+        taught = {name: any(leaf.any() for leaf in jax.tree.leaves(node)) for name, node in found.items()}
+        assert all(taught[name] for name in ("actor", "critic", "core", "fuse", "view", "detections"))
+        assert {taught[name] for name in ("experience_stream", "experience_view", "method")} == {bool(coin)}
+
+
+@pytest.mark.slow
+def test_an_update_teaches_both_streams():
+    learner = learner_with("org")
+    before = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
+    after, metrics = jax.jit(learner.update)(before, learner.config.scalars(4), PARAMS, KNOWLEDGE)
+    assert all(np.isfinite(value) for value in metrics.values())
+    changed = jax.tree.map(lambda old, new: bool((old != new).any()), before.params, after.params)
+    assert all(jax.tree.leaves([changed["actor"], changed["experience_stream"]["actor"]]))
