@@ -23,7 +23,7 @@ class Sizes:
       row_outputs: m, its outputs per category.
     """
 
-    hidden: int = 128
+    hidden: int = 64
     view_outputs: int = 64
     appearance: int = 16
     row_hidden: int = 32

@@ -33,7 +33,7 @@ class PPOConfig:
     rollout: int = 15
     epochs: int = 1
     minibatches: int = 8
-    learning_rate: float = 2e-3
+    learning_rate: float = 4e-3
     gamma: float = 0.99
     gae_lambda: float = 0.95
     clip: float = 0.2
