@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ class Row(NamedTuple):
     decoding: Decoding
 
     @property
-    def arm(self) -> str | None:
+    def arm(self) -> Literal["baseline", "layout"] | None:
         """Return the arm whose policies it takes; None for any."""
         if self.variant in ("random", "oracle"):
             return None

@@ -11,20 +11,22 @@ from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.evaluation.variants import Row
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import Results, evaluate
+from jaxnav.runs.policies import EstimatorName
 
 
-def account(run: Run, without: Run, **options: Any) -> list[Entry]:
+def account(run: Run, without: Run, *, setting: EstimatorName | None = None, **options: Any) -> list[Entry]:
     """Account for the experience of a run, on fixed episodes.
 
     Args:
       run: a finished run.
       without: a finished run of agents that cannot know any layout, such as those of the method `anonymous`.
-      **options: of `evaluate`, for both runs.
+      setting: layout estimator to use instead of the run's.
+      **options: the others of `evaluate`, for both runs.
 
     Raises:
       InputError: no finished run, an impossible option, or runs that `leads` cannot compare.
     """
-    return leads(evaluate(run, **options), evaluate(without, **options | {"setting": None}))
+    return leads(evaluate(run, setting=setting, **options), evaluate(without, **options))
 
 
 def leads(results: Results, without: Results) -> list[Entry]:
