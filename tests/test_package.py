@@ -44,7 +44,9 @@ def test_the_version_is_printed(capsys):
     assert capsys.readouterr().out == f"jaxnav {jaxnav.__version__}\n"
 
 
-@pytest.mark.parametrize(("wrong", "mend"), [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, episode")])
+@pytest.mark.parametrize(
+    ("wrong", "mend"), [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, episode")]
+)
 def test_unknown_commands_are_refused_with_a_hint(wrong, mend, capsys):
     assert main([wrong]) == 2
     assert mend in capsys.readouterr().err
