@@ -16,6 +16,7 @@ def build(
     num_cells: int = 0,
     num_scenes: int = 0,
     shaping: float = 0.0,
+    expert: bool = False,
 ) -> tuple[ObjectNav, EnvParams]:
     """Build environment and parameters of a compiled bank.
 
@@ -26,6 +27,7 @@ def build(
       num_cells, num_scenes: sizes to pad the tables to where the bank is smaller, so that banks of equal sizes share
         one compilation: with cells that no episode gets to, and with its own scenes again from the first.
       shaping: see `ObjectNav`.
+      expert: whether somebody imitates shortest paths.
     """
     rooms = [prior_index(room) for room in bank.room_types]
     limits = [step_limits.get(room, default_limit) for room in bank.room_types]
@@ -45,6 +47,7 @@ def build(
         rows=padded(bank.rows, poses_per_cell),
         success=padded(np.packbits(bank.best_length == 1, axis=1, bitorder="little"), poses_per_cell),
         goal_distance=padded(bank.goal_distance),
+        expert=padded(bank.expert, poses_per_cell) if expert else None,
         **{
             name: jnp.asarray(getattr(bank, name)[scenes]) for name in ("first_cell", "num_cells", "goals", "num_goals")
         },

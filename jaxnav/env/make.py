@@ -9,7 +9,7 @@ from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, from_file, generated
+from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
 
 
 def make(
@@ -28,8 +28,8 @@ def make(
       split: `train`, `val` or `test`; training episodes are shorter.
       scenes: path of a scene file to read instead.
       task: what is asked instead of the world's own.
-      seed: of the generated scenes, or of the exchange of labels in those of a file.
-      shift: layout shift from 0 to 1; on the scenes of a file by an exchange of labels.
+      seed: of the generated scenes, and of the shift.
+      shift: layout shift, from 0 to 1: the share of the categories that exchange their places.
 
     Raises:
       InputError: bad world, split or scene file, or no scene with a reachable goal.
@@ -38,10 +38,8 @@ def make(
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}; a scene file goes to `scenes`")
     usual = WORLDS[world]
     task = task or usual.task
-    if scenes is None:
-        chosen = generated(world, split, None, seed, shift)
-    else:
-        chosen = from_file(scenes, split, shift, seed, task.categories)
+    unshifted: Scenes = generated(world, split, None, seed) if scenes is None else from_file(scenes, split)
+    chosen = shifted(unshifted, task, shift, seed)
     bank = compile_bank((chosen[i] for i in range(len(chosen))), task)
     if split == "train":
         env, params = build(bank, {}, usual.train_step_limit, shaping=usual.shaping)

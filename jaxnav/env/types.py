@@ -10,7 +10,8 @@ class Tables(struct.PyTreeNode):
     """Hold a bank of scenes on the device.
 
     See `jaxnav.scenes.tables.compile.Bank` for the shapes. `success`, uint8 [P, ceil(K / 8)], holds a bit per pose and
-    goal: whether Done succeeds there. It stands apart from the rows, so that no observation holds it.
+    goal: whether Done succeeds there. `expert` is `Bank.expert`, None where nobody imitates it. Both stand apart from
+    the rows, so that no observation holds them.
     """
 
     ahead: jax.Array
@@ -21,6 +22,7 @@ class Tables(struct.PyTreeNode):
     num_cells: jax.Array
     goals: jax.Array
     num_goals: jax.Array
+    expert: jax.Array | None = None
 
 
 class EnvParams(struct.PyTreeNode):

@@ -110,6 +110,23 @@ def best_lengths(successor: np.ndarray, success: np.ndarray) -> np.ndarray:
         reached = spread
 
 
+def best_actions(successor: np.ndarray, best_length: np.ndarray, pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return the first action of a shortest path.
+
+    Args:
+      successor: int [P, 6].
+      best_length: uint16 [P, K], see `best_lengths`.
+      pose, goal: int [...], of which to which.
+
+    Returns:
+      int [...], Done where it succeeds; of equally good actions the first. `NUM_ACTIONS`, which is none, where there is
+      no way.
+    """
+    left = best_length[pose, goal]
+    nearer = best_length[successor[pose, :DONE], goal[..., None]] == left[..., None] - 1
+    return np.where(left > 1, nearer.argmax(axis=-1), np.where(left == 1, DONE, NUM_ACTIONS))
+
+
 def walking_distances(ahead: np.ndarray, rules: Rules, direct: np.ndarray) -> np.ndarray:
     """Return the shortest walks from each cell to goals.
 

@@ -10,7 +10,7 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.files.scene_file import iterate_scenes
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, world_named
+from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted, world_named
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,7 @@ class SceneSource:
       file: scene file, or the name of a generated world: `rooms`, `apartments` or `houses`.
       split: of the scenes; default: all of a file, `val` of a generated world.
       seed: of a generated world, and of the shift.
-      shift: from 0 to 1: layout shift of a generated world, in a file the share of the categories that exchange labels.
+      shift: layout shift, from 0 to 1: the share of the categories that exchange their places.
       world: world whose categories and rules count; default: the generated one, or what the scenes of a file stand for.
     """
 
@@ -54,15 +54,17 @@ class SceneSource:
         """Open the scenes.
 
         Args:
-          task: whose categories a shift exchanges in a file; None for that of the world.
+          task: whose categories a shift exchanges; None for that of the world.
           count: number of scenes of a generated world; None for its usual number.
 
         Raises:
           InputError: no readable scene file, no scene of the split, or an impossible number.
         """
         if self.file in WORLDS:
-            return generated(self.file, self.split or "val", count, self.seed, self.shift)
-        return from_file(self.file, self.split, self.shift, self.seed, (task or self.task).categories)
+            scenes: Scenes = generated(self.file, self.split or "val", count, self.seed)
+        else:
+            scenes = from_file(self.file, self.split)
+        return shifted(scenes, task or self.task, self.shift, self.seed)
 
     def select(self, name: str | None = None, index: int | None = None) -> Scene:
         """Return the scene of a name or an index.

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Protocol
 
 from jaxnav.errors import InputError, MissingSplitError
-from jaxnav.scenes.categories import ITHOR_CATEGORIES
+from jaxnav.scenes.exchange import check_shift, exchange_places
 from jaxnav.scenes.files.record import read_bytes
 from jaxnav.scenes.files.scene_file import read_scenes
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
-from jaxnav.scenes.generate.relabel import relabel
 from jaxnav.scenes.generate.rooms import generate_room_at
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
@@ -22,7 +21,7 @@ class World:
     """Describe what the scenes of a world have in common.
 
     Attributes:
-      generate: a scene from (split, index, seed, shift).
+      generate: a scene from (split, index, seed).
       counts: usual number of scenes of each split.
       task: categories, goals and rules.
       total_steps: environment steps that a policy is usually trained for.
@@ -33,7 +32,7 @@ class World:
       budgets: actions within which success is counted too: where experience is worth most, and later.
     """
 
-    generate: Callable[[str, int, int, float], Scene]
+    generate: Callable[[str, int, int], Scene]
     counts: dict[str, int]
     task: Task
     total_steps: int
@@ -125,15 +124,12 @@ class GeneratedScenes:
       split: `train`, `val` or `test`.
       count: number of scenes.
       seed: of the generator, at least 0.
-      shift: from 0 to 1: in `rooms` the share of the categories that exchange labels, see `relabel`; in homes the
-        probability that an object is put where those of another type belong.
     """
 
     world: str
     split: str
     count: int
     seed: int = 0
-    shift: float = 0.0
 
     @property
     def identity(self) -> str:
@@ -146,7 +142,7 @@ class GeneratedScenes:
     def __getitem__(self, index: int) -> Scene:
         if not 0 <= index < self.count:
             raise IndexError(index)
-        return WORLDS[self.world].generate(self.split, index, self.seed, self.shift)
+        return WORLDS[self.world].generate(self.split, index, self.seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,8 +150,8 @@ class FileScenes:
     """Hold the scenes of a file.
 
     Attributes:
-      scenes: as read, or relabelled.
-      identity: split and checksum of the file, and how it is relabelled.
+      scenes: as read.
+      identity: split and checksum of the file.
     """
 
     scenes: tuple[Scene, ...]
@@ -168,15 +164,59 @@ class FileScenes:
         return self.scenes[index]
 
 
-def generated(world: str, split: str, count: int | None = None, seed: int = 0, shift: float = 0.0) -> GeneratedScenes:
+@dataclasses.dataclass(frozen=True)
+class ShiftedScenes:
+    """Shift the layout of scenes on access.
+
+    Attributes:
+      scenes: without a shift.
+      task: its categories exchange their places.
+      shift: share of the categories, from 0 to 1; see `exchange_places`.
+      seed: of the exchange.
+    """
+
+    scenes: Scenes
+    task: Task
+    shift: float
+    seed: int
+
+    @property
+    def identity(self) -> str:
+        """Return that of the scenes, and the shift."""
+        categories, goals = self.task.categories, self.task.goals
+        return f"{self.scenes.identity}, places exchanged: {self.shift}, {self.seed}, {categories}, {goals}"
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> Scene:
+        return exchange_places(self.scenes[index], self.task, self.shift, self.seed)
+
+
+def shifted(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Scenes:
+    """Return scenes with a shifted layout.
+
+    Args:
+      scenes: of a file or of a generated world.
+      task: its categories exchange their places; see `exchange_places`.
+      shift: layout shift, from 0 (the scenes themselves) to 1.
+      seed: of the exchange, at least 0.
+
+    Raises:
+      InputError: an impossible number.
+    """
+    check_shift(shift, seed)
+    return ShiftedScenes(scenes, task, shift, seed) if shift else scenes
+
+
+def generated(world: str, split: str, count: int | None = None, seed: int = 0) -> GeneratedScenes:
     """Describe the scenes of one split of a generated world.
 
     Args:
       world: a key of `WORLDS`.
       split: `train`, `val` or `test`.
       count: number of scenes; None for the world's usual one.
-      seed: of the generator.
-      shift: layout shift, from 0 (the training distribution) to 1.
+      seed: of the generator, at least 0.
 
     Raises:
       InputError: an unknown name, or an impossible number.
@@ -187,42 +227,30 @@ def generated(world: str, split: str, count: int | None = None, seed: int = 0, s
     count = WORLDS[world].counts[split] if count is None else count
     if count < 1:
         raise InputError(f"world {world!r}: {count} scenes of split {split!r}; ask for at least one")
-    if seed < 0 or not 0.0 <= shift <= 1.0:
-        raise InputError(f"world {world!r}: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
-    return GeneratedScenes(world, split, count, seed, shift)
+    if seed < 0:
+        raise InputError(f"world {world!r}: seed {seed}; give a number of at least 0")
+    return GeneratedScenes(world, split, count, seed)
 
 
-def from_file(
-    path: str | Path,
-    split: str | None,
-    shift: float = 0.0,
-    seed: int = 0,
-    categories: tuple[str, ...] = ITHOR_CATEGORIES,
-) -> FileScenes:
+def from_file(path: str | Path, split: str | None) -> FileScenes:
     """Read the scenes of one split of a scene file.
 
     Args:
       path: the scene file.
       split: `train`, `val` or `test`; None for all scenes.
-      shift: share of the categories present in a scene that exchange their labels, from 0 to 1; see `relabel`.
-      seed: of the relabelling.
-      categories: the vocabulary that is relabelled.
 
     Raises:
       MissingSplitError: the file holds no scene of the split.
-      InputError: unknown split, no readable scene file, or an impossible number.
+      InputError: unknown split, or no readable scene file.
     """
     if split is not None:
         _check_split(split)
     scenes = read_scenes(path)
-    chosen = [scene for scene in scenes if split in (None, scene.split)]
+    chosen = tuple(scene for scene in scenes if split in (None, scene.split))
     if not chosen:
         held = sorted({scene.split for scene in scenes})
         raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(held)}")
-    identity = f"{split or 'all'} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}"
-    if shift:
-        identity += f", relabelled: {shift=}, {seed=}, {categories=}"
-    return FileScenes(tuple(relabel(scene, categories, shift, seed) for scene in chosen), identity)
+    return FileScenes(chosen, f"{split or 'all'} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}")
 
 
 def _check_split(split: str) -> None:

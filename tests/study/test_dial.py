@@ -5,23 +5,26 @@ import pytest
 from support.intervals import around, bounds
 
 from jaxnav.errors import InputError
-from jaxnav.study.dial import Totals, compare
-from jaxnav.study.instrument_report import BASELINES, MEASURES, Measure
+from jaxnav.study.dial import TRAINED, Totals, compare
+from jaxnav.study.instrument_report import BY_CATEGORY, MEASURES, WITHOUT, Measure
 
 ROOMS, NAMES = ("kitchen", "kitchen", "bedroom"), ("a", "b", "c")  # the only bedroom: all are one stratum
 
 
-def totals(names=NAMES, rooms=ROOMS, **values) -> Totals:
+def totals(names=NAMES, rooms=ROOMS, categories=None, seeds=2, **values) -> Totals:
     """Return totals of two episodes in each scene.
 
-    A measure is given by its mean in each scene, [N] or by seed [S, N]; else it is 1. The baselines have two seeds.
+    A measure is given by its mean in each scene, [N] or by seed [S, N]; else it is 1. What is trained has `seeds`.
     """
-    ones = {name: np.ones((2 if name in BASELINES else 1, len(names))) for name in MEASURES}
+    ones = {name: np.ones((seeds if name in TRAINED else 1, len(names))) for name in MEASURES}
     means: dict[Measure, np.ndarray] = {
         name: np.atleast_2d(np.array(values.get(name, ones[name]), float)) for name in MEASURES
     }
     weights = np.full(len(names), 2.0)
-    return Totals({name: 2.0 * mean for name, mean in means.items()}, dict.fromkeys(MEASURES, weights), rooms, names)
+    sums: dict[Measure, np.ndarray] = {name: 2.0 * mean for name, mean in means.items()}
+    by_category: dict[Measure, np.ndarray] = dict.fromkeys(BY_CATEGORY, np.full((len(names), 2), 50.0))
+    by_category |= {"goal_detected": np.array(categories, float)} if categories else {}
+    return Totals(sums, dict.fromkeys(MEASURES, weights), by_category, rooms, names)
 
 
 def test_means_and_changes_are_as_worked():
@@ -35,7 +38,7 @@ def test_means_and_changes_are_as_worked():
     matched = {change.measure: change for change in report.matched}
     assert matched["best_length"].change.mean == pytest.approx(5.0)
     assert matched["random_sr"].change.mean == pytest.approx(100 * 0.4 / 6)
-    assert [change.holds for change in report.matched] == [True, False, True]
+    assert [change.holds for change in report.matched] == [True, False, True, True]
     # Sample variances 100 and (9^2 + 1 + 10^2) / 2 = 91 of three scenes, / 3 of their mean.
     assert bounds(lengths[0]) == pytest.approx(around(20.0, 100 / 3, 2))
     assert bounds(lengths[1]) == pytest.approx(around(21.0, 91 / 3, 2))
@@ -92,7 +95,8 @@ def test_training_runs_are_left_out_of_all_shifts_at_once():
     assert bounds(report.discriminating[1].change) == pytest.approx((10.0, 10.0, 10.0))
     # One run: no interval, and no verdict without one.
     first, last = (
-        totals(baseline_argmax_sr=[[60.0 - lost] * 3], baseline_sample_sr=[[60.0 - lost] * 3]) for lost in (0.0, 10.0)
+        totals(seeds=1, baseline_argmax_sr=[[60.0 - lost] * 3], baseline_sample_sr=[[60.0 - lost] * 3])
+        for lost in (0.0, 10.0)
     )
     loss = compare([0.0, 1.0], [first, last]).discriminating[1]
     assert (loss.change.mean, loss.change.bounded, loss.holds) == (10.0, False, False)
@@ -101,3 +105,32 @@ def test_training_runs_are_left_out_of_all_shifts_at_once():
 def test_nothing_is_compared_with_zero():
     with pytest.raises(InputError, match=r"frontier_sr is 0 at shift 0: nothing to compare with; give more --episodes"):
         compare([0.0, 1.0], [totals(frontier_sr=[0, 0, 0]), totals()])
+
+
+def test_changes_of_categories_do_not_cancel():
+    # The first is in all three scenes, the second in two: they change by 3 and by -18, in the mean of scenes by
+    # (3 * 3 + 2 * 18) / 5 = 9. The mean of all goals falls by 27 / 5 only.
+    before = [[50, 80], [60, np.nan], [70, 60]]
+    after = [[56, 60], [60, np.nan], [73, 44]]
+    report = compare([0.0, 1.0], [totals(categories=before), totals(categories=after)])
+    assert report.categories is not None
+    detected, succeeds = report.categories
+    assert (detected.measure, detected.change.mean, detected.holds) == ("goal_detected", pytest.approx(9.0), False)
+    assert (succeeds.measure, succeeds.change.mean, succeeds.holds) == ("done_succeeds", 0.0, True)
+
+
+@pytest.mark.parametrize(("lost", "wrong", "holds"), [(1.9, 1.9, True), (2.1, 2.1, False), (-5.0, -5.0, True)])
+def test_agents_without_experience_must_lose_little(lost, wrong, holds):
+    first = totals(without_argmax_sr=[[80.0] * 3] * 2, without_argmax_wrong=[[3.0] * 3] * 2)
+    last = totals(without_argmax_sr=[[80.0 - lost] * 3] * 2, without_argmax_wrong=[[3.0 + wrong] * 3] * 2)
+    report = compare([0.0, 1.0], [first, last])
+    assert report.without is not None
+    changes = {change.measure: change for change in report.without}
+    assert changes["without_argmax_sr"].change.mean == pytest.approx(lost)
+    assert changes["without_argmax_wrong"].change.mean == pytest.approx(wrong)  # a wrong Done more is a loss
+    assert changes["without_argmax_sr"].holds == changes["without_argmax_wrong"].holds == holds
+    # Without such agents there is nothing to say.
+    others = [
+        each._replace(values={k: v for k, v in each.values.items() if k not in WITHOUT}) for each in (first, last)
+    ]
+    assert compare([0.0, 1.0], others).without is None

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxnav.scenes.generate.furnished_room import FORWARD, RIGHT, FurnishedRoom, Placed, clear_zone
+from jaxnav.scenes.generate.furnished_room import FORWARD, RIGHT, FurnishedRoom, clear_zone
 from jaxnav.scenes.generate.room_rules import Item, Rule
 from jaxnav.scenes.generate.room_shapes import inside
 from jaxnav.scenes.generate.spots import Spots, draw_spots
@@ -77,7 +77,6 @@ def put(room: FurnishedRoom, name: str, item: Item, size: np.ndarray, rng: np.ra
         if len(spots.turns):
             best = _choose(room, spots, rule, rng)
             _add_block(room, name, item, size, pitch, Spots(*(field[[best]] for field in spots)), rests, middle)
-            room.placed.append(Placed(name, item, size))
             return True
     return False
 

@@ -1,7 +1,5 @@
 """A room with the objects that were put in it."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from jaxnav.scenes.generate.room_rules import Item
@@ -12,20 +10,6 @@ ZONE_HEIGHT = 0.8  # the floor that is kept clear in front of furniture is clear
 #: (x, z) of forward and right after 0 to 3 quarter turns clockwise from +z.
 FORWARD = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)])
 RIGHT = np.array([(1, 0), (0, -1), (-1, 0), (0, 1)])
-
-
-class Placed(NamedTuple):
-    """Hold one object or block that was put.
-
-    Attributes:
-      name: its type.
-      item: what it is and the rule that it was put by.
-      size: width, height and depth [3] of one object, metres.
-    """
-
-    name: str
-    item: Item
-    size: np.ndarray
 
 
 class FurnishedRoom:
@@ -40,7 +24,6 @@ class FurnishedRoom:
       boxes: float64 [N, 2, 3], low and high corner (x, y, z), metres.
       zones: float64 [Z, 2, 3], boxes that are kept clear in front of objects.
       zone_owners: [Z] index of the object that each zone belongs to.
-      placed: what was put, in order.
     """
 
     def __init__(self, shape: Shape):
@@ -52,7 +35,6 @@ class FurnishedRoom:
         self.boxes = np.zeros((0, 2, 3))
         self.zones = np.zeros((0, 2, 3))
         self.zone_owners: list[int] = []
-        self.placed: list[Placed] = []
 
     def add(
         self, name: str, low: np.ndarray, high: np.ndarray, turn: int, parent: int, item: Item, middle: bool

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,15 +10,12 @@ import numpy as np
 from jaxnav.scenes.generate.floor_plans import FloorPlan, room_shape
 from jaxnav.scenes.generate.furnish import draw_contents, furnish
 from jaxnav.scenes.generate.furnished_room import FurnishedRoom
-from jaxnav.scenes.generate.room_rules import HomeStatistics, Item, Rule
+from jaxnav.scenes.generate.room_rules import Item, Rule
 from jaxnav.scenes.generate.rooms import CONNECTED_SHARE, away_from_boxes, away_from_walls, connected, make_scene
-from jaxnav.scenes.generate.shift import derangement, settle, shift_objects
 from jaxnav.scenes.scene import CELL, Room, Scene
 
-CELLS_TOLERANCE = 0.15  # of the number of standable cells under a shift
 CONTENTS_ATTEMPTS = 8  # to draw contents that a room has space for
 ATTEMPTS = 10  # to furnish a room with its contents
-SHIFT_ATTEMPTS = 30  # to place all objects of a home again
 
 # Types that stand for walls and doors while a room is being furnished; the scene has cells instead.
 PARTITION, DOORWAY = "Partition", "Doorway"
@@ -47,10 +44,10 @@ class Home:
     The origin of each room is the low corner of its floor.
     """
 
-    def __init__(self, plan: FloorPlan, statistics: HomeStatistics, goal_range: GoalRange):
-        self.plan, self.statistics, self.goal_range = plan, statistics, goal_range
+    def __init__(self, plan: FloorPlan, rules: Mapping[str, Mapping[str, Item]], goal_range: GoalRange):
+        self.plan, self.goal_range = plan, goal_range
         self.clear = away_from_walls(plan.walls)
-        self.rules = [statistics.rooms[room_type] for room_type in plan.types]
+        self.rules = [rules[room_type] for room_type in plan.types]
         self.bare = [self._bare(k) for k in range(len(plan.rooms))]
 
     def furnished(self, rng: np.random.Generator) -> list[FurnishedRoom] | None:
@@ -66,21 +63,6 @@ class Home:
                 return None
             rooms.append(room)
         return rooms
-
-    def shifted(self, rooms: list[FurnishedRoom], shift: float, rng: np.random.Generator) -> list[FurnishedRoom] | None:
-        """Place the objects of the rooms again, with a shift.
-
-        Returns:
-          The rooms, or None if they cannot be walked through.
-        """
-        cells = self.reach(rooms).sum()
-        partners = derangement(self.statistics.exchange)
-        for _ in range(SHIFT_ATTEMPTS):
-            moved = shift_objects(self.bare, self.rules, rooms, partners, shift, rng)
-            moved = moved and settle(self.bare, moved, self.usable, rng)
-            if moved and abs(self.reach(moved).sum() / cells - 1.0) < CELLS_TOLERANCE:
-                return moved
-        return None
 
     def usable(self, k: int, room: FurnishedRoom) -> bool:
         """Return whether room `k` can be walked through.

@@ -15,8 +15,6 @@ FURNITURE_GAP = 0.01  # between a piece of furniture and its wall, metres
 class Rule:
     """Describe where objects of a type are put.
 
-    It does not depend on the object, so that types can exchange their rules.
-
     Attributes:
       at: weight of each place: `wall`, `corner`, `middle`, or one of `on`, `in` (let into its surface), `above`,
         `beside`, `before`, `around` and a type. Places of types that the room does not have are left out.
@@ -77,19 +75,6 @@ class RoomStatistics:
     items: Mapping[str, Item]
 
 
-@dataclasses.dataclass(frozen=True)
-class HomeStatistics:
-    """Hold the statistics of the rooms of a home.
-
-    Attributes:
-      rooms: by room type, what stands there by type, in the order in which it is put.
-      exchange: groups of types of similar size and support that exchange their rules, room included, under a shift.
-    """
-
-    rooms: Mapping[str, Mapping[str, Item]]
-    exchange: tuple[tuple[str, ...], ...]
-
-
 @functools.cache
 def room_statistics() -> dict[str, RoomStatistics]:
     """Read the statistics of `rooms.yaml` by room type."""
@@ -100,10 +85,13 @@ def room_statistics() -> dict[str, RoomStatistics]:
 
 
 @functools.cache
-def home_statistics(world: str) -> HomeStatistics:
-    """Read the statistics of `apartments.yaml` or `houses.yaml`."""
-    raw = _read(f"{world}.yaml")
-    return HomeStatistics({room_type: _items(items) for room_type, items in raw["rooms"].items()}, raw["exchange"])
+def home_rules(world: str) -> Mapping[str, Mapping[str, Item]]:
+    """Read `apartments.yaml` or `houses.yaml`.
+
+    Returns:
+      By room type, what stands there by type, in the order in which it is put.
+    """
+    return {room_type: _items(items) for room_type, items in _read(f"{world}.yaml").items()}
 
 
 def _read(file: str) -> dict[str, Any]:

@@ -6,12 +6,11 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
+from jaxnav.scenes.generate.arguments import check_scene_arguments
 from jaxnav.scenes.generate.furnish import draw_contents, furnish
 from jaxnav.scenes.generate.furnished_room import FurnishedRoom
-from jaxnav.scenes.generate.relabel import relabel
 from jaxnav.scenes.generate.room_rules import room_statistics
 from jaxnav.scenes.generate.room_shapes import draw_shape, wall_mask
-from jaxnav.scenes.generate.shift import check_scene_arguments
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL, SPLITS, Scene
 
@@ -25,50 +24,46 @@ ATTEMPTS = 40  # to furnish a room with the drawn contents
 TARGETS = frozenset(ITHOR_CATEGORIES)
 
 
-def generate_rooms(
-    num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0, shift: float = 0.0
-) -> list[Scene]:
+def generate_rooms(num_train: int = 80, num_val: int = 20, num_test: int = 20, seed: int = 0) -> list[Scene]:
     """Generate single rooms.
 
-    A scene depends on the seed, its split, its index and the shift alone.
+    A scene depends on the seed, its split and its index alone.
 
     Args:
       num_train: number of training scenes, at least 0; room types take turns.
       num_val: number of validation scenes.
       num_test: number of test scenes.
       seed: at least 0.
-      shift: share of the categories in a room that exchange their labels, from 0 to 1; see `relabel`.
 
     Returns:
       The scenes, split by split, named like `train-kitchen-003`.
 
     Raises:
-      InputError: a count or the seed is negative, the shift is not in [0, 1], or there is no scene at all.
+      InputError: a count or the seed is negative, or there is no scene at all.
     """
     counts = dict(zip(SPLITS, (num_train, num_val, num_test), strict=True))
     for split, count in counts.items():
         if count < 0:
             raise InputError(f"generate_rooms: num_{split} is {count}; give a number of at least 0")
-        check_scene_arguments("generate_rooms", split, count, seed, shift)
+        check_scene_arguments("generate_rooms", split, count, seed)
     if not sum(counts.values()):
         raise InputError("generate_rooms: num_train, num_val and num_test are all 0; ask for at least one scene")
-    return [generate_room_at(split, i, seed, shift) for split, count in counts.items() for i in range(count)]
+    return [generate_room_at(split, i, seed) for split, count in counts.items() for i in range(count)]
 
 
-def generate_room_at(split: str, index: int, seed: int, shift: float = 0.0) -> Scene:
+def generate_room_at(split: str, index: int, seed: int) -> Scene:
     """Generate the scene of one split and index.
 
     It is that of `generate_rooms`; indices begin at 0, and room types take turns.
 
     Raises:
-      InputError: unknown split, negative index or seed, or a shift that is not in [0, 1].
+      InputError: unknown split, or a negative index or seed.
     """
-    check_scene_arguments("generate_room_at", split, index, seed, shift)
+    check_scene_arguments("generate_room_at", split, index, seed)
     room_type = ROOM_TYPES[index % len(ROOM_TYPES)]
     drawn = _draw_room(room_type, np.random.default_rng((seed, SPLITS.index(split), index)))
     walls, furniture = wall_mask(drawn.furniture.shape), drawn.furniture
-    scene = make_scene(f"{split}-{room_type}-{index:03d}", "rooms", room_type, split, walls, drawn.reach, furniture)
-    return relabel(scene, ITHOR_CATEGORIES, shift, seed)
+    return make_scene(f"{split}-{room_type}-{index:03d}", "rooms", room_type, split, walls, drawn.reach, furniture)
 
 
 class DrawnRoom(NamedTuple):

@@ -1,15 +1,24 @@
 """Compilation of scenes to flat tables over every pose."""
 
+import itertools
 import zlib
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids
-from jaxnav.scenes.lattice import ahead_of, best_lengths, standable_cells, successors, walking_distances
+from jaxnav.scenes.lattice import (
+    ahead_of,
+    best_actions,
+    best_lengths,
+    standable_cells,
+    successors,
+    walking_distances,
+)
 from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.tables.detector import MAX_RANGE, detection_range, object_size
 from jaxnav.scenes.tables.ego_view import ego_views
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.tables.sightings import Targets, detect, find_sightings
@@ -77,6 +86,18 @@ class Bank(NamedTuple):
         """Return the pose after every action, int32 [P, 6]."""
         return successors(self.ahead, self.task.rules)
 
+    @property
+    def expert(self) -> np.ndarray:
+        """Return the first action of a shortest path to every goal.
+
+        Returns:
+          uint8 [P, K], see `best_actions`.
+        """
+        successor, poses = self.successor, np.arange(len(self.rows))
+        goals = [np.full_like(poses, goal) for goal in range(self.best_length.shape[1])]
+        actions = [best_actions(successor, self.best_length, poses, goal).astype(np.uint8) for goal in goals]
+        return np.stack(actions, axis=-1)
+
 
 def compile_scene(scene: Scene, task: Task) -> SceneTable:
     """Compile one scene by the rules of docs/environment.md."""
@@ -84,7 +105,8 @@ def compile_scene(scene: Scene, task: Task) -> SceneTable:
     cells = standable_cells(scene.reach)
     centres, ahead = cell_centres(scene, cells), ahead_of(cells, rules)
     targets = _targets(scene, task, centres)
-    sightings = find_sightings(scene, rules, centres, targets)
+    limit = np.maximum(detection_range(object_size(scene.boxes[targets.objects])), rules.success_distance)
+    sightings = find_sightings(scene, rules, centres, targets, limit)
     shape = (len(cells) * rules.poses_per_cell, len(task.categories))
     if rules.success == "seen":
         success = sightings.within(rules.success_distance, shape)
@@ -104,6 +126,22 @@ def compile_scene(scene: Scene, task: Task) -> SceneTable:
     )
 
 
+def in_view(scene: Scene, task: Task) -> np.ndarray:
+    """Return which categories are in view from every pose.
+
+    They are those of which a detector without misses, and of the same range (`MAX_RANGE`) for objects of all sizes,
+    would see an object.
+
+    Returns:
+      bool [P, K], poses in the order of `SceneTable.rows`.
+    """
+    cells = standable_cells(scene.reach)
+    centres = cell_centres(scene, cells)
+    targets = _targets(scene, task, centres)
+    sightings = find_sightings(scene, task.rules, centres, targets, np.full(len(targets.objects), MAX_RANGE))
+    return sightings.within(MAX_RANGE, (len(cells) * task.rules.poses_per_cell, len(task.categories)))
+
+
 def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
     """Compile scenes into one bank.
 
@@ -118,28 +156,26 @@ def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
 def join(tables: Sequence[SceneTable], task: Task) -> Bank:
     """Join the tables of scenes end to end; see `compile_bank`."""
     possible = [np.flatnonzero((table.best_length > 0).any(axis=0)) for table in tables]
-    kept = [(table, goals) for table, goals in zip(tables, possible, strict=True) if len(goals)]
+    kept = [_bank(table, goals, task) for table, goals in zip(tables, possible, strict=True) if len(goals)]
     if not kept:
         raise no_goal(len(tables), task)
-    num_cells = np.array([len(table.ahead) for table, _ in kept], np.int32)
-    first_cell = np.cumsum(num_cells, dtype=np.int32) - num_cells
-    goals = np.zeros((len(kept), len(task.categories)), np.int32)
-    for row, (_, valid) in zip(goals, kept, strict=True):
-        row[: len(valid)] = valid
-    return Bank(
-        task=task,
-        names=tuple(table.name for table, _ in kept),
-        room_types=tuple(table.room_type for table, _ in kept),
-        ahead=np.concatenate([table.ahead + first for (table, _), first in zip(kept, first_cell, strict=True)]),
-        rows=np.concatenate([table.rows for table, _ in kept]),
-        best_length=np.concatenate([table.best_length for table, _ in kept]),
-        goal_distance=np.concatenate([table.goal_distance for table, _ in kept]),
-        first_cell=first_cell,
-        num_cells=num_cells,
-        goals=goals,
-        num_goals=np.array([len(valid) for _, valid in kept], np.int32),
-        skipped=tuple(table.name for table, goals in zip(tables, possible, strict=True) if not len(goals)),
-    )
+    skipped = tuple(table.name for table, goals in zip(tables, possible, strict=True) if not len(goals))
+    return concatenate(kept)._replace(skipped=skipped)
+
+
+def concatenate(banks: Sequence[Bank]) -> Bank:
+    """Put the scenes of banks of one task end to end."""
+    first = np.cumsum([0] + [len(bank.ahead) for bank in banks[:-1]], dtype=np.int32)
+    moved = [
+        bank._replace(ahead=bank.ahead + start, first_cell=bank.first_cell + start)
+        for bank, start in zip(banks, first, strict=True)
+    ]
+
+    def together(name: str) -> Any:
+        parts = [getattr(bank, name) for bank in moved]
+        return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else tuple(itertools.chain(*parts))
+
+    return Bank(banks[0].task, *(together(name) for name in Bank._fields[1:]))
 
 
 def no_goal(num_scenes: int, task: Task) -> InputError:
@@ -156,6 +192,26 @@ def checksum(bank: Bank) -> int:
     for part in bank:
         crc = zlib.crc32(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode(), crc)
     return crc
+
+
+def _bank(table: SceneTable, goals: np.ndarray, task: Task) -> Bank:
+    """Return the bank of one scene with its possible goals."""
+    filled = np.zeros((1, len(task.categories)), np.int32)
+    filled[0, : len(goals)] = goals
+    return Bank(
+        task=task,
+        names=(table.name,),
+        room_types=(table.room_type,),
+        ahead=table.ahead,
+        rows=table.rows,
+        best_length=table.best_length,
+        goal_distance=table.goal_distance,
+        first_cell=np.zeros(1, np.int32),
+        num_cells=np.array([len(table.ahead)], np.int32),
+        goals=filled,
+        num_goals=np.array([len(goals)], np.int32),
+        skipped=(),
+    )
 
 
 def _targets(scene: Scene, task: Task, centres: np.ndarray) -> Targets:

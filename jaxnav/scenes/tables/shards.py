@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 #: The code that shards follow from, below `_SOURCE`; importers write scene files, whose checksums count instead.
 _CODE = (
-    *("categories.py", "lattice.py", "scene.py", "task.py", "worlds.py"),
+    *("categories.py", "exchange.py", "lattice.py", "scene.py", "task.py", "worlds.py"),
     *("generate/*.py", "generate/*.yaml", "tables/*.py"),
     *("files/record.py", "files/scene_file.py", "files/walls.py"),
 )

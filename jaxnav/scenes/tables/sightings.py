@@ -75,19 +75,18 @@ class Sightings(NamedTuple):
         return table
 
 
-def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Targets) -> Sightings:
+def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Targets, limit: np.ndarray) -> Sightings:
     """Find which objects have a clear line to which cells.
-
-    Pairs count up to the detection range of the object or the success distance, whichever is greater.
 
     Args:
       scene: whose walls and opaque boxes hide things.
       rules: camera, headings and horizons.
       centres: float64 [C, 2], world (x, z) of the cells.
       targets: the objects.
+      limit: float [N], the distance up to which each of them counts, metres.
     """
     size, distance = object_size(scene.boxes[targets.objects]), targets.distance
-    cell, target = np.nonzero(distance <= np.maximum(detection_range(size), rules.success_distance) + TOLERANCE)
+    cell, target = np.nonzero(distance <= limit + TOLERANCE)
     clear = line_of_sight(scene, rules, centres[cell], targets.objects[target])
     cell, target = cell[clear], target[clear]
     order = np.lexsort((-target, -distance[cell, target]))

@@ -9,7 +9,7 @@ from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, FRIDGE, HOUSES, 
 from jaxnav.errors import InputError
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.tables.compile import compile_bank, compile_scene
+from jaxnav.scenes.tables.compile import compile_bank, compile_scene, concatenate
 from jaxnav.scenes.tables.detector import PERFECT
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
@@ -141,3 +141,18 @@ def test_only_goals_of_the_task_are_looked_for(rules):
     assert ROW_FORMAT.presence(bank.rows)[0].tolist() == [True, True, False]  # but books are detected
     with pytest.raises(InputError, match=r"categories Fridge near"):
         compile_bank([scene], dataclasses.replace(task, goals=("Fridge",)))
+
+
+# Banks end to end
+
+
+def test_banks_end_to_end_are_the_bank_of_all_scenes():
+    near = ("Book", 0, 1.5, 1, *SMALL)
+    scenes = [draw(["..", ".."], near), draw(["..."], ("Chair", 0.25, 1.5, 1, *SMALL)), draw(["."], near)]
+    task = Task(CATEGORIES, rules=ROOMS)
+    whole = compile_bank(scenes, task)
+    parts = concatenate([compile_bank(scenes[:1], task), compile_bank(scenes[1:], task)])
+    assert whole.first_cell.tolist() == [0, 4, 7]
+    for name, one, other in zip(whole._fields, whole, parts, strict=True):
+        assert getattr(one, "dtype", None) == getattr(other, "dtype", None)
+        np.testing.assert_array_equal(one, other, err_msg=name)
