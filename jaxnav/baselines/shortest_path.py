@@ -15,6 +15,7 @@ from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome, first_states
 from jaxnav.policies.acting import Acting, Agent
+from jaxnav.scenes.lattice import best_actions
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.task import DONE
 
@@ -28,10 +29,8 @@ def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
     successor, goal = bank.successor, episodes.goal
     pose, left, actions = episodes.pose, episodes.best_length, []
     while (left > 0).any():
-        after = successor[pose]
-        nearer = bank.best_length[after[:, :DONE], goal[:, None]] == (left - 1)[:, None]
-        action = np.where(left > 1, nearer.argmax(axis=1), DONE)
-        pose, left = after[np.arange(len(pose)), action], np.maximum(left - 1, 0)
+        action = np.where(left > 0, best_actions(successor, bank.best_length, pose, goal), DONE)
+        pose, left = successor[pose, action], np.maximum(left - 1, 0)
         actions.append(action)
     return np.array(actions, np.int32)
 
