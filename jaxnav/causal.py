@@ -4,12 +4,15 @@ The causal graph has three pathways into the action: scene, goal, and the experi
 A counterfactual keeps the factual experience and replaces the other two: `do(pathways, scene=0, goal=0)`.
 """
 
+import typing
 from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
 
-Form = Literal["paper", "residual"]
+#: How equation 2 combines logits, see `stde`.
+Form = Literal["paper", "residual", "switch"]
+FORMS: tuple[Form, ...] = typing.get_args(Form)
 Pathways = TypeVar("Pathways", bound=Any)
 
 
@@ -49,17 +52,23 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
     return logits - counterfactual
 
 
-def removal_weight(gap: jax.Array, epsilon: jax.Array | float) -> jax.Array:
-    """Return the weight ReLU(D - epsilon) of eq. 2.
+def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "residual") -> jax.Array:
+    """Return the weight s of what is removed in eq. 2.
 
     Args:
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more the weight is 0.
+      form: `switch` weighs by 1 where D > epsilon and else by 0; the others by ReLU(D - epsilon).
 
     Returns:
       float32 [...], in [0, 1].
+
+    Raises:
+      ValueError: unknown form.
     """
-    return jax.nn.relu(gap - epsilon)
+    if form not in FORMS:
+        raise ValueError(f"form={form!r}: choose one of {', '.join(FORMS)}")
+    return (gap > epsilon).astype(jnp.float32) if form == "switch" else jax.nn.relu(gap - epsilon)
 
 
 def stde(
@@ -77,7 +86,8 @@ def stde(
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
       form: with s = ReLU(D - epsilon), `paper`: a - s a_bar (`tde` at s = 1); `residual`: (1 + s) a - s a_bar, which
-        keeps the temperature of a. The two rank actions alike when the paper's weight is s / (1 + s).
+        keeps the temperature of a. The two rank actions alike when the paper's weight is s / (1 + s). `switch`: `tde`
+        where D > epsilon, else a.
 
     Returns:
       float [..., A], bit-identical to `logits` where s is 0.
@@ -85,8 +95,6 @@ def stde(
     Raises:
       ValueError: unknown form.
     """
-    if form not in ("paper", "residual"):
-        raise ValueError(f"form={form!r}: choose 'paper' or 'residual'")
-    s = removal_weight(gap, epsilon)[..., None].astype(logits.dtype)
-    combined = (logits if form == "paper" else (1 + s) * logits) - s * counterfactual
+    s = removal_weight(gap, epsilon, form)[..., None].astype(logits.dtype)
+    combined = ((1 + s) * logits if form == "residual" else logits) - s * counterfactual
     return jnp.where(s == 0, logits, combined)  # 0 * a_bar may still flip the sign of a zero

@@ -3,7 +3,8 @@
 It holds a Dirichlet belief about which categories are seen together. Row i of `alpha` [K, K] parametrises a Dirichlet
 over the categories j != i seen together with category i. The belief starts at the prior alpha*, gains counts as the
 episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5, or `evidence_gap`) and the expected co-occurrence w
-(eq. 6). There are no learned parameters. Functions take one episode; callers `vmap`.
+(eq. 6). Only the gaps `learned` and `overdue` know more than the prior (`Signs`). Functions take one episode; callers
+`vmap`.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxnav.gaps import Signs, evidence_gap, learned_gap, overdue_gap, seen_together
 from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, presence_kl
 
 #: Over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
@@ -35,8 +37,11 @@ class Setting:
       gate: update only if two or more categories are visible and the set differs from the last accepted one.
       gap: what D measures: `novelty`, how much the last view changed the belief (eq. 5), or `evidence`, how badly all
         that was seen so far fits the prior (`evidence_gap`; `reduction`, `decay` and `passes` then have no effect),
-        `clock`, 1 when the gate opens: what the sum over all rows in `released` comes to, for tanh is saturated there,
-        or `none`: D stays 0, so that sTDE takes nothing out. Training has no use for D.
+        `learned`, how surely what was seen together is not of the layout of training (`learned_gap`), `overdue`, how
+        surely the goal would have been seen by now in that layout (`overdue_gap`), `clock`, 1 when the gate opens:
+        what the sum over all rows in `released` comes to, for tanh is saturated there, or `none`: D stays 0, so that
+        sTDE takes nothing out. Training has no use for D.
+      hold: the gap never falls within an episode.
       decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
       passes: estimator calls per step, >= 1. All but the first find nothing new, so an accepted gap is already decayed.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
@@ -49,12 +54,13 @@ class Setting:
     increment: int = 1
     own_column: bool = False
     gate: bool = True
-    gap: Literal["novelty", "evidence", "clock", "none"] = "novelty"
+    gap: Literal["novelty", "evidence", "learned", "overdue", "clock", "none"] = "novelty"
+    hold: bool = False
     decay: float = 0.8
     passes: int = 1
     strength: float | None = 20.0
     uniform: float = 0.05
-    form: Literal["paper", "residual"] = "residual"
+    form: Literal["paper", "residual", "switch"] = "residual"
 
     def __post_init__(self):
         for name, hint in typing.get_type_hints(type(self)).items():
@@ -124,37 +130,6 @@ def prior_from_counts(counts: jax.Array, setting: str | Setting = "calibrated") 
     return jnp.maximum(alpha, MIN_CONCENTRATION) * others
 
 
-def evidence_gap(prior: jax.Array, alpha: jax.Array) -> jax.Array:
-    """Return the gap D by the evidence of an episode.
-
-    It says how far what was seen together falls short of agreeing with the prior. With the expected shares p_i =
-    alpha*_i / a_i before and q_i = alpha_i / (a_i + n_i) after n_i sightings, row i agrees by p_i . q_i, the
-    probability that one draw of each is alike. For layouts drawn from the prior that has mean p_i . p_i and variance
-    n_i v_i / ((a_i + n_i) (a_i + 1)), where v_i is the variance of p_ij, j drawn from p_i. So
-
-      z = sum_i (p_i . p_i - p_i . q_i) / sum_i sqrt(n_i v_i / ((a_i + n_i) (a_i + 1))),
-
-    the denominator being the standard deviation if rows are fully correlated, its upper bound, and D = erf(z / sqrt 2)
-    or 0 where z < 0: 2 P - 1, P the probability (normal approximation) that the prior's own layouts agree better.
-
-    Args:
-      prior: float32 [K, K], alpha*, 0 on the diagonal.
-      alpha: float32 [K, K], the belief, >= alpha*; the diagonal is ignored.
-
-    Returns:
-      float32 [], in [0, 1] (1 only by rounding); 0 where nothing was gained, below 0.01 where prior rows are uniform.
-    """
-    seen = (alpha - prior) * (1 - jnp.eye(len(prior), dtype=jnp.float32))
-    a, n = prior.sum(-1), seen.sum(-1)
-    p = prior / a[:, None]
-    shortfall = (p * p).sum(-1, keepdims=True) - p
-    excess = (seen * shortfall).sum(-1) / (a + n)
-    deviation = jnp.sqrt(n * (p * shortfall**2).sum(-1) / ((a + n) * (a + 1)))
-    # Where rows are uniform both are 0 up to rounding (1e-7), which the bound keeps out of the ratio.
-    z = excess.sum() / jnp.maximum(deviation.sum(), 1e-5)
-    return jnp.maximum(jax.lax.erf(z * 0.5**0.5), 0)
-
-
 class LayoutState(struct.PyTreeNode):
     """Hold the belief within one episode.
 
@@ -162,11 +137,14 @@ class LayoutState(struct.PyTreeNode):
       alpha: float32 [K, K], concentrations; 0 on the diagonal unless the setting counts a row's own category.
       last: bool [K], the visible set accepted last.
       gap: float32 [], layout gap D in [0, 1] (1 only by rounding).
+      together: bool [K, K], what was seen together so far (`seen_together`), for the gaps `learned` and `overdue`; None
+        for the others.
     """
 
     alpha: jax.Array
     last: jax.Array
     gap: jax.Array
+    together: jax.Array | None = None
 
 
 class LayoutEstimator(struct.PyTreeNode):
@@ -175,25 +153,40 @@ class LayoutEstimator(struct.PyTreeNode):
     Attributes:
       prior: float32 [K, K], alpha* as from `prior_from_counts`.
       setting: a name in `SETTINGS` or a `Setting`; static. An unknown name raises a ValueError.
+      signs: what the gaps `learned` and `overdue` know, leaves [K, K]; None for the others.
     """
 
     prior: jax.Array
     setting: str | Setting = struct.field(pytree_node=False, default="calibrated")
+    signs: Signs | None = None
 
     def __post_init__(self):
         named_setting(self.setting)
 
     def init(self) -> LayoutState:
         """Return the belief at an episode's start."""
+        size = self.prior.shape[-1]
+        recorded = named_setting(self.setting).gap in ("learned", "overdue")
         return LayoutState(
-            alpha=self.prior, last=jnp.zeros(self.prior.shape[-1], dtype=bool), gap=jnp.zeros((), dtype=jnp.float32)
+            alpha=self.prior,
+            last=jnp.zeros(size, dtype=bool),
+            gap=jnp.zeros((), dtype=jnp.float32),
+            together=jnp.zeros((size, size), dtype=bool) if recorded else None,
         )
 
-    def update(self, state: LayoutState, presence: jax.Array) -> LayoutState:
+    def update(self, state: LayoutState, presence: jax.Array, goal: jax.Array | int | None = None) -> LayoutState:
         """Take in the categories visible at one step (eqs. 3-5).
 
-        `state` is the belief before the step, `presence` bool or real [K], nonzero where a category is visible. Returns
-        the belief after the step; its gap is the divergence of the one from the other, or of the belief from the prior.
+        Args:
+          state: the belief before the step.
+          presence: bool or real [K], nonzero where a category is visible.
+          goal: int [], what is sought; only the gap `overdue` needs it.
+
+        Returns:
+          The belief after the step. Its gap is the divergence of the one from the other, or as the setting says.
+
+        Raises:
+          ValueError: the gap needs signs or a goal, and there are none.
         """
         setting = named_setting(self.setting)
         seen = presence.astype(bool)
@@ -209,20 +202,26 @@ class LayoutEstimator(struct.PyTreeNode):
         accept = (seen.sum() >= 2) & (seen != state.last).any() if setting.gate else jnp.bool_(True)
         posterior = jnp.where(accept, alpha + counts, alpha)  # eq. 4
         last = jnp.where(accept, seen, state.last)
-        if setting.gap == "none":
-            return LayoutState(alpha=posterior, last=last, gap=state.gap)
-        if setting.gap == "evidence":
-            return LayoutState(alpha=posterior, last=last, gap=evidence_gap(self.prior, posterior))
-
-        kl = presence_kl(kl_prior, counts, setting.increment)  # [K]
-        if setting.reduction == "mean_visible":
-            mean_kl = (kl * visible).sum() / jnp.maximum(visible.sum(), 1)
-        else:
-            mean_kl = kl.mean() if setting.reduction == "mean" else kl.sum()
-        fresh = jnp.float32(1.0) if setting.gap == "clock" else jnp.tanh(mean_kl)
-        new_gap = fresh * setting.decay ** (setting.passes - 1)  # eq. 5
-        gap = jnp.where(accept, new_gap, state.gap * setting.decay**setting.passes)
-        return LayoutState(alpha=posterior, last=last, gap=gap)
+        after = LayoutState(alpha=posterior, last=last, gap=state.gap, together=state.together)
+        match setting.gap:
+            case "none":
+                return after
+            case "evidence":
+                gap = evidence_gap(self.prior, posterior)
+            case "learned" | "overdue":
+                assert state.together is not None
+                after = after.replace(together=state.together | seen_together(seen[None]))
+                gap = self._gap_by_signs(after, goal)
+            case "novelty" | "clock":
+                kl = presence_kl(kl_prior, counts, setting.increment)  # [K]
+                if setting.reduction == "mean_visible":
+                    mean_kl = (kl * visible).sum() / jnp.maximum(visible.sum(), 1)
+                else:
+                    mean_kl = kl.mean() if setting.reduction == "mean" else kl.sum()
+                fresh = jnp.float32(1.0) if setting.gap == "clock" else jnp.tanh(mean_kl)
+                new_gap = fresh * setting.decay ** (setting.passes - 1)  # eq. 5
+                gap = jnp.where(accept, new_gap, state.gap * setting.decay**setting.passes)
+        return after.replace(gap=jnp.maximum(gap, state.gap) if setting.hold else gap)
 
     @staticmethod
     def expectation(state: LayoutState, goal: jax.Array | int | None = None) -> jax.Array:
@@ -247,3 +246,15 @@ class LayoutEstimator(struct.PyTreeNode):
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
         """Return w x g of eq. 7, float32 [K]."""
         return LayoutEstimator.expectation(state, goal)
+
+    def _gap_by_signs(self, state: LayoutState, goal: jax.Array | int | None) -> jax.Array:
+        """Return the gap that learned signs tell."""
+        setting = named_setting(self.setting)
+        assert state.together is not None
+        if self.signs is None:
+            raise ValueError(f"gap={setting.gap!r}: needs `signs`, learned before training")
+        if setting.gap == "learned":
+            return learned_gap(state.together, self.signs.odds)
+        if goal is None:
+            raise ValueError("gap='overdue': needs the goal; give it to `update`")
+        return overdue_gap(state.together, self.signs.chance, goal)

@@ -12,7 +12,8 @@ from hypothesis import given
 
 from jaxnav.causal import do, removal_weight, stde, tde
 
-FORMS = ("paper", "residual")
+FORMS = ("paper", "residual", "switch")
+SOFT = FORMS[:2]
 LOGITS = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32))
 
 
@@ -74,7 +75,15 @@ def test_open_gate_changes_logits():
     assert not np.array_equal(stde(a, a, jnp.ones(1), 0.9), stde(a, 2 * a, jnp.ones(1), 0.9))
 
 
-@pytest.mark.parametrize("form", FORMS)
+@given(LOGITS, LOGITS, hnp.arrays(np.float32, 4, elements=st.floats(0, 1, width=32)), st.floats(0, 1, width=32))
+def test_switch_is_eq_1_or_nothing_to_the_bit(a, a_bar, gap, epsilon):
+    a, a_bar = jnp.asarray(a), jnp.asarray(a_bar)
+    result, weight = stde(a, a_bar, jnp.asarray(gap), epsilon, "switch"), removal_weight(gap, epsilon, "switch")
+    np.testing.assert_array_equal(weight, gap > np.float32(epsilon))
+    np.testing.assert_array_equal(bits(result), bits(np.where(weight[:, None] == 1, tde(a, a_bar), a)))
+
+
+@pytest.mark.parametrize("form", SOFT)
 @given(LOGITS, LOGITS, st.floats(0, 1, width=32), st.floats(0, 0.9990234375, width=32))
 def test_continuous_in_epsilon(form, a, a_bar, gap, epsilon):
     # |d result / d epsilon| <= |a| + |a_bar| <= 60, so a step of 2^-10 moves a logit by at most 0.06 (and rounding).

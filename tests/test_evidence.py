@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from scipy.stats import dirichlet, dirichlet_multinomial, mannwhitneyu, multinomial, norm
 
-from jaxnav.layout import SETTINGS, LayoutEstimator, Setting, evidence_gap, prior_from_counts
+from jaxnav.gaps import evidence_gap
+from jaxnav.layout import SETTINGS, LayoutEstimator, Setting, prior_from_counts
 
 K, EPISODES, STEPS = 12, 200, 20
 VIEWS = hnp.arrays(np.bool_, (5, K))

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.inference import Inference, counterfactual_logits, remove
+from jaxnav.evaluation.inference import Inference, counterfactual_logits, gap_used, remove
 from jaxnav.policies.acting import Acting, Agent, Taken, carried, select
 from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.policy import Params, Policy
@@ -220,7 +220,8 @@ def act(
     logits, weight = decision.logits, jnp.zeros(running.shape)
     if removes:
         counterfactual = counterfactual_logits(cell, policy, pathways, memory, keys, step_keys)
-        logits, weight = remove(cell, logits, counterfactual, acting.gap(agent), running)
+        gap = gap_used(cell, acting.gap(agent), running, keys, agent.state.time)
+        logits, weight = remove(cell, logits, counterfactual, gap)
     logits = jnp.where(cell.uniform, 0.0, logits)
     sampled = jax.vmap(jax.random.categorical)(step_keys, logits)
     choice = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)

@@ -7,9 +7,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.causal import do, removal_weight, stde, tde
+from jaxnav.causal import FORMS, do, removal_weight, stde, tde
 from jaxnav.policies.pathways import Memory, Pathways
 from jaxnav.policies.policy import Policy
+
+#: Folded into an episode's key; no time is that late.
+_NOISE, _ORDER = 2**30, 2**30 + 1
 
 
 class Branch(enum.IntEnum):
@@ -24,41 +27,80 @@ class Branch(enum.IntEnum):
     NOISE = 2
 
 
+class Source(enum.IntEnum):
+    """Name where the layout gap of a step comes from.
+
+    The episode's own belief; the belief of another running episode at the same time, at random, the same one as long as
+    both run; the mean of all running episodes, which has their course over time and nothing of the episode; or a number
+    given beforehand, from one step to another.
+    """
+
+    OWN = 0
+    OTHER = 1
+    MEAN = 2
+    GIVEN = 3
+
+
 class Inference(struct.PyTreeNode):
     """Say how parameters are used, leaves [] or [C].
 
     Experience is removed by sTDE (eq. 2) with the threshold `epsilon`, or by TDE (eq. 1) where `hard` holds; neither
-    has an effect with epsilon = inf. The last four are controls.
+    has an effect with epsilon = inf. The last six are controls.
 
     Attributes:
       params: int32, index of the parameters.
       epsilon: float32.
       hard: bool, TDE.
-      residual: bool, combine in the residual form rather than in the paper's.
+      form: int32, index of the form in `causal.FORMS`.
       layout: bool, multiply the layout's weights in; otherwise they are ones.
       greedy: bool, take the best action rather than sample.
       uniform: bool, ignore the policy and act at random.
-      gap: float32, a constant in place of the episode's layout gap; NaN for the episode's.
+      source: int32, where the layout gap comes from: a `Source`.
+      gap: float32, the gap that is given; from step `begin` to before step `end`, 0 at other times.
+      begin, end: int32, steps.
       intervention: float32, scene and goal are set to uniform random numbers below this; 0 in sTDE.
-      shuffled: bool, take the gap of the next running episode of the list at the same time.
       branch: int32, the logits that are removed: a `Branch`.
     """
 
     params: jax.Array
     epsilon: jax.Array
     hard: jax.Array
-    residual: jax.Array
+    form: jax.Array
     layout: jax.Array
     greedy: jax.Array
     uniform: jax.Array
+    source: jax.Array
     gap: jax.Array
+    begin: jax.Array
+    end: jax.Array
     intervention: jax.Array
-    shuffled: jax.Array
     branch: jax.Array
 
 
+def gap_used(cell: Inference, gap: jax.Array, running: jax.Array, keys: jax.Array, time: jax.Array) -> jax.Array:
+    """Return the layout gaps that a cell removes experience by.
+
+    Args:
+      cell: how to infer.
+      gap: float32 [E], of the episodes' beliefs.
+      running: bool [E], episodes that have not ended.
+      keys: [E], of the episodes; folded further.
+      time: int32 [E], steps taken.
+
+    Returns:
+      float32 [E].
+    """
+    sources = (
+        lambda: gap,
+        lambda: gap[_other_running(running, keys)],
+        lambda: jnp.broadcast_to(jnp.mean(gap, where=running), gap.shape),
+        lambda: jnp.where((time >= cell.begin) & (time < cell.end), cell.gap, 0.0),
+    )
+    return jax.lax.switch(cell.source, sources)
+
+
 def remove(
-    cell: Inference, logits: jax.Array, counterfactual: jax.Array, gap: jax.Array, running: jax.Array
+    cell: Inference, logits: jax.Array, counterfactual: jax.Array, gap: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Remove experience from logits as a cell says.
 
@@ -67,17 +109,14 @@ def remove(
       logits: float32 [E, A], factual.
       counterfactual: float32 [E, A], to remove.
       gap: float32 [E], layout gaps.
-      running: bool [E], episodes that have not ended.
 
     Returns:
       Logits float32 [E, A], and the weight float32 [E] of what was removed.
     """
-    gap = jnp.where(jnp.isnan(cell.gap), gap, cell.gap)
-    gap = jnp.where(cell.shuffled, gap[_next_running(running)], gap)
-    residual, paper = (stde(logits, counterfactual, gap, cell.epsilon, form) for form in ("residual", "paper"))
-    soft = jnp.where(cell.residual, residual, paper)
+    soft = jnp.stack([stde(logits, counterfactual, gap, cell.epsilon, form) for form in FORMS])[cell.form]
+    weight = jnp.stack([removal_weight(gap, cell.epsilon, form) for form in FORMS])[cell.form]
     removed = jnp.where(cell.hard, tde(logits, counterfactual), soft)
-    return removed, jnp.where(cell.hard, 1.0, removal_weight(gap, cell.epsilon))
+    return removed, jnp.where(cell.hard, 1.0, weight)
 
 
 def counterfactual_logits(
@@ -113,18 +152,17 @@ def counterfactual_logits(
     branches = (
         lambda: logits,
         lambda: jnp.zeros_like(logits),
-        lambda: (
-            logits.std(axis=-1, keepdims=True) * draw(keys, 2**30, logits, jax.random.normal)
-        ),  # no time is that late
+        lambda: logits.std(axis=-1, keepdims=True) * draw(keys, _NOISE, logits, jax.random.normal),
     )
     return jax.lax.switch(cell.branch, branches)
 
 
-def _next_running(running: jax.Array) -> jax.Array:
-    """Return for each running episode the next one, int [E].
+def _other_running(running: jax.Array, keys: jax.Array) -> jax.Array:
+    """Return for each running episode another one, int [E].
 
-    Cyclically; of no meaning for episodes that have ended.
+    It is the next one, cyclically, in an order drawn from the keys; of no meaning for episodes that have ended.
     """
-    order = jnp.argsort(~running)  # stable: those that run first
-    place = jnp.cumsum(running) - 1
+    rank = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, _ORDER)))(keys)
+    order = jnp.argsort(jnp.where(running, rank, 1.0))  # those that run first
+    place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order)))
     return order[(place + 1) % jnp.maximum(running.sum(), 1)]

@@ -25,6 +25,19 @@ def notes(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, ro
     return found + _no_better(rows, success, episodes)
 
 
+def spent(budget: Mapping[str, int]) -> str:
+    """Say what environment steps stand behind a policy.
+
+    Args:
+      budget: steps of `exploration`, `pretraining` and `learning`.
+    """
+    exploration, pretraining, learning = (f"{budget[name]:,}" for name in ("exploration", "pretraining", "learning"))
+    return (
+        f"Environment steps behind each policy: {exploration} of exploration for the layout priors, {pretraining} of "
+        f"pre-training, {learning} of learning."
+    )
+
+
 def trained_out(log: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say how far val success still rose at the end of training.
 

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxnav.causal import Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import paired_difference, scene_clusters, summary
@@ -23,7 +24,6 @@ FORMAT = 1
 Metric = Literal["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
-Form = Literal["residual", "paper"]
 
 #: What every row has; in percent but for `dts`, which is in metres. `sr@N`, success within N actions, comes besides.
 _METRICS: tuple[Metric, ...] = typing.get_args(Metric)

@@ -98,4 +98,5 @@ def label(row: dict[str, Any]) -> str:
             label = "+ w + TDE"
         case _:
             label = f"+ w + sTDE (eps={row['epsilon']:g})"
-    return label + (", paper form" if row["variant"] == "stde" and row["form"] == "paper" else "")
+    forms = {"paper": ", paper form", "switch": ", switch"}
+    return label + (forms.get(row["form"], "") if row["variant"] == "stde" else "")

@@ -7,9 +7,10 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxnav.causal import FORMS, Form
 from jaxnav.errors import InputError
-from jaxnav.evaluation.inference import Branch, Inference
-from jaxnav.evaluation.report import Decoding, Form, Variant
+from jaxnav.evaluation.inference import Branch, Inference, Source
+from jaxnav.evaluation.report import Decoding, Variant
 
 
 class Row(NamedTuple):
@@ -87,12 +88,14 @@ def _cell(row: Row, arms: Sequence[str], seed: int, num_seeds: int) -> Inference
         params=jnp.int32(seed + num_seeds * place),
         epsilon=jnp.float32(float("inf") if row.epsilon is None else row.epsilon),
         hard=jnp.bool_(row.variant == "tde"),
-        residual=jnp.bool_(row.form == "residual"),
+        form=jnp.int32(FORMS.index(row.form or "paper")),
         layout=jnp.bool_(row.arm == "layout"),
         greedy=jnp.bool_(row.decoding == "argmax"),
         uniform=jnp.bool_(row.variant == "random"),
-        gap=jnp.float32(float("nan")),
+        source=jnp.int32(Source.OWN),
+        gap=jnp.float32(0.0),
+        begin=jnp.int32(0),
+        end=jnp.int32(0),
         intervention=jnp.float32(0.0),
-        shuffled=jnp.bool_(False),
         branch=jnp.int32(Branch.COUNTERFACTUAL),
     )

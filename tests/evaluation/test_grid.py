@@ -13,7 +13,7 @@ from support import tiny_world as tiny
 from jaxnav.causal import stde
 from jaxnav.evaluation.episodes import episode_list, together
 from jaxnav.evaluation.grid import Evaluator, act, first_states
-from jaxnav.evaluation.inference import Branch
+from jaxnav.evaluation.inference import Branch, Source
 from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
@@ -41,8 +41,9 @@ def control(epsilon, form, decoding, **changes):
 
 #: Controls whose gaps or logits are of other episodes or drawn by key.
 CONTROLS = [
-    control(0.0, "paper", "argmax", shuffled=True),
-    control(0.2, "residual", "sample", shuffled=True),
+    control(0.0, "paper", "argmax", source=Source.OTHER),
+    control(0.2, "residual", "sample", source=Source.MEAN),
+    control(0.2, "residual", "sample", source=Source.GIVEN, gap=1.0, begin=2, end=5),
     control(0.0, "paper", "argmax", branch=Branch.NOISE),
     control(0.0, "paper", "sample", intervention=1.0),
 ]

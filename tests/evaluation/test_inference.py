@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import kstest
 from support import tiny_world as tiny
 
-from jaxnav.causal import do
+from jaxnav.causal import Form, do
 from jaxnav.evaluation.episodes import episode_list
 from jaxnav.evaluation.grid import act, first_states
-from jaxnav.evaluation.inference import Branch, counterfactual_logits
-from jaxnav.evaluation.report import Decoding, Form, Variant
+from jaxnav.evaluation.inference import Branch, Source, counterfactual_logits, gap_used
+from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Knowledge
@@ -39,7 +39,8 @@ def cell(
 LAYOUT = cell("layout")
 CONTROLS: dict[str, dict[str, Any]] = {
     "none": {},
-    "shuffled": {"shuffled": True},
+    "other": {"source": Source.OTHER},
+    "course": {"source": Source.MEAN},
     "zeros": {"branch": Branch.ZEROS},
     "noise": {"branch": Branch.NOISE},
     "random": {"intervention": 1.0},
@@ -159,7 +160,7 @@ def test_noise_is_the_same_throughout_an_episode_and_an_intervention_drawn_at_ev
 @pytest.mark.parametrize("weight", [0.3, 2.0])
 def test_zeros_leave_the_best_action_as_it_is(agent, form, weight):
     plain, _ = step(agent, variant="layout")
-    constant = {"form": form, "epsilon": 0.0, "gap": weight}
+    constant = {"form": form, "epsilon": 0.0, "gap": weight, "source": Source.GIVEN, "end": 9}
     zeros, weights = step(agent, **constant, **CONTROLS["zeros"])
     np.testing.assert_array_equal(weights, np.float32(weight))
     np.testing.assert_array_equal(zeros, plain)
@@ -171,7 +172,7 @@ def test_zeros_leave_the_best_action_as_it_is(agent, form, weight):
 def test_zeros_are_no_control_of_the_papers_form(agent):
     """a - s 0 = a whatever the weight, sampled actions too; in the residual form the policy is sharper: (1 + s) a."""
     plain, _ = step(agent, variant="layout", decoding="sample")
-    constant = {"decoding": "sample", "gap": 2.0, **CONTROLS["zeros"]}
+    constant = {"decoding": "sample", "gap": 2.0, "source": Source.GIVEN, "end": 9, **CONTROLS["zeros"]}
     np.testing.assert_array_equal(step(agent, form="paper", **constant)[0], plain)
     assert (step(agent, form="residual", **constant)[0] != plain).any()
 
@@ -187,21 +188,68 @@ def test_at_epsilon_one_every_control_is_plus_w(agent, control, form, decoding):
 
 
 def test_a_constant_weight_of_one_in_the_papers_form_is_hard_tde(agent):
-    found, weight = step(agent, gap=1.0, epsilon=0.0)
+    found, weight = step(agent, gap=1.0, source=Source.GIVEN, end=9, epsilon=0.0)
     np.testing.assert_array_equal(found, step(agent, variant="tde")[0])
     np.testing.assert_array_equal(weight, np.ones(EPISODES))
 
 
-# The weight of another episode
+# Where the gap comes from
+
+GAP = jnp.arange(EPISODES) / 100  # names the episode
 
 
-@pytest.mark.parametrize("running", [EVERY, np.arange(EPISODES) % 7 != 3, np.arange(EPISODES) == 5])
-def test_a_shuffled_weight_is_that_of_the_next_running_episode(agent, running):
-    gap = jnp.arange(EPISODES) / 100  # names the episode
-    named = with_gap(agent, gap)
-    _, weight = step(named, running, shuffled=True)
-    # The last one's next is the first; one that runs alone keeps its own.
-    np.testing.assert_array_equal(weight[running], np.roll(gap[running], -1))
+def used(running=EVERY, keys=EPISODE_KEYS, time=0, **changes):
+    """The gaps of running episodes that a cell uses, with the numbers of these episodes."""
+    gap = gap_used(cell(**changes), GAP, jnp.asarray(running), keys, jnp.full(EPISODES, time))
+    return np.asarray(gap)[np.asarray(running)], np.flatnonzero(running)
+
+
+def numbers(gap):
+    return np.rint(100 * gap).astype(int)
+
+
+@pytest.mark.parametrize("running", [EVERY, np.arange(EPISODES) % 7 != 3])
+def test_the_gap_of_another_episode_is_that_of_each_once(running):
+    gap, own = used(running, source=Source.OTHER)
+    other = numbers(gap)
+    assert sorted(other) == own.tolist()  # a permutation of those that run
+    assert (other != own).all()
+    # One cycle through all of them.
+    step = dict(zip(own, other, strict=True))
+    place, visited = own[0], set()
+    while place not in visited:
+        visited.add(place)
+        place = step[place]
+    assert len(visited) == len(own)
+
+
+def test_who_is_whose_other_is_drawn_and_stays():
+    """The order owes nothing to the list: neighbours in a list may be of one scene or of one shift."""
+    other = numbers(used(source=Source.OTHER)[0])
+    assert abs(np.corrcoef(other, np.arange(EPISODES))[0, 1]) < 0.4  # 48 at random: standard deviation 0.15
+    np.testing.assert_array_equal(numbers(used(source=Source.OTHER, time=9)[0]), other)
+    assert (numbers(used(source=Source.OTHER, keys=STEP_KEYS)[0]) != other).any()
+    # Where an episode ends, only the one that had its gap takes another.
+    ended = np.arange(EPISODES) != 7
+    left, own = used(ended, source=Source.OTHER)
+    assert (numbers(left) != other[own]).sum() == 1
+
+
+def test_one_that_runs_alone_keeps_its_gap():
+    gap, own = used(np.arange(EPISODES) == 5, source=Source.OTHER)
+    assert numbers(gap) == own == [5]
+
+
+def test_the_gap_of_equal_course_is_the_mean_of_those_that_run():
+    # Of 0, 0.01 ... 0.47 the first ten: 0.045.
+    gap, _ = used(np.arange(EPISODES) < 10, source=Source.MEAN)
+    np.testing.assert_allclose(gap, 0.045, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("time", "expected"), [(1, 0.0), (2, 0.7), (4, 0.7), (5, 0.0)])
+def test_a_given_gap_lasts_from_one_step_to_before_another(time, expected):
+    gap, _ = used(time=time, source=Source.GIVEN, gap=0.7, begin=2, end=5)
+    np.testing.assert_array_equal(gap, np.float32(expected))
 
 
 def with_gap(agent, gap):
@@ -209,10 +257,10 @@ def with_gap(agent, gap):
     return agent._replace(perceived=agent.perceived._replace(layout=layout))
 
 
-def test_shuffling_unequal_ones_changes_actions(agent):
+def test_the_gap_of_another_episode_changes_actions(agent):
     apart = with_gap(agent, (jnp.arange(EPISODES) % 2).astype(jnp.float32))
-    plain, shuffled = (step(apart, shuffled=shuffled)[0] for shuffled in (False, True))
-    assert (plain != shuffled).any()
+    plain, other = (step(apart, source=source)[0] for source in (Source.OWN, Source.OTHER))
+    assert (plain != other).any()
 
 
 def test_actions_are_of_the_task(agent):
