@@ -11,7 +11,7 @@ from jaxnav.env.types import Observation
 from jaxnav.numerics.product import Linear, product
 from jaxnav.numerics.recurrence import gru
 from jaxnav.policies.category_maps import CategoryMaps
-from jaxnav.policies.features import CONFIDENCE, NUM_FEATURES, Features, features
+from jaxnav.policies.features import CONFIDENCE, Features, features
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways, zero_experience
 from jaxnav.policies.spatial_memory import SpatialMemory
@@ -35,12 +35,12 @@ class Policy(Stream):
         method, sizes = find_method(spec.method), spec.sizes
         self.row_format = RowFormat(spec.num_categories)
         self.perceive, self.adaptation = method.perceive, method.adaptation
-        self.direct = spec.direct
+        self.direct, self.goal_row = spec.direct, spec.goal_row
         seen = dataclasses.replace(spec, num_categories=self._num_perceived())
         self.appearance = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
         known = 0 if spec.spatial_memory is None else spec.spatial_memory.num_inputs
         self.view = Linear(2 * self.row_format.view**2 + known, self.num_views * sizes.view_outputs, rngs=rngs)
-        self.detections = CategoryMaps(sizes.appearance + NUM_FEATURES, seen, rngs)
+        self.detections = CategoryMaps.of_detections(seen, rngs)
         self.sought = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
         self.method = method.experience(seen, rngs)
         self.recurrent = self.method.recurrent or method.adaptation is not None
@@ -92,7 +92,7 @@ class Policy(Stream):
         return Pathways(
             scene=nnx.relu(self.view(scene)),
             goal=self._embed_goal(seen, appearance),
-            experience=self.method.encode(seen, appearance, jax.lax.stop_gradient(weights), reading),
+            experience=self.method.encode(seen, self.experience_appearance, jax.lax.stop_gradient(weights), reading),
             gate=DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence),
         )
 
@@ -132,9 +132,14 @@ class Policy(Stream):
         memory = Memory(hidden=jnp.zeros((*batch, self.hidden)), action=jnp.full(batch, NO_ACTION, jnp.int32))
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
 
+    @property
+    def experience_appearance(self) -> jax.Array:
+        """Return the embeddings of categories that experience gets."""
+        return self.appearance.embedding[...]
+
     def _widths(self, sizes: Sizes) -> tuple[int, ...]:
         """Return the widths of scene, goal, experience and previous action."""
-        goal = self.detections.width + sizes.appearance
+        goal = self.detections.width + sizes.row_outputs * self.goal_row + sizes.appearance
         return sizes.view_outputs, goal, self.method.width, NUM_ACTIONS
 
     def _num_perceived(self) -> int:
@@ -147,10 +152,14 @@ class Policy(Stream):
         return jax.eval_shape(self.perceive, everything).visible.shape[-1]
 
     def _embed_goal(self, seen: Features, appearance: jax.Array) -> jax.Array:
-        """Embed detections and what is sought, without experience."""
-        shown = self.detections.project_appearance(appearance)
-        shown = seen.visible[..., None] * jnp.broadcast_to(shown, (*seen.visible.shape, shown.shape[-1]))
-        rows = shown + self.detections.project_rows(seen.table)
+        """Embed detections and what is sought, without experience.
+
+        With `goal_row` the goal's detection enters in the row of its category and once more in a row of its own: when
+        to say Done is then learned for all goals at once.
+        """
+        rows = self.detections.project_detections(seen, appearance)
         if self.direct != "all":
             rows = rows * (seen.goal if self.direct == "goal" else jnp.zeros_like(seen.goal))[..., None]
-        return jnp.concatenate([self.detections.finish(rows), seen.goal @ self.sought.embedding[...]], axis=-1)
+        goal_row = (rows * seen.goal[..., None]).sum(axis=-2, keepdims=True)
+        detections = [self.detections.finish(each) for each in ((rows, goal_row) if self.goal_row else (rows,))]
+        return jnp.concatenate([*detections, seen.goal @ self.sought.embedding[...]], axis=-1)

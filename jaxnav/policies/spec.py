@@ -44,6 +44,7 @@ class PolicySpec:
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
       decision: how pathways become logits.
+      goal_row: whether the direct pathway holds the goal's detection once more, in a row of its own; not in the paper.
     """
 
     method: str = "org"
@@ -54,6 +55,7 @@ class PolicySpec:
     done_gate: bool = False
     spatial_memory: SpatialMemory | None = None
     decision: Deciding = "fused"
+    goal_row: bool = True
 
     def __post_init__(self) -> None:
         if self.decision not in get_args(Deciding):

@@ -1,7 +1,5 @@
 """A stream: what enters a recurrent core, and the heads on it."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +17,9 @@ SELDOM = -2.5
 class Stream(nnx.Module):
     """Make logits and a value by a recurrent core."""
 
-    def __init__(self, widths: tuple[int, ...], num_choices: int, spec: PolicySpec, rngs: nnx.Rngs) -> None:
+    def __init__(
+        self, widths: tuple[int, ...], num_choices: int, spec: PolicySpec, rngs: nnx.Rngs, done: float = SELDOM
+    ) -> None:
         """Prepare.
 
         Args:
@@ -27,14 +27,19 @@ class Stream(nnx.Module):
           num_choices: A.
           spec: of the policy.
           rngs: of the parameters.
+          done: first logit of Done, where actions are chosen.
         """
         self.widths, self.hidden, self.done_gate = widths, spec.sizes.hidden, spec.done_gate
         self.fuse = Linear(sum(widths), self.hidden, rngs=rngs)
         self.core = nnx.GRUCell(self.hidden, self.hidden, rngs=rngs)
         # Small first logits: the first policy is close to uniform but for Done.
         small = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        bias = _seldom_done if num_choices == NUM_ACTIONS else nnx.initializers.zeros
-        self.actor = Linear(self.hidden, num_choices, kernel_init=small, bias_init=bias, rngs=rngs)
+        first = np.zeros(num_choices, np.float32)
+        if num_choices == NUM_ACTIONS:
+            first[DONE] = done
+        self.actor = Linear(
+            self.hidden, num_choices, kernel_init=small, bias_init=lambda *_: jnp.asarray(first), rngs=rngs
+        )
         self.critic = Linear(self.hidden, 1, rngs=rngs)
 
     def mediated_input(self, pathways: Pathways, action: jax.Array) -> jax.Array:
@@ -69,8 +74,3 @@ class Stream(nnx.Module):
     def fuse_kernels(self) -> list[jax.Array]:
         """Return the kernels of all that enters."""
         return jnp.split(self.fuse.kernel[...], np.cumsum(self.widths)[:-1])
-
-
-def _seldom_done(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
-    del key
-    return jnp.zeros(shape, dtype).at[DONE].set(SELDOM)

@@ -19,7 +19,8 @@ class Streams(Policy):
     """Decide by the sum of two streams.
 
     The direct stream gets scene and goal, the stream of experience all that is in `Pathways.experience`, a view of its
-    own included. Scene and experience end with a 1, a factor on the stream: 0 removes it.
+    own included. Scene and experience end with a 1, a factor on the stream: 0 removes it. The direct stream learns
+    where it acts alone, the stream of experience what to add to it.
     """
 
     num_views = 2
@@ -27,7 +28,8 @@ class Streams(Policy):
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)
         widths = self.method.width + spec.sizes.view_outputs + 1, NUM_ACTIONS
-        self.experience_stream = Stream(widths, self.actor.out_features, spec, rngs)
+        self.experience_stream = Stream(widths, self.actor.out_features, spec, rngs, done=0.0)
+        self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
 
     def encode(
         self,
@@ -74,6 +76,7 @@ class Streams(Policy):
         halves = jnp.split(hidden, 2, axis=-1)
         direct, experience = super().act(halves[0], pathways), self.experience_stream.act(halves[1], pathways)
         seen, known = pathways.scene[..., -1:], pathways.experience[..., -1:]
+        direct = _fixed(direct, known != 0)
         # Rounded, so that the sum is exact and removing one stream (eq. 1) leaves the other to the bit.
         logits = rounded(seen * direct.logits) + rounded(known * experience.logits)
         return Decision(logits, seen[..., 0] * direct.value + known[..., 0] * experience.value, hidden)
@@ -82,6 +85,11 @@ class Streams(Policy):
         """Return the memory at the start of an episode."""
         hidden, experienced = jnp.zeros((*batch, 2 * self.hidden)), jnp.ones(batch)
         return super().initial_memory(batch)._replace(hidden=hidden, experienced=experienced)
+
+    @property
+    def experience_appearance(self) -> jax.Array:
+        """Return the embeddings of categories that experience gets."""
+        return self.known_appearance.embedding[...]
 
     @property
     def recurrent_kernel(self) -> jax.Array:
@@ -94,6 +102,15 @@ class Streams(Policy):
         """Return the widths of what enters the direct stream."""
         scene, goal, _, action = super()._widths(sizes)
         return scene + 1, goal, 0, action
+
+
+def _fixed(decision: Decision, where: jax.Array) -> Decision:
+    """Let no gradient reach logits and value somewhere, bool [..., 1]."""
+    fixed = jax.lax.stop_gradient(decision)
+    return decision._replace(
+        logits=jnp.where(where, fixed.logits, decision.logits),
+        value=jnp.where(where[..., 0], fixed.value, decision.value),
+    )
 
 
 def _present(pathway: jax.Array) -> jax.Array:

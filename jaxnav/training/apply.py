@@ -20,6 +20,17 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     return optax.apply_if_finite(chain, max_consecutive_errors=2**30)
 
 
+def renewed(config: PPOConfig, optimizer: Any, weights: Params, when: jax.Array) -> Any:
+    """Start an optimizer anew where a stage begins, bool [].
+
+    Adam takes too large steps for parameters that begin to learn late: it believes their moments to be as old as the
+    others'. What it counts of skipped steps goes on.
+    """
+    fresh: Any = make_optimizer(config).init(weights)
+    inner = jax.tree.map(lambda new, old: jnp.where(when, new, old), fresh.inner_state, optimizer.inner_state)
+    return optimizer._replace(inner_state=inner)
+
+
 def apply_gradient(
     config: PPOConfig,
     weights: Params,

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxnav.policies.methods import Stage
+
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
@@ -17,7 +19,7 @@ class PPOConfig:
       rollout: steps of every episode between two updates; at most the shortest step limit.
       epochs: passes over a rollout.
       minibatches: parts of a pass, split over episodes.
-      learning_rate: of Adam at the start; falls linearly to 0.
+      learning_rate: of Adam at the start; falls linearly to 0, in each stage of training anew.
       gamma: discount.
       gae_lambda: of generalised advantage estimation.
       clip: of the probability ratio.
@@ -26,7 +28,9 @@ class PPOConfig:
       value: weight of the value loss.
       max_grad_norm: global norm to which gradients are clipped.
       distil: weight of the counterfactual branch's loss where it is distilled.
-      experience: probability that an episode of training has the stream of experience, where there are streams.
+      alone: share of the updates, the first after any pre-training, in which the direct stream acts and learns alone,
+        where there are streams.
+      experience: probability that an episode after that has the stream of experience.
     """
 
     num_envs: int = 256
@@ -42,6 +46,7 @@ class PPOConfig:
     value: float = 0.5
     max_grad_norm: float = 0.5
     distil: float = 0.5
+    alone: float = 0.5
     experience: float = 0.8
 
     def num_updates(self, total_steps: int) -> int:
@@ -51,17 +56,17 @@ class PPOConfig:
         """
         return -(-total_steps // (self.num_envs * self.rollout))
 
-    def scalars(self, num_updates: int) -> "PPOScalars":
-        """Return the traced part, for so many updates in all."""
-        names = [name for name in PPOScalars.__dataclass_fields__ if name != "num_updates"]
+    def scalars(self, num_updates: int, begin: int = 0) -> "PPOScalars":
+        """Return the traced part, for a stage of so many updates."""
+        names = PPOScalars.__dataclass_fields__.keys() - {"begin", "num_updates"}
         settings = {name: jnp.float32(getattr(self, name)) for name in names}
-        return PPOScalars(**settings, num_updates=jnp.float32(num_updates))
+        return PPOScalars(**settings, begin=jnp.float32(begin), num_updates=jnp.float32(num_updates))
 
 
 class PPOScalars(struct.PyTreeNode):
     """Hold the settings that may change without compiling anew.
 
-    float32 [] each, see `PPOConfig`.
+    float32 [] each, see `PPOConfig`; `begin` are the updates before the stage, `num_updates` those in it.
     """
 
     learning_rate: jax.Array
@@ -73,9 +78,25 @@ class PPOScalars(struct.PyTreeNode):
     value: jax.Array
     distil: jax.Array
     experience: jax.Array
+    begin: jax.Array
     num_updates: jax.Array
 
 
 #: How the branch that a counterfactual decision uses is trained: not at all (the paper's text), by zeroing both direct
 #: pathways with a fair coin (the released code), or by matching the factual policy beside the rollout.
 Counterfactual = Literal["none", "coin", "distil"]
+
+
+def stage_at(stages: tuple[Stage, ...], share: float) -> int:
+    """Return the stage after a share of all updates.
+
+    Args:
+      stages: of a method, in order.
+      share: of the updates that are done, in [0, 1).
+    """
+    end = 0.0
+    for number, stage in enumerate(stages):
+        end += stage.share
+        if share < end - 1e-9:
+            return number
+    return len(stages) - 1

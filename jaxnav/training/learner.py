@@ -13,7 +13,7 @@ from jaxnav.env.types import EnvParams
 from jaxnav.policies.acting import Acting, Agent
 from jaxnav.policies.methods import Knowledge, Method, Stage
 from jaxnav.policies.policy import Params, init_params
-from jaxnav.training.apply import apply_gradient, make_optimizer
+from jaxnav.training.apply import apply_gradient, make_optimizer, renewed
 from jaxnav.training.collect import Rollout, Transition, collect, draw_coins
 from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
 from jaxnav.training.loss import advantages, ppo_loss, replay
@@ -68,13 +68,13 @@ class Learner:
       acting: how the episodes are acted.
       config: of PPO; its scalars are traced where updates are done, so only the sizes matter there.
       counterfactual: how the counterfactual branch is trained.
-      stage: number of the method's stage of training.
+      stage: of training.
     """
 
     acting: Acting
     config: PPOConfig
     counterfactual: Counterfactual
-    stage: int = 0
+    stage: Stage = Stage()
 
     def init(self, key: jax.Array, params: EnvParams, knowledge: Knowledge) -> LearnerState:
         """Start a seed; the key is consumed."""
@@ -111,6 +111,8 @@ class Learner:
         def step(state: LearnerState, _: None) -> tuple[LearnerState, Metrics]:
             return self.update(state, scalars, params, knowledge)
 
+        begins = state.update.astype(jnp.float32) == scalars.begin
+        state = state.replace(optimizer=renewed(self.config, state.optimizer, state.params, begins))
         state, metrics = jax.lax.scan(step, state, None, length=num_updates)
         sums = {name: value.sum() for name, value in metrics.items()}
         episodes = sums.pop("episodes")
@@ -126,7 +128,8 @@ class Learner:
         key = jax.random.fold_in(state.key, state.update)
         rollout_key, shuffle_key = (jax.random.fold_in(key, purpose) for purpose in (_ROLLOUT, _SHUFFLE))
         policy, coin = self.acting.bind(state.params), self.counterfactual == "coin"
-        arguments = state.agent, rollout_key, self.config.rollout, coin, params, knowledge, scalars.experience
+        share = 0.0 if self.stage.alone else scalars.experience
+        arguments = state.agent, rollout_key, self.config.rollout, coin, params, knowledge, share
         agent, rollout = collect(self.acting, policy, *arguments)
         (weights, optimizer), metrics = self._learn(state, rollout, shuffle_key, scalars, params)
         metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(rollout.transitions, params)
@@ -141,7 +144,7 @@ class Learner:
         transitions, config = rollout.transitions, self.config
         returns = transitions.reward, transitions.value, rollout.next_value, transitions.ended
         advantage = advantages(*returns, scalars.gamma, scalars.gae_lambda)
-        done = state.update.astype(jnp.float32) / scalars.num_updates
+        done = (state.update.astype(jnp.float32) - scalars.begin) / scalars.num_updates
         rate = scalars.learning_rate * (1.0 - done)
         scalars = scalars.replace(entropy=scalars.entropy + done * (scalars.final_entropy - scalars.entropy))
 
@@ -151,7 +154,7 @@ class Learner:
 
         def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], Metrics]:
             gradient, parts = differentiate(carry[0], part, params, scalars)
-            carry = apply_gradient(config, *carry, gradient, rate, self._stage.trainable)
+            carry = apply_gradient(config, *carry, gradient, rate, self.stage.trainable)
             return carry, parts | {"gradient_norm": optax.tree.norm(gradient)}
 
         def epoch(carry: tuple[Params, Any], key: jax.Array) -> tuple[tuple[Params, Any], Metrics]:
@@ -167,22 +170,19 @@ class Learner:
         """Return the loss of a minibatch (transitions, memory, advantage)."""
         transitions, memory, advantage = part
         replayed = replay(self.acting.bind(weights), transitions, memory, params)
-        loss = self._stage.loss or ppo_loss
+        loss = self.stage.loss or ppo_loss
         return loss(replayed, advantage, scalars, self.counterfactual == "distil", self._method)
 
     def _start(self, weights: Params, key: jax.Array, params: EnvParams, knowledge: Knowledge) -> Agent:
+        share = 0.0 if self.stage.alone else self.config.experience
         memory = self.acting.bind(weights).initial_memory((self.config.num_envs,))
-        memory = draw_coins(memory, True, jax.random.fold_in(key, _EXPERIENCE), self.config.experience)
+        memory = draw_coins(memory, True, jax.random.fold_in(key, _EXPERIENCE), share)
         return self.acting.start(key, self.config.num_envs, memory, knowledge, params)
 
     @property
     def _method(self) -> Method:
         assert self.acting.method is not None
         return self.acting.method
-
-    @property
-    def _stage(self) -> Stage:
-        return self._method.stages[self.stage]
 
 
 def block_order(key: jax.Array, episodes: int, minibatches: int) -> jax.Array:

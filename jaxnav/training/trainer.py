@@ -40,7 +40,7 @@ class Trainer:
     def __init__(
         self,
         learners: Mapping[str, Learner],
-        scalars: PPOScalars,
+        stages: Sequence[tuple[Stage, PPOScalars]],
         knowledge: Knowledge,
         key: jax.Array,
         seeds: int,
@@ -50,18 +50,19 @@ class Trainer:
 
         Args:
           learners: of each arm, a name in `ARM_KEYS`.
-          scalars: the traced settings of PPO.
+          stages: of training, with the traced settings of PPO in each.
           knowledge: what was learned before training.
           key: typed PRNG key [] of all arms and seeds.
           seeds: S, of each arm.
           chunk: updates of one call of `train`.
         """
         self.learners = dict(learners)
-        self._scalars, self._knowledge, self._key = scalars, knowledge, key
+        self._scalars, self._knowledge, self._key = tuple(scalars for _, scalars in stages), knowledge, key
+        self._stages = [stage for stage, _ in stages]
         self._seeds, self._chunk = seeds, chunk
         self._compiled: dict[tuple[str, int], Any] = {}
-        self._starts = {name: jax.jit(learner.init) for name, learner in self.learners.items()}
-        self._restarts = {name: jax.jit(learner.restart, donate_argnums=0) for name, learner in self.learners.items()}
+        self._starts = {name: jax.jit(self._learner(name, 0).init) for name in self.learners}
+        self._restarts: dict[tuple[str, int], Any] = {}
         self._keeps = {name: jax.jit(learner.keep, donate_argnums=0) for name, learner in self.learners.items()}
 
     def abstract(self, params: EnvParams) -> Seeds:
@@ -85,10 +86,10 @@ class Trainer:
             states[name] = [start(key, params, self._knowledge) for key in keys]
         return states
 
-    def restart(self, states: States, params: EnvParams) -> States:
+    def restart(self, states: States, params: EnvParams, stage: int = 0) -> States:
         """Give every seed new episodes; donates the states."""
         return {
-            name: [self._restarts[name](state, params, self._knowledge) for state in seeds]
+            name: [self._restart(name, stage)(state, params, self._knowledge) for state in seeds]
             for name, seeds in states.items()
         }
 
@@ -107,7 +108,7 @@ class Trainer:
         Args:
           states: of every seed.
           params: the environment's.
-          stage: number of the methods' stage, see `stage_at`.
+          stage: number of the stage, see `training.config.stage_at`.
 
         Returns:
           The states after the chunk, and its metrics.
@@ -127,18 +128,33 @@ class Trainer:
     def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
         """Compile the chunk of an arm, unless it is."""
         if (name, stage) not in self._compiled:
-            learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
+            learner, num_updates = self._learner(name, stage), self._chunk
 
             def train(state: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
                 return learner.train(state, scalars, params, knowledge, num_updates)
 
-            lowered = jax.jit(train, donate_argnums=0).lower(states[0], self._scalars, params, self._knowledge)
+            given = states[0], self._scalars[stage], params, self._knowledge
+            lowered = jax.jit(train, donate_argnums=0).lower(*given)
             self._compiled[name, stage] = lowered.compile()
         return self._compiled[name, stage]
 
     def _call(self, task: tuple[str, int], stage: int, states: States, params: EnvParams) -> Any:
         (name, seed), call = task, self._compiled[task[0], stage]
-        return jax.block_until_ready(call(states[name][seed], self._scalars, params, self._knowledge))
+        given = states[name][seed], self._scalars[stage], params, self._knowledge
+        return jax.block_until_ready(call(*given))
+
+    def _learner(self, name: str, stage: int) -> Learner:
+        """Return the learner of an arm in a stage."""
+        return dataclasses.replace(self.learners[name], stage=self._stages[stage])
+
+    def _restart(self, name: str, stage: int) -> Any:
+        """Return what gives an arm new episodes in a stage."""
+        if (name, stage) not in self._restarts:
+            self._restarts[name, stage] = self._restarter(self._learner(name, stage))
+        return self._restarts[name, stage]
+
+    def _restarter(self, learner: Learner) -> Any:
+        return jax.jit(learner.restart, donate_argnums=0)
 
 
 class ShardedTrainer(Trainer):
@@ -161,9 +177,7 @@ class ShardedTrainer(Trainer):
             out_shardings=[self._place] * self._seeds,
         )
         for name, learner in self.learners.items():
-            restart = jax.vmap(learner.restart, in_axes=(0, None, None))
-            self._starts[name] = jax.jit(learner.init, out_shardings=self._place)
-            self._restarts[name] = jax.jit(restart, out_shardings=self._stacked, donate_argnums=0)
+            self._starts[name] = jax.jit(self._learner(name, 0).init, out_shardings=self._place)
             self._keeps[name] = jax.jit(jax.vmap(learner.keep), out_shardings=self._stacked, donate_argnums=0)
 
     def abstract(self, params: EnvParams) -> Seeds:
@@ -184,10 +198,10 @@ class ShardedTrainer(Trainer):
         """Start every seed."""
         return self.pack(super().init(self._everywhere(params)))
 
-    def restart(self, states: States, params: EnvParams) -> States:
+    def restart(self, states: States, params: EnvParams, stage: int = 0) -> States:
         """Give every seed new episodes; donates the states."""
         params = self._everywhere(params)
-        return {name: self._restarts[name](state, params, self._knowledge) for name, state in states.items()}
+        return {name: self._restart(name, stage)(state, params, self._knowledge) for name, state in states.items()}
 
     def keep(self, states: States, scores: Mapping[str, Sequence[float]]) -> States:
         """Keep policies; see `Trainer.keep`."""
@@ -200,10 +214,14 @@ class ShardedTrainer(Trainer):
         metrics: Metrics = {}
         for name in self.learners:
             train = self._compile(name, stage, states[name], params)
-            after[name], values = train(states[name], self._scalars, params, self._knowledge)
+            after[name], values = train(states[name], self._scalars[stage], params, self._knowledge)
             rows = jax.device_get(values)
             metrics[name] = [{key: float(value[seed]) for key, value in rows.items()} for seed in range(self._seeds)]
         return after, metrics
+
+    def _restarter(self, learner: Learner) -> Any:
+        restart = jax.vmap(learner.restart, in_axes=(0, None, None))
+        return jax.jit(restart, out_shardings=self._stacked, donate_argnums=0)
 
     def _everywhere(self, params: EnvParams) -> EnvParams:
         if params is not self._given:  # copied once for as long as a bank is used
@@ -214,7 +232,7 @@ class ShardedTrainer(Trainer):
         """Compile the chunk of an arm, unless it is."""
         if (name, stage) in self._compiled:
             return self._compiled[name, stage]
-        learner, num_updates = dataclasses.replace(self.learners[name], stage=stage), self._chunk
+        learner, num_updates = self._learner(name, stage), self._chunk
 
         def train(states: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
             def one(state: LearnerState) -> Any:
@@ -227,20 +245,5 @@ class ShardedTrainer(Trainer):
 
         call = jax.jit(train, out_shardings=(self._stacked, replicated(self._mesh)), donate_argnums=0)
         with jax.set_mesh(self._mesh):
-            self._compiled[name, stage] = call.lower(states, self._scalars, params, self._knowledge).compile()
+            self._compiled[name, stage] = call.lower(states, self._scalars[stage], params, self._knowledge).compile()
         return self._compiled[name, stage]
-
-
-def stage_at(stages: tuple[Stage, ...], share: float) -> int:
-    """Return the stage after a share of all updates.
-
-    Args:
-      stages: of a method, in order.
-      share: of the updates that are done, in [0, 1).
-    """
-    end = 0.0
-    for number, stage in enumerate(stages):
-        end += stage.share
-        if share < end - 1e-9:
-            return number
-    return len(stages) - 1

@@ -91,6 +91,23 @@ def test_the_detection_of_the_goal_reaches_it_unless_it_sees_none(direct):
     assert (one.goal != other.goal).any(axis=1).tolist() == [name != "none"] * BATCH
 
 
+def test_the_detection_of_the_goal_enters_in_one_place_whatever_is_sought():
+    """Goals that look alike and are detected alike have equal rows there."""
+    outputs, appearance = SIZES.row_outputs, SIZES.appearance
+    spec = dataclasses.replace(SPEC, goal_row=True)
+    weights = lively(0, spec)
+    weights["appearance"]["embedding"] = jnp.ones_like(weights["appearance"]["embedding"])
+    observation = with_detections(detections(SEEN, UNSEEN))
+    goal = np.asarray(bind(spec, weights).pathways(observation, jnp.ones((BATCH, K))).goal)
+    by_category, own, _ = np.split(goal, [K * outputs, (K + 1) * outputs], axis=1)
+    assert goal.shape[1] == (K + 1) * outputs + appearance
+    assert len(np.unique(by_category, axis=0)) == len(np.unique(GOAL))
+    assert len(np.unique(own, axis=0)) == 1
+    others = with_detections(detections(UNSEEN, SEEN))
+    unseen = np.asarray(bind(spec, weights).pathways(others, jnp.ones((BATCH, K))).goal)[:, K * outputs : -appearance]
+    assert np.all(np.any(unseen != own, axis=1))
+
+
 def test_what_is_sought_is_always_known(direct):
     _, policy = direct
     goal = policy.pathways(with_detections(detections(UNSEEN, UNSEEN))).goal

@@ -44,11 +44,12 @@ class Decisions(NamedTuple):
 @functools.cache
 def compiled(spec):
     """Decisions as a function of parameters, observation, layout weights, surroundings and memory."""
+    reading = tiny.reading(spec.method, BATCH)
 
     @jax.jit
     def decide(weights, observation, layout, surroundings, memory):
         policy = bind(spec, weights)
-        pathways = policy.pathways(observation, layout, None, surroundings, memory)
+        pathways = policy.pathways(observation, layout, reading, surroundings, memory)
         counterfactual = do(pathways, scene=0.0, goal=0.0)
         given = pathways, counterfactual, do(pathways, experience=0.0), do(counterfactual, experience=0.0)
         return Decisions(*(policy.decide(each, memory) for each in given))
@@ -192,7 +193,7 @@ def test_an_episode_begins_with_experience():
 def test_streams_add_a_view_and_a_stream():
     specs = tiny.SPEC, tiny.STREAMS
     fused, both = (jax.eval_shape(functools.partial(init_params, spec), jax.random.key(0)) for spec in specs)
-    assert both.keys() - fused.keys() == {"experience_stream"}
+    assert both.keys() - fused.keys() == {"experience_stream", "known_appearance"}
     assert both["experience_stream"].keys() == {"fuse", "core", "actor", "critic"}
     assert both["view"]["bias"].shape == (2 * tiny.SIZES.view_outputs,)
     for name in ("core", "actor", "critic", "method", "detections", "sought", "appearance"):

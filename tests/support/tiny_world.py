@@ -11,7 +11,7 @@ from jaxnav.env.build import build
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.env.types import Observation
 from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
-from jaxnav.policies.methods import Knowledge
+from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import compile_bank
@@ -20,7 +20,7 @@ from jaxnav.scenes.task import Task
 from support.scenes import CATEGORIES, SMALL, draw
 
 SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
-SPEC = PolicySpec("org", len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),))
+SPEC = PolicySpec("org", len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),), goal_row=False)
 STREAMS = dataclasses.replace(SPEC, decision="streams", direct="goal")
 SETTING = SETTINGS["calibrated"]
 #: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
@@ -46,6 +46,17 @@ def knowledge():
     """Some prior of each room type."""
     counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, *2 * [len(CATEGORIES)]))
     return Knowledge(jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts)))
+
+
+def reading(name, count):
+    """What a method's tracker reads before anything is seen, [count, ...]; None without a tracker."""
+    method = find_method(name)
+    if method.tracker is None:
+        return None
+    learned = {} if method.learn is None else method.learn([BANK], np.ones((NUM_PRIORS, *2 * [len(CATEGORIES)])))
+    known = knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
+    one = method.tracker.read(method.tracker.init(known), known, jnp.int32(0))
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), one)
 
 
 _init = jax.jit(init_params, static_argnums=0)

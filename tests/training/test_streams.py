@@ -13,10 +13,13 @@ from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
 
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import find_method
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
 from jaxnav.training.collect import collect
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.learner import Learner
 from jaxnav.training.loss import ppo_loss, replay
+from jaxnav.training.trainer import Trainer
 
 SHARE, ROLLOUTS = 0.7, 3
 #: In parallel over time, attending with the memory, and adapting.
@@ -96,6 +99,54 @@ def test_its_share_is_as_configured(share):
     np.testing.assert_array_equal(after.memory.experienced[~fresh], first[~fresh])
 
 
+def moved(before, after):
+    """Which parts of the parameters differ."""
+    changed = jax.tree.map(lambda old, new: bool((old != new).any()), before, after)
+    return {name for name, part in changed.items() if any(jax.tree.leaves(part))}
+
+
+@pytest.mark.slow
+def test_the_direct_stream_is_alone_first():
+    """Two updates of it, then two of both; each stage has an optimizer and a course of the rate of its own."""
+    config = RunConfig(decision="streams", arms=("layout",), seeds=1, chunk=2, total_steps=4 * ENVS * LENGTH)
+    config = check(dataclasses.replace(config, ppo=learner_with("org", experience=SHARE).config))
+    assert config.schedule == [0, 1]
+    trainer = Trainer(
+        {"layout": learner_with("org", experience=SHARE)},
+        list(zip(config.stages, config.scalars, strict=True)),
+        KNOWLEDGE,
+        jax.random.key(0),
+        seeds=1,
+        chunk=2,
+    )
+    first = trainer.init(PARAMS)
+    begin = jax.device_get(first["layout"][0])
+    assert not begin.agent.memory.experienced.any()
+    assert not jax.device_get(trainer.restart(first, PARAMS, 0)["layout"][0]).agent.memory.experienced.any()
+    middle = jax.device_get(trainer.train(trainer.init(PARAMS), PARAMS, 0)[0]["layout"][0])
+    direct = {"actor", "critic", "core", "fuse", "detections", "appearance", "sought", "view"}
+    assert moved(begin.params, middle.params) == direct
+
+    states, _ = trainer.train(trainer.init(PARAMS), PARAMS, 0)
+    states = trainer.restart(states, PARAMS, 1)
+    assert states["layout"][0].agent.memory.experienced.mean() == pytest.approx(SHARE, abs=0.25)
+    after = jax.device_get(trainer.train(states, PARAMS, 1)[0]["layout"][0])
+    assert {"experience_stream", "known_appearance", "method"} <= moved(middle.params, after.params)
+    counts = [leaf for leaf in jax.tree.leaves(after.optimizer.inner_state) if leaf.dtype == jnp.int32]
+    assert [int(count) for count in counts] == [2 * learner_with("org").config.minibatches]  # those of its stage alone
+
+
+def test_the_rate_runs_its_course_in_every_stage():
+    """Of ten chunks VTNet's pre-training has two, the direct stream alone four; Adam's first step is the rate."""
+    config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
+    assert config.schedule == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
+    assert [stage.alone for stage in config.stages] == [False, True, False]
+    assert [(float(each.begin), float(each.num_updates)) for each in config.scalars] == [(0, 4), (4, 8), (12, 8)]
+    assert config.budget["pretraining"] == 2 * 2 * 3840
+    fused = dataclasses.replace(config, method="org", decision="fused")
+    assert [(float(each.begin), float(each.num_updates)) for each in fused.scalars] == [(0, 20)]
+
+
 # Replay
 
 
@@ -116,7 +167,8 @@ def test_replay_decides_as_the_rollout_did(method):
 
 
 @pytest.mark.parametrize("method", [HOSTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in HOSTS[1:])])
-def test_episodes_without_experience_teach_the_direct_stream_alone(method):
+def test_each_stream_learns_where_it_acts_last(method):
+    """The direct stream where it is alone, experience where it adds to it."""
     weights, rollouts = rolled(method)
     transitions, memory, _ = rollouts[1]
     advantage = jnp.asarray(np.random.default_rng(0).normal(size=(LENGTH, ENVS)), jnp.float32)
@@ -137,8 +189,9 @@ def test_episodes_without_experience_teach_the_direct_stream_alone(method):
         views = jnp.split(found["view"]["kernel"], 2, axis=-1)
         found |= {"view": views[0], "experience_view": views[1]}
         taught = {name: any(leaf.any() for leaf in jax.tree.leaves(node)) for name, node in found.items()}
-        assert all(taught[name] for name in ("actor", "critic", "core", "fuse", "view", "detections"))
-        assert {taught[name] for name in ("experience_stream", "experience_view", "method")} == {bool(coin)}
+        direct = {"actor", "critic", "core", "fuse", "view", "detections", "appearance", "sought"}
+        assert {taught[name] for name in direct} == {not coin}
+        assert {taught[name] for name in found.keys() - direct} == {bool(coin)}
 
 
 @pytest.mark.slow
