@@ -20,10 +20,9 @@ from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import METHODS, Method, find_method
 from jaxnav.policies.testing import check_method
 from jaxnav.training.collect import collect
-from jaxnav.training.config import PPOConfig
+from jaxnav.training.config import PPOConfig, stage_at
 from jaxnav.training.learner import Learner
 from jaxnav.training.loss import ppo_loss, replay
-from jaxnav.training.trainer import stage_at
 
 SPECS = {
     name: dataclasses.replace(tiny.SPEC, method=f"support.methods:{name}", method_sizes=())
@@ -79,7 +78,7 @@ def test_methods_that_break_the_contract_are_flagged(name):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nothing", "method 'nothing': is unknown; choose one of anonymous, org, rgb"),
+        ("nothing", "method 'nothing': is unknown; choose one of anonymous, eotp, hoz, org, rgb, sp"),
         ("orgg", "did you mean 'org'?"),
         ("no.such.module:MINE", "cannot be imported (ModuleNotFoundError"),
         ("support.methods:MISSING", "cannot be imported (AttributeError"),
@@ -172,7 +171,7 @@ def test_stages_train_their_own_part():
     before = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWN)
     scalars = learner.config.scalars(4)
     moved = []
-    for stage in (0, 1):
+    for stage in methods.STAGED.stages:
         update = jax.jit(dataclasses.replace(learner, stage=stage).update)
         after, _ = update(before, scalars, PARAMS, KNOWN)
         changes = jax.tree.map(lambda a, b: bool((a != b).any()), before.params, after.params)

@@ -18,8 +18,12 @@ from jaxnav.policies.methods.base import (
     Stage,
     Tracker,
 )
+from jaxnav.policies.methods.eotp import EOTP
+from jaxnav.policies.methods.hoz import HOZ
 from jaxnav.policies.methods.org import ORG
 from jaxnav.policies.methods.rgb import RGB
+from jaxnav.policies.methods.sp import SP
+from jaxnav.policies.methods.vtnet import VTNET
 
 __all__ = [
     "METHODS",
@@ -36,7 +40,15 @@ __all__ = [
 ]
 
 #: The methods of this package.
-METHODS = {"anonymous": ANONYMOUS, "org": ORG, "rgb": RGB}
+METHODS = {
+    "anonymous": ANONYMOUS,
+    "eotp": EOTP,
+    "hoz": HOZ,
+    "org": ORG,
+    "rgb": RGB,
+    "sp": SP,
+    "vtnet": VTNET,
+}
 #: Entry points of this group name the methods of other packages.
 GROUP = "jaxnav.methods"
 

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from flax import nnx
 
+from jaxnav.gaps import Signs
 from jaxnav.policies.features import Features
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.task import NUM_ACTIONS
@@ -27,10 +28,12 @@ class Knowledge(NamedTuple):
     Attributes:
       layout: float32 [rooms, K, K], the layout prior alpha* of each room type.
       method: nested dict of arrays, what the method's `learn` returned; empty if it learns nothing.
+      signs: what sightings tell of the layout, leaves [rooms, K, K]; None where no gap goes by them.
     """
 
     layout: jax.Array
     method: Tree = {}  # noqa: RUF012  (never written to)
+    signs: Signs | None = None
 
 
 class Percept(NamedTuple):
@@ -167,11 +170,15 @@ class Stage:
       share: of all updates, above 0; the shares of a method add up to 1.
       loss: the loss in place of PPO's, with the arguments and results of `jaxnav.training.loss.ppo_loss`.
       trainable: whether the parameter at a path of names is trained; None for all.
+      imitates: whether the loss reads what shortest paths do, `Tables.expert`, which only then are there.
+      alone: whether the direct stream acts without that of experience, where there are streams.
     """
 
     share: float = 1.0
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None
     trainable: Callable[[tuple[str, ...]], bool] | None = None
+    imitates: bool = False
+    alone: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +191,7 @@ class Method:
       tracker: what an episode remembers without parameters.
       learn: from the banks of training scenes and counts float32 [rooms, K, K] (poses of exploration at which two
         categories were detected together) to what is known before training, a nested dict of arrays.
-      stages: of training, in order.
+      stages: of training, in order; all before the last are pre-training.
       auxiliary: one more term of the loss, from a `jaxnav.training.loss.Replay` to a loss float32 [] and named parts.
       adaptation: how the policy changes within an episode.
       control: how its choices become actions.
@@ -200,3 +207,8 @@ class Method:
     adaptation: Adaptation | None = None
     control: Control = Primitive()
     hosts_layout: bool = True
+
+    def __post_init__(self) -> None:
+        shares = [stage.share for stage in self.stages]
+        if not shares or min(shares) <= 0.0 or abs(sum(shares) - 1.0) > 1e-6:
+            raise ValueError(f"the shares of its stages are {shares}; give shares above 0 that add up to 1")
