@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
+from jaxnav.causal import Form
 from jaxnav.cli.console import exit_code, result_console
 from jaxnav.errors import InputError
 from jaxnav.evaluation.accounting import accounting_table
@@ -29,7 +30,8 @@ class AccountConfig:
       shift: layout shifts, from 0 to 1; a table for each.
       episodes: in the fixed list, balanced over room types and scenes.
       epsilon: thresholds of sTDE.
-      setting: layout estimator to use instead of the run's.
+      form: how sTDE combines the logits; default: the run's layout setting's.
+      setting, hold: layout estimator to use instead of the run's, as of `eval`.
       seed: of the episode list and the sampled actions.
       json: where to write the tables; default: in the run directory.
     """
@@ -40,7 +42,9 @@ class AccountConfig:
     shift: tuple[float, ...] = (0.0, 1.0)
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.5,)
+    form: tuple[Form, ...] | None = None
     setting: EstimatorName | None = None
+    hold: bool = False
     seed: int = 0
     json: Path | None = None
 
@@ -56,7 +60,8 @@ def _account(config: AccountConfig, console: Console, out: Console) -> None:
     """Evaluate both runs at every shift, print and write."""
     run, without = Run.open(config.run), Run.open(config.without)
     target = config.json or config.run / f"account-{config.split}.json"
-    options = {name: getattr(config, name) for name in ("split", "episodes", "epsilon", "setting", "seed")}
+    names = ("split", "episodes", "epsilon", "form", "setting", "hold", "seed")
+    options = {name: getattr(config, name) for name in names}
     found = {}
     for shift in config.shift:
         entries = account(run, without, shift=shift, console=console, **options)

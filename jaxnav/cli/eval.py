@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
+from jaxnav.causal import Form
 from jaxnav.cli.console import exit_code, result_console
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import Form
 from jaxnav.evaluation.report_tables import console_table, difference_table
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import evaluate
@@ -24,14 +24,15 @@ class EvalConfig:
       run: the run directory.
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
-      shift: layout shift, from 0 to 1; in single rooms and in a file the share of the categories that exchange their
-        labels; default: the run's, and 0 with `--scenes`.
+      shift: layout shift, from 0 to 1: the share of the categories that exchange their places; default: the run's, and
+        0 with `--scenes`.
       episodes: in the fixed list, balanced over room types and scenes; where scenes are streamed equally many in every
         shard, and balanced there.
       epsilon: thresholds of sTDE; all of them in one compiled call.
       form: how sTDE combines the logits; default: the run's layout setting's.
-      setting: layout estimator to use instead of the run's: `evidence` and `clock` measure the gap in another way,
-        `paper` and `released` change the layout's weights too.
+      setting: layout estimator to use instead of the run's: `paper` and `released` change the layout's weights too,
+        the others measure the gap in another way; see docs/methods.md.
+      hold: the gap never falls within an episode; with `--form switch` experience is then out for good.
       seed: of the episode list and the sampled actions.
       json: where to write the table; default: in the run directory.
     """
@@ -44,6 +45,7 @@ class EvalConfig:
     epsilon: tuple[float, ...] = (0.5,)
     form: tuple[Form, ...] | None = None
     setting: EstimatorName | None = None
+    hold: bool = False
     seed: int = 0
     json: Path | None = None
 
@@ -66,6 +68,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         epsilon=config.epsilon,
         form=config.form,
         setting=config.setting,
+        hold=config.hold,
         seed=config.seed,
         console=console,
     )

@@ -1,6 +1,6 @@
 """Evaluation of trials with the policies of a run."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -64,14 +64,19 @@ class Bench:
 
     def outcomes(self, subject: Subject, gap: Gap, trials: Iterable[Trial]) -> dict[Trial, Outcome]:
         """Return the outcomes of each trial, leaves [S, E]."""
+        trials = list(dict.fromkeys(trials))
+        setting = gap_settings(layout_setting(subject.policies))[gap]
+        return dict(zip(trials, self.run(subject, setting, trials), strict=True))
+
+    def run(self, subject: Subject, setting: Setting | None, trials: Sequence[Trial]) -> list[Outcome]:
+        """Run trials with a layout setting; outcomes are [S, E]."""
         policies, world, episodes = subject
-        trials, seeds = list(dict.fromkeys(trials)), self.config.base.seeds
-        acting = Acting(world.env, policies.spec, gap_settings(layout_setting(policies))[gap])
+        acting, seeds = Acting(world.env, policies.spec, setting), policies.seeds
         evaluator = self._evaluators.setdefault(acting, Evaluator(acting))
-        outcomes: dict[Trial, Outcome] = {}
+        outcomes: list[Outcome] = []
         params = world.params(0)
         for first in range(0, len(trials), self.BLOCK):
-            block = trials[first : first + self.BLOCK]
+            block = list(trials[first : first + self.BLOCK])
             filled = block + block[-1:] * (self.BLOCK - len(block))
             outcome = evaluator(
                 trial_grid(filled, policies.arms, seeds),
@@ -80,8 +85,9 @@ class Bench:
                 policies.knowledge,
                 jax.random.key(self.config.seed),
             )
-            for i, trial in enumerate(block):
-                outcomes[trial] = jax.tree.map(lambda leaf, i=i: leaf[i * seeds : (i + 1) * seeds], outcome)
+            outcomes += [
+                jax.tree.map(lambda leaf, i=i: leaf[i * seeds : (i + 1) * seeds], outcome) for i in range(len(block))
+            ]
         return outcomes
 
 

@@ -20,7 +20,7 @@ class StudyConfig:
       document: Markdown file written from the results; figures go into a folder beside it.
       runs: folder of the training runs.
       trainings: names of the training runs; `main` is always there.
-      real: scene file with `train` and `val`; one more run is trained on it and relabelled.
+      real: scene file with `train` and `val`; one more run is trained on it and its layout shifted.
       split: scenes to evaluate on. `test` takes the epsilon chosen on `val`; use it once.
       shifts: layout shifts; the first is the training layout.
       epsilon: thresholds of sTDE.
@@ -33,7 +33,19 @@ class StudyConfig:
     results: Path = Path("results")
     document: Path = Path("docs/study.md")
     runs: Path = Path("runs/study")
-    trainings: tuple[str, ...] = ("main", "none", "coin", "goal", "released", "paper", "gate", "direct", "shaping")
+    trainings: tuple[str, ...] = (
+        "main",
+        "anonymous",
+        "streams",
+        "none",
+        "coin",
+        "goal",
+        "released",
+        "paper",
+        "gate",
+        "direct",
+        "shaping",
+    )
     real: Path | None = None
     split: Literal["val", "test"] = "val"
     shifts: tuple[float, ...] = (0.0, 0.5, 1.0)
@@ -44,9 +56,12 @@ class StudyConfig:
     base: RunConfig = RunConfig(seeds=5, total_steps=2_000_000, worlds=WorldConfig(num_val=80, num_test=80))
 
 
-#: Settings that each run changes. Runs of the layout arm alone are compared with their plain layout weights.
+#: Settings that each run changes. Runs of the layout arm alone are compared with their plain layout weights; agents of
+#: `anonymous` cannot know any layout, and all others are compared with them.
 CHANGES: Mapping[str, Mapping[str, Any]] = {
     "main": {},
+    "anonymous": {"method": "anonymous", "arms": ("baseline",)},
+    "streams": {"decision": "streams", "arms": ("layout",)},
     "none": {"counterfactual": "none", "arms": ("layout",)},
     "coin": {"counterfactual": "coin", "arms": ("layout",)},
     "released": {"layout": {"setting": "released"}, "arms": ("layout",)},

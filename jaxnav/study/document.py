@@ -4,6 +4,7 @@ from pathlib import Path
 
 from jaxnav.errors import InputError
 from jaxnav.store.files import write_atomic
+from jaxnav.study.mixture_tables import mixture_sections
 from jaxnav.study.results import StudyResults, load_results
 from jaxnav.study.tables import (
     claims_table,
@@ -92,6 +93,8 @@ def _world(results: StudyResults, world: str) -> list[str]:
     ]
     lines += ["Best actions:", "", *metrics_table(conditions, "argmax"), ""]
     lines += ["Sampled actions:", "", *metrics_table(conditions, "sample"), ""]
+    if world == "main" and results.mixtures:
+        lines += mixture_sections(results.mixtures)
     lines += ["### Controls", "", *controls_table(conditions), ""]
     if world == "main" and goal:
         title = "### Controls where the direct pathway sees the goal's detection alone"

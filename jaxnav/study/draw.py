@@ -5,8 +5,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from jaxnav.causal import Form
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import Form
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.figures import (
     auc_figure,
@@ -19,7 +19,7 @@ from jaxnav.study.figures import (
 from jaxnav.study.records import Condition, TrialRow
 from jaxnav.study.results import WorldResults, load_results
 from jaxnav.study.tables import table_1
-from jaxnav.study.trials import FORMS
+from jaxnav.study.trials import SWEPT
 from jaxnav.viz.figure import save_figure
 
 
@@ -56,7 +56,7 @@ def _sweeps(conditions: Sequence[Condition]) -> dict[tuple[float, Form], dict[fl
     return {
         (condition.shift, form): dict(sorted(condition.sweep(form).items()))
         for condition in conditions
-        for form in FORMS
+        for form in SWEPT
     }
 
 

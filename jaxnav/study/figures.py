@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxnav.evaluation.report import Form
+from jaxnav.causal import Form
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.curves import AucPanel, Belief, Curve, GapCourse
 from jaxnav.study.records import GainBySimilarity, Metric, SuccessBySimilarity, TrialRow

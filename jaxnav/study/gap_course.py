@@ -7,7 +7,7 @@ from rich.console import Console
 
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.policies import Policies, gap_settings, load_policies
+from jaxnav.runs.policies import Gap, Policies, gap_settings, load_policies
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.study.bench import layout_setting, study_episodes
 from jaxnav.study.config import StudyConfig
@@ -23,7 +23,7 @@ def gap_course(run: RunConfig, config: StudyConfig, console: Console) -> GapCour
     """Measure the gap by step, and whether it shows shifts.
 
     Args:
-      run: a finished run with both arms.
+      run: a finished run with the arm of the layout.
       config: of the study.
       console: shows the progress.
 
@@ -31,7 +31,7 @@ def gap_course(run: RunConfig, config: StudyConfig, console: Console) -> GapCour
       InputError: the run is not finished, or its scenes fill more than one shard.
     """
     policies = load_policies(run)
-    settings = _settings(layout_setting(policies))
+    settings = _settings(policies)
     traces = _shortest([_traces(run, config, shift, policies, settings, console) for shift in config.shifts])
     means = [mean_by_step(trace) for trace in traces]
     aucs = [auc_by_step(trace, traces[0]) for trace in traces[1:]]
@@ -54,11 +54,15 @@ def gap_course(run: RunConfig, config: StudyConfig, console: Console) -> GapCour
     return GapCourse(tuple(range(running.shape[1])), running, tuple(panels), tuple(auc))
 
 
-def _settings(setting: Setting) -> dict[str, Setting]:
-    """Return the layout settings whose gaps are compared."""
-    by_gap = gap_settings(setting)
-    paper, released = SETTINGS["paper"], SETTINGS["released"]
-    return {"paper": paper, "released": released, "calibrated": by_gap["novelty"], "evidence": by_gap["evidence"]}
+def _settings(policies: Policies) -> dict[str, Setting]:
+    """Return the layout settings whose gaps are compared.
+
+    Those that go by signs are left out where the run learned none.
+    """
+    by_gap = gap_settings(layout_setting(policies))
+    gaps: tuple[Gap, ...] = ("evidence",) if policies.knowledge.signs is None else ("evidence", "learned", "overdue")
+    others = {gap: by_gap[gap] for gap in gaps}
+    return {"paper": SETTINGS["paper"], "released": SETTINGS["released"], "calibrated": by_gap["novelty"]} | others
 
 
 def _traces(

@@ -10,7 +10,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.report import FORMAT, versions, write_report
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.directory import load_run, settings
-from jaxnav.runs.policies import load_policies
+from jaxnav.runs.policies import Policies, load_policies
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.study.codec import to_json
 from jaxnav.study.config import StudyConfig
@@ -27,6 +27,8 @@ class InstrumentConfig:
     Attributes:
       run: the run directory; the table is also written there, as instrument-SPLIT.json.
       shift: layout shifts, at least two; all are compared with the lowest.
+      without: run directory of agents that cannot know any layout, such as those of the method `anonymous`: they must
+        lose nothing.
       split: scenes to evaluate on.
       episodes: number at each shift; see the evaluation.
       scenes_per_split: generated scenes of the split; default: the run's.
@@ -35,6 +37,7 @@ class InstrumentConfig:
 
     run: Path
     shift: tuple[float, ...] = (0.0, 0.5, 1.0)
+    without: Path | None = None
     split: Literal["train", "val", "test"] = "val"
     episodes: int = 1000
     scenes_per_split: int | None = None
@@ -43,7 +46,7 @@ class InstrumentConfig:
 
 def study_instrument(config: StudyConfig, run: RunConfig) -> InstrumentConfig:
     """Return the proof that a study asks of a run."""
-    return InstrumentConfig(run.run_dir, config.shifts, config.split, config.episodes, seed=config.seed)
+    return InstrumentConfig(run.run_dir, config.shifts, None, config.split, config.episodes, seed=config.seed)
 
 
 def prove_main_run(config: StudyConfig, console: Console, out: Console) -> None:
@@ -83,13 +86,26 @@ def prove_instrument(config: InstrumentConfig, console: Console, out: Console) -
 def instrument_report(config: InstrumentConfig, run: RunConfig, console: Console) -> InstrumentReport:
     """Measure a finished run at every shift and compare."""
     policies, totals = load_policies(run), []
+    without = None if config.without is None else load_without(config.without, run)
     shifts = sorted(set(config.shift))
     for shift in shifts:
         console.print(f"shift {shift:g}:")
         world = evaluation_world(run, config.split, None, shift, console)
-        totals.append(measure_scenes(world, policies, config.episodes, config.seed))
+        totals.append(measure_scenes(world, policies, without, config.episodes, config.seed))
     about = settings(run) | {"evaluation_split": config.split, "evaluation_seed": config.seed}
     return dataclasses.replace(compare(shifts, totals), run=about)
+
+
+def load_without(folder: Path, run: RunConfig) -> Policies:
+    """Load agents that cannot know any layout.
+
+    Raises:
+      InputError: no finished run, or one of another task or number of seeds.
+    """
+    other = load_run(folder)
+    if (other.task, other.seeds) != (run.task, run.seeds):
+        raise InputError(f"--without {folder}: is of another task or number of seeds; train it like {run.run_dir}")
+    return load_policies(other, ("baseline",))
 
 
 def _checked_run(config: InstrumentConfig) -> RunConfig:

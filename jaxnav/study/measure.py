@@ -17,7 +17,7 @@ from jaxnav.study.config import StudyConfig
 from jaxnav.study.outcomes import TrialOutcomes, mean_weight
 from jaxnav.study.records import Condition, FullCondition, GainBySimilarity, Gains, SuccessBySimilarity
 from jaxnav.study.results import load_condition
-from jaxnav.study.trials import FORMS, THRESHOLD, USES, Control, Trial, Variant
+from jaxnav.study.trials import SWEPT, THRESHOLD, USES, Control, Trial, Variant
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 GAPS: tuple[Gap, ...] = ("novelty", "evidence", "clock")
@@ -117,13 +117,13 @@ def _stde_outcomes(subject: Subject, gap: Gap, bench: Bench, epsilons: Sequence[
     uses = USES.values()
     trials = [Trial("stde", decoding, *use) for use in uses for decoding in DECODINGS]
     if gap == "novelty":
-        trials += [Trial("stde", "argmax", epsilon, form) for form in FORMS for epsilon in epsilons]
+        trials += [Trial("stde", "argmax", epsilon, form) for form in SWEPT for epsilon in epsilons]
     if gap == "clock":
         return bench.outcomes(subject, gap, trials)
     trials += [Trial("stde", decoding, *use, control) for use in uses for control, decoding in CONTROLS]
     outcomes = bench.outcomes(subject, gap, trials)
     weights = {use: mean_weight(outcomes[Trial("stde", "argmax", *use)]) for use in uses}
-    constants = [Trial("stde", "argmax", *use, "constant", weight) for use, weight in weights.items()]
+    constants = [Trial("stde", "argmax", *use, "constant", weight=weight) for use, weight in weights.items()]
     return outcomes | bench.outcomes(subject, gap, constants)
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from jaxnav.evaluation.report import Form
+from jaxnav.causal import Form
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.runs.policies import Gap
 from jaxnav.study.codec import INLINE, OPTIONAL

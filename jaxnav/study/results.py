@@ -6,16 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from jaxnav.evaluation.report import FORMAT, versions
+from jaxnav.evaluation.report import FORMAT, Decoding, versions
 from jaxnav.store.files import write_atomic
 from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.instrument_report import InstrumentReport
+from jaxnav.study.mixture_report import Mixture
 from jaxnav.study.records import Condition, FullCondition
 
 #: Runs whose worlds are measured as instruments, and whose gaps are followed.
 WORLDS = ("main", "real")
 Kind = TypeVar("Kind", bound=Condition)
+Part = Condition | InstrumentReport | GapCourse | Mixture
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class StudyResults:
       total_steps: environment steps of each policy.
       worlds: `main`, and `real` where it was studied.
       runs: conditions of each run, one for each shift; `main` comes first.
+      mixtures: removals in a mixed population, by run and decoding.
     """
 
     shifts: tuple[float, ...]
@@ -52,11 +55,17 @@ class StudyResults:
     total_steps: int
     worlds: Mapping[str, WorldResults]
     runs: Mapping[str, tuple[Condition, ...]]
+    mixtures: tuple[Mixture, ...] = ()
 
 
 def condition_name(run: str, shift: float) -> str:
     """Return the name of the part that holds a condition."""
     return f"{run}-shift{shift:g}"
+
+
+def mixture_name(run: str, decoding: Decoding) -> str:
+    """Return the name of the part that holds a mixture."""
+    return f"mixture-{run}-{decoding}"
 
 
 def load_results(folder: Path) -> StudyResults | None:
@@ -84,8 +93,9 @@ def load_results(folder: Path) -> StudyResults | None:
         for name in sorted(names, key=lambda name: (name != "main", name))
         if all(condition_name(name, shift) in parts for shift in study["shifts"])
     }
-    base = study["base"]
-    return StudyResults(tuple(study["shifts"]), study["episodes"], base["seeds"], base["total_steps"], worlds, runs)
+    mixtures = tuple(from_json(Mixture, part) for name, part in parts.items() if name.startswith("mixture-"))
+    base, shifts = study["base"], tuple(study["shifts"])
+    return StudyResults(shifts, study["episodes"], base["seeds"], base["total_steps"], worlds, runs, mixtures)
 
 
 def load_condition(path: Path) -> Condition:
@@ -93,7 +103,7 @@ def load_condition(path: Path) -> Condition:
     return from_json(Condition, json.loads(path.read_text()))
 
 
-def write_part(path: Path, study: Mapping[str, Any], record: Condition | InstrumentReport | GapCourse) -> None:
+def write_part(path: Path, study: Mapping[str, Any], record: Part) -> None:
     """Write a part of a study, numbers to six digits.
 
     Raises:
@@ -101,7 +111,7 @@ def write_part(path: Path, study: Mapping[str, Any], record: Condition | Instrum
       ValueError: a curve holds NaN or an infinity.
     """
     part = {"study": study, "versions": versions(), "format": FORMAT, **to_json(record)}
-    write_atomic(path, (json.dumps(_rounded(part), allow_nan=False) + "\n").encode())
+    write_atomic(path, (json.dumps(rounded(part), allow_nan=False) + "\n").encode())
 
 
 def is_written(path: Path, study: Mapping[str, Any]) -> bool:
@@ -116,10 +126,10 @@ def _conditions(parts: Mapping[str, Any], run: str, shifts: list[float], kind: t
     return tuple(from_json(kind, parts[condition_name(run, shift)]) for shift in shifts)
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """Return JSON with six digits of each number."""
     if isinstance(value, dict):
-        return {name: _rounded(item) for name, item in value.items()}
+        return {name: rounded(item) for name, item in value.items()}
     if isinstance(value, list):
-        return [_rounded(item) for item in value]
+        return [rounded(item) for item in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value

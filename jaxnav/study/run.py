@@ -7,19 +7,19 @@ from rich.console import Console
 
 from jaxnav.study.bench import Bench
 from jaxnav.study.config import StudyConfig, study_identity
-from jaxnav.study.curves import GapCourse
 from jaxnav.study.document import check_document, write_document
 from jaxnav.study.gap_course import gap_course
 from jaxnav.study.instrument import instrument_report, study_instrument
-from jaxnav.study.instrument_report import InstrumentReport
-from jaxnav.study.measure import chosen_epsilon, measure_condition
-from jaxnav.study.records import Condition
-from jaxnav.study.results import WORLDS, condition_name, is_written, write_part
+from jaxnav.study.measure import DECODINGS, chosen_epsilon, measure_condition
+from jaxnav.study.mixture import measure_mixture
+from jaxnav.study.results import WORLDS, Part, condition_name, is_written, mixture_name, write_part
 from jaxnav.study.runs import ensure_trained, study_runs
 from jaxnav.viz import require_pictures
 
 #: Runs that have every trial.
 FULL = ("main", "goal", "real")
+#: Runs whose experience is accounted for, beside agents that cannot know any layout.
+ACCOUNTED, WITHOUT = ("main", "streams"), "anonymous"
 
 
 def run_study(config: StudyConfig, console: Console) -> None:
@@ -42,19 +42,25 @@ def run_study(config: StudyConfig, console: Console) -> None:
         ensure_trained(run, console)
     folder, study, bench = config.results / config.split, study_identity(config), Bench(config)
 
-    def write(name: str, measure: Callable[[], Condition | InstrumentReport | GapCourse]) -> None:
+    def write(name: str, measure: Callable[[], Part]) -> None:
         path = folder / f"{name}.json"
         if not is_written(path, study):
             console.print(f"{path}")
             write_part(path, study, measure())
 
     for name, run in runs.items():
+        if name == WITHOUT:
+            continue
         for shift in config.shifts:
             write(condition_name(name, shift), partial(measure_condition, run, name in FULL, shift, bench, console))
         if name in WORLDS:
             instrument = study_instrument(config, run)
             write(f"instrument-{name}", partial(instrument_report, instrument, run, console))
             write(f"gap-{name}", partial(gap_course, run, config, console))
+        if name in ACCOUNTED and WITHOUT in runs:
+            for decoding in DECODINGS:
+                mixed = partial(measure_mixture, run, runs[WITHOUT], decoding, bench, console)
+                write(mixture_name(name, decoding), mixed)
     if config.split == "val":
         draw_figures(folder, config.document.parent / "images" / "study")
     write_document(config.results, config.document)

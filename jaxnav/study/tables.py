@@ -24,7 +24,12 @@ CONTROLS: Mapping[Control | None, str] = {
 #: Gaps of Table 1 and of the controls.
 GAPS: Mapping[Gap, str] = {"novelty": "", "evidence": ", `evidence`"}
 #: Steps of the table of the gap's AUC.
-STEPS = (0, 1, 5, 10, 20, 40)
+STEPS = (0, 1, 5, 10, 20, 40, 80)
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, numbers to the right."""
+    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] + ["---:"] * (len(header) - 1), *rows)]
 
 
 def claims_table(results: StudyResults, world: str) -> list[str]:
@@ -34,13 +39,13 @@ def claims_table(results: StudyResults, world: str) -> list[str]:
         digits = 1 if "points" in claim.unit else 2
         effect = f"{claim.effect:+.{digits}f}"
         rows.append((claim.text, effect, f"{claim.least:g} {claim.unit}", claim.verdict))
-    return _markdown(("claim", "effect", "least", "verdict"), rows)
+    return markdown(("claim", "effect", "least", "verdict"), rows)
 
 
 def instrument_table(report: InstrumentReport) -> list[str]:
     """Return what is measured at each shift, and the verdicts."""
     header = ("shift", *(f"{column.shift:g}" for column in report.shifts))
-    return [*_markdown(header, table_cells(report)), "", "```", *verdicts(report), "```"]
+    return [*markdown(header, table_cells(report)), "", "```", *verdicts(report), "```"]
 
 
 def table_1(condition: Condition, decoding: Decoding = "argmax") -> list[tuple[str, TrialRow]]:
@@ -71,7 +76,7 @@ def metrics_table(conditions: Sequence[Condition], decoding: Decoding) -> list[s
             metrics = _spread(row.sr), _spread(row.spl), _spread(row.dts, 2)
             difference = f"{row.difference.sr:+.1f}" if row.difference else ""
             rows.append((name, *metrics, difference, f"{row.mean_weight:.3f}"))
-    return _markdown(("", "SR", "SPL", "DTS", "to + w", "weight"), rows)
+    return markdown(("", "SR", "SPL", "DTS", "to + w", "weight"), rows)
 
 
 def controls_table(conditions: Sequence[Condition]) -> list[str]:
@@ -90,7 +95,7 @@ def controls_table(conditions: Sequence[Condition]) -> list[str]:
                 rows.append((f"{name}, gap `{gap}`{text}", *cells(trial, gap)))
         clock = cells(Trial("stde", "argmax", *use), "clock")
         rows.append((f"{name}, the released code's novelty clock", *clock))
-    return _markdown(("SR to + w (mean weight)", *(f"shift {each.shift:g}" for each in conditions)), rows)
+    return markdown(("SR to + w (mean weight)", *(f"shift {each.shift:g}" for each in conditions)), rows)
 
 
 def runs_table(results: StudyResults) -> list[str]:
@@ -109,7 +114,7 @@ def runs_table(results: StudyResults) -> list[str]:
     sizes = set(parameters.values())
     same = f"All policies have {sizes.pop():,} parameters." if len(sizes) == 1 else f"Parameters: {parameters}."
     header = ("SR (to + w; + w: to the baseline)", *(f"shift {shift:g}" for shift in results.shifts))
-    return [*_markdown(header, rows), "", same]
+    return [*markdown(header, rows), "", same]
 
 
 def gap_tables(course: GapCourse) -> list[str]:
@@ -119,13 +124,9 @@ def gap_tables(course: GapCourse) -> list[str]:
     for panel in course.auc:
         rows = [(f"`{line.setting}`", *(f"{line.curve.at(step):.2f}" for step in steps)) for line in panel.lines]
         lines += [f"AUC of the gap, shift {panel.shift:g} against none, by step:", ""]
-        lines += [*_markdown(("setting", *map(str, steps)), rows), ""]
+        lines += [*markdown(("setting", *map(str, steps)), rows), ""]
     shares = ", ".join(f"{100 * course.running[0, step]:.0f}" for step in steps)
     return [*lines, f"Episodes that still run at these steps, shift 0: {shares} %."]
-
-
-def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] + ["---:"] * (len(header) - 1), *rows)]
 
 
 def _spread(metric: Interval, digits: int = 1) -> str:

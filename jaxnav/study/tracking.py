@@ -11,6 +11,7 @@ import numpy as np
 from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import first_states
+from jaxnav.gaps import Signs
 from jaxnav.layout import LayoutEstimator, LayoutState, Setting
 from jaxnav.policies.acting import Acting, Agent, carried
 from jaxnav.policies.methods import Knowledge
@@ -87,7 +88,8 @@ def _walks(
     They are [N, T + 1, settings, 2, E] and [N, T + 1, E].
     """
     count, room = len(start.pose), params.room[start.scene]
-    watchers = [(setting, prior[room]) for setting, prior in zip(settings, setting_priors, strict=True)]
+    signs = jax.tree.map(lambda leaf: leaf[room], knowledge.signs)
+    watchers = [(setting, prior[room], signs) for setting, prior in zip(settings, setting_priors, strict=True)]
 
     def walk(numbered: tuple[jax.Array, Params]) -> tuple[jax.Array, jax.Array]:
         number, policy_weights = numbered
@@ -97,7 +99,9 @@ def _walks(
         def step(carry: tuple, _: None) -> tuple[tuple, tuple[jax.Array, jax.Array]]:
             agent, running, beliefs = carry
             presence = acting.env.row_format.presence(params.tables.rows[agent.state.pose])
-            beliefs = [_watch(*watcher, pair, presence) for watcher, pair in zip(watchers, beliefs, strict=True)]
+            beliefs = [
+                _watch(*watcher, pair, presence, start.goal) for watcher, pair in zip(watchers, beliefs, strict=True)
+            ]
             next_agent, ended = _act(acting, policy, agent, knowledge, params, keys)
             gaps = jnp.stack([jnp.stack([belief.gap for belief in pair]) for pair in beliefs])
             return (next_agent, running & ~ended, beliefs), (gaps, running)
@@ -123,14 +127,19 @@ def _act(
     return after, taken.ended
 
 
-def _first_beliefs(setting: str | Setting, priors: jax.Array) -> tuple[LayoutState, LayoutState]:
+def _first_beliefs(setting: str | Setting, priors: jax.Array, signs: Signs | None) -> tuple[LayoutState, LayoutState]:
     """Return both beliefs of each episode before anything is seen."""
-    first = jax.vmap(lambda prior: LayoutEstimator(prior, setting).init())(priors)
+    first = jax.vmap(lambda prior, signs: LayoutEstimator(prior, setting, signs).init())(priors, signs)
     return first, first
 
 
 def _watch(
-    setting: str | Setting, priors: jax.Array, beliefs: tuple[LayoutState, LayoutState], presence: jax.Array
+    setting: str | Setting,
+    priors: jax.Array,
+    signs: Signs | None,
+    beliefs: tuple[LayoutState, LayoutState],
+    presence: jax.Array,
+    goal: jax.Array,
 ) -> tuple[LayoutState, LayoutState]:
     """Return both beliefs after a view of each episode.
 
@@ -139,12 +148,14 @@ def _watch(
     Args:
       setting: of the estimator.
       priors: float32 [E, K, K].
+      signs: leaves [E, K, K]; None where no gap goes by them.
       beliefs: before the view, leaves [E, ...].
       presence: bool [E, K].
+      goal: int32 [E].
     """
 
-    def one(prior: jax.Array, updated: LayoutState, frozen: LayoutState, seen: jax.Array):
-        estimator = LayoutEstimator(prior, setting)
-        return estimator.update(updated, seen), estimator.update(frozen, seen).replace(alpha=prior)
+    def one(prior, signs, updated: LayoutState, frozen: LayoutState, seen: jax.Array, goal: jax.Array):
+        estimator = LayoutEstimator(prior, setting, signs)
+        return estimator.update(updated, seen, goal), estimator.update(frozen, seen, goal).replace(alpha=prior)
 
-    return jax.vmap(one)(priors, *beliefs, presence)
+    return jax.vmap(one)(priors, signs, *beliefs, presence, goal)

@@ -7,13 +7,19 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxnav.evaluation.inference import Branch, Inference
-from jaxnav.evaluation.report import Decoding, Form
+from jaxnav.causal import Form
+from jaxnav.evaluation.inference import Branch, Inference, Source
+from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.study.codec import OPTIONAL
 
-#: What a control changes about sTDE: the weight is its mean at every step, or that of another episode; zeros or noise
-#: are subtracted instead of logits; the intervention is random instead of zero.
-Control = Literal["constant", "shuffled", "zeros", "noise", "random"]
+#: Controls that know nothing of the episode: the mean gap of all episodes at the time, of equal `course`; a gap of 1
+#: `after` a step or `until` it, else 0.
+Schedule = Literal["course", "after", "until"]
+#: What a control changes about sTDE. The gap: that of another episode (`shuffled`); `constant`, such that the weight is
+#: its mean at every step; or a clock's. What is subtracted: `zeros` or `noise` instead of logits. The intervention:
+#: `random` instead of zero.
+Control = Literal["shuffled", "constant", "zeros", "noise", "random"]
 Variant = Literal["baseline", "layout", "tde", "stde"]
 
 
@@ -24,7 +30,9 @@ class Use(NamedTuple):
     form: Form
 
 
-FORMS: tuple[Form, ...] = ("residual", "paper")
+#: A step that no episode reaches.
+NEVER = 2**30
+SWEPT: tuple[Form, ...] = ("residual", "paper")
 #: Uses of sTDE with all gaps and controls: the paper's threshold, and no threshold in the paper's form.
 THRESHOLD, NO_THRESHOLD = Use(0.5, "residual"), Use(0.0, "paper")
 USES: Mapping[str, Use] = {"sTDE (eps 0.5)": THRESHOLD, "sTDE (eps 0, paper's form)": NO_THRESHOLD}
@@ -39,6 +47,7 @@ class Trial:
       decoding: of actions.
       epsilon, form: of sTDE.
       control: what is changed about sTDE.
+      step: of `after` and `until`.
       weight: the weight of `constant`; trials that differ by it alone are equal.
     """
 
@@ -46,17 +55,24 @@ class Trial:
     decoding: Decoding = "argmax"
     epsilon: float | None = None
     form: Form | None = None
-    control: Control | None = None
+    control: Control | Schedule | None = None
+    step: int | None = dataclasses.field(default=None, metadata=OPTIONAL)
     weight: float = dataclasses.field(default=0.0, compare=False)
 
     def cells(self, arms: Sequence[str], num_seeds: int) -> Inference:
         """Return the cells of the grid, leaves [S]; see `inference_grid`."""
         cells = inference_grid([table_row(self.variant, self.epsilon, self.form, self.decoding)], arms, num_seeds)
         match self.control:
-            case "constant":
-                changes = {"gap": jnp.float32(self.weight), "epsilon": jnp.float32(0.0)}
             case "shuffled":
-                changes = {"shuffled": jnp.bool_(True)}
+                changes = {"source": jnp.int32(Source.OTHER)}
+            case "course":
+                changes = {"source": jnp.int32(Source.MEAN)}
+            case "constant":
+                changes = _given(self.weight, 0, NEVER) | {"epsilon": jnp.float32(0.0)}
+            case "after":
+                changes = _given(1.0, self._step, NEVER)
+            case "until":
+                changes = _given(1.0, 0, self._step)
             case "zeros":
                 changes = {"branch": jnp.int32(Branch.ZEROS)}
             case "noise":
@@ -66,6 +82,22 @@ class Trial:
             case None:
                 changes = {}
         return cells.replace(**{name: jnp.broadcast_to(value, (num_seeds,)) for name, value in changes.items()})
+
+    @property
+    def _step(self) -> int:
+        if self.step is None:
+            raise ValueError(f"{self.control}: give its step")
+        return self.step
+
+
+def _given(gap: float, begin: int, end: int) -> dict[str, jax.Array]:
+    """Return what makes the gap a number from one step to another."""
+    return {
+        "source": jnp.int32(Source.GIVEN),
+        "gap": jnp.float32(gap),
+        "begin": jnp.int32(begin),
+        "end": jnp.int32(end),
+    }
 
 
 def trial_grid(trials: Sequence[Trial], arms: Sequence[str], num_seeds: int) -> Inference:

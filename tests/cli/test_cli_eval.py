@@ -182,7 +182,7 @@ def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys
 
 
 @pytest.mark.slow
-def test_a_shift_relabels_a_scene_file(run_dir, tmp_path, capsys):
+def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
     shutil.copytree(run_dir, run)
     config = json.loads((run / "config.json").read_text())
@@ -198,7 +198,7 @@ def test_a_shift_relabels_a_scene_file(run_dir, tmp_path, capsys):
     assert told[0.0] != told[1.0]
     capsys.readouterr()
     assert evaluate(run, "--shift", 1.5, "--scenes", file) == 2
-    assert "relabelling: seed 0, shift 1.5; give" in refusal(capsys)
+    assert "layout shift: seed 0, shift 1.5; give" in refusal(capsys)
 
 
 def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):

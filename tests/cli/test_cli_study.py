@@ -179,7 +179,10 @@ def test_test_is_a_separate_section_and_leaves_the_figures(steps, tmp_path):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--trainings", "main", "coins"], "trainings: 'coins' is unknown; choose from main, none, coin"),
+        (
+            ["--trainings", "main", "coins"],
+            "trainings: 'coins' is unknown; choose from main, anonymous, streams, none, coin",
+        ),
         (["--shifts", "0.5"], "shifts: (0.5,): give two or more from 0 to 1, rising"),
         (["--shifts", "0.5", "0.5"], "rising"),
         (["--shifts", "1", "0"], "rising"),

@@ -98,7 +98,11 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("counterfactual: maybe", "counterfactual must be one of 'none', 'coin', 'distil', but is 'maybe'"),
         ("decision: both", "decision must be one of 'fused', 'streams', but is 'both'"),
         ("ppo: {experience: 0}", "ppo.experience is 0.0; give a number between 0 and 1, both excluded"),
+        ("ppo: {alone: 1.0}", "ppo.alone is 1.0; give a share from 0 to below 1"),
         ("ppo: {experience: 1.0}", "ppo.experience is 1.0; give a number between 0 and 1, both excluded"),
+        ("{method: vtnet, pretraining: 1}", "pretraining is 1.0; give a share between 0 and 1, both excluded"),
+        ("{method: vtnet, total_steps: 9}", "total_steps is 9; stage 2 of method 'vtnet', a share of 0.8, gets none"),
+        ("pretraining: 0.2", "pretraining is 0.2; method 'org' has none; leave it out"),
         ("method: orgy", "method 'orgy': is unknown; did you mean 'org'?"),
         ("method: no_such_package:MINE", "method 'no_such_package:MINE': cannot be imported (ModuleNotFoundError: "),
         ("method: jaxnav.layout:MINE", "method 'jaxnav.layout:MINE': cannot be imported (AttributeError: "),
@@ -188,9 +192,9 @@ WHOLE = gzip.compress(b'{"name": "a"}\n' * 9, mtime=0)
         (None, "cannot be read (No such file or directory)"),
         (b"not compressed", "line 1: not JSON"),
         (WHOLE[:-9], "is cut short or damaged"),
-        (gzip.compress(b"{]\n"), "line 1: not JSON"),
+        (gzip.compress(b"{]\n", mtime=0), "line 1: not JSON"),
         (WHOLE, "line 1, scene 'a': world is missing; add it"),
-        (gzip.compress(b""), "holds no scene"),
+        (gzip.compress(b"", mtime=0), "holds no scene"),
     ],
 )
 def test_bad_scene_files_are_refused_by_name(tmp_path, capsys, data, problem):

@@ -68,7 +68,7 @@ def test_the_help_names_every_setting(capsys):
 def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
     for missing in (tmp_path / "none.yaml", "smoek"):
         assert train(missing, tmp_path / "run") == 2
-        mend = "choose from long, paper, smoke, study, study_quick, or give a file"
+        mend = "choose from long, paper, paper_vtnet, small_goals, smoke, study, study_quick, or give a file"
         assert refusal(capsys) == f"error: {missing}: no such configuration; {mend}"
     assert not (tmp_path / "run").exists()
 
@@ -80,7 +80,7 @@ def test_a_config_is_the_name_of_a_packaged_one_or_a_file(tmp_path, monkeypatch)
     def seeds(config):
         return parse(RunConfig(), ["--config", config], "train.py", "").seeds
 
-    assert list(CONFIGS) == ["long", "paper", "smoke", "study", "study_quick"]
+    assert list(CONFIGS) == ["long", "paper", "paper_vtnet", "small_goals", "smoke", "study", "study_quick"]
     assert (seeds("smoke"), seeds("./smoke"), seeds(str(CONFIGS["smoke"]))) == (1, 4, 1)
 
 

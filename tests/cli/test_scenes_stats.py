@@ -142,11 +142,14 @@ def test_scenes_in_which_nothing_is_seen_together_have_no_gap(tmp_path_factory, 
     assert row(rows[start:], "kitchen") == ["0"]
 
 
-def test_a_shift_exchanges_labels_in_a_file(file, capsys):
+def test_a_shift_exchanges_places_in_a_file(file, capsys):
     plain, shifted = (stats(capsys, file, *options) for options in ((), ("--shift", "1")))
-    # Two books and a chair: who is in half of the scenes, how many, how high.
-    assert row(plain, "Book")[:3] == row(shifted, "Chair")[:3] == ["50%", "2.00", "0.90 m"]
-    assert row(plain, "Chair")[:3] == row(shifted, "Book")[:3] == ["50%", "1.00", "0.50 m"]
+    # Two books and a stool: who is in half of the scenes, how many, how high. Undersides stay at 0.5, 0.7 and 0.05 m;
+    # half of the stool's height of 0.9 m, and of the books' 0.6 m, comes on top.
+    assert row(plain, "Book")[:3] == ["50%", "2.00", "0.90 m"]
+    assert row(shifted, "Chair")[:3] == ["50%", "2.00", "1.05 m"]
+    assert row(plain, "Chair")[:3] == ["50%", "1.00", "0.50 m"]
+    assert row(shifted, "Book")[:3] == ["50%", "1.00", "0.35 m"]
 
 
 def test_what_is_refused(tmp_path, tmp_path_factory, file, capsys):

@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 from support.study_results import band, estimate, interval, row
 
-from jaxnav.evaluation.report import Form
+from jaxnav.causal import Form
 from jaxnav.study import figures
 from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
 from jaxnav.study.records import GainBySimilarity, SuccessBySimilarity, TrialRow

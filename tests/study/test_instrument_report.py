@@ -5,7 +5,7 @@ import dataclasses
 from support import study_results
 
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.study.instrument_report import Change, console_table, verdicts
+from jaxnav.study.instrument_report import MEASURES, Change, console_table, verdicts
 
 
 def test_the_table_has_a_column_for_each_shift():
@@ -13,7 +13,7 @@ def test_the_table_has_a_column_for_each_shift():
     assert [column.header for column in table.columns] == ["Layout shift", "0", "1"]
     cells = [str(cell) for cell in table.columns[2].cells]
     assert cells[:3] == ["80", "1000", "11.00 [10.50, 11.50]"]
-    assert len(cells) == 2 + 8
+    assert len(cells) == 2 + len(MEASURES)
 
 
 def test_the_verdicts_name_every_change():
@@ -21,7 +21,18 @@ def test_the_verdicts_name_every_change():
         Change("random_sr", 0.0, 0.5, Interval(100.0, 100.0, 100.0), holds=False),
         Change("random_sr", 0.0, 1.0, Interval(0.0, 0.0, 0.0), holds=True),
     )
-    lines = verdicts(dataclasses.replace(study_results.instrument(), matched=changes))
+    blind = (Change("without_argmax_sr", 0.0, 1.0, Interval(1.0, 0.5, 1.5), holds=True),)
+    categories = (Change("goal_detected", 0.0, 1.0, Interval(6.0, 5.5, 6.5), holds=False),)
+    report = dataclasses.replace(study_results.instrument(), matched=changes)
+    lines = verdicts(report)
+    assert verdicts(dataclasses.replace(report, categories=categories, without=blind)) == [
+        *lines[:3],
+        "Categories matched (change at most 5 points in the mean over categories)?",
+        "  NO   Goal detected where it is in view (%), shift 1: 6.0 [5.5, 6.5] points",
+        *lines[3:],
+        "No loss without experience (fewer than 2 points)?",
+        "  yes  SR without experience, argmax (%), shift 0 to 1: 1.0 [0.5, 1.5] points lost",
+    ]
     assert lines == [
         "Difficulty matched (within 5 % of shift 0)?",
         "  NO   Random SR (%), shift 0.5: +100.0 [+100.0, +100.0] %",

@@ -3,7 +3,7 @@
 import pytest
 from support import study_results
 
-from jaxnav.evaluation.report import Form
+from jaxnav.causal import Form
 from jaxnav.study.trials import NO_THRESHOLD, Trial
 
 PAPER = Trial("stde", "argmax", *NO_THRESHOLD)
@@ -20,7 +20,7 @@ def test_a_row_is_picked_by_its_trial_and_else_is_the_main_one():
 
 
 def test_a_constant_is_picked_whatever_its_weight():
-    weighed = Trial("stde", "argmax", 0.0, "paper", "constant", 0.3)
+    weighed = Trial("stde", "argmax", 0.0, "paper", "constant", weight=0.3)
     assert study_results.condition(1.0).row(weighed).trial.weight == 0.0
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxnav.errors import InputError
-from jaxnav.evaluation.inference import Branch
+from jaxnav.evaluation.inference import Branch, Source
 from jaxnav.evaluation.variants import inference_grid, table_rows
-from jaxnav.study.trials import Control, Trial, trial_grid
+from jaxnav.study.trials import NEVER, Control, Schedule, Trial, trial_grid
 
 ARMS = ("baseline", "layout")
 SEEDS = 2
@@ -47,16 +47,19 @@ def test_the_grid_holds_a_cell_per_row_and_seed():
 
 def test_cells_are_those_of_stde_but_for_what_the_control_changes():
     plain = Trial("stde", "sample", 0.5, "residual").cells(ARMS, SEEDS)
-    changed: dict[Control, dict[str, Any]] = {
-        "constant": {"gap": np.float32(0.3), "epsilon": np.float32(0.0)},
-        "shuffled": {"shuffled": True},
+    changed: dict[Control | Schedule, dict[str, Any]] = {
+        "shuffled": {"source": Source.OTHER},
+        "course": {"source": Source.MEAN},
+        "constant": {"source": Source.GIVEN, "gap": np.float32(0.3), "end": NEVER, "epsilon": np.float32(0.0)},
+        "after": {"source": Source.GIVEN, "gap": 1.0, "begin": 7, "end": NEVER},
+        "until": {"source": Source.GIVEN, "gap": 1.0, "end": 7},
         "zeros": {"branch": Branch.ZEROS},
         "noise": {"branch": Branch.NOISE},
         "random": {"intervention": 1.0},
     }
-    assert set(changed) == set(get_args(Control))
+    assert set(changed) == {*get_args(Control), *get_args(Schedule)}
     for control, expected in changed.items():
-        cells = Trial("stde", "sample", 0.5, "residual", control, 0.3).cells(ARMS, SEEDS)
+        cells = Trial("stde", "sample", 0.5, "residual", control, 7, 0.3).cells(ARMS, SEEDS)
         chex.assert_trees_all_equal_shapes_and_dtypes(cells, plain)
         for name in vars(plain):
             wanted = np.broadcast_to(expected.get(name, getattr(plain, name)), (SEEDS,))
@@ -72,7 +75,7 @@ def test_the_grid_holds_the_seeds_of_one_trial_after_the_other():
 
 
 def test_trials_that_differ_by_weight_alone_are_equal():
-    one, other = (Trial("stde", "argmax", 0.5, "residual", "constant", weight) for weight in (0.1, 0.2))
+    one, other = (Trial("stde", "argmax", 0.5, "residual", "constant", weight=weight) for weight in (0.1, 0.2))
     assert one == other
     assert hash(one) == hash(other)
     assert one != Trial("stde", "argmax", 0.5, "residual")

@@ -1,0 +1,119 @@
+"""A run in a mixed population."""
+
+import dataclasses
+import json
+
+import pytest
+from rich.console import Console
+from support import study_results
+
+from jaxnav.cli import mixture as command
+from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.study.bench import Bench
+from jaxnav.study.codec import from_json
+from jaxnav.study.config import StudyConfig
+from jaxnav.study.mixture import ORACLE, WAYS, measure_mixture
+from jaxnav.study.mixture_report import Mixture
+
+QUIET = Console(quiet=True)
+VALUES = {name: (Interval(50.0, 40.0, 60.0), Interval(30.0, 20.0, 40.0)) for name in ("sr", "spl", "sr@20", "sr@50")}
+SOME = (WAYS[0], WAYS[-1])  # each is compiled anew
+BENCH = Bench(StudyConfig(shifts=(0.0, 1.0), episodes=8))
+
+
+@pytest.mark.slow
+def test_every_removal_is_measured_at_both_shifts(drawn_run):
+    """The run's own baseline stands in for agents without experience."""
+    config = drawn_run.config
+    found = measure_mixture(config, config, "sample", BENCH, QUIET, SOME)
+    assert found.episodes >= 8
+    assert found.shifts == (0.0, 1.0)
+    names = [removal.name for removal in found.removals]
+    assert names[:2] == ["TDE", ORACLE]
+    assert names[-len(SOME) :] == [str(way) for way in SOME]
+    assert len(set(names)) == len(names)
+    by_name = {removal.name: removal for removal in found.removals}
+    assert by_name["TDE"].weight == (1.0, 1.0)
+    assert by_name[ORACLE].weight == (0.0, 1.0)
+    # Told the shift: nothing is changed where there is none, everything where there is one.
+    assert [by_name[ORACLE].change["sr"][0].mean, by_name[ORACLE].change["sr"][1].mean] == [
+        0.0,
+        by_name["TDE"].change["sr"][1].mean,
+    ]
+    for removal in found.removals:
+        assert all(0.0 <= weight <= 1.0 for weight in removal.weight)
+        for metric, change in removal.change.items():
+            lead, value = found.lead[metric], found.agent[metric]
+            assert change[0].mean + value[0].mean >= -1e-9
+            assert lead[0].mean == pytest.approx(value[0].mean - found.without[metric][0].mean)
+    for way in SOME:
+        clock = names[2 : -len(SOME)]
+        assert sum(control in clock for control in by_name[str(way)].compared or ()) == 1
+
+
+def test_runs_that_differ_are_refused(drawn_run):
+    config = drawn_run.config
+    for name, value in {"seeds": config.seeds + 1, "world": "houses"}.items():
+        other = dataclasses.replace(config, **{name: value})
+        with pytest.raises(InputError, match=f"differ in {name}; train both alike"):
+            measure_mixture(config, other, "sample", BENCH, QUIET)
+
+
+# The command
+
+
+MIXTURE = Mixture(
+    run="streams",
+    decoding="sample",
+    world="rooms",
+    shifts=(0.0, 1.0),
+    scenes=6,
+    episodes=8,
+    length=(4.0, 5.0),
+    without=VALUES,
+    agent=VALUES,
+    lead=VALUES,
+    removals=(),
+)
+
+
+def test_the_command_prints_tables_and_writes_json(drawn_run, tmp_path, monkeypatch, capsys):
+    asked = {}
+
+    def measured(run, without, decoding, bench, console):
+        asked.update(run=run, without=without, decoding=decoding, study=bench.config)
+        return MIXTURE
+
+    monkeypatch.setattr(command, "measure_mixture", measured)
+    monkeypatch.setattr(command, "gap_course", lambda run, study, console: study_results.course())
+    folder, target = str(drawn_run.config.run_dir), tmp_path / "mixture.json"
+    options = ["--shift", "0.5", "--decoding", "argmax", "--episodes", "8", "--json", str(target)]
+    assert command.main([folder, folder, *options]) == 0
+    assert (asked["decoding"], asked["study"].shifts, asked["study"].episodes) == ("argmax", (0.0, 0.5), 8)
+    assert asked["run"].run_dir == asked["without"].run_dir == drawn_run.config.run_dir
+    printed = capsys.readouterr().out
+    assert "### What experience is worth" in printed
+    assert "AUC of the gap" in printed
+    report = json.loads(target.read_text())
+    assert from_json(Mixture, report["mixture"]) == MIXTURE
+    assert report["settings"]["shift"] == "0.5"
+
+
+@pytest.mark.parametrize(
+    ("options", "mend"),
+    [
+        (["--shift", "0"], "--shift 0: give a number above 0, at most 1"),
+        (["--shift", "1.5"], "--shift 1.5: give a number above 0, at most 1"),
+        (["--episodes", "0"], "episodes: 0: give at least 1"),
+    ],
+)
+def test_the_command_refuses_what_is_impossible(drawn_run, options, mend, capsys):
+    folder = str(drawn_run.config.run_dir)
+    assert command.main([folder, folder, *options]) == 2
+    assert mend in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_needs_finished_runs(tmp_path, capsys):
+    assert command.main([str(tmp_path / "none"), str(tmp_path / "none")]) == 2
+    assert "none" in capsys.readouterr().err
