@@ -1,11 +1,14 @@
 """Calls timed in turns, spreads, and a benchmark's report."""
 
+import contextlib
 import importlib.metadata
 import json
 import os
 import platform
 import resource
 import statistics
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -81,3 +84,10 @@ def machine() -> dict[str, Any]:
 def report(results: dict[str, Any]) -> None:
     """Print the machine and the results as one JSON object."""
     print(json.dumps({"machine": machine(), **results}, indent=2))
+
+
+def in_folder(main: Callable[[Path, Path], None]) -> None:
+    """Call with the file of the command line, and its folder or a temporary one."""
+    file, *folder = map(Path, sys.argv[1:])
+    with contextlib.nullcontext(folder[0]) if folder else tempfile.TemporaryDirectory() as chosen:
+        main(file, Path(chosen))

@@ -57,7 +57,10 @@ def entries() -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "calibrate", lambda: np.asarray(calibrate(env, params, setup.explored.counts, setting, key).early)
 
     trainer = setup.trainer
-    yield "learner_init", partial(jax.jit(trainer.learners["layout"].init), key, params, knowledge)
+    yield (
+        "learner_init",
+        partial(jax.jit(trainer.learners["layout"].init), key, params, knowledge),
+    )
     for name in config.arms:
         alone = make_trainer(dataclasses.replace(config, arms=(name,)), env, setting, knowledge)
         yield f"train_{name}", training(alone, params)

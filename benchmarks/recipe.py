@@ -9,13 +9,12 @@ temporary one; an interrupted search goes on there. The result goes to stdout as
 
 import dataclasses
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from _common import report
+from _common import in_folder, report
 
 import jaxnav
 from jaxnav.runs.overlay import apply_values
@@ -77,8 +76,4 @@ def table(stage: str, rows: dict[str, dict[str, float]]) -> str:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 2:
-        main(Path(sys.argv[1]), Path(sys.argv[2]))
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            main(Path(sys.argv[1]), Path(temporary))
+    in_folder(main)

@@ -14,19 +14,21 @@ from jaxnav.runs.evaluate import Results, evaluate
 from jaxnav.runs.policies import EstimatorName
 
 
-def account(run: Run, without: Run, *, setting: EstimatorName | None = None, **options: Any) -> list[Entry]:
+def account(
+    run: Run, without: Run, *, setting: EstimatorName | None = None, hold: bool = False, **options: Any
+) -> list[Entry]:
     """Account for the experience of a run, on fixed episodes.
 
     Args:
       run: a finished run.
       without: a finished run of agents that cannot know any layout, such as those of the method `anonymous`.
-      setting: layout estimator to use instead of the run's.
+      setting, hold: layout estimator to use instead of the run's.
       **options: the others of `evaluate`, for both runs.
 
     Raises:
       InputError: no finished run, an impossible option, or runs that `leads` cannot compare.
     """
-    return leads(evaluate(run, setting=setting, **options), evaluate(without, **options))
+    return leads(evaluate(run, setting=setting, hold=hold, **options), evaluate(without, **options))
 
 
 def leads(results: Results, without: Results) -> list[Entry]:

@@ -15,8 +15,8 @@ def check(config: RunConfig) -> RunConfig:
     """Return the config, complete and possible.
 
     A method that cannot host the layout loses the arm `layout`; paths may be given as texts. With streams the direct
-    pathway sees the goal's detection alone, and the counterfactual branch needs no training: the stream of experience
-    is on and off by episodes, which trains both streams.
+    pathway sees the goal's detection alone, and the counterfactual branch needs no training of its own: both
+    streams are policies.
 
     Raises:
       InputError: names the first impossible setting.
@@ -30,6 +30,7 @@ def check(config: RunConfig) -> RunConfig:
         config = dataclasses.replace(config, direct="goal", counterfactual="none")
     _check_method(config, method)
     _check_numbers(config)
+    _check_stages(config)
     _check_layout(config)
     _check_learning(config)
     _check_world(config)
@@ -50,6 +51,20 @@ def _check_method(config: RunConfig, method: Method) -> None:
         known = f"{config.method!r} has {', '.join(sizes)}" if sizes else f"{config.method!r} has no sizes of its own"
         _need(name in sizes, f"method_sizes.{name}", value, f"is unknown; {known}")
         _need(value >= 1, f"method_sizes.{name}", value, "give at least 1")
+
+
+def _check_stages(config: RunConfig) -> None:
+    share = config.pretraining
+    if share is not None:
+        _need(0.0 < share < 1.0, "pretraining", share, "give a share between 0 and 1, both excluded")
+        _need(len(config.stages) > 1, "pretraining", share, f"method {config.method!r} has none; leave it out")
+    name, value = ("total_steps", config.total_steps) if share is None else ("pretraining", share)
+    for number, stage in enumerate(config.stages, 1):
+        mend = (
+            f"stage {number} of method {config.method!r}, a share of {stage.share:.3g}, gets none of the "
+            f"{len(config.schedule)} chunks of {config.chunk} updates: give more total_steps or a smaller chunk"
+        )
+        _need(number - 1 in config.schedule, name, value, mend)
 
 
 def _check_numbers(config: RunConfig) -> None:
@@ -82,6 +97,7 @@ def _check_learning(config: RunConfig) -> None:
     _need_all(ppo, "ppo", ("gamma", "gae_lambda"), lambda x: 0.0 <= x <= 1.0, "give a number from 0 to 1")
     between = "give a number between 0 and 1, both excluded"
     _need_all(ppo, "ppo", ("experience",), lambda x: 0.0 < x < 1.0, between)
+    _need_all(ppo, "ppo", ("alone",), lambda x: 0.0 <= x < 1.0, "give a share from 0 to below 1")
     rates = ("learning_rate", "clip", "max_grad_norm")
     _need_all(ppo, "ppo", rates, lambda x: 0.0 < x < float("inf"), "give a positive number")
     weights = ("entropy", "final_entropy", "value", "distil")

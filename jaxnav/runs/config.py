@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Literal
 
 from jaxnav.layout import Reduction
+from jaxnav.policies.methods import Stage, find_method
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import Deciding, Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.detector import Detector
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.training.config import Counterfactual, PPOConfig
+from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars, stage_at
 
 Arm = Literal["baseline", "layout"]
 #: Policies without and with the layout estimator; they differ by its weights alone.
@@ -26,7 +27,7 @@ class WorldConfig:
     Attributes:
       num_train, num_val, num_test: generated scenes of each split.
       seed: of the generator.
-      shift: layout shift of the scenes, from 0 to 1; single rooms and files are relabelled.
+      shift: layout shift of the scenes, from 0 to 1: the share of the categories that exchange their places.
       categories: what can be detected.
       goals: what of it can be looked for; None with categories of one's own: all of them.
       train_step_limit: actions of a training episode.
@@ -59,7 +60,8 @@ class LayoutConfig:
       strength, reduction: of the prior's rows, and over rows in the gap; None: whatever makes the gap run as in the
         paper in the training scenes. Of no use to `paper` and `released`.
       prior: one for each `room` type, which tells the policy the type of the room; or all rooms `pooled` into one.
-      walks, steps: random walks and their steps that collect the prior in the training scenes.
+      walks, steps: random walks and their steps that collect the prior in the training scenes; the gap `learned` takes
+        four times as many walks.
     """
 
     setting: Literal["paper", "released", "calibrated"] = "calibrated"
@@ -82,16 +84,20 @@ class RunConfig:
       scenes: scene file to read instead; its splits are used.
       arms: kinds of policies that are trained; a method that cannot host the layout has the baseline alone.
       seeds: policies trained of each kind.
-      total_steps: environment steps of each policy, rounded up to whole chunks; None: as usual in the world. The
-        layout's policies have seen the prior's random steps (`layout.walks x layout.steps`) besides.
+      total_steps: environment steps of each policy, those of its pre-training included, rounded up to whole chunks;
+        None: as usual in the world. The layout's policies have seen the prior's random steps (`layout.walks x
+        layout.steps`) besides.
+      pretraining: share of them that the method's pre-training takes, in whole chunks; None: as usual for the method.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
       decision: how pathways become logits: `fused` before one recurrent core, as in the paper, or as the sum of two
-        `streams`, of which that of experience is off in some training episodes (see `ppo.experience`); with streams
-        `direct` is goal and `counterfactual` none.
+        `streams`, of which that of experience is off at first and in some training episodes (see `ppo.alone` and
+        `ppo.experience`); with streams `direct` is goal and `counterfactual` none.
       direct: which detections the direct pathway of the goal sees.
       spatial_memory: whether policies remember, on the direct pathway of the scene, which cells they have seen and
         visited; the paper's do not.
+      goal_row: give the direct pathway the goal's detection in a row of its own too, whatever the goal is; the paper's
+        has it in that of its category alone.
       done_gate: multiply the logit of Done by 0.58 times the confidence that the goal is in sight.
       chunk: updates per compiled call; between calls the run logs, saves (every `save_every` calls) and, where scenes
         are streamed, goes on to the next shard with new episodes.
@@ -114,11 +120,13 @@ class RunConfig:
     arms: tuple[Arm, ...] = ARMS
     seeds: int = 3
     total_steps: int | None = None
+    pretraining: float | None = None
     seed: int = 0
     counterfactual: Counterfactual = "distil"
     decision: Deciding = "fused"
     direct: Direct = "all"
     spatial_memory: bool = True
+    goal_row: bool = True
     done_gate: bool = False
     chunk: int = 16
     save_every: int = 4
@@ -151,13 +159,54 @@ class RunConfig:
         """Return what its policies are built from."""
         sizes = tuple(sorted(self.method_sizes.items()))
         memory = SpatialMemory(self.task.rules.headings) if self.spatial_memory else None
-        options = self.direct, self.done_gate, memory, self.decision
+        options = self.direct, self.done_gate, memory, self.decision, self.goal_row
         return PolicySpec(self.method, num_categories, self.sizes, sizes, *options)
 
     @property
     def train_step_limit(self) -> int:
         """Return the actions of a training episode."""
         return self.worlds.train_step_limit or WORLDS[self.world].train_step_limit
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """Return the stages of training.
+
+        Those of the method, as `pretraining` shares them; with streams the last is two, the direct stream alone first.
+        """
+        *before, last = find_method(self.method).stages
+        if self.pretraining is not None and before:
+            scale = self.pretraining / sum(stage.share for stage in before)
+            before = [dataclasses.replace(stage, share=scale * stage.share) for stage in before]
+            last = dataclasses.replace(last, share=1.0 - self.pretraining)
+        alone = self.ppo.alone * last.share if self.decision == "streams" else 0.0
+        if not alone:
+            return (*before, last)
+        both = dataclasses.replace(last, share=last.share - alone)
+        return (*before, dataclasses.replace(last, share=alone, alone=True), both)
+
+    @property
+    def schedule(self) -> list[int]:
+        """Return the number of the stage of every chunk, in order."""
+        chunks = self.total_updates // self.chunk
+        return [stage_at(self.stages, chunk / chunks) for chunk in range(chunks)]
+
+    @property
+    def scalars(self) -> list[PPOScalars]:
+        """Return the traced settings of PPO in every stage."""
+        schedule, numbers = self.schedule, range(len(self.stages))
+        begins, lengths = ([self.chunk * how(number) for number in numbers] for how in (schedule.index, schedule.count))
+        return [self.ppo.scalars(length, begin) for begin, length in zip(begins, lengths, strict=True)]
+
+    @property
+    def budget(self) -> dict[str, int]:
+        """Return the environment steps behind a policy, by what they are for."""
+        before, chunk_steps = len(find_method(self.method).stages) - 1, self.chunk * self.update_steps
+        learning = sum(stage >= before for stage in self.schedule)
+        return {
+            "exploration": self.layout.walks * self.layout.steps,
+            "pretraining": chunk_steps * (len(self.schedule) - learning),
+            "learning": chunk_steps * learning,
+        }
 
     @property
     def update_steps(self) -> int:

@@ -11,12 +11,13 @@ import numpy as np
 from rich.console import Console
 
 from jaxnav.baselines.shortest_path import oracle_outcome
+from jaxnav.causal import Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, episode_list, together
 from jaxnav.evaluation.grid import Evaluator, Outcome
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.notes import notes, trained_out
-from jaxnav.evaluation.report import Form, build_difference, build_report, build_row, write_report
+from jaxnav.evaluation.notes import notes, spent, trained_out
+from jaxnav.evaluation.report import build_difference, build_report, build_row, write_report
 from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
 from jaxnav.runs.directory import Run, settings
 from jaxnav.runs.policies import EstimatorName, Policies
@@ -72,6 +73,7 @@ def evaluate(
     epsilon: Sequence[float] | np.ndarray = (0.5,),
     form: Sequence[Form] | None = None,
     setting: EstimatorName | None = None,
+    hold: bool = False,
     seed: int = 0,
     console: Console | None = None,
 ) -> Results:
@@ -85,7 +87,7 @@ def evaluate(
       episodes: in the fixed list, balanced over room types and scenes.
       epsilon: thresholds of sTDE.
       form: how sTDE combines the logits; None for that of the run's layout setting.
-      setting: layout estimator to use instead of the run's; see `Policies.estimating`.
+      setting, hold: layout estimator to use instead of the run's; see `Policies.estimating`.
       seed: of the episode list and the sampled actions, from 0 to 2**32 - 1.
       console: to tell of progress on; None for silence.
 
@@ -94,7 +96,7 @@ def evaluate(
     """
     check_seed(seed)
     console = console or Console(quiet=True)
-    config, policies = run.config, run.policies().estimating(setting)
+    config, policies = run.config, run.policies().estimating(setting, hold)
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
@@ -105,16 +107,18 @@ def evaluate(
     about = settings(config) | {
         "steps_per_policy": config.total_updates * config.update_steps,
         "prior_steps": policies.prior_steps,
+        "budget": (budget := config.budget | {"exploration": policies.prior_steps}),
         "evaluation_source": str(scenes or config.source),
         "evaluation_shift": evaluation_shift(config, scenes, shift),
         "evaluation_seed": seed,
         "evaluation_setting": setting,
+        "evaluation_hold": hold,
     }
     results = Results(rows, outcome, together(lists), world.env.categories, WORLDS[config.world].budgets, {})
     names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
     table, differences = _table(results, names), _differences(results)
     told = notes(rows, results.metrics()["sr"], results.episodes, room_prior=config.layout.prior == "room")
-    told += trained_out(run.log())
+    told += [spent(budget), *trained_out(run.log())]
     return results._replace(report=build_report(table, differences, told, compilations, about))
 
 

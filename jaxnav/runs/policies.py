@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
+from jaxnav.gaps import Signs
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Knowledge, find_method
@@ -25,10 +26,10 @@ from jaxnav.training.exploration import Exploration
 
 #: Folder of the exported policies in a run directory.
 POLICIES = "policies"
-#: How the gap is measured: as a run's layout setting has it, or in one of two other ways.
-Gap = Literal["novelty", "evidence", "clock"]
+#: How the gap is measured: as a run's layout setting has it, or in another way.
+Gap = Literal["novelty", "evidence", "learned", "overdue", "clock"]
 #: Layout estimators that a run can be evaluated with, besides that of its training.
-EstimatorName = Literal["paper", "released", "evidence", "clock"]
+EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
 
 
 class Policies(NamedTuple):
@@ -62,26 +63,31 @@ class Policies(NamedTuple):
         first = self.seeds * self.arms.index(arm)
         return jax.tree.map(lambda leaf: leaf[first : first + self.seeds], self.params)
 
-    def estimating(self, name: EstimatorName | None) -> "Policies":
+    def estimating(self, name: EstimatorName | None, hold: bool = False) -> "Policies":
         """Return these policies beside another layout estimator.
 
         Args:
-          name: `evidence` and `clock` measure the gap in another way and leave the layout's weights; `paper` and
-            `released` make weights too; None changes nothing.
+          name: `paper` and `released` make weights too; the others measure the gap in another way and leave the
+            layout's weights; None leaves the estimator.
+          hold: the gap never falls within an episode.
 
         Raises:
-          InputError: none of the policies uses the layout.
+          InputError: none of the policies uses the layout, or the run knows no signs for `learned` or `overdue`.
         """
-        if name is None:
+        if name is None and not hold:
             return self
         if self.setting is None:
-            raise InputError(f"--setting {name}: needs policies with the layout; train a run with the arm `layout`")
-        if name in ("evidence", "clock"):
-            return self._replace(setting=gap_settings(self.setting)[name])
-        setting = SETTINGS[name]
-        return self._replace(
-            setting=setting, knowledge=self.knowledge._replace(layout=layout_priors(self.counts, setting))
-        )
+            asked = "--hold" if name is None else f"--setting {name}"
+            raise InputError(f"{asked}: needs policies with the layout; train a run with the arm `layout`")
+        if name in ("learned", "overdue") and self.knowledge.signs is None:
+            raise InputError(f"--setting {name}: the run learned no signs of another layout; train it anew")
+        setting, knowledge = self.setting, self.knowledge
+        if name in ("paper", "released"):
+            setting = SETTINGS[name]
+            knowledge = knowledge._replace(layout=layout_priors(self.counts, setting))
+        elif name is not None:
+            setting = gap_settings(setting)[name]
+        return self._replace(setting=dataclasses.replace(setting, hold=hold or setting.hold), knowledge=knowledge)
 
     def acting(self, env: ObjectNav) -> Acting:
         """Return how they act in an environment."""
@@ -94,11 +100,9 @@ def gap_settings(setting: Setting) -> dict[Gap, Setting]:
     None changes the layout's weights. `clock` is what the gap of the released code comes to: all at once when something
     new is seen, then gone in steps.
     """
-    return {
-        "novelty": setting,
-        "evidence": dataclasses.replace(setting, gap="evidence"),
-        "clock": dataclasses.replace(setting, gap="clock", passes=SETTINGS["released"].passes),
-    }
+    settings: dict[Gap, Setting] = {gap: dataclasses.replace(setting, gap=gap) for gap in get_args(Gap)}
+    settings["clock"] = dataclasses.replace(settings["clock"], passes=SETTINGS["released"].passes)
+    return settings
 
 
 def load_policies(run: RunConfig, arms: Sequence[str] | None = None) -> Policies:
@@ -147,14 +151,14 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
     Its parameters have no leading axis.
 
     Raises:
-      InputError: the spec is of another version, or the method cannot be found.
+      InputError: the spec is of another version, or the method cannot be found or lacks what it learned.
     """
     try:
-        find_method(spec["method"])
+        if find_method(spec["method"]).learn is not None and "knowledge" not in tensors:
+            raise InputError(f"what method {spec['method']!r} learns before training is missing; train the run anew")
         sizes, method_sizes = Sizes(**spec["sizes"]), tuple(sorted(spec["method_sizes"].items()))
-        spatial = spec.get("spatial_memory")  # version 0.2 had none
-        spatial = None if spatial is None else SpatialMemory(**spatial)
-        decision = spec.get("decision", "fused")  # version 0.2 had no other
+        spatial = None if spec["spatial_memory"] is None else SpatialMemory(**spec["spatial_memory"])
+        options = spec["direct"], spec["done_gate"], spatial, spec["decision"], spec["goal_row"]
         built = spec["method"], len(spec["categories"]), sizes, method_sizes
         return Policies(
             params=jax.tree.map(jnp.asarray, tensors["policy"]),
@@ -162,9 +166,10 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
             knowledge=Knowledge(
                 layout=jnp.asarray(tensors["layout"]["prior"]),
                 method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
+                signs=jax.tree.map(jnp.asarray, Signs(**tensors["signs"])) if "signs" in tensors else None,
             ),
             counts=jnp.asarray(tensors["layout"]["counts"]),
-            spec=PolicySpec(*built, spec["direct"], spec["done_gate"], spatial, decision),
+            spec=PolicySpec(*built, *options),
             setting=None if spec["layout"] is None else Setting(**spec["layout"]),
             prior_steps=spec["prior_steps"],
         )
@@ -204,6 +209,7 @@ def export_policy(
         "decision": config.decision,
         "direct": config.direct,
         "done_gate": config.done_gate,
+        "goal_row": config.goal_row,
         "spatial_memory": None if policy.spatial_memory is None else dataclasses.asdict(policy.spatial_memory),
         "layout": None if setting is None else dataclasses.asdict(setting),
         "prior_steps": int(explored.steps),
@@ -213,4 +219,6 @@ def export_policy(
     tensors = {"policy": jax.device_get(params), "layout": layout}
     if knowledge.method:
         tensors["knowledge"] = jax.device_get(knowledge.method)
+    if knowledge.signs is not None:
+        tensors["signs"] = jax.device_get(knowledge.signs._asdict())
     export_params(folder, tensors, spec)

@@ -1,5 +1,6 @@
 """A trained policy that acts on observations, one episode at a time."""
 
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.causal import do, stde
+from jaxnav.causal import Form, do, stde
 from jaxnav.env.objectnav import OTHER_ROOM, prior_index
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
@@ -17,7 +18,7 @@ from jaxnav.policies.pathways import Decision, Memory
 from jaxnav.policies.perception import Perceived, Perception, View
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.policies import read_export
+from jaxnav.runs.policies import EstimatorName, read_export
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 
@@ -104,7 +105,7 @@ class LoadedPolicy(struct.PyTreeNode):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
         odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
         percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1])
-        perceived = perception.update(memory.perceived, percept, self.knowledge, memory.room)
+        perceived = perception.update(memory.perceived, percept, observation.goal, self.knowledge, memory.room)
         view = perception.view(perceived, observation, self.knowledge)
         decision, logits = self._decide(view, memory.memory, perceived.layout, epsilon)
         choice = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
@@ -132,14 +133,21 @@ class LoadedPolicy(struct.PyTreeNode):
         return decision, stde(decision.logits, counterfactual.logits, layout.gap, epsilon, self.setting.form)
 
 
-def load_policy(path: str | Path) -> LoadedPolicy:
+def load_policy(
+    path: str | Path, setting: EstimatorName | None = None, hold: bool = False, form: Form | None = None
+) -> LoadedPolicy:
     """Load an exported policy.
 
     Args:
       path: folder of one policy, such as `runs/rooms/policies/layout-0`.
+      setting, hold: layout estimator to use instead of the policy's; see `Policies.estimating`.
+      form: how sTDE combines the logits; None for that of the layout setting.
 
     Raises:
-      InputError: no export there, a damaged one, or one whose method cannot be found.
+      InputError: no export there, a damaged one, one whose method cannot be found, or an impossible setting.
     """
-    policies = read_export(Path(path))
-    return LoadedPolicy(policies.params, policies.knowledge, policies.spec, policies.setting)
+    policies = read_export(Path(path)).estimating(setting, hold)
+    layout = policies.setting
+    if layout is not None and form is not None:
+        layout = dataclasses.replace(layout, form=form)
+    return LoadedPolicy(policies.params, policies.knowledge, policies.spec, layout)

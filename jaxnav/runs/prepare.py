@@ -14,11 +14,12 @@ from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.worlds import CompiledWorld, read_ahead
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, calibrate, layout_priors
+from jaxnav.training.exchange import learn_signs
 from jaxnav.training.exploration import Exploration, explore
 from jaxnav.training.learner import Learner
 from jaxnav.training.trainer import ShardedTrainer, Trainer
 
-_EXPLORE, _CALIBRATE = 2**31 - 1, 2**31 - 2  # purposes of keys; arms use 0, 1, ...
+_EXPLORE, _CALIBRATE, _EXCHANGE = 2**31 - 1, 2**31 - 2, 2**31 - 3  # purposes of keys; arms use 0, 1, ...
 
 
 def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
@@ -61,12 +62,19 @@ def calibrate_setting(config: RunConfig, world: CompiledWorld, explored: Explora
 def learn_knowledge(config: RunConfig, world: CompiledWorld, explored: Exploration, setting: Setting) -> Knowledge:
     """Learn what is known before training.
 
-    That is the layout priors, and what the method learns.
+    That is the layout priors, what the method learns and, where policies use the layout, what sightings tell of it
+    (in the training scenes of the first bank).
     """
     learn, layout = find_method(config.method).learn, layout_priors(explored.counts, setting)
-    if learn is None:
-        return Knowledge(layout)
-    return Knowledge(layout, jax.tree.map(jax.numpy.asarray, learn(world.banks, np.asarray(explored.counts))))
+    method = {} if learn is None else jax.tree.map(jax.numpy.asarray, learn(world.banks, np.asarray(explored.counts)))
+    if "layout" not in config.arms:
+        return Knowledge(layout, method)
+    key = jax.random.fold_in(jax.random.key(config.seed), _EXCHANGE)
+    walks, pooled = 4 * config.layout.walks, config.layout.prior == "pooled"
+    signs = jax.jit(learn_signs, static_argnums=(0, 4, 5))(
+        world.env, world.params(0), explored.counts, key, walks, pooled
+    )
+    return Knowledge(layout, method, signs)
 
 
 def make_trainer(
@@ -86,6 +94,6 @@ def make_trainer(
     learners = {
         name: Learner(Acting(env, spec, settings[name]), config.ppo, config.counterfactual) for name in config.arms
     }
-    scalars, key = config.ppo.scalars(config.total_updates), jax.random.key(config.seed)
-    arguments = learners, scalars, knowledge, key, config.seeds, config.chunk
+    stages, key = list(zip(config.stages, config.scalars, strict=True)), jax.random.key(config.seed)
+    arguments = learners, stages, knowledge, key, config.seeds, config.chunk
     return Trainer(*arguments) if mesh is None else ShardedTrainer(*arguments, mesh=mesh)

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from jaxnav.causal import Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import together
 from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.report import Decoding, Form
+from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.variants import table_row
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import check_seed, run_rows

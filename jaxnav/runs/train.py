@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.layout import Setting
-from jaxnav.policies.methods import METHODS, Knowledge, find_method
+from jaxnav.policies.methods import METHODS, Knowledge
 from jaxnav.policies.policy import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.runs.check import check
@@ -32,7 +32,7 @@ from jaxnav.training.devices import Devices, by_first_process, check_agreement, 
 from jaxnav.training.exploration import Exploration
 from jaxnav.training.learner import LearnerState
 from jaxnav.training.peers import watched
-from jaxnav.training.trainer import States, Trainer, stage_at
+from jaxnav.training.trainer import States, Trainer
 
 
 @watched()
@@ -58,7 +58,7 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
         console = Console(quiet=True)
     check_agreement(json.dumps(make_manifest(settings(config))))  # before the scenes, which may take long
     world = training_world(config, console)
-    manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint})
+    manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint, "budget": config.budget})
     check_agreement(json.dumps(manifest))
     by_first_process(lambda: claim(config))
 
@@ -150,8 +150,7 @@ def _do_updates(
 
     Each is in the next bank of scenes; between chunks the run measures its policies, logs, shows and saves.
     """
-    stages = find_method(config.method).stages
-    steps = config.chunk * config.update_steps * config.seeds * len(states)
+    steps, schedule = config.chunk * config.update_steps * config.seeds * len(states), config.schedule
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("compiling", total=config.total_updates, completed=done)
@@ -159,14 +158,16 @@ def _do_updates(
         began = time.monotonic()
         for turn, params in zip(left, read_ahead(world, [order[turn] for turn in left]), strict=True):
             if turn and order[turn] != order[turn - 1]:
-                states = trainer.restart(states, params)
-            states, metrics = trainer.train(states, params, stage_at(stages, done / config.total_updates))
+                states = trainer.restart(states, params, schedule[turn])
+            states, metrics = trainer.train(states, params, schedule[turn])
             done += config.chunk
             rate = steps / (time.monotonic() - began)
             if validator is not None and done in config.validated:
                 present = trainer.unpack(states)
                 scores = validator.measure({name: [state.params for state in seeds] for name, seeds in present.items()})
-                states = trainer.keep(states, {name: [row[SCORE] for row in rows] for name, rows in scores.items()})
+                if schedule[turn] == schedule[-1]:  # before that part of the policy has not learned
+                    found = {name: [row[SCORE] for row in rows] for name, rows in scores.items()}
+                    states = trainer.keep(states, found)
                 metrics = {name: [a | b for a, b in zip(metrics[name], scores[name], strict=True)] for name in metrics}
             began = time.monotonic()
             if first_process():

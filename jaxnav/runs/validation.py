@@ -73,7 +73,7 @@ class Validator:
         self._parts: dict[Split, _Part] = {
             split: _Part(
                 episode_list(world.banks[0], config.val_episodes, _SEED),
-                dataclasses.replace(world, **sizes, **limits).params(0),
+                dataclasses.replace(world, **sizes, **limits, expert=False).params(0),
             )
             for split, world in worlds.items()
         }

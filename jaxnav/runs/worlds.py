@@ -15,9 +15,9 @@ from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import unknown_types
-from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank
+from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank, concatenate
 from jaxnav.scenes.tables.shards import Shards, compile_shards
-from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated
+from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +32,7 @@ class CompiledWorld:
       step_limit: the same in other rooms.
       num_cells, num_scenes: of the largest bank.
       fingerprint: text that differs wherever the banks differ.
+      expert: whether a method imitates shortest paths in them.
     """
 
     scenes: Scenes
@@ -42,19 +43,22 @@ class CompiledWorld:
     num_cells: int
     num_scenes: int
     fingerprint: str
+    expert: bool = False
 
     def params(self, index: int) -> EnvParams:
         """Return the environment's parameters with one of the banks.
 
         Those of all banks are of equal shape.
         """
-        return build(self.banks[index], self.step_limits, self.step_limit, self.num_cells, self.num_scenes)[1]
+        sizes = self.num_cells, self.num_scenes
+        return build(self.banks[index], self.step_limits, self.step_limit, *sizes, expert=self.expert)[1]
 
 
 def training_world(config: RunConfig, console: Console) -> CompiledWorld:
     """Compile the training scenes of a run."""
     scenes = _scenes(config, "train", config.scenes, config.worlds.shift, console)
-    return _compiled(config, scenes, {}, config.train_step_limit, console)
+    world = _compiled(config, scenes, {}, config.train_step_limit, console)
+    return dataclasses.replace(world, expert=any(stage.imitates for stage in config.stages))
 
 
 def evaluation_world(
@@ -74,6 +78,19 @@ def evaluation_world(
     return _compiled(config, chosen, limits, limit, console)
 
 
+def one_world(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
+    """Put the scenes of compiled worlds with equal rules end to end.
+
+    Raises:
+      InputError: the scenes of one of them fill more than one shard.
+    """
+    if any(len(world.banks) > 1 for world in worlds):
+        raise InputError("scenes fill more than one shard; give more --shard-scenes, or fewer scenes")
+    bank = concatenate([world.banks[0] for world in worlds])
+    about = len(bank.ahead), len(bank.names), "-".join(world.fingerprint for world in worlds)
+    return CompiledWorld(worlds[0].scenes, worlds[0].env, (bank,), worlds[0].step_limits, worlds[0].step_limit, *about)
+
+
 def evaluation_shift(config: RunConfig, scenes: Path | None, shift: float | None) -> float:
     """Return the shift that is asked for, else the run's.
 
@@ -85,14 +102,15 @@ def evaluation_shift(config: RunConfig, scenes: Path | None, shift: float | None
 
 
 def _scenes(config: RunConfig, split: str, path: Path | None, shift: float, console: Console) -> Scenes:
+    task, seed = config.task, config.worlds.seed
     if path is None:
-        return generated(config.world, split, getattr(config.worlds, f"num_{split}"), config.worlds.seed, shift)
-    scenes = from_file(path, split, shift, config.worlds.seed, config.task.categories)
-    if counts := unknown_types(scenes.scenes, config.task.categories):
+        return shifted(generated(config.world, split, getattr(config.worlds, f"num_{split}"), seed), task, shift, seed)
+    scenes = from_file(path, split)
+    if counts := unknown_types(scenes.scenes, task.categories):
         types = ", ".join(f"{name} x {count}" for name, count in counts.most_common(5))
         rest = f" and {len(counts) - 5} more" if len(counts) > 5 else ""
         console.print(f"{path}: types that are no category and only block the sight: {types}{rest}", soft_wrap=True)
-    return scenes
+    return shifted(scenes, task, shift, seed)
 
 
 def _compiled(

@@ -13,7 +13,7 @@ from jaxnav.errors import InputError
 from jaxnav.store.files import write_atomic
 
 #: Version of the layout of the two files.
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 _PARAMS, _POLICY = "params.safetensors", "policy.json"
 

@@ -10,6 +10,7 @@ from support.tiny_world import lively
 
 import jaxnav
 from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.gaps import Signs
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig
@@ -18,6 +19,7 @@ from jaxnav.runs.overlay import apply_yaml
 from jaxnav.runs.policies import POLICIES, export_policy
 from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import layout_priors
+from jaxnav.training.exchange import chances
 from jaxnav.training.exploration import Exploration
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24
@@ -41,8 +43,11 @@ def drawn_run(config) -> Run:
     claim(config)
     categories = len(config.task.categories)
     counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, categories, categories)).astype(np.float32)
+    counts[:, np.arange(categories), np.arange(categories)] = 9  # no pair is seen more often than each of the two
     explored = Exploration(jnp.asarray(counts), jnp.int32(1280), jnp.int32(600))
-    knowledge = Knowledge(layout_priors(explored.counts, SETTING))
+    odds = np.triu(np.random.default_rng(1).normal(size=counts.shape), 1).astype(np.float32)
+    signs = Signs(jnp.asarray(odds), chances(explored.counts))
+    knowledge = Knowledge(layout_priors(explored.counts, SETTING), signs=signs)
     for number, arm in enumerate(config.arms):
         for seed in range(SEEDS):
             params = lively(SEEDS * number + seed, config.policy_spec(categories))

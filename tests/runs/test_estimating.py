@@ -12,12 +12,13 @@ from jaxnav.layout import SETTINGS
 from jaxnav.runs.prepare import explore_world
 from jaxnav.runs.worlds import training_world
 from jaxnav.training.calibration import layout_priors
+from jaxnav.training.exchange import chances
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", ["evidence", "clock"])
+@pytest.mark.parametrize("setting", ["evidence", "learned", "overdue", "clock"])
 def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, evaluated, setting):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting=setting)
     assert other.rows == evaluated.rows
@@ -50,6 +51,25 @@ def test_settings_keep_what_they_do_not_name(drawn_run):
     released = policies.estimating("released")
     assert released.setting == SETTINGS["released"]
     np.testing.assert_array_equal(released.knowledge.layout, layout_priors(policies.counts, "released"))
+
+
+def test_gaps_that_a_run_did_not_learn_are_refused(drawn_run):
+    policies = drawn_run.policies()
+    np.testing.assert_array_equal(policies.knowledge.signs.chance, chances(policies.counts))  # as exported
+    without = policies._replace(knowledge=policies.knowledge._replace(signs=None))
+    for name in ("learned", "overdue"):
+        assert policies.estimating(name).setting == dataclasses.replace(policies.setting, gap=name)
+        with pytest.raises(InputError, match=f"--setting {name}: the run learned no signs of another layout"):
+            without.estimating(name)
+
+
+def test_holding_is_for_every_estimator(drawn_run):
+    policies = drawn_run.policies()
+    for name in (None, "evidence", "released", "clock"):
+        plain, held = policies.estimating(name).setting, policies.estimating(name, hold=True).setting
+        assert held == dataclasses.replace(plain, hold=True)
+    with pytest.raises(InputError, match="--hold: needs policies with the layout"):
+        policies._replace(setting=None).estimating(None, hold=True)
 
 
 def test_policies_without_the_layout_have_no_estimator(drawn_run):

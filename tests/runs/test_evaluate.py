@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from jaxnav.evaluation.notes import notes
+from jaxnav.evaluation.notes import notes, spent
 from jaxnav.evaluation.variants import Row
 
 LAYOUT, TDE = Row("layout", None, None, "argmax"), Row("tde", None, "paper", "argmax")
@@ -67,7 +67,7 @@ def test_only_what_is_trained_varies_with_training(evaluated):
 def test_the_notes_are_those_of_the_rows_and_the_run(evaluated):
     success = evaluated.metrics()["sr"]
     expected = notes(evaluated.rows, success, evaluated.episodes, room_prior=True)
-    assert evaluated.report["notes"] == expected
+    assert evaluated.report["notes"] == [*expected, spent(evaluated.report["run"]["budget"])]
     assert any("told the type of the room" in note for note in expected)
     assert expected != notes(evaluated.rows, success, evaluated.episodes, room_prior=False)
 

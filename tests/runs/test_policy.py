@@ -92,6 +92,24 @@ def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, ep
         assert actions == trace.action.tolist()
 
 
+@pytest.mark.parametrize("setting", ["overdue", pytest.param("learned", marks=pytest.mark.slow)])
+def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setting):
+    """It switches, and holds: once without experience, always without."""
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1", setting, hold=True, form="switch")
+    policies, params, bank = drawn_run.policies().estimating(setting, hold=True), world.params(0), world.banks[0]
+    episodes, weights = episode_list(bank, 8), tiny.at(policies.of("layout"), 1)
+    cell = tiny.at(inference_grid([table_row("stde", 0.6, "switch", "argmax")], ["layout"], 1), 0)
+    switched = []
+    for episode in range(0, 8, 2):
+        start, room = tiny.at(first_states(episodes), episode), bank.room_types[episodes.scene[episode]]
+        trace = play(cell, weights, start, policies.acting(world.env), params, policies.knowledge)
+        steps = len(trace.action)
+        assert follow(policy, world.env, params, start, room, steps, epsilon=0.6) == trace.action.tolist()
+        assert (np.diff(trace.gap) >= 0).all()
+        switched += (trace.gap > 0.6).tolist()
+    assert 0 < np.mean(switched) < 1
+
+
 def test_removal_and_keys_change_actions(drawn_run, world):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1")
     starts, bank = first_states(episode_list(world.banks[0], 8)), world.banks[0]

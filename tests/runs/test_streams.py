@@ -13,6 +13,7 @@ from rich.console import Console
 from support.tiny_world import lively
 
 import jaxnav
+from jaxnav.errors import InputError
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.policies import POLICIES, export_policy
@@ -49,12 +50,13 @@ def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
     np.testing.assert_array_equal(memory.memory.experienced, 1.0)
 
 
-def test_exports_that_do_not_name_a_decision_are_fused(drawn_run, tmp_path):
+def test_exports_that_do_not_name_a_decision_are_refused(drawn_run, tmp_path):
     folder = shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
     exported = json.loads((folder / "policy.json").read_text())
     assert exported["spec"].pop("decision") == "fused"
     (folder / "policy.json").write_text(json.dumps(exported))
-    assert jaxnav.load_policy(folder).spec == drawn_run.config.policy_spec(len(drawn_run.config.task.categories))
+    with pytest.raises(InputError, match=r"layout-0: its spec does not fit this code \(KeyError: 'decision'\)"):
+        jaxnav.load_policy(folder)
 
 
 @pytest.mark.slow

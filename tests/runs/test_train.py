@@ -8,14 +8,22 @@ import chex
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 from support.commands import POLICIES, SEEDS, contents, finished_run
 
 import jaxnav
+from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
 from jaxnav.evaluation.variants import Row
+from jaxnav.policies.methods.graphs import learn_graph
+from jaxnav.policies.methods.zones import learn_zones
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.overlay import apply_yaml
+from jaxnav.runs.prepare import explore_world
+from jaxnav.runs.worlds import evaluation_world, training_world
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.worlds import generated
 
 EPISODES = 4
 
@@ -142,3 +150,36 @@ def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
 def test_paths_may_be_texts():
     config = check(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
     assert (config.run_dir, config.scenes) == (Path("runs/two"), Path("rooms.jsonl.gz"))
+
+
+@pytest.mark.slow
+def test_zones_are_learned_in_the_training_scenes_alone_and_exported(config, tmp_path):
+    hoz = small(config, tmp_path / "run", method="hoz", method_sizes={})
+    exported = jaxnav.train(hoz).policies().knowledge.method
+
+    def learned(split):
+        scenes = generated(hoz.world, split, getattr(hoz.worlds, f"num_{split}"), hoz.worlds.seed)
+        bank = compile_bank((scenes[i] for i in range(len(scenes))), hoz.task)
+        return learn_zones([bank], np.zeros((NUM_PRIORS, *2 * [len(hoz.task.categories)])))
+
+    chex.assert_trees_all_equal(exported, learned("train"))
+    for split in ("val", "test"):
+        assert (exported["nodes"] != learned(split)["nodes"]).any()
+    results = jaxnav.evaluate(jaxnav.Run.open(tmp_path / "run"), episodes=EPISODES)
+    assert {leaf.shape[-1] for leaf in results.outcome} == {EPISODES}
+
+
+@pytest.mark.slow
+def test_scene_priors_are_learned_in_the_training_scenes_alone_and_exported(config, tmp_path):
+    sp, console = small(config, tmp_path / "run", method="sp", method_sizes={}), Console(quiet=True)
+    exported = jaxnav.train(sp).policies().knowledge.method
+
+    def learned(world):
+        return learn_graph(world.banks, np.asarray(explore_world(sp, world).counts))
+
+    chex.assert_trees_all_equal(exported, learned(training_world(sp, console)))
+    for split in ("val", "test"):
+        other = learned(evaluation_world(sp, split, None, None, console))
+        assert np.abs(exported["mixing"] - other["mixing"]).max() > 0.01
+    results = jaxnav.evaluate(jaxnav.Run.open(tmp_path / "run"), episodes=EPISODES)
+    assert {leaf.shape[-1] for leaf in results.outcome} == {EPISODES}

@@ -1,0 +1,106 @@
+"""Stages of training and the environment steps behind a policy."""
+
+import dataclasses
+import json
+
+import chex
+import pytest
+
+import jaxnav
+from jaxnav.errors import InputError
+from jaxnav.evaluation.notes import spent
+from jaxnav.policies.methods import Method, Stage
+from jaxnav.policies.methods.rgb import NoExperience
+from jaxnav.runs.check import check
+from jaxnav.runs.config import LayoutConfig, RunConfig
+from jaxnav.runs.train import train
+from jaxnav.training.config import PPOConfig
+from jaxnav.training.trainer import Trainer
+
+#: Ten chunks of two updates of 64 x 10 steps.
+CONFIG = RunConfig(
+    method="vtnet",
+    chunk=2,
+    total_steps=10 * 2 * 640,
+    ppo=PPOConfig(num_envs=64, rollout=10, minibatches=4),
+    layout=LayoutConfig(walks=30, steps=20),
+)
+
+
+def test_pretraining_is_part_of_the_budget():
+    # A fifth of ten chunks of 1,280 steps.
+    assert CONFIG.schedule == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
+    assert CONFIG.budget == {"exploration": 600, "pretraining": 2 * 1280, "learning": 8 * 1280}
+    plain = dataclasses.replace(CONFIG, method="org")
+    assert plain.schedule == 10 * [0]
+    assert plain.budget == {"exploration": 600, "pretraining": 0, "learning": 12800}
+    told = "600 of exploration for the layout priors, 2,560 of pre-training, 10,240 of learning."
+    assert told in spent(CONFIG.budget)
+
+
+@pytest.mark.parametrize(("share", "chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
+def test_its_share_can_be_set_in_whole_chunks(share, chunks):
+    config = check(dataclasses.replace(CONFIG, pretraining=share))
+    assert config.schedule == chunks * [0] + (10 - chunks) * [1]
+    assert sum(stage.share for stage in config.stages) == pytest.approx(1.0)
+    assert sum(config.budget.values()) - 600 == CONFIG.total_steps
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pretraining": 0.0}, "config: pretraining is 0.0; give a share between 0 and 1, both excluded"),
+        ({"pretraining": 1.0}, "config: pretraining is 1.0; give a share between 0 and 1, both excluded"),
+        ({"pretraining": float("nan")}, "config: pretraining is nan; give a share"),
+        ({"pretraining": 0.95}, "config: pretraining is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
+        ({"total_steps": 1}, "config: total_steps is 1; stage 2 of method 'vtnet', a share of 0.8, gets none of the 1"),
+        ({"method": "org", "pretraining": 0.2}, "config: pretraining is 0.2; method 'org' has none; leave it out"),
+    ],
+)
+def test_impossible_shares_are_refused(options, message):
+    with pytest.raises(InputError) as refusal:
+        check(dataclasses.replace(CONFIG, **options))
+    assert str(refusal.value).startswith(message)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("shares", [(), (0.5,), (0.5, 0.6), (0.0, 1.0)])
+def test_the_shares_of_a_method_add_up(shares):
+    with pytest.raises(ValueError, match="add up to 1"):
+        Method(NoExperience, stages=tuple(Stage(share) for share in shares))
+
+
+@pytest.mark.slow
+def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(config, tmp_path, monkeypatch):
+    """Two chunks, one of each stage; a run that stops after the first ends as one that does not."""
+    sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
+    options = {"method": "vtnet", "method_sizes": sizes, "arms": ("baseline",), "seeds": 1}
+    config = dataclasses.replace(config, **options, run_dir=tmp_path / "whole")
+    run = train(config)
+    first, last = run.log()
+    assert "imitation_loss" in first
+    assert "policy_loss" not in first
+    assert "policy_loss" in last
+    for checkpoint in (run.config.run_dir / "checkpoints").iterdir():
+        metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
+        assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "pretraining": 256, "learning": 256}
+
+    done = []
+
+    def stop_after_the_first(self, *arguments):
+        if done:
+            raise KeyboardInterrupt
+        done.append(arguments)
+        return once(self, *arguments)
+
+    once = Trainer.train
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train", stop_after_the_first)
+        with pytest.raises(KeyboardInterrupt):
+            train(dataclasses.replace(config, run_dir=tmp_path / "resumed"))
+    resumed = train(dataclasses.replace(config, run_dir=tmp_path / "resumed"))
+    assert resumed.log() == run.log()
+    policies = [jaxnav.load_policy(each.config.run_dir / "policies" / "baseline-0").params for each in (run, resumed)]
+    chex.assert_trees_all_equal(*policies)
+    budget = jaxnav.evaluate(run, episodes=8).report["run"]["budget"]
+    assert budget == {"exploration": 1280, "pretraining": 256, "learning": 256}
