@@ -217,7 +217,8 @@ from jaxnav.store.export import load_params
 from jaxnav.env.types import Observation
 params, told = load_params(Path(sys.argv[1]))
 sizes = spec.Sizes(**told["sizes"]), tuple(map(tuple, told["method_sizes"]))
-bound = policy.bind(spec.PolicySpec(told["method"], told["num_categories"], *sizes), params)
+told = spec.PolicySpec(told["method"], told["num_categories"], *sizes, goal_row=told["goal_row"])
+bound = policy.bind(told, params)
 given = np.load(sys.argv[2])
 observation = Observation(row=jnp.asarray(given["row"]), goal=jnp.asarray(given["goal"]))
 pathways = bound.pathways(observation, jnp.asarray(given["weights"]))

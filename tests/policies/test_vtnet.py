@@ -216,7 +216,7 @@ def test_pretraining_lowers_its_loss_and_leaves_the_policy_as_it_is():
     state, first = jax.jit(learner.train, static_argnums=4)(before, config.scalars(400), params, KNOWLEDGE, 50)
     after, last = jax.jit(learner.train, static_argnums=4)(state, config.scalars(400), params, KNOWLEDGE, 50)
     assert first["imitation_loss"] < np.log(6)
-    assert last["imitation_loss"] < 0.8 * first["imitation_loss"]
+    assert last["imitation_loss"] < 0.9 * first["imitation_loss"]
     assert last["imitation_agreement"] > first["imitation_agreement"]
     for name, part in before.params.items():
         if name != "method":
