@@ -18,6 +18,8 @@ from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS
 #: Index of the layout prior that all room types outside `ROOM_TYPES` share, and the number of priors.
 OTHER_ROOM = len(ROOM_TYPES)
 NUM_PRIORS = OTHER_ROOM + 1
+#: Cells of which an episode that starts near its goal takes the nearest.
+CANDIDATES = 8
 
 
 def prior_index(room_type: str) -> int:
@@ -35,11 +37,13 @@ class ObjectNav:
       task: what is asked of the agent.
       shaping: reward for every metre that an action brings the agent nearer to its goal (by `goal_distance`), in
         training.
+      near_starts: probability that an episode starts in the nearest to its goal of several random cells, in training.
       made_with: parameters that `jaxnav.make` made with it.
     """
 
     task: Task
     shaping: float = 0.0
+    near_starts: float = 0.0
     made_with: EnvParams | None = dataclasses.field(default=None, compare=False, repr=False)
 
     @property
@@ -85,14 +89,15 @@ class ObjectNav:
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
         """Start an episode.
 
-        Scene, goal among its possible ones, cell and heading are each uniform; the horizon is 0.
+        Scene, goal among its possible ones, cell and heading are each uniform; the horizon is 0. With
+        `near_starts` some cells are the nearest to the goal of `CANDIDATES` uniform ones.
 
         Args:
           key: consumed.
           params: the bank and its limits.
         """
         tables = params.tables
-        bits = _words(key, 4)
+        bits = _words(key, 4 + CANDIDATES * bool(self.near_starts))
 
         def below(i: int, count: jax.Array) -> jax.Array:
             # Modulo of 32 random bits: the bias is under count / 2**32.
@@ -100,9 +105,15 @@ class ObjectNav:
 
         scene = below(0, jnp.asarray(tables.num_goals.shape[0], jnp.int32))
         goal = tables.goals[scene, below(1, tables.num_goals[scene])]
-        cell = tables.first_cell[scene] + below(2, tables.num_cells[scene])
         rules = self.task.rules
         heading = below(3, jnp.asarray(rules.headings, jnp.int32))
+        cell = tables.first_cell[scene] + below(2, tables.num_cells[scene])
+        if self.near_starts:
+            others = [below(4 + i, tables.num_cells[scene]) for i in range(CANDIDATES - 1)]
+            candidates = jnp.stack([cell, *(tables.first_cell[scene] + other for other in others)])
+            nearest = candidates[tables.goal_distance[candidates, goal].argmin()]
+            near = (bits[-1] >> jnp.uint32(8)).astype(jnp.float32) < self.near_starts * 2.0**24
+            cell = jnp.where(near, nearest, cell)
         pose = (cell * rules.headings + heading) * len(rules.horizons)
         state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose))
         return self.observe(state, params), state

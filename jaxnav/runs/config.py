@@ -34,6 +34,7 @@ class WorldConfig:
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
       shaping: reward in training for every metre nearer to the goal.
+      near_starts: probability that a training episode starts near its goal: in the nearest to it of eight random cells.
       shard_scenes: more scenes than this are compiled to disk, in shards of so many, and streamed from there.
     """
 
@@ -48,6 +49,7 @@ class WorldConfig:
     step_limit: int | None = None
     large_step_limit: int | None = None
     shaping: float | None = None
+    near_starts: float = 0.0
     shard_scenes: int = 128
 
 

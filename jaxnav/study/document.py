@@ -80,7 +80,7 @@ def _world(results: StudyResults, world: str) -> list[str]:
     """Return all sections of one world."""
     in_world = results.worlds[world]
     conditions, goal = in_world.conditions, results.runs.get("goal")
-    title = "Generated rooms" if world == "main" else "Scenes of the file"
+    title = f"Generated {conditions[0].world}" if world == "main" else "Scenes of the file"
     lines = [f"## {title}: {conditions[0].scenes} scenes", ""]
     lines += ["### Claims", "", *claims_table(results, world), ""]
     lines += ["### Is it an instrument?", "", *instrument_table(in_world.instrument), ""]

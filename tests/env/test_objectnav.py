@@ -1,5 +1,7 @@
 """One episode: its start, its steps and its end."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from support.scenes import BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, draw
 
 from jaxnav.env.build import build
 from jaxnav.env.make import make
+from jaxnav.env.objectnav import CANDIDATES
 from jaxnav.env.types import State
 from jaxnav.scenes.generate.rooms import generate_rooms
 from jaxnav.scenes.tables.compile import compile_bank
@@ -125,3 +128,28 @@ def test_padded_tables_hold_the_same_episodes():
         assert not np.asarray(longer[name][-added:]).any()
     small = build(BANK, {}, 9, cells - 1, 2)[1]
     assert (len(small.tables.ahead), len(small.room)) == (cells, 4)
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_some_starts_are_near_the_goal(share):
+    """Of C cells the nearest: its distance is at most x with probability 1 - (1 - F(x))^C, F that of one cell."""
+    env, params = build(BANK, {}, 10)
+    keys = jax.random.split(jax.random.key(0), 40_000)
+
+    def distances(env):
+        _, state = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
+        distance = BANK.goal_distance[np.asarray(env.cell(state.pose)), np.asarray(state.goal)]
+        return state, distance, np.asarray(state.scene) * 100 + np.asarray(state.goal)
+
+    plain, uniform, kinds = distances(env)
+    near, nearer, _ = distances(dataclasses.replace(env, near_starts=share))
+    for name in ("scene", "goal"):
+        np.testing.assert_array_equal(getattr(near, name), getattr(plain, name))
+    assert (nearer <= uniform).all()
+    assert (nearer < uniform).any()
+    kind = np.bincount(kinds).argmax()  # one scene and goal, so that F is of its cells
+    one, other = uniform[kinds == kind], nearer[kinds == kind]
+    for x in np.quantile(one, [0.1, 0.3, 0.6]):
+        below = (one <= x).mean()
+        expected = (1 - share) * below + share * (1 - (1 - below) ** CANDIDATES)
+        assert (other <= x).mean() == pytest.approx(expected, abs=0.04)
