@@ -45,7 +45,7 @@ test: lint
 	$(BIN)/python -m pytest -n 2
 
 test-slow: $(READY)
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest -n 2 -m slow --timeout 900
+	$(BIN)/python -m pytest -n 2 -m slow --timeout 900
 
 # A benchmark that fails leaves its last result as it is, and the others go on.
 bench: $(READY)

@@ -124,7 +124,8 @@ def test_the_commands_of_the_readme_train_and_evaluate_the_method(folder, tmp_pa
 
     def run(*arguments, cwd=folder):
         arguments = [str(argument).replace("runs/mine", str(run_dir)) for argument in arguments]
-        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
+        environment.pop("PYTHONPATH", None)
         return subprocess.run(arguments, cwd=cwd, env=environment, capture_output=True, text=True)
 
     installed = Path(sys.executable).with_name("jaxnav")

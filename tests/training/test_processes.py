@@ -29,7 +29,7 @@ def start(address, index, config_file, run_dir, *options):
     return run([*command, devices, *options], JAX_COORDINATOR_BIND_ADDRESS=address, XLA_FLAGS="")
 
 
-def ends(*processes, timeout=200):
+def ends(*processes, timeout=600):
     """Exit codes and messages of processes."""
     try:
         messages = [process.communicate(timeout=timeout)[1] for process in processes]
@@ -89,7 +89,7 @@ def test_a_killed_process_ends_the_other_one(victim, tmp_path, capsys):
         time.sleep(0.1)
     both[victim].kill()
     both[victim].communicate()
-    (code,), (message,) = ends(both[1 - victim], timeout=60)
+    (code,), (message,) = ends(both[1 - victim], timeout=300)
     assert_told(code, message)
     assert train(config_file, run_dir, "--seeds", 1, *sixty) == 0
     assert re.search(r"resumed after update \d+ of 60", capsys.readouterr().err)
@@ -99,7 +99,7 @@ def test_a_killed_process_ends_the_other_one(victim, tmp_path, capsys):
 def test_a_process_that_stays_alone_ends(tmp_path):
     config_file = write_config(tmp_path)
     alone = [start(free_address(), index, config_file, tmp_path / "run") for index in range(2)]  # each waits elsewhere
-    for code, message in zip(*ends(*alone, timeout=60), strict=True):
+    for code, message in zip(*ends(*alone, timeout=300), strict=True):
         assert_told(code, message)
     assert not (tmp_path / "run").exists()
 
