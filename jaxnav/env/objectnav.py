@@ -35,8 +35,8 @@ class ObjectNav:
 
     Attributes:
       task: what is asked of the agent.
-      shaping: reward for every metre that an action brings the agent nearer to its goal (by `goal_distance`), in
-        training.
+      shaping: reward for every metre that the agent comes nearer to its goal than before in the episode (by
+        `goal_distance`), in training.
       near_starts: probability that an episode starts in the nearest to its goal of several random cells, in training.
       made_with: parameters that `jaxnav.make` made with it.
     """
@@ -115,7 +115,8 @@ class ObjectNav:
             near = (bits[-1] >> jnp.uint32(8)).astype(jnp.float32) < self.near_starts * 2.0**24
             cell = jnp.where(near, nearest, cell)
         pose = (cell * rules.headings + heading) * len(rules.horizons)
-        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose))
+        nearest = tables.goal_distance[cell, goal] if self.shaping else None
+        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose), nearest=nearest)
         return self.observe(state, params), state
 
     def observe(self, state: State, params: EnvParams) -> Observation:
@@ -169,11 +170,11 @@ class ObjectNav:
         reward = jnp.where(done & self.succeeds(state, params), params.success_reward, params.step_reward)
         truncated = ~done & (time >= params.step_limit[state.scene])
         pose = self.after(state.pose, action, params)
-        if self.shaping:
-            distance = params.tables.goal_distance
-            before, after = distance[self.cell(state.pose), state.goal], distance[self.cell(pose), state.goal]
-            reward += self.shaping * (before - after)
-        return state.replace(pose=pose, time=time), reward, done, truncated
+        nearest = state.nearest
+        if nearest is not None:
+            nearest = jnp.minimum(nearest, params.tables.goal_distance[self.cell(pose), state.goal])
+            reward += self.shaping * (state.nearest - nearest)
+        return state.replace(pose=pose, time=time, nearest=nearest), reward, done, truncated
 
     def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
         """Take an action, with same-step auto-reset.

@@ -51,12 +51,14 @@ class State(struct.PyTreeNode):
       scene: int32 [], scene index.
       goal: int32 [], category that is sought.
       time: int32 [], actions taken so far.
+      nearest: float32 [], metres to the goal where the episode came nearest to it; None where nothing is shaped.
     """
 
     pose: jax.Array
     scene: jax.Array
     goal: jax.Array
     time: jax.Array
+    nearest: jax.Array | None = None
 
 
 class Observation(struct.PyTreeNode):

@@ -91,7 +91,7 @@ def test_starts_are_uniform(rules):
 
 
 @pytest.mark.parametrize(("rules", "ahead"), [(ROOMS, 1.0), pytest.param(HOUSES, 0.75, marks=pytest.mark.slow)])
-def test_shaping_rewards_metres_nearer_to_the_goal(rules, ahead):
+def test_shaping_rewards_metres_nearer_than_before(rules, ahead):
     # A corridor of 8 cells along z; the book's centre is at z = 2.75, its footprint from 2.5 m on (sight: 2.75 - z to
     # the centre, walk: 2.5 - z to the footprint). Each MoveAhead is 0.25 m, whatever is measured.
     corridor = draw(["."] * 8, ("Book", 0, 1.0, 2.75, 0.5, 0.5, 0.5))
@@ -103,10 +103,17 @@ def test_shaping_rewards_metres_nearer_to_the_goal(rules, ahead):
     start = State(pose=jnp.int32(3 * per_cell), scene=jnp.int32(0), goal=jnp.int32(BOOK), time=jnp.int32(0))
     turned = start.replace(pose=start.pose + back)
     assert plain.advance(start, jnp.int32(MOVE_AHEAD), params)[1] == jnp.float32(-0.01)
-    for state, action, metres in [(start, MOVE_AHEAD, 0.25), (turned, MOVE_AHEAD, -0.25), (start, LOOK_UP, 0.0)]:
-        reward = shaped.advance(state, jnp.int32(action), params)[1]
-        np.testing.assert_allclose(reward, -0.01 + 2.0 * metres, atol=1e-6)
-    done = start.replace(pose=jnp.int32(7 * per_cell))
+    here = bank.goal_distance[3, BOOK]
+    # Away pays nothing, nor does the way back to where it was nearer.
+    for state, action, metres in [(start, MOVE_AHEAD, 0.25), (turned, MOVE_AHEAD, 0.0), (start, LOOK_UP, 0.0)]:
+        for nearest, gained in [(here, metres), (here - 0.25, 0.0), (here - 0.125, max(metres - 0.125, 0.0))]:
+            given = state.replace(nearest=jnp.float32(nearest))
+            after, reward, _, _ = shaped.advance(given, jnp.int32(action), params)
+            np.testing.assert_allclose(reward, -0.01 + 2.0 * gained, atol=1e-6)
+            np.testing.assert_allclose(after.nearest, nearest - gained, atol=1e-6)
+    _, begun = shaped.reset(jax.random.key(0), params)
+    np.testing.assert_allclose(begun.nearest, bank.goal_distance[shaped.cell(begun.pose), BOOK])
+    done = start.replace(pose=jnp.int32(7 * per_cell), nearest=jnp.float32(ahead))
     np.testing.assert_allclose(bank.goal_distance[7, BOOK], ahead)  # z = 1.75
     assert shaped.advance(done, jnp.int32(DONE), params)[1] == 5.0
     assert make("rooms")[0].shaping == 0.0

@@ -191,9 +191,7 @@ def test_each_stream_learns_where_it_acts_last(method):
         taught = {name: any(leaf.any() for leaf in jax.tree.leaves(node)) for name, node in found.items()}
         direct = {"actor", "critic", "core", "fuse", "view", "detections", "appearance", "sought"}
         assert {taught[name] for name in direct} == {not coin}
-        unread = (
-            {"known_appearance"} if method.endswith("ATTENTIVE") else set()
-        )  # it does not read them
+        unread = {"known_appearance"} if method.endswith("ATTENTIVE") else set()  # it does not read them
         assert {taught[name] for name in found.keys() - direct - unread} == {bool(coin)}
 
 
