@@ -33,7 +33,7 @@ class WorldConfig:
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
-      shaping: reward in training for every metre nearer to the goal.
+      shaping: reward in training for every metre nearer to the goal than before in the episode.
       near_starts: probability that a training episode starts near its goal: in the nearest to it of eight random cells.
       shard_scenes: more scenes than this are compiled to disk, in shards of so many, and streamed from there.
     """

@@ -28,7 +28,8 @@ class World:
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
       large_step_limit: the same in living rooms.
-      shaping: reward in training for every metre nearer to the goal, needed where goals are rarely reached by chance.
+      shaping: reward in training for every metre nearer to the goal than before in the episode, needed where goals are
+        rarely reached by chance.
       budgets: actions within which success is counted too: where experience is worth most, and later.
     """
 
