@@ -98,7 +98,7 @@ def _check_learning(config: RunConfig) -> None:
     between = "give a number between 0 and 1, both excluded"
     _need_all(ppo, "ppo", ("experience",), lambda x: 0.0 < x < 1.0, between)
     _need_all(ppo, "ppo", ("alone",), lambda x: 0.0 <= x < 1.0, "give a share from 0 to below 1")
-    rates = ("learning_rate", "clip", "max_grad_norm")
+    rates = ("learning_rate", "experience_rate", "clip", "max_grad_norm")
     _need_all(ppo, "ppo", rates, lambda x: 0.0 < x < float("inf"), "give a positive number")
     weights = ("entropy", "final_entropy", "value", "distil")
     _need_all(ppo, "ppo", weights, lambda x: 0.0 <= x < float("inf"), "give 0 or more")

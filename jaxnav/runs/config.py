@@ -183,7 +183,7 @@ class RunConfig:
         alone = self.ppo.alone * last.share if self.decision == "streams" else 0.0
         if not alone:
             return (*before, last)
-        both = dataclasses.replace(last, share=last.share - alone)
+        both = dataclasses.replace(last, share=last.share - alone, rate=last.rate * self.ppo.experience_rate)
         return (*before, dataclasses.replace(last, share=alone, alone=True), both)
 
     @property
@@ -197,7 +197,8 @@ class RunConfig:
         """Return the traced settings of PPO in every stage."""
         schedule, numbers = self.schedule, range(len(self.stages))
         begins, lengths = ([self.chunk * how(number) for number in numbers] for how in (schedule.index, schedule.count))
-        return [self.ppo.scalars(length, begin) for begin, length in zip(begins, lengths, strict=True)]
+        parts = zip(self.stages, lengths, begins, strict=True)
+        return [self.ppo.scalars(length, begin, stage.rate) for stage, length, begin in parts]
 
     @property
     def budget(self) -> dict[str, int]:

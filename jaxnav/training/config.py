@@ -31,6 +31,7 @@ class PPOConfig:
       alone: share of the updates, the first after any pre-training, in which the direct stream acts and learns alone,
         where there are streams.
       experience: probability that an episode after that has the stream of experience.
+      experience_rate: factor on the learning rate after that, for what is added disturbs a policy that has learned.
     """
 
     num_envs: int = 256
@@ -48,6 +49,7 @@ class PPOConfig:
     distil: float = 0.5
     alone: float = 0.5
     experience: float = 0.8
+    experience_rate: float = 0.25
 
     def num_updates(self, total_steps: int) -> int:
         """Return the updates that environment steps of a seed take.
@@ -56,10 +58,14 @@ class PPOConfig:
         """
         return -(-total_steps // (self.num_envs * self.rollout))
 
-    def scalars(self, num_updates: int, begin: int = 0) -> "PPOScalars":
-        """Return the traced part, for a stage of so many updates."""
+    def scalars(self, num_updates: int, begin: int = 0, rate: float = 1.0) -> "PPOScalars":
+        """Return the traced part, for a stage of so many updates.
+
+        `rate` is a factor on the learning rate.
+        """
         names = PPOScalars.__dataclass_fields__.keys() - {"begin", "num_updates"}
         settings = {name: jnp.float32(getattr(self, name)) for name in names}
+        settings["learning_rate"] *= rate
         return PPOScalars(**settings, begin=jnp.float32(begin), num_updates=jnp.float32(num_updates))
 
 

@@ -172,6 +172,7 @@ class Stage:
       trainable: whether the parameter at a path of names is trained; None for all.
       imitates: whether the loss reads what shortest paths do, `Tables.expert`, which only then are there.
       alone: whether the direct stream acts without that of experience, where there are streams.
+      rate: factor on the learning rate.
     """
 
     share: float = 1.0
@@ -179,6 +180,7 @@ class Stage:
     trainable: Callable[[tuple[str, ...]], bool] | None = None
     imitates: bool = False
     alone: bool = False
+    rate: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
