@@ -191,7 +191,8 @@ def _describe(annotation: Any) -> str:
         return f"a list [{', '.join(map(_describe, arguments))}]"
     if origin is dict:
         return f"a mapping of {_describe(arguments[0])} to {_describe(arguments[1])}"
-    return {Path: "a path", Any: "anything", types.NoneType: "null"}.get(annotation, annotation.__name__)
+    named: dict[Any, str] = {Path: "a path", Any: "anything", types.NoneType: "null"}
+    return named.get(annotation) or annotation.__name__
 
 
 def _shown(value: Any) -> str:

@@ -35,7 +35,7 @@ def write_comparison(config: CompareConfig, found: Mapping[str, Measured]) -> No
     lines = [*_head(config, runs, found), *reading_section(config.document)]
     for world in config.worlds:
         there = [entry for entry in runs if entry.world == world and entry.name in found]
-        parts = {(entry.method, entry.decision): found[entry.name] for entry in there}
+        parts: Parts = {(entry.method, entry.decision): found[entry.name] for entry in there}
         lines += _world(config, world, parts, found.get(frontier_name(world)))
     write_lines(config.document, lines)
 
