@@ -81,9 +81,9 @@ class Measured:
         return None
 
     def clusters(self) -> Clusters:
-        """Return the floor plans of the scenes, weighed by their episodes."""
+        """Return the floor plans of the episodes, scene by scene."""
         plans = np.array([floor_plan(name) for name in self.scenes])
-        return scene_clusters(plans, np.array(self.rooms), self.episodes)
+        return scene_clusters(np.repeat(plans, self.episodes), np.repeat(self.rooms, self.episodes))
 
     def summary(self, line: Line, metric: Metric) -> Interval:
         """Return a metric of an agent; SR and SPL in percent."""
@@ -103,5 +103,11 @@ class Measured:
         return paired_difference(a, b, self.clusters(), same_runs=same)
 
     def _values(self, line: Line, metric: Metric) -> np.ndarray:
-        """Return values of the scenes, [S, N], whose mean is that of the episodes."""
-        return SCALE[metric] * getattr(line, metric) * (len(self.episodes) / self.episodes.sum())
+        """Give the first episode of each scene its sum and the others 0, [S, E].
+
+        Means and intervals are those of the episodes, and whole numbers stay exact.
+        """
+        sums = SCALE[metric] * getattr(line, metric)
+        values = np.zeros((len(sums), self.episodes.sum()))
+        values[:, np.cumsum(self.episodes) - self.episodes] = sums
+        return values

@@ -51,7 +51,8 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Meas
         *(f"* {line}" for line in _reading_help(config)),
         "",
         "Numbers are means over seeds and episodes with 95 % intervals over training runs and scenes "
-        "(docs/statistics.md), not corrected for their number. Differences are paired on the episodes.",
+        "(docs/statistics.md), not corrected for their number. Differences are paired on the episodes. DTS is better "
+        "where it is lower.",
         "",
     ]
     if missing := [name for name in config.expected if name not in config.methods]:
