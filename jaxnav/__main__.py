@@ -14,6 +14,7 @@ COMMANDS = {
     "episode": "draw one evaluation episode of a run",
     "instrument": "prove that the layout shift leaves the difficulty and costs the baseline",
     "study": "put the claims of the paper to the test: runs, results, figures, a document",
+    "compare": "compare methods without and with the layout: Table 2 of the paper, ablations",
     "scenes": "import scenes, show one as a picture, tell what a file of them holds",
     "table": "print an evaluation as a Markdown table",
 }

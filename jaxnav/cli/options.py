@@ -2,14 +2,16 @@
 
 import argparse
 import dataclasses
-from collections.abc import Sequence
-from typing import Annotated, TypeVar
+import typing
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, TypeVar
 
 import tyro
+import yaml
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from jaxnav.errors import InputError
-from jaxnav.runs.overlay import CONFIGS, RENAMED, apply_yaml
+from jaxnav.runs.overlay import CONFIGS, RENAMED, apply_yaml, from_text
 
 Config = TypeVar("Config")
 
@@ -22,13 +24,19 @@ _CONFIG = tyro.conf.arg(
 )
 
 
-def parse(default: Config, arguments: list[str] | None, prog: str, description: str) -> Config:
+def parse(
+    default: Config,
+    arguments: list[str] | None,
+    prog: str,
+    description: str,
+    check: Callable[[Config], Config] = lambda config: config,
+) -> Config:
     """Return the settings of a command.
 
-    They are `default`, then the configuration of `--config`, then the other options.
+    They are `default`, then the configuration of `--config`, then the other options, checked by `check`.
 
     Raises:
-      InputError: bad configuration, or an option that has been renamed.
+      InputError: bad configuration, or an option that has been renamed; names the configuration.
       SystemExit: with code 2 after a bad option, 0 after --help.
     """
     first = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
@@ -37,7 +45,11 @@ def parse(default: Config, arguments: list[str] | None, prog: str, description: 
     _refuse_renamed(rest)
     if known.config is not None:
         default = apply_yaml(default, known.config)
-    return parse_options(type(default), rest, prog, description, default)
+    config = parse_options(type(default), rest, prog, description, default)
+    try:
+        return check(config)
+    except InputError as error:
+        raise InputError(f"{known.config}: {error}" if known.config else str(error)) from error
 
 
 def parse_options(
@@ -84,6 +96,22 @@ def _mapping(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[dict[str, int]
         instance_from_str=_pairs,
         is_instance=lambda value: isinstance(value, dict),
         str_from_instance=lambda pairs: [word for pair in pairs.items() for word in map(str, pair)],
+    )
+
+
+@_REGISTRY.primitive_rule
+def _nested(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[dict[str, Any]] | None:
+    """Make any other mapping one option, whose value is YAML."""
+    if typing.get_origin(info.type) is not dict or info.type == dict[str, int]:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="YAML",
+        instance_from_str=lambda words: from_text(words[0], info.type),
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=lambda value: [
+            yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6).strip()
+        ],
     )
 
 

@@ -18,4 +18,4 @@ def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> Stud
       InputError: bad configuration or setting.
       SystemExit: with code 2 after a bad option, 0 after --help.
     """
-    return check_study(parse(StudyConfig(), arguments, prog, "Put the paper's claims to the test."))
+    return parse(StudyConfig(), arguments, prog, "Put the paper's claims to the test.", check_study)

@@ -42,6 +42,19 @@ def trained_out(log: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say how far val success still rose at the end of training.
 
     Args:
+      log: the rows of a run; see `last_quarter`.
+    """
+    if (course := last_quarter(log)) is None:
+        return []
+    return ["In the last quarter of training val success (best actions) went from {:.1f} to {:.1f} %.".format(*course)]
+
+
+def last_quarter(log: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
+    """Return val success before the last quarter and at the end.
+
+    Both are in percent, with best actions, the mean over arms and seeds; None with too few measurements.
+
+    Args:
       log: the rows of a run; those with a measurement on val count.
     """
     course: dict[int, list[float]] = {}
@@ -50,9 +63,9 @@ def trained_out(log: Sequence[Mapping[str, Any]]) -> list[str]:
             course.setdefault(row["env_steps"], []).append(100.0 * row["val_success"])
     before = [steps for steps in course if steps <= 0.75 * max(course)]
     if not before:
-        return []
+        return None
     then, now = (float(np.mean(course[max(steps)])) for steps in (before, course))
-    return [f"In the last quarter of training val success (best actions) went from {then:.1f} to {now:.1f} %."]
+    return then, now
 
 
 def _missing_intervals(seeds: int, episodes: EpisodeList) -> list[str]:

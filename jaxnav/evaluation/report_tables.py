@@ -7,7 +7,8 @@ from rich.text import Text
 
 from jaxnav.evaluation.statistics import Interval
 
-_COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
+#: Titles and decimal places of the metrics.
+COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
 #: How episodes fail: means without intervals, beside the columns.
 _FAILURES = {"timeout": "Time-out (%)", "wrong_done": "Wrong Done (%)"}
 
@@ -35,10 +36,10 @@ def difference_table(report: dict[str, Any]) -> Table:
     for entry in report["differences"]:
         compared = label({**entry, "variant": entry["to"], "method": ""})
         reference = "+ w" if entry["from"] == "layout" else entry["from"]
-        _, digits = _COLUMNS[entry["metric"]]
+        _, digits = COLUMNS[entry["metric"]]
         cell = f"{Interval.from_json(entry):+.{digits}f}"
         lines.setdefault((f"{compared} - {reference}", entry["decoding"]), []).append(cell)
-    table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in _COLUMNS.values()))
+    table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in COLUMNS.values()))
     for names, cells in lines.items():
         table.add_row(*map(Text, (*names, *cells)))
     return table
@@ -56,7 +57,7 @@ def markdown_table(report: dict[str, Any]) -> str:
 
 def _titles(report: dict[str, Any]) -> list[str]:
     """Return the headings beside the first."""
-    titles = [title for title, _ in _COLUMNS.values()]
+    titles = [title for title, _ in COLUMNS.values()]
     if budgets := _budgets(report):
         titles.append(f"SR within {', '.join(map(str, budgets))} (%)")
     return [*titles, *_FAILURES.values()]
@@ -75,7 +76,7 @@ def _groups(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
         heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
         cells = (
             label(row),
-            *(f"{Interval.from_json(row[metric]):.{digits}f}" for metric, (_, digits) in _COLUMNS.items()),
+            *(f"{Interval.from_json(row[metric]):.{digits}f}" for metric, (_, digits) in COLUMNS.items()),
             *([", ".join(f"{row[f'sr@{budget}']['mean']:.1f}" for budget in budgets)] if budgets else ()),
             *(f"{row[metric]['mean']:.1f}" if metric in row else "" for metric in _FAILURES),  # version 0.2 had none
         )

@@ -137,8 +137,7 @@ def run_rows(
     Returns:
       The episodes of each bank, outcomes with leaves [R, S, E], and the number of compilations.
     """
-    each = -(-episodes // len(world.banks))
-    lists = [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
+    lists = episode_lists(world, episodes, seed)
     evaluator = Evaluator(policies.acting(world.env))
     outcome = evaluator(
         inference_grid(rows, policies.arms, policies.seeds),
@@ -149,6 +148,12 @@ def run_rows(
     )
     outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.seeds, -1), outcome)
     return lists, outcome, evaluator.compilations
+
+
+def episode_lists(world: CompiledWorld, episodes: int, seed: int) -> list[EpisodeList]:
+    """Draw so many episodes in all, equally many in every bank."""
+    each = -(-episodes // len(world.banks))
+    return [episode_list(bank, each, seed, part) for part, bank in enumerate(world.banks)]
 
 
 def check_seed(seed: int) -> None:

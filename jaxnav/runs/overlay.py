@@ -26,8 +26,8 @@ def apply_yaml(default: Config, source: str | Path) -> Config:
     """Return `default` with the values of a configuration.
 
     Only what the file names changes, and each value is checked against the annotation of its field. Known annotations:
-    `bool`, `int`, `float`, `str`, `Path`, `Literal`, `X | None`, `tuple`, `dict`, nested dataclasses. Where a float is
-    expected, whole numbers and texts such as `3e-4` (text to YAML 1.1) are taken as floats.
+    `bool`, `int`, `float`, `str`, `Path`, `Any`, `Literal`, `X | None`, `tuple`, `dict`, nested dataclasses. Where a
+    float is expected, whole numbers and texts such as `3e-4` (text to YAML 1.1) are taken as floats.
 
     Args:
       default: instance of a frozen dataclass.
@@ -49,6 +49,14 @@ def apply_values(default: Config, values: dict[str, Any], source: Path) -> Confi
       InputError: see `apply_yaml`.
     """
     return _overlay(default, values, source, "")
+
+
+def from_text(text: str, annotation: Any) -> Any:
+    """Return the value of an annotated setting in YAML, or raise `ValueError`."""
+    try:
+        return _convert(yaml.load(text, _Loader), annotation)
+    except (_Mismatch, yaml.YAMLError) as error:
+        raise ValueError(f"{text!r}: give {_describe(annotation)} in YAML") from error
 
 
 class _Loader(yaml.SafeLoader):
@@ -77,11 +85,7 @@ def _load(path: Path) -> Any:
     except yaml.MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise InputError(f"{path}{line}: not valid YAML ({error.problem}); mend the line") from error
-    except (
-        yaml.YAMLError,
-        ValueError,
-        RecursionError,
-    ) as error:  # bytes that are no text, impossible dates, deep nests
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # no text, impossible dates, deep nests
         raise InputError(f"{path}: not valid YAML ({error}); mend the file") from error
 
 
@@ -134,6 +138,8 @@ def _convert(value: Any, annotation: Any) -> Any:
         return _convert_dict(value, arguments)
     elif annotation is float:
         return _convert_float(value)
+    elif annotation is Any:
+        return value
     elif annotation is Path:
         return Path(_convert(value, str))
     elif annotation in (bool, int, str, types.NoneType):
@@ -185,9 +191,8 @@ def _describe(annotation: Any) -> str:
         return f"a list [{', '.join(map(_describe, arguments))}]"
     if origin is dict:
         return f"a mapping of {_describe(arguments[0])} to {_describe(arguments[1])}"
-    if annotation is Path:
-        return "a path"
-    return "null" if annotation is types.NoneType else annotation.__name__
+    named: dict[Any, str] = {Path: "a path", Any: "anything", types.NoneType: "null"}
+    return named.get(annotation) or annotation.__name__
 
 
 def _shown(value: Any) -> str:

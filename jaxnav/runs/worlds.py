@@ -53,6 +53,10 @@ class CompiledWorld:
         sizes = self.num_cells, self.num_scenes
         return build(self.banks[index], self.step_limits, self.step_limit, *sizes, expert=self.expert)[1]
 
+    def limits(self, bank: Bank) -> np.ndarray:
+        """Return the actions of an episode in each scene, int [S]."""
+        return np.array([self.step_limits.get(room, self.step_limit) for room in bank.room_types])
+
 
 def training_world(config: RunConfig, console: Console) -> CompiledWorld:
     """Compile the training scenes of a run."""

@@ -87,16 +87,26 @@ def check_study(config: StudyConfig) -> StudyConfig:
         raise InputError(f"shifts: {shifts}: give two or more from 0 to 1, rising")
     if not (config.epsilon and all(0.0 <= epsilon < float("inf") for epsilon in config.epsilon)):
         raise InputError(f"epsilon: {config.epsilon}: give numbers from 0 to below infinity")
-    for name in ("episodes", "steps"):
-        if getattr(config, name) < 1:
-            raise InputError(f"{name}: {getattr(config, name)}: give at least 1")
-    if not 0 <= config.seed < 2**32:
-        raise InputError(f"seed: {config.seed}: give a whole number from 0 to 2**32 - 1")
-    if not isinstance(config.base.devices, int | None):
-        raise InputError(f"base.devices: {config.base.devices}: a study is one process; give a number of devices")
+    if config.steps < 1:
+        raise InputError(f"steps: {config.steps}: give at least 1")
+    check_shared(config.episodes, config.seed, config.base)
     if config.real is not None and not config.real.is_file():
         raise InputError(f"real: {config.real}: there is no such file")
     return config
+
+
+def check_shared(episodes: int, seed: int, base: RunConfig) -> None:
+    """Check what everything that trains many runs is given.
+
+    Raises:
+      InputError: names the first impossible setting.
+    """
+    if episodes < 1:
+        raise InputError(f"episodes: {episodes}: give at least 1")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"seed: {seed}: give a whole number from 0 to 2**32 - 1")
+    if not isinstance(base.devices, int | None):
+        raise InputError(f"base.devices: {base.devices}: all runs are trained in one process; give a number of devices")
 
 
 def study_identity(config: StudyConfig) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The study's document, written from its results."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from jaxnav.errors import InputError
@@ -47,9 +48,7 @@ def write_document(results: Path, document: Path) -> None:
     val, test = (load_results(results / split) for split in ("val", "test"))
     if val is None:
         raise InputError(f"{results / 'val'}: holds no results; run the study first")
-    check_document(document)
-    reading = document.read_text(encoding="utf-8").split(READING)[1] if document.exists() else "\n\n"
-    lines = _head(val, reading)
+    lines = _head(val, reading_section(document))
     for world in val.worlds:
         lines += _world(val, world)
     if test is not None:
@@ -57,10 +56,26 @@ def write_document(results: Path, document: Path) -> None:
         lines += ["Epsilon (of the residual form) was chosen on `val`, at the first shift.", ""]
         for world in test.worlds.values():
             lines += [*metrics_table(world.conditions, "argmax"), ""]
+    write_lines(document, lines)
+
+
+def reading_section(document: Path) -> list[str]:
+    """Return the section whose text is written by hand, and kept.
+
+    Raises:
+      InputError: see `check_document`.
+    """
+    check_document(document)
+    reading = document.read_text(encoding="utf-8").split(READING)[1] if document.exists() else "\n\n"
+    return ["## Summary", "", READING + reading + READING, ""]
+
+
+def write_lines(document: Path, lines: Sequence[str]) -> None:
+    """Write a document at once."""
     write_atomic(document, ("\n".join(lines).rstrip() + "\n").encode())
 
 
-def _head(results: StudyResults, reading: str) -> list[str]:
+def _head(results: StudyResults, reading: Sequence[str]) -> list[str]:
     return [
         "# The study: the paper's claims put to the test",
         "",
@@ -69,10 +84,7 @@ def _head(results: StudyResults, reading: str) -> list[str]:
         "number. `least` is the least effect that would matter. All but the summary is written by `jaxnav study`, from "
         "the results.",
         "",
-        "## Summary",
-        "",
-        READING + reading + READING,
-        "",
+        *reading,
     ]
 
 

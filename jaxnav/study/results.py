@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from jaxnav.evaluation.report import FORMAT, Decoding, versions
 from jaxnav.store.files import write_atomic
 from jaxnav.study.codec import from_json, to_json
+from jaxnav.study.compare_report import Measured
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.instrument_report import InstrumentReport
 from jaxnav.study.mixture_report import Mixture
@@ -17,7 +18,7 @@ from jaxnav.study.records import Condition, FullCondition
 #: Runs whose worlds are measured as instruments, and whose gaps are followed.
 WORLDS = ("main", "real")
 Kind = TypeVar("Kind", bound=Condition)
-Part = Condition | InstrumentReport | GapCourse | Mixture
+Part = Condition | InstrumentReport | GapCourse | Mixture | Measured
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,7 @@ def measure_scenes(
 def _measure_bank(
     bank: Bank, episodes: EpisodeList, world: CompiledWorld, priors: np.ndarray, scenes: Iterator[Scene]
 ) -> BankMeasures:
-    limits = np.array([world.step_limits.get(room, world.step_limit) for room in bank.room_types])
+    limits = world.limits(bank)
     searched, counts = frontier_outcome(bank, episodes, limits), scene_counts(bank)
     prior = priors[[prior_index(room) for room in bank.room_types]]
     return BankMeasures(

@@ -16,6 +16,18 @@ from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.overlay import CONFIGS, apply_yaml
 
+PRESETS = [
+    "ablations",
+    "long",
+    "paper",
+    "paper_vtnet",
+    "small_goals",
+    "smoke",
+    "study",
+    "study_quick",
+    "table2",
+]
+
 
 @pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
 @pytest.mark.parametrize("value", [" 2", "=2"])
@@ -68,7 +80,7 @@ def test_the_help_names_every_setting(capsys):
 def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
     for missing in (tmp_path / "none.yaml", "smoek"):
         assert train(missing, tmp_path / "run") == 2
-        mend = "choose from long, paper, paper_vtnet, small_goals, smoke, study, study_quick, or give a file"
+        mend = f"choose from {', '.join(PRESETS)}, or give a file"
         assert refusal(capsys) == f"error: {missing}: no such configuration; {mend}"
     assert not (tmp_path / "run").exists()
 
@@ -80,7 +92,7 @@ def test_a_config_is_the_name_of_a_packaged_one_or_a_file(tmp_path, monkeypatch)
     def seeds(config):
         return parse(RunConfig(), ["--config", config], "train.py", "").seeds
 
-    assert list(CONFIGS) == ["long", "paper", "paper_vtnet", "small_goals", "smoke", "study", "study_quick"]
+    assert list(CONFIGS) == PRESETS
     assert (seeds("smoke"), seeds("./smoke"), seeds(str(CONFIGS["smoke"]))) == (1, 4, 1)
 
 
@@ -91,13 +103,13 @@ def test_the_example_of_a_configuration_is_a_possible_run():
     assert config not in (RunConfig(), apply_yaml(RunConfig(), "smoke"))
 
 
-@pytest.mark.parametrize("command", ["train", "study", "instrument"])
+@pytest.mark.parametrize("command", ["train", "study", "compare", "instrument"])
 def test_the_help_lists_the_option_of_the_configuration(capsys, command):
     with pytest.raises(SystemExit):
         main([command, "--help"])
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
     assert text.startswith(f"usage: jaxnav {command} ")
-    assert "--config NAME|FILE.yaml settings to lay over the defaults: a packaged configuration (long, " in text
+    assert "--config NAME|FILE.yaml settings to lay over the defaults: a packaged configuration (ablations, " in text
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,49 @@
+"""The agents of a comparison, and what each is compared with."""
+
+import itertools
+from typing import NamedTuple
+
+from jaxnav.policies.spec import Deciding
+from jaxnav.study.compare_config import CompareConfig
+
+#: Uses of a run's policies, and how they are printed.
+VARIANTS = {"baseline": "", "layout": " + w", "stde": " + w + sTDE"}
+#: What is improved within a run: an agent and what it is compared with.
+STEPS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"))
+
+
+class Agent(NamedTuple):
+    """Name one row of a world's table.
+
+    Attributes:
+      method, decision: of its run.
+      variant: a key of `VARIANTS`.
+    """
+
+    method: str
+    decision: Deciding
+    variant: str
+
+    def __str__(self) -> str:
+        return run_label(self.method, self.decision) + VARIANTS[self.variant]
+
+
+def run_label(method: str, decision: Deciding) -> str:
+    """Return the name of a run as printed."""
+    return f"`{method.rpartition('.')[2]}`" + (f", {decision}" if decision != "fused" else "")
+
+
+def comparisons(config: CompareConfig) -> list[tuple[Agent, Agent]]:
+    """Return every agent with what it is compared with."""
+    first, *others = config.decisions
+    pairs = []
+    for method in config.methods:
+        for decision, (variant, reference) in itertools.product(config.decisions, STEPS):
+            pairs.append((Agent(method, decision, variant), Agent(method, decision, reference)))
+        for decision, variant in itertools.product(others, VARIANTS):
+            pairs.append((Agent(method, decision, variant), Agent(method, first, variant)))
+        for ablation, decision, variant in itertools.product(
+            config.ablations.get(method, ()), config.decisions, VARIANTS
+        ):
+            pairs.append((Agent(method, decision, variant), Agent(ablation, decision, variant)))
+    return pairs

@@ -1,0 +1,266 @@
+"""The compare command: from training to the document, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from support.commands import CONFIG, contents, evaluate, refusal
+
+from jaxnav.cli import compare as command
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.policies.methods import METHODS
+from jaxnav.study import compare
+from jaxnav.study.compare_config import entries
+from jaxnav.study.compare_report import Line, Measured, Training
+from jaxnav.study.document import READING
+
+OWN = ("method: ", "method_sizes: ")  # every run has its own, or one method alone has them
+BASE = "".join(f"  {line}\n" for line in CONFIG.strip().splitlines() if not line.startswith(OWN))
+COMPARE = f"""
+worlds:
+  near: {{world: rooms}}
+  far: {{worlds: {{num_val: 5}}}}
+methods: [anonymous, org]
+ablations: {{org: [rgb]}}
+expected: [org, savn]
+episodes: 24
+base:
+{BASE}"""
+
+RUNS = ["anonymous-fused", "org-fused", "org-streams", "rgb-fused", "rgb-streams"]
+PARTS = ["near-frontier", "far-frontier", *(f"{world}-{name}" for world in ("near", "far") for name in RUNS)]
+
+
+def run(folder, *options):
+    """Run the command with all its files below a folder."""
+    config = folder / "compare.yaml"
+    config.write_text(COMPARE)
+    places = {"results": "results", "document": "docs/table.md", "runs": "runs"}
+    given = [part for name, place in places.items() for part in (f"--{name}", str(folder / place))]
+    return command.main(["--config", str(config), *given, *map(str, options)])
+
+
+def tables(folder):
+    """Return the cells of the document's rows, by section and first cell."""
+    found = {}
+    for section in (folder / "docs" / "table.md").read_text().split("### ")[1:]:
+        title, *lines = section.splitlines()
+        rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
+        found.setdefault(title, {row[0]: row[1:] for row in rows})  # of the first world
+    return found
+
+
+def agent(variant, decoding, successes):
+    """Return a line of two seeds that succeed so often in each of three scenes of four episodes."""
+    sums = np.tile(np.array(successes, float), (2, 1))
+    return Line(variant, decoding, sr=sums, spl=sums / 2.0, dts=4.0 - sums)
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """Replace all work; return the names of its steps."""
+    names = []
+
+    def drawn(name, lines, training=None):
+        names.append(name)
+        scenes = ("a", "b", "c")
+        return Measured(scenes, ("Kitchen",) * 3, np.array([4, 4, 4]), tuple(lines), training)
+
+    def frontier(config, shared, console):
+        return drawn(
+            "far-frontier" if shared.worlds.num_val == 5 else "near-frontier", [agent("frontier", "argmax", (4, 4, 4))]
+        )
+
+    def entry(config, entry, console):
+        more = entry.decision == "streams"
+        lines = [agent("random", "sample", (0, 1, 0))]
+        for decoding in ("argmax", "sample"):
+            lines += [agent(arm, decoding, (1, 2, 2 + more)) for arm in entry.run.arms]
+            lines += [agent("stde", decoding, (1, 3, 3))] * ("layout" in entry.run.arms)
+        budget = {"exploration": 1280, "pretraining": 0, "learning": 512}
+        return drawn(entry.name, lines, Training(budget, 90.0, (10.0, 12.5), ("Note of all.",)))
+
+    monkeypatch.setattr(compare, "measure_frontier", frontier)
+    monkeypatch.setattr(compare, "measure_entry", entry)
+    return names
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_numbers_of_the_document_are_those_of_an_evaluation(tmp_path):
+    options = ("--worlds", "{near: {}}", "--methods", "org", "--ablations", "{}")
+    assert run(tmp_path, *options) == 0
+    found, target = tables(tmp_path), tmp_path / "eval.json"
+    agents = {"fused": "`org`", "streams": "`org`, streams"}
+    names = {"baseline": "", "layout": " + w", "stde": " + w + sTDE"}
+    for decision, name in agents.items():
+        assert evaluate(tmp_path / "runs" / f"near-org-{decision}", "--episodes", 24, "--json", target) == 0
+        report = json.loads(target.read_text())
+        titles = {"random": "Random", "oracle": "Shortest path"}
+        titles |= {variant: name + text for variant, text in names.items()}
+        rows = [row for row in report["rows"] if row["variant"] in titles]
+        assert len(rows) == (8 if decision == "fused" else 6)
+        for row in rows:
+            section = found[f"Success, {'sampled' if row['decoding'] == 'sample' else 'best'} actions"]
+            cells = [
+                f"{Interval.from_json(row[metric]):.{digits}f}"
+                for metric, digits in zip(("sr", "spl", "dts"), (1, 1, 2), strict=True)
+            ]
+            assert section[titles[row["variant"]]] == cells
+        for each in report["differences"]:
+            if each["metric"] == "sr" and each["to"] in names:
+                section = found[f"Improvements, {'sampled' if each['decoding'] == 'sample' else 'best'} actions"]
+                title = f"{name}{names[each['to']]} over {name}{names[each['from']]}"
+                assert section[title][0] == f"{Interval.from_json(each):+z.1f}"
+    # Again: nothing is done anew.
+    before = contents(tmp_path)
+    assert run(tmp_path, *options) == 0
+    assert contents(tmp_path) == before
+
+
+# The command alone, on given results
+
+
+def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
+    assert run(tmp_path) == 0
+    assert steps == PARTS
+    text, found = (tmp_path / "docs" / "table.md").read_text(), tables(tmp_path)
+    assert "2 seeds of each policy" in text
+    assert "512 in near, 512 in far. 24 episodes in each world, of the split `val`" in text
+    assert "left out: savn." in text
+    assert "Not finished" not in text
+    assert "## near: 3 scenes, 12 episodes" in text
+    assert "* All runs: Note of all.\n" in text
+    runs = ["`org`", "`org` + w", "`org` + w + sTDE", "`org`, streams + w", "`org`, streams + w + sTDE"]
+    rows = [*runs, *(name.replace("org", "rgb") for name in runs)]
+    for name in ("best", "sampled"):
+        section = found[f"Success, {name} actions"]
+        assert list(section)[2:] == ["Random", "Frontier search", "`anonymous`", *rows]
+        improved = found[f"Improvements, {name} actions"]
+        assert list(improved)[2:] == [
+            "`org` + w over `org`",
+            "`org` + w + sTDE over `org` + w",
+            "`org` + w + sTDE over `org`",
+            "`org`, streams + w + sTDE over `org`, streams + w",
+            "`org`, streams + w over `org` + w",
+            "`org`, streams + w + sTDE over `org` + w + sTDE",
+            *(f"{one} over {one.replace('org', 'rgb')}" for one in runs),
+        ]
+    assert found["Success, best actions"]["`org` + w"][0].startswith("41.7 [")
+    assert found["Improvements, best actions"]["`org` + w + sTDE over `org` + w"][0].startswith("+16.7 [")
+    assert found["Improvements, best actions"]["`org`, streams + w over `org` + w"][2].startswith("-0.08 [")
+    assert found["What the runs took"]["`org`, streams"] == ["1,280", "0", "512", "1.5", "10.0 → 12.5"]
+
+
+def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path):
+    def again(*options):
+        steps.clear()
+        assert run(tmp_path, *options) == 0
+        return steps
+
+    assert again() == PARTS
+    document = tmp_path / "docs" / "table.md"
+    document.write_text(document.read_text().replace(f"{READING}\n\n{READING}", f"{READING}\nBy hand.\n{READING}"))
+    before = contents(tmp_path)
+    assert again() == []
+    assert contents(tmp_path) == before
+    (tmp_path / "results" / "val" / "near-org-fused.json").unlink()
+    (tmp_path / "results" / "val" / "far-rgb-fused.json").write_text("{")
+    assert again() == ["near-org-fused", "far-rgb-fused"]
+    assert contents(tmp_path) == before
+    # A method more leaves what is there; another threshold does not matter to a searcher, other episodes do.
+    assert again("--methods", "anonymous", "org", "sp") == [
+        f"{world}-sp-{how}" for world in ("near", "far") for how in ("fused", "streams")
+    ]
+    assert again("--epsilon", 0.2) == PARTS[2:]
+    assert again("--episodes", 30, "--epsilon", 0.2) == PARTS
+
+
+def test_an_interrupted_comparison_says_so_and_goes_on(steps, tmp_path, monkeypatch):
+    measure = compare.measure_entry
+
+    def interrupted(config, entry, console):
+        if entry.name == "near-org-streams":
+            raise KeyboardInterrupt
+        return measure(config, entry, console)
+
+    monkeypatch.setattr(compare, "measure_entry", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path)
+    text = (tmp_path / "docs" / "table.md").read_text()
+    assert "**Not finished:** 8 of 10 runs are missing." in text
+    assert "## near" in text
+    assert "## far" not in text
+    monkeypatch.setattr(compare, "measure_entry", measure)
+    steps.clear()
+    assert run(tmp_path) == 0
+    assert steps == PARTS[4:]
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--methods", "orgg", "--ablations", "{}"], "method 'orgg': is unknown; did you mean 'org'?"),
+        (["--methods"], "methods: empty: give one or more, each once"),
+        (["--methods", "org", "org"], "methods: org, org: give one or more, each once"),
+        (["--ablations", "{vtnet: [rgb]}"], "ablations: 'vtnet' is none of the methods anonymous, org"),
+        (["--worlds", "{}"], "worlds: empty: give one or more"),
+        (["--worlds", "{a/b: {}}"], "worlds: 'a/b': is part of file names; give letters"),
+        (["--worlds", "{flat: {world: flats}}"], "worlds.flat: world must be one of 'rooms', 'apartments'"),
+        (["--worlds", "{flat: {seeds: 3}}"], "worlds.flat.seeds: a world may change world, scenes, worlds, detector"),
+        (["--worlds", "{flat: {worlds: {shift: 2.0}}}"], "flat-anonymous-fused: config: worlds.shift is 2.0; give"),
+        (["--base.seeds", "0"], "config: seeds is 0; give at least 1"),
+        (["--base.method", "rgb"], "base.method: every run has its own; leave it out and give `methods`"),
+        (["--episodes", "0"], "episodes: 0: give at least 1"),
+        (["--epsilon", "-1"], "epsilon: -1.0: give a number from 0"),
+        (["--base.devices", "cluster"], "base.devices: cluster: all runs are trained in one process"),
+    ],
+)
+def test_bad_requests_are_refused_before_any_training(steps, tmp_path, capsys, options, problem):
+    assert run(tmp_path, *options) == 2
+    error = refusal(capsys)
+    assert error.startswith(f"error: {tmp_path / 'compare.yaml'}: ")
+    assert problem in error
+    assert steps == []
+    assert set(contents(tmp_path)) == {"compare.yaml"}
+
+
+def test_another_document_is_refused(steps, tmp_path, capsys):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "table.md").write_text("My own notes.")
+    assert run(tmp_path) == 2
+    assert "give another --document" in refusal(capsys)
+    assert steps == []
+
+
+def test_a_mapping_of_another_kind_is_refused(tmp_path, capsys):
+    for text in ("[1", "[near]", "{near: 1}"):
+        with pytest.raises(SystemExit):
+            run(tmp_path, "--worlds", text)
+        assert "mapping" in capsys.readouterr().err
+
+
+# The configs that come with it
+
+
+def test_table_2_has_every_method(monkeypatch):
+    config = command.parse_compare(["--config", "table2"])
+    assert config.methods == tuple(METHODS)
+    runs = entries(config)
+    assert {entry.world for entry in runs} == {"rooms", "apartments"}
+    assert len(runs) == 2 * (2 * len(METHODS) - 1)  # `anonymous` has no streams
+    for entry in runs:
+        assert (entry.run.method, entry.run.world, entry.run.seeds) == (entry.method, entry.world, 3)
+        hosts = METHODS[entry.method].hosts_layout
+        assert entry.run.arms == (("layout",) if entry.decision == "streams" else ("baseline", "layout")[: 1 + hosts])
+    assert len({entry.run.total_steps for entry in runs}) == 1
+
+
+def test_the_ablations_have_the_baseline_alone():
+    config = command.parse_compare(["--config", "ablations"])
+    runs = entries(config)
+    assert len(runs) == 2 * 9
+    assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}

@@ -1,0 +1,54 @@
+"""The results of a comparison beside those of an evaluation."""
+
+import json
+
+import pytest
+
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.study.codec import from_json, to_json
+from jaxnav.study.compare import by_scene
+from jaxnav.study.compare_report import SCALE, Measured, Training
+
+TRAINING = Training({"exploration": 1280, "pretraining": 0, "learning": 512}, 60.0, None, ("A note.",))
+
+
+@pytest.fixture(scope="module")
+def measured(evaluated):
+    """The evaluation's results by scene, written and read again."""
+    return from_json(Measured, json.loads(json.dumps(to_json(by_scene(evaluated, TRAINING)))))
+
+
+def same(one, report):
+    """Return whether an interval is that of a report; its runs are told apart in reports alone."""
+    other = Interval.from_json(report)
+    bounds = [(each.mean, each.low, each.high, each.std) for each in (one, other)]
+    return bounds[0] == pytest.approx(bounds[1], rel=1e-9, abs=1e-9, nan_ok=True)
+
+
+def test_sums_by_scene_tell_what_the_episodes_tell(evaluated, measured):
+    """Means and intervals are those of `jaxnav eval`."""
+    assert sum(measured.episodes) == 24
+    rows = evaluated.report["rows"]
+    assert len(rows) == len(measured.lines) == 30
+    for row, line in zip(rows, measured.lines, strict=True):
+        assert (line.variant, line.decoding) == (row["variant"], row["decoding"])
+        assert all(same(measured.summary(line, metric), row[metric]) for metric in SCALE)
+        assert measured.summary(line, "sr").mean == row["sr"]["mean"]  # to the bit: it is rounded for the document
+
+
+def test_differences_are_those_of_the_evaluation(evaluated, measured):
+    """Of the layout, which are other networks, and of what is removed from it, which are the same."""
+    lines = {
+        (row.variant, row.epsilon, row.form, row.decoding): measured.lines[i] for i, row in enumerate(evaluated.rows)
+    }
+    for entry in evaluated.report["differences"]:
+        line = lines[entry["to"], entry["epsilon"], entry["form"], entry["decoding"]]
+        reference = lines[entry["from"], None, None, entry["decoding"]]
+        assert same(measured.difference(line, measured, reference, entry["metric"]), entry)
+
+
+def test_agents_are_found_by_name(measured):
+    assert measured.line("layout", "sample").decoding == "sample"
+    assert measured.line("random", "argmax") is measured.line("random", "sample")  # it has no best action
+    assert measured.line("frontier", "argmax") is None
+    assert measured.training == TRAINING
