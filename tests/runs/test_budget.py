@@ -27,20 +27,20 @@ CONFIG = RunConfig(
 )
 
 
-def test_pretraining_is_part_of_the_budget():
+def test_imitation_is_part_of_the_budget():
     # A fifth of ten chunks of 1,280 steps.
     assert CONFIG.schedule == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
-    assert CONFIG.budget == {"exploration": 600, "pretraining": 2 * 1280, "learning": 8 * 1280}
+    assert CONFIG.budget == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
     plain = dataclasses.replace(CONFIG, method="org")
     assert plain.schedule == 10 * [0]
-    assert plain.budget == {"exploration": 600, "pretraining": 0, "learning": 12800}
-    told = "600 of exploration for the layout priors, 2,560 of pre-training, 10,240 of learning."
+    assert plain.budget == {"exploration": 600, "imitation": 0, "learning": 12800}
+    told = "600 of exploration for the layout priors, 2,560 of imitation, 10,240 of learning."
     assert told in spent(CONFIG.budget)
 
 
 @pytest.mark.parametrize(("share", "chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
 def test_its_share_can_be_set_in_whole_chunks(share, chunks):
-    config = check(dataclasses.replace(CONFIG, pretraining=share))
+    config = check(dataclasses.replace(CONFIG, imitation=share))
     assert config.schedule == chunks * [0] + (10 - chunks) * [1]
     assert sum(stage.share for stage in config.stages) == pytest.approx(1.0)
     assert sum(config.budget.values()) - 600 == CONFIG.total_steps
@@ -49,12 +49,12 @@ def test_its_share_can_be_set_in_whole_chunks(share, chunks):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"pretraining": 0.0}, "config: pretraining is 0.0; give a share between 0 and 1, both excluded"),
-        ({"pretraining": 1.0}, "config: pretraining is 1.0; give a share between 0 and 1, both excluded"),
-        ({"pretraining": float("nan")}, "config: pretraining is nan; give a share"),
-        ({"pretraining": 0.95}, "config: pretraining is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
+        ({"imitation": 0.0}, "config: imitation is 0.0; give a share between 0 and 1, both excluded"),
+        ({"imitation": 1.0}, "config: imitation is 1.0; give a share between 0 and 1, both excluded"),
+        ({"imitation": float("nan")}, "config: imitation is nan; give a share"),
+        ({"imitation": 0.95}, "config: imitation is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
         ({"total_steps": 1}, "config: total_steps is 1; stage 2 of method 'vtnet', a share of 0.8, gets none of the 1"),
-        ({"method": "org", "pretraining": 0.2}, "config: pretraining is 0.2; method 'org' has none; leave it out"),
+        ({"method": "org", "imitation": 0.2}, "config: imitation is 0.2; 'org' has no stages of both kinds; leave"),
     ],
 )
 def test_impossible_shares_are_refused(options, message):
@@ -83,7 +83,7 @@ def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(config
     assert "policy_loss" in last
     for checkpoint in (run.config.run_dir / "checkpoints").iterdir():
         metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
-        assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "pretraining": 256, "learning": 256}
+        assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "imitation": 256, "learning": 256}
 
     done = []
 
@@ -103,4 +103,4 @@ def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(config
     policies = [jaxnav.load_policy(each.config.run_dir / "policies" / "baseline-0").params for each in (run, resumed)]
     chex.assert_trees_all_equal(*policies)
     budget = jaxnav.evaluate(run, episodes=8).report["run"]["budget"]
-    assert budget == {"exploration": 1280, "pretraining": 256, "learning": 256}
+    assert budget == {"exploration": 1280, "imitation": 256, "learning": 256}

@@ -137,12 +137,12 @@ def test_the_direct_stream_is_alone_first():
 
 
 def test_the_rate_runs_its_course_in_every_stage():
-    """Of ten chunks VTNet's pre-training has two, the direct stream alone four; Adam's first step is the rate."""
+    """Of ten chunks VTNet's imitation has two, the direct stream alone four; Adam's first step is the rate."""
     config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
     assert config.schedule == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert [stage.alone for stage in config.stages] == [False, True, False]
     assert [(float(each.begin), float(each.num_updates)) for each in config.scalars] == [(0, 4), (4, 8), (12, 8)]
-    assert config.budget["pretraining"] == 2 * 2 * 3840
+    assert config.budget["imitation"] == 2 * 2 * 3840
     fused = dataclasses.replace(config, method="org", decision="fused")
     assert [(float(each.begin), float(each.num_updates)) for each in fused.scalars] == [(0, 20)]
 
