@@ -14,6 +14,7 @@ from jaxnav.policies.methods.rgb import NoExperience
 from jaxnav.runs.check import check
 from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.runs.train import train
+from jaxnav.runs.validation import Validator
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.trainer import Trainer
 
@@ -33,6 +34,9 @@ def test_imitation_is_part_of_the_budget():
     assert CONFIG.budget == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
     plain = dataclasses.replace(CONFIG, method="org")
     assert plain.schedule == 10 * [0]
+    last = dataclasses.replace(CONFIG, method="tpn")
+    assert (last.schedule, last.budget) == ([0, 0, 0, 0, 0, 0, 0, 0, 1, 1], CONFIG.budget)
+    assert dataclasses.replace(last, imitation=0.5).schedule == 5 * [0] + 5 * [1]
     assert plain.budget == {"exploration": 600, "imitation": 0, "learning": 12800}
     told = "600 of exploration for the layout priors, 2,560 of imitation, 10,240 of learning."
     assert told in spent(CONFIG.budget)
@@ -54,6 +58,10 @@ def test_its_share_can_be_set_in_whole_chunks(share, chunks):
         ({"imitation": float("nan")}, "config: imitation is nan; give a share"),
         ({"imitation": 0.95}, "config: imitation is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
         ({"total_steps": 1}, "config: total_steps is 1; stage 2 of method 'vtnet', a share of 0.8, gets none of the 1"),
+        (
+            {"method": "tpn", "imitation": 0.01, "total_steps": 1280},
+            "config: imitation is 0.01; stage 2 of method 'tpn', a share of 0.01, gets none of the 1 chunks",
+        ),
         ({"method": "org", "imitation": 0.2}, "config: imitation is 0.2; 'org' has no stages of both kinds; leave"),
     ],
 )
@@ -71,16 +79,21 @@ def test_the_shares_of_a_method_add_up(shares):
 
 
 @pytest.mark.slow
-def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(config, tmp_path, monkeypatch):
+@pytest.mark.parametrize("method", ["vtnet", "tpn"])
+def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(method, config, tmp_path, monkeypatch):
     """Two chunks, one of each stage; a run that stops after the first ends as one that does not."""
     sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
-    options = {"method": "vtnet", "method_sizes": sizes, "arms": ("baseline",), "seeds": 1}
+    sizes = sizes if method == "vtnet" else {"tentative_width": 8}
+    options = {"method": method, "method_sizes": sizes, "imitation": 0.5, "arms": ("baseline",), "seeds": 1}
     config = dataclasses.replace(config, **options, run_dir=tmp_path / "whole")
-    run = train(config)
-    first, last = run.log()
-    assert "imitation_loss" in first
-    assert "policy_loss" not in first
-    assert "policy_loss" in last
+    asked, measure = [], Validator.measure
+    with monkeypatch.context() as patch:
+        patch.setattr(Validator, "measure", lambda *given: asked.append(given[2]) or measure(*given))
+        run = train(config)
+    assert asked == [method == "vtnet", True]  # measured as the stage acts
+    imitated = ["imitation_loss" in row for row in run.log()]
+    assert imitated == ([True, False] if method == "vtnet" else [False, True])
+    assert ["policy_loss" in row for row in run.log()] == [not each for each in imitated]
     for checkpoint in (run.config.run_dir / "checkpoints").iterdir():
         metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
         assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "imitation": 256, "learning": 256}

@@ -136,6 +136,17 @@ def test_the_direct_stream_is_alone_first():
     assert [int(count) for count in counts] == [2 * learner_with("org").config.minibatches]  # those of its stage alone
 
 
+def test_the_direct_stream_is_alone_in_the_stage_that_learns_last():
+    """Of ten chunks the tentative policy's imitation has the last two."""
+    config = RunConfig(method="tpn", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
+    assert config.schedule == [0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
+    assert [(stage.alone, stage.imitates, stage.adapts) for stage in config.stages] == [
+        (True, False, False),
+        (False, False, False),
+        (False, True, True),
+    ]
+
+
 def test_the_rate_runs_its_course_in_every_stage():
     """Of ten chunks VTNet's imitation has two, the direct stream alone four; Adam's first step is the rate."""
     config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
@@ -191,7 +202,7 @@ def test_each_stream_learns_where_it_acts_last(method):
         taught = {name: any(leaf.any() for leaf in jax.tree.leaves(node)) for name, node in found.items()}
         direct = {"actor", "critic", "core", "fuse", "view", "detections", "appearance", "sought"}
         assert {taught[name] for name in direct} == {not coin}
-        unread = {"known_appearance"} if method.endswith("ATTENTIVE") else set()  # it has no use for what categories are
+        unread = {"known_appearance"} if method.endswith("ATTENTIVE") else set()  # categories are nothing to it
         assert {taught[name] for name in found.keys() - direct - unread} == {bool(coin)}
 
 
