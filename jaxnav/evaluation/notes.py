@@ -29,12 +29,12 @@ def spent(budget: Mapping[str, int]) -> str:
     """Say what environment steps stand behind a policy.
 
     Args:
-      budget: steps of `exploration`, `pretraining` and `learning`.
+      budget: steps of `exploration`, `imitation` and `learning`.
     """
-    exploration, pretraining, learning = (f"{budget[name]:,}" for name in ("exploration", "pretraining", "learning"))
+    exploration, imitation, learning = (f"{budget[name]:,}" for name in ("exploration", "imitation", "learning"))
     return (
-        f"Environment steps behind each policy: {exploration} of exploration for the layout priors, {pretraining} of "
-        f"pre-training, {learning} of learning."
+        f"Environment steps behind each policy: {exploration} of exploration for the layout priors, {imitation} of "
+        f"imitation, {learning} of learning."
     )
 
 

@@ -65,11 +65,13 @@ class Acting:
       env: the environment.
       spec: of the policy; None where actions are given.
       setting: of the layout estimator; None leaves the layout out.
+      adapts: whether the method's adaptation, if it has one, changes the policy.
     """
 
     env: ObjectNav
     spec: PolicySpec | None = None
     setting: Setting | None = None
+    adapts: bool = True
 
     @property
     def method(self) -> Method | None:
@@ -80,7 +82,10 @@ class Acting:
         """Bind parameters to the policy."""
         if self.spec is None:
             raise ValueError("Acting without a spec has no policy to bind; give one")
-        return bind(self.spec, params)
+        policy = bind(self.spec, params)
+        if not self.adapts:
+            policy.adaptation = None
+        return policy
 
     def view(self, agent: Agent, knowledge: Knowledge | None, params: EnvParams) -> View:
         """Return what the policy gets in the present states."""

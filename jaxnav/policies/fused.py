@@ -43,7 +43,6 @@ class Policy(Stream):
         self.detections = CategoryMaps.of_detections(seen, rngs)
         self.sought = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
         self.method = method.experience(seen, rngs)
-        self.recurrent = self.method.recurrent or method.adaptation is not None
         super().__init__(self._widths(sizes), method.control.num_choices, spec, rngs)
 
     def pathways(
@@ -94,6 +93,7 @@ class Policy(Stream):
             goal=self._embed_goal(seen, appearance),
             experience=self.method.encode(seen, self.experience_appearance, jax.lax.stop_gradient(weights), reading),
             gate=DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence),
+            reading=reading,
         )
 
     def attend(self, encoded: Pathways, memory: Memory) -> Pathways:
@@ -113,11 +113,14 @@ class Policy(Stream):
             decision = self.adaptation.decide(self, pathways, memory)
         return decision._replace(experienced=memory.experienced)
 
-    def decide_plainly(self, pathways: Pathways, memory: Memory) -> Decision:
-        """Decide without the method's adaptation."""
+    def decide_plainly(self, pathways: Pathways, memory: Memory, change: jax.Array | None = None) -> Decision:
+        """Decide without the method's adaptation.
+
+        An adaptation may give a change of the actor, see `Stream.act`.
+        """
         drive = self.drive(self.direct_input(pathways) + self.mediated_input(pathways, memory.action))
         hidden = gru(drive, memory.hidden @ self.recurrent_kernel, memory.hidden)
-        return self.act(hidden, pathways)._replace(fast=memory.fast)
+        return self.act(hidden, pathways, change)._replace(fast=memory.fast)
 
     def direct_input(self, pathways: Pathways) -> jax.Array:
         """Return what enters by the direct pathways, float32 [..., H].
@@ -131,6 +134,11 @@ class Policy(Stream):
         """Return the memory at the start of an episode."""
         memory = Memory(hidden=jnp.zeros((*batch, self.hidden)), action=jnp.full(batch, NO_ACTION, jnp.int32))
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
+
+    @property
+    def recurrent(self) -> bool:
+        """Return whether training unrolls it step by step."""
+        return self.method.recurrent or self.adaptation is not None
 
     @property
     def experience_appearance(self) -> jax.Array:

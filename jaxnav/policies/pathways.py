@@ -23,12 +23,14 @@ class Pathways(NamedTuple):
       goal: float32 [..., G], the direct pathway G -> A: detections and what is sought, without experience.
       experience: float32 [..., Z], the mediator Z: what the method makes of scene and goal by experience.
       gate: float32 [..., 1], factor on the logit of Done; no pathway, so interventions leave it as it is.
+      reading: what the method's tracker read, for its adaptation, leaves [...]; no pathway either.
     """
 
     scene: jax.Array
     goal: jax.Array
     experience: jax.Array
     gate: jax.Array
+    reading: Any = None
 
 
 class Memory(NamedTuple):

@@ -58,12 +58,21 @@ class Stream(nnx.Module):
         """
         return biased(product(nnx.relu(entering), self.core.dense_i.kernel[...]), self.core.dense_i)
 
-    def act(self, hidden: jax.Array, pathways: Pathways) -> Decision:
-        """Decide by a hidden state float32 [..., H]."""
+    def act(self, hidden: jax.Array, pathways: Pathways, change: jax.Array | None = None) -> Decision:
+        """Decide by a hidden state float32 [..., H].
+
+        A change float32 [..., H + 1, A] is added to the actor's kernel and bias; None adds nothing.
+        """
         logits = self.actor(hidden)
-        if self.done_gate:
-            logits = jnp.concatenate([logits[..., :DONE], pathways.gate * logits[..., DONE:]], axis=-1)
-        return Decision(logits=logits, value=self.critic(hidden)[..., 0], hidden=hidden)
+        if change is not None:
+            logits = logits + (with_one(hidden)[..., None] * change).sum(axis=-2)
+        return Decision(logits=self.gated(logits, pathways), value=self.critic(hidden)[..., 0], hidden=hidden)
+
+    def gated(self, logits: jax.Array, pathways: Pathways) -> jax.Array:
+        """Multiply the logit of Done by the gate, if there is one."""
+        if not self.done_gate:
+            return logits
+        return jnp.concatenate([logits[..., :DONE], pathways.gate * logits[..., DONE:]], axis=-1)
 
     @property
     def recurrent_kernel(self) -> jax.Array:
@@ -74,3 +83,8 @@ class Stream(nnx.Module):
     def fuse_kernels(self) -> list[jax.Array]:
         """Return the kernels of all that enters."""
         return jnp.split(self.fuse.kernel[...], np.cumsum(self.widths)[:-1])
+
+
+def with_one(values: jax.Array) -> jax.Array:
+    """Append a 1 to values [..., N]."""
+    return jnp.concatenate([values, jnp.ones_like(values[..., :1])], axis=-1)

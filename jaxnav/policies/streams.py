@@ -11,7 +11,7 @@ from jaxnav.numerics.rounding import rounded
 from jaxnav.policies.fused import Policy
 from jaxnav.policies.pathways import Decision, Memory, Pathways
 from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.policies.stream import Stream
+from jaxnav.policies.stream import Stream, with_one
 from jaxnav.scenes.task import NUM_ACTIONS
 
 
@@ -40,7 +40,7 @@ class Streams(Policy):
     ) -> Pathways:
         """Embed without memory; the experience may still have to `attend`."""
         encoded = super().encode(observation, weights, reading, surroundings)
-        views = [_present(view) for view in jnp.split(encoded.scene, 2, axis=-1)]
+        views = [with_one(view) for view in jnp.split(encoded.scene, 2, axis=-1)]
         encoded = encoded._replace(scene=views[0], experience=(encoded.experience, views[1]))
         return encoded if self.method.recurrent else _joined(encoded)
 
@@ -71,10 +71,13 @@ class Streams(Policy):
         gates = zip(_gates(super().drive(direct)), _gates(self.experience_stream.drive(experience)), strict=True)
         return jnp.concatenate([part for gate in gates for part in gate], axis=-1)
 
-    def act(self, hidden: jax.Array, pathways: Pathways) -> Decision:
-        """Decide by both hidden states, float32 [..., 2 H]."""
+    def act(self, hidden: jax.Array, pathways: Pathways, change: jax.Array | None = None) -> Decision:
+        """Decide by both hidden states, float32 [..., 2 H].
+
+        A change is one of the direct stream's actor.
+        """
         halves = jnp.split(hidden, 2, axis=-1)
-        direct, experience = super().act(halves[0], pathways), self.experience_stream.act(halves[1], pathways)
+        direct, experience = super().act(halves[0], pathways, change), self.experience_stream.act(halves[1], pathways)
         seen, known = pathways.scene[..., -1:], pathways.experience[..., -1:]
         direct = _fixed(direct, known != 0)
         # Rounded, so that the sum is exact and removing one stream (eq. 1) leaves the other to the bit.
@@ -111,11 +114,6 @@ def _fixed(decision: Decision, where: jax.Array) -> Decision:
         logits=jnp.where(where, fixed.logits, decision.logits),
         value=jnp.where(where[..., 0], fixed.value, decision.value),
     )
-
-
-def _present(pathway: jax.Array) -> jax.Array:
-    """Add the 1 that says that the pathway is there."""
-    return jnp.concatenate([pathway, jnp.ones_like(pathway[..., :1])], axis=-1)
 
 
 def _joined(encoded: Pathways) -> Pathways:

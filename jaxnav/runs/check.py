@@ -30,7 +30,7 @@ def check(config: RunConfig) -> RunConfig:
         config = dataclasses.replace(config, direct="goal", counterfactual="none")
     _check_method(config, method)
     _check_numbers(config)
-    _check_stages(config)
+    _check_stages(config, method)
     _check_layout(config)
     _check_learning(config)
     _check_world(config)
@@ -53,12 +53,13 @@ def _check_method(config: RunConfig, method: Method) -> None:
         _need(value >= 1, f"method_sizes.{name}", value, "give at least 1")
 
 
-def _check_stages(config: RunConfig) -> None:
-    share = config.pretraining
+def _check_stages(config: RunConfig, method: Method) -> None:
+    share = config.imitation
     if share is not None:
-        _need(0.0 < share < 1.0, "pretraining", share, "give a share between 0 and 1, both excluded")
-        _need(len(config.stages) > 1, "pretraining", share, f"method {config.method!r} has none; leave it out")
-    name, value = ("total_steps", config.total_steps) if share is None else ("pretraining", share)
+        _need(0.0 < share < 1.0, "imitation", share, "give a share between 0 and 1, both excluded")
+        kinds = {stage.imitates for stage in method.stages}
+        _need(len(kinds) == 2, "imitation", share, f"{config.method!r} has no stages of both kinds; leave it out")
+    name, value = ("total_steps", config.total_steps) if share is None else ("imitation", share)
     for number, stage in enumerate(config.stages, 1):
         mend = (
             f"stage {number} of method {config.method!r}, a share of {stage.share:.3g}, gets none of the "

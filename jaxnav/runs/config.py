@@ -86,10 +86,11 @@ class RunConfig:
       scenes: scene file to read instead; its splits are used.
       arms: kinds of policies that are trained; a method that cannot host the layout has the baseline alone.
       seeds: policies trained of each kind.
-      total_steps: environment steps of each policy, those of its pre-training included, rounded up to whole chunks;
+      total_steps: environment steps of each policy, those of imitation included, rounded up to whole chunks;
         None: as usual in the world. The layout's policies have seen the prior's random steps (`layout.walks x
         layout.steps`) besides.
-      pretraining: share of them that the method's pre-training takes, in whole chunks; None: as usual for the method.
+      imitation: share of them in which the method imitates shortest paths, in whole chunks; None: as usual for the
+        method.
       seed: of all randomness in training.
       counterfactual: how the branch that counterfactual decisions use is trained.
       decision: how pathways become logits: `fused` before one recurrent core, as in the paper, or as the sum of two
@@ -122,7 +123,7 @@ class RunConfig:
     arms: tuple[Arm, ...] = ARMS
     seeds: int = 3
     total_steps: int | None = None
-    pretraining: float | None = None
+    imitation: float | None = None
     seed: int = 0
     counterfactual: Counterfactual = "distil"
     decision: Deciding = "fused"
@@ -173,18 +174,23 @@ class RunConfig:
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages of training.
 
-        Those of the method, as `pretraining` shares them; with streams the last is two, the direct stream alone first.
+        Those of the method, as `imitation` shares them; with streams the last that does not imitate is two, the direct
+        stream alone first.
         """
-        *before, last = find_method(self.method).stages
-        if self.pretraining is not None and before:
-            scale = self.pretraining / sum(stage.share for stage in before)
-            before = [dataclasses.replace(stage, share=scale * stage.share) for stage in before]
-            last = dataclasses.replace(last, share=1.0 - self.pretraining)
-        alone = self.ppo.alone * last.share if self.decision == "streams" else 0.0
-        if not alone:
-            return (*before, last)
-        both = dataclasses.replace(last, share=last.share - alone, rate=last.rate * self.ppo.experience_rate)
-        return (*before, dataclasses.replace(last, share=alone, alone=True), both)
+        stages = list(find_method(self.method).stages)
+        if self.imitation is not None:
+            wanted = {True: self.imitation, False: 1.0 - self.imitation}
+            usual = {kind: sum(stage.share for stage in stages if stage.imitates == kind) for kind in wanted}
+            shares = [stage.share * wanted[stage.imitates] / usual[stage.imitates] for stage in stages]
+            stages = [dataclasses.replace(stage, share=share) for stage, share in zip(stages, shares, strict=True)]
+        learning = [number for number, stage in enumerate(stages) if not stage.imitates]
+        if self.decision == "streams" and self.ppo.alone and learning:
+            whole, alone = stages[learning[-1]], self.ppo.alone
+            first = dataclasses.replace(whole, share=alone * whole.share, alone=True)
+            rate = whole.rate * self.ppo.experience_rate
+            both = dataclasses.replace(whole, share=(1.0 - alone) * whole.share, rate=rate)
+            stages[learning[-1] : learning[-1] + 1] = [first, both]
+        return tuple(stages)
 
     @property
     def schedule(self) -> list[int]:
@@ -203,12 +209,12 @@ class RunConfig:
     @property
     def budget(self) -> dict[str, int]:
         """Return the environment steps behind a policy, by what they are for."""
-        before, chunk_steps = len(find_method(self.method).stages) - 1, self.chunk * self.update_steps
-        learning = sum(stage >= before for stage in self.schedule)
+        chunk_steps = self.chunk * self.update_steps
+        imitating = sum(self.stages[number].imitates for number in self.schedule)
         return {
             "exploration": self.layout.walks * self.layout.steps,
-            "pretraining": chunk_steps * (len(self.schedule) - learning),
-            "learning": chunk_steps * learning,
+            "imitation": chunk_steps * imitating,
+            "learning": chunk_steps * (len(self.schedule) - imitating),
         }
 
     @property

@@ -163,8 +163,8 @@ def _do_updates(
             done += config.chunk
             rate = steps / (time.monotonic() - began)
             if validator is not None and done in config.validated:
-                present = trainer.unpack(states)
-                scores = validator.measure({name: [state.params for state in seeds] for name, seeds in present.items()})
+                present = {name: [each.params for each in seeds] for name, seeds in trainer.unpack(states).items()}
+                scores = validator.measure(present, config.stages[schedule[turn]].adapts)
                 if schedule[turn] == schedule[-1]:  # before that part of the policy has not learned
                     found = {name: [row[SCORE] for row in rows] for name, rows in scores.items()}
                     states = trainer.keep(states, found)

@@ -44,7 +44,7 @@ class _Part(NamedTuple):
 
 
 class Validator:
-    """Measure policies on fixed episodes, by one compiled function.
+    """Measure policies on fixed episodes.
 
     The episodes are as long as those of `evaluate`, but others. They take place in val scenes, and once, at the end, in
     training scenes too: what is lost from these to those is overfitting, what is lost in both is not learned.
@@ -77,15 +77,22 @@ class Validator:
             )
             for split, world in worlds.items()
         }
-        self._evaluator = Evaluator(dataclasses.replace(acting, env=new.env), removes=False)
+        self._evaluators = {
+            adapts: Evaluator(dataclasses.replace(acting, env=new.env, adapts=adapts), removes=False)
+            for adapts in (True, False)
+        }
         self._knowledge = jax.device_get(knowledge)
         self._grids = {
             arm: inference_grid([Row(arm, None, None, decoding) for decoding in DECODINGS], (arm,), 1)
             for arm in config.arms
         }
 
-    def measure(self, policies: Policies) -> Scores:
+    def measure(self, policies: Policies, adapts: bool = True) -> Scores:
         """Measure policies in val scenes.
+
+        Args:
+          policies: of every arm and seed.
+          adapts: whether the method's adaptation changes them.
 
         Returns:
           `val_success`, `val_spl`, `val_timeout` and `val_wrong_done` with the best actions, the same with
@@ -93,7 +100,7 @@ class Validator:
         """
         best_length = self._parts["val"].episodes.best_length
         scores: Scores = {arm: [] for arm in policies}
-        for (arm, _), outcome in self._run(policies, "val").items():
+        for (arm, _), outcome in self._run(policies, "val", adapts).items():
             metrics = episode_metrics(outcome, best_length)
             named = {"val_success": "sr", "val_spl": "spl", "val_timeout": "timeout", "val_wrong_done": "wrong_done"}
             best, sampled = ({name: float(metrics[of][i].mean()) for name, of in named.items()} for i in range(2))
@@ -109,7 +116,7 @@ class Validator:
         budgets = [budget for budget in _BUDGETS if budget < longest] + [longest]
         found: dict[str, Any] = {"budgets": budgets}
         for split in SPLITS:
-            runs = self._run(policies, split)
+            runs = self._run(policies, split, adapts=True)
             for arm in policies:
                 outcomes = [outcome for (name, _), outcome in runs.items() if name == arm]
                 for i, decoding in enumerate(DECODINGS):
@@ -117,17 +124,17 @@ class Validator:
                     found.setdefault(split, {}).setdefault(arm, {})[decoding] = [round(x, 4) for x in curve.tolist()]
         return found
 
-    def _run(self, policies: Policies, split: Split) -> dict[tuple[str, int], Outcome]:
+    def _run(self, policies: Policies, split: Split, adapts: bool) -> dict[tuple[str, int], Outcome]:
         """Run every policy, side by side, with best and sampled actions; leaves [2, E]."""
-        part = self._parts[split]
+        part, evaluator = self._parts[split], self._evaluators[adapts]
 
         def run(task: tuple[str, int]) -> Outcome:
             arm, seed = task
             weights = jax.tree.map(lambda leaf: np.asarray(leaf)[None], policies[arm][seed])
-            return self._evaluator(self._grids[arm], weights, [part], self._knowledge, jax.random.key(0))
+            return evaluator(self._grids[arm], weights, [part], self._knowledge, jax.random.key(0))
 
         tasks = [(arm, seed) for arm, seeds in policies.items() for seed in range(len(seeds))]
-        if not self._evaluator.compilations:
+        if not evaluator.compilations:
             run(tasks[0])  # compiles, once for all
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             return dict(zip(tasks, pool.map(run, tasks), strict=True))

@@ -44,7 +44,7 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Meas
     """Return the title and what holds for all tables."""
     steps = {entry.world: entry.run.total_updates * entry.run.update_steps for entry in runs}
     text = [
-        f"{config.base.seeds} seeds of each policy. Environment steps of each, pre-training included: "
+        f"{config.base.seeds} seeds of each policy. Environment steps of each, imitation included: "
         + ", ".join(f"{number:,} in {world}" for world, number in steps.items())
         + f". {config.episodes:,} episodes in each world, of the split `{config.split}` and the same for all rows.",
         "",
@@ -139,7 +139,7 @@ def _training_table(parts: Parts) -> list[str]:
     rows = []
     for run, part in parts.items():
         if training := part.training:
-            steps = (f"{training.budget[name]:,}" for name in ("exploration", "pretraining", "learning"))
+            steps = (f"{training.budget[name]:,}" for name in ("exploration", "imitation", "learning"))
             course = "{:.1f} → {:.1f}".format(*training.course) if training.course else "-"
             rows.append((run_label(*run), *steps, f"{training.wall_s / 60:,.1f}", course))
     return markdown(

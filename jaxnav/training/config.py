@@ -28,8 +28,8 @@ class PPOConfig:
       value: weight of the value loss.
       max_grad_norm: global norm to which gradients are clipped.
       distil: weight of the counterfactual branch's loss where it is distilled.
-      alone: share of the updates, the first after any pre-training, in which the direct stream acts and learns alone,
-        where there are streams.
+      alone: share of the updates of the last stage that does not imitate, the first of them, in which the direct stream
+        acts and learns alone, where there are streams.
       experience: probability that an episode after that has the stream of experience.
       experience_rate: factor on the learning rate after that, for what is added disturbs a policy that has learned.
     """

@@ -10,7 +10,7 @@ from flax import struct
 from jax.sharding import PartitionSpec
 
 from jaxnav.env.types import EnvParams
-from jaxnav.policies.acting import Acting, Agent
+from jaxnav.policies.acting import Acting, Agent, carried
 from jaxnav.policies.methods import Knowledge, Method, Stage
 from jaxnav.policies.policy import Params, init_params
 from jaxnav.training.apply import apply_gradient, make_optimizer, renewed
@@ -127,10 +127,15 @@ class Learner:
         """Collect once and learn from it for some epochs."""
         key = jax.random.fold_in(state.key, state.update)
         rollout_key, shuffle_key = (jax.random.fold_in(key, purpose) for purpose in (_ROLLOUT, _SHUFFLE))
-        policy, coin = self.acting.bind(state.params), self.counterfactual == "coin"
+        acting, coin = self._acting, self.counterfactual == "coin"
         share = 0.0 if self.stage.alone else scalars.experience
-        arguments = state.agent, rollout_key, self.config.rollout, coin, params, knowledge, share
-        agent, rollout = collect(self.acting, policy, *arguments)
+        agent, fast = state.agent, carried(state.agent).fast
+        if not self.stage.adapts:  # fast weights, which may be large, wait for a stage that has a use for them
+            agent = _with_fast(agent, None)
+        arguments = agent, rollout_key, self.config.rollout, coin, params, knowledge, share
+        agent, rollout = collect(acting, acting.bind(state.params), *arguments)
+        if not self.stage.adapts:
+            agent = _with_fast(agent, fast)
         (weights, optimizer), metrics = self._learn(state, rollout, shuffle_key, scalars, params)
         metrics = {name: value.mean() for name, value in metrics.items()} | _episode_sums(rollout.transitions, params)
         skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
@@ -169,7 +174,7 @@ class Learner:
     ) -> tuple[jax.Array, Metrics]:
         """Return the loss of a minibatch (transitions, memory, advantage)."""
         transitions, memory, advantage = part
-        replayed = replay(self.acting.bind(weights), transitions, memory, params)
+        replayed = replay(self._acting.bind(weights), transitions, memory, params)
         loss = self.stage.loss or ppo_loss
         return loss(replayed, advantage, scalars, self.counterfactual == "distil", self._method)
 
@@ -178,6 +183,11 @@ class Learner:
         memory = self.acting.bind(weights).initial_memory((self.config.num_envs,))
         memory = draw_coins(memory, True, jax.random.fold_in(key, _EXPERIENCE), share)
         return self.acting.start(key, self.config.num_envs, memory, knowledge, params)
+
+    @property
+    def _acting(self) -> Acting:
+        """Return how the stage's episodes are acted."""
+        return dataclasses.replace(self.acting, adapts=self.stage.adapts)
 
     @property
     def _method(self) -> Method:
@@ -211,6 +221,11 @@ def regroup(tree: Any, order: jax.Array, axis: int) -> Any:
         return jnp.moveaxis(jnp.take_along_axis(blocks, index, axis + 1), axis + 1, 0)
 
     return jax.tree.map(divide, tree)
+
+
+def _with_fast(agent: Agent, fast: Any) -> Agent:
+    """Give agents other fast weights."""
+    return agent._replace(memory=carried(agent)._replace(fast=fast))
 
 
 def _episode_sums(transitions: Transition, params: EnvParams) -> dict[str, jax.Array]:

@@ -77,7 +77,7 @@ def steps(monkeypatch):
         for decoding in ("argmax", "sample"):
             lines += [agent(arm, decoding, (1, 2, 2 + more)) for arm in entry.run.arms]
             lines += [agent("stde", decoding, (1, 3, 3))] * ("layout" in entry.run.arms)
-        budget = {"exploration": 1280, "pretraining": 0, "learning": 512}
+        budget = {"exploration": 1280, "imitation": 0, "learning": 512}
         return drawn(entry.name, lines, Training(budget, 90.0, (10.0, 12.5), ("Note of all.",)))
 
     monkeypatch.setattr(compare, "measure_frontier", frontier)

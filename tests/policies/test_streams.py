@@ -66,9 +66,12 @@ def observations(generator):
 
 
 def memories(generator, experienced=1.0, spec=tiny.STREAMS):
+    """Random memories; an adaptation has changed the policy."""
     hidden = jnp.asarray(generator.uniform(-1, 1, (BATCH, 2 * HIDDEN)), jnp.float32)
     action = jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32)
-    fast = jnp.zeros((BATCH, NUM_ACTIONS)) if spec.method.endswith("ADAPTIVE") else None
+    fast = bind(spec, tiny.lively(0, spec)).initial_memory((BATCH,)).fast
+    if spec.method == "tpn":
+        fast = fast._replace(decisions=fast.decisions + 7, change=jnp.asarray(generator.normal(size=fast.change.shape)))
     return Memory(hidden, action, fast, jnp.full(BATCH, experienced))
 
 

@@ -1,4 +1,4 @@
-"""VTNet: tokens are a set, queries are places in view, and pre-training imitates shortest paths."""
+"""VTNet: tokens are a set, queries are places in view, and training begins with imitation of shortest paths."""
 
 import dataclasses
 import functools
@@ -194,7 +194,7 @@ def test_impossible_sizes_are_refused(sizes, message):
         Transformer(dataclasses.replace(SPEC, method_sizes=tuple(sizes.items())), nnx.Rngs(0))
 
 
-# Pre-training
+# Imitation
 
 
 def test_the_loss_is_the_cross_entropy_to_the_expert():
@@ -206,7 +206,7 @@ def test_the_loss_is_the_cross_entropy_to_the_expert():
 
 
 @pytest.mark.slow
-def test_pretraining_lowers_its_loss_and_leaves_the_policy_as_it_is():
+def test_imitation_lowers_its_loss_and_leaves_the_policy_as_it_is():
     spec = dataclasses.replace(tiny.SPEC, method="vtnet", method_sizes=tuple(SIZES.items()))
     expert = jnp.asarray(tiny.BANK.expert)
     params = PARAMS.replace(tables=PARAMS.tables.replace(expert=expert))

@@ -14,6 +14,7 @@ from jaxnav.policies.methods.rgb import NoExperience
 from jaxnav.runs.check import check
 from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.runs.train import train
+from jaxnav.runs.validation import Validator
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.trainer import Trainer
 
@@ -27,20 +28,23 @@ CONFIG = RunConfig(
 )
 
 
-def test_pretraining_is_part_of_the_budget():
+def test_imitation_is_part_of_the_budget():
     # A fifth of ten chunks of 1,280 steps.
     assert CONFIG.schedule == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
-    assert CONFIG.budget == {"exploration": 600, "pretraining": 2 * 1280, "learning": 8 * 1280}
+    assert CONFIG.budget == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
     plain = dataclasses.replace(CONFIG, method="org")
     assert plain.schedule == 10 * [0]
-    assert plain.budget == {"exploration": 600, "pretraining": 0, "learning": 12800}
-    told = "600 of exploration for the layout priors, 2,560 of pre-training, 10,240 of learning."
+    last = dataclasses.replace(CONFIG, method="tpn")
+    assert (last.schedule, last.budget) == ([0, 0, 0, 0, 0, 0, 0, 0, 1, 1], CONFIG.budget)
+    assert dataclasses.replace(last, imitation=0.5).schedule == 5 * [0] + 5 * [1]
+    assert plain.budget == {"exploration": 600, "imitation": 0, "learning": 12800}
+    told = "600 of exploration for the layout priors, 2,560 of imitation, 10,240 of learning."
     assert told in spent(CONFIG.budget)
 
 
 @pytest.mark.parametrize(("share", "chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
 def test_its_share_can_be_set_in_whole_chunks(share, chunks):
-    config = check(dataclasses.replace(CONFIG, pretraining=share))
+    config = check(dataclasses.replace(CONFIG, imitation=share))
     assert config.schedule == chunks * [0] + (10 - chunks) * [1]
     assert sum(stage.share for stage in config.stages) == pytest.approx(1.0)
     assert sum(config.budget.values()) - 600 == CONFIG.total_steps
@@ -49,12 +53,16 @@ def test_its_share_can_be_set_in_whole_chunks(share, chunks):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"pretraining": 0.0}, "config: pretraining is 0.0; give a share between 0 and 1, both excluded"),
-        ({"pretraining": 1.0}, "config: pretraining is 1.0; give a share between 0 and 1, both excluded"),
-        ({"pretraining": float("nan")}, "config: pretraining is nan; give a share"),
-        ({"pretraining": 0.95}, "config: pretraining is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
+        ({"imitation": 0.0}, "config: imitation is 0.0; give a share between 0 and 1, both excluded"),
+        ({"imitation": 1.0}, "config: imitation is 1.0; give a share between 0 and 1, both excluded"),
+        ({"imitation": float("nan")}, "config: imitation is nan; give a share"),
+        ({"imitation": 0.95}, "config: imitation is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
         ({"total_steps": 1}, "config: total_steps is 1; stage 2 of method 'vtnet', a share of 0.8, gets none of the 1"),
-        ({"method": "org", "pretraining": 0.2}, "config: pretraining is 0.2; method 'org' has none; leave it out"),
+        (
+            {"method": "tpn", "imitation": 0.01, "total_steps": 1280},
+            "config: imitation is 0.01; stage 2 of method 'tpn', a share of 0.01, gets none of the 1 chunks",
+        ),
+        ({"method": "org", "imitation": 0.2}, "config: imitation is 0.2; 'org' has no stages of both kinds; leave"),
     ],
 )
 def test_impossible_shares_are_refused(options, message):
@@ -71,19 +79,24 @@ def test_the_shares_of_a_method_add_up(shares):
 
 
 @pytest.mark.slow
-def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(config, tmp_path, monkeypatch):
+@pytest.mark.parametrize("method", ["vtnet", "tpn"])
+def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(method, config, tmp_path, monkeypatch):
     """Two chunks, one of each stage; a run that stops after the first ends as one that does not."""
     sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
-    options = {"method": "vtnet", "method_sizes": sizes, "arms": ("baseline",), "seeds": 1}
+    sizes = sizes if method == "vtnet" else {"tentative_width": 8}
+    options = {"method": method, "method_sizes": sizes, "imitation": 0.5, "arms": ("baseline",), "seeds": 1}
     config = dataclasses.replace(config, **options, run_dir=tmp_path / "whole")
-    run = train(config)
-    first, last = run.log()
-    assert "imitation_loss" in first
-    assert "policy_loss" not in first
-    assert "policy_loss" in last
+    asked, measure = [], Validator.measure
+    with monkeypatch.context() as patch:
+        patch.setattr(Validator, "measure", lambda *given: asked.append(given[2]) or measure(*given))
+        run = train(config)
+    assert asked == [method == "vtnet", True]  # measured as the stage acts
+    imitated = ["imitation_loss" in row for row in run.log()]
+    assert imitated == ([True, False] if method == "vtnet" else [False, True])
+    assert ["policy_loss" in row for row in run.log()] == [not each for each in imitated]
     for checkpoint in (run.config.run_dir / "checkpoints").iterdir():
         metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
-        assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "pretraining": 256, "learning": 256}
+        assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "imitation": 256, "learning": 256}
 
     done = []
 
@@ -103,4 +116,4 @@ def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(config
     policies = [jaxnav.load_policy(each.config.run_dir / "policies" / "baseline-0").params for each in (run, resumed)]
     chex.assert_trees_all_equal(*policies)
     budget = jaxnav.evaluate(run, episodes=8).report["run"]["budget"]
-    assert budget == {"exploration": 1280, "pretraining": 256, "learning": 256}
+    assert budget == {"exploration": 1280, "imitation": 256, "learning": 256}

@@ -9,7 +9,7 @@ from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.compare import by_scene
 from jaxnav.study.compare_report import SCALE, Measured, Training
 
-TRAINING = Training({"exploration": 1280, "pretraining": 0, "learning": 512}, 60.0, None, ("A note.",))
+TRAINING = Training({"exploration": 1280, "imitation": 0, "learning": 512}, 60.0, None, ("A note.",))
 
 
 @pytest.fixture(scope="module")

@@ -136,14 +136,25 @@ def test_the_direct_stream_is_alone_first():
     assert [int(count) for count in counts] == [2 * learner_with("org").config.minibatches]  # those of its stage alone
 
 
+def test_the_direct_stream_is_alone_in_the_stage_that_learns_last():
+    """Of ten chunks the tentative policy's imitation has the last two."""
+    config = RunConfig(method="tpn", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
+    assert config.schedule == [0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
+    assert [(stage.alone, stage.imitates, stage.adapts) for stage in config.stages] == [
+        (True, False, False),
+        (False, False, False),
+        (False, True, True),
+    ]
+
+
 def test_the_rate_runs_its_course_in_every_stage():
-    """Of ten chunks VTNet's pre-training has two, the direct stream alone four; Adam's first step is the rate."""
+    """Of ten chunks VTNet's imitation has two, the direct stream alone four; Adam's first step is the rate."""
     config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
     assert config.schedule == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert [stage.alone for stage in config.stages] == [False, True, False]
     assert [(float(each.begin), float(each.num_updates)) for each in config.scalars] == [(0, 4), (4, 8), (12, 8)]
     assert [float(each.learning_rate) for each in config.scalars] == pytest.approx([4e-3, 4e-3, 1e-3])
-    assert config.budget["pretraining"] == 2 * 2 * 3840
+    assert config.budget["imitation"] == 2 * 2 * 3840
     fused = dataclasses.replace(config, method="org", decision="fused")
     assert [(float(each.begin), float(each.num_updates)) for each in fused.scalars] == [(0, 20)]
 

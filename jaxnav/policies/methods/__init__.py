@@ -23,6 +23,7 @@ from jaxnav.policies.methods.hoz import HOZ
 from jaxnav.policies.methods.org import ORG
 from jaxnav.policies.methods.rgb import RGB
 from jaxnav.policies.methods.sp import SP
+from jaxnav.policies.methods.tpn import TPN
 from jaxnav.policies.methods.vtnet import VTNET
 
 __all__ = [
@@ -47,6 +48,7 @@ METHODS = {
     "org": ORG,
     "rgb": RGB,
     "sp": SP,
+    "tpn": TPN,
     "vtnet": VTNET,
 }
 #: Entry points of this group name the methods of other packages.

@@ -173,6 +173,8 @@ class Stage:
       imitates: whether the loss reads what shortest paths do, `Tables.expert`, which only then are there.
       alone: whether the direct stream acts without that of experience, where there are streams.
       rate: factor on the learning rate.
+      adapts: whether the method's adaptation changes the policy while it acts and learns; if not, fast weights stay as
+        they are.
     """
 
     share: float = 1.0
@@ -181,6 +183,7 @@ class Stage:
     imitates: bool = False
     alone: bool = False
     rate: float = 1.0
+    adapts: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,7 +196,7 @@ class Method:
       tracker: what an episode remembers without parameters.
       learn: from the banks of training scenes and counts float32 [rooms, K, K] (poses of exploration at which two
         categories were detected together) to what is known before training, a nested dict of arrays.
-      stages: of training, in order; all before the last are pre-training.
+      stages: of training, in order; of the policies that the last one passes through the best is kept.
       auxiliary: one more term of the loss, from a `jaxnav.training.loss.Replay` to a loss float32 [] and named parts.
       adaptation: how the policy changes within an episode.
       control: how its choices become actions.

@@ -19,7 +19,7 @@ from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NUM_ACTIONS
 
 #: Share of all updates in which the transformer learns what shortest paths do, before it is trained with the policy.
-PRETRAINING = 0.2
+IMITATION = 0.2
 
 
 class Attention(nnx.Module):
@@ -121,7 +121,7 @@ class Transformer(Experience):
         self.decoder = nnx.Dict({f"{i}": layer(*["answers"] * (i > 0), "tokens") for i in range(decoders)})
         self.maps = Linear(width, outputs, rngs=rngs)
         self.width = side**2 * outputs
-        self.expert = Linear(self.width, NUM_ACTIONS, rngs=rngs)  # for pre-training alone
+        self.expert = Linear(self.width, NUM_ACTIONS, rngs=rngs)  # for imitation alone
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Any) -> jax.Array:
         """Return experience, each encoded category weighted by the layout."""
@@ -198,7 +198,7 @@ def places(side: int, width: int) -> np.ndarray:
     return np.concatenate([code.repeat(side, axis=0), np.tile(code, (side, 1))], axis=1).astype(np.float32)
 
 
-def pretraining_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+def expert_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Return how badly experience alone tells a shortest path's actions.
 
     A head of its own reads it, and nothing else does: the policy only explores in this stage.
@@ -211,10 +211,10 @@ def pretraining_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.A
 VTNET = Method(
     Transformer,
     stages=(
-        Stage(PRETRAINING, pretraining_loss, trainable=lambda path: path[0] == "method", imitates=True),
-        Stage(1.0 - PRETRAINING),
+        Stage(IMITATION, expert_loss, trainable=lambda path: path[0] == "method", imitates=True),
+        Stage(1.0 - IMITATION),
     ),
 )
-#: The ablations that it must beat: without attention, and without pre-training.
+#: The ablations that it must beat: without attention, and without imitation.
 AVERAGED = dataclasses.replace(VTNET, experience=AveragingTransformer)
 UNTAUGHT = dataclasses.replace(VTNET, stages=(Stage(),))

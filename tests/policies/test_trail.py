@@ -1,0 +1,89 @@
+"""The trail of an episode: exactly the repeated poses are told, by compass and odometry alone."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+
+from jaxnav.env.build import build
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import Percept
+from jaxnav.policies.methods.trail import PoseTracker, learn_motion
+from jaxnav.policies.pathways import NO_ACTION
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT
+from jaxnav.scenes.worlds import WORLDS, generated
+
+
+def knowledge(bank=tiny.BANK):
+    return tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_motion([bank], np.zeros(0))))
+
+
+def follow(walk, length=100):
+    """Which poses of a walk [(heading, action, moved)] are repeated."""
+    known, tracker = knowledge(), PoseTracker(length)
+    headings, actions, moved = (jnp.asarray(column) for column in zip(*walk, strict=True))
+
+    def step(note, inputs):
+        note = tracker.update(note, known, Percept(jnp.zeros(0, jnp.uint8), *inputs))
+        return note, tracker.read(note, known, jnp.int32(0))
+
+    return jax.lax.scan(step, tracker.init(known), (headings, actions, moved))[1].tolist()
+
+
+def test_a_walk_repeats_the_poses_that_it_comes_back_to():
+    walk = [
+        ((0, NO_ACTION, False), False),
+        ((1, ROTATE_RIGHT, False), False),
+        ((0, ROTATE_LEFT, False), True),  # back to the first heading
+        ((0, MOVE_AHEAD, True), False),
+        ((0, LOOK_DOWN, False), False),
+        ((0, LOOK_DOWN, False), True),  # no lower
+        ((0, LOOK_UP, False), True),
+        ((0, MOVE_AHEAD, False), True),  # blocked
+        ((1, ROTATE_RIGHT, False), False),
+        ((1, MOVE_AHEAD, True), False),  # diagonally
+        *(((heading, ROTATE_RIGHT, False), False) for heading in (2, 3, 4, 5)),
+        ((5, MOVE_AHEAD, True), False),  # there again, but with another heading
+        *(((heading, ROTATE_RIGHT, False), False) for heading in (6, 7)),
+        ((0, ROTATE_RIGHT, False), True),
+    ]
+    assert follow([step for step, _ in walk]) == [repeated for _, repeated in walk]
+
+
+def test_what_is_too_long_ago_is_forgotten():
+    turns = [(heading % 8, ROTATE_RIGHT, False) for heading in range(17)]
+    assert follow(turns) == 8 * [False] + 9 * [True]
+    assert follow(turns, 8) == 8 * [False] + 9 * [True]
+    assert not any(follow(turns, 7))
+
+
+@pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
+def test_exactly_the_repeated_poses_of_random_walks_are_told(world):
+    """With 8 and 12 headings, 2 horizons and 1, and walks longer than what is remembered."""
+    task, walks, steps = WORLDS[world].task, 32, 300
+    bank = compile_bank([generated(world, "train", 1)[0]], task)
+    env, params = build(bank, {}, 10**6)
+    acting = Acting(env, dataclasses.replace(tiny.SPEC, method="tpn", num_categories=len(task.categories)))
+    known = knowledge(bank)
+
+    @jax.jit
+    def walk(key):
+        start = acting.start(key, walks, None, known, params)
+
+        def step(agent, key):
+            draw = jax.random.randint(key, (walks,), 0, NUM_ACTIONS - 1)
+            agent, _ = acting.step(agent, jnp.where(draw % 2 == 0, MOVE_AHEAD, draw), known, params)
+            return agent, (agent.state.pose, acting.view(agent, known, params).reading)
+
+        _, (poses, repeated) = jax.lax.scan(step, start, jax.random.split(key, steps))
+        return jnp.concatenate([start.state.pose[None], poses]), repeated
+
+    poses, repeated = jax.tree.map(np.asarray, walk(jax.random.key(0)))
+    for now in range(1, steps + 1):
+        before = poses[max(0, now - PoseTracker().length) : now]
+        np.testing.assert_array_equal(repeated[now - 1], (before == poses[now]).any(axis=0))
+    assert 0.1 < repeated.mean() < 0.9
