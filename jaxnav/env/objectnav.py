@@ -172,8 +172,8 @@ class ObjectNav:
         pose = self.after(state.pose, action, params)
         nearest = state.nearest
         if nearest is not None:
-            nearest = jnp.minimum(nearest, params.tables.goal_distance[self.cell(pose), state.goal])
-            reward += self.shaping * (state.nearest - nearest)
+            before, nearest = nearest, jnp.minimum(nearest, params.tables.goal_distance[self.cell(pose), state.goal])
+            reward += self.shaping * (before - nearest)
         return state.replace(pose=pose, time=time, nearest=nearest), reward, done, truncated
 
     def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:

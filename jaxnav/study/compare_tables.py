@@ -143,7 +143,7 @@ def _training_table(parts: Parts) -> list[str]:
             course = "{:.1f} → {:.1f}".format(*training.course) if training.course else "-"
             rows.append((run_label(*run), *steps, f"{training.wall_s / 60:,.1f}", course))
     return markdown(
-        ("run", "exploration (steps)", "pre-training (steps)", "learning (steps)", "wall time (min)", "val SR (%)"),
+        ("run", "exploration (steps)", "imitation (steps)", "learning (steps)", "wall time (min)", "val SR (%)"),
         rows,
     )
 
@@ -155,7 +155,7 @@ def _notes(parts: Parts) -> list[str]:
         for note in part.training.notes if part.training else ():
             told.setdefault(note, []).append(run_label(*run))
     return [
-        "Exploration, pre-training and learning are the environment steps behind each policy. The wall time is that of "
+        "Exploration, imitation and learning are the environment steps behind each policy. The wall time is that of "
         "the whole run, all its seeds, without and with w, side by side. Val SR is that of best actions, the mean of "
         "all policies, before the last quarter of training and at its end: where it rises, longer training pays.",
         "",

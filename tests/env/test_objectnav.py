@@ -110,9 +110,9 @@ def test_shaping_rewards_metres_nearer_than_before(rules, ahead):
             given = state.replace(nearest=jnp.float32(nearest))
             after, reward, _, _ = shaped.advance(given, jnp.int32(action), params)
             np.testing.assert_allclose(reward, -0.01 + 2.0 * gained, atol=1e-6)
-            np.testing.assert_allclose(after.nearest, nearest - gained, atol=1e-6)
+            assert after.nearest == pytest.approx(nearest - gained, abs=1e-6)
     _, begun = shaped.reset(jax.random.key(0), params)
-    np.testing.assert_allclose(begun.nearest, bank.goal_distance[shaped.cell(begun.pose), BOOK])
+    assert begun.nearest == pytest.approx(bank.goal_distance[shaped.cell(begun.pose), BOOK])
     done = start.replace(pose=jnp.int32(7 * per_cell), nearest=jnp.float32(ahead))
     np.testing.assert_allclose(bank.goal_distance[7, BOOK], ahead)  # z = 1.75
     assert shaped.advance(done, jnp.int32(DONE), params)[1] == 5.0
