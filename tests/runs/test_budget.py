@@ -85,7 +85,7 @@ def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(method
     sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
     sizes = sizes if method == "vtnet" else {"tentative_width": 8}
     options = {"method": method, "method_sizes": sizes, "imitation": 0.5, "arms": ("baseline",), "seeds": 1}
-    config = dataclasses.replace(config, **options, run_dir=tmp_path / "whole")
+    config = dataclasses.replace(config, **options, validations=2, val_episodes=4, run_dir=tmp_path / "whole")
     asked, measure = [], Validator.measure
     with monkeypatch.context() as patch:
         patch.setattr(Validator, "measure", lambda *given: asked.append(given[2]) or measure(*given))
