@@ -49,7 +49,7 @@ class PPOConfig:
     distil: float = 0.5
     alone: float = 0.5
     experience: float = 0.8
-    experience_rate: float = 0.25
+    experience_rate: float = 0.5
 
     def num_updates(self, total_steps: int) -> int:
         """Return the updates that environment steps of a seed take.

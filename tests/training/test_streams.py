@@ -153,7 +153,7 @@ def test_the_rate_runs_its_course_in_every_stage():
     assert config.schedule == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert [stage.alone for stage in config.stages] == [False, True, False]
     assert [(float(each.begin), float(each.num_updates)) for each in config.scalars] == [(0, 4), (4, 8), (12, 8)]
-    assert [float(each.learning_rate) for each in config.scalars] == pytest.approx([4e-3, 4e-3, 1e-3])
+    assert [float(each.learning_rate) for each in config.scalars] == pytest.approx([4e-3, 4e-3, 2e-3])
     assert config.budget["imitation"] == 2 * 2 * 3840
     fused = dataclasses.replace(config, method="org", decision="fused")
     assert [(float(each.begin), float(each.num_updates)) for each in fused.scalars] == [(0, 20)]
