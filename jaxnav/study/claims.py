@@ -6,6 +6,7 @@ from typing import NamedTuple
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.design import Design
+from jaxnav.study.mixture_report import Mixture
 from jaxnav.study.records import SceneEffects
 from jaxnav.study.results import StudyResults
 from jaxnav.study.trials import NO_THRESHOLD, THRESHOLD, Trial
@@ -55,6 +56,27 @@ def claims(results: StudyResults, world: str = "main") -> list[Claim]:
         Claim("Success follows the layout's similarity (Fig. 4)", "r", first.similarity.pearson, 0.1),
         Claim("Gains over the baseline are larger where similarity is low (Fig. 5)", "points per -0.1", -slope, 1.0),
         *_gap_claims(in_world.course, first.shift, last.shift),
+        *(claim for mixture in results.mixtures if world == "main" for claim in claims_of_experience(mixture)),
+    ]
+
+
+def claims_of_experience(mixture: Mixture) -> list[Claim]:
+    """Return what is claimed of experience and of its removal, sampled actions."""
+    if mixture.decoding != "sample":
+        return []
+    run, (first, *_, last) = mixture.run, mixture.shifts
+    return [
+        _points(f"Experience pays at shift {first:g} (`{run}`, sampled)", mixture.lead["sr"][0]),
+        _points(f"Experience costs at shift {last:g} (`{run}`, sampled)", -mixture.lead["sr"][-1]),
+        _points(f"Hard TDE gains at shift {last:g} (`{run}`, sampled)", mixture.removal("TDE").change["sr"][-1]),
+        *(
+            _points(
+                f"{removal.name}: gains on the gap of another episode, over the mixture (`{run}`, sampled)",
+                removal.compared["shuffled"].gained["sr"],
+            )
+            for removal in mixture.removals
+            if removal.compared
+        ),
     ]
 
 

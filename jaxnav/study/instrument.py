@@ -44,9 +44,9 @@ class InstrumentConfig:
     seed: int = 0
 
 
-def study_instrument(config: StudyConfig, run: RunConfig) -> InstrumentConfig:
+def study_instrument(config: StudyConfig, run: RunConfig, without: Path | None = None) -> InstrumentConfig:
     """Return the proof that a study asks of a run."""
-    return InstrumentConfig(run.run_dir, config.shifts, None, config.split, config.episodes, seed=config.seed)
+    return InstrumentConfig(run.run_dir, config.shifts, without, config.split, config.episodes, seed=config.seed)
 
 
 def prove_main_run(config: StudyConfig, console: Console, out: Console) -> None:

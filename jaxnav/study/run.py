@@ -54,7 +54,8 @@ def run_study(config: StudyConfig, console: Console) -> None:
         for shift in config.shifts:
             write(condition_name(name, shift), partial(measure_condition, run, name in FULL, shift, bench, console))
         if name in WORLDS:
-            instrument = study_instrument(config, run)
+            without = runs[WITHOUT].run_dir if name == "main" and WITHOUT in runs else None
+            instrument = study_instrument(config, run, without)
             write(f"instrument-{name}", partial(instrument_report, instrument, run, console))
             write(f"gap-{name}", partial(gap_course, run, config, console))
         if name in ACCOUNTED and WITHOUT in runs:

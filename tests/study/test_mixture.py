@@ -1,5 +1,7 @@
 """Removal in a mixed population: what is compared with what."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import Outcome
 from jaxnav.evaluation.statistics import Interval
+from jaxnav.study.claims import claims_of_experience
 from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.mixture import Ledger, clock_trials
 from jaxnav.study.mixture_report import Compared, Mixture, Removal
@@ -167,3 +170,10 @@ def test_the_tables_hold_what_was_measured():
     assert clock.split("|")[2:4] == [" `after step 15`, the best clock (0.30, 0.70) ", " +4.0 [+3.0, +5.0] "]
     assert "the gap of another episode" in other
     assert [line.split("|")[1].strip() for line in order_table(MIXTURE)[2:]] == ["after step 15"]
+
+
+def test_claims_of_experience_are_read_from_the_mixture():
+    found = [(claim.effect.mean, claim.verdict) for claim in claims_of_experience(MIXTURE)]
+    # Value 25, cost 25, what TDE changes at the last shift, and what the gap gains on another's: 1 [0, 2] is not clear.
+    assert found == [(25.0, "holds"), (25.0, "holds"), (2.0, "holds"), (1.0, "cannot be told")]
+    assert claims_of_experience(dataclasses.replace(MIXTURE, decoding="argmax")) == []
