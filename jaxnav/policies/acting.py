@@ -171,7 +171,7 @@ class Acting:
         """
         headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
         pose, room = agent.state.pose, params.room[agent.state.scene]
-        percept = Percept(params.tables.rows[pose], pose // horizons % headings, action, moved)
+        percept = Percept(params.tables.rows[pose], pose // horizons % headings, action, moved, pose % horizons)
         update = jax.vmap(self._perception.update, (0, 0, 0, None, 0))
         return agent._replace(perceived=update(agent.perceived, percept, agent.state.goal, knowledge, room))
 

@@ -106,7 +106,7 @@ def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge:
             pose = agent.state.pose[i]
             moved = jnp.bool_(before is not None and env.cell(before.state.pose[i]) != env.cell(pose))
             heading = pose // horizons % headings
-            percept = Percept(params.tables.rows[pose], heading, carried(agent).action[i], moved)
+            percept = Percept(params.tables.rows[pose], heading, carried(agent).action[i], moved, pose % horizons)
             note = update(note, percept)
             kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.perceived.note)
             chex.assert_trees_all_equal_shapes_and_dtypes(kept, note)

@@ -80,6 +80,7 @@ class LoadedPolicy(struct.PyTreeNode):
         key: jax.Array | None = None,
         heading: jax.Array | int | None = None,
         moved: jax.Array | bool | None = None,
+        horizon: jax.Array | int = 0,
     ) -> tuple[jax.Array, EpisodeMemory]:
         """Take in one observation and choose an action.
 
@@ -93,6 +94,7 @@ class LoadedPolicy(struct.PyTreeNode):
           heading: compass heading, and
           moved: whether the last action changed the cell; policies with a spatial memory and methods with a tracker
             need both.
+          horizon: index of the camera's horizon, 0 for level; `tpn` goes by it too.
 
         Returns:
           The action int32 [], and the memory for the next step.
@@ -104,7 +106,7 @@ class LoadedPolicy(struct.PyTreeNode):
         if perception.uses_odometry and (heading is None or moved is None):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
         odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
-        percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1])
+        percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon))
         perceived = perception.update(memory.perceived, percept, observation.goal, self.knowledge, memory.room)
         view = perception.view(perceived, observation, self.knowledge)
         decision, logits = self._decide(view, memory.memory, perceived.layout, epsilon)

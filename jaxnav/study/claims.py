@@ -45,7 +45,7 @@ class Claim(NamedTuple):
 
 
 def claims(results: StudyResults, world: str = "main") -> list[Claim]:
-    """Return what the paper claims of one world, best actions."""
+    """Return what is claimed of one world, best actions unless told."""
     in_world = results.worlds[world]
     first, last = in_world.conditions[0], in_world.conditions[-1]
     slope = last.gains.stde.slope
@@ -71,8 +71,8 @@ def claims_of_experience(mixture: Mixture) -> list[Claim]:
         _points(f"Hard TDE gains at shift {last:g} (`{run}`, sampled)", mixture.removal("TDE").change["sr"][-1]),
         *(
             _points(
-                f"{removal.name}: gains on the gap of another episode, over the mixture (`{run}`, sampled)",
-                removal.compared["shuffled"].gained["sr"],
+                f"Removal gains over the mixture: {removal.name} (`{run}`, sampled)",
+                removal.mixture["sr"],
             )
             for removal in mixture.removals
             if removal.compared

@@ -73,7 +73,7 @@ def _reading_help(config: CompareConfig) -> list[str]:
         lines += [
             "`+ w`: the layout's weights multiply its experience (eq. 7).",
             "`+ w + sTDE`: the same policies, experience removed at inference (eq. 2); epsilon "
-            f"{config.epsilon:g} and form `{config.form}` were chosen before any result.",
+            f"{config.epsilon:g} and form `{config.form}` were given beforehand, not chosen by these results.",
         ]
     if "streams" in config.decisions:
         lines.append("`streams`: logits are the sum of two streams (docs/methods.md); else there is one core.")

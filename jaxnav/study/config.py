@@ -72,6 +72,9 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
     "shaping": {"worlds": {"shaping": 1.0}},
 }
 
+#: The run of agents that cannot know any layout; whatever is measured beside them depends on whether it is there.
+WITHOUT = "anonymous"
+
 
 def check_study(config: StudyConfig) -> StudyConfig:
     """Return the same config if every setting is possible.
@@ -115,6 +118,7 @@ def study_identity(config: StudyConfig) -> dict[str, Any]:
     File places, the split and the list of other runs are left out.
     """
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    settings["without"] = WITHOUT in config.trainings
     for name in ("results", "document", "runs", "split", "trainings", "real"):
         settings.pop(name)
     for name in ("run_dir", "save_every", "cache", "devices"):

@@ -6,7 +6,7 @@ from functools import partial
 from rich.console import Console
 
 from jaxnav.study.bench import Bench
-from jaxnav.study.config import StudyConfig, study_identity
+from jaxnav.study.config import WITHOUT, StudyConfig, study_identity
 from jaxnav.study.document import check_document, write_document
 from jaxnav.study.gap_course import gap_course
 from jaxnav.study.instrument import instrument_report, study_instrument
@@ -18,8 +18,8 @@ from jaxnav.viz import require_pictures
 
 #: Runs that have every trial.
 FULL = ("main", "goal", "real")
-#: Runs whose experience is accounted for, beside agents that cannot know any layout.
-ACCOUNTED, WITHOUT = ("main", "streams"), "anonymous"
+#: Runs whose experience is accounted for, beside agents without any.
+ACCOUNTED = ("main", "streams")
 
 
 def run_study(config: StudyConfig, console: Console) -> None:

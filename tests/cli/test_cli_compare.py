@@ -256,11 +256,12 @@ def test_table_2_has_every_method(monkeypatch):
         assert (entry.run.method, entry.run.world, entry.run.seeds) == (entry.method, entry.world, 3)
         hosts = METHODS[entry.method].hosts_layout
         assert entry.run.arms == (("layout",) if entry.decision == "streams" else ("baseline", "layout")[: 1 + hosts])
-    assert len({entry.run.total_steps for entry in runs}) == 1
+    for world in {entry.world for entry in runs}:  # the same steps for all
+        assert len({entry.run.total_updates * entry.run.update_steps for entry in runs if entry.world == world}) == 1
 
 
 def test_the_ablations_have_the_baseline_alone():
     config = command.parse_compare(["--config", "ablations"])
     runs = entries(config)
-    assert len(runs) == 2 * 9
+    assert len(runs) == 2 * 12
     assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}

@@ -88,8 +88,10 @@ def test_banks_are_read_one_ahead(world, monkeypatch):
 @pytest.mark.slow
 def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
-    config = RunConfig(ppo=PPOConfig(num_envs=32, rollout=4, minibatches=2), seeds=1, sizes=tiny.SIZES)
+    ppo = PPOConfig(num_envs=32, rollout=4, minibatches=2)
+    config = RunConfig(ppo=ppo, seeds=1, sizes=tiny.SIZES, worlds=WorldConfig(near_starts=0.5))
     trainer = make_trainer(config, world.env, Setting(), Knowledge(jnp.ones((NUM_PRIORS, 22, 22))))
+    assert (trainer.learners["layout"].acting.env.near_starts, world.env.near_starts) == (0.5, 0.0)
     before = trainer.init(world.params(0))
     kept = jax.tree.map(np.array, before["layout"][0].replace(key=None))
     after = trainer.restart(before, world.params(1))["layout"][0]

@@ -212,11 +212,11 @@ def test_another_document_is_refused_before_any_training(untrained, tmp_path, ca
     assert set(contents(tmp_path)) == {"study.yaml", "docs/study.md"}
 
 
-@pytest.mark.parametrize("name", ["study", "study_quick"])
-def test_the_configs_that_come_with_it(name):
+@pytest.mark.parametrize(("name", "scenes"), [("study", 40), ("study_quick", 80)])
+def test_the_configs_that_come_with_it(name, scenes):
     config = command.parse_study(["--config", name])
     assert config.shifts == (0.0, 0.5, 1.0)
-    assert run_config(config, "main").worlds.num_val == 80
+    assert run_config(config, "main").worlds.num_val == scenes
     assert {0.0, 0.5, 1.0} <= set(config.epsilon)
     assert (config.document == Path("docs/study.md")) == (name == "study")
 

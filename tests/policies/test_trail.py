@@ -1,4 +1,4 @@
-"""The trail of an episode: exactly the repeated poses are told, by compass and odometry alone."""
+"""The trail of an episode: exactly the repeated poses are told, by compass, odometry and horizon."""
 
 import dataclasses
 
@@ -9,6 +9,8 @@ import pytest
 from support import tiny_world as tiny
 
 from jaxnav.env.build import build
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.grid import first_states
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import Percept
 from jaxnav.policies.methods.trail import PoseTracker, learn_motion
@@ -23,39 +25,39 @@ def knowledge(bank=tiny.BANK):
 
 
 def follow(walk, length=100):
-    """Which poses of a walk [(heading, action, moved)] are repeated."""
+    """Which poses of a walk [(heading, action, moved, horizon)] are repeated."""
     known, tracker = knowledge(), PoseTracker(length)
-    headings, actions, moved = (jnp.asarray(column) for column in zip(*walk, strict=True))
+    columns = tuple(jnp.asarray(column) for column in zip(*walk, strict=True))
 
     def step(note, inputs):
         note = tracker.update(note, known, Percept(jnp.zeros(0, jnp.uint8), *inputs))
         return note, tracker.read(note, known, jnp.int32(0))
 
-    return jax.lax.scan(step, tracker.init(known), (headings, actions, moved))[1].tolist()
+    return jax.lax.scan(step, tracker.init(known), columns)[1].tolist()
 
 
 def test_a_walk_repeats_the_poses_that_it_comes_back_to():
     walk = [
-        ((0, NO_ACTION, False), False),
-        ((1, ROTATE_RIGHT, False), False),
-        ((0, ROTATE_LEFT, False), True),  # back to the first heading
-        ((0, MOVE_AHEAD, True), False),
-        ((0, LOOK_DOWN, False), False),
-        ((0, LOOK_DOWN, False), True),  # no lower
-        ((0, LOOK_UP, False), True),
-        ((0, MOVE_AHEAD, False), True),  # blocked
-        ((1, ROTATE_RIGHT, False), False),
-        ((1, MOVE_AHEAD, True), False),  # diagonally
-        *(((heading, ROTATE_RIGHT, False), False) for heading in (2, 3, 4, 5)),
-        ((5, MOVE_AHEAD, True), False),  # there again, but with another heading
-        *(((heading, ROTATE_RIGHT, False), False) for heading in (6, 7)),
-        ((0, ROTATE_RIGHT, False), True),
+        ((0, NO_ACTION, False, 0), False),
+        ((1, ROTATE_RIGHT, False, 0), False),
+        ((0, ROTATE_LEFT, False, 0), True),  # back to the first heading
+        ((0, MOVE_AHEAD, True, 0), False),
+        ((0, LOOK_DOWN, False, 1), False),
+        ((0, LOOK_DOWN, False, 1), True),  # no lower
+        ((0, LOOK_UP, False, 0), True),
+        ((0, MOVE_AHEAD, False, 0), True),  # blocked
+        ((1, ROTATE_RIGHT, False, 0), False),
+        ((1, MOVE_AHEAD, True, 0), False),  # diagonally
+        *(((heading, ROTATE_RIGHT, False, 0), False) for heading in (2, 3, 4, 5)),
+        ((5, MOVE_AHEAD, True, 0), False),  # there again, but with another heading
+        *(((heading, ROTATE_RIGHT, False, 0), False) for heading in (6, 7)),
+        ((0, ROTATE_RIGHT, False, 0), True),
     ]
     assert follow([step for step, _ in walk]) == [repeated for _, repeated in walk]
 
 
 def test_what_is_too_long_ago_is_forgotten():
-    turns = [(heading % 8, ROTATE_RIGHT, False) for heading in range(17)]
+    turns = [(heading % 8, ROTATE_RIGHT, False, 0) for heading in range(17)]
     assert follow(turns) == 8 * [False] + 9 * [True]
     assert follow(turns, 8) == 8 * [False] + 9 * [True]
     assert not any(follow(turns, 7))
@@ -67,12 +69,13 @@ def test_exactly_the_repeated_poses_of_random_walks_are_told(world):
     task, walks, steps = WORLDS[world].task, 32, 300
     bank = compile_bank([generated(world, "train", 1)[0]], task)
     env, params = build(bank, {}, 10**6)
+    episodes = episode_list(bank, walks, seed=0)
     acting = Acting(env, dataclasses.replace(tiny.SPEC, method="tpn", num_categories=len(task.categories)))
     known = knowledge(bank)
 
     @jax.jit
     def walk(key):
-        start = acting.start(key, walks, None, known, params)
+        start = acting.begin(first_states(episodes), None, known, params)  # half of them look down, where one can
 
         def step(agent, key):
             draw = jax.random.randint(key, (walks,), 0, NUM_ACTIONS - 1)

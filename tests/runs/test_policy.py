@@ -30,9 +30,9 @@ from jaxnav.scenes.categories import ROOM_TYPES
 _compiled = jax.jit(LoadedPolicy.act)
 
 
-def act(policy, observation, memory, epsilon=0.1, *, key=None, heading=0, moved=False):
+def act(policy, observation, memory, epsilon=0.1, *, key=None, heading=0, moved=False, horizon=0):
     """One step, by as few compilations as there are kinds of policies."""
-    told = {"heading": jnp.int32(heading), "moved": jnp.bool_(moved)}
+    told = {"heading": jnp.int32(heading), "moved": jnp.bool_(moved), "horizon": jnp.int32(horizon)}
     return _compiled(policy, observation, memory, jnp.float32(epsilon), key=key, **told)
 
 
@@ -60,6 +60,7 @@ def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.
             key=None if key is None else jax.random.fold_in(key, time),
             heading=state.pose // horizons % headings if told else 0,
             moved=env.cell(state.pose) != env.cell(before.pose) if told else False,
+            horizon=state.pose % horizons if told else 0,
         )
         actions.append(int(action))
         before, (state, *_) = state, env.advance(state, action, params)

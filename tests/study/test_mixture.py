@@ -174,6 +174,6 @@ def test_the_tables_hold_what_was_measured():
 
 def test_claims_of_experience_are_read_from_the_mixture():
     found = [(claim.effect.mean, claim.verdict) for claim in claims_of_experience(MIXTURE)]
-    # Value 25, cost 25, what TDE changes at the last shift, and what the gap gains on another's: 1 [0, 2] is not clear.
-    assert found == [(25.0, "holds"), (25.0, "holds"), (2.0, "holds"), (1.0, "cannot be told")]
+    # Value 25, cost 25, what TDE changes at the last shift, and what the gap's removal gains in all: 0.5 [-0.5, 1.5].
+    assert found == [(25.0, "holds"), (25.0, "holds"), (2.0, "holds"), (0.5, "too small to matter")]
     assert claims_of_experience(dataclasses.replace(MIXTURE, decoding="argmax")) == []

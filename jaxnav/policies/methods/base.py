@@ -44,12 +44,14 @@ class Percept(NamedTuple):
       heading: int32 [], compass heading, 0 to H - 1, clockwise.
       action: int32 [], the action that led here; `NO_ACTION` at the start.
       moved: bool [], whether it changed the cell.
+      horizon: int32 [], index of the camera's horizon.
     """
 
     row: jax.Array
     heading: jax.Array
     action: jax.Array
     moved: jax.Array
+    horizon: jax.Array
 
 
 class Tracker(Protocol):

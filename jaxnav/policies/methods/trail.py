@@ -10,7 +10,6 @@ import numpy as np
 
 from jaxnav.policies.methods.base import Knowledge, Percept
 from jaxnav.scenes.tables.compile import Bank
-from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP
 
 _SIDE = 2**13  # cells of a line; with 12 headings and 2 horizons the numbers of poses fit in 31 bits
 _NOWHERE = np.iinfo(np.int32).min
@@ -22,19 +21,17 @@ class Trail(NamedTuple):
     Attributes:
       poses: int32 [N], numbers of the last ones, the present one at the end.
       place: int32 [2], (dz, dx) in cells from where the episode began.
-      horizon: int32 [], index of the horizon.
       repeated: bool [], whether the present pose is among those before.
     """
 
     poses: jax.Array
     place: jax.Array
-    horizon: jax.Array
     repeated: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseTracker:
-    """Tell by compass and odometry whether the agent was here before.
+    """Tell by compass, odometry and horizon whether the agent was here before.
 
     A pose is cell, heading and horizon. The method's knowledge is that of `learn_motion`.
 
@@ -47,17 +44,15 @@ class PoseTracker:
     def init(self, knowledge: Knowledge) -> Trail:
         """Return a trail that has not begun."""
         nowhere = jnp.full(self.length, _NOWHERE, jnp.int32)
-        return Trail(nowhere, jnp.zeros(2, jnp.int32), jnp.int32(0), jnp.bool_(False))
+        return Trail(nowhere, jnp.zeros(2, jnp.int32), jnp.bool_(False))
 
     def update(self, note: Trail, knowledge: Knowledge, percept: Percept) -> Trail:
         """Go on to the present pose."""
         steps, horizons = knowledge.method["steps"], knowledge.method["horizons"]
         place = note.place + jnp.where(percept.moved, steps[percept.heading], 0)
-        looked = (percept.action == LOOK_DOWN).astype(jnp.int32) - (percept.action == LOOK_UP).astype(jnp.int32)
-        horizon = jnp.clip(note.horizon + looked, 0, horizons - 1)
-        pose = ((place[0] * _SIDE + place[1]) * len(steps) + percept.heading) * horizons + horizon
+        pose = ((place[0] * _SIDE + place[1]) * len(steps) + percept.heading) * horizons + percept.horizon
         poses = jnp.concatenate([note.poses[1:], pose[None]])
-        return Trail(poses, place, horizon, (note.poses == pose).any())
+        return Trail(poses, place, (note.poses == pose).any())
 
     def read(self, note: Trail, knowledge: Knowledge, goal: jax.Array) -> jax.Array:
         """Return whether the present pose is repeated, bool []."""
