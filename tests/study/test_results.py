@@ -12,6 +12,7 @@ from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.document import READING, write_document
 from jaxnav.study.instrument_report import InstrumentReport
+from jaxnav.study.mixture_report import Mixture
 from jaxnav.study.records import Condition, FullCondition
 from jaxnav.study.results import is_written, load_condition, load_results, write_part
 
@@ -22,6 +23,8 @@ HEADER = {"study", "versions", "format"}
 
 def kind(part: dict[str, Any]) -> type:
     """Return the type of the record that a part holds."""
+    if "removals" in part:
+        return Mixture
     if "rows" in part:
         return FullCondition if "gains" in part else Condition
     return InstrumentReport if "matched" in part else GapCourse
