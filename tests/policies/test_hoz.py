@@ -2,174 +2,42 @@
 
 import dataclasses
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
+from support.scenes import BOOK, CHAIR, FRIDGE
+from support.zones import (
+    BEDROOM,
+    EAST,
+    EVERY,
+    KITCHEN,
+    KITCHENS,
+    NOTHING,
+    PATH,
+    PER_CELL,
+    ROOMS,
+    K,
+    corridor,
+    holding,
+    learned,
+)
 
-from jaxnav.env.objectnav import NUM_PRIORS, prior_index
-from jaxnav.errors import InputError
+from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.policies.features import features
 from jaxnav.policies.methods import Knowledge, Percept
 from jaxnav.policies.methods.hoz import ZonePath, ZoneTracker
 from jaxnav.policies.methods.zones import (
-    adjacency,
     indirect_shares,
     learn_permuted,
     learn_zones,
-    next_zones,
-    room_graphs,
 )
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.policies.policy import bind, init_params
-from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.tables.observation_row import RowFormat
-from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_RIGHT, Task
-from jaxnav.scenes.worlds import WORLDS, generated
-
-K, TASK, ROOMS = len(CATEGORIES), Task(CATEGORIES), [prior_index(room) for room in ("kitchen", "bedroom")]
-EAST, WEST, PER_CELL = 2, 6, TASK.rules.poses_per_cell
-KITCHEN, BEDROOM = ROOMS
-NOTHING = np.zeros((NUM_PRIORS, K, K))
-EVERY = np.ones(K, bool)
-
-
-def corridor(*shown, room_type="kitchen"):
-    """Three cells to the east for every category shown, which is detected at all of their poses and alone."""
-    cells = np.arange(3 * len(shown))
-    ahead = np.repeat(cells[:, None], TASK.rules.headings, axis=1).astype(np.int32)
-    ahead[:, EAST], ahead[:, WEST] = np.minimum(cells + 1, cells[-1]), np.maximum(cells - 1, 0)
-    detections = np.zeros((len(cells) * PER_CELL, K, 4), np.uint8)
-    detections[np.arange(len(detections)), np.repeat(shown, 3 * PER_CELL), 0] = 255
-    row_format = RowFormat(K)
-    rows = row_format.pack(detections, np.zeros((len(detections), row_format.view, row_format.view), np.uint8))
-    distance, length = np.ones((len(cells), K), np.float32), np.ones((len(rows), K), np.uint16)
-    one = np.array([0], np.int32), np.array([len(cells)], np.int32)
-    goals = np.arange(K, dtype=np.int32)[None], np.array([K], np.int32)
-    return Bank(TASK, ("corridor",), (room_type,), ahead, rows, length, distance, *one, *goals, ())
-
-
-PATH = corridor(BOOK, CHAIR, FRIDGE)
-
-
-@functools.cache
-def learned(*banks_of, zones=3):
-    """Zones of corridors, each told by its categories and its room type."""
-    banks = [corridor(*shown, room_type=room) for shown, room in banks_of]
-    return learn_zones(banks, NOTHING, zones)
-
-
-KITCHENS = (((BOOK, CHAIR, FRIDGE), "kitchen"),)
-
-
-def holding(zones, category, room=KITCHEN):
-    """The zone at which a category is always detected."""
-    (zone,) = np.flatnonzero(zones["nodes"][room, :, category] == 1.0)
-    return int(zone)
-
-
-# What is learned
-
-
-def test_the_graph_of_a_corridor_is_the_one_by_hand():
-    zones = learned(*KITCHENS)
-    book, chair, fridge = (holding(zones, category) for category in (BOOK, CHAIR, FRIDGE))
-    np.testing.assert_array_equal(zones["nodes"][KITCHEN][[book, chair, fridge]], np.eye(3))
-    # Each zone has 3 cells of 16 poses. To its neighbour lead 2 actions, MoveAhead at either horizon, and 2 back: of
-    # 48 x 48 pairs, both ways counted, (2 + 2) / (2 x 2304) adjoin. Book and fridge do not.
-    graphs, scenes = room_graphs([PATH], K, 3)
-    near = adjacency(graphs)[KITCHEN]
-    assert scenes.tolist() == [1, 0, 0, 0, 0]
-    assert near[book, chair] == near[chair, book] == near[chair, fridge] == 4 / 4608
-    assert near[book, fridge] == near[book, book] == 0.0
-    # Relative to the strongest the edges are 1; with loops the degrees are 2, 3 and 2.
-    expected = np.array([[1 / 2, 6**-0.5, 0], [6**-0.5, 1 / 3, 6**-0.5], [0, 6**-0.5, 1 / 2]])
-    order = np.ix_([book, chair, fridge], [book, chair, fridge])
-    np.testing.assert_allclose(zones["mixing"][KITCHEN][order], expected, rtol=1e-6)
-    following = zones["next_zone"][KITCHEN]
-    assert following[book, fridge] == following[fridge, book] == chair
-    assert following[book, chair] == chair
-    assert following[chair, fridge] == fridge
-    assert [following[zone, zone] for zone in range(3)] == [0, 1, 2]
-    # 2 of the 6 pairs of zones, and the same of zones and goals, for each category has a zone of its own.
-    assert indirect_shares(zones["nodes"], zones["next_zone"], EVERY) == (2 / 6, 2 / 6)
-    # Chair alone is next to both: of its two pairs with another zone, none is indirect.
-    assert indirect_shares(zones["nodes"], zones["next_zone"], np.arange(K) == CHAIR) == (2 / 6, 0.0)
-
-
-def test_next_zones_are_those_of_the_best_of_all_paths():
-    """An independent reference: every simple path of five zones."""
-    draws = np.random.default_rng(0)
-    for _ in range(20):
-        edges = draws.random((5, 5)) * (draws.random((5, 5)) < 0.7)
-        edges = np.maximum(edges, edges.T) * (1 - np.eye(5))
-        found = next_zones(edges)
-        for start, end in itertools.permutations(range(5), 2):
-            between = [zone for zone in range(5) if zone not in (start, end)]
-            paths = [(start, *some, end) for n in range(4) for some in itertools.permutations(between, n)]
-            products = [np.prod([edges[step] for step in itertools.pairwise(path)]) for path in paths]
-            best = int(np.argmax(products))
-            assert found[start, end] == (paths[best][1] if products[best] > 0 else end)
-
-
-def test_of_equal_paths_the_direct_one_is_taken():
-    edges = np.array([[0.0, 0.5, 0.25], [0.5, 0.0, 0.5], [0.25, 0.5, 0.0]])
-    assert next_zones(edges)[0, 2] == 2
-    assert next_zones(edges - 0.01 * (edges == 0.25))[0, 2] == 1
-
-
-def test_scenes_join_by_what_is_seen_whatever_their_order():
-    """Zones of k-means have no order; book joins book, and counts add up."""
-    orders = [(BOOK, CHAIR, FRIDGE), (FRIDGE, CHAIR, BOOK), (CHAIR, FRIDGE, BOOK)]
-    graphs, scenes = room_graphs([corridor(*order) for order in orders], K, 3)
-    assert scenes[KITCHEN] == 3
-    np.testing.assert_array_equal(np.sort(graphs.centres[KITCHEN], axis=0), np.sort(np.eye(3), axis=0))
-    np.testing.assert_array_equal(graphs.poses[KITCHEN], [144, 144, 144])
-    at = graphs.centres[KITCHEN].argmax(axis=0)  # the zone of each category
-    crossings = graphs.moves[KITCHEN][np.ix_(at, at)]
-    # Book and chair adjoin in two of the three, chair and fridge in all, book and fridge in one: 2 actions each.
-    np.testing.assert_array_equal(crossings[np.triu_indices(3, 1)], [4, 2, 6])
-
-
-def test_zones_without_poses_are_never_entered():
-    zones = learned(*KITCHENS, zones=5)  # three different views
-    held = zones["nodes"][KITCHEN].max(axis=-1) >= 0
-    assert held.sum() == 3
-    assert (zones["nodes"][KITCHEN][~held] == -1).all()
-    assert (zones["nodes"][BEDROOM] == -1).all()
-    assert indirect_shares(zones["nodes"], zones["next_zone"], EVERY) == (2 / 6, 2 / 6)
-    assert all(np.isfinite(zones[name]).all() for name in ("nodes", "mixing", "detected"))
-    knowledge = Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, zones))
-    note = ZoneTracker().init(knowledge)
-    for cell in range(9):
-        note = see(note, knowledge, cell)
-        assert held[note.zone]
-        assert (read_of(note, knowledge, BOOK).zones >= 0).all()
-
-
-def test_more_zones_than_poses_are_refused():
-    assert len(corridor(BOOK).rows) == 48
-    assert len(learn_zones([corridor(BOOK)], NOTHING, 48)["nodes"][0]) == 48
-    with pytest.raises(InputError) as refusal:
-        learn_zones([corridor(BOOK)], NOTHING, 49)
-    assert str(refusal.value) == "scene 'corridor': has 48 poses for 49 zones; give at most 48 zones"
-
-
-def test_what_is_learned_depends_on_the_banks_alone():
-    bank = compile_bank([tiny.KITCHEN, tiny.BEDROOM], TASK)
-    one, again = learn_zones([bank], NOTHING), learn_zones([bank], NOTHING + 1)
-    assert all(np.array_equal(one[name], again[name]) for name in one)
-    halves = [compile_bank([scene], TASK) for scene in (tiny.KITCHEN, tiny.BEDROOM)]
-    apart = learn_zones(halves, NOTHING)
-    assert apart["nodes"].shape == one["nodes"].shape
-    other = learn_zones(halves[:1], NOTHING)
-    assert (other["nodes"][BEDROOM] == -1).all()
-    assert (one["nodes"][BEDROOM] >= 0).any()
-
+from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_RIGHT
 
 # What an episode remembers
 
@@ -211,6 +79,22 @@ def test_the_zone_follows_a_walk_and_the_next_zone_leads_to_the_goal():
     book, chair, fridge = (holding(zones, category) for category in range(K))
     for at, place in ((0, (book, chair, fridge)), (4, (chair, fridge, fridge)), (8, (fridge, fridge, fridge))):
         np.testing.assert_allclose(ahead[at], (mixing @ nodes)[list(place)], atol=1e-6)
+
+
+def test_zones_without_poses_are_never_entered():
+    zones = learned(*KITCHENS, zones=5)  # three different views
+    held = zones["nodes"][KITCHEN].max(axis=-1) >= 0
+    assert held.sum() == 3
+    assert (zones["nodes"][KITCHEN][~held] == -1).all()
+    assert (zones["nodes"][BEDROOM] == -1).all()
+    assert indirect_shares(zones["nodes"], zones["next_zone"], EVERY) == (2 / 6, 2 / 6)
+    assert all(np.isfinite(zones[name]).all() for name in ("nodes", "mixing", "detected"))
+    knowledge = Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, zones))
+    note = ZoneTracker().init(knowledge)
+    for cell in range(9):
+        note = see(note, knowledge, cell)
+        assert held[note.zone]
+        assert (read_of(note, knowledge, BOOK).zones >= 0).all()
 
 
 def test_a_view_pulls_the_node_of_its_zone_alone():
@@ -310,18 +194,3 @@ def test_layout_weights_multiply_the_zones_too():
         assert np.array_equal(here[chair], there[chair]) == same
         assert not np.array_equal(here, there)
     np.testing.assert_array_equal(experience(reading)[-NUM_PRIORS:], reading.rooms)
-
-
-# The shipped worlds
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("world", "scenes"), [("rooms", 80), ("apartments", 8), ("houses", 4)])
-def test_indirect_paths_exist_where_edges_are_relative_and_not_where_they_are_absolute(world, scenes):
-    task, every = WORLDS[world].task, generated(world, "train", scenes)
-    bank = compile_bank((every[i] for i in range(scenes)), task)
-    nothing = np.zeros((NUM_PRIORS, *2 * [len(task.categories)]))
-    zones = learn_zones([bank], nothing)
-    assert min(indirect_shares(zones["nodes"], zones["next_zone"], task.is_goal())) > 0.2
-    graphs, _ = room_graphs([bank], len(task.categories), 8)
-    assert max(indirect_shares(zones["nodes"], next_zones(adjacency(graphs)), task.is_goal())) < 0.02
