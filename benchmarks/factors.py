@@ -26,7 +26,7 @@ METRICS = ("sr", "spl")
 DECODINGS = ("argmax", "sample")
 
 
-class Measured(NamedTuple):
+class Scores(NamedTuple):
     """Hold the results of one agent, float64 [S, E] in percent, by decoding and metric."""
 
     values: dict[tuple[str, str], np.ndarray]
@@ -45,9 +45,9 @@ def main(given: Path, folder: Path) -> None:
 
 def effects(base: jaxnav.RunConfig, factors: dict[str, Any], folder: Path, given: Path) -> dict[str, Any]:
     """Train and evaluate what the factors' effects on a base are made of."""
-    names, trained = list(factors), dict[str, Measured]()
+    names, trained = list(factors), dict[str, Scores]()
 
-    def agent(*chosen: str) -> Measured:
+    def agent(*chosen: str) -> Scores:
         config = base
         for name in chosen:
             config = apply_values(config, factors[name], given)
@@ -68,7 +68,7 @@ def effects(base: jaxnav.RunConfig, factors: dict[str, Any], folder: Path, given
     return {"agents": agents, "effects": found, "whole": difference(ladder[0], ladder[-1])}
 
 
-def measured(config: jaxnav.RunConfig, folder: Path) -> Measured:
+def measured(config: jaxnav.RunConfig, folder: Path) -> Scores:
     """Train an agent and evaluate it; the arm of the layout where there is one."""
     run = jaxnav.train(dataclasses.replace(config, run_dir=folder))
     results = jaxnav.evaluate(run)
@@ -79,16 +79,16 @@ def measured(config: jaxnav.RunConfig, folder: Path) -> Measured:
         for decoding in DECODINGS
     }
     print(folder.name, {key: round(float(each.mean()), 1) for key, each in values.items()}, file=sys.stderr, flush=True)
-    return Measured(values, results.episodes)
+    return Scores(values, results.episodes)
 
 
-def difference(one: Measured, other: Measured) -> dict[str, Interval]:
+def difference(one: Scores, other: Scores) -> dict[str, Interval]:
     """Return what the other has more, by metric and decoding."""
     scenes = one.episodes.clusters()
     return {" ".join(key): paired_difference(one.values[key], other.values[key], scenes) for key in one.values}
 
 
-def means(agent: Measured) -> dict[str, Interval]:
+def means(agent: Scores) -> dict[str, Interval]:
     """Return the results of an agent."""
     scenes = agent.episodes.clusters()
     return {" ".join(key): summary(values, scenes) for key, values in agent.values.items()}

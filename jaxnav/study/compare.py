@@ -20,14 +20,14 @@ from jaxnav.runs.evaluate import Results, episode_lists, evaluate
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.study.codec import from_json
 from jaxnav.study.compare_config import CompareConfig, Entry, entries, entry_identity, frontier_identity, world_runs
-from jaxnav.study.compare_report import SCALE, Line, Measured, Training
+from jaxnav.study.compare_report import SCALE, Line, Scores, Training
 from jaxnav.study.compare_tables import frontier_name, write_comparison
 from jaxnav.study.document import check_document
-from jaxnav.study.results import is_written, write_part
+from jaxnav.study.results import is_written, write_record
 from jaxnav.study.runs import ensure_trained
 
 #: Name, settings that decide the numbers, and how they are measured.
-Part = tuple[str, Mapping[str, Any], Callable[[], Measured]]
+Job = tuple[str, Mapping[str, Any], Callable[[], Scores]]
 
 
 def run_compare(config: CompareConfig, console: Console) -> None:
@@ -40,31 +40,31 @@ def run_compare(config: CompareConfig, console: Console) -> None:
       InputError: the document is another one, or a run is impossible.
     """
     check_document(config.document)
-    parts, found = _parts(config, console), {}
-    for name, identity, measure in parts:
+    jobs, found = _jobs(config, console), {}
+    for name, identity, measure in jobs:
         path = config.results / config.split / f"{name}.json"
         if not is_written(path, identity):
             console.print(f"{path}", soft_wrap=True)
-            write_part(path, identity, measure())
-        found[name] = from_json(Measured, json.loads(path.read_text()))
+            write_record(path, identity, measure())
+        found[name] = from_json(Scores, json.loads(path.read_text()))
         write_comparison(config, found)
     console.print(f"written to {config.document}", soft_wrap=True)
 
 
-def _parts(config: CompareConfig, console: Console) -> list[Part]:
-    """Return all parts of a comparison, the untrained ones first."""
-    searched: list[Part] = [
+def _jobs(config: CompareConfig, console: Console) -> list[Job]:
+    """Return all jobs of a comparison, the untrained ones first."""
+    searched: list[Job] = [
         (frontier_name(world), frontier_identity(config, run), partial(measure_frontier, config, run, console))
         for world, run in world_runs(config).items()
     ]
-    trained: list[Part] = [
+    trained: list[Job] = [
         (entry.name, entry_identity(config, entry), partial(measure_entry, config, entry, console))
         for entry in entries(config)
     ]
     return searched + trained
 
 
-def measure_entry(config: CompareConfig, entry: Entry, console: Console) -> Measured:
+def measure_entry(config: CompareConfig, entry: Entry, console: Console) -> Scores:
     """Train a run unless it is finished, and evaluate it.
 
     The numbers are those of `jaxnav eval` with the same split, number of episodes, epsilon, form and seed.
@@ -86,17 +86,17 @@ def measure_entry(config: CompareConfig, entry: Entry, console: Console) -> Meas
     return by_scene(results, Training(budget, wall, last_quarter(run.log()), tuple(told)))
 
 
-def by_scene(results: Results, training: Training) -> Measured:
+def by_scene(results: Results, training: Training) -> Scores:
     """Return the results of an evaluation, scene by scene."""
     metrics = results.metrics()
     lines = [
         _line(row.variant, row.decoding, {name: metrics[name][i] for name in SCALE}, results.episodes)
         for i, row in enumerate(results.rows)
     ]
-    return _measured(results.episodes, lines, training)
+    return _scores(results.episodes, lines, training)
 
 
-def measure_frontier(config: CompareConfig, run: RunConfig, console: Console) -> Measured:
+def measure_frontier(config: CompareConfig, run: RunConfig, console: Console) -> Scores:
     """Search the frontiers in the episodes of a world."""
     world = evaluation_world(run, config.split, None, None, console)
     lists = episode_lists(world, config.episodes, config.seed)
@@ -105,7 +105,7 @@ def measure_frontier(config: CompareConfig, run: RunConfig, console: Console) ->
     ]
     outcome, episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[None], *outcomes), together(lists)
     metrics = episode_metrics(outcome, episodes.best_length)
-    return _measured(episodes, [_line("frontier", "argmax", metrics, episodes)])
+    return _scores(episodes, [_line("frontier", "argmax", metrics, episodes)])
 
 
 def _line(variant: str, decoding: Decoding, metrics: Mapping[str, np.ndarray], episodes: EpisodeList) -> Line:
@@ -115,8 +115,8 @@ def _line(variant: str, decoding: Decoding, metrics: Mapping[str, np.ndarray], e
     return Line(variant, decoding, **{name: metrics[name] @ inside for name in SCALE})
 
 
-def _measured(episodes: EpisodeList, lines: Iterable[Line], training: Training | None = None) -> Measured:
+def _scores(episodes: EpisodeList, lines: Iterable[Line], training: Training | None = None) -> Scores:
     """Return results with what is known of the scenes."""
     drawn, first, counts = np.unique(episodes.scene, return_index=True, return_counts=True)
     rooms = tuple(episodes.rooms[room] for room in episodes.room[first])
-    return Measured(tuple(episodes.scenes[scene] for scene in drawn), rooms, counts, tuple(lines), training)
+    return Scores(tuple(episodes.scenes[scene] for scene in drawn), rooms, counts, tuple(lines), training)

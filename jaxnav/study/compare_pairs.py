@@ -12,7 +12,7 @@ VARIANTS = {"baseline": "", "layout": " + w", "stde": " + w + sTDE"}
 STEPS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"))
 
 
-class Agent(NamedTuple):
+class TableRow(NamedTuple):
     """Name one row of a world's table.
 
     Attributes:
@@ -33,17 +33,17 @@ def run_label(method: str, decision: Deciding) -> str:
     return f"`{method.rpartition('.')[2]}`" + (f", {decision}" if decision != "fused" else "")
 
 
-def comparisons(config: CompareConfig) -> list[tuple[Agent, Agent]]:
+def comparisons(config: CompareConfig) -> list[tuple[TableRow, TableRow]]:
     """Return every agent with what it is compared with."""
     first, *others = config.decisions
     pairs = []
     for method in config.methods:
         for decision, (variant, reference) in itertools.product(config.decisions, STEPS):
-            pairs.append((Agent(method, decision, variant), Agent(method, decision, reference)))
+            pairs.append((TableRow(method, decision, variant), TableRow(method, decision, reference)))
         for decision, variant in itertools.product(others, VARIANTS):
-            pairs.append((Agent(method, decision, variant), Agent(method, first, variant)))
+            pairs.append((TableRow(method, decision, variant), TableRow(method, first, variant)))
         for ablation, decision, variant in itertools.product(
             config.ablations.get(method, ()), config.decisions, VARIANTS
         ):
-            pairs.append((Agent(method, decision, variant), Agent(ablation, decision, variant)))
+            pairs.append((TableRow(method, decision, variant), TableRow(ablation, decision, variant)))
     return pairs

@@ -52,7 +52,7 @@ class Training:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Measured:
+class Scores:
     """Hold the results of a run, or of agents without training.
 
     Episodes of a scene weigh alike, so sums by scene tell all that means and intervals of the episodes need.
@@ -89,7 +89,7 @@ class Measured:
         """Return a metric of an agent; SR and SPL in percent."""
         return summary(self._values(line, metric), self.clusters(), trained=line.variant not in REFERENCES)
 
-    def difference(self, line: Line, other: "Measured", reference: Line, metric: Metric) -> Interval:
+    def difference(self, line: Line, other: "Scores", reference: Line, metric: Metric) -> Interval:
         """Return a metric of an agent less that of a reference.
 
         Args:

@@ -7,15 +7,15 @@ from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.report_tables import COLUMNS
 from jaxnav.policies.spec import Deciding
 from jaxnav.study.compare_config import CompareConfig, Entry, entries
-from jaxnav.study.compare_pairs import VARIANTS, Agent, comparisons, run_label
-from jaxnav.study.compare_report import SCALE, Line, Measured
+from jaxnav.study.compare_pairs import VARIANTS, TableRow, comparisons, run_label
+from jaxnav.study.compare_report import SCALE, Line, Scores
 from jaxnav.study.document import reading_section, write_lines
 from jaxnav.study.tables import markdown
 
 DECODINGS: Mapping[Decoding, str] = {"argmax": "best actions", "sample": "sampled actions"}
-UNTRAINED = {"random": "Random", "frontier": "Frontier search", "oracle": "Shortest path"}
+REFERENCE_TITLES = {"random": "Random", "frontier": "Frontier search", "oracle": "Shortest path"}
 #: Results of a world's runs, by method and decision.
-Parts = Mapping[tuple[str, Deciding], Measured]
+Parts = Mapping[tuple[str, Deciding], Scores]
 
 
 def frontier_name(world: str) -> str:
@@ -23,7 +23,7 @@ def frontier_name(world: str) -> str:
     return f"{world}-frontier"
 
 
-def write_comparison(config: CompareConfig, found: Mapping[str, Measured]) -> None:
+def write_comparison(config: CompareConfig, found: Mapping[str, Scores]) -> None:
     """Write the document from the results that are there.
 
     What stands between the two lines `<!-- reading -->` of the document is kept: it is written by hand.
@@ -40,7 +40,7 @@ def write_comparison(config: CompareConfig, found: Mapping[str, Measured]) -> No
     write_lines(config.document, lines)
 
 
-def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Measured]) -> list[str]:
+def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scores]) -> list[str]:
     """Return the title and what holds for all tables."""
     steps = {entry.world: entry.run.total_updates * entry.run.update_steps for entry in runs}
     text = [
@@ -82,7 +82,7 @@ def _reading_help(config: CompareConfig) -> list[str]:
     return lines
 
 
-def _world(config: CompareConfig, world: str, parts: Parts, frontier: Measured | None) -> list[str]:
+def _world(config: CompareConfig, world: str, parts: Parts, frontier: Scores | None) -> list[str]:
     """Return all sections of one world."""
     if not parts:
         return []
@@ -98,15 +98,15 @@ def _world(config: CompareConfig, world: str, parts: Parts, frontier: Measured |
     return [*lines, "### What the runs took", "", *_training_table(parts), "", *_notes(parts), ""]
 
 
-def _metrics_table(untrained: Iterable[Measured], parts: Parts, decoding: Decoding) -> list[str]:
+def _metrics_table(untrained: Iterable[Scores], parts: Parts, decoding: Decoding) -> list[str]:
     """Return SR, SPL and DTS of every agent."""
     rows = [
         (title, part, line)
-        for (variant, title), part in itertools.product(UNTRAINED.items(), untrained)
+        for (variant, title), part in itertools.product(REFERENCE_TITLES.items(), untrained)
         if (line := part.line(variant, decoding))
     ]
     rows += [
-        (str(Agent(*run, variant)), part, line)
+        (str(TableRow(*run, variant)), part, line)
         for (run, part), variant in itertools.product(parts.items(), VARIANTS)
         if (line := part.line(variant, decoding))
     ]
@@ -120,7 +120,7 @@ def _metrics_table(untrained: Iterable[Measured], parts: Parts, decoding: Decodi
 def _improvements(config: CompareConfig, parts: Parts, decoding: Decoding) -> list[tuple[str, ...]]:
     """Return the paired differences between agents, as cells."""
 
-    def line(agent: Agent) -> tuple[Measured, Line] | None:
+    def line(agent: TableRow) -> tuple[Scores, Line] | None:
         part = parts.get((agent.method, agent.decision))
         found = part and part.line(agent.variant, decoding)
         return (part, found) if part and found else None

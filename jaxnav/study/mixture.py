@@ -62,10 +62,10 @@ CONTROLS: Mapping[Form, tuple[Control | Schedule, ...]] = {
     "paper": ("shuffled", "course"),
     "switch": ("shuffled",),
 }
-Measured = Mapping[str, np.ndarray]
+Values = Mapping[str, np.ndarray]
 
 
-class Part(NamedTuple):
+class Subset(NamedTuple):
     """Hold which episodes count, and their scenes."""
 
     chosen: np.ndarray
@@ -85,10 +85,10 @@ class Ledger:
         self._episodes, self._budgets = episodes, budgets
         self.metrics = ("sr", "spl", *(f"sr@{budget}" for budget in budgets))
         chosen = [shift == part for part in range(shift.max() + 1)]
-        self._parts = [Part(each, part_of(episodes, each).clusters()) for each in chosen]
-        self._all = Part(np.ones(len(shift), bool), episodes.clusters())
+        self._parts = [Subset(each, part_of(episodes, each).clusters()) for each in chosen]
+        self._all = Subset(np.ones(len(shift), bool), episodes.clusters())
 
-    def measure(self, outcome: Outcome) -> Measured:
+    def measure(self, outcome: Outcome) -> Values:
         """Return the metrics of outcomes in percent, [S, E]."""
         found = episode_metrics(outcome, self._episodes.best_length, self._budgets)
         return {name: 100.0 * found[name] for name in self.metrics}
@@ -106,35 +106,35 @@ class Ledger:
         """Return values [..., E] of each shift."""
         return tuple(values[..., part.chosen] for part in self._parts)
 
-    def means(self, measured: Measured) -> dict[str, ByShift]:
+    def means(self, measured: Values) -> dict[str, ByShift]:
         """Return the means at each shift."""
         return {
             name: tuple(summary(measured[name][:, part.chosen], part.scenes) for part in self._parts)
             for name in self.metrics
         }
 
-    def changes(self, a: Measured, b: Measured, *, same_runs: bool) -> dict[str, ByShift]:
+    def changes(self, a: Values, b: Values, *, same_runs: bool) -> dict[str, ByShift]:
         """Return `b - a` at each shift."""
         return {
             name: tuple(self._difference(a[name], b[name], part, same_runs=same_runs) for part in self._parts)
             for name in self.metrics
         }
 
-    def overall(self, a: Measured, b: Measured) -> dict[str, Interval]:
+    def overall(self, a: Values, b: Values) -> dict[str, Interval]:
         """Return `b - a` of the same policies over all episodes."""
         return {name: paired_difference(a[name], b[name], self._all.scenes, same_runs=True) for name in self.metrics}
 
-    def left(self, without: Measured, agent: Measured, removed: Measured) -> dict[str, ByShift]:
+    def left(self, without: Values, agent: Values, removed: Values) -> dict[str, ByShift]:
         """Return the share of a lead that removal leaves."""
 
-        def share(name: str, part: Part) -> Interval:
+        def share(name: str, part: Subset) -> Interval:
             nobody, acting, left = (each[name][:, part.chosen] for each in (without, agent, removed))
             return share_left(nobody, acting, left, part.scenes)
 
         return {name: tuple(share(name, part) for part in self._parts) for name in self.metrics}
 
     @staticmethod
-    def _difference(a: np.ndarray, b: np.ndarray, part: Part, *, same_runs: bool) -> Interval:
+    def _difference(a: np.ndarray, b: np.ndarray, part: Subset, *, same_runs: bool) -> Interval:
         return paired_difference(a[:, part.chosen], b[:, part.chosen], part.scenes, same_runs=same_runs)
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from jaxnav.evaluation.report import FORMAT, Decoding, versions
 from jaxnav.store.files import write_atomic
 from jaxnav.study.codec import from_json, to_json
-from jaxnav.study.compare_report import Measured
+from jaxnav.study.compare_report import Scores
 from jaxnav.study.curves import GapCourse
 from jaxnav.study.instrument_report import InstrumentReport
 from jaxnav.study.mixture_report import Mixture
@@ -18,7 +18,7 @@ from jaxnav.study.records import Condition, FullCondition
 #: Runs whose worlds are measured as instruments, and whose gaps are followed.
 WORLDS = ("main", "real")
 Kind = TypeVar("Kind", bound=Condition)
-Part = Condition | InstrumentReport | GapCourse | Mixture | Measured
+Record = Condition | InstrumentReport | GapCourse | Mixture | Scores
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def load_condition(path: Path) -> Condition:
     return from_json(Condition, json.loads(path.read_text()))
 
 
-def write_part(path: Path, study: Mapping[str, Any], record: Part) -> None:
+def write_record(path: Path, study: Mapping[str, Any], record: Record) -> None:
     """Write a part of a study, numbers to six digits.
 
     Raises:

@@ -12,7 +12,7 @@ from jaxnav.study.gap_course import gap_course
 from jaxnav.study.instrument import instrument_report, study_instrument
 from jaxnav.study.measure import DECODINGS, chosen_epsilon, measure_condition
 from jaxnav.study.mixture import measure_mixture
-from jaxnav.study.results import WORLDS, Part, condition_name, is_written, mixture_name, write_part
+from jaxnav.study.results import WORLDS, Record, condition_name, is_written, mixture_name, write_record
 from jaxnav.study.runs import ensure_trained, study_runs
 from jaxnav.viz import require_pictures
 
@@ -42,11 +42,11 @@ def run_study(config: StudyConfig, console: Console) -> None:
         ensure_trained(run, console)
     folder, study, bench = config.results / config.split, study_identity(config), Bench(config)
 
-    def write(name: str, measure: Callable[[], Part]) -> None:
+    def write(name: str, measure: Callable[[], Record]) -> None:
         path = folder / f"{name}.json"
         if not is_written(path, study):
             console.print(f"{path}")
-            write_part(path, study, measure())
+            write_record(path, study, measure())
 
     for name, run in runs.items():
         if name == WITHOUT:

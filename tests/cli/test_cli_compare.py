@@ -11,7 +11,7 @@ from jaxnav.evaluation.statistics import Interval
 from jaxnav.policies.methods import METHODS
 from jaxnav.study import compare
 from jaxnav.study.compare_config import entries
-from jaxnav.study.compare_report import Line, Measured, Training
+from jaxnav.study.compare_report import Line, Scores, Training
 from jaxnav.study.document import READING
 
 OWN = ("method: ", "method_sizes: ")  # every run has its own, or one method alone has them
@@ -64,7 +64,7 @@ def steps(monkeypatch):
     def drawn(name, lines, training=None):
         names.append(name)
         scenes = ("a", "b", "c")
-        return Measured(scenes, ("Kitchen",) * 3, np.array([4, 4, 4]), tuple(lines), training)
+        return Scores(scenes, ("Kitchen",) * 3, np.array([4, 4, 4]), tuple(lines), training)
 
     def frontier(config, shared, console):
         return drawn(

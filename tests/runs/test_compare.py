@@ -7,7 +7,7 @@ import pytest
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.compare import by_scene
-from jaxnav.study.compare_report import SCALE, Measured, Training
+from jaxnav.study.compare_report import SCALE, Scores, Training
 
 TRAINING = Training({"exploration": 1280, "imitation": 0, "learning": 512}, 60.0, None, ("A note.",))
 
@@ -15,7 +15,7 @@ TRAINING = Training({"exploration": 1280, "imitation": 0, "learning": 512}, 60.0
 @pytest.fixture(scope="module")
 def measured(evaluated):
     """The evaluation's results by scene, written and read again."""
-    return from_json(Measured, json.loads(json.dumps(to_json(by_scene(evaluated, TRAINING)))))
+    return from_json(Scores, json.loads(json.dumps(to_json(by_scene(evaluated, TRAINING)))))
 
 
 def same(one, report):

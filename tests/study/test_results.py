@@ -14,7 +14,7 @@ from jaxnav.study.document import READING, write_document
 from jaxnav.study.instrument_report import InstrumentReport
 from jaxnav.study.mixture_report import Mixture
 from jaxnav.study.records import Condition, FullCondition
-from jaxnav.study.results import is_written, load_condition, load_results, write_part
+from jaxnav.study.results import is_written, load_condition, load_results, write_record
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = sorted((ROOT / "results" / "val").glob("*.json")) + sorted((ROOT / "results" / "quick").rglob("*.json"))
@@ -100,7 +100,7 @@ def test_a_part_is_written_with_its_study_and_six_digits(tmp_path):
     path = tmp_path / "part.json"
     course = GapCourse((0,), np.array([[1 / 3]]), (), ())
     assert not is_written(path, {"seed": 0})
-    write_part(path, {"seed": 0}, course)
+    write_record(path, {"seed": 0}, course)
     part = json.loads(path.read_text())
     assert part.keys() > HEADER
     assert (part["study"], part["running"]) == ({"seed": 0}, [[0.333333]])
