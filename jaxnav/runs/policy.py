@@ -12,10 +12,10 @@ from jaxnav.causal import Form, do, stde
 from jaxnav.env.objectnav import OTHER_ROOM, prior_index
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
-from jaxnav.layout import LayoutState, Setting
+from jaxnav.layout import Setting
 from jaxnav.policies.methods import Knowledge, Percept, find_method
 from jaxnav.policies.pathways import Decision, Memory
-from jaxnav.policies.perception import Perceived, Perception, View
+from jaxnav.policies.perception import Perceived, Perception
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.policies import EstimatorName, read_export
@@ -35,6 +35,28 @@ class EpisodeMemory(NamedTuple):
     memory: Memory
     perceived: Perceived
     room: jax.Array
+
+
+class Choice(NamedTuple):
+    """Hold what a policy makes of one observation.
+
+    Attributes:
+      logits: float32 [C], by which it chooses: of eq. 2 where the policy uses the layout, else the factual ones.
+      factual: float32 [C], a.
+      counterfactual: float32 [C], a_bar; None where the policy does not use the layout.
+      gap: float32 [], D; None there too.
+      weights: float32 [K], w x g of eq. 7; None there too.
+      perceived: belief, map and note with this view.
+      decision: the factual one, for the memory after an action.
+    """
+
+    logits: jax.Array
+    factual: jax.Array
+    counterfactual: jax.Array | None
+    gap: jax.Array | None
+    weights: jax.Array | None
+    perceived: Perceived
+    decision: Decision
 
 
 class LoadedPolicy(struct.PyTreeNode):
@@ -66,10 +88,12 @@ class LoadedPolicy(struct.PyTreeNode):
         """
         if room_type is not None and room_type not in ROOM_TYPES:
             raise InputError(f"room_type {room_type!r}: choose one of {', '.join(ROOM_TYPES)}, or None")
-        room = jnp.int32(OTHER_ROOM if room_type is None else prior_index(room_type))
-        return EpisodeMemory(
-            bind(self.spec, self.params).initial_memory(), self._perception.init(self.knowledge, room), room
-        )
+        return self.begin(jnp.int32(OTHER_ROOM if room_type is None else prior_index(room_type)))
+
+    def begin(self, room: jax.Array) -> EpisodeMemory:
+        """Begin an episode in a room type int32 [], an index of layout priors."""
+        memory = bind(self.spec, self.params).initial_memory()
+        return EpisodeMemory(memory, self._perception.init(self.knowledge, room), room)
 
     def act(
         self,
@@ -102,6 +126,30 @@ class LoadedPolicy(struct.PyTreeNode):
         Raises:
           InputError: heading or moved is needed and missing.
         """
+        choice = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
+        chosen = jnp.argmax(choice.logits) if key is None else jax.random.categorical(key, choice.logits)
+        return self.follow(choice, chosen.astype(jnp.int32), memory.room)
+
+    def follow(self, choice: Choice, chosen: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
+        """Return the action int32 [] of what was chosen, and the memory."""
+        action = find_method(self.spec.method).control.act(chosen, choice.perceived.note)
+        return action, EpisodeMemory(choice.decision.memory(action), choice.perceived, room)
+
+    def decide(
+        self,
+        observation: Observation,
+        memory: EpisodeMemory,
+        epsilon: jax.Array | float = 0.5,
+        *,
+        heading: jax.Array | int | None = None,
+        moved: jax.Array | bool | None = None,
+        horizon: jax.Array | int = 0,
+    ) -> Choice:
+        """Take in one observation; see `act`.
+
+        Raises:
+          InputError: heading or moved is needed and missing.
+        """
         perception = self._perception
         if perception.uses_odometry and (heading is None or moved is None):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
@@ -109,30 +157,19 @@ class LoadedPolicy(struct.PyTreeNode):
         percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon))
         perceived = perception.update(memory.perceived, percept, observation.goal, self.knowledge, memory.room)
         view = perception.view(perceived, observation, self.knowledge)
-        decision, logits = self._decide(view, memory.memory, perceived.layout, epsilon)
-        choice = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
-        action = find_method(self.spec.method).control.act(choice.astype(jnp.int32), perceived.note)
-        return action, EpisodeMemory(decision.memory(action), perceived, memory.room)
+        policy = bind(self.spec, self.params)
+        pathways = policy.pathways(*view, memory.memory)
+        decision = policy.decide(pathways, memory.memory)
+        layout, setting = perceived.layout, self.setting
+        if layout is None or setting is None:
+            return Choice(decision.logits, decision.logits, None, None, None, perceived, decision)
+        removed = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.memory).logits
+        logits = stde(decision.logits, removed, layout.gap, epsilon, setting.form)
+        return Choice(logits, decision.logits, removed, layout.gap, view.weights, perceived, decision)
 
     @property
     def _perception(self) -> Perception:
         return Perception(RowFormat(self.spec.num_categories), self.spec, self.setting)
-
-    def _decide(
-        self,
-        view: View,
-        memory: Memory,
-        layout: LayoutState | None,
-        epsilon: jax.Array | float,
-    ) -> tuple[Decision, jax.Array]:
-        """Return the factual decision, and logits without experience."""
-        policy = bind(self.spec, self.params)
-        pathways = policy.pathways(*view, memory)
-        decision = policy.decide(pathways, memory)
-        if layout is None or self.setting is None:
-            return decision, decision.logits
-        counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory)
-        return decision, stde(decision.logits, counterfactual.logits, layout.gap, epsilon, self.setting.form)
 
 
 def load_policy(

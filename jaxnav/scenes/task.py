@@ -14,7 +14,9 @@ from jaxnav.scenes.categories import (
 )
 from jaxnav.scenes.tables.detector import Detector
 
-NUM_ACTIONS = 6
+#: Names of the actions, in their order.
+ACTIONS = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
+NUM_ACTIONS = len(ACTIONS)
 MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTIONS)
 
 #: (dz, dx) of the eight neighbouring cells, clockwise from +z.

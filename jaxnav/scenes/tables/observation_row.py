@@ -65,24 +65,26 @@ class RowFormat:
     def _view_bytes(self) -> int:
         return -(-self.view * self.view // 4)
 
-    def pack(self, detections: np.ndarray, view: np.ndarray) -> np.ndarray:
+    def pack(self, detections: Any, view: Any) -> Any:
         """Pack detections and views into rows.
 
         Args:
-          detections: uint8 [P, K, 4], confidence, ahead, right and apparent size.
-          view: uint8 [P, V, V], ego-centric views.
+          detections: uint8 [..., K, 4], confidence, ahead, right and apparent size.
+          view: uint8 [..., V, V], ego-centric views.
 
         Returns:
-          uint8 [P, num_bytes].
+          uint8 [..., num_bytes].
         """
-        num_poses = len(view)
-        rows = np.zeros((num_poses, self.num_bytes), np.uint8)
-        rows[:, : self._view_at] = detections.reshape(num_poses, self._view_at)
-        cells = np.zeros((num_poses, 4 * self._view_bytes), np.uint8)
-        cells[:, : self.view * self.view] = view.reshape(num_poses, self.view * self.view)
-        groups = cells.reshape(num_poses, self._view_bytes, 4) << np.array([0, 2, 4, 6], np.uint8)
-        rows[:, self._view_at : self._view_at + self._view_bytes] = groups.sum(-1, dtype=np.uint8)
-        return rows
+        xp, poses = view.__array_namespace__(), view.shape[:-2]
+
+        def zeros(number: int) -> Any:
+            return xp.zeros((*poses, number), dtype=np.uint8)
+
+        cells = xp.concat([view.reshape(*poses, -1), zeros(4 * self._view_bytes - self.view * self.view)], axis=-1)
+        groups = cells.reshape(*poses, self._view_bytes, 4)
+        packed = xp.sum(groups << _shifts(groups.ndim), axis=-1, dtype=np.uint8)
+        rest = zeros(self.num_bytes - self._view_at - self._view_bytes)
+        return xp.concat([detections.reshape(*poses, self._view_at), packed, rest], axis=-1)
 
     def detections(self, rows: Any) -> Any:
         """Return the detections of rows uint8 [..., num_bytes].
@@ -101,6 +103,10 @@ class RowFormat:
         Row 0 is nearest to the agent, column 0 leftmost.
         """
         packed = rows[..., self._view_at : self._view_at + self._view_bytes]
-        shifts = np.array([0, 2, 4, 6], np.uint8).reshape((1,) * packed.ndim + (4,))
-        cells = (packed[..., None] >> shifts) & np.uint8(3)
+        cells = (packed[..., None] >> _shifts(packed.ndim + 1)) & np.uint8(3)
         return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]
+
+
+def _shifts(rank: int) -> np.ndarray:
+    """Return where the four cells of a byte lie in it, uint8 [1, ..., 1, 4]."""
+    return np.array([0, 2, 4, 6], np.uint8).reshape((1,) * (rank - 1) + (4,))

@@ -1,0 +1,190 @@
+"""An exported step acts as the policy, where neither jaxnav nor flax can be imported."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+
+import chex
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from support.commands import contents, refusal
+
+import jaxnav
+from jaxnav.__main__ import main
+from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.env.types import Observation
+from jaxnav.policies.methods import METHODS
+from jaxnav.runs.exported import input_shapes, program
+from jaxnav.runs.policies import POLICIES
+from jaxnav.runs.policy import LoadedPolicy
+from jaxnav.scenes.tables.observation_row import RowFormat
+
+EPISODES, STEPS = 3, 4
+#: A process that knows JAX alone runs the code of the model card, then the steps of a file.
+ALONE = """
+import sys
+
+class Nothing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("jaxnav", "flax", "optax", "chex"):
+            raise ImportError(name)
+
+sys.meta_path.insert(0, Nothing())
+{code}
+steps = np.load("steps.npz")
+inputs = jax.tree.map(lambda each: np.zeros((3, *each.shape[1:]), each.dtype), shapes)
+found = {{}}
+for time in range(4):
+    inputs |= {{name: steps[name][time] for name in steps.files}}
+    outputs = step.call(inputs, np.float32(0.1))
+    inputs["memory"] = outputs.pop("memory")
+    for name, value in outputs.items():
+        found.setdefault(name, []).append(value)
+np.savez("found.npz", **found)
+"""
+
+
+def walk(policy: LoadedPolicy) -> dict[str, np.ndarray]:
+    """Inputs of steps that are no episode of any world, so that nothing in them is alike; the second begins anew."""
+    rng = np.random.default_rng(0)
+    shapes = input_shapes(policy, EPISODES)
+    del shapes["memory"]
+    limits = {"detections": 256, "view": 3, "goal": 5, "action": 6, "heading": 8, "horizon": 2, "room": 5, "moved": 2}
+    steps = {
+        name: rng.integers(0, limits[name], (STEPS, *leaf.shape)).astype(leaf.dtype)
+        for name, leaf in shapes.items()
+        if name in limits
+    }
+    steps["detections"][..., 0] *= rng.random(steps["detections"].shape[:-1]) < 0.12  # few are detected
+    steps["room"][:] = steps["room"][0]
+    steps["first"] = np.zeros((STEPS, EPISODES), bool)
+    steps["first"][0], steps["first"][2, 1] = True, True
+    return steps
+
+
+def acted(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the policy makes of the same steps, one episode after the other."""
+    decide, found = jax.jit(LoadedPolicy.decide), []
+    for episode in range(EPISODES):
+        for time in range(STEPS):
+            told = {name: jnp.asarray(values[time, episode]) for name, values in steps.items()}
+            memory = policy.begin(told["room"]) if told["first"] else memory  # noqa: F821
+            if not told["first"]:
+                memory = memory._replace(memory=memory.memory._replace(action=told["action"]))
+            row = RowFormat(policy.spec.num_categories).pack(told["detections"], told["view"])
+            observation = Observation(row, told["goal"])
+            odometry = {name: told[name] for name in ("heading", "moved", "horizon")}
+            choice = decide(policy, observation, memory, jnp.float32(0.1), **odometry)
+            action, memory = policy.follow(choice, jnp.argmax(choice.logits).astype(jnp.int32), memory.room)
+            names = ("logits", "factual", "counterfactual", "gap", "weights")
+            found.append({"action": action} | {name: getattr(choice, name) for name in names})
+    shape = EPISODES, STEPS
+    return {
+        name: np.stack([each[name] for each in found]).reshape(*shape, *np.shape(value)).swapaxes(0, 1)
+        for name, value in found[0].items()
+        if value is not None
+    }
+
+
+def assert_same(found, expected):
+    assert found.keys() == expected.keys()
+    np.testing.assert_array_equal(found["action"], expected["action"])
+    for name in found:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
+    out = tmp_path / "out"
+    options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out)]
+    assert main(["export", str(drawn_run.config.run_dir), *options]) == 0
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1")
+    steps, card = walk(policy), (out / "README.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
+    np.savez(out / "steps.npz", **steps)
+    subprocess.run([sys.executable, "-c", ALONE.format(code=code)], cwd=out, check=True, timeout=200)
+    found = np.load(out / "found.npz")
+    assert_same({name: found[name] for name in found.files}, expected := acted(policy, steps))
+    assert np.ptp(expected["gap"]) > 0.01
+    assert not np.allclose(expected["logits"], expected["factual"])  # experience was removed
+    named = json.loads((out / "step.json").read_text())
+    assert named["actions"][0] == "MoveAhead"
+    assert named["categories"] == list(drawn_run.config.task.categories)
+    assert "**Method**: `org`, decision `fused`, layout weights" in card
+    assert f"**Parameters**: {sum(leaf.size for leaf in jax.tree.leaves(policy.params)):,}" in card
+
+
+@pytest.mark.parametrize(
+    ("method", "decision"),
+    [
+        ("org", "streams"),
+        *(
+            pytest.param(method, decision, marks=pytest.mark.slow)
+            for method in METHODS
+            for decision in ("fused", "streams")
+            if (method, decision) != ("org", "streams")
+        ),
+    ],
+)
+def test_a_program_acts_as_its_policy(method, decision):
+    direct = "goal" if decision == "streams" else "all"
+    spec = dataclasses.replace(tiny.SPEC, method=method, method_sizes=(), decision=decision, direct=direct)
+    learn, known = METHODS[method].learn, tiny.knowledge()
+    if learn is not None:
+        learned = learn([tiny.BANK], np.ones((NUM_PRIORS, spec.num_categories, spec.num_categories)))
+        known = known._replace(method=jax.tree.map(jnp.asarray, learned))
+    setting = tiny.SETTING if METHODS[method].hosts_layout else None
+    policy = LoadedPolicy(tiny.lively(2, spec), known, spec, setting)
+    exported, steps = jax.export.deserialize(bytearray(program(policy))), walk(policy)
+    memory = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in input_shapes(policy, 3)["memory"].items()}
+    found = []
+    for time in range(STEPS):
+        outputs = exported.call(
+            {"memory": memory} | {name: values[time] for name, values in steps.items()}, np.float32(0.1)
+        )
+        memory = outputs.pop("memory")
+        found.append(outputs)
+    assert_same({name: np.stack([each[name] for each in found]) for name in found[0]}, acted(policy, steps))
+
+
+def test_exported_parameters_act_as_those_of_the_run(drawn_run, tmp_path):
+    run, out = drawn_run.config.run_dir, tmp_path / "out"
+    assert main(["export", str(run), "--policy", "baseline-1", "--out", str(out)]) == 0
+    policies = [jaxnav.load_policy(folder) for folder in (out, run / POLICIES / "baseline-1")]
+    chex.assert_trees_all_equal(*policies)
+    assert "no layout weights" in (out / "README.md").read_text()
+    assert main(["export", str(run), "--policy", "baseline-0", "--out", str(out)]) == 0  # replaced
+    assert contents(out)["params.safetensors"] == contents(run / POLICIES / "baseline-0")["params.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("options", "mend"),
+    [
+        (["--policy", "layout-9"], "has baseline-0, baseline-1, layout-0, layout-1"),
+        (["--out", "."], "is there and holds no export; give another --out"),
+        (["--out", "file/out"], "cannot be written"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(drawn_run, tmp_path, monkeypatch, capsys, options, mend):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert main(["export", str(drawn_run.config.run_dir.absolute()), *options]) == 2
+    assert mend in refusal(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_program_without_flatbuffers_names_the_extra(drawn_run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(jax.export.Exported, "serialize", nothing_there)
+    out = tmp_path / "out"
+    assert main(["export", str(drawn_run.config.run_dir), "--format", "stablehlo", "--out", str(out)]) == 2
+    assert "needs flatbuffers; install it by: pip install 'jaxnav[export]'" in refusal(capsys)
+    assert not out.exists()
+
+
+def nothing_there(_):
+    raise ImportError("flatbuffers")
