@@ -45,7 +45,8 @@ def test_the_version_is_printed(capsys):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "mend"), [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, mixture, export, episode")]
+    ("wrong", "mend"),
+    [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, mixture, export, episode")],
 )
 def test_unknown_commands_are_refused_with_a_hint(wrong, mend, capsys):
     assert main([wrong]) == 2

@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from typing import Any
 
 import chex
 import jax
@@ -72,10 +73,12 @@ def acted(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[str, np.nd
     """What the policy makes of the same steps, one episode after the other."""
     decide, found = jax.jit(LoadedPolicy.decide), []
     for episode in range(EPISODES):
+        memory = policy.begin(jnp.int32(0))
         for time in range(STEPS):
             told = {name: jnp.asarray(values[time, episode]) for name, values in steps.items()}
-            memory = policy.begin(told["room"]) if told["first"] else memory  # noqa: F821
-            if not told["first"]:
+            if told["first"]:
+                memory = policy.begin(told["room"])
+            else:
                 memory = memory._replace(memory=memory.memory._replace(action=told["action"]))
             row = RowFormat(policy.spec.num_categories).pack(told["detections"], told["view"])
             observation = Observation(row, told["goal"])
@@ -106,7 +109,7 @@ def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1")
     steps, card = walk(policy), (out / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
-    np.savez(out / "steps.npz", **steps)
+    np.savez(out / "steps.npz", allow_pickle=False, **steps)
     subprocess.run([sys.executable, "-c", ALONE.format(code=code)], cwd=out, check=True, timeout=200)
     found = np.load(out / "found.npz")
     assert_same({name: found[name] for name in found.files}, expected := acted(policy, steps))
@@ -144,7 +147,7 @@ def test_a_program_acts_as_its_policy(method, decision):
     memory = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in input_shapes(policy, 3)["memory"].items()}
     found = []
     for time in range(STEPS):
-        outputs = exported.call(
+        outputs: Any = exported.call(
             {"memory": memory} | {name: values[time] for name, values in steps.items()}, np.float32(0.1)
         )
         memory = outputs.pop("memory")
