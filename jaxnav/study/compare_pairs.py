@@ -8,6 +8,8 @@ from jaxnav.study.compare_config import CompareConfig
 
 #: Uses of a run's policies, and how they are printed.
 VARIANTS = {"baseline": "", "layout": " + w", "stde": " + w + sTDE"}
+#: The agents that cannot know any layout.
+WITHOUT = "anonymous"
 #: What is improved within a run: an agent and what it is compared with.
 STEPS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"))
 
@@ -38,6 +40,8 @@ def comparisons(config: CompareConfig) -> list[tuple[TableRow, TableRow]]:
     first, *others = config.decisions
     pairs = []
     for method in config.methods:
+        if method != WITHOUT and WITHOUT in config.methods:  # what experience is worth
+            pairs.append((TableRow(method, "fused", "baseline"), TableRow(WITHOUT, "fused", "baseline")))
         for decision, (variant, reference) in itertools.product(config.decisions, STEPS):
             pairs.append((TableRow(method, decision, variant), TableRow(method, decision, reference)))
         for decision, variant in itertools.product(others, VARIANTS):

@@ -67,7 +67,8 @@ def _reading_help(config: CompareConfig) -> list[str]:
     lines = [
         "Random, frontier search (it explores without any prior) and the shortest path (it knows everything) are not "
         "trained; their rows are the same in all tables.",
-        "A method's name alone: the host, without the layout. `anonymous` cannot know any layout.",
+        "A method's name alone: the host, without the layout. `anonymous` cannot know any layout: what a method leads "
+        "it by is what its experience is worth.",
     ]
     if "layout" in config.base.arms:
         lines += [

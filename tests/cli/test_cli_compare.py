@@ -138,6 +138,7 @@ def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
         assert list(section)[2:] == ["Random", "Frontier search", "`anonymous`", *rows]
         improved = found[f"Improvements, {name} actions"]
         assert list(improved)[2:] == [
+            "`org` over `anonymous`",
             "`org` + w over `org`",
             "`org` + w + sTDE over `org` + w",
             "`org` + w + sTDE over `org`",
