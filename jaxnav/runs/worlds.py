@@ -14,7 +14,7 @@ from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig
-from jaxnav.scenes.categories import unknown_types
+from jaxnav.scenes.categories import most_common, unknown_types
 from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank, concatenate
 from jaxnav.scenes.tables.shards import Shards, compile_shards
 from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
@@ -111,9 +111,8 @@ def _scenes(config: RunConfig, split: str, path: Path | None, shift: float, cons
         return shifted(generated(config.world, split, getattr(config.worlds, f"num_{split}"), seed), task, shift, seed)
     scenes = from_file(path, split)
     if counts := unknown_types(scenes.scenes, task.categories):
-        types = ", ".join(f"{name} x {count}" for name, count in counts.most_common(5))
-        rest = f" and {len(counts) - 5} more" if len(counts) > 5 else ""
-        console.print(f"{path}: types that are no category and only block the sight: {types}{rest}", soft_wrap=True)
+        types = most_common(counts)
+        console.print(f"{path}: types that are no category and only block the sight: {types}", soft_wrap=True)
     return shifted(scenes, task, shift, seed)
 
 
