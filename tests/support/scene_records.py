@@ -72,7 +72,7 @@ def check_outcomes(
     for result in results:
         outcomes[type(result)] += 1
         if isinstance(result, Note):
-            assert result.count > 0
+            assert result.number > 0
         elif isinstance(result, InputError):
             assert str(result).startswith(str(path))
         else:

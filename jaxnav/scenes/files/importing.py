@@ -165,7 +165,7 @@ def _usable(
             if isinstance(scene, InputError):
                 raise scene
             if isinstance(scene, Note):
-                notes += Counter({scene.text: scene.count})
+                notes += Counter({scene.text: scene.number})
                 continue
             vocabulary = categories or WORLDS[world_named(scene.world)].task.categories
             _check(scene, kept, vocabulary, source)

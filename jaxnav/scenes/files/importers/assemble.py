@@ -19,11 +19,11 @@ class Note(NamedTuple):
 
     Attributes:
       text: what was done, in words that follow a number.
-      count: the number.
+      number: of what it was done to.
     """
 
     text: str
-    count: int
+    number: int
 
 
 class Thing(NamedTuple):

@@ -123,7 +123,7 @@ def test_the_agents_part_is_kept_if_asked_for(tmp_path, place, part, moved):
     # 121 and 106 cells: the part that is not kept is the other one.
     expected = {"cells are not connected with the agent and left out": 227 - len(part)}
     expected |= {"agents are moved to the nearest free cell": 1} if moved else {}
-    assert {note.text: note.count for note in notes if isinstance(note, Note)} == expected
+    assert {note.text: note.number for note in notes if isinstance(note, Note)} == expected
 
 
 def test_a_house_of_one_room_has_its_type(scene_of):

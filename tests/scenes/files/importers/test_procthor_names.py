@@ -63,7 +63,7 @@ def test_real_houses_lose_no_goal_without_the_database(file, houses, guessed):
         results = list(read_procthor(path, "train", database))
         types.append([result.types for result in results if isinstance(result, Scene)])
         notes = [note for note in results if isinstance(note, Note)]
-        numbers.append(sum(note.count for note in notes if note.text.startswith("types of objects are guessed")))
+        numbers.append(sum(note.number for note in notes if note.text.startswith("types of objects are guessed")))
     assert len(types[0]) == houses
     assert types[0] == types[1]
     assert numbers == [0, guessed]
