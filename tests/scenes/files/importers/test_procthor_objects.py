@@ -1,13 +1,17 @@
 """Objects of ProcTHOR houses: types, sizes and parents."""
 
+import gzip
+import json
+
 import numpy as np
 import pytest
 from support.importer_inputs.procthor import ASSET_LISTS, BOWL, HOUSE, TABLE, item
 from support.lattice import block, points_of
 from support.mutations import changed
+from support.real_scenes import PROCTHOR, require
 from support.scene_records import assert_scenes_equal
 
-from jaxnav.scenes.files.importers.procthor_objects import Asset, read_objects
+from jaxnav.scenes.files.importers.procthor_objects import Asset, read_assets, read_objects
 from jaxnav.scenes.files.record import Record
 from jaxnav.scenes.generate.sizes import typical_box
 
@@ -66,6 +70,24 @@ def test_counters_around_a_corner_are_strips(asset, yaw, strips):
     # Further strips rest on the first, as the pot does.
     assert [thing.parent for thing in things] == [-1] + [0] * len(strips)
     assert [thing.type for thing in things] == ["CounterTop"] * len(strips) + ["Pot"]
+
+
+def test_all_that_stands_on_real_counters_stands_on_their_strips():
+    assets = read_assets(require(PROCTHOR / "asset-database.json"))
+    corners, on_them = 0, 0
+    for file in ("100k", "ai2", "objaverse"):
+        lines = gzip.decompress((PROCTHOR / f"houses_{file}.jsonl.gz").read_bytes()).splitlines()
+        for things in (read_objects(Record("house", json.loads(line)), assets).things for line in lines):
+            boxes = np.array([thing.box for thing in things])[:, [0, 2, 3, 5]]
+            parents = np.array([thing.parent for thing in things])
+            counters = np.array([thing.type == "CounterTop" for thing in things])
+            for first in set(parents[counters & (parents >= 0)].tolist()):
+                strips = boxes[[first, *np.flatnonzero(counters & (parents == first))]]
+                items = boxes[~counters & (parents == first)]
+                away = np.abs(items[:, None, :2] - strips[:, :2]) - strips[:, 2:] / 2
+                assert (away.max(axis=2).min(axis=1) <= 0).all()
+                corners, on_them = corners + 1, on_them + len(items)
+    assert (corners, on_them) == (83, 1093)
 
 
 def test_the_name_of_a_counter_tells_its_size_in_feet():
