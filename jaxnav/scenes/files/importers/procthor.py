@@ -23,8 +23,8 @@ from jaxnav.scenes.scene import CELL, Room, Scene
 
 _FARTHEST = 2  # cells that an agent's place may be from free floor
 
-#: Where the types and sizes of ProcTHOR's assets are.
-DATABASE = "procthor/databases/asset-database.json of github.com/allenai/procthor"
+# Where the types and sizes of ProcTHOR's assets are.
+_DATABASE = "procthor/databases/asset-database.json of github.com/allenai/procthor"
 
 
 def read_procthor(
@@ -52,7 +52,7 @@ def read_procthor(
       InputError: a file is missing or damaged, or holds no house.
     """
     known = read_assets(assets) if assets else {}
-    mend = "" if assets else f"; --assets tells them, {DATABASE}"
+    mend = "" if assets else f"; --assets tells them, {_DATABASE}"
     stem = re.sub(r"\.jsonl?(\.gz)?$", "", path.name)
     index = -1
     for index, (where, value) in enumerate(_houses(path)):
