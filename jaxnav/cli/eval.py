@@ -24,8 +24,10 @@ class EvalConfig:
       run: the run directory.
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
+      world: generated world instead, for a policy that was trained in scenes of a file; categories and rules stay the
+        run's.
       shift: layout shift, from 0 to 1: the share of the categories that exchange their places; default: the run's, and
-        0 with `--scenes`.
+        0 with `--scenes` or `--world`.
       episodes: in the fixed list, balanced over room types and scenes; where scenes are streamed equally many in every
         shard, and balanced there.
       epsilon: thresholds of sTDE; all of them in one compiled call.
@@ -40,6 +42,7 @@ class EvalConfig:
     run: Annotated[Path, tyro.conf.Positional]
     split: Literal["train", "val", "test"] = "val"
     scenes: Path | None = None
+    world: Literal["rooms", "apartments", "houses"] | None = None
     shift: float | None = None
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.5,)
@@ -63,6 +66,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         Run.open(config.run),
         split=config.split,
         scenes=config.scenes,
+        world=config.world,
         shift=config.shift,
         episodes=config.episodes,
         epsilon=config.epsilon,
@@ -89,8 +93,9 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
 
 def _target(config: EvalConfig) -> Path:
     """Return where the table goes, or refuse early."""
-    source = "" if config.scenes is None else f"{config.scenes.name.split('.')[0]}-"
-    name = f"eval-{source}{config.split}" + ("" if config.shift is None else f"-shift{config.shift:g}")
+    source = config.world or (config.scenes and config.scenes.name.split(".")[0])
+    name = f"eval-{source}-{config.split}" if source else f"eval-{config.split}"
+    name += "" if config.shift is None else f"-shift{config.shift:g}"
     name += "" if config.setting is None else f"-{config.setting}"
     target = config.json or config.run / f"{name}.json"
     if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):

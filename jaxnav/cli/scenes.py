@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,8 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.scene_statistics import scene_statistics
 from jaxnav.runs.directory import load_run
 from jaxnav.runs.policies import load_policies
-from jaxnav.scenes.files.importing import Format, Split, import_scenes, read_format
+from jaxnav.scenes.categories import most_common
+from jaxnav.scenes.files.importing import Format, ImportSummary, Split, import_scenes, read_format
 from jaxnav.scenes.sources import SceneSource
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.viz import require_pictures
@@ -37,7 +39,10 @@ class ImportConfig:
       val, test: patterns of scene names, such as `FloorPlan_Train11_*`, that make up these splits.
       world: world whose vocabulary the types are compared with; default: that which the scenes stand for.
       categories: vocabulary to compare with instead.
-      assets: asset database of ProcTHOR (JSON), for types and sizes.
+      assets: asset database of ProcTHOR (`procthor/databases/asset-database.json` of github.com/allenai/procthor), for
+        types and sizes.
+      agent_part: of ProcTHOR houses only what is connected with the agent's place in the file, instead of the largest
+        connected part.
       maps: semantic floor maps for Habitat episodes (`*_info.pbz2`).
       from_controller: read from an installed `ai2thor` simulator instead of from files.
       base: scene file with the rooms that re-placements are of.
@@ -52,6 +57,7 @@ class ImportConfig:
     world: Literal["rooms", "apartments", "houses"] | None = None
     categories: tuple[str, ...] | None = None
     assets: Path | None = None
+    agent_part: bool = False
     maps: Path | None = None
     from_controller: bool = False
     base: Path | None = None
@@ -107,16 +113,39 @@ def convert(config: ImportConfig, console: Console) -> None:
         console.print(f"refused: {error}", style="yellow", markup=False, soft_wrap=True)
 
     scenes = read_format(
-        config.format, config.source, config.split, config.assets, config.maps, config.from_controller, config.base
+        config.format,
+        config.source,
+        config.split,
+        assets=config.assets,
+        maps=config.maps,
+        from_controller=config.from_controller,
+        base=config.base,
+        agent_part=config.agent_part,
     )
     categories = config.categories or (WORLDS[config.world].task.categories if config.world else None)
     summary = import_scenes(
         scenes, config.source, config.out, config.split, config.val, config.test, categories, report
     )
-    for name, count in summary.unknown.most_common():
-        console.print(f"unknown type, only blocks the sight: {name} x {count}", markup=False, soft_wrap=True)
-    counts = f"{summary.imported} scenes imported, {summary.refused} refused"
+    for told in _told(summary):
+        console.print(told, style="yellow", markup=False, soft_wrap=True)
+    if summary.unknown:
+        objects, types = summary.unknown.total(), most_common(summary.unknown)
+        told = f"objects of unknown types, which only block the sight: {objects:,}, of them {types}"
+        console.print(told, markup=False, soft_wrap=True)
+    counts = f"{len(summary.scenes)} scenes imported, {summary.refused} refused"
     console.print(f"{counts}; written to {config.out}", soft_wrap=True)
+
+
+def _told(summary: ImportSummary) -> Iterator[str]:
+    """Yield what an import guessed, moved or left out."""
+    yield from (f"{count:,} {text}" for text, count in summary.notes.items())
+    if summary.unconnected:
+        cells = {name: int(scene.reach.sum()) for name, scene in summary.scenes.items()}
+        ((name, most),) = summary.unconnected.most_common(1)
+        yield (
+            f"{summary.unconnected.total():,} of {sum(cells.values()):,} cells in {len(summary.unconnected)} scenes "
+            f"are not connected with the largest part and not used; most in {name}, {most} of {cells[name]}"
+        )
 
 
 def show(config: ShowConfig, console: Console) -> None:

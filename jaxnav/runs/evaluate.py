@@ -68,6 +68,7 @@ def evaluate(
     *,
     split: str = "val",
     scenes: Path | None = None,
+    world: str | None = None,
     shift: float | None = None,
     episodes: int = 1000,
     epsilon: Sequence[float] | np.ndarray = (0.5,),
@@ -83,7 +84,8 @@ def evaluate(
       run: a finished run.
       split: scenes to evaluate on.
       scenes: scene file to read instead of the run's own world or file.
-      shift: layout shift, from 0 to 1; None for the run's, and 0 with `scenes`.
+      world: generated world instead, by the categories and rules of the run.
+      shift: layout shift, from 0 to 1; None for the run's, and 0 with `scenes` or `world`.
       episodes: in the fixed list, balanced over room types and scenes.
       epsilon: thresholds of sTDE.
       form: how sTDE combines the logits; None for that of the run's layout setting.
@@ -100,22 +102,22 @@ def evaluate(
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
-    world = evaluation_world(config, split, scenes, shift, console)
-    lists, outcome, compilations = run_rows(rows, policies, world, episodes, seed)
-    shortest = oracle_outcome(world.banks, lists, read_ahead(world, range(len(world.banks))), world.env)
+    compiled = evaluation_world(config, split, scenes, shift, console, world)
+    lists, outcome, compilations = run_rows(rows, policies, compiled, episodes, seed)
+    shortest = oracle_outcome(compiled.banks, lists, read_ahead(compiled, range(len(compiled.banks))), compiled.env)
     rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)
     about = settings(config) | {
         "steps_per_policy": config.total_updates * config.update_steps,
         "prior_steps": policies.prior_steps,
         "budget": (budget := config.budget | {"exploration": policies.prior_steps}),
-        "evaluation_source": str(scenes or config.source),
-        "evaluation_shift": evaluation_shift(config, scenes, shift),
+        "evaluation_source": str(scenes or world or config.source),
+        "evaluation_shift": evaluation_shift(config, scenes or world, shift),
         "evaluation_seed": seed,
         "evaluation_setting": setting,
         "evaluation_hold": hold,
     }
-    results = Results(rows, outcome, together(lists), world.env.categories, WORLDS[config.world].budgets, {})
-    names = {"method": config.method.upper(), "world": world.scenes[0].world, "split": split}
+    results = Results(rows, outcome, together(lists), compiled.env.categories, WORLDS[config.world].budgets, {})
+    names = {"method": config.method.upper(), "world": compiled.scenes[0].world, "split": split}
     table, differences = _table(results, names), _differences(results)
     told = notes(rows, results.metrics()["sr"], results.episodes, room_prior=config.layout.prior == "room")
     told += [spent(budget), *trained_out(run.log())]

@@ -14,7 +14,7 @@ from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig
-from jaxnav.scenes.categories import unknown_types
+from jaxnav.scenes.categories import most_common, unknown_types
 from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank, concatenate
 from jaxnav.scenes.tables.shards import Shards, compile_shards
 from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
@@ -60,25 +60,33 @@ class CompiledWorld:
 
 def training_world(config: RunConfig, console: Console) -> CompiledWorld:
     """Compile the training scenes of a run."""
-    scenes = _scenes(config, "train", config.scenes, config.worlds.shift, console)
+    scenes = _scenes(config, config.world, "train", config.scenes, config.worlds.shift, console)
     world = _compiled(config, scenes, {}, config.train_step_limit, console)
     return dataclasses.replace(world, expert=any(stage.imitates for stage in config.stages))
 
 
 def evaluation_world(
-    config: RunConfig, split: str, scenes: Path | None, shift: float | None, console: Console
+    config: RunConfig,
+    split: str,
+    scenes: Path | None,
+    shift: float | None,
+    console: Console,
+    world: str | None = None,
 ) -> CompiledWorld:
     """Compile the scenes to evaluate a run in.
 
-    One split of its own world or file, or of another file, or at another shift.
+    One split of its own world or file, of another file or of a generated world, or at another shift. Categories and
+    rules are the run's.
 
     Raises:
-      InputError: bad scene file, no scene of the split, or a bad shift.
+      InputError: bad scene file, no scene of the split, a bad shift, or both a file and a world.
     """
-    world = WORLDS[config.world]
-    limits = {"living_room": config.worlds.large_step_limit or world.large_step_limit}
-    limit = config.worlds.step_limit or world.step_limit
-    chosen = _scenes(config, split, scenes or config.scenes, evaluation_shift(config, scenes, shift), console)
+    if scenes and world:
+        raise InputError(f"--scenes, --world: both are given ({scenes}, {world}); leave one out")
+    name, path = world or config.world, scenes or (None if world else config.scenes)
+    limits = {"living_room": config.worlds.large_step_limit or WORLDS[name].large_step_limit}
+    limit = config.worlds.step_limit or WORLDS[name].step_limit
+    chosen = _scenes(config, name, split, path, evaluation_shift(config, scenes or world, shift), console)
     return _compiled(config, chosen, limits, limit, console)
 
 
@@ -95,25 +103,24 @@ def one_world(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
     return CompiledWorld(worlds[0].scenes, worlds[0].env, (bank,), worlds[0].step_limits, worlds[0].step_limit, *about)
 
 
-def evaluation_shift(config: RunConfig, scenes: Path | None, shift: float | None) -> float:
+def evaluation_shift(config: RunConfig, other: Path | str | None, shift: float | None) -> float:
     """Return the shift that is asked for, else the run's.
 
-    Another file is taken as it is.
+    Another file or world is taken as it is.
     """
     if shift is not None:
         return shift
-    return 0.0 if scenes else config.worlds.shift
+    return 0.0 if other else config.worlds.shift
 
 
-def _scenes(config: RunConfig, split: str, path: Path | None, shift: float, console: Console) -> Scenes:
+def _scenes(config: RunConfig, world: str, split: str, path: Path | None, shift: float, console: Console) -> Scenes:
     task, seed = config.task, config.worlds.seed
     if path is None:
-        return shifted(generated(config.world, split, getattr(config.worlds, f"num_{split}"), seed), task, shift, seed)
+        return shifted(generated(world, split, getattr(config.worlds, f"num_{split}"), seed), task, shift, seed)
     scenes = from_file(path, split)
     if counts := unknown_types(scenes.scenes, task.categories):
-        types = ", ".join(f"{name} x {count}" for name, count in counts.most_common(5))
-        rest = f" and {len(counts) - 5} more" if len(counts) > 5 else ""
-        console.print(f"{path}: types that are no category and only block the sight: {types}{rest}", soft_wrap=True)
+        types = most_common(counts)
+        console.print(f"{path}: types that are no category and only block the sight: {types}", soft_wrap=True)
     return shifted(scenes, task, shift, seed)
 
 

@@ -53,6 +53,12 @@ def category_ids(types: tuple[str, ...], categories: tuple[str, ...]) -> tuple[i
     return tuple(index.get(name, index.get(ALIASES.get(name, name), -1)) for name in types)
 
 
+def most_common(counts: Counter[str], number: int = 5) -> str:
+    """Name the most frequent entries and the number of others."""
+    shown = ", ".join(f"{name} x {count}" for name, count in counts.most_common(number))
+    return shown + (f" and {len(counts) - number} more" if len(counts) > number else "")
+
+
 def unknown_types(scenes: Iterable[Scene], categories: tuple[str, ...]) -> Counter[str]:
     """Count the objects of types that are no category.
 

@@ -201,6 +201,31 @@ def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
     assert "layout shift: seed 0, shift 1.5; give" in refusal(capsys)
 
 
+@pytest.mark.slow
+def test_a_policy_of_a_file_is_evaluated_in_a_generated_world(run_dir, tmp_path, capsys):
+    run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
+    shutil.copytree(run_dir, run)
+    assert evaluate(run, "--episodes", 8) == 0  # in the run's own rooms
+    config = json.loads((run / "config.json").read_text())
+    config["scenes"] = str(file)
+    config["worlds"]["shift"] = 0.5  # of the scenes of the file
+    (run / "config.json").write_text(json.dumps(config))
+    write_scenes(file, (generated("rooms", "val", seed=1)[i] for i in range(2)))
+    assert evaluate(run, "--episodes", 8, "--world", "rooms") == 0
+    rooms, own = (json.loads((run / name).read_text()) for name in ("eval-rooms-val.json", "eval-val.json"))
+    assert rooms["rows"] == own["rows"]
+    assert (rooms["run"]["evaluation_source"], rooms["run"]["evaluation_shift"]) == ("rooms", 0.0)
+    assert evaluate(run, "--episodes", 8, "--json", tmp_path / "file.json") == 0
+    assert json.loads((tmp_path / "file.json").read_text())["rows"] != own["rows"]
+    # Its categories are the run's in another world too, whose limit of actions the run's settings replace.
+    assert evaluate(run, "--episodes", 8, "--world", "houses") == 0
+    assert {row["world"] for row in json.loads((run / "eval-houses-val.json").read_text())["rows"]} == {"houses"}
+    assert {row["goal"] for row in _episodes(run / "eval-houses-val.json")} <= set(ITHOR_CATEGORIES)
+    capsys.readouterr()
+    assert evaluate(run, "--world", "rooms", "--scenes", file) == 2
+    assert f"--scenes, --world: both are given ({file}, rooms); leave one out" in refusal(capsys)
+
+
 def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(run_dir, run)

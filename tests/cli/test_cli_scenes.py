@@ -7,7 +7,7 @@ import pytest
 from support.commands import refusal
 from support.fuzz_importers import CRASHED, FORMATS, fuzz
 from support.importer_inputs.ai2thor import METADATA
-from support.importer_inputs.procthor import HOUSE, door
+from support.importer_inputs.procthor import ASSETS, HOUSE, door
 
 from jaxnav.__main__ import main
 from jaxnav.env.make import make
@@ -58,9 +58,39 @@ def test_refused_scenes_are_told_and_counted_and_the_others_kept(tmp_path, capsy
     told = capsys.readouterr().err
     assert f"refused: {source}" in told
     assert "doors[0]: wall0" in told
-    assert "unknown type, only blocks the sight: Bowl x 1" in told
+    assert "objects of unknown types, which only block the sight: 1, of them Bowl x 1\n" in told
+    # Without the database, types and sizes of table and bowl come from their names.
+    assert "2 types of objects are guessed from the names of their assets; --assets tells them, procthor/data" in told
+    assert "2 sizes of objects are the typical ones of their types; --assets" in told
     assert "1 scenes imported, 1 refused" in told
     assert len(read_scenes(target)) == 1
+
+
+def test_what_is_not_connected_is_counted(tmp_path, capsys):
+    shut = HOUSE | {"doors": []}
+    source, target = tmp_path / "houses.jsonl", tmp_path / "scenes.jsonl.gz"
+    source.write_text("\n".join(json.dumps(house) for house in (HOUSE, shut)))
+    (tmp_path / "assets.json").write_text(json.dumps(ASSETS))
+    assert run("procthor", source, target, "--assets", tmp_path / "assets.json") == 0
+    told = capsys.readouterr().err
+    # 230 cells with the door, 227 without it: 121 in the larger room and 106 in the other.
+    assert "106 of 457 cells in 1 scenes are not connected with the largest part and not used; most in houses-1" in told
+    assert "houses-1, 106 of 227" in told
+    assert "guessed" not in told
+    assert run("procthor", source, target, "--assets", tmp_path / "assets.json", "--agent-part") == 0
+    told = capsys.readouterr().err
+    assert "121 cells are not connected with the agent and left out" in told  # it stands in the smaller room
+    assert "largest" not in told
+
+
+def test_many_unknown_types_take_one_line(tmp_path, capsys):
+    things = [METADATA["objects"][1] | {"objectId": f"T{i}", "objectType": f"T{i}"} for i in range(9)]
+    source = tmp_path / "room.json"
+    source.write_text(json.dumps(METADATA | {"objects": METADATA["objects"] + things + things[:2]}))
+    assert run("ai2thor", source, tmp_path / "scenes.jsonl.gz") == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "unknown types" in line]
+    # Nine types, two of them twice, and of the room's objects table and drawer.
+    assert line.endswith(": 13, of them T0 x 2, T1 x 2, DiningTable x 1, Drawer x 1, T2 x 1 and 6 more")
 
 
 def test_two_scenes_of_one_name_are_one_too_many(tmp_path, capsys):
@@ -103,6 +133,7 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, capsys):
     [
         ("procthor", ["--from-controller"], "--from-controller: is for the format ai2thor, not for procthor"),
         ("ai2thor", ["--maps", "a.pbz2"], "--maps: is for the format habitat, not for ai2thor"),
+        ("ai2thor", ["--agent-part"], "--agent-part: is for the format procthor, not for ai2thor"),
         ("habitat", ["--assets", "a.json"], "--assets: is for the format procthor, not for habitat"),
         ("ai2thor", ["--base", "a.jsonl.gz"], "--base: is for the format replacements, not for ai2thor"),
         ("replacements", [], "--base: is missing; replacements need the scene file"),

@@ -8,6 +8,7 @@ _FOLDER = Path(__file__).parents[3] / "shared" / "scenes"
 ITHOR = _FOLDER / "ithor_train_val.jsonl.gz"
 ITHOR_SHUFFLES = _FOLDER / "ithor_shuffles_train.jsonl.gz"
 ROBOTHOR = _FOLDER / "robothor_train.jsonl.gz"
+PROCTHOR = _FOLDER / "procthor"
 
 
 def require(path: Path) -> Path:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.files.importers.assemble import Note
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
 
@@ -40,7 +41,7 @@ def as_scene(result: Scene | InputError) -> Scene:
     return result
 
 
-def scenes_and_errors(results: Iterable[Scene | InputError]) -> tuple[list[Scene], list[str]]:
+def scenes_and_errors(results: Iterable[Scene | InputError | Note]) -> tuple[list[Scene], list[str]]:
     """Return the scenes among results, and the errors' messages."""
     results = list(results)
     return [r for r in results if isinstance(r, Scene)], [str(r) for r in results if isinstance(r, InputError)]
@@ -61,14 +62,18 @@ def assert_scenes_equal(a: Scene | InputError, b: Scene | InputError) -> None:
         np.testing.assert_array_equal(one.cells, other.cells, strict=True)
 
 
-def check_outcomes(results: Iterable[Scene | InputError], outcomes: collections.Counter[type], path: Path) -> None:
+def check_outcomes(
+    results: Iterable[Scene | InputError | Note], outcomes: collections.Counter[type], path: Path
+) -> None:
     """Check that results are storable scenes or named errors.
 
     A scene file can hold the scenes, and errors name their file. They are counted by type.
     """
     for result in results:
         outcomes[type(result)] += 1
-        if isinstance(result, InputError):
+        if isinstance(result, Note):
+            assert result.number > 0
+        elif isinstance(result, InputError):
             assert str(result).startswith(str(path))
         else:
             write_scenes(path.parent / "fuzzed.jsonl.gz", [result])

@@ -11,35 +11,47 @@ from typing import Literal, NamedTuple
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids, unknown_types
 from jaxnav.scenes.files.importers.ai2thor import read_ai2thor
+from jaxnav.scenes.files.importers.assemble import Note
 from jaxnav.scenes.files.importers.controller import read_controller
 from jaxnav.scenes.files.importers.habitat import read_habitat
 from jaxnav.scenes.files.importers.procthor import read_procthor
 from jaxnav.scenes.files.importers.replacements import read_replacements
 from jaxnav.scenes.files.importers.scene_data import read_scene_data
 from jaxnav.scenes.files.scene_file import iterate_scenes, write_scenes
+from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS, world_named
 
 Format = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
 Split = Literal["train", "val", "test"]
-Imported = Iterator[Scene | InputError]
+Imported = Iterator[Scene | InputError | Note]
 
 #: Format that each option of `read_format` is for.
-FORMAT_OPTIONS = {"assets": "procthor", "maps": "habitat", "from_controller": "ai2thor", "base": "replacements"}
+FORMAT_OPTIONS = {
+    "assets": "procthor",
+    "agent_part": "procthor",
+    "maps": "habitat",
+    "from_controller": "ai2thor",
+    "base": "replacements",
+}
 
 
 class ImportSummary(NamedTuple):
     """Summarize an import.
 
     Attributes:
-      imported: number of scenes that were written.
+      scenes: those that were written, by name.
       refused: number of scenes that could not be used.
       unknown: number of objects of each type that is in no vocabulary.
+      unconnected: standable cells outside the largest connected part, of each scene that has such cells.
+      notes: what else was done to the scenes, and its number.
     """
 
-    imported: int
+    scenes: dict[str, Scene]
     refused: int
     unknown: Counter[str]
+    unconnected: Counter[str]
+    notes: Counter[str]
 
 
 def read_format(
@@ -50,6 +62,7 @@ def read_format(
     maps: Path | None = None,
     from_controller: bool = False,
     base: Path | None = None,
+    agent_part: bool = False,
 ) -> Imported:
     """Yield the scenes of a source.
 
@@ -61,18 +74,20 @@ def read_format(
       maps: semantic floor maps for Habitat episodes.
       from_controller: whether to read from an installed AI2-THOR simulator.
       base: scene file with the rooms that re-placements are of.
+      agent_part: of ProcTHOR houses only what is connected with the agent's place in the file.
 
     Yields:
-      A scene, or why it cannot be used.
+      A scene, or why it cannot be used; also notes of what was done.
 
     Raises:
       InputError: the source cannot be read, or an option is missing or is for another format.
     """
-    _check_options(form, {"assets": assets, "maps": maps, "from_controller": from_controller, "base": base})
+    options = {"assets": assets, "agent_part": agent_part, "maps": maps, "base": base}
+    _check_options(form, options | {"from_controller": from_controller})
     path = Path(source)
     match form:
         case "procthor":
-            yield from read_procthor(path, split, assets)
+            yield from read_procthor(path, split, assets, agent_part)
         case "ai2thor":
             yield from read_controller(source.split(","), split) if from_controller else read_ai2thor(path, split)
         case "scene-data":
@@ -88,7 +103,7 @@ def read_format(
 
 
 def import_scenes(
-    scenes: Iterable[Scene | InputError],
+    scenes: Iterable[Scene | InputError | Note],
     source: str,
     out: Path,
     split: Split = "train",
@@ -113,9 +128,10 @@ def import_scenes(
     """
     if not out.name.endswith(".jsonl.gz"):
         raise InputError(f"{out}: give a name that ends in .jsonl.gz")
-    kept, refused, unknown = _usable(scenes, source, categories, report)
+    summary = _usable(scenes, source, categories, report)
+    kept = summary.scenes
     if not kept:
-        raise InputError(f"{source}: none of its {refused} scenes can be used; mend what is said of them above")
+        raise InputError(f"{source}: none of its {summary.refused} scenes can be used; mend what is said of them above")
     for pattern in (*val, *test):
         if not fnmatch.filter(kept, pattern):
             raise InputError(f"pattern {pattern!r}: fits no scene; there are {reprlib.repr(sorted(kept))}")
@@ -123,7 +139,7 @@ def import_scenes(
         write_scenes(out, [_with_split(scene, {"val": val, "test": test}, split) for scene in kept.values()])
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another name") from error
-    return ImportSummary(len(kept), refused, unknown)
+    return summary
 
 
 def _check_options(form: Format, options: dict[str, Path | bool | None]) -> None:
@@ -135,19 +151,22 @@ def _check_options(form: Format, options: dict[str, Path | bool | None]) -> None
 
 
 def _usable(
-    scenes: Iterable[Scene | InputError],
+    scenes: Iterable[Scene | InputError | Note],
     source: str,
     categories: tuple[str, ...] | None,
     report: Callable[[InputError], None],
-) -> tuple[dict[str, Scene], int, Counter[str]]:
-    """Return usable scenes, the number of others, and unknown types."""
+) -> ImportSummary:
+    """Return the usable scenes and what is told of them."""
     kept: dict[str, Scene] = {}
-    unknown: Counter[str] = Counter()
+    unknown, unconnected, notes = Counter[str](), Counter[str](), Counter[str]()
     refused = 0
     for scene in scenes:
         try:
             if isinstance(scene, InputError):
                 raise scene
+            if isinstance(scene, Note):
+                notes += Counter({scene.text: scene.number})
+                continue
             vocabulary = categories or WORLDS[world_named(scene.world)].task.categories
             _check(scene, kept, vocabulary, source)
         except InputError as error:
@@ -156,7 +175,8 @@ def _usable(
         else:
             kept[scene.name] = scene
             unknown += unknown_types([scene], vocabulary)
-    return kept, refused, unknown
+            unconnected += Counter({scene.name: int(scene.reach.sum()) - len(standable_cells(scene.reach))})
+    return ImportSummary(kept, refused, unknown, unconnected, notes)
 
 
 def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> None:

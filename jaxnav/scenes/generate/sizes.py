@@ -21,6 +21,11 @@ def typical_box(name: str) -> tuple[float, float, float, float]:
     return sizes.get(name) or sizes.get(ALIASES.get(name, name), UNKNOWN)
 
 
+def typical_types() -> tuple[str, ...]:
+    """Return the types whose typical size is known."""
+    return tuple(_sizes())
+
+
 @functools.cache
 def _sizes() -> dict[str, tuple[float, float, float, float]]:
     table = yaml.safe_load(pathlib.Path(__file__).with_name("sizes.yaml").read_text())

@@ -1,5 +1,5 @@
 """Importers of scenes, one module per format.
 
 Every importer is a generator. It yields a `Scene` or, for a scene that cannot be used, the `InputError` that says why.
-A file that cannot be read at all raises an `InputError`.
+A file that cannot be read at all raises an `InputError`. After a scene may come `Note`s of what was done to it.
 """

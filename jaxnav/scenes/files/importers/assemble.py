@@ -14,6 +14,18 @@ MAX_SIDE = 2000  # cells; a larger extent is a mistake
 MARGIN = 3  # cells around the standable ones; what lies beyond is indistinguishable from a wall
 
 
+class Note(NamedTuple):
+    """Say what was done to scenes, to be told once after an import.
+
+    Attributes:
+      text: what was done, in words that follow a number.
+      number: of what it was done to.
+    """
+
+    text: str
+    number: int
+
+
 class Thing(NamedTuple):
     """Describe an object of a scene.
 

@@ -42,9 +42,9 @@ def episode_files(path: Path) -> list[Path]:
     elif folder != path:
         return [path]
     files = sorted(folder.glob("*.json.gz"))
-    # SemExp keeps its episodes beside those of Habitat, which it does not use.
-    replaced = {file.name.replace("_episodes.json.gz", ".json.gz") for file in files if "_episodes.json" in file.name}
-    return [file for file in files if file.name not in replaced]
+    # SemExp keeps `X_episodes.json.gz` beside Habitat's `X.json.gz` or `X.glb.json.gz`, which it does not use.
+    scenes = [file.name.split(".")[0] for file in files]
+    return [file for file, scene in zip(files, scenes, strict=True) if f"{scene}_episodes" not in scenes]
 
 
 def read_episodes(file: Path) -> list[SceneEpisodes]:

@@ -3,9 +3,10 @@
 A house has rooms, walls with doors and a tree of objects, but no reachable positions.
 """
 
+import dataclasses
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,34 +14,45 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers import polygons
-from jaxnav.scenes.files.importers.assemble import MAX_SIDE, lattice_cells, scene
-from jaxnav.scenes.files.importers.procthor_objects import Asset, read_assets, read_things
+from jaxnav.scenes.files.importers.assemble import MAX_SIDE, Note, Thing, lattice_cells, scene
+from jaxnav.scenes.files.importers.procthor_objects import read_assets, read_objects
 from jaxnav.scenes.files.importers.procthor_walls import read_rooms, read_walls
 from jaxnav.scenes.files.record import Record, parse_json, read_bytes
 from jaxnav.scenes.generate.rooms import AGENT_RADIUS, OBSTACLE_HEIGHTS
 from jaxnav.scenes.scene import CELL, Room, Scene
 
+_FARTHEST = 2  # cells that an agent's place may be from free floor
 
-def read_procthor(path: Path, split: str, assets: Path | None = None) -> Iterator[Scene | InputError]:
+# Where the types and sizes of ProcTHOR's assets are.
+_DATABASE = "procthor/databases/asset-database.json of github.com/allenai/procthor"
+
+
+def read_procthor(
+    path: Path, split: str, assets: Path | None = None, agent_part: bool = False
+) -> Iterator[Scene | InputError | Note]:
     """Read ProcTHOR houses.
 
     The agent can stand on the lattice points of the rooms that are at least 0.2 m from walls and from objects whose
-    boxes reach into 0.1-1.7 m above the floor, as far as they are connected with its place in the file
-    (`metadata.agent`). Walls that are marked empty and inner doors that are not shut let it, and its sight, through.
+    boxes reach into 0.1-1.7 m above the floor. Walls that are marked empty and inner doors that are not shut let it,
+    and its sight, through. A house of one room has the type of that room.
 
     Args:
       path: one house per line (`*.jsonl`), or a house or a list of houses (`*.json`); both also with gzip.
       split: `train`, `val` or `test`.
       assets: asset database (JSON), by asset id or as lists by type. Objects that it does not hold have the type that
         their names say, and typical sizes.
+      agent_part: only the cells that are connected with the agent's place in the file (`metadata.agent`); it is moved
+        to the nearest free cell, at most 0.5 m away.
 
     Yields:
-      A scene `<file>-<index>` for each house, or the error that says why there is none.
+      A scene `<file>-<index>` for each house and notes of what was guessed or moved, or the error that says why there
+      is no scene.
 
     Raises:
       InputError: a file is missing or damaged, or holds no house.
     """
     known = read_assets(assets) if assets else {}
+    mend = "" if assets else f"; --assets tells them, {_DATABASE}"
     stem = re.sub(r"\.jsonl?(\.gz)?$", "", path.name)
     index = -1
     for index, (where, value) in enumerate(_houses(path)):
@@ -48,10 +60,21 @@ def read_procthor(path: Path, split: str, assets: Path | None = None) -> Iterato
         try:
             if isinstance(value, InputError):
                 raise value
-            result = _scene(Record(where, {}).record(f"house {name!r}", value), name, split, known)
+            house = Record(where, {}).record(f"house {name!r}", value)
+            objects = read_objects(house, known)
+            whole = _scene(house, name, split, objects.things)
+            reach, moved = _agent_part(house, whole) if agent_part else (whole.reach, False)
         except InputError as error:
-            result = error
-        yield result
+            yield error
+        else:
+            yield dataclasses.replace(whole, reach=reach)
+            counts = {
+                f"types of objects are guessed from the names of their assets{mend}": objects.types,
+                f"sizes of objects are the typical ones of their types{mend}": objects.sizes,
+                "agents are moved to the nearest free cell": int(moved),
+                "cells are not connected with the agent and left out": int((whole.reach & ~reach).sum()),
+            }
+            yield from (Note(text, count) for text, count in counts.items() if count)
     if index < 0:
         raise InputError(f"{path}: holds no house; write one JSON object per line")
 
@@ -87,7 +110,7 @@ def _by_line(path: Path, content: bytes) -> bool:
     return True
 
 
-def _scene(house: Record, name: str, split: str, assets: dict[str, Asset]) -> Scene:
+def _scene(house: Record, name: str, split: str, things: Sequence[Thing]) -> Scene:
     floors = read_rooms(house)
     corners = np.concatenate([floor.corners for floor in floors])
     # One more cell all around holds the outer walls.
@@ -98,16 +121,17 @@ def _scene(house: Record, name: str, split: str, assets: dict[str, Asset]) -> Sc
 
     rooms = tuple(Room(floor.type, polygons.inside(floor.corners, x, z)) for floor in floors)
     walls = read_walls(house, {floor.id for floor in floors})
-    things = read_things(house, assets)
     centre, size = np.split(np.array([thing.box for thing in things]), 2, axis=1)
     boxes = np.stack([centre - size / 2, centre + size / 2], axis=1)  # [N, 2, 3]
     in_way = boxes[(boxes[:, 0, 1] < OBSTACLE_HEIGHTS[1]) & (boxes[:, 1, 1] > OBSTACLE_HEIGHTS[0])][:, :, [0, 2]]
     indoors = np.any([room.cells for room in rooms], axis=0)
     free = indoors & ~polygons.nearer(np.concatenate([walls, in_way]), x, z, AGENT_RADIUS)
+    if not free.any():
+        raise house.error("rooms", f"have no floor {AGENT_RADIUS} m from walls and objects; leave the house out")
     return scene(
-        *(name, "procthor", "house", split),
+        *(name, "procthor", rooms[0].type if len(rooms) == 1 else "house", split),
         origin=(float(x[0]), float(z[0])),
-        reach=polygons.connected_part(free, _start(house, free, low)),
+        reach=free,
         # A wall on the border of two cells takes both. Where walls meet they share a cell, so that no sight slips
         # through; the square of a standable cell, at most 0.18 m from its centre, touches none.
         walls=polygons.touched(walls, x, z),
@@ -116,17 +140,18 @@ def _scene(house: Record, name: str, split: str, assets: dict[str, Asset]) -> Sc
     )
 
 
-def _start(house: Record, free: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Return the free cell at or beside the agent.
+def _agent_part(house: Record, whole: Scene) -> tuple[np.ndarray, bool]:
+    """Return the cells connected with the agent, bool [nz, nx].
 
-    It is int [2], (iz, ix). `low` (x, z) is the lattice index of cell [0, 0].
+    Also whether its place had to be moved.
     """
     metadata = house.record("metadata", house.get("metadata"))
     agent = metadata.record("agent", metadata.get("agent"))
     place = agent.vector("position", agent.get("position"), "xz")
-    cell = lattice_cells(agent, "position", [place])[0] - low[::-1].astype(int)
-    offsets = np.argwhere(free) - cell
-    offsets = offsets[np.abs(offsets).max(axis=1) <= 1]
-    if not len(offsets):
+    cell = lattice_cells(agent, "position", [place])[0] - np.rint(np.divide(whole.origin[::-1], CELL)).astype(int)
+    free = np.argwhere(whole.reach)
+    distances = np.linalg.norm(free - cell, axis=1)
+    nearest = int(distances.argmin())
+    if distances[nearest] > _FARTHEST:
         raise agent.error("position", f"is {place} (x, z), where the agent cannot stand; put it on free floor")
-    return cell + offsets[np.abs(offsets).sum(axis=1).argmin()]
+    return polygons.connected_part(whole.reach, free[nearest]), distances[nearest] > 0

@@ -27,10 +27,15 @@ _PIXEL, _CELL = 5, 25  # centimetres
 _FAR = 10**7  # centimetres of an origin, or pixels; a greater number is a mistake
 _MIN_PIXELS = 3  # of an object; less is noise
 
+_MIN_FREE = 8  # of the 25 pixels of a cell, for it to be standable; narrow doors have few
+
 # A strip this wide (pixels) between floor on both sides, and this long (cells), is a wall. The floor of a map ends 0.1
-# to 0.2 m before an obstacle, so the obstacle is at most 0.4 m thick, yet 1 m long, unlike usual furniture.
+# to 0.2 m before an obstacle, so the obstacle is at most 0.4 m thick, yet 1 m long, unlike usual furniture. The cells
+# on both sides of a narrow strip may have enough free pixels to be standable, and would be neighbours.
 _STRIP_WIDTH = (4, 12)
+_NARROW_STRIP = (4, 6)
 _STRIP_LENGTH = 4
+_NARROW_ROWS = 3  # of the 5 of a cell that a narrow strip crosses; with fewer there is room for a door
 
 
 class FloorMap(NamedTuple):
@@ -94,34 +99,52 @@ def floor_map(record: Record) -> FloorMap:
 def scene_of_map(record: Record, name: str, split: str, floor: FloorMap) -> Scene:
     """Build the scene of one floor.
 
-    Its x is Habitat's, its z is minus Habitat's. A lattice point is standable if the pixel under it is navigable,
-    because navigable floor already keeps the agent's radius clear of obstacles. An object is a connected part of a
-    category's layer, at the typical height. Walls are the cells far from everything (`derive_walls`) and thin strips
-    that divide the floor.
+    Its x is Habitat's, its z is minus Habitat's. A cell is standable if at least 8 of its 25 pixels are navigable: the
+    agent's radius is clear of obstacles there already. An object is a connected part of a category's layer, at the
+    typical height. Walls are the cells far from everything (`derive_walls`) and thin strips that divide the floor.
 
     Raises:
-      InputError: the floor has no standable point or no object.
+      InputError: the floor has no standable cell or no object.
     """
-    cells, things = _standable(floor), list(_things(floor))
+    free = _per_cell(floor, floor.layers[0]) >= _MIN_FREE
+    reach = free & ~_long_parts(_strips(floor, _NARROW_STRIP, _NARROW_ROWS))
+    cells, things = _cells(floor, reach), list(_things(floor))
     if not len(cells):
-        raise record.error("sem_map", "has no standable point in layer 0; leave the floor out")
+        raise record.error("sem_map", f"has no cell with {_MIN_FREE} pixels of layer 0; leave the floor out")
     if not things:
         raise record.error("sem_map", "has no object in layers 1 and up; leave the floor out")
     scene = scene_of_cells(name, "gibson", "house", split, cells, things)
-    return dataclasses.replace(scene, walls=scene.walls | _thin_walls(floor, scene))
+    thin = _cells(floor, _long_parts(_strips(floor, _STRIP_WIDTH, 1) & ~reach))
+    index = thin - np.rint(np.divide(scene.origin[::-1], _CELL / 100)).astype(int)
+    walls = scene.walls.copy()
+    walls[tuple(index[((index >= 0) & (index < walls.shape)).all(axis=1)].T)] = True
+    return dataclasses.replace(scene, walls=walls)
 
 
-def _standable(floor: FloorMap) -> np.ndarray:
-    """Return standable lattice indices (iz, ix), int [N, 2]."""
-    (x, i), (z, j) = (_lattice(low, count) for low, count in zip(floor.origin, floor.layers.shape[1:], strict=True))
-    at_x, at_z = np.nonzero(floor.layers[0][np.ix_(i, j)])
-    return np.stack([-z[at_z], x[at_x]], axis=1)
+def _lattice(low: int, count: int) -> np.ndarray:
+    """Return the lattice index nearest to each pixel along an axis."""
+    return (2 * (low + _PIXEL * np.arange(count)) + _PIXEL + _CELL) // (2 * _CELL)
 
 
-def _lattice(low: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return lattice indices and pixels along one axis."""
-    index = np.arange(-(-low // _CELL), -(-(low + _PIXEL * count) // _CELL))
-    return index, (_CELL * index - low) // _PIXEL
+def _per_cell(floor: FloorMap, mask: np.ndarray) -> np.ndarray:
+    """Count the pixels of a mask [nx, nz] in each cell.
+
+    Returns:
+      int [cells along x, cells along Habitat's z]; a whole cell has 25 pixels.
+    """
+    x, z = (_lattice(low, count) for low, count in zip(floor.origin, mask.shape, strict=True))
+    counts = np.zeros((np.ptp(x) + 1, np.ptp(z) + 1), np.int64)
+    np.add.at(counts, np.ix_(x - x[0], z - z[0]), mask)
+    return counts
+
+
+def _cells(floor: FloorMap, mask: np.ndarray) -> np.ndarray:
+    """Return the lattice indices (iz, ix) of a mask, int [N, 2].
+
+    Its first cell is that of the first pixel.
+    """
+    x, z = (np.argwhere(mask) + [_lattice(low, 1)[0] for low in floor.origin]).T
+    return np.stack([-z, x], axis=1)
 
 
 def _things(floor: FloorMap) -> Iterator[Thing]:
@@ -135,31 +158,37 @@ def _things(floor: FloorMap) -> Iterator[Thing]:
                 yield Thing(name, (x, y, 0.0 - z, size_x, height, size_z))
 
 
-def _thin_walls(floor: FloorMap, scene: Scene) -> np.ndarray:
-    """Return the cells of thin walls, bool [nz, nx].
+def _strips(floor: FloorMap, widths: tuple[int, int], rows: int) -> np.ndarray:
+    """Return the cells in the middle of thin strips between floor.
 
-    They are in the middle of long thin strips between floor on both sides.
+    Args:
+      floor: the map.
+      widths: least and greatest, pixels.
+      rows: least number of rows of pixels of a cell that a strip crosses.
+
+    Returns:
+      bool [cells along x, cells along Habitat's z].
     """
     free, objects = floor.layers[0], floor.layers[1:].any(axis=0)
-    middles = (_strip_middles(free) | _strip_middles(free.T).T) & ~objects
-    x, z = (floor.origin + _PIXEL * (np.argwhere(middles) + 0.5)).T / 100
-    index = np.rint((np.stack([-z, x], axis=1) - scene.origin[::-1]) * 100 / _CELL).astype(int)
-    inside = ((index >= 0) & (index < scene.reach.shape)).all(axis=1)
-    strips, walls = np.zeros_like(scene.reach), np.zeros_like(scene.reach)
-    strips[tuple(index[inside].T)] = True
-    for part in connected_parts(strips & ~scene.reach):
-        if len(part) >= _STRIP_LENGTH:
-            walls[tuple(part.T)] = True
+    across = (_strip_middles(free, widths), _strip_middles(free.T, widths).T)
+    return np.any([_per_cell(floor, middles & ~objects) >= rows for middles in across], axis=0)
+
+
+def _long_parts(strips: np.ndarray) -> np.ndarray:
+    """Return the parts that are long enough for a wall."""
+    walls = np.zeros_like(strips)
+    for part in connected_parts(strips):
+        walls[tuple(part.T)] = len(part) >= _STRIP_LENGTH
     return walls
 
 
-def _strip_middles(free: np.ndarray) -> np.ndarray:
+def _strip_middles(free: np.ndarray, widths: tuple[int, int]) -> np.ndarray:
     """Return the pixels in the middle of a thin gap.
 
-    The gap lies between free pixels of their row. bool, of the shape of `free` [H, W].
+    The gap lies between free pixels of their row, and has one such pixel. bool, of the shape of `free` [H, W].
     """
     column = np.arange(free.shape[1])
     before = np.maximum.accumulate(np.where(free, column, -_FAR), axis=1)
     after = np.minimum.accumulate(np.where(free, column, _FAR)[:, ::-1], axis=1)[:, ::-1]
     width = after - before - 1
-    return (width >= _STRIP_WIDTH[0]) & (width <= _STRIP_WIDTH[1]) & (np.abs(2 * column - before - after) <= 1)
+    return (width >= widths[0]) & (width <= widths[1]) & (column == (before + after) // 2)

@@ -10,6 +10,7 @@ from support.scene_records import as_scene
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.ai2thor import read_ai2thor
+from jaxnav.scenes.files.importers.assemble import Note
 from jaxnav.scenes.files.importers.procthor import read_procthor
 from jaxnav.scenes.scene import Scene
 
@@ -27,10 +28,13 @@ def read_metadata(tmp_path: Path) -> Callable[[object], Scene | InputError]:
 
 @pytest.fixture
 def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
-    def read(house: object, assets: object = ASSETS) -> Scene | InputError:
+    def read(house: object, assets: object = ASSETS, *, agent_part: bool = False) -> Scene | InputError:
         (tmp_path / "house.json").write_text(json.dumps(house))
         (tmp_path / "assets.json").write_text(json.dumps(assets))
-        (result,) = read_procthor(tmp_path / "house.json", "val", tmp_path / "assets.json" if assets else None)
+        database = tmp_path / "assets.json" if assets else None
+        result, *notes = read_procthor(tmp_path / "house.json", "val", database, agent_part)
+        assert all(isinstance(note, Note) for note in notes)
+        assert not isinstance(result, Note)
         return result
 
     return read
@@ -39,4 +43,4 @@ def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
 @pytest.fixture
 def scene_of(read_house: Callable[..., Scene | InputError]) -> Callable[..., Scene]:
     """Return a reader of houses that must give a scene."""
-    return lambda *arguments: as_scene(read_house(*arguments))
+    return lambda *arguments, **options: as_scene(read_house(*arguments, **options))

@@ -41,7 +41,8 @@ def test_floors_of_a_mapped_house(tmp_path, maps):
 def test_every_way_to_name_a_split(tmp_path, maps):
     folder = tmp_path / "val"
     file = write_json(folder / "content" / "Home_episodes.json.gz", {"episodes": STARTS})
-    write_json(folder / "content" / "Home.json.gz", {"episodes": [episode(99.0, 0.0, 99.0)]})  # Habitat's, not SemExp's
+    for dummy in ("Home.json.gz", "Home.glb.json.gz"):  # Habitat's, not SemExp's
+        write_json(folder / "content" / dummy, {"episodes": [episode(99.0, 0.0, 99.0)]})
     whole = write_json(folder / "val.json.gz", {"episodes": []})
     for path in (folder, folder / "content", whole, file):
         assert [scene.name for scene in scenes_and_errors(read_habitat(path, "val", maps))[0]] == [

@@ -1,12 +1,16 @@
 """ProcTHOR houses to scenes: two rooms worked out by hand."""
 
+import json
+
 import numpy as np
 import pytest
-from support.importer_inputs.procthor import BOWL, HOUSE, build, door, item, point, wall
+from support.importer_inputs.procthor import ASSETS, BOWL, HOUSE, build, door, item, point, wall
 from support.lattice import block, points_of
 from support.mutations import changed
-from support.scene_records import assert_scenes_equal
+from support.scene_records import as_scene, assert_scenes_equal
 
+from jaxnav.scenes.files.importers.assemble import Note
+from jaxnav.scenes.files.importers.procthor import read_procthor
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.scenes.lattice import standable_cells
 
@@ -39,7 +43,8 @@ def test_two_rooms_worked_out_by_hand(scene_of):
 
 def test_a_shut_door_lets_neither_feet_nor_eyes_through(scene_of):
     scene = scene_of(changed(HOUSE, "doors", 0, "openness", 0))
-    assert points_of(scene, scene.reach) == ROOM_3
+    assert points_of(scene, scene.reach) == ROOM_2 | ROOM_3
+    assert len(standable_cells(scene.reach)) == len(ROOM_2)  # 121 cells; the agent's room has 106
     assert points_of(scene, scene.walls) == OUTER | INNER
 
 
@@ -98,8 +103,32 @@ def test_a_wall_on_the_border_of_cells_takes_both(scene_of):
     assert points_of(scene, scene.reach) == block(0.25, 1.75, 0.25, 1.75)
 
 
-def test_the_agent_tells_which_part_is_reached(scene_of):
+@pytest.mark.parametrize(
+    ("place", "part", "moved"),
+    [
+        ((5.0, 0.5), ROOM_3, 0),
+        ((2.51, 0.5), ROOM_2, 0),
+        ((0.01, 0.51), ROOM_2, 1),  # in the wall, one cell from the floor
+        ((4.0, 3.25), ROOM_3, 1),  # two cells from the floor
+    ],
+)
+def test_the_agents_part_is_kept_if_asked_for(tmp_path, place, part, moved):
     house = changed(HOUSE, "doors", [])
-    assert points_of(scene_of(house), scene_of(house).reach) == ROOM_3
-    house["metadata"]["agent"]["position"] = point(0.01, 0.95, 0.51)  # in the wall, one cell from the floor
-    assert points_of(scene_of(house), scene_of(house).reach) == ROOM_2
+    house["metadata"]["agent"]["position"] = point(place[0], 0.95, place[1])
+    (tmp_path / "house.json").write_text(json.dumps(house))
+    (tmp_path / "assets.json").write_text(json.dumps(ASSETS))
+    result, *notes = read_procthor(tmp_path / "house.json", "val", tmp_path / "assets.json", agent_part=True)
+    assert not isinstance(result, Note)
+    assert points_of(as_scene(result), as_scene(result).reach) == part
+    # 121 and 106 cells: the part that is not kept is the other one.
+    expected = {"cells are not connected with the agent and left out": 227 - len(part)}
+    expected |= {"agents are moved to the nearest free cell": 1} if moved else {}
+    assert {note.text: note.number for note in notes if isinstance(note, Note)} == expected
+
+
+def test_a_house_of_one_room_has_its_type(scene_of):
+    corners = [(0, 0), (0, 2), (2, 2), (2, 0)]
+    scene = scene_of(build(("LivingRoom", corners), objects=(BOWL,), agent=(1, 1)))
+    assert (scene.room_type, [room.type for room in scene.rooms]) == ("living_room", ["living_room"])
+    two = scene_of(build(("Bedroom", corners), ("Bedroom", [(x + 2, z) for x, z in corners]), objects=(BOWL,)))
+    assert two.room_type == "house"

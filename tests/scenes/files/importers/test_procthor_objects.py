@@ -1,19 +1,26 @@
 """Objects of ProcTHOR houses: types, sizes and parents."""
 
+import gzip
+import json
+
 import numpy as np
 import pytest
 from support.importer_inputs.procthor import ASSET_LISTS, BOWL, HOUSE, TABLE, item
 from support.lattice import block, points_of
 from support.mutations import changed
+from support.real_scenes import PROCTHOR, require
 from support.scene_records import assert_scenes_equal
 
+from jaxnav.scenes.files.importers.procthor_objects import Asset, read_assets, read_objects
+from jaxnav.scenes.files.record import Record
 from jaxnav.scenes.generate.sizes import typical_box
 
 
 @pytest.mark.parametrize(
     ("fields", "expected"),
     [
-        ({"objectType": "ObjaTrashCan", "id": "Bowl|2|0", "assetId": "Bowl_1"}, "ObjaTrashCan"),
+        ({"objectType": "ObjaTrashCan", "id": "Bowl|2|0", "assetId": "Bowl_1"}, "GarbageCan"),
+        ({"objectType": "ObjaBucket", "id": "Bowl|2|0", "assetId": "Bowl_1"}, "ObjaBucket"),
         ({"id": "Mug|surface|2|0", "assetId": "Bowl_1"}, "Bowl"),  # the asset database goes before the id
         ({"id": "Mug|surface|2|0", "assetId": "Mug_3"}, "Mug"),
         ({"id": "RemoteControl|2|0", "assetId": "Remote_1"}, "RemoteControl"),
@@ -34,6 +41,61 @@ def test_sizes_come_from_the_asset_database_turned_or_are_typical(scene_of):
     assert typical.boxes[0].tolist() == [4.5, 0.4, 1.5, *typical_box("DiningTable")[:3]]
     assert_scenes_equal(scene_of(HOUSE, ASSET_LISTS), scene_of(HOUSE))
     assert_scenes_equal(scene_of(HOUSE, {"Bowl_1": {"boundingBox": None}}), scene_of(HOUSE, None))
+
+
+L, C = "Countertop_L_10x8", "Countertop_C_8x6"
+
+
+@pytest.mark.parametrize(
+    ("asset", "yaw", "strips"),
+    [
+        # L at yaw 0, 3.0 x 2.4 m around (10, 20): along low z, 0.61 m deep, and along high x, the other 1.79 m.
+        (L, 0.0, [(10.0, 19.105, 3.0, 0.61), (11.195, 20.305, 0.61, 1.79)]),
+        # Turned clockwise by 90 degrees, +z comes to +x and +x to -z: along low x, and along low z.
+        (L, 90.0, [(9.105, 20.0, 0.61, 3.0), (10.305, 18.805, 1.79, 0.61)]),
+        (L, 180.0, [(10.0, 20.895, 3.0, 0.61), (8.805, 19.695, 0.61, 1.79)]),
+        # C at yaw 0, 2.4 x 1.8 m: along low z, high x and low x.
+        (C, 0.0, [(10.0, 19.405, 2.4, 0.61), (10.895, 20.305, 0.61, 1.19), (9.105, 20.305, 0.61, 1.19)]),
+        ("Countertop_I_8x6", 0.0, [(10.0, 20.0, 2.4, 1.8)]),
+    ],
+)
+def test_counters_around_a_corner_are_strips(asset, yaw, strips):
+    size = {"L": [3.0, 0.9, 2.4], "C": [2.4, 0.9, 1.8], "I": [2.4, 0.9, 1.8]}[asset[11]]
+    pot = item("Pot|2|1", "Pot_1", 10.0, 1.0, 19.3)
+    counter = item("CounterTop|2|0", asset, 10.0, 0.45, 20.0, yaw, children=[pot])
+    things = read_objects(Record("house", {"objects": [counter]}), {asset: Asset("CounterTop", size)}).things
+    boxes = np.array([thing.box for thing in things[:-1]])
+    np.testing.assert_allclose(boxes[:, [0, 2, 3, 5]], strips, atol=1e-9)
+    np.testing.assert_allclose(boxes[:, [1, 4]], [(0.45, 0.9)] * len(strips))
+    # Further strips rest on the first, as the pot does.
+    assert [thing.parent for thing in things] == [-1] + [0] * len(strips)
+    assert [thing.type for thing in things] == ["CounterTop"] * len(strips) + ["Pot"]
+
+
+def test_all_that_stands_on_real_counters_stands_on_their_strips():
+    assets = read_assets(require(PROCTHOR / "asset-database.json"))
+    corners, on_them = 0, 0
+    for file in ("100k", "ai2", "objaverse"):
+        lines = gzip.decompress((PROCTHOR / f"houses_{file}.jsonl.gz").read_bytes()).splitlines()
+        for things in (read_objects(Record("house", json.loads(line)), assets).things for line in lines):
+            boxes = np.array([thing.box for thing in things])[:, [0, 2, 3, 5]]
+            parents = np.array([thing.parent for thing in things])
+            counters = np.array([thing.type == "CounterTop" for thing in things])
+            for first in set(parents[counters & (parents >= 0)].tolist()):
+                strips = boxes[[first, *np.flatnonzero(counters & (parents == first))]]
+                items = boxes[~counters & (parents == first)]
+                away = np.abs(items[:, None, :2] - strips[:, :2]) - strips[:, 2:] / 2
+                assert (away.max(axis=2).min(axis=1) <= 0).all()
+                corners, on_them = corners + 1, on_them + len(items)
+    assert (corners, on_them) == (83, 1093)
+
+
+def test_the_name_of_a_counter_tells_its_size_in_feet():
+    counter = item("CounterTop|2|0", "Countertop_Island_10x3", 10.0, 0.47, 20.0)
+    objects = read_objects(Record("house", {"objects": [counter]}), {})
+    # 10 and 3 feet of 0.305 m.
+    assert objects.things[0].box == pytest.approx((10.0, 0.47, 20.0, 3.05, 0.94, 0.915))
+    assert (objects.types, objects.sizes) == (0, 0)
 
 
 def test_children_follow_their_parents(scene_of):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.importer_inputs.procthor import build, door, item, point
 from support.lattice import EIGHT, FOUR, parts_of
-from support.scene_records import as_scene
+from support.scene_records import scenes_and_errors
 
 from jaxnav.scenes.files.importers.procthor import read_procthor
 
@@ -85,8 +85,7 @@ def test_random_houses_equal_the_rules_point_by_point(tmp_path_factory, house):
     path.write_text(json.dumps(house.document()))
     assets = {"Fridge_1": {"boundingBox": point(house.fridge_size[0], 1.8, house.fridge_size[1])}}
     path.with_name("assets.json").write_text(json.dumps(assets))
-    (result,) = read_procthor(path, "train", path.with_name("assets.json"))
-    scene = as_scene(result)
+    (scene,), _ = scenes_and_errors(read_procthor(path, "train", path.with_name("assets.json")))
 
     x, z = np.meshgrid(
         *(first + 0.25 * np.arange(n) for first, n in zip(scene.origin, scene.reach.T.shape, strict=True))
@@ -99,9 +98,11 @@ def test_random_houses_equal_the_rules_point_by_point(tmp_path_factory, house):
     free = (x > 0) & (x < house.width) & (z > 0) & (z < house.depth)
     for box in [house.fridge_box(), *walls]:
         free &= np.hypot(*away(box)) >= 0.2 - 1e-9
+    np.testing.assert_array_equal(scene.reach, free)
     start = np.isclose(x, house.start[0]) & (z == house.start[1])
     parts = parts_of(free, EIGHT).labels
-    np.testing.assert_array_equal(scene.reach, parts == parts[start])
+    (agents, *_), _ = scenes_and_errors(read_procthor(path, "train", path.with_name("assets.json"), agent_part=True))
+    np.testing.assert_array_equal(agents.reach, parts == parts[start])
     np.testing.assert_array_equal(scene.walls, np.any([away(box).max(axis=0) <= 0.125 + 1e-9 for box in walls], axis=0))
     assert not (scene.reach & scene.walls).any()
     # Sight does not slip diagonally between wall cells, and passes an open door.

@@ -6,9 +6,9 @@ import json
 
 import pytest
 from hypothesis import given
-from support.importer_inputs.procthor import BOWL, HOUSE, point
+from support.importer_inputs.procthor import ASSETS, BOWL, HOUSE, TABLE, point
 from support.mutations import changed, mutated, mutated_text, without
-from support.scene_records import check_outcomes
+from support.scene_records import assert_scenes_equal, check_outcomes, scenes_and_errors
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.procthor import read_procthor
@@ -23,7 +23,6 @@ BAD = [
     (without(HOUSE, "walls"), "walls is missing"),
     (without(HOUSE, "doors"), "doors is missing"),
     (without(HOUSE, "objects"), "objects is missing"),
-    (without(HOUSE, "metadata", "agent"), "metadata: agent is missing"),
     (without(HOUSE, "doors", 0, "holePolygon"), "doors[0]: holePolygon is missing"),
     (without(HOUSE, "rooms", 0, "roomType"), "rooms[0]: roomType is missing"),
     (without(HOUSE, "walls", 2, "polygon", 1, "z"), "walls[2]: polygon[1]: z is missing"),
@@ -46,8 +45,12 @@ BAD = [
     (changed(HOUSE, "doors", 0, "openness", "wide"), "doors[0]: openness is 'wide'"),
     (changed(HOUSE, "objects", 0, "position", "y", NAN), "objects[0]: position: y is nan"),
     (changed(HOUSE, "objects", 0, "children", 0, BOWL | {"objectType": 5}), "objectType is 5"),
+    (changed(HOUSE, "objects", 0, TABLE | {"position": point(3, 0.4, 1.5), "assetId": "Hall"}), "have no floor 0.2 m"),
+]
+BAD_AGENTS = [
+    (without(HOUSE, "metadata", "agent"), "metadata: agent is missing"),
     (changed(HOUSE, "metadata", "agent", "position", "x", 4.9), "position holds [4.9, 0.5]"),
-    (changed(HOUSE, "metadata", "agent", "position", point(4.5, 0.9, 1.5)), "where the agent cannot stand"),
+    (changed(HOUSE, "metadata", "agent", "position", point(4.5, 0.9, 3.5)), "where the agent cannot stand"),  # 3 cells
     (changed(HOUSE, "metadata", "agent", "position", point(-500, 0.9, 1.5)), "where the agent cannot stand"),
 ]
 
@@ -58,22 +61,28 @@ def test_bad_houses_are_refused_with_their_place(tmp_path, read_house, house, pr
         with pytest.raises(InputError, match=problem):
             read_house(house)
         return
-    error = read_house(house)
+    error = read_house(house, ASSETS | {"Hall": {"boundingBox": point(6, 2, 6)}})
     assert isinstance(error, InputError)
     assert str(error).startswith(f"{tmp_path / 'house.json'}, line 1: house 'house-0'")
     assert problem in str(error)
+
+
+@pytest.mark.parametrize(("house", "problem"), BAD_AGENTS)
+def test_a_bad_place_of_the_agent_matters_only_if_its_part_is_asked_for(read_house, house, problem):
+    error = read_house(house, agent_part=True)
+    assert isinstance(error, InputError)
+    assert problem in str(error)
+    assert_scenes_equal(read_house(house), read_house(HOUSE))
 
 
 def test_the_other_houses_of_a_file_are_imported(tmp_path):
     path = tmp_path / "val.jsonl.gz"
     lines = [json.dumps(HOUSE), "{", "", json.dumps(without(HOUSE, "rooms")), json.dumps(HOUSE)]
     path.write_bytes(gzip.compress("\n".join(lines).encode()))
-    first, partial, bad, last = read_procthor(path, "val")
-    assert isinstance(first, Scene)
-    assert isinstance(last, Scene)
-    assert (first.name, last.name) == ("val-0", "val-3")
-    assert str(partial).startswith(f"{path}, line 2: not JSON")
-    assert str(bad).startswith(f"{path}, line 4: house 'val-2': rooms is missing")
+    scenes, (partial, bad) = scenes_and_errors(read_procthor(path, "val"))
+    assert [scene.name for scene in scenes] == ["val-0", "val-3"]
+    assert partial.startswith(f"{path}, line 2: not JSON")
+    assert bad.startswith(f"{path}, line 4: house 'val-2': rooms is missing")
 
 
 @pytest.mark.parametrize(
@@ -124,9 +133,9 @@ def test_mutated_houses_are_imported_or_refused(tmp_path):
     @given(mutated(HOUSE))
     def check(house):
         path.write_text(json.dumps(house) + "\n" + json.dumps(HOUSE))
-        *results, last = read_procthor(path, "train")
+        results = list(read_procthor(path, "train"))
         check_outcomes(results, outcomes, path)
-        assert isinstance(last, Scene)
+        assert [result.name for result in results if isinstance(result, Scene)][-1] == "houses-1"
 
     check()
     assert min(outcomes[Scene], outcomes[InputError]) >= 10

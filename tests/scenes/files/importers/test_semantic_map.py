@@ -1,6 +1,8 @@
 """Semantic floor maps: points, boxes, thin walls and damage."""
 
 import bz2
+import collections
+import math
 import pickle
 from pathlib import Path
 
@@ -13,7 +15,8 @@ from support.lattice import points_of
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.semantic_map import floor_map, read_maps, scene_of_map
-from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.files.walls import derive_walls
+from jaxnav.scenes.lattice import connected_parts, standable_cells
 from jaxnav.scenes.scene import Scene
 
 
@@ -23,35 +26,51 @@ def scene_of(tmp_path: Path, floor: dict) -> Scene:
 
 
 @pytest.mark.parametrize(
-    ("origin", "pixel", "points"),
+    ("origin", "block", "points"),
     [
-        # Pixel (10, 15): x from 2.00 + 0.50 m, z from -1.00 + 0.75 m: the lattice point x = 2.5, z = -(-0.25).
-        ((-100, 200), (10, 15), {(2.5, 0.25)}),
-        ((-98, 203), (9, 14), {(2.5, 0.25)}),  # x 2.48 to 2.53 and z -0.28 to -0.23 m
-        ((-98, 203), (10, 14), set()),  # x 2.53 to 2.58 m holds no multiple of 0.25
+        # Pixels 8-12 and 13-17: x from 2.40 to 2.65 m, z from -0.35 to -0.10 m. Their middles are from 2.425 to 2.625
+        # and from -0.325 to -0.125 m, and those at 2.625 and -0.125 are nearer to no point: they count above.
+        ((-100, 200), (slice(8, 13), slice(13, 18)), {(2.5, 0.25)}),  # 4 x 4 pixels here
+        ((-100, 200), (slice(7, 10), slice(12, 15)), {(2.5, 0.25)}),  # 3 x 3
+        ((-100, 200), (slice(7, 9), slice(12, 16)), {(2.5, 0.25)}),  # 2 x 4
+        ((-100, 200), (slice(7, 8), slice(9, 20)), set()),  # 11 pixels of a line, at most 5 in a cell
+        ((-98, 203), (slice(7, 9), slice(12, 16)), {(2.5, 0.25)}),  # x 2.38 to 2.48 and z -0.38 to -0.18 m
+        ((-103, 203), (slice(7, 9), slice(13, 16)), set()),  # 2 x 3
     ],
 )
-def test_the_pixel_under_a_lattice_point_decides(tmp_path, origin, pixel, points):
+def test_eight_of_the_pixels_around_a_point_make_it_standable(tmp_path, origin, block, points):
     floor = l_shaped_floor(origin=np.array(origin))
     floor["sem_map"][0] = 0
-    floor["sem_map"][0][pixel] = 1
+    floor["sem_map"][0][block] = 1
     try:
         scene = scene_of(tmp_path, floor)
     except InputError as error:
-        assert "floor 0: sem_map has no standable point" in str(error)  # noqa: PT017  (reading may also succeed)
+        assert "floor 0: sem_map has no cell with 8 pixels of layer 0" in str(error)  # noqa: PT017  (it may succeed)
         assert not points
     else:
         assert points_of(scene, scene.reach) == points
 
 
+def counted_points(floor: dict) -> set[tuple[float, float]]:
+    """Return the standable points, pixel by pixel, in half centimetres."""
+    counts = collections.Counter()
+    for i, j in np.argwhere(floor["sem_map"][0]).tolist():
+        middles = (2 * floor["origin"][k] + 10 * pixel + 5 for k, pixel in ((1, i), (0, j)))
+        counts[tuple(math.floor(middle / 50 + 0.5) for middle in middles)] += 1
+    return {(0.25 * x, -0.25 * z) for (x, z), count in counts.items() if count >= 8}
+
+
 def test_l_shaped_floor_with_a_chair(tmp_path):
-    scene = scene_of(tmp_path, l_shaped_floor())
-    # Lattice x 2.00 to 4.75 m (12 points), of which 2.00 to 3.25 (6) go on to all 12 of z; z -1.00 to 0.25 m (6).
-    points = {(2 + 0.25 * i, 1 - 0.25 * j) for i in range(12) for j in range(12) if i < 6 or j < 6}
-    # Around the chair pixels 36-53 and 0-17: x 3.80 to 4.70 m is 4.00, 4.25, 4.50; z -1.00 to -0.10 is -1.00 to -0.25.
-    points -= {(x, z) for x in (4.0, 4.25, 4.5) for z in (1.0, 0.75, 0.5, 0.25)}
-    assert points_of(scene, scene.reach) == points
-    assert len(standable_cells(scene.reach)) == len(points) == 96
+    floor = l_shaped_floor()
+    scene = scene_of(tmp_path, floor)
+    points = points_of(scene, scene.reach)
+    assert points == counted_points(floor)
+    # The floor ends at x = 2 m, where a cell has two columns of its pixels, and at 5 m, where it has three.
+    assert {(2.0, 0.0), (5.0, 0.0)} <= points
+    assert not {(1.75, 0.0), (5.25, 0.0)} & points
+    # Around the chair pixels 36-53 and 0-17 are x 3.80 to 4.70 m and z -1.00 to -0.10 m.
+    assert not {(x, z) for x in (4.0, 4.25, 4.5) for z in (1.0, 0.75, 0.5, 0.25)} & points
+    assert len(standable_cells(scene.reach)) == len(points)
     # Chair: pixels 40-49 and 4-13, so x 4.00 to 4.50 and Habitat's z -0.80 to -0.30 m; a chair is 0.95 m high.
     assert (scene.world, scene.room_type, scene.types) == ("gibson", "house", ("Chair",))
     np.testing.assert_allclose(scene.boxes, [[4.25, 0.48, 0.55, 0.5, 0.95, 0.5]], atol=1e-12)
@@ -73,23 +92,36 @@ def rooms_parted_by(strip: slice, door: slice) -> dict:
 
 
 def inner_walls(scene: Scene) -> np.ndarray:
-    """Return the walls without the outermost cells.
-
-    Those lie three from every standable one.
-    """
-    inner = np.zeros_like(scene.walls)
-    inner[1:-1, 1:-1] = scene.walls[1:-1, 1:-1]
-    return inner
+    """Return the walls without those far from everything."""
+    return scene.walls & ~derive_walls(scene.reach, scene.origin, scene.boxes)
 
 
 def test_a_long_thin_strip_between_floors_is_a_wall(tmp_path):
-    # Pixels 36-45 are x 1.80 to 2.30 m, their middle 2.05 m: cells at x = 2.00, index 8 + 3 of margin.
+    # Pixels 36-45 are x 1.80 to 2.30 m, their middle pixel 2.00 to 2.05 m: cells at x = 2.00, index 8 + 3 of margin.
     scene = scene_of(tmp_path, rooms_parted_by(slice(36, 46), slice(30, 45)))
     walls = np.argwhere(inner_walls(scene))
     assert set(walls[:, 1].tolist()) == {11}
-    # The door is at Habitat's z 1.50 to 2.25 m, so the cells from 1.50 to 2.00 m are floor. The last begins at 3.875 m.
+    # The door is at Habitat's z 1.50 to 2.25 m: two rows of pixels of the cell at 1.50 m and three of that at 2.25 m.
     z = [-(scene.origin[1] + 0.25 * iz) for iz in walls[::-1, 0].tolist()]
-    assert z == [*np.arange(0, 1.5, 0.25), *np.arange(2.25, 4.25, 0.25)]
+    assert z == [*np.arange(0, 1.5, 0.25), *np.arange(2.5, 4.25, 0.25)]
+
+
+@pytest.mark.parametrize("start", range(30, 35))
+@pytest.mark.parametrize("width", range(4, 13))
+def test_walls_part_the_floor_wherever_they_lie_on_the_lattice(tmp_path, start, width):
+    strip = slice(start, start + width)
+    scene = scene_of(tmp_path, rooms_parted_by(strip, slice(0, 0)))
+    assert len(connected_parts(scene.reach)) == 2
+    assert min(map(len, connected_parts(scene.reach))) >= 80  # at least 6 of 17 columns of 16 rows, less the chair
+    # A door of two cells joins them.
+    assert len(connected_parts(scene_of(tmp_path, rooms_parted_by(strip, slice(30, 40))).reach)) == 1
+
+
+@pytest.mark.parametrize(("door", "parts"), [(slice(31, 34), 1), (slice(30, 32), 1), (slice(31, 32), 2)])
+def test_narrow_doors_stay_open(tmp_path, door, parts):
+    # Pixels 31-33 are z 1.55 to 1.70 m, with no multiple of 0.25 m; two of them are in the cell at 1.75 m.
+    scene = scene_of(tmp_path, rooms_parted_by(slice(36, 46), door))
+    assert len(connected_parts(scene.reach)) == parts
 
 
 @pytest.mark.parametrize(
@@ -117,7 +149,7 @@ def test_wide_short_or_narrow_strips_are_no_walls(tmp_path, strip, door):
         ({"sem_map": np.zeros((16, 0, 4))}, r"sem_map is no array \[16, H, W\]"),
         ({"sem_map": np.full((16, 4, 4), np.nan)}, "sem_map holds other values"),
         ({"sem_map": np.full((16, 4, 4), 2)}, "sem_map holds other values"),
-        ({"sem_map": np.zeros((16, 40, 40))}, "sem_map has no standable point"),
+        ({"sem_map": np.zeros((16, 40, 40))}, "sem_map has no cell with 8 pixels"),
         ({"sem_map": np.pad(np.ones((1, 40, 40)), ((0, 15), (0, 0), (0, 0)))}, "sem_map has no object"),
     ],
 )
