@@ -75,6 +75,7 @@ def evaluate(
     setting: EstimatorName | None = None,
     hold: bool = False,
     seed: int = 0,
+    world: CompiledWorld | None = None,
     console: Console | None = None,
 ) -> Results:
     """Evaluate a run on fixed episodes, in one compiled call.
@@ -89,6 +90,7 @@ def evaluate(
       form: how sTDE combines the logits; None for that of the run's layout setting.
       setting, hold: layout estimator to use instead of the run's; see `Policies.estimating`.
       seed: of the episode list and the sampled actions, from 0 to 2**32 - 1.
+      world: of `evaluation_world` with these arguments, where it is compiled already.
       console: to tell of progress on; None for silence.
 
     Raises:
@@ -100,7 +102,7 @@ def evaluate(
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
-    world = evaluation_world(config, split, scenes, shift, console)
+    world = world or evaluation_world(config, split, scenes, shift, console)
     lists, outcome, compilations = run_rows(rows, policies, world, episodes, seed)
     shortest = oracle_outcome(world.banks, lists, read_ahead(world, range(len(world.banks))), world.env)
     rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)
