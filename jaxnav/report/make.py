@@ -33,7 +33,7 @@ def make_report(run: Run, beside: Run | None, options: Options, console: Console
         "Training runs": f"{run.config.seeds} of each arm",
         "Steps": f"{about['steps_per_policy']:,} a policy",
         "Episodes": f"{first['episodes']:,} at each shift",
-        "Made with": ", ".join(f"{name} {version}" for name, version in report["versions"].items()),
+        "Made with": ", ".join(f"{name} {report['versions'][name]}" for name in ("jaxnav", "jax")),
     }
     title = f"{run.config.method.upper()} in {first['world']}"
     sections = make_sections(run, by_shift, options.threshold)

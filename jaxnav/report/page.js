@@ -109,11 +109,11 @@
       ...KINDS.map((kind, i) => element("b", { style: `color: var(--${["blue", "pale", "orange"][i]})` }, kind)));
     const root = element("article", { className: "side" }, choice,
       element("p", { className: "status" }, doing, ending(course)), drawing,
-      element("h3", {}, "Gap and weight of removal", level), drawCourse(gap, weight, thresholds[player], cursor),
+      element("h3", {}, "Layout gap", level), drawCourse(gap, weight, thresholds[player], cursor),
       element("h3", {}, "Action", key), actions,
       element("div", { className: "pair" },
         element("div", {}, element("h3", {}, "Detected now"), seen),
-        element("div", {}, element("h3", {}, "Layout towards the goal"), layouts)));
+        element("div", {}, element("h3", {}, "Goal expected beside"), layouts)));
 
     function update(step) {
       const at = Math.min(step, course.actions.length - 1), view = plan.views[course.views[at]];
@@ -125,7 +125,7 @@
         ...drawView(view, unit, episode.goal));
       const action = course.actions[at], ended = step >= course.actions.length;
       doing.textContent = ended ? `ended at step ${at + 1}` : `step ${at + 1}: ${ACTIONS[action]}`;
-      level.textContent = `${gap[at].toFixed(2)}, ${weight[at].toFixed(2)}`;
+      level.textContent = `D ${gap[at].toFixed(2)}, removed with weight ${weight[at].toFixed(2)}`;
       for (const end of ["x1", "x2"]) cursor.setAttribute(end, at + 0.5);
       actions.replaceChildren(...ACTIONS.flatMap((name, i) => {
         const three = KINDS.map((_, kind) => chances[(at * 3 + kind) * ACTIONS.length + i]);
@@ -185,10 +185,10 @@
 
   function listEpisodes() {
     const { episodes, plans, categories, differ, evaluated, players, split } = shown();
-    const [left, right] = state.players;
-    part("count").textContent = left === right ? `${episodes.length} of ${evaluated} episodes, ${split}.`
+    const [left, right] = state.players, whole = evaluated.toLocaleString("en");
+    part("count").textContent = left === right ? `${episodes.length} of ${whole} episodes, ${split}.`
       : `“${players[left]}” and “${players[right]}” end differently, or at another step, in ${differ[left][right]} of `
-        + `${evaluated} episodes (${split}). ${episodes.length} can be replayed, those that differ first.`;
+        + `${whole} episodes (${split}). ${episodes.length} can be replayed, those that differ first.`;
     part("episodes").replaceChildren(...order().map((index) => {
       const episode = episodes[index], button = element("button", { type: "button" },
         element("strong", {}, categories[episode.goal]), element("small", {}, plans[episode.plan].name),
@@ -230,8 +230,8 @@
   function chooseShift(index) {
     const { players, thresholds } = shifts[index], removing = thresholds.findIndex((threshold) => threshold !== null);
     // Without and with removal, where there is one.
-    const pair = removing > 0 ? [removing - 1, removing] : [0, players.length - 1];
-    Object.assign(state, { shift: index, players: pair });
+    const compared = removing > 0 ? [removing - 1, removing] : [0, players.length - 1];
+    Object.assign(state, { shift: index, players: compared });
     if (shifts.length > 1) part("shifts").replaceChildren(...shifts.map(({ shift }, i) => {
       const button = element("button", { type: "button", ariaPressed: String(i === index) }, `Shift ${shift}`);
       button.addEventListener("click", () => chooseShift(i));
@@ -271,7 +271,7 @@
   part("replays").addEventListener("keydown", (event) => {
     const { key, target } = event, native = target.tagName;
     const taken = native === "SELECT" || (native === "BUTTON" && key === " ") || (native === "INPUT" && key.startsWith("Arrow"));
-    if (taken || event.ctrlKey || event.metaKey || event.altKey || !(key in keys)) return;
+    if (taken || event.ctrlKey || event.metaKey || event.altKey || !Object.hasOwn(keys, key)) return;
     event.preventDefault();
     keys[key]();
   });

@@ -19,7 +19,7 @@ from jaxnav.report.content import Section, Table, as_texts
 from jaxnav.report.gather import Measured
 from jaxnav.runs.directory import Run
 from jaxnav.study.curves import GapCourse, GapLine, GapPanel
-from jaxnav.study.gap_course import BELIEFS
+from jaxnav.study.gap_course import BELIEFS, shortest
 from jaxnav.study.gap_statistics import mean_by_step
 
 RESULTS = (
@@ -38,8 +38,8 @@ THRESHOLDS = (
     "actions; bands are 95 % intervals."
 )
 GAP = (
-    "The gap D after each action, over the episodes that still run, with the belief updated by what is seen and "
-    "left at the prior. Sampled actions, nothing removed."
+    "The gap D after each action, over the episodes that still run, with the belief updated by what is seen, "
+    "and frozen at the prior. Sampled actions; nothing is removed."
 )
 SIMILARITY = (
     "Success of {row} against the similarity of the goal's surroundings to those in training: the cosine of its "
@@ -70,7 +70,7 @@ def _results(reports: Mapping[float, dict[str, Any]], threshold: float) -> Secti
         short = _at(report, threshold)
         tables.append(as_texts(f"Shift {shift:g}", console_table(short)))
         if short["differences"]:
-            tables.append(as_texts(f"Shift {shift:g}, paired differences", difference_table(short)))
+            folded.append(as_texts(f"Shift {shift:g}, paired differences", difference_table(short)))
         if len(short["rows"]) < len(report["rows"]):
             folded.append(as_texts(f"Shift {shift:g}, every threshold", console_table(report)))
         notes += report["notes"]
@@ -102,17 +102,18 @@ def _account(by_shift: Mapping[float, Measured], threshold: float) -> Section | 
 
 
 def _gap(run: Run, by_shift: Mapping[float, Measured]) -> Section | None:
-    gaps = {shift: each.gaps for shift, each in by_shift.items() if each.gaps is not None}
-    if not gaps:
+    traces = [each.gaps for each in by_shift.values() if each.gaps is not None]
+    if not traces:
         return None
-    steps = min(int(trace.running.any(axis=(0, 1)).sum()) for trace in gaps.values())
-    lines = []
-    for shift, trace in gaps.items():
-        mean = mean_by_step(trace._replace(gap=trace.gap[..., :steps], running=trace.running[..., :steps]))
-        lines += [GapLine(shift, belief, mean.line(0, which)) for belief, which in BELIEFS.items()]
-    running = [trace.running[..., :steps].mean(axis=(0, 1)) for trace in gaps.values()]
+    traces = shortest(traces)
+    lines = [
+        GapLine(shift, belief, mean.line(0, which))
+        for shift, mean in zip(by_shift, map(mean_by_step, traces), strict=True)
+        for belief, which in BELIEFS.items()
+    ]
+    running = np.stack([trace.running.mean(axis=(0, 1)) for trace in traces])
     panel = GapPanel(run.config.layout.setting, tuple(lines))
-    return Section("The gap", GAP, (gap_chart(GapCourse(tuple(range(steps)), np.stack(running), (panel,), ())),))
+    return Section("The gap", GAP, (gap_chart(GapCourse(tuple(range(running.shape[1])), running, (panel,), ())),))
 
 
 def _similarity(by_shift: Mapping[float, Measured]) -> Section | None:

@@ -1,5 +1,6 @@
 """The picture of an episode shows every step, and the view cone ends at walls."""
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 from PIL.GifImagePlugin import GifImageFile
@@ -21,7 +22,7 @@ def test_a_picture_has_a_frame_per_step(tmp_path):
     for chosen in action[:-1]:
         pose.append(int(tiny.BANK.successor[pose[-1], chosen]))
     gap, logits = np.linspace(0.9, 0.2, len(pose)), np.zeros((len(pose), NUM_ACTIONS))
-    inferred = Inferred(np.ones((len(pose), 1)), gap, gap - 0.1, logits, logits, logits)
+    inferred = Inferred(*map(jnp.asarray, (np.ones((len(pose), 1)), gap, gap - 0.1, logits, logits, logits)))
     trace = Trace(np.array(pose), np.array(action), inferred, success=False)
     scene = (tiny.KITCHEN, tiny.BEDROOM)[episodes.scene[0]]
     cells = cell_centres(scene, standable_cells(scene.reach))

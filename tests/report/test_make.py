@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from jaxnav.evaluation.accounting import accounting_table
 from jaxnav.evaluation.report_tables import console_table
 from jaxnav.report.gather import Options, measure
 from jaxnav.report.make import make_report
-from jaxnav.report.replays import choose
+from jaxnav.report.replays import Player, choose
 from jaxnav.report.sections import make_sections
 from jaxnav.runs.account import account
 from jaxnav.scenes.tables.detector import Detector
@@ -50,9 +51,9 @@ def unpack(text, *shape):
 
 def printed(table):
     """The numbers of a terminal's table, in order."""
-    console = Console(file=io.StringIO(), width=400)
-    console.print(table)
-    return re.findall(r"[-+]?\d+\.\d+", console.file.getvalue())
+    text = io.StringIO()
+    Console(file=text, width=400).print(table)
+    return re.findall(r"[-+]?\d+\.\d+", text.getvalue())
 
 
 @pytest.mark.slow
@@ -125,16 +126,18 @@ def test_a_page_of_sixty_episodes_is_small(run, measured):
 
 
 def test_the_most_disputed_episodes_come_first():
-    class Other:
-        def __init__(self, length):
-            self.length = np.array(length)
+    def player(success, length):
+        nothing: Any = None
+        return Player("", nothing, nothing, nothing, np.array(success, bool), np.array(length))
 
-        def differs(self, other):
-            return self.length != other.length
-
-    # Pairs that differ, by episode: none, two of three, all three, two of three.
-    players = [Other([1, 1, 1, 1]), Other([1, 1, 2, 1]), Other([1, 2, 3, 2])]
+    # Pairs that differ, by episode: none; two of three; all three; two of three, in success alone.
+    players = [
+        player([1, 1, 1, 1], [4, 4, 4, 4]),
+        player([1, 1, 1, 1], [4, 4, 5, 4]),
+        player([1, 1, 1, 0], [4, 5, 6, 4]),
+    ]
     assert choose(players, 3).tolist() == [2, 1, 3]
+    assert choose(players, 9).tolist() == [2, 1, 3, 0]
 
 
 def test_what_is_refused_is_refused_before_anything_is_run(run, tmp_path, monkeypatch):
