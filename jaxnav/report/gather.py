@@ -11,7 +11,8 @@ from jaxnav.evaluation.accounting import Entry
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.report_tables import label
 from jaxnav.evaluation.similarity import scene_counts
-from jaxnav.report.replays import Player, Replays, make_replays
+from jaxnav.report.players import Player
+from jaxnav.report.replays import Replays, make_replays
 from jaxnav.runs.account import leads
 from jaxnav.runs.directory import Run
 from jaxnav.runs.evaluate import Results, evaluate
@@ -100,7 +101,8 @@ def measure(run: Run, beside: Run | None, shift: float, options: Options, consol
         other = evaluation_world(beside.config, options.split, None, shift, Console(quiet=True))
         known = options.evaluate(beside, shift, other, Console(quiet=True))
         entries = leads(results, known)
-        players += [p for p in _players(known, beside.policies(), other, options.threshold) if p.row.arm == "baseline"]
+        others = _players(known, beside.policies(), other, options.threshold)
+        players += [player._replace(role="without") for player in others if player.role == "baseline"]
     first = _first_bank(results.episodes, world)
     alone = len(world.banks) == 1
     return Measured(
@@ -119,7 +121,7 @@ def _players(results: Results, policies: Policies, world: CompiledWorld, thresho
         if row.decoding != "argmax" or row.variant in ("oracle", "tde") or row.epsilon not in (None, threshold):
             continue
         success, length = (np.asarray(leaf)[i, 0, :count] for leaf in (results.outcome.success, results.outcome.length))
-        players.append(Player(label(results.report["rows"][i]), policies, world, row, success, length))
+        players.append(Player(row.variant, label(results.report["rows"][i]), policies, world, row, success, length))
     return players
 
 

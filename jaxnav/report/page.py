@@ -26,7 +26,7 @@ def render(title: str, facts: Mapping[str, str], sections: Sequence[Section], re
       sections: in order; the replays follow the first.
       replays: at each shift.
     """
-    script = _file("page.js")
+    script = _file("draw.js") + _file("player.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     rendered = [_section(section) for section in sections]
     titles = [sections[0].title, "Replays", *(section.title for section in sections[1:])]

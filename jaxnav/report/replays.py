@@ -2,43 +2,16 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import softmax
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.playback import Trace
-from jaxnav.evaluation.variants import Row
 from jaxnav.report.plans import Plan, make_plan, pack
-from jaxnav.runs.policies import Policies
+from jaxnav.report.players import Player, choose, compare
 from jaxnav.runs.replay import replay, scene_named
-from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.tables.detector import MAX_RANGE
-
-
-class Player(NamedTuple):
-    """Hold an agent, and how it fared in the evaluation.
-
-    Attributes:
-      name: the row, as tables name it.
-      policies: of its run.
-      world: its scenes, the same for all players.
-      row: of the evaluation, with best actions.
-      success: bool [E], of the first seed.
-      length: int [E], actions.
-    """
-
-    name: str
-    policies: Policies
-    world: CompiledWorld
-    row: Row
-    success: np.ndarray
-    length: np.ndarray
-
-    def differs(self, other: "Player") -> np.ndarray:
-        """Return which episodes end otherwise, or at another step, bool [E]."""
-        return (self.success != other.success) | (self.length != other.length)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +62,7 @@ class Replays:
       split: of the scenes.
       categories: names.
       players: names; what tables call the rows.
+      comparisons: pairs of players by name, what is with and what is without; the first is shown first.
       thresholds: of sTDE, by player; None where nothing is removed.
       differ: [P, P], in how many of the evaluation's episodes two players end otherwise or at another step.
       evaluated: number of these.
@@ -102,6 +76,7 @@ class Replays:
     split: str
     categories: list[str]
     players: list[str]
+    comparisons: dict[str, tuple[int, int]]
     thresholds: list[float | None]
     differ: list[list[int]]
     evaluated: int
@@ -109,19 +84,6 @@ class Replays:
     reach: int
     plans: list[Plan]
     episodes: list[Episode]
-
-
-def choose(players: Sequence[Player], count: int) -> np.ndarray:
-    """Choose the episodes to replay, indices in order.
-
-    Those in which most pairs of players differ come first, then those that come first in the list.
-
-    Args:
-      players: at least one.
-      count: of episodes, or as many as there are.
-    """
-    pairs = sum((a.differs(b).astype(int) for a in players for b in players), start=np.zeros_like(players[0].length))
-    return np.argsort(-pairs, kind="stable")[:count]
 
 
 def make_replays(players: Sequence[Player], episodes: EpisodeList, count: int, shift: float, split: str) -> Replays:
@@ -133,7 +95,8 @@ def make_replays(players: Sequence[Player], episodes: EpisodeList, count: int, s
       count: of episodes to replay.
       shift, split: of the scenes.
     """
-    bank, world = players[0].world.banks[0], players[0].world
+    world = players[0].world
+    bank, rules = world.banks[0], world.banks[0].task.rules
     chosen = episodes.take(choose(players, count))
     played = [replay(player.policies, player.world, chosen, player.row) for player in players]
     scenes = np.unique(chosen.scene)
@@ -142,12 +105,12 @@ def make_replays(players: Sequence[Player], episodes: EpisodeList, count: int, s
         for scene in scenes
     ]
     of = np.searchsorted(scenes, chosen.scene)
-    rules = bank.task.rules
     return Replays(
         shift=shift,
         split=split,
         categories=list(bank.task.categories),
         players=[player.name for player in players],
+        comparisons=compare(players),
         thresholds=[player.row.epsilon for player in players],
         differ=[[int(a.differs(b).sum()) for b in players] for a in players],
         evaluated=len(episodes.goal),

@@ -34,6 +34,11 @@ for (let step = 0; step <= Number(slider.max); step++) {
 }
 for (const key of ["ArrowLeft", "ArrowLeft", "ArrowRight", "x"]) { press(key); read(); }
 const goals = by("#episodes strong").map((goal) => goal.textContent);
+const agents = () => by("select").map((choice) => choice.selectedIndex);
+const before = agents();
+by("#comparisons button")[1].click();
+const swapped = agents();
+by("#comparisons button")[0].click();
 press("n");
 const after = document.querySelector('#episodes [aria-current="true"] strong').textContent;
 press("p");
@@ -44,7 +49,7 @@ setTimeout(() => {
   const verdict = document.createElement("pre");
   verdict.id = "verdict";
   verdict.textContent = JSON.stringify({
-    seen, goals, after, playing, stopped: document.getElementById("play").textContent,
+    seen, goals, after, playing, before, swapped, stopped: document.getElementById("play").textContent,
     count: document.getElementById("count").textContent, options: by("option").map((option) => option.textContent),
   });
   document.body.append(verdict);
@@ -93,6 +98,10 @@ def test_keys_step_and_change_the_episode(driven):
     goals = [replays().categories[each.goal] for each in reversed(replays().episodes)]
     assert driven["goals"] == goals  # those that differ come first
     assert driven["after"] == goals[1]
+
+
+def test_a_comparison_chooses_both_agents(driven):
+    assert (driven["before"], driven["swapped"]) == ([0, 1], [1, 0])
 
 
 def test_the_button_plays_to_the_end(driven):

@@ -19,7 +19,7 @@ from jaxnav.evaluation.accounting import accounting_table
 from jaxnav.evaluation.report_tables import console_table
 from jaxnav.report.gather import Options, measure
 from jaxnav.report.make import make_report
-from jaxnav.report.replays import Player, choose
+from jaxnav.report.players import Player, choose
 from jaxnav.report.sections import make_sections
 from jaxnav.runs.account import account
 from jaxnav.scenes.tables.detector import Detector
@@ -82,6 +82,7 @@ def test_courses_end_as_in_the_evaluation(measured, evaluated):
     differ = (success[:, None] != success) | (length[:, None] != length)  # [P, P, E]
     assert replays.differ == differ.sum(axis=-1).tolist()
     assert replays.evaluated == 24
+    assert replays.comparisons == {"Removal": (1, 2), "Experience": (1, 3), "Layout weights": (1, 0)}
     order = np.argsort(-differ.sum(axis=(0, 1)), kind="stable")[:10]
     assert differ.any()
     for episode, index in zip(replays.episodes, order, strict=True):
@@ -128,7 +129,7 @@ def test_a_page_of_sixty_episodes_is_small(run, measured):
 def test_the_most_disputed_episodes_come_first():
     def player(success, length):
         nothing: Any = None
-        return Player("", nothing, nothing, nothing, np.array(success, bool), np.array(length))
+        return Player("layout", "", nothing, nothing, nothing, np.array(success, bool), np.array(length))
 
     # Pairs that differ, by episode: none; two of three; all three; two of three, in success alone.
     players = [

@@ -41,6 +41,7 @@ def replays(name=""):
         split="val",
         categories=[category + name for category in tiny.CATEGORIES],
         players=["layout" + name, "removed" + name],
+        comparisons={"Removal" + name: (0, 1), "Other" + name: (1, 0)},
         thresholds=[None, 0.5],
         differ=[[0, 7], [7, 0]],
         evaluated=24,
