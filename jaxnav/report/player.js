@@ -47,15 +47,15 @@ function makeSide(number) {
       const three = KINDS.map((_, kind) => chances[(at * 3 + kind) * ACTIONS.length + i]);
       return bar(name, three, KINDS, i === action ? "chosen" : "");
     }));
-    list(seen, view.seen.map(([category, , , sure]) => [sure / 100, category]), 1);
+    list(seen, view.seen.map(([category, , , sure]) => [sure / 100, category]), 1, "nothing");
     const known = Array.from(layout.slice(at * categories.length, (at + 1) * categories.length), (w, i) => [w, i]);
     const others = known.filter(([w, i]) => w > 0 && i !== episode.goal).sort((a, b) => b[0] - a[0]);
-    list(layouts, others, others.length ? others[0][0] : 1);
+    list(layouts, others, others.length ? others[0][0] : 1, "no layout");
   }
-  function list(where, shares, whole) {
+  function list(where, shares, whole, none) {
     const bars = shares.slice(0, MOST).flatMap(([share, category]) =>
       bar(categories[category], [share], [category === episode.goal ? "sought" : "other"], "", whole));
-    where.replaceChildren(...(bars.length ? bars : [element("span", { className: "none" }, "nothing")]));
+    where.replaceChildren(...(bars.length ? bars : [element("span", { className: "none" }, none)]));
   }
 
   return { root, update };
