@@ -35,7 +35,7 @@ class View:
     Attributes:
       x, z: of the agent.
       yaw: degrees clockwise from +z.
-      cone: packed, the depths of the view cone's rays from left to right, as shares of `MAX_RANGE`.
+      cone: packed, the depths of every other ray of the view cone from left to right, as shares of `MAX_RANGE`.
       seen: index of the category, x, z and confidence in percent of each detection, the surest first.
     """
 
@@ -118,7 +118,7 @@ def _views(scene: Scene, bank: Bank, index: int, poses: np.ndarray) -> list[View
         heading = int(pose) // len(rules.horizons) % rules.headings
         yaw = 360.0 / rules.headings * heading
         outline = view_cone(scene, rules, place, yaw)
-        depth = np.linalg.norm(outline[1:] - place, axis=1) / MAX_RANGE
+        depth = np.linalg.norm(outline[1::2] - place, axis=1) / MAX_RANGE
         detections = row_format.detections(bank.rows[pose])
         seen = sorted(np.flatnonzero(detections[:, 0]), key=lambda i: -int(detections[i, 0]))
         points = _centimetres(detected_places(detections[seen], place, rules.directions()[heading]))
