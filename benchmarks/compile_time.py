@@ -72,8 +72,9 @@ def entries() -> Iterator[tuple[str, Callable[[], Any]]]:
     rows = [table_row("layout", None, None, "sample"), table_row("stde", 0.5, "residual", "sample")]
     grid, episodes = inference_grid(rows, config.arms, 1), episode_list(setup.world.banks[0])
     yield "evaluate", partial(Evaluator(acting), grid, weights, [(episodes, params)], knowledge, key)
-    cell, one, start = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (grid, weights, first_states(episodes)))
-    yield "play", lambda: play(cell, one, start, acting, params, knowledge).action
+    cell, one = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (grid, weights))
+    start = jax.tree.map(lambda leaf: leaf[:1], first_states(episodes))
+    yield "play", lambda: play(cell, one, start, acting, params, knowledge)[0].action
 
 
 def training(trainer: Trainer, params: Any) -> Callable[[], Any]:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("cli",),
+    ("report",),
     ("study",),
     ("viz",),
     ("runs",),

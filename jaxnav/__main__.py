@@ -11,6 +11,7 @@ COMMANDS = {
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
     "account": "say what experience is worth, beside a run of agents without any",
     "mixture": "remove experience where half of the scenes are shifted: what is kept, recovered, known",
+    "report": "show a run on one page: tables, curves and replays side by side",
     "export": "export a policy with its model card, also as a program that runs without jaxnav",
     "episode": "draw one evaluation episode of a run",
     "instrument": "prove that the layout shift leaves the difficulty and costs the baseline",

@@ -46,7 +46,7 @@ def test_the_version_is_printed(capsys):
 
 @pytest.mark.parametrize(
     ("wrong", "mend"),
-    [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, mixture, export, episode")],
+    [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, mixture, report, export, ")],
 )
 def test_unknown_commands_are_refused_with_a_hint(wrong, mend, capsys):
     assert main([wrong]) == 2
@@ -56,7 +56,7 @@ def test_unknown_commands_are_refused_with_a_hint(wrong, mend, capsys):
 def test_commands_get_the_other_arguments(tmp_path, capsys):
     assert main([]) == 0
     assert "episode" in capsys.readouterr().out
-    for command in ("eval", "episode"):
+    for command in ("eval", "episode", "report"):
         assert main([command, str(tmp_path / "nowhere")]) == 2
         assert "nowhere: holds no run" in re.sub(r"\s+", " ", capsys.readouterr().err)
 

@@ -35,6 +35,11 @@ class EpisodeList(NamedTuple):
         """Return the floor plan of each episode, [E]; see `floor_plan`."""
         return np.array([floor_plan(name) for name in self.scenes])[self.scene]
 
+    def take(self, chosen: np.ndarray) -> "EpisodeList":
+        """Return the chosen episodes; bool [E], or indices."""
+        fields = ("scene", "goal", "pose", "best_length", "room")
+        return self._replace(**{name: getattr(self, name)[chosen] for name in fields})
+
     def clusters(self) -> Clusters:
         """Return the floor plans as clusters, within room types."""
         return scene_clusters(self.plan, self.room)

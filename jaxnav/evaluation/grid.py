@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.inference import Inference, counterfactual_logits, gap_used, remove
+from jaxnav.evaluation.inference import Inference, Inferred, counterfactual_logits, gap_used, remove
 from jaxnav.policies.acting import Acting, Agent, Taken, carried, select
 from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.policy import Params, Policy
@@ -165,8 +165,8 @@ def _run_episodes(
 
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome, keys = progress
-        after, taken, weight = act(cell, policy, agent, running, keys, acting, params, knowledge, removes)
-        outcome = outcome.after(running, carried(taken.agent).action, taken, weight)
+        after, taken, inferred = act(cell, policy, agent, running, keys, acting, params, knowledge, removes)
+        outcome = outcome.after(running, carried(taken.agent).action, taken, inferred.weight)
         return _Progress(select(running, after, agent), running & ~taken.ended, outcome, keys)
 
     progress = _Progress(agent, jnp.ones(count, bool), Outcome.start(count), keys)
@@ -194,7 +194,7 @@ def act(
     params: EnvParams,
     knowledge: Knowledge,
     removes: bool = True,
-) -> tuple[Agent, Taken, jax.Array]:
+) -> tuple[Agent, Taken, Inferred]:
     """Decide, remove experience and act, once in E episodes.
 
     Args:
@@ -209,7 +209,7 @@ def act(
       removes: whether experience may be removed.
 
     Returns:
-      The agent after the step, what came of it, and the weight float32 [E] of what was removed.
+      The agent after the step, what came of it, and how the action was inferred.
     """
     memory = carried(agent)
     view = acting.view(agent, knowledge, params)
@@ -217,13 +217,14 @@ def act(
     pathways = policy.pathways(*view, memory)
     decision = policy.decide(pathways, memory)
     step_keys = jax.vmap(jax.random.fold_in)(keys, agent.state.time)
-    logits, weight = decision.logits, jnp.zeros(running.shape)
+    logits = counterfactual = decision.logits
+    gap, weight = acting.gap(agent), jnp.zeros(running.shape)
     if removes:
         counterfactual = counterfactual_logits(cell, policy, pathways, memory, keys, step_keys)
-        gap = gap_used(cell, acting.gap(agent), running, keys, agent.state.time)
+        gap = gap_used(cell, gap, running, keys, agent.state.time)
         logits, weight = remove(cell, logits, counterfactual, gap)
     logits = jnp.where(cell.uniform, 0.0, logits)
     sampled = jax.vmap(jax.random.categorical)(step_keys, logits)
     choice = jnp.where(cell.greedy, jnp.argmax(logits, axis=-1), sampled).astype(jnp.int32)
     after, taken = acting.step(agent, choice, knowledge, params, policy=policy, decision=decision)
-    return after, taken, weight
+    return after, taken, Inferred(view.weights, gap, weight, decision.logits, counterfactual, logits)

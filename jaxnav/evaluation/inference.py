@@ -2,6 +2,7 @@
 
 import enum
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,26 @@ class Inference(struct.PyTreeNode):
     end: jax.Array
     intervention: jax.Array
     branch: jax.Array
+
+
+class Inferred(NamedTuple):
+    """Hold how actions were inferred at one step, leaves [E, ...].
+
+    Attributes:
+      layout: float32 [K], the layout's weights for the goal (eq. 7); ones without the layout.
+      gap: float32, layout gap by which experience was removed.
+      weight: float32, of the logits that were removed.
+      factual: float32 [A], logits of the decision.
+      counterfactual: float32 [A], logits to remove; those of the decision where nothing can be removed.
+      corrected: float32 [A], logits that chose the action.
+    """
+
+    layout: jax.Array
+    gap: jax.Array
+    weight: jax.Array
+    factual: jax.Array
+    counterfactual: jax.Array
+    corrected: jax.Array
 
 
 def gap_used(cell: Inference, gap: jax.Array, running: jax.Array, keys: jax.Array, time: jax.Array) -> jax.Array:

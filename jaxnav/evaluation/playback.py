@@ -1,5 +1,6 @@
-"""One evaluation episode, step by step: what was seen, believed and done."""
+"""Evaluation episodes, step by step: what was seen, believed, inferred and done."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -8,8 +9,8 @@ import numpy as np
 
 from jaxnav.env.types import EnvParams, State
 from jaxnav.evaluation.grid import act
-from jaxnav.evaluation.inference import Inference
-from jaxnav.policies.acting import Acting, Agent, Taken, carried
+from jaxnav.evaluation.inference import Inference, Inferred
+from jaxnav.policies.acting import Acting, Agent, carried, select
 from jaxnav.policies.methods import Knowledge
 from jaxnav.policies.policy import Params
 
@@ -20,14 +21,29 @@ class Trace(NamedTuple):
     Attributes:
       pose: int32 [T], pose at which each action was chosen.
       action: int32 [T]; only the last can be Done.
-      gap: float32 [T], layout gap D.
+      inferred: how each action was inferred, leaves [T, ...].
       success: whether the episode ended with Done where it succeeds.
     """
 
     pose: np.ndarray
     action: np.ndarray
-    gap: np.ndarray
+    inferred: Inferred
     success: bool
+
+    @property
+    def gap(self) -> np.ndarray:
+        """Return the layout gap D, float32 [T]."""
+        return np.asarray(self.inferred.gap)
+
+
+class _Step(NamedTuple):
+    """Hold one step of E episodes, leaves [E, ...]."""
+
+    pose: jax.Array
+    action: jax.Array
+    inferred: Inferred
+    success: jax.Array
+    running: jax.Array
 
 
 def play(
@@ -37,32 +53,53 @@ def play(
     acting: Acting,
     params: EnvParams,
     knowledge: Knowledge,
-) -> Trace:
-    """Play one episode to its end, step by step.
+) -> list[Trace]:
+    """Play episodes to their ends, step by step.
 
     Args:
       cell: how to infer, leaves []; `cell.params` is not used.
       weights: parameters of the policy.
-      start: of the episode, leaves [].
+      start: of the episodes, leaves [E].
       acting: how to act.
       params: the environment's.
       knowledge: what was learned before training.
     """
-
-    @jax.jit
-    def step(weights: Params, agent: Agent, keys: jax.Array) -> tuple[Agent, Taken]:
-        after, taken, _ = act(cell, acting.bind(weights), agent, jnp.ones(1, bool), keys, acting, params, knowledge)
-        return after, taken
-
-    keys = jax.random.key(0)[None]
-    first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
-    agent = acting.begin(first, acting.bind(weights).initial_memory((1,)), knowledge, params)
+    count = len(start.pose)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(count))
+    agent, running = _begin(weights, start, acting, params, knowledge), jnp.ones(count, bool)
     steps = []
-    while True:
-        pose, gap = agent.state.pose, acting.gap(agent)
-        agent, taken = step(weights, agent, keys)
-        steps.append((pose[0], carried(taken.agent).action[0], gap[0]))
-        if taken.ended[0]:
-            break
-    pose, action, gap = (np.asarray(column) for column in zip(*steps, strict=True))
-    return Trace(pose=pose, action=action, gap=gap, success=bool(taken.success[0]))
+    while running.any():
+        before = running
+        agent, running, step = _step(cell, weights, agent, running, keys, acting, params, knowledge)
+        steps.append(jax.tree.map(np.asarray, step._replace(running=before)))
+    course = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *steps)  # [E, T, ...]
+    return [_trace(jax.tree.map(lambda leaf, e=e: leaf[e], course)) for e in range(count)]
+
+
+def _trace(course: _Step) -> Trace:
+    """Return the part of a course in which the episode runs."""
+    pose, action, inferred, success, _ = jax.tree.map(lambda leaf: leaf[course.running], course)
+    return Trace(pose, action, inferred, bool(success[-1]))
+
+
+@functools.partial(jax.jit, static_argnames="acting")
+def _begin(weights: Params, start: State, acting: Acting, params: EnvParams, knowledge: Knowledge) -> Agent:
+    return acting.begin(start, acting.bind(weights).initial_memory(start.pose.shape), knowledge, params)
+
+
+@functools.partial(jax.jit, static_argnames="acting")
+def _step(
+    cell: Inference,
+    weights: Params,
+    agent: Agent,
+    running: jax.Array,
+    keys: jax.Array,
+    acting: Acting,
+    params: EnvParams,
+    knowledge: Knowledge,
+) -> tuple[Agent, jax.Array, _Step]:
+    """Act once where episodes run; return what runs on, and the step."""
+    policy = acting.bind(weights)
+    after, taken, inferred = act(cell, policy, agent, running, keys, acting, params, knowledge)
+    step = _Step(agent.state.pose, carried(taken.agent).action, inferred, taken.success, running)
+    return select(running, after, agent), running & ~taken.ended, step

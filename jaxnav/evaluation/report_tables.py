@@ -34,11 +34,9 @@ def difference_table(report: dict[str, Any]) -> Table:
     """
     lines: dict[tuple[str, str], list[str]] = {}
     for entry in report["differences"]:
-        compared = label({**entry, "variant": entry["to"], "method": ""})
-        reference = "+ w" if entry["from"] == "layout" else entry["from"]
         _, digits = COLUMNS[entry["metric"]]
         cell = f"{Interval.from_json(entry):+.{digits}f}"
-        lines.setdefault((f"{compared} - {reference}", entry["decoding"]), []).append(cell)
+        lines.setdefault((difference_label(entry), entry["decoding"]), []).append(cell)
     table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in COLUMNS.values()))
     for names, cells in lines.items():
         table.add_row(*map(Text, (*names, *cells)))
@@ -101,3 +99,9 @@ def label(row: dict[str, Any]) -> str:
             label = f"+ w + sTDE (eps={row['epsilon']:g})"
     forms = {"paper": ", paper form", "switch": ", switch"}
     return label + (forms.get(row["form"], "") if row["variant"] == "stde" else "")
+
+
+def difference_label(entry: dict[str, Any]) -> str:
+    """Return the name of a paired difference of a report."""
+    compared = label({**entry, "variant": entry["to"], "method": ""})
+    return f"{compared} - {'+ w' if entry['from'] == 'layout' else entry['from']}"

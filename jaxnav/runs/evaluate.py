@@ -76,6 +76,7 @@ def evaluate(
     setting: EstimatorName | None = None,
     hold: bool = False,
     seed: int = 0,
+    compiled: CompiledWorld | None = None,
     console: Console | None = None,
 ) -> Results:
     """Evaluate a run on fixed episodes, in one compiled call.
@@ -91,6 +92,7 @@ def evaluate(
       form: how sTDE combines the logits; None for that of the run's layout setting.
       setting, hold: layout estimator to use instead of the run's; see `Policies.estimating`.
       seed: of the episode list and the sampled actions, from 0 to 2**32 - 1.
+      compiled: the world of `evaluation_world` with these arguments, where it is there already.
       console: to tell of progress on; None for silence.
 
     Raises:
@@ -102,7 +104,7 @@ def evaluate(
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
-    compiled = evaluation_world(config, split, scenes, shift, console, world)
+    compiled = compiled or evaluation_world(config, split, scenes, shift, console, world)
     lists, outcome, compilations = run_rows(rows, policies, compiled, episodes, seed)
     shortest = oracle_outcome(compiled.banks, lists, read_ahead(compiled, range(len(compiled.banks))), compiled.env)
     rows, outcome = [*rows, table_row("oracle", None, None, "argmax")], _with_oracle(outcome, shortest)

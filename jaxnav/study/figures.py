@@ -1,7 +1,7 @@
 """Figures of the study; bands are 95 % intervals."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from jaxnav.causal import Form
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.study.curves import AucPanel, Belief, Curve, GapCourse
-from jaxnav.study.records import GainBySimilarity, Metric, SuccessBySimilarity, TrialRow
+from jaxnav.study.records import GainBySimilarity, Metric, SuccessBySimilarity
 from jaxnav.study.style import (
     BAR,
     LEVEL,
@@ -29,6 +29,14 @@ MAX_AREA = 60.0  # points^2, of the marker with the most episodes
 BINS = 6  # in the similarity figure, of equal numbers of points
 _METRICS: Mapping[Metric, str] = {"sr": "SR (%)", "spl": "SPL (%)", "dts": "DTS (m)"}
 _BELIEFS: Mapping[Belief, dict[str, Any]] = {"updated": {"ls": "-"}, "frozen": {"ls": "--", "mfc": "white"}}
+
+
+class Measured(Protocol):
+    """A row of a table."""
+
+    def metric(self, name: Metric) -> Interval:
+        """Return one of the metrics."""
+        ...
 
 
 def similarity_figure(by_shift: Mapping[float, SuccessBySimilarity]) -> Figure:
@@ -83,7 +91,7 @@ def gain_figure(by_shift: Mapping[float, GainBySimilarity], variant: str) -> Fig
     return fix_placement(figure)
 
 
-def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, TrialRow]]) -> Figure:
+def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, Measured]]) -> Figure:
     """Draw the metrics over epsilon (paper's Fig. 6a).
 
     There is a line per shift, and a row of panels per form.

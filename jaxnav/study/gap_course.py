@@ -32,7 +32,7 @@ def gap_course(run: RunConfig, config: StudyConfig, console: Console) -> GapCour
     """
     policies = load_policies(run)
     settings = _settings(policies)
-    traces = _shortest([_traces(run, config, shift, policies, settings, console) for shift in config.shifts])
+    traces = shortest([_traces(run, config, shift, policies, settings, console) for shift in config.shifts])
     means = [mean_by_step(trace) for trace in traces]
     aucs = [auc_by_step(trace, traces[0]) for trace in traces[1:]]
     panels = [
@@ -88,7 +88,7 @@ def _traces(
     )
 
 
-def _shortest(traces: list[GapTraces]) -> list[GapTraces]:
+def shortest(traces: list[GapTraces]) -> list[GapTraces]:
     """Return the steps at which episodes run at every shift."""
     steps = min(int(trace.running.any(axis=(0, 1)).sum()) for trace in traces)
     return [trace._replace(gap=trace.gap[..., :steps], running=trace.running[..., :steps]) for trace in traces]

@@ -27,7 +27,7 @@ from jaxnav.scenes.worlds import WORLDS
 from jaxnav.study.bench import Bench, Subject, layout_setting
 from jaxnav.study.mixture_report import ByShift, Compared, Mixture, Removal
 from jaxnav.study.outcomes import mean_weight
-from jaxnav.study.population import mixed_population, part_of
+from jaxnav.study.population import mixed_population
 from jaxnav.study.trials import Control, Schedule, Trial, Use
 
 #: Constant gaps, and times by the second budget of the world, after or until which experience is taken out whole. All
@@ -85,7 +85,7 @@ class Ledger:
         self._episodes, self._budgets = episodes, budgets
         self.metrics = ("sr", "spl", *(f"sr@{budget}" for budget in budgets))
         chosen = [shift == part for part in range(shift.max() + 1)]
-        self._parts = [Subset(each, part_of(episodes, each).clusters()) for each in chosen]
+        self._parts = [Subset(each, episodes.take(each).clusters()) for each in chosen]
         self._all = Subset(np.ones(len(shift), bool), episodes.clusters())
 
     def measure(self, outcome: Outcome) -> Values:

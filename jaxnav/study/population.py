@@ -59,9 +59,3 @@ def end_to_end(lists: Sequence[EpisodeList], poses: Sequence[int]) -> EpisodeLis
     first = np.cumsum([0, *poses[:-1]])
     pose = [episodes.pose + start for episodes, start in zip(lists, first, strict=True)]
     return whole._replace(pose=np.concatenate(pose).astype(np.int32))
-
-
-def part_of(episodes: EpisodeList, chosen: np.ndarray) -> EpisodeList:
-    """Return the chosen episodes of a list; `chosen` is bool [E]."""
-    fields = ("scene", "goal", "pose", "best_length", "room")
-    return episodes._replace(**{name: getattr(episodes, name)[chosen] for name in fields})

@@ -3,21 +3,17 @@
 from pathlib import Path
 from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from jaxnav.env.types import State
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import EpisodeList, episode_list
-from jaxnav.evaluation.playback import Trace, play
-from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.variants import table_row
 from jaxnav.runs.directory import load_run
-from jaxnav.runs.policies import EstimatorName, Policies, load_policies
-from jaxnav.runs.worlds import CompiledWorld, evaluation_world
+from jaxnav.runs.policies import EstimatorName, load_policies
+from jaxnav.runs.replay import replay, scene_named
+from jaxnav.runs.worlds import evaluation_world
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.viz.episode import Episode
 
@@ -62,8 +58,10 @@ def play_episode(
     if not 0 <= index < len(episodes.goal):
         raise InputError(f"--index {index}: give a number from 0 to {len(episodes.goal) - 1}")
     threshold = epsilon if variant == "stde" else None
-    trace = _trace(policies, world, episodes, index, variant, threshold)
-    scene = _scene(world, bank.names[episodes.scene[index]])
+    form = None if policies.setting is None else policies.setting.form
+    chosen = episodes.take(np.array([index]))
+    (trace,) = replay(policies, world, chosen, table_row(variant, threshold, form, "argmax"))
+    scene = scene_named(world, bank.names[episodes.scene[index]])
     cells = trace.pose // bank.task.rules.poses_per_cell - bank.first_cell[episodes.scene[index]]
     title = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
     return Episode(
@@ -77,31 +75,3 @@ def play_episode(
         epsilon=np.inf if threshold is None else threshold,
         title=f"{policies.spec.method.upper()}{title[variant]}  ·  {scene.name}",
     )
-
-
-def _trace(
-    policies: Policies,
-    world: CompiledWorld,
-    episodes: EpisodeList,
-    index: int,
-    variant: Variant,
-    epsilon: float | None,
-) -> Trace:
-    """Play an episode of the first bank, first seed."""
-    pose, scene, goal = episodes.pose[index], episodes.scene[index], episodes.goal[index]
-    form = None if policies.setting is None else policies.setting.form
-    row = table_row(variant, epsilon, form, "argmax")
-    inference = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], policies.arms, policies.seeds))
-    return play(
-        inference,
-        jax.tree.map(lambda leaf: leaf[inference.params], policies.params),
-        State(pose=pose, scene=scene, goal=goal, time=jnp.int32(0)),
-        policies.acting(world.env),
-        world.params(0),
-        policies.knowledge,
-    )
-
-
-def _scene(world: CompiledWorld, name: str) -> Scene:
-    scenes = (world.scenes[i] for i in range(len(world.scenes)))
-    return next(scene for scene in scenes if scene.name == name)

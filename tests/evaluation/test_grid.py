@@ -235,10 +235,10 @@ def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, numbe
         running = np.ones(len(EPISODES.goal), bool)
         success, length, total = ~running, np.zeros(len(running), int), np.zeros(len(running))
         while running.any():
-            agent, taken, weight = take(cell, weights, agent, running, keys)
+            agent, taken, inferred = take(cell, weights, agent, running, keys)
             success |= running & np.asarray(taken.success)
             length += running
-            total += np.where(running, weight, 0.0)
+            total += np.where(running, inferred.weight, 0.0)
             running &= ~np.asarray(taken.ended)
         found = tiny.at(outcome, len(ROWS) + number, seed)
         np.testing.assert_array_equal(found.success, success)
@@ -249,14 +249,20 @@ def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, numbe
 def test_playing_an_episode_agrees_with_the_grid(outcome):
     row = ROWS.index(Row("stde", 0.2, "residual", "argmax"))
     cell = tiny.at(CELLS, row * SEEDS + 1)
-    for episode in (0, 17):
-        start = tiny.at(first_states(EPISODES), episode)
-        trace = play(cell, tiny.at(WEIGHTS, int(cell.params)), start, ACTING, PARAMS, KNOWLEDGE)
+    traces = play(cell, tiny.at(WEIGHTS, int(cell.params)), first_states(EPISODES), ACTING, PARAMS, KNOWLEDGE)
+    for episode, trace in enumerate(traces):
         found = tiny.at(outcome, row, 1, episode)
         assert (len(trace.pose), trace.success) == (found.length, found.success)
         assert trace.pose[0] == EPISODES.pose[episode]
         assert not (trace.action[:-1] == DONE).any()
         assert np.maximum(trace.gap - 0.2, 0).mean() == pytest.approx(found.weight, abs=1e-6)
+        how, weight = trace.inferred, np.maximum(trace.gap - 0.2, 0)[:, None]
+        np.testing.assert_allclose(how.weight, weight[:, 0], atol=1e-7)
+        # Equation 2 in its residual form, and the best action of what it gives.
+        expected = (1 + weight) * how.factual - weight * how.counterfactual
+        np.testing.assert_allclose(how.corrected, expected, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(trace.action, how.corrected.argmax(axis=1))
+        assert how.layout.shape == (len(trace.pose), len(tiny.CATEGORIES))
 
 
 def test_episodes_end_once(outcome):

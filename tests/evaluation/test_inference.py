@@ -85,8 +85,8 @@ def agent():
 
 def step(agent, running=EVERY, **options):
     """What one step takes, and the weights that it takes it with."""
-    _, taken, weight = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
-    return np.asarray(taken.agent.memory.action), np.asarray(weight)
+    _, taken, inferred = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
+    return np.asarray(taken.agent.memory.action), np.asarray(inferred.weight)
 
 
 # What is taken out

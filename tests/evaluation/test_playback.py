@@ -1,15 +1,17 @@
 """The picture of an episode shows every step, and the view cone ends at walls."""
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 from PIL.GifImagePlugin import GifImageFile
 from support import tiny_world as tiny
 
 from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.inference import Inferred
 from jaxnav.evaluation.playback import Trace
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.visibility import cell_centres
-from jaxnav.scenes.task import DONE, Rules
+from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
 from jaxnav.viz.episode import Episode, draw_episode
 from jaxnav.viz.plan import view_cone
 
@@ -19,7 +21,9 @@ def test_a_picture_has_a_frame_per_step(tmp_path):
     pose, action = [int(episodes.pose[0])], [0, 1, 2, 1, 0, DONE]
     for chosen in action[:-1]:
         pose.append(int(tiny.BANK.successor[pose[-1], chosen]))
-    trace = Trace(np.array(pose), np.array(action), np.linspace(0.9, 0.2, len(pose)), success=False)
+    gap, logits = np.linspace(0.9, 0.2, len(pose)), np.zeros((len(pose), NUM_ACTIONS))
+    inferred = Inferred(*map(jnp.asarray, (np.ones((len(pose), 1)), gap, gap - 0.1, logits, logits, logits)))
+    trace = Trace(np.array(pose), np.array(action), inferred, success=False)
     scene = (tiny.KITCHEN, tiny.BEDROOM)[episodes.scene[0]]
     cells = cell_centres(scene, standable_cells(scene.reach))
     episode = Episode(

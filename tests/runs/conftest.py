@@ -1,61 +1,26 @@
 """A run whose policies were drawn instead of trained, and its evaluation."""
 
-import dataclasses
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.commands import SEEDS, write_config
-from support.tiny_world import lively
+from support.drawn_run import draw_run, tiny_config
 
 import jaxnav
-from jaxnav.env.objectnav import NUM_PRIORS
-from jaxnav.gaps import Signs
-from jaxnav.layout import SETTINGS
-from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Run, claim
-from jaxnav.runs.overlay import apply_yaml
-from jaxnav.runs.policies import POLICIES, export_policy
-from jaxnav.scenes.task import DONE
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.exchange import chances
-from jaxnav.training.exploration import Exploration
+from jaxnav.runs.directory import Run
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24
-#: With weak prior rows a view changes the belief much: large gaps, which sTDE acts on.
-SETTING = dataclasses.replace(SETTINGS["calibrated"], strength=1.0)
 
 
 @pytest.fixture(scope="session")
 def config(tmp_path_factory) -> RunConfig:
     """The settings of the command's tests."""
-    folder = tmp_path_factory.mktemp("runs")
-    return dataclasses.replace(apply_yaml(RunConfig(), write_config(folder)), run_dir=folder / "run")
+    return tiny_config(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture(scope="session")
 def drawn_run(config) -> Run:
-    """A run as training leaves it, with policies that act by what they see.
-
-    Those of a few updates never choose Done, so that all their episodes are alike.
-    """
-    claim(config)
-    categories = len(config.task.categories)
-    counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, categories, categories)).astype(np.float32)
-    counts[:, np.arange(categories), np.arange(categories)] = 9  # no pair is seen more often than each of the two
-    explored = Exploration(jnp.asarray(counts), jnp.int32(1280), jnp.int32(600))
-    odds = np.triu(np.random.default_rng(1).normal(size=counts.shape), 1).astype(np.float32)
-    signs = Signs(jnp.asarray(odds), chances(explored.counts))
-    knowledge = Knowledge(layout_priors(explored.counts, SETTING), signs=signs)
-    for number, arm in enumerate(config.arms):
-        for seed in range(SEEDS):
-            params = lively(SEEDS * number + seed, config.policy_spec(categories))
-            params["actor"]["bias"] = params["actor"]["bias"].at[DONE].set(-2.0)  # episodes of several steps
-            setting = SETTING if arm == "layout" else None
-            folder = config.run_dir / POLICIES / f"{arm}-{seed}"
-            export_policy(folder, config, params, knowledge, setting, explored)
-    return Run(config)
+    """A run as training leaves it, with policies that act by what they see."""
+    return draw_run(config)
 
 
 @pytest.fixture(scope="session")

@@ -67,6 +67,11 @@ def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.
     return actions
 
 
+def alone(start):
+    """One state as a batch of one."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
+
+
 @pytest.mark.parametrize(
     ("variant", "epsilon", "decoding"),
     [
@@ -78,7 +83,8 @@ def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.
     ],
 )
 def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsilon, decoding):
-    arm, seed, key = "baseline" if variant == "baseline" else "layout", 1, jax.random.key(0)  # the key is play's
+    arm, seed = "baseline" if variant == "baseline" else "layout", 1
+    key = jax.random.fold_in(jax.random.key(0), 0)  # that of the first episode played
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / f"{arm}-{seed}")
     policies, params, bank = drawn_run.policies(), world.params(0), world.banks[0]
     episodes = episode_list(bank, 8)
@@ -86,7 +92,7 @@ def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, ep
         start = tiny.at(first_states(episodes), episode)
         weights = tiny.at(policies.of(arm), seed)
         cell = cell_of(variant, epsilon, decoding)
-        trace = play(cell, weights, start, policies.acting(world.env), params, policies.knowledge)
+        (trace,) = play(cell, weights, alone(start), policies.acting(world.env), params, policies.knowledge)
         room = bank.room_types[episodes.scene[episode]]
         steps, sampled = len(trace.action), key if decoding == "sample" else None
         actions = follow(policy, world.env, params, start, room, steps, key=sampled, epsilon=epsilon or 0.0)
@@ -103,7 +109,7 @@ def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setti
     switched = []
     for episode in range(0, 8, 2):
         start, room = tiny.at(first_states(episodes), episode), bank.room_types[episodes.scene[episode]]
-        trace = play(cell, weights, start, policies.acting(world.env), params, policies.knowledge)
+        (trace,) = play(cell, weights, alone(start), policies.acting(world.env), params, policies.knowledge)
         steps = len(trace.action)
         assert follow(policy, world.env, params, start, room, steps, epsilon=0.6) == trace.action.tolist()
         assert (np.diff(trace.gap) >= 0).all()
@@ -216,7 +222,7 @@ def test_a_tracker_takes_in_every_step(monkeypatch):
     weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
     policy = LoadedPolicy(weights, knowledge, spec, tiny.SETTING)
     start = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(1), time=jnp.int32(0))
-    trace = play(cell_of("stde", 0.1), weights, start, Acting(env, spec, tiny.SETTING), params, knowledge)
+    (trace,) = play(cell_of("stde", 0.1), weights, alone(start), Acting(env, spec, tiny.SETTING), params, knowledge)
     assert len(trace.action) == tiny.LIMITS[0]
     walk = functools.partial(follow, policy, env, params, start, "kitchen", len(trace.action), epsilon=0.1)
     assert walk() == trace.action.tolist()

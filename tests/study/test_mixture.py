@@ -14,7 +14,7 @@ from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.mixture import Ledger, clock_trials
 from jaxnav.study.mixture_report import Compared, Mixture, Removal
 from jaxnav.study.mixture_tables import accounting_table, controls_table, order_table, removal_table
-from jaxnav.study.population import end_to_end, part_of
+from jaxnav.study.population import end_to_end
 from jaxnav.study.trials import NEVER
 
 SCENES, EACH, RUNS = 6, 4, 3
@@ -105,7 +105,7 @@ def test_lists_of_banks_end_to_end():
     whole = end_to_end([episodes(3), episodes(4)], [100, 200])
     assert sorted(set(whole.pose.tolist())) == [3, 104]
     assert whole.scene.max() == 4 * SCENES - 1
-    second = part_of(whole, whole.pose == 104)
+    second = whole.take(whole.pose == 104)
     assert len(second.goal) == 2 * SCENES * EACH
     # One floor plan is one cluster, at whatever shift: six of them, and so five degrees of freedom.
     assert whole.clusters().degrees == second.clusters().degrees == SCENES - 1

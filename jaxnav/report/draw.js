@@ -1,0 +1,116 @@
+"use strict";
+// What replays draw. Every name goes through textContent, none is parsed.
+
+const ACTIONS = ["move ahead", "turn left", "turn right", "look up", "look down", "Done"];
+const DONE = 5;
+const KINDS = ["factual", "counterfactual", "corrected"];
+
+function element(name, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+}
+
+function shape(name, attributes = {}, ...children) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+
+const unpack = (text) => Float64Array.from(atob(text), (byte) => byte.charCodeAt(0) / 255);
+const rectangle = ([x, z, width, height], kind) => shape("rect", { x, y: -z - height, width, height, class: kind });
+
+// The plan: y is -z, so that z points up; lengths are centimetres.
+
+function drawPlan(plan, categories, goal) {
+  const [x, z, width, height] = plan.box, unit = Math.max(width, height) / 100, edge = 4 * unit;
+  const drawing = shape("svg", {
+    class: "plan", viewBox: [x - edge, -z - height - edge, width + 2 * edge, height + 2 * edge].join(" "),
+    "font-size": 2.9 * unit, role: "img", "aria-label": `Plan of ${plan.name}`,
+  });
+  plan.floors.forEach((floor, tint) => {
+    const cells = floor.cells.map((cell) => rectangle(cell, "floor"));
+    if (floor.name) cells.forEach((cell) => (cell.style.fill = `var(--tint-${((tint - 1) % 6) + 1})`));
+    drawing.append(...cells);
+  });
+  drawing.append(...plan.walls.map((wall) => rectangle(wall, "wall")));
+  for (const [bx, bz, w, d, tall] of plan.furniture) {
+    const box = rectangle([bx, bz, w, d], "furniture");
+    box.style.fill = `color-mix(in srgb, var(--high) ${tall}%, var(--low))`;
+    box.setAttribute("stroke-width", 0.25 * unit);
+    drawing.append(box);
+  }
+  for (const floor of plan.floors) if (floor.name) drawing.append(roomName(floor));
+  const things = plan.objects.map(([category, ox, oz]) => {
+    const thing = category === goal ? star(ox, -oz, 2.2 * unit)
+      : shape("circle", { class: "object", cx: ox, cy: -oz, r: 0.55 * unit });
+    thing.append(shape("title", {}, categories[category]));
+    return [category === goal, thing];
+  });
+  things.sort((a, b) => a[0] - b[0]).forEach(([, thing]) => drawing.append(thing));
+  return { drawing, unit };
+}
+
+function roomName({ name, cells }) {
+  const area = cells.reduce((sum, [, , w, d]) => sum + w * d, 0);
+  const centre = (at) => cells.reduce((sum, cell) => sum + (cell[at] + cell[at + 2] / 2) * cell[2] * cell[3], 0) / area;
+  return shape("text", { class: "name", x: centre(0), y: -centre(1) }, name.replaceAll("_", " "));
+}
+
+function star(x, y, size) {
+  const points = Array.from({ length: 10 }, (_, i) => {
+    const radius = i % 2 ? 0.42 * size : size, angle = (i * Math.PI) / 5;
+    return `${x + radius * Math.sin(angle)},${y - radius * Math.cos(angle)}`;
+  });
+  return shape("polygon", { class: "goal", points: points.join(" "), "stroke-width": 0.15 * size });
+}
+
+function drawView(view, optics, categories, unit, goal) {
+  const depths = unpack(view.cone), { field_of_view: width, reach } = optics;
+  const outline = Array.from(depths, (depth, i) => {
+    const angle = ((view.yaw + width * (i / (depths.length - 1) - 0.5)) * Math.PI) / 180;
+    return `${view.x + depth * reach * Math.sin(angle)},${-view.z - depth * reach * Math.cos(angle)}`;
+  });
+  const rings = view.seen.flatMap(([category, x, z]) => [
+    shape("circle", {
+      class: category === goal ? "ring sought" : "ring", cx: x, cy: -z, r: 1.7 * unit, "stroke-width": 0.45 * unit,
+    }),
+    shape("text", { x: x + 2.3 * unit, y: -z + unit }, categories[category]),
+  ]);
+  const arrow = shape("path", {
+    class: "agent", d: "M0,-1 L.75,.9 L0,.45 L-.75,.9 Z", "stroke-width": 0.14,
+    transform: `translate(${view.x} ${-view.z}) rotate(${view.yaw}) scale(${2.2 * unit})`,
+  });
+  return [shape("polygon", { class: "cone", points: `${view.x},${-view.z} ${outline.join(" ")}` }), ...rings, arrow];
+}
+
+// An episode's course
+
+function bar(name, shares, kinds, emphasis, whole = 1) {
+  const strips = shares.map((share, i) => {
+    const strip = element("i", { className: kinds[i] });
+    strip.style.width = `${(100 * share) / whole}%`;
+    return strip;
+  });
+  return [element("span", { className: emphasis, title: name }, name), element("span", { className: "bar" }, ...strips),
+    element("span", { className: emphasis }, `${Math.round(100 * shares[shares.length - 1])} %`)];
+}
+
+function drawCourse(gap, weight, threshold, cursor, length) {
+  const steps = (values) => Array.from(values, (value, i) => `${i},${1 - value} ${i + 1},${1 - value}`).join(" ");
+  const lines = threshold === null || threshold > 1 ? []
+    : [shape("line", { class: "level", x1: 0, x2: length, y1: 1 - threshold, y2: 1 - threshold })];
+  cursor.setAttribute("y1", 0);
+  cursor.setAttribute("y2", 1);
+  return shape("svg", { class: "course", viewBox: `0 0 ${length} 1`, preserveAspectRatio: "none", role: "img",
+    "aria-label": "Layout gap, and weight of what is removed, by step" },
+  shape("polygon", { class: "weight", points: `0,1 ${steps(weight)} ${weight.length},1` }),
+  ...lines, shape("polyline", { class: "gap", points: steps(gap) }), cursor);
+}
+
+function ending({ success, actions }, told = true) {
+  const count = actions.length, word = success ? "found" : actions[count - 1] === DONE ? "wrong Done" : "out of time";
+  const properties = { className: success ? "good" : "bad", title: `${word} after ${count} actions` };
+  return element("span", properties, `${success ? "✓" : "✕"} ${told ? `${word}, ` : ""}${count}`);
+}
