@@ -9,12 +9,13 @@ DOCUMENT = $(if $(filter results/performance,$(RESULTS)),docs/performance.md,$(R
 # Neither peers, whose environments hold JAX for processors alone, nor what splits this machine's cores.
 ON_GPU := environment training utilisation inference seeds sweep growth
 
-.PHONY: help setup run test lint test-slow bench bench-gpu lock clean
+.PHONY: help setup run test lint docs test-slow bench bench-gpu lock clean
 
 help:
 	@echo 'make run        train on procedural rooms, then evaluate the run (runs/rooms)'
 	@echo 'make test       lint, import layers, types and the fast tests'
 	@echo 'make test-slow  the slow tests'
+	@echo 'make docs       the documentation as a site, in site/'
 	@echo 'make bench      every benchmark into results/performance, then the tables of docs/performance.md'
 	@echo 'make bench-gpu  those that a GPU can run, into results/performance-gpu'
 	@echo 'make setup      only build .venv;  make lock  pin anew;  make clean  remove what was built'
@@ -41,7 +42,11 @@ lint: $(READY)
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-test: lint
+# What is not as it should be, a broken link for one, is an error.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+test: lint docs
 	$(BIN)/python -m pytest -n 2
 
 test-slow: $(READY)
@@ -67,5 +72,5 @@ lock:
 	  --upgrade --no-header --no-annotate --generate-hashes --quiet --output-file requirements.lock
 
 clean:
-	rm -rf .venv build dist *.egg-info .cache .hypothesis .import_linter_cache .pytest_cache .ruff_cache
+	rm -rf .venv build dist site *.egg-info .cache .hypothesis .import_linter_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
