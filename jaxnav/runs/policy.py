@@ -106,13 +106,15 @@ class LoadedPolicy(struct.PyTreeNode):
         if perception.uses_odometry and (heading is None or moved is None):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
         odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
-        percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon))
-        perceived = perception.update(memory.perceived, percept, observation.goal, self.knowledge, memory.room)
+        position = odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon)
+        percept = Percept(observation.row, *position, observation.goal)
+        perceived = perception.update(memory.perceived, percept, self.knowledge, memory.room)
         view = perception.view(perceived, observation, self.knowledge)
         decision, logits = self._decide(view, memory.memory, perceived.layout, epsilon)
         choice = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
-        action = find_method(self.spec.method).control.act(choice.astype(jnp.int32), perceived.note)
-        return action, EpisodeMemory(decision.memory(action), perceived, memory.room)
+        control = find_method(self.spec.method).control
+        action, note = control.act(choice.astype(jnp.int32), perceived.note, self.knowledge)
+        return action, EpisodeMemory(decision.memory(action), perceived._replace(note=note), memory.room)
 
     @property
     def _perception(self) -> Perception:
