@@ -139,10 +139,7 @@ class Control(Protocol):
     def due(self, note: Tree) -> jax.Array | None:
         """Return whether the choice counts now, bool [...].
 
-        Choices at other times are ignored, and not learned from. None where every choice counts.
-
-        Args:
-          note: of the tracker, leaves [..., ...].
+        At other times it is ignored, and not learned from. None where every one counts. The note has leaves [..., ...].
         """
         ...
 
@@ -231,6 +228,7 @@ class Method:
       auxiliary: one more term of the loss, from a `jaxnav.training.loss.Replay` to a loss float32 [] and named parts.
       adaptation: how the policy changes within an episode.
       control: how its choices become actions.
+      check: from what was learned and a bank to an `InputError` if the method cannot act in its scenes.
       hosts_layout: whether the layout's weights can enter; if not, it is trained without the layout alone.
     """
 
@@ -242,6 +240,7 @@ class Method:
     auxiliary: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None
     adaptation: Adaptation | None = None
     control: Control = Primitive()
+    check: Callable[[Knowledge, Bank], None] | None = None
     hosts_layout: bool = True
 
     def __post_init__(self) -> None:

@@ -23,8 +23,8 @@ def learn_home(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarra
       counts: of exploration, unused.
 
     Returns:
-      What `learn_motion` returns, and `enough`, float32 [], metres at which Done succeeds; `edge`, float32 [], the share
-      of a goal's size by which it is reached earlier; `lines`, int32 [N], as many as the map of the largest home has.
+      What `learn_motion` returns, and by name `enough`, float32 [], metres at which Done succeeds; `edge`, float32 [],
+      the share of a goal's size by which it is reached earlier; `lines`, int32 [N], those of a map of the largest home.
 
     Raises:
       InputError: the map has no bit for a category.
@@ -32,10 +32,8 @@ def learn_home(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarra
     banks = list(banks)
     task, size = banks[0].task, max(WORD, *(max(map_sizes(bank).values()) for bank in banks))
     if len(task.categories) > MAX_CATEGORIES:
-        number = len(task.categories)
-        raise InputError(
-            f"method semexp: the task has {number} categories; a map holds {MAX_CATEGORIES}, leave some out"
-        )
+        many = f"the task has {len(task.categories)} categories, and a map holds {MAX_CATEGORIES}"
+        raise InputError(f"method semexp: {many}; leave some out")
     rules = task.rules
     learned = {
         "enough": np.array(rules.success_distance - SLACK, np.float32),
@@ -54,9 +52,8 @@ def check_home(knowledge: Knowledge, bank: Bank) -> None:
     size = len(knowledge.method["lines"])
     for name, needed in map_sizes(bank).items():
         if needed > size:
-            raise InputError(
-                f"method semexp: scene {name} needs a map of {needed} cells, the policy's has {size}; train it in homes as large"
-            )
+            short = f"scene {name} needs a map of {needed} cells, and that of the training homes has {size}"
+            raise InputError(f"method semexp: {short}; train in homes as large")
 
 
 def map_sizes(bank: Bank) -> dict[str, int]:

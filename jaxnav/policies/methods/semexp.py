@@ -12,7 +12,7 @@ from flax import nnx
 from jaxnav.numerics.product import Linear
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.base import Experience, Method
-from jaxnav.policies.methods.home import learn_home
+from jaxnav.policies.methods.home import check_home, learn_home
 from jaxnav.policies.methods.local_policy import LocalPolicy
 from jaxnav.policies.methods.map_tracker import SIDE, MapReading, MapTracker
 from jaxnav.policies.semantic_map import EXPLORED, FREE, VISITED, WALL
@@ -52,6 +52,6 @@ class MappedCategories(Experience):
         return blocks.reshape(*blocks.shape[:-2], self.width)
 
 
-SEMEXP = Method(MappedCategories, tracker=MapTracker(), learn=learn_home, control=LocalPolicy())
+SEMEXP = Method(MappedCategories, tracker=MapTracker(), learn=learn_home, control=LocalPolicy(), check=check_home)
 #: The control that it must beat: the nearest frontier, whatever is chosen.
 NEAREST = dataclasses.replace(SEMEXP, control=LocalPolicy(nearest=True))
