@@ -104,7 +104,7 @@ class SemanticMap:
 
         Both are int32 [9].
         """
-        block = np.stack(np.indices((3, 3)), axis=-1).reshape(-1, 2).astype(np.int32) - 1
+        block = np.moveaxis(np.indices((3, 3)), 0, -1).reshape(-1, 2).astype(np.int32) - 1
         z, x = ((place[None] + block) % self.size).T
         return z, x
 

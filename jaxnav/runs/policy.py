@@ -94,7 +94,7 @@ class LoadedPolicy(struct.PyTreeNode):
           heading: compass heading, and
           moved: whether the last action changed the cell; policies with a spatial memory and methods with a tracker
             need both.
-          horizon: index of the camera's horizon, 0 for level; `tpn` goes by it too.
+          horizon: index of the camera's horizon, 0 for level; `tpn` and `semexp` go by it too.
 
         Returns:
           The action int32 [], and the memory for the next step.

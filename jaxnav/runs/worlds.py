@@ -61,8 +61,9 @@ class CompiledWorld:
           InputError: it does.
         """
         refuse = find_method(method).check
-        for bank in () if refuse is None else self.banks:
-            refuse(knowledge, bank)
+        if refuse is not None:
+            for bank in self.banks:
+                refuse(knowledge, bank)
 
     def limits(self, bank: Bank) -> np.ndarray:
         """Return the actions of an episode in each scene, int [S]."""

@@ -18,7 +18,7 @@ from jaxnav.evaluation.grid import first_states
 from jaxnav.policies.acting import Acting, select
 from jaxnav.policies.methods.home import cell_places, check_home, learn_home, map_sizes
 from jaxnav.policies.methods.local_policy import LocalPolicy
-from jaxnav.policies.methods.map_tracker import AGREED, SIDE
+from jaxnav.policies.methods.map_tracker import AGREED, SIDE, MapTracker
 from jaxnav.policies.methods.semexp import SEMEXP
 from jaxnav.policies.policy import bind
 from jaxnav.policies.semantic_map import FREE, TRIED, WALL
@@ -45,16 +45,18 @@ def acting(method="semexp", env=ENV):
     return Acting(env, dataclasses.replace(SPEC, method=method, num_categories=len(env.categories)))
 
 
-def walk(start, choices, count=60, method="semexp"):
-    """Agents and actions of an episode in the corridor, given one choice for every step."""
-    agents, actions = [jax.jit(acting(method).begin)(State(*start), None, known(), PARAMS)], []
-    step = jax.jit(acting(method).step)
-    for choice in choices[:count]:
+def walk(start, choices):
+    """Agents and actions of an episode in the corridor, given one choice for every step, and what came of it."""
+    agents, actions = [jax.jit(acting().begin)(State(*start), None, known(), PARAMS)], []
+    step = jax.jit(acting().step)
+    taken = None
+    for choice in choices:
         after, taken = step(agents[-1], jnp.array([choice], jnp.int32), known(), PARAMS)
         actions.append(int(acted(agents[-1], choice)[0]))
         agents.append(after)
         if bool(taken.ended[0]):
             break
+    assert taken is not None
     return agents, actions, taken
 
 
@@ -94,12 +96,12 @@ def test_a_first_sight_nearby_is_not_enough():
 
 
 def test_choices_count_only_when_they_are_due():
-    due, goal = SEMEXP.control.due, FRIDGE  # which is not there, so that the episode goes on
+    due, goal = LocalPolicy().due, FRIDGE  # which is not there, so that the episode goes on
     north = walk(at(2, 4, goal), [block_ahead(20)] * 40)
     counted = [bool(due(agent.perceived.note)[0]) for agent in north[0]]
     second = counted.index(True, 1)
     assert counted[0]
-    assert second <= SEMEXP.control.interval
+    assert second <= LocalPolicy().interval
     others = walk(at(2, 4, goal), [block_ahead(20), *range(second - 1)])
     assert north[1][:second] == others[1]
 
@@ -118,7 +120,7 @@ def test_the_planner_goes_by_the_map_and_not_by_the_walls():
 
 def test_the_long_term_goal_is_kept_for_n_actions():
     """In a room without an end the block stays worth exploring: the choice counts every 25 actions."""
-    note = SEMEXP.tracker.init(known())._replace(sweep=jnp.int32(0))
+    note = MapTracker().init(known())._replace(sweep=jnp.int32(0))
     act = jax.jit(lambda note: SEMEXP.control.act(jnp.int32(block_ahead(20)), note, known())[1])
     due = []
     for _ in range(51):
@@ -193,8 +195,7 @@ def test_homes_are_searched_without_learning(world):
     bank = compile_bank([scenes[i] for i in range(3)], preset.task)
     env, params = build(bank, {}, preset.step_limit)
     knowledge = known(bank)
-    act = Acting(env, dataclasses.replace(SPEC, method="jaxnav.policies.methods.semexp:NEAREST"))
-    act = dataclasses.replace(act, spec=dataclasses.replace(act.spec, num_categories=len(env.categories)))
+    act = acting("jaxnav.policies.methods.semexp:NEAREST", env)
     prior = jnp.ones((6, len(env.categories), len(env.categories)))
 
     @jax.jit

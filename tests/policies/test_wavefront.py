@@ -96,7 +96,7 @@ def test_a_cell_spreads_to_its_eight_neighbours(z, x):
     cells[z, x] = True
     around = np.concatenate([[(z, x)], np.add((z, x), NEIGHBOURS)])
     board = spread(pack(jnp.asarray(cells)))
-    everywhere = jnp.asarray(np.stack(np.indices((SIZE, SIZE)), axis=-1), jnp.int32)
+    everywhere = jnp.asarray(np.moveaxis(np.indices((SIZE, SIZE)), 0, -1), jnp.int32)
     expected = np.zeros_like(cells)
     expected[tuple((around % SIZE).T)] = True
     np.testing.assert_array_equal(holds(board, everywhere), expected)
