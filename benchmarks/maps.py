@@ -7,7 +7,7 @@ searches in generated val scenes (all three worlds without arguments) with the a
   random      a random block every 25 actions
   truth       the nearest frontier, on a map that holds floor, walls and objects from the start
   level       nearest, without ever looking down
-  far         nearest, but Done up to 1.5 m from the object's centre
+  far         nearest, but Done up to 1.45 m from the object's centre
 
 Rates are percent. The result goes to stdout as JSON.
 """

@@ -28,9 +28,9 @@ BANK, LIMIT = compile_bank([CORRIDOR], Task(CATEGORIES)), 26
 
 def test_choices_that_do_not_count_teach_nothing():
     before = rolled(False)
-    due = np.random.default_rng(0).random((LENGTH, ENVS)) < 0.3
+    due = jnp.asarray(np.random.default_rng(0).random((LENGTH, ENVS)) < 0.3)
     advantage = np.random.default_rng(1).normal(size=(LENGTH, ENVS)).astype(np.float32)
-    transitions = jax.tree.map(jnp.asarray, before.transitions)._replace(due=jnp.asarray(due))
+    transitions = jax.tree.map(jnp.asarray, before.transitions)._replace(due=due)
 
     @jax.jit
     def learn(weights, transitions, advantage):
@@ -41,7 +41,7 @@ def test_choices_that_do_not_count_teach_nothing():
         return jax.value_and_grad(loss)(weights)
 
     expected = learn(before.weights, transitions, jnp.asarray(advantage))
-    off = transitions._replace(choice=jnp.where(due, transitions.choice, 0), log_prob=transitions.log_prob - ~due)
+    off = transitions._replace(choice=jnp.where(due, transitions.choice, 0), log_prob=jnp.where(due, transitions.log_prob, -9.0))
     found = learn(before.weights, off, jnp.where(due, advantage, 9.0))
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), found, expected)
     counted = learn(before.weights, transitions._replace(due=None), jnp.asarray(advantage))
