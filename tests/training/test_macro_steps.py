@@ -41,7 +41,9 @@ def test_choices_that_do_not_count_teach_nothing():
         return jax.value_and_grad(loss)(weights)
 
     expected = learn(before.weights, transitions, jnp.asarray(advantage))
-    off = transitions._replace(choice=jnp.where(due, transitions.choice, 0), log_prob=jnp.where(due, transitions.log_prob, -9.0))
+    off = transitions._replace(
+        choice=jnp.where(due, transitions.choice, 0), log_prob=jnp.where(due, transitions.log_prob, -9.0)
+    )
     found = learn(before.weights, off, jnp.where(due, advantage, 9.0))
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), found, expected)
     counted = learn(before.weights, transitions._replace(due=None), jnp.asarray(advantage))
