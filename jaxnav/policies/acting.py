@@ -145,7 +145,7 @@ class Acting:
         Returns:
           The agent after the step, in a new episode where one ended and keys are given, and what came of it.
         """
-        action = choice if self.method is None else jax.vmap(self.method.control.act)(choice, agent.perceived.note)
+        action, agent = self._controlled(agent, choice, knowledge)
         last, reward, terminated, truncated, success, state = self._act(agent.state, action, keys, params)
         moved = self.env.cell(last.pose) != self.env.cell(agent.state.pose)
         memory = None if decision is None else decision.memory(action)
@@ -160,6 +160,13 @@ class Acting:
         action, moved = jnp.where(taken.ended, NO_ACTION, action), moved & ~taken.ended
         return self.perceive(following, action, moved, knowledge, params), taken
 
+    def due(self, agent: Agent) -> jax.Array | None:
+        """Return which choices count now, bool [B].
+
+        None where all do.
+        """
+        return None if self.method is None else self.method.control.due(agent.perceived.note)
+
     def perceive(self, agent: Agent, action: jax.Array, moved: jax.Array, knowledge: Any, params: EnvParams) -> Agent:
         """Take the present views into beliefs and notes.
 
@@ -171,9 +178,18 @@ class Acting:
         """
         headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
         pose, room = agent.state.pose, params.room[agent.state.scene]
-        percept = Percept(params.tables.rows[pose], pose // horizons % headings, action, moved, pose % horizons)
-        update = jax.vmap(self._perception.update, (0, 0, 0, None, 0))
-        return agent._replace(perceived=update(agent.perceived, percept, agent.state.goal, knowledge, room))
+        heading, horizon = pose // horizons % headings, pose % horizons
+        percept = Percept(params.tables.rows[pose], heading, action, moved, horizon, agent.state.goal)
+        update = jax.vmap(self._perception.update, (0, 0, None, 0))
+        return agent._replace(perceived=update(agent.perceived, percept, knowledge, room))
+
+    def _controlled(self, agent: Agent, choice: jax.Array, knowledge: Any) -> tuple[jax.Array, Agent]:
+        """Return the actions of choices, and the agents with their notes."""
+        if self.method is None:
+            return choice, agent
+        perceived = agent.perceived
+        action, note = jax.vmap(self.method.control.act, (0, 0, None))(choice, perceived.note, knowledge)
+        return action, agent._replace(perceived=perceived._replace(note=note))
 
     @property
     def _perception(self) -> Perception:

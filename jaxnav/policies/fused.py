@@ -38,7 +38,8 @@ class Policy(Stream):
         self.direct, self.goal_row = spec.direct, spec.goal_row
         seen = dataclasses.replace(spec, num_categories=self._num_perceived())
         self.appearance = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
-        known = 0 if spec.spatial_memory is None else spec.spatial_memory.num_inputs
+        known = method.experience.geometry
+        known += 0 if spec.spatial_memory is None else spec.spatial_memory.num_inputs
         self.view = Linear(2 * self.row_format.view**2 + known, self.num_views * sizes.view_outputs, rngs=rngs)
         self.detections = CategoryMaps.of_detections(seen, rngs)
         self.sought = nnx.Embed(seen.num_categories, sizes.appearance, rngs=rngs)
@@ -86,6 +87,8 @@ class Policy(Stream):
         scene = seen.view
         if surroundings is not None:
             scene = jnp.concatenate([scene, SpatialMemory.inputs(surroundings)], axis=-1)
+        if self.method.geometry:
+            scene = jnp.concatenate([scene, self.method.surroundings(reading)], axis=-1)
         appearance = self.appearance.embedding[...]
         confidence = (seen.table[..., CONFIDENCE] * seen.goal).sum(axis=-1, keepdims=True)
         return Pathways(

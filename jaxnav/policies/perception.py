@@ -72,21 +72,18 @@ class Perception:
         explored = None if spatial is None else spatial.init()
         return Perceived(layout, explored, None if self._tracker is None else self._tracker.init(knowledge))
 
-    def update(
-        self, perceived: Perceived, percept: Percept, goal: jax.Array, knowledge: Any, room: jax.Array
-    ) -> Perceived:
+    def update(self, perceived: Perceived, percept: Percept, knowledge: Any, room: jax.Array) -> Perceived:
         """Take in one view.
 
         Args:
           perceived: before it.
           percept: the view, and how the agent came to it.
-          goal: int32 [], what is sought.
           knowledge, room: as in `init`.
         """
         layout, explored, note = perceived
         estimator, spatial = self._estimator(knowledge, room), self._spatial_memory
         if estimator is not None and layout is not None:
-            layout = estimator.update(layout, self.row_format.presence(percept.row), goal)
+            layout = estimator.update(layout, self.row_format.presence(percept.row), percept.goal)
         if spatial is not None and explored is not None:
             explored = spatial.update(explored, percept.row, percept.heading, percept.moved, self.row_format)
         if self._tracker is not None:

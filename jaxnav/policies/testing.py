@@ -62,12 +62,14 @@ def check_method(name: str, method_sizes: Mapping[str, int] | None = None, steps
         return acting.start(key, _BATCH, memory, knowledge, params)
 
     act = jax.jit(lambda agent, key: _act(acting, acting.bind(weights), agent, key, knowledge, params))
-    agents = [start()]
+    agents, choices = [start()], []
     for time in range(steps):
-        agents.append(act(agents[-1], jax.random.fold_in(key, time)))
+        agent, choice = act(agents[-1], jax.random.fold_in(key, time))
+        agents.append(agent)
+        choices.append(choice)
         action = carried(agents[-1]).action
         _promise(bool(((action >= 0) & (action < env.num_actions)).all()), "a choice that becomes no action")
-    _check_notes(method, agents, env, knowledge, params)
+    _check_notes(method, agents, choices, env, knowledge, params)
     _check_decision(acting, weights, agents[-1], method.control.num_choices, knowledge, params)
 
 
@@ -85,28 +87,38 @@ def _lively(params: dict[str, Any], key: jax.Array) -> dict[str, Any]:
 
 def _act(
     acting: Acting, policy: Policy, agent: Agent, key: jax.Array, knowledge: Knowledge, params: EnvParams
-) -> Agent:
-    """Act once, without reset."""
+) -> tuple[Agent, jax.Array]:
+    """Act once, without reset, and return what was chosen too."""
     pathways = policy.pathways(*acting.view(agent, knowledge, params), carried(agent))
     decision = policy.decide(pathways, carried(agent))
     choice = jax.random.categorical(key, decision.logits)
-    return acting.step(agent, choice, knowledge, params, policy=policy, decision=decision)[0]
+    return acting.step(agent, choice, knowledge, params, policy=policy, decision=decision)[0], choice
 
 
-def _check_notes(method: Method, agents: list[Agent], env: ObjectNav, knowledge: Knowledge, params: EnvParams) -> None:
-    """Check that notes take in every view once."""
+def _check_notes(
+    method: Method,
+    agents: list[Agent],
+    choices: list[jax.Array],
+    env: ObjectNav,
+    knowledge: Knowledge,
+    params: EnvParams,
+) -> None:
+    """Check that notes take in every view once, and every choice."""
     tracker = method.tracker
     if tracker is None:
         return
     headings, horizons = env.task.rules.headings, len(env.task.rules.horizons)
     update = jax.jit(lambda note, percept: tracker.update(note, knowledge, percept))
+    control = jax.jit(lambda choice, note: method.control.act(choice, note, knowledge)[1])
     for i in range(_BATCH):
         note = tracker.init(knowledge)
-        for before, agent in zip([None, *agents], agents, strict=False):
+        for before, agent, choice in zip([None, *agents], agents, [None, *choices], strict=False):
             pose = agent.state.pose[i]
+            note = note if choice is None else control(choice[i], note)
             moved = jnp.bool_(before is not None and env.cell(before.state.pose[i]) != env.cell(pose))
             heading = pose // horizons % headings
-            percept = Percept(params.tables.rows[pose], heading, carried(agent).action[i], moved, pose % horizons)
+            position = heading, carried(agent).action[i], moved, pose % horizons
+            percept = Percept(params.tables.rows[pose], *position, agent.state.goal[i])
             note = update(note, percept)
             kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.perceived.note)
             chex.assert_trees_all_equal_shapes_and_dtypes(kept, note)

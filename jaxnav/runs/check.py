@@ -8,6 +8,7 @@ from typing import Any
 from jaxnav.errors import InputError
 from jaxnav.policies.methods import Method, find_method
 from jaxnav.runs.config import ARMS, RunConfig
+from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.devices import Devices
 
 
@@ -47,6 +48,8 @@ def _check_method(config: RunConfig, method: Method) -> None:
     _need(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
     hosted = method.hosts_layout or "layout" not in arms
     _need(hosted, "arms", arms, f"method {config.method!r} cannot host the layout; give baseline alone")
+    gated = not config.done_gate or method.control.num_choices == NUM_ACTIONS
+    _need(gated, "done_gate", True, f"what method {config.method!r} chooses are no actions; leave it out")
     for name, value in config.method_sizes.items():
         known = f"{config.method!r} has {', '.join(sizes)}" if sizes else f"{config.method!r} has no sizes of its own"
         _need(name in sizes, f"method_sizes.{name}", value, f"is unknown; {known}")

@@ -118,7 +118,7 @@ class LoadedPolicy(struct.PyTreeNode):
           heading: compass heading, and
           moved: whether the last action changed the cell; policies with a spatial memory and methods with a tracker
             need both.
-          horizon: index of the camera's horizon, 0 for level; `tpn` goes by it too.
+          horizon: index of the camera's horizon, 0 for level; `tpn` and `semexp` go by it too.
 
         Returns:
           The action int32 [], and the memory for the next step.
@@ -132,8 +132,9 @@ class LoadedPolicy(struct.PyTreeNode):
 
     def follow(self, choice: Choice, chosen: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
         """Return the action int32 [] of what was chosen, and the memory."""
-        action = find_method(self.spec.method).control.act(chosen, choice.perceived.note)
-        return action, EpisodeMemory(choice.decision.memory(action), choice.perceived, room)
+        control, perceived = find_method(self.spec.method).control, choice.perceived
+        action, note = control.act(chosen, perceived.note, self.knowledge)
+        return action, EpisodeMemory(choice.decision.memory(action), perceived._replace(note=note), room)
 
     def decide(
         self,
@@ -154,8 +155,9 @@ class LoadedPolicy(struct.PyTreeNode):
         if perception.uses_odometry and (heading is None or moved is None):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
         odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
-        percept = Percept(observation.row, odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon))
-        perceived = perception.update(memory.perceived, percept, observation.goal, self.knowledge, memory.room)
+        position = odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon)
+        percept = Percept(observation.row, *position, observation.goal)
+        perceived = perception.update(memory.perceived, percept, self.knowledge, memory.room)
         view = perception.view(perceived, observation, self.knowledge)
         policy = bind(self.spec, self.params)
         pathways = policy.pathways(*view, memory.memory)

@@ -64,8 +64,10 @@ class Validator:
 
         Raises:
           MissingSplitError: the file of scenes has none of val.
+          InputError: the method cannot act in them.
         """
         new = evaluation_world(config, "val", None, None, console)
+        new.check(config.method, knowledge)
         # Of equal sizes, so that one compilation serves both.
         sizes = {name: max(getattr(new, name), getattr(training, name)) for name in ("num_cells", "num_scenes")}
         limits = {"step_limits": new.step_limits, "step_limit": new.step_limit}

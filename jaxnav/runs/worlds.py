@@ -13,6 +13,7 @@ from jaxnav.env.build import build
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError
+from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import most_common, unknown_types
 from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank, concatenate
@@ -52,6 +53,17 @@ class CompiledWorld:
         """
         sizes = self.num_cells, self.num_scenes
         return build(self.banks[index], self.step_limits, self.step_limit, *sizes, expert=self.expert)[1]
+
+    def check(self, method: str, knowledge: Knowledge) -> None:
+        """Let a method refuse scenes that it cannot act in.
+
+        Raises:
+          InputError: it does.
+        """
+        refuse = find_method(method).check
+        if refuse is not None:
+            for bank in self.banks:
+                refuse(knowledge, bank)
 
     def limits(self, bank: Bank) -> np.ndarray:
         """Return the actions of an episode in each scene, int [S]."""

@@ -26,6 +26,7 @@ class Transition(NamedTuple):
       surroundings: uint8 [B, M], what the spatial memory read; None without one.
       direct: bool [B], False where both direct pathways were zeroed; None if they never are.
       experienced: float32 [B], 0 where experience was zeroed, otherwise 1; None if it never is.
+      due: bool [B], whether the choice counted; None where every choice does.
       choice: int32 [B], what the policy chose.
       action: int32 [B], what was done.
       log_prob, value, reward: float32 [B].
@@ -40,6 +41,7 @@ class Transition(NamedTuple):
     surroundings: jax.Array | None
     direct: jax.Array | None
     experienced: jax.Array | None
+    due: jax.Array | None
     choice: jax.Array
     action: jax.Array
     log_prob: jax.Array
@@ -169,6 +171,7 @@ def collect(
             surroundings=view.surroundings,
             direct=direct,
             experienced=decision.experienced,
+            due=acting.due(agent),
             choice=choice,
             action=carried(taken.agent).action,
             log_prob=log_prob,

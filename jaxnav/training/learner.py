@@ -148,7 +148,7 @@ class Learner:
         """Take a gradient step for every minibatch of every epoch."""
         transitions, config = rollout.transitions, self.config
         returns = transitions.reward, transitions.value, rollout.next_value, transitions.ended
-        advantage = advantages(*returns, scalars.gamma, scalars.gae_lambda)
+        advantage = advantages(*returns, scalars.gamma, scalars.gae_lambda, transitions.due)
         done = (state.update.astype(jnp.float32) - scalars.begin) / scalars.num_updates
         rate = scalars.learning_rate * (1.0 - done)
         scalars = scalars.replace(entropy=scalars.entropy + done * (scalars.final_entropy - scalars.entropy))

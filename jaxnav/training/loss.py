@@ -14,17 +14,24 @@ from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways, zero
 from jaxnav.policies.policy import Policy
 from jaxnav.training.collect import Transition, zero_direct
 from jaxnav.training.config import PPOScalars
-from jaxnav.training.shares import moments
+from jaxnav.training.shares import average, moments
 
 Parts = dict[str, jax.Array]
 
 
 def advantages(
-    reward: jax.Array, value: jax.Array, next_value: jax.Array, ended: jax.Array, gamma: jax.Array, lambda_: jax.Array
+    reward: jax.Array,
+    value: jax.Array,
+    next_value: jax.Array,
+    ended: jax.Array,
+    gamma: jax.Array,
+    lambda_: jax.Array,
+    due: jax.Array | None = None,
 ) -> jax.Array:
     """Return generalised advantage estimates, float32 [T, B].
 
-    Source: Schulman et al., 2016.
+    Source: Schulman et al., 2016. Between two choices lambda is 1: the values there cancel, and what is left is the
+    estimate over macro-steps of n actions each with their discounted rewards and the discount gamma^n.
 
     Args:
       reward: float32 [T, B].
@@ -34,8 +41,11 @@ def advantages(
       ended: bool [T, B], the episode ended with this step, either way.
       gamma: float32 [], discount.
       lambda_: float32 [].
+      due: bool [T, B], whether the choice counted; None where every choice does. Elsewhere estimates have no meaning.
     """
     delta = reward + gamma * next_value - value
+    if due is not None:
+        lambda_ = jnp.where(jnp.concatenate([due[1:], jnp.ones_like(due[:1])]), lambda_, 1.0)
     decay = gamma * lambda_ * (1.0 - ended.astype(jnp.float32))
 
     def back(advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -119,7 +129,8 @@ def ppo_loss(
     """Return the clipped PPO loss over [T, B].
 
     Where `distil` holds, the counterfactual branch learns to act like the factual policy as well as experience and
-    memory allow: KL(pi || counterfactual), the target fixed. The method's auxiliary loss is added.
+    memory allow: KL(pi || counterfactual), the target fixed. The method's auxiliary loss is added. Choices that did not
+    count weigh nothing.
 
     Args:
       replayed: the decisions made again.
@@ -136,16 +147,17 @@ def ppo_loss(
     log_prob = jnp.take_along_axis(log_pi, transitions.choice[..., None], axis=-1)[..., 0]
     ratio = jnp.exp(log_prob - transitions.log_prob)
     target = advantage + transitions.value
-    mean, deviation = moments(advantage)
+    due = transitions.due
+    mean, deviation = moments(advantage, due)
     scaled = (advantage - mean) / (deviation + 1e-8)
     clipped = jnp.clip(ratio, 1.0 - scalars.clip, 1.0 + scalars.clip)
-    policy_loss = -jnp.minimum(ratio * scaled, clipped * scaled).mean()
-    value_loss = 0.5 * jnp.square(decisions.value - target).mean()
-    entropy = -(jnp.exp(log_pi) * log_pi).sum(axis=-1).mean()
+    policy_loss = -average(jnp.minimum(ratio * scaled, clipped * scaled), due)
+    value_loss = 0.5 * average(jnp.square(decisions.value - target), due)
+    entropy = -average((jnp.exp(log_pi) * log_pi).sum(axis=-1), due)
     loss = policy_loss + scalars.value * value_loss - scalars.entropy * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
     if distil:
-        divergence = _distillation(log_pi, replayed.counterfactual.logits)
+        divergence = _distillation(log_pi, replayed.counterfactual.logits, due)
         loss = loss + scalars.distil * divergence
         parts["distil_loss"] = divergence
     if method.auxiliary is not None:
@@ -154,7 +166,7 @@ def ppo_loss(
     return loss, parts
 
 
-def _distillation(log_pi: jax.Array, counterfactual: jax.Array) -> jax.Array:
+def _distillation(log_pi: jax.Array, counterfactual: jax.Array, due: jax.Array | None) -> jax.Array:
     """Return the mean KL(pi || counterfactual), pi fixed."""
     fixed = jax.lax.stop_gradient(log_pi)
-    return (jnp.exp(fixed) * (fixed - jax.nn.log_softmax(counterfactual))).sum(axis=-1).mean()
+    return average((jnp.exp(fixed) * (fixed - jax.nn.log_softmax(counterfactual))).sum(axis=-1), due)

@@ -33,12 +33,30 @@ def averaged(function: Callable[..., Any], *places: Any) -> Callable[..., Any]:
     return jax.shard_map(average, in_specs=places, out_specs=PartitionSpec(), check_vma=False)
 
 
-def moments(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+def average(values: jax.Array, counted: jax.Array | None = None) -> jax.Array:
+    """Return the mean float32 [] of those values [...] that count.
+
+    Args:
+      values: float32 [...]; within `averaged` a device's share.
+      counted: bool [...], which of them; None for all. 0 where none of all devices counts.
+    """
+    if counted is None:
+        return values.mean()
+    share = counted.astype(jnp.float32).mean()
+    if EPISODES in jax.sharding.get_abstract_mesh().manual_axes:
+        share = jax.lax.pmean(share, EPISODES)
+    return jnp.where(counted, values, 0.0).mean() / jnp.maximum(share, 1.0 / 2**24)
+
+
+def moments(values: jax.Array, counted: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
     """Return mean and deviation of the values of all devices.
 
-    Float32 [...] to float32 [] each; within `averaged` the values are a device's share.
+    Float32 [...] to float32 [] each; within `averaged` the values are a device's share. `counted` is as in `average`.
     """
     if EPISODES not in jax.sharding.get_abstract_mesh().manual_axes:
-        return values.mean(), values.std()
-    mean, square = jax.lax.pmean(jnp.stack([values.mean(), jnp.square(values).mean()]), EPISODES)
+        if counted is None:
+            return values.mean(), values.std()
+        mean = average(values, counted)
+        return mean, jnp.sqrt(average(jnp.square(values - mean), counted))
+    mean, square = jax.lax.pmean(jnp.stack([average(values, counted), average(jnp.square(values), counted)]), EPISODES)
     return mean, jnp.sqrt(jnp.maximum(square - jnp.square(mean), 0.0))

@@ -264,5 +264,5 @@ def test_table_2_has_every_method(monkeypatch):
 def test_the_ablations_have_the_baseline_alone():
     config = command.parse_compare(["--config", "ablations"])
     runs = entries(config)
-    assert len(runs) == 2 * 12
+    assert len(runs) == 2 * 14
     assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}

@@ -100,6 +100,7 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("ppo: {experience: 0}", "ppo.experience is 0.0; give a number between 0 and 1, both excluded"),
         ("ppo: {alone: 1.0}", "ppo.alone is 1.0; give a share from 0 to below 1"),
         ("ppo: {experience: 1.0}", "ppo.experience is 1.0; give a number between 0 and 1, both excluded"),
+        ("{method: semexp, done_gate: true}", "done_gate is True; what method 'semexp' chooses are no actions"),
         ("{method: vtnet, imitation: 1}", "imitation is 1.0; give a share between 0 and 1, both excluded"),
         ("{method: vtnet, total_steps: 9}", "total_steps is 9; stage 2 of method 'vtnet', a share of 0.8, gets none"),
         ("imitation: 0.2", "imitation is 0.2; 'org' has no stages of both kinds; leave it out"),

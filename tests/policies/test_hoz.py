@@ -54,9 +54,8 @@ def known(*banks_of, zones=3):
 def see(note, knowledge, cell, heading=EAST):
     """Look from a cell of the corridor of book, chair and fridge."""
     row = jnp.asarray(PATH.rows[cell * PER_CELL + 2 * heading])
-    return update(
-        note, knowledge, Percept(row, jnp.int32(heading), jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0))
-    )
+    nothing = jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0), jnp.int32(0)
+    return update(note, knowledge, Percept(row, jnp.int32(heading), *nothing))
 
 
 def test_the_zone_follows_a_walk_and_the_next_zone_leads_to_the_goal():
@@ -103,7 +102,9 @@ def test_a_view_pulls_the_node_of_its_zone_alone():
     both = np.array(PATH.rows[0])
     both[4 * CHAIR] = 200  # the chair beside the book: as near to either, and book's zone may be the other's
     nodes = np.asarray(knowledge.method["nodes"][KITCHEN])
-    percept = Percept(jnp.asarray(both), jnp.int32(0), jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0))
+    percept = Percept(
+        jnp.asarray(both), jnp.int32(0), jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0), jnp.int32(0)
+    )
     note = update(TRACKER.init(knowledge), knowledge, percept)
     zone = int(note.zone)
     assert zone in (book, holding(learned(*KITCHENS), CHAIR))

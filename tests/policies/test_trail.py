@@ -30,7 +30,9 @@ def follow(walk, length=100):
     columns = tuple(jnp.asarray(column) for column in zip(*walk, strict=True))
 
     def step(note, inputs):
-        note = tracker.update(note, known, Percept(jnp.zeros(0, jnp.uint8), *inputs))
+        heading, action, moved, horizon = inputs
+        percept = Percept(jnp.zeros(0, jnp.uint8), heading, action, moved, horizon, jnp.int32(0))
+        note = tracker.update(note, known, percept)
         return note, tracker.read(note, known, jnp.int32(0))
 
     return jax.lax.scan(step, tracker.init(known), columns)[1].tolist()

@@ -112,8 +112,11 @@ class TwoChoices:
 
     num_choices: int = 2
 
-    def act(self, choice, note):
-        return 2 * (note["views"] % 3) + choice
+    def due(self, note):
+        return None
+
+    def act(self, choice, note, knowledge):
+        return 2 * (note["views"] % 3) + choice, note
 
 
 CONTROLLED = Method(Reading, tracker=Counter(), control=TwoChoices())
@@ -195,8 +198,8 @@ class Growing(Counter):
 class TooMany(TwoChoices):
     """Turn a choice into an action that there is not."""
 
-    def act(self, choice, note):
-        return NUM_ACTIONS + choice * ROTATE_RIGHT
+    def act(self, choice, note, knowledge):
+        return NUM_ACTIONS + choice * ROTATE_RIGHT, note
 
 
 BROKEN = {

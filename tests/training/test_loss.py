@@ -43,6 +43,39 @@ def test_advantages_by_hand():
     np.testing.assert_array_equal(found, column(0.5, -2.0, 2.0, 2.0, 4.0))
 
 
+def test_advantages_of_a_macro_step_by_hand():
+    """Choices at steps 0 and 2, gamma = lambda = 1/2; what stands for a value at step 1 does not matter.
+
+    A_2 = delta_2 = 1 + 6/2 - 1 = 3. The macro-step of steps 0 and 1 has the reward 1 + 0/2 = 1 and the discount 1/4:
+    delta_0 = 1 + 1/4 - 1 = 0.25 and A_0 = 0.25 + 1/4 1/2 3 = 0.625.
+    """
+    due, ended = column(True, False, True), column(False, False, False)
+    reward, last = column(F(1), F(0), F(1)), F(6)
+    for between in (F(2), F(-8)):
+        value, next_value = column(F(1), between, F(1)), column(between, F(1), last)
+        found = advantages(reward, value, next_value, ended, jnp.float32(0.5), jnp.float32(0.5), due)
+        np.testing.assert_array_equal(found[::2], column(0.625, 3.0))
+
+
+@given(st.integers(0, 1000), st.floats(0, 1, width=32), st.floats(0, 1, width=32))
+def test_advantages_over_macro_steps_are_those_of_their_sums(seed, gamma, lambda_):
+    """Generalised advantages of macro-steps, each with its discounted rewards and gamma to the power of its length."""
+    reward, value, next_value, ended = random_steps(seed)
+    due = np.random.default_rng(seed + 1).random(reward.shape) < 0.4
+    due[0] = True
+    due[1:] |= ended[:-1]  # an episode begins with a choice
+    found = advantages(*(jnp.asarray(x) for x in (reward, value, next_value, ended)), F(gamma), F(lambda_), due)
+    for b in range(reward.shape[1]):
+        starts = np.flatnonzero(due[:, b])
+        advantage = 0.0
+        for start, end in reversed(list(zip(starts, [*starts[1:], len(reward)], strict=True))):
+            discounts = gamma ** np.arange(end - start)
+            total = (discounts * reward[start:end, b]).sum() + gamma ** (end - start) * next_value[end - 1, b]
+            carry = 0.0 if ended[end - 1, b] else gamma ** (end - start) * lambda_ * advantage
+            advantage = total - value[start, b] + carry
+            np.testing.assert_allclose(found[start, b], advantage, rtol=1e-3, atol=1e-4)
+
+
 def random_steps(seed, length=7, envs=5):
     generator = np.random.default_rng(seed)
     reward, value, last = generator.normal(size=(3, length, envs)).astype(F)

@@ -45,6 +45,7 @@ class Percept(NamedTuple):
       action: int32 [], the action that led here; `NO_ACTION` at the start.
       moved: bool [], whether it changed the cell.
       horizon: int32 [], index of the camera's horizon.
+      goal: int32 [], what is sought.
     """
 
     row: jax.Array
@@ -52,6 +53,7 @@ class Percept(NamedTuple):
     action: jax.Array
     moved: jax.Array
     horizon: jax.Array
+    goal: jax.Array
 
 
 class Tracker(Protocol):
@@ -83,9 +85,11 @@ class Experience(nnx.Module):
       sizes: the method's own whole-number sizes and their defaults, beside those that all methods share.
       width: Z, the size of the experience.
       recurrent: whether `attend` reads the memory; training then unrolls the policy step by step.
+      geometry: so many numbers of the reading belong to the direct pathway of the scene, see `surroundings`.
     """
 
     sizes: ClassVar[Mapping[str, int]] = {}
+    geometry: ClassVar[int] = 0
     width: int
     recurrent = False
 
@@ -110,6 +114,14 @@ class Experience(nnx.Module):
         """
         raise NotImplementedError
 
+    @staticmethod
+    def surroundings(reading: Tree) -> jax.Array:
+        """Return what the reading tells of the scene without objects.
+
+        It is float32 [..., geometry], and no part of Z.
+        """
+        raise NotImplementedError
+
     def attend(self, encoded: Tree, memory: "Memory") -> jax.Array:
         """Return the experience float32 [..., Z], given the memory."""
         del memory
@@ -124,8 +136,18 @@ class Control(Protocol):
         """Return the size of the policy's output."""
         ...
 
-    def act(self, choice: jax.Array, note: Tree) -> jax.Array:
-        """Return the action int32 [] of a choice int32 []."""
+    def due(self, note: Tree) -> jax.Array | None:
+        """Return whether the choice counts now, bool [...].
+
+        At other times it is ignored, and not learned from. None where every one counts. The note has leaves [..., ...].
+        """
+        ...
+
+    def act(self, choice: jax.Array, note: Tree, knowledge: Any) -> tuple[jax.Array, Tree]:
+        """Return the action int32 [] of a choice int32 [], and the note.
+
+        One episode; callers `vmap`.
+        """
         ...
 
 
@@ -135,10 +157,14 @@ class Primitive:
 
     num_choices: int = NUM_ACTIONS
 
-    def act(self, choice: jax.Array, note: Tree) -> jax.Array:
-        """Return the choice."""
+    def due(self, note: Tree) -> None:
+        """Return that every choice counts."""
         del note
-        return choice
+
+    def act(self, choice: jax.Array, note: Tree, knowledge: Any) -> tuple[jax.Array, Tree]:
+        """Return the choice."""
+        del knowledge
+        return choice, note
 
 
 class Adaptation(Protocol):
@@ -202,6 +228,7 @@ class Method:
       auxiliary: one more term of the loss, from a `jaxnav.training.loss.Replay` to a loss float32 [] and named parts.
       adaptation: how the policy changes within an episode.
       control: how its choices become actions.
+      check: from what was learned and a bank to an `InputError` if the method cannot act in its scenes.
       hosts_layout: whether the layout's weights can enter; if not, it is trained without the layout alone.
     """
 
@@ -213,6 +240,7 @@ class Method:
     auxiliary: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None
     adaptation: Adaptation | None = None
     control: Control = Primitive()
+    check: Callable[[Knowledge, Bank], None] | None = None
     hosts_layout: bool = True
 
     def __post_init__(self) -> None:

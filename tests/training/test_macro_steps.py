@@ -1,0 +1,67 @@
+"""Macro-steps: choices that do not count teach nothing, and a policy learns where to search."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, rolled
+from support.scenes import CATEGORIES, SMALL, draw
+
+from jaxnav.env.build import build
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods.home import learn_home
+from jaxnav.policies.methods.semexp import SEMEXP
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import Task
+from jaxnav.training.config import PPOConfig
+from jaxnav.training.learner import Learner
+from jaxnav.training.loss import ppo_loss, replay
+
+#: A corridor of 10 m with a book at its north end; the actions are enough for one way, not for both.
+CORRIDOR = draw([["."]] * 40, ("Book", 0.0, 0.8, 9.75, *SMALL))
+BANK, LIMIT = compile_bank([CORRIDOR], Task(CATEGORIES)), 26
+
+
+def test_choices_that_do_not_count_teach_nothing():
+    before = rolled(False)
+    due = jnp.asarray(np.random.default_rng(0).random((LENGTH, ENVS)) < 0.3)
+    advantage = np.random.default_rng(1).normal(size=(LENGTH, ENVS)).astype(np.float32)
+    transitions = jax.tree.map(jnp.asarray, before.transitions)._replace(due=due)
+
+    @jax.jit
+    def learn(weights, transitions, advantage):
+        def loss(weights):
+            replayed = replay(ACTING.bind(weights), transitions, before.memory, PARAMS)
+            return ppo_loss(replayed, advantage, PPOConfig().scalars(1), True, SEMEXP)[0]
+
+        return jax.value_and_grad(loss)(weights)
+
+    expected = learn(before.weights, transitions, jnp.asarray(advantage))
+    off = transitions._replace(
+        choice=jnp.where(due, transitions.choice, 0), log_prob=jnp.where(due, transitions.log_prob, -9.0)
+    )
+    found = learn(before.weights, off, jnp.where(due, advantage, 9.0))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), found, expected)
+    counted = learn(before.weights, transitions._replace(due=None), jnp.asarray(advantage))
+    assert abs(float(counted[0] - expected[0])) > 1e-4
+
+
+@pytest.mark.slow
+def test_where_to_search_is_learned():
+    """The book is always north: who chooses at random goes south as often, and finds it too late."""
+    env, params = build(BANK, {}, LIMIT)
+    knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_home([BANK], np.zeros(0))))
+    spec = dataclasses.replace(tiny.SPEC, method="semexp", method_sizes=())
+    config = PPOConfig(num_envs=ENVS, rollout=LIMIT, epochs=4, minibatches=2, gamma=0.97)
+    learner = Learner(Acting(env, spec, tiny.SETTING), config, "none")
+    state = jax.jit(learner.init)(jax.random.key(0), params, knowledge)
+    train = jax.jit(functools.partial(learner.train, num_updates=10))
+    success = []
+    for _ in range(12):
+        state, metrics = train(state, config.scalars(120), params, knowledge)
+        success.append(float(metrics["success"]))
+    assert np.mean(success[-4:]) > 2 * success[0]
