@@ -22,6 +22,7 @@ from jaxnav.policies.methods.eotp import EOTP
 from jaxnav.policies.methods.hoz import HOZ
 from jaxnav.policies.methods.org import ORG
 from jaxnav.policies.methods.rgb import RGB
+from jaxnav.policies.methods.savn import SAVN
 from jaxnav.policies.methods.sp import SP
 from jaxnav.policies.methods.tpn import TPN
 from jaxnav.policies.methods.vtnet import VTNET
@@ -47,6 +48,7 @@ METHODS = {
     "hoz": HOZ,
     "org": ORG,
     "rgb": RGB,
+    "savn": SAVN,
     "sp": SP,
     "tpn": TPN,
     "vtnet": VTNET,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxnav.numerics.product import Linear, biased, product
+from jaxnav.policies.adaptation import LearnedLoss, LearnedSteps
 from jaxnav.policies.category_maps import CategoryMaps
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.base import Experience, Method
@@ -85,6 +86,14 @@ class UniformAttention(SpatialAttention):
         return shown / shown.sum(axis=-1, keepdims=True)
 
 
+class AdaptedAttention(SpatialAttention):
+    """Attend to them; a learned loss stands by."""
+
+    def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
+        super().__init__(spec, rngs)
+        self.learned_loss = LearnedLoss(rngs)
+
+
 def _directed(vectors: jax.Array) -> jax.Array:
     """Return vectors [..., h] at length 1; 0 stays 0."""
     return vectors * jax.lax.rsqrt(jnp.square(vectors).sum(axis=-1, keepdims=True) + _TINY)
@@ -93,3 +102,5 @@ def _directed(vectors: jax.Array) -> jax.Array:
 EOTP = Method(SpatialAttention)
 #: EOTP with equal attention: the ablation that it must beat.
 UNIFORM = Method(UniformAttention)
+#: EOTP that adapts within an episode, as its released agent does.
+ADAPTED = Method(AdaptedAttention, adaptation=LearnedSteps())
