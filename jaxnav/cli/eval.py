@@ -33,6 +33,7 @@ class EvalConfig:
       setting: layout estimator to use instead of the run's: `paper` and `released` change the layout's weights too,
         the others measure the gap in another way; see docs/methods.md.
       hold: the gap never falls within an episode; with `--form switch` experience is then out for good.
+      inner_steps: by which a method that learns within an episode may adapt, 0 for none; default: its usual number.
       seed: of the episode list and the sampled actions.
       json: where to write the table; default: in the run directory.
     """
@@ -46,6 +47,7 @@ class EvalConfig:
     form: tuple[Form, ...] | None = None
     setting: EstimatorName | None = None
     hold: bool = False
+    inner_steps: int | None = None
     seed: int = 0
     json: Path | None = None
 
@@ -69,6 +71,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         form=config.form,
         setting=config.setting,
         hold=config.hold,
+        inner_steps=config.inner_steps,
         seed=config.seed,
         console=console,
     )
@@ -92,6 +95,7 @@ def _target(config: EvalConfig) -> Path:
     source = "" if config.scenes is None else f"{config.scenes.name.split('.')[0]}-"
     name = f"eval-{source}{config.split}" + ("" if config.shift is None else f"-shift{config.shift:g}")
     name += "" if config.setting is None else f"-{config.setting}"
+    name += "" if config.inner_steps is None else f"-inner{config.inner_steps}"
     target = config.json or config.run / f"{name}.json"
     if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
         raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")

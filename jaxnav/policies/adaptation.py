@@ -2,40 +2,20 @@
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from jaxnav.numerics.product import Linear
+from jaxnav.errors import InputError
 from jaxnav.numerics.sparse import where_due
+from jaxnav.policies.learned_loss import WINDOW, Judging
 from jaxnav.policies.pathways import Decision, Memory, Pathways, zero_experience
 
 if TYPE_CHECKING:
+    from jaxnav.policies.methods.base import Adaptation
     from jaxnav.policies.policy import Policy
-
-#: Environment steps between two inner steps. The learned loss reads all of them.
-WINDOW = 6
-_CHANNELS = 10  # of the learned loss
-_TINY = 1e-12  # below the square of any loss
-
-
-class LearnedLoss(nnx.Module):
-    """Judge a window without reward.
-
-    Two causal convolutions along a row's entries, the window's steps being channels, and the length of the result.
-    """
-
-    def __init__(self, rngs: nnx.Rngs) -> None:
-        self.first, self.second = Linear(2 * WINDOW, _CHANNELS, rngs=rngs), Linear(2 * _CHANNELS, 1, rngs=rngs)
-
-    def __call__(self, rows: jax.Array) -> jax.Array:
-        """Return the loss of rows float32 [..., W, L], at least 0."""
-        entries = jnp.swapaxes(rows, -1, -2)
-        inner = nnx.leaky_relu(self.first(_with_earlier(entries, 1)))
-        outer = nnx.leaky_relu(self.second(_with_earlier(inner, 2)))
-        return jnp.sqrt(jnp.square(outer).sum(axis=(-2, -1)) + _TINY)
 
 
 class Factors(NamedTuple):
@@ -126,7 +106,7 @@ class LearnedSteps:
 
     def step(self, policy: "Policy", fast: FastWeights) -> dict[str, Factors]:
         """Return the factors of an inner step, [W, ...], of one episode."""
-        loss = policy.method.learned_loss
+        loss = cast(Judging, policy.method).learned_loss
         if not self.second_order:  # not into the loss itself: nothing else would teach it
             graph, state = nnx.split(policy)
             policy, fast = nnx.merge(graph, jax.lax.stop_gradient(state)), jax.lax.stop_gradient(fast)
@@ -138,6 +118,22 @@ class LearnedSteps:
 
         gradient, inputs = jax.grad(judge, has_aux=True)(added)
         return {layer: Factors(inputs[layer], -self.rate * by_output) for layer, by_output in gradient.items()}
+
+
+def limited(adaptation: "Adaptation | None", steps: int) -> "Adaptation | None":
+    """Return an adaptation that takes fewer inner steps.
+
+    Raises:
+      InputError: it takes no inner steps, or not so many; none at all is always possible.
+    """
+    if steps == 0:
+        return None
+    if not isinstance(adaptation, LearnedSteps):
+        raise InputError(f"inner_steps is {steps}; the method adapts in another way: give 0, or leave it out")
+    if not 0 < steps <= adaptation.steps:
+        most = f"an episode remembers {adaptation.steps} windows of {WINDOW} actions"
+        raise InputError(f"inner_steps is {steps}; {most}: give 0 to {adaptation.steps}")
+    return dataclasses.replace(adaptation, steps=steps)
 
 
 def replay_window(
@@ -188,9 +184,3 @@ def _noted(fast: FastWeights, pathways: Pathways, memory: Memory) -> FastWeights
         pathways=jax.tree.map(append, fast.pathways, alone),
         action=append(fast.action, memory.action),
     )
-
-
-def _with_earlier(entries: jax.Array, distance: int) -> jax.Array:
-    """Join each entry [..., L, C] and the one so far before it."""
-    earlier = jnp.concatenate([jnp.zeros_like(entries[..., :distance, :]), entries[..., :-distance, :]], axis=-2)
-    return jnp.concatenate([earlier, entries], axis=-1)

@@ -131,7 +131,7 @@ def test_the_actor_is_renewed():
 
 def test_an_agent_that_does_not_try_decides_plainly():
     for acting in (
-        dataclasses.replace(ACTING, adapts=False),
+        dataclasses.replace(ACTING, inner_steps=0),
         dataclasses.replace(ACTING, spec=dataclasses.replace(SPEC, method="jaxnav.policies.methods.tpn:UNTRIED")),
     ):
         policy, (_, pathways, memory) = acting.bind(tiny.lively(0, SPEC)), given(SPEC)
@@ -139,7 +139,7 @@ def test_an_agent_that_does_not_try_decides_plainly():
         decision = policy.decide(pathways, memory)
         chex.assert_trees_all_equal(decision.fast.change, memory.fast.change)
         np.testing.assert_allclose(decision.logits, policy.decide_plainly(pathways, memory).logits, atol=1e-6)
-    assert not dataclasses.replace(ACTING, adapts=False).bind(tiny.lively(0, SPEC)).recurrent
+    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.lively(0, SPEC)).recurrent
 
 
 # Training

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxnav.numerics.product import Linear, biased, product
-from jaxnav.policies.adaptation import LearnedLoss, LearnedSteps
+from jaxnav.policies.adaptation import LearnedSteps
 from jaxnav.policies.category_maps import CategoryMaps
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.base import Experience, Method
+from jaxnav.policies.methods.savn import WithLearnedLoss
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import NUM_ACTIONS
@@ -86,12 +87,8 @@ class UniformAttention(SpatialAttention):
         return shown / shown.sum(axis=-1, keepdims=True)
 
 
-class AdaptedAttention(SpatialAttention):
+class AdaptedAttention(WithLearnedLoss, SpatialAttention):
     """Attend to them; a learned loss stands by."""
-
-    def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
-        super().__init__(spec, rngs)
-        self.learned_loss = LearnedLoss(rngs)
 
 
 def _directed(vectors: jax.Array) -> jax.Array:

@@ -4,18 +4,23 @@ import dataclasses
 
 from flax import nnx
 
-from jaxnav.policies.adaptation import LearnedLoss, LearnedSteps
-from jaxnav.policies.methods.base import Method
+from jaxnav.policies.adaptation import LearnedSteps
+from jaxnav.policies.learned_loss import LearnedLoss
+from jaxnav.policies.methods.base import Experience, Method
 from jaxnav.policies.methods.rgb import NoExperience
 from jaxnav.policies.spec import PolicySpec
 
 
-class LearnedInteraction(NoExperience):
-    """Make no experience; a learned loss stands by."""
+class WithLearnedLoss(Experience):
+    """Add a learned loss to another experience, before which it is inherited."""
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)
         self.learned_loss = LearnedLoss(rngs)
+
+
+class LearnedInteraction(WithLearnedLoss, NoExperience):
+    """Make no experience; a learned loss stands by."""
 
 
 SAVN = Method(LearnedInteraction, adaptation=LearnedSteps(), hosts_layout=False)
