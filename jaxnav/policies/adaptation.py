@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from jaxnav.errors import InputError
@@ -41,14 +42,14 @@ class FastWeights(NamedTuple):
     Attributes:
       decisions: int32 [...], so far.
       start: float32 [..., H], the hidden state before the window.
-      pathways: of the last decisions, leaves [..., W, ...]; the latest is at the end.
+      pathways: float32 [..., W, P], all pathways of the last decisions, joined; the latest is at the end.
       action: int32 [..., W], the action before each of them.
       factors: of each layer, a row for every step of the windows so far; the latest are at the end.
     """
 
     decisions: jax.Array
     start: jax.Array
-    pathways: Pathways
+    pathways: jax.Array
     action: jax.Array
     factors: dict[str, Factors]
 
@@ -75,17 +76,16 @@ class LearnedSteps:
 
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> FastWeights:
         """Return an empty window and no change."""
-
-        def empty(count: int, widths: tuple[int, ...]) -> list[jax.Array]:
-            return [jnp.zeros((*batch, count, width)) for width in widths]
-
         rank = self.steps * WINDOW
         return FastWeights(
             decisions=jnp.zeros(batch, jnp.int32),
             start=jnp.zeros((*batch, len(policy.recurrent_kernel))),
-            pathways=Pathways(*empty(WINDOW, policy.pathway_widths)),
+            pathways=jnp.zeros((*batch, WINDOW, sum(policy.pathway_widths))),
             action=jnp.zeros((*batch, WINDOW), jnp.int32),
-            factors={layer: Factors(*empty(rank, widths)) for layer, widths in policy.layer_widths.items()},
+            factors={
+                layer: Factors(*(jnp.zeros((*batch, rank, width)) for width in widths))
+                for layer, widths in policy.layer_widths.items()
+            },
         )
 
     def decide(self, policy: "Policy", pathways: Pathways, memory: Memory) -> Decision:
@@ -150,8 +150,9 @@ def replay_window(
       Rows float32 [W, H + A] of hidden state and probabilities, and the inputs [W, M] of each layer.
     """
 
-    def again(hidden: jax.Array, part: tuple[Pathways, jax.Array, dict[str, jax.Array]]) -> tuple[jax.Array, Any]:
-        pathways, action, added = part
+    def again(hidden: jax.Array, part: tuple[jax.Array, jax.Array, dict[str, jax.Array]]) -> tuple[jax.Array, Any]:
+        entered, action, added = part
+        pathways = Pathways(*jnp.split(entered, np.cumsum(policy.pathway_widths)[:-1]))
         inputs: dict[str, jax.Array] = {}
 
         def change(layer: str, entering: jax.Array) -> jax.Array:
@@ -171,7 +172,7 @@ def _noted(fast: FastWeights, pathways: Pathways, memory: Memory) -> FastWeights
 
     With streams the window goes without experience: the direct stream adapts as if it acted alone.
     """
-    alone = zero_experience(pathways._replace(reading=None), jax.tree.map(jnp.zeros_like, memory.experienced))
+    alone = zero_experience(pathways, jax.tree.map(jnp.zeros_like, memory.experienced))
     axis = memory.action.ndim
 
     def append(past: jax.Array, now: jax.Array) -> jax.Array:
@@ -181,6 +182,6 @@ def _noted(fast: FastWeights, pathways: Pathways, memory: Memory) -> FastWeights
     return fast._replace(
         decisions=fast.decisions + 1,
         start=jnp.where(begins, memory.hidden, fast.start),
-        pathways=jax.tree.map(append, fast.pathways, alone),
+        pathways=append(fast.pathways, jnp.concatenate(alone[:-1], axis=-1)),
         action=append(fast.action, memory.action),
     )

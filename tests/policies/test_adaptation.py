@@ -200,6 +200,14 @@ def test_the_window_is_what_was_decided():
     np.testing.assert_allclose(inputs["core"], before.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", SPECS)
+def test_fast_weights_can_be_stored(name):
+    """Checkpoints hold no empty arrays, though experience may have no width."""
+    spec = SPECS[name]
+    memory = jax.eval_shape(lambda: bind(spec, tiny.lively(0, spec)).initial_memory((3,)))
+    assert all(leaf.size > 0 for leaf in jax.tree.leaves(memory.fast))
+
+
 # Fewer steps
 
 

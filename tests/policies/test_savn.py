@@ -42,9 +42,8 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     def go():
         policy = ACTING.bind(weights)
         agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
-        for number in range(1, 3):
-            key = jax.random.key(number)
-            agent, rollout = collect(ACTING, policy, agent, key, LENGTH + 1, False, PARAMS, KNOWLEDGE)
+        agent, _ = collect(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWLEDGE)
+        agent, rollout = collect(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWLEDGE)
         return agent, rollout, replay(policy, rollout.transitions, rollout.memory, PARAMS).decisions
 
     agent, rollout, again = go()
@@ -116,9 +115,8 @@ def fall(weights, steps):
 def test_training_teaches_the_loss_and_its_steps_make_it_fall():
     learner = Learner(ACTING, PPOConfig(num_envs=ENVS, rollout=10, epochs=2, minibatches=2), "none")
     begin = jax.jit(learner.init)(jax.random.key(0), LONG, KNOWLEDGE)
-    after, _ = jax.jit(functools.partial(learner.train, num_updates=20))(
-        begin, learner.config.scalars(40), LONG, KNOWLEDGE
-    )
+    train = jax.jit(functools.partial(learner.train, num_updates=20))
+    after, _ = train(begin, learner.config.scalars(40), LONG, KNOWLEDGE)
     loss_before, loss_after = (state.params["method"]["learned_loss"] for state in (begin, after))
     moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), loss_before, loss_after)
     assert min(jax.tree.leaves(moved)) > 1e-3
