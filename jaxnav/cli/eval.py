@@ -35,6 +35,7 @@ class EvalConfig:
       setting: layout estimator to use instead of the run's: `paper` and `released` change the layout's weights too,
         the others measure the gap in another way; see docs/methods.md.
       hold: the gap never falls within an episode; with `--form switch` experience is then out for good.
+      inner_steps: by which a method that learns within an episode may adapt, 0 for none; default: its usual number.
       seed: of the episode list and the sampled actions.
       json: where to write the table; default: in the run directory.
     """
@@ -49,6 +50,7 @@ class EvalConfig:
     form: tuple[Form, ...] | None = None
     setting: EstimatorName | None = None
     hold: bool = False
+    inner_steps: int | None = None
     seed: int = 0
     json: Path | None = None
 
@@ -73,6 +75,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         form=config.form,
         setting=config.setting,
         hold=config.hold,
+        inner_steps=config.inner_steps,
         seed=config.seed,
         console=console,
     )
@@ -97,6 +100,7 @@ def _target(config: EvalConfig) -> Path:
     name = f"eval-{source}-{config.split}" if source else f"eval-{config.split}"
     name += "" if config.shift is None else f"-shift{config.shift:g}"
     name += "" if config.setting is None else f"-{config.setting}"
+    name += "" if config.inner_steps is None else f"-inner{config.inner_steps}"
     target = config.json or config.run / f"{name}.json"
     if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
         raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")

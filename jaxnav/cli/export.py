@@ -141,7 +141,7 @@ Inputs, a row for each episode:
 * `moved` bool: whether the last action changed the cell; `first` bool: whether an episode begins
 * `memory`: what the step before returned; not read where an episode begins
 
-Outputs: `action` int32, the best one (where `logits` are of actions, you may sample one and give it as the next `action`);
-`logits`, `factual` and, where the policy uses the layout, `counterfactual` float32 [6]; there also the layout gap `gap`
-and the weights `weights` [K] of eq. 7; `memory`.
+Outputs: `action` int32, the best one (where `logits` are of actions, you may sample one and give it as the next
+`action`); `logits`, `factual` and, where the policy uses the layout, `counterfactual` float32 [6]; there also the
+layout gap `gap` and the weights `weights` [K] of eq. 7; `memory`.
 """

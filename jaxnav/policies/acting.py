@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, State
 from jaxnav.layout import Setting
+from jaxnav.policies.adaptation import limited
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
 from jaxnav.policies.perception import Perceived, Perception, View
@@ -65,13 +66,13 @@ class Acting:
       env: the environment.
       spec: of the policy; None where actions are given.
       setting: of the layout estimator; None leaves the layout out.
-      adapts: whether the method's adaptation, if it has one, changes the policy.
+      inner_steps: by which the method's adaptation may change the policy in an episode; 0: none, None: as usual.
     """
 
     env: ObjectNav
     spec: PolicySpec | None = None
     setting: Setting | None = None
-    adapts: bool = True
+    inner_steps: int | None = None
 
     @property
     def method(self) -> Method | None:
@@ -83,8 +84,8 @@ class Acting:
         if self.spec is None:
             raise ValueError("Acting without a spec has no policy to bind; give one")
         policy = bind(self.spec, params)
-        if not self.adapts:
-            policy.adaptation = None
+        if self.inner_steps is not None:
+            policy.adaptation = limited(policy.adaptation, self.inner_steps)
         return policy
 
     def view(self, agent: Agent, knowledge: Knowledge | None, params: EnvParams) -> View:

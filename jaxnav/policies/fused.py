@@ -16,7 +16,7 @@ from jaxnav.policies.methods import find_method
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory, Pathways, zero_experience
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.policies.stream import Stream
+from jaxnav.policies.stream import NO_CHANGES, Changes, Stream
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NUM_ACTIONS
 
@@ -116,14 +116,14 @@ class Policy(Stream):
             decision = self.adaptation.decide(self, pathways, memory)
         return decision._replace(experienced=memory.experienced)
 
-    def decide_plainly(self, pathways: Pathways, memory: Memory, change: jax.Array | None = None) -> Decision:
+    def decide_plainly(self, pathways: Pathways, memory: Memory, changes: Changes = NO_CHANGES) -> Decision:
         """Decide without the method's adaptation.
 
-        An adaptation may give a change of the actor, see `Stream.act`.
+        An adaptation may change the layers; with streams they are those of the direct stream.
         """
-        drive = self.drive(self.direct_input(pathways) + self.mediated_input(pathways, memory.action))
-        hidden = gru(drive, memory.hidden @ self.recurrent_kernel, memory.hidden)
-        return self.act(hidden, pathways, change)._replace(fast=memory.fast)
+        entering = self.direct_input(pathways) + self.mediated_input(pathways, memory.action, changes)
+        hidden = gru(self.drive(entering, changes), self.project(memory.hidden, changes), memory.hidden)
+        return self.act(hidden, pathways, changes)._replace(fast=memory.fast)
 
     def direct_input(self, pathways: Pathways) -> jax.Array:
         """Return what enters by the direct pathways, float32 [..., H].
@@ -147,6 +147,11 @@ class Policy(Stream):
     def experience_appearance(self) -> jax.Array:
         """Return the embeddings of categories that experience gets."""
         return self.appearance.embedding[...]
+
+    @property
+    def pathway_widths(self) -> tuple[int, ...]:
+        """Return the widths of scene, goal, experience and gate."""
+        return *self.widths[:3], 1
 
     def _widths(self, sizes: Sizes) -> tuple[int, ...]:
         """Return the widths of scene, goal, experience and previous action."""

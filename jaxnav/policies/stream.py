@@ -1,5 +1,8 @@
 """A stream: what enters a recurrent core, and the heads on it."""
 
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +15,11 @@ from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 #: First logit of Done: chosen once in 60 steps, for an agent that gives up at once never learns what it might find.
 SELDOM = -2.5
+
+#: What an adaptation adds to the outputs [..., N] of some of the layers `fuse`, `drive`, `core` and `actor`, given the
+#: inputs [..., M] of each. Where the layer has a bias the last input is 1.
+Changes = Mapping[str, Callable[[jax.Array], jax.Array]]
+NO_CHANGES: Changes = MappingProxyType({})
 
 
 class Stream(nnx.Module):
@@ -42,30 +50,38 @@ class Stream(nnx.Module):
         )
         self.critic = Linear(self.hidden, 1, rngs=rngs)
 
-    def mediated_input(self, pathways: Pathways, action: jax.Array) -> jax.Array:
+    def mediated_input(self, pathways: Pathways, action: jax.Array, changes: Changes = NO_CHANGES) -> jax.Array:
         """Return what enters by experience and previous action.
 
-        Float32 [..., H]; the action is int32 [...].
+        Float32 [..., H]; the action is int32 [...]. A change of the layer `fuse`, which takes in all pathways, is part.
         """
         *_, experience, previous = self.fuse_kernels
         one_hot = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
-        return biased(product(pathways.experience, experience) + product(one_hot, previous), self.fuse)
+        entering = biased(product(pathways.experience, experience) + product(one_hot, previous), self.fuse)
+        if "fuse" not in changes:
+            return entering
+        parts = pathways.scene, pathways.goal, pathways.experience, one_hot
+        return entering + changes["fuse"](with_one(jnp.concatenate(parts, axis=-1)))
 
-    def drive(self, entering: jax.Array) -> jax.Array:
+    def drive(self, entering: jax.Array, changes: Changes = NO_CHANGES) -> jax.Array:
         """Return the core's input, float32 [..., 3 H].
 
         It is made of all that enters, float32 [..., H].
         """
-        return biased(product(nnx.relu(entering), self.core.dense_i.kernel[...]), self.core.dense_i)
+        inputs = nnx.relu(entering)
+        drive = biased(product(inputs, self.core.dense_i.kernel[...]), self.core.dense_i)
+        return drive + changes["drive"](with_one(inputs)) if "drive" in changes else drive
 
-    def act(self, hidden: jax.Array, pathways: Pathways, change: jax.Array | None = None) -> Decision:
-        """Decide by a hidden state float32 [..., H].
+    def project(self, hidden: jax.Array, changes: Changes = NO_CHANGES) -> jax.Array:
+        """Return what the hidden state [..., H] does, float32 [..., 3 H]."""
+        projected = hidden @ self.core.dense_h.kernel[...]
+        return projected + changes["core"](hidden) if "core" in changes else projected
 
-        A change float32 [..., H + 1, A] is added to the actor's kernel and bias; None adds nothing.
-        """
+    def act(self, hidden: jax.Array, pathways: Pathways, changes: Changes = NO_CHANGES) -> Decision:
+        """Decide by a hidden state float32 [..., H]."""
         logits = self.actor(hidden)
-        if change is not None:
-            logits = logits + (with_one(hidden)[..., None] * change).sum(axis=-2)
+        if "actor" in changes:
+            logits = logits + changes["actor"](with_one(hidden))
         return Decision(logits=self.gated(logits, pathways), value=self.critic(hidden)[..., 0], hidden=hidden)
 
     def gated(self, logits: jax.Array, pathways: Pathways) -> jax.Array:
@@ -73,6 +89,17 @@ class Stream(nnx.Module):
         if not self.done_gate:
             return logits
         return jnp.concatenate([logits[..., :DONE], pathways.gate * logits[..., DONE:]], axis=-1)
+
+    @property
+    def layer_widths(self) -> dict[str, tuple[int, int]]:
+        """Return the widths of inputs and outputs of the layers that may change."""
+        hidden, gates = self.hidden, 3 * self.hidden
+        return {
+            "fuse": (sum(self.widths) + 1, hidden),
+            "drive": (hidden + 1, gates),
+            "core": (hidden, gates),
+            "actor": (hidden + 1, self.actor.out_features),
+        }
 
     @property
     def recurrent_kernel(self) -> jax.Array:

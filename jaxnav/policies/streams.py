@@ -11,7 +11,7 @@ from jaxnav.numerics.rounding import rounded
 from jaxnav.policies.fused import Policy
 from jaxnav.policies.pathways import Decision, Memory, Pathways
 from jaxnav.policies.spec import PolicySpec, Sizes
-from jaxnav.policies.stream import Stream, with_one
+from jaxnav.policies.stream import NO_CHANGES, Changes, Stream, with_one
 from jaxnav.scenes.task import NUM_ACTIONS
 
 
@@ -57,27 +57,29 @@ class Streams(Policy):
         direct = super().direct_input(pathways)
         return jnp.concatenate([direct, jnp.zeros_like(direct)], axis=-1)
 
-    def mediated_input(self, pathways: Pathways, action: jax.Array) -> jax.Array:
+    def mediated_input(self, pathways: Pathways, action: jax.Array, changes: Changes = NO_CHANGES) -> jax.Array:
         """Return what enters by experience and previous action.
 
         Float32 [..., 2 H]; the direct stream gets the previous action alone.
         """
-        direct = super().mediated_input(pathways._replace(experience=pathways.experience[..., :0]), action)
+        without = pathways._replace(experience=pathways.experience[..., :0])
+        direct = super().mediated_input(without, action, changes)
         return jnp.concatenate([direct, self.experience_stream.mediated_input(pathways, action)], axis=-1)
 
-    def drive(self, entering: jax.Array) -> jax.Array:
+    def drive(self, entering: jax.Array, changes: Changes = NO_CHANGES) -> jax.Array:
         """Return the cores' input, float32 [..., 6 H]."""
         direct, experience = jnp.split(entering, 2, axis=-1)
-        gates = zip(_gates(super().drive(direct)), _gates(self.experience_stream.drive(experience)), strict=True)
-        return jnp.concatenate([part for gate in gates for part in gate], axis=-1)
+        return _interleaved(super().drive(direct, changes), self.experience_stream.drive(experience))
 
-    def act(self, hidden: jax.Array, pathways: Pathways, change: jax.Array | None = None) -> Decision:
-        """Decide by both hidden states, float32 [..., 2 H].
+    def project(self, hidden: jax.Array, changes: Changes = NO_CHANGES) -> jax.Array:
+        """Return what both hidden states [..., 2 H] do, float32 [..., 6 H]."""
+        direct, experience = jnp.split(hidden, 2, axis=-1)
+        return _interleaved(super().project(direct, changes), self.experience_stream.project(experience))
 
-        A change is one of the direct stream's actor.
-        """
+    def act(self, hidden: jax.Array, pathways: Pathways, changes: Changes = NO_CHANGES) -> Decision:
+        """Decide by both hidden states, float32 [..., 2 H]."""
         halves = jnp.split(hidden, 2, axis=-1)
-        direct, experience = super().act(halves[0], pathways, change), self.experience_stream.act(halves[1], pathways)
+        direct, experience = super().act(halves[0], pathways, changes), self.experience_stream.act(halves[1], pathways)
         seen, known = pathways.scene[..., -1:], pathways.experience[..., -1:]
         direct = _fixed(direct, known != 0)
         # Rounded, so that the sum is exact and removing one stream (eq. 1) leaves the other to the bit.
@@ -101,6 +103,11 @@ class Streams(Policy):
         gates = zip(*(_gates(kernel) for kernel in kernels), strict=True)
         return jnp.concatenate([jax.scipy.linalg.block_diag(*gate) for gate in gates], axis=-1)
 
+    @property
+    def pathway_widths(self) -> tuple[int, ...]:
+        """Return the widths of scene, goal, experience and gate."""
+        return *self.widths[:2], self.experience_stream.widths[0], 1
+
     def _widths(self, sizes: Sizes) -> tuple[int, ...]:
         """Return the widths of what enters the direct stream."""
         scene, goal, _, action = super()._widths(sizes)
@@ -119,6 +126,13 @@ def _fixed(decision: Decision, where: jax.Array) -> Decision:
 def _joined(encoded: Pathways) -> Pathways:
     """Join the method's experience and the view beside it."""
     return encoded._replace(experience=jnp.concatenate(encoded.experience, axis=-1))
+
+
+def _interleaved(direct: jax.Array, experience: jax.Array) -> jax.Array:
+    """Join the streams gate by gate, [..., 6 H]."""
+    return jnp.concatenate(
+        [part for gate in zip(_gates(direct), _gates(experience), strict=True) for part in gate], axis=-1
+    )
 
 
 def _gates(values: jax.Array) -> list[jax.Array]:

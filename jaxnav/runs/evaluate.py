@@ -75,6 +75,7 @@ def evaluate(
     form: Sequence[Form] | None = None,
     setting: EstimatorName | None = None,
     hold: bool = False,
+    inner_steps: int | None = None,
     seed: int = 0,
     compiled: CompiledWorld | None = None,
     console: Console | None = None,
@@ -91,6 +92,7 @@ def evaluate(
       epsilon: thresholds of sTDE.
       form: how sTDE combines the logits; None for that of the run's layout setting.
       setting, hold: layout estimator to use instead of the run's; see `Policies.estimating`.
+      inner_steps: by which policies may adapt in an episode; see `Policies.adapting`.
       seed: of the episode list and the sampled actions, from 0 to 2**32 - 1.
       compiled: the world of `evaluation_world` with these arguments, where it is there already.
       console: to tell of progress on; None for silence.
@@ -100,7 +102,7 @@ def evaluate(
     """
     check_seed(seed)
     console = console or Console(quiet=True)
-    config, policies = run.config, run.policies().estimating(setting, hold)
+    config, policies = run.config, run.policies().estimating(setting, hold).adapting(inner_steps)
     if form is None:
         form = () if policies.setting is None else (policies.setting.form,)
     rows = table_rows([float(threshold) for threshold in epsilon], form, policies.arms)
@@ -117,6 +119,7 @@ def evaluate(
         "evaluation_seed": seed,
         "evaluation_setting": setting,
         "evaluation_hold": hold,
+        "evaluation_inner_steps": inner_steps,
     }
     results = Results(rows, outcome, together(lists), compiled.env.categories, WORLDS[config.world].budgets, {})
     names = {"method": config.method.upper(), "world": compiled.scenes[0].world, "split": split}

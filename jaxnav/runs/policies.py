@@ -15,6 +15,7 @@ from jaxnav.errors import InputError
 from jaxnav.gaps import Signs
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.acting import Acting
+from jaxnav.policies.adaptation import limited
 from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
@@ -43,6 +44,7 @@ class Policies(NamedTuple):
       spec: what the policies are built from.
       setting: of the layout estimator, as calibrated; None without the arm `layout`.
       prior_steps: random steps that the priors were collected in.
+      inner_steps: by which they may adapt in an episode; None for the method's usual number.
     """
 
     params: dict[str, Any]
@@ -52,6 +54,7 @@ class Policies(NamedTuple):
     spec: PolicySpec
     setting: Setting | None
     prior_steps: int
+    inner_steps: int | None = None
 
     @property
     def seeds(self) -> int:
@@ -89,9 +92,26 @@ class Policies(NamedTuple):
             setting = gap_settings(setting)[name]
         return self._replace(setting=dataclasses.replace(setting, hold=hold or setting.hold), knowledge=knowledge)
 
+    def adapting(self, steps: int | None) -> "Policies":
+        """Return these policies with so many inner steps in an episode.
+
+        0 switches their adaptation off, None leaves it.
+
+        Raises:
+          InputError: the method does not adapt, or not by so many steps.
+        """
+        if steps is None:
+            return self
+        adaptation = find_method(self.spec.method).adaptation
+        if adaptation is None:
+            name = self.spec.method
+            raise InputError(f"inner_steps is {steps}; method {name!r} does not adapt in an episode, leave it out")
+        limited(adaptation, steps)
+        return self._replace(inner_steps=steps)
+
     def acting(self, env: ObjectNav) -> Acting:
         """Return how they act in an environment."""
-        return Acting(env, self.spec, self.setting)
+        return Acting(env, self.spec, self.setting, self.inner_steps)
 
 
 def gap_settings(setting: Setting) -> dict[Gap, Setting]:

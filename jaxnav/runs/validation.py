@@ -80,8 +80,8 @@ class Validator:
             for split, world in worlds.items()
         }
         self._evaluators = {
-            adapts: Evaluator(dataclasses.replace(acting, env=new.env, adapts=adapts), removes=False)
-            for adapts in (True, False)
+            adapts: Evaluator(dataclasses.replace(acting, env=new.env, inner_steps=inner_steps), removes=False)
+            for adapts, inner_steps in ((True, None), (False, 0))
         }
         self._knowledge = jax.device_get(knowledge)
         self._grids = {

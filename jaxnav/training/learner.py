@@ -187,7 +187,7 @@ class Learner:
     @property
     def _acting(self) -> Acting:
         """Return how the stage's episodes are acted."""
-        return dataclasses.replace(self.acting, adapts=self.stage.adapts)
+        return dataclasses.replace(self.acting, inner_steps=None if self.stage.adapts else 0)
 
     @property
     def _method(self) -> Method:

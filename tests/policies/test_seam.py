@@ -78,7 +78,7 @@ def test_methods_that_break_the_contract_are_flagged(name):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nothing", "method 'nothing': is unknown; choose one of anonymous, eotp, hoz, org, rgb, semexp, sp, tpn"),
+        ("nothing", "method 'nothing': is unknown; choose one of anonymous, eotp, hoz, org, rgb, savn, "),
         ("orgg", "did you mean 'org'?"),
         ("no.such.module:MINE", "cannot be imported (ModuleNotFoundError"),
         ("support.methods:MISSING", "cannot be imported (AttributeError"),

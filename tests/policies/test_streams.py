@@ -72,6 +72,9 @@ def memories(generator, experienced=1.0, spec=tiny.STREAMS):
     fast = bind(spec, tiny.lively(0, spec)).initial_memory((BATCH,)).fast
     if spec.method == "tpn":
         fast = fast._replace(decisions=fast.decisions + 7, change=jnp.asarray(generator.normal(size=fast.change.shape)))
+    if spec.method == "savn":
+        factors = jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=leaf.shape), jnp.float32), fast.factors)
+        fast = fast._replace(factors=factors)
     return Memory(hidden, action, fast, jnp.full(BATCH, experienced))
 
 

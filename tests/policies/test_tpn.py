@@ -17,10 +17,11 @@ from jaxnav.causal import do
 from jaxnav.env.types import Observation
 from jaxnav.policies.acting import Acting, carried
 from jaxnav.policies.methods import METHODS
-from jaxnav.policies.methods.tpn import ATTENDED, REMEMBERED, Indiscriminate, TentativePolicy
+from jaxnav.policies.methods.tpn import ATTENDED, REMEMBERED, Indiscriminate, TentativePolicy, actor_changes
 from jaxnav.policies.methods.trail import learn_motion
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import bind
+from jaxnav.policies.stream import NO_CHANGES
 from jaxnav.policies.testing import check_method
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.collect import collect
@@ -107,7 +108,7 @@ def test_the_step_descends_the_cross_entropy_at_repeated_poses(options):
     best = decision.fast.prediction.argmax(axis=-1)
 
     def cross_entropy(change):
-        log_pi = jax.nn.log_softmax(policy.decide_plainly(pathways, memory, change).logits)
+        log_pi = jax.nn.log_softmax(policy.decide_plainly(pathways, memory, actor_changes(change)).logits)
         return -jnp.take_along_axis(log_pi, best[:, None], axis=-1).sum()
 
     gradient = jax.grad(cross_entropy)(memory.fast.change)
@@ -122,7 +123,7 @@ def test_the_actor_is_renewed():
     for decisions, kept in ((49, True), (50, False), (0, False)):
         policy, pathways, memory = given(SPEC, decisions)
         decision = policy.decide(pathways, memory)
-        expected = policy.decide_plainly(pathways, memory, memory.fast.change if kept else None)
+        expected = policy.decide_plainly(pathways, memory, actor_changes(memory.fast.change) if kept else NO_CHANGES)
         np.testing.assert_allclose(decision.logits, expected.logits, rtol=1e-5, atol=1e-5)
         unrepeated = ~np.asarray(pathways.reading)
         assert np.asarray(decision.fast.change)[unrepeated].any() == kept
@@ -130,7 +131,7 @@ def test_the_actor_is_renewed():
 
 def test_an_agent_that_does_not_try_decides_plainly():
     for acting in (
-        dataclasses.replace(ACTING, adapts=False),
+        dataclasses.replace(ACTING, inner_steps=0),
         dataclasses.replace(ACTING, spec=dataclasses.replace(SPEC, method="jaxnav.policies.methods.tpn:UNTRIED")),
     ):
         policy, (_, pathways, memory) = acting.bind(tiny.lively(0, SPEC)), given(SPEC)
@@ -138,7 +139,7 @@ def test_an_agent_that_does_not_try_decides_plainly():
         decision = policy.decide(pathways, memory)
         chex.assert_trees_all_equal(decision.fast.change, memory.fast.change)
         np.testing.assert_allclose(decision.logits, policy.decide_plainly(pathways, memory).logits, atol=1e-6)
-    assert not dataclasses.replace(ACTING, adapts=False).bind(tiny.lively(0, SPEC)).recurrent
+    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.lively(0, SPEC)).recurrent
 
 
 # Training

@@ -77,6 +77,22 @@ def test_policies_without_the_layout_have_no_estimator(drawn_run):
         drawn_run.policies(("baseline",))._replace(setting=None).estimating("evidence")
 
 
+def test_policies_adapt_by_as_many_steps_as_they_can(drawn_run):
+    policies = drawn_run.policies()
+    assert policies.adapting(None) is policies
+    with pytest.raises(
+        InputError, match=r"^inner_steps is 0; method 'org' does not adapt in an episode, leave it out$"
+    ):
+        policies.adapting(0)
+    adaptive = policies._replace(spec=dataclasses.replace(policies.spec, method="savn"))
+    with pytest.raises(
+        InputError, match=r"^inner_steps is 5; an episode remembers 4 windows of 6 actions: give 0 to 4$"
+    ):
+        adaptive.adapting(5)
+    assert adaptive.adapting(0).acting(None).inner_steps == 0
+    assert adaptive.acting(None).inner_steps is None
+
+
 def test_a_pooled_prior_is_one_for_all_rooms(config):
     world = training_world(config, Console(quiet=True))
     pooled = dataclasses.replace(config, layout=dataclasses.replace(config.layout, prior="pooled"))

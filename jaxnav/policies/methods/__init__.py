@@ -22,6 +22,7 @@ from jaxnav.policies.methods.eotp import EOTP
 from jaxnav.policies.methods.hoz import HOZ
 from jaxnav.policies.methods.org import ORG
 from jaxnav.policies.methods.rgb import RGB
+from jaxnav.policies.methods.savn import SAVN
 from jaxnav.policies.methods.semexp import SEMEXP
 from jaxnav.policies.methods.sp import SP
 from jaxnav.policies.methods.tpn import TPN
@@ -48,6 +49,7 @@ METHODS = {
     "hoz": HOZ,
     "org": ORG,
     "rgb": RGB,
+    "savn": SAVN,
     "semexp": SEMEXP,
     "sp": SP,
     "tpn": TPN,

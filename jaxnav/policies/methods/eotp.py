@@ -7,9 +7,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxnav.numerics.product import Linear, biased, product
+from jaxnav.policies.adaptation import LearnedSteps
 from jaxnav.policies.category_maps import CategoryMaps
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.base import Experience, Method
+from jaxnav.policies.methods.savn import WithLearnedLoss
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import NUM_ACTIONS
@@ -85,6 +87,10 @@ class UniformAttention(SpatialAttention):
         return shown / shown.sum(axis=-1, keepdims=True)
 
 
+class AdaptedAttention(WithLearnedLoss, SpatialAttention):
+    """Attend to them; a learned loss stands by."""
+
+
 def _directed(vectors: jax.Array) -> jax.Array:
     """Return vectors [..., h] at length 1; 0 stays 0."""
     return vectors * jax.lax.rsqrt(jnp.square(vectors).sum(axis=-1, keepdims=True) + _TINY)
@@ -93,3 +99,5 @@ def _directed(vectors: jax.Array) -> jax.Array:
 EOTP = Method(SpatialAttention)
 #: EOTP with equal attention: the ablation that it must beat.
 UNIFORM = Method(UniformAttention)
+#: EOTP that adapts within an episode, as its released agent does.
+ADAPTED = Method(AdaptedAttention, adaptation=LearnedSteps())

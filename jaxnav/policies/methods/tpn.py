@@ -16,7 +16,7 @@ from jaxnav.policies.methods.org import ObjectRelations
 from jaxnav.policies.methods.trail import PoseTracker, learn_motion
 from jaxnav.policies.methods.vtnet import FeedForward
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.policies.stream import with_one
+from jaxnav.policies.stream import Changes, with_one
 from jaxnav.scenes.task import NUM_ACTIONS
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class TentativeSteps:
         assert isinstance(policy.method, TentativeRelations)
         tentative, (past, decisions, change, _) = policy.method.tentative, memory.fast
         change = jnp.where((decisions % self.renewal == 0)[..., None, None], 0.0, change)
-        decision = policy.decide_plainly(pathways, memory, change)
+        decision = policy.decide_plainly(pathways, memory, actor_changes(change))
         before, now = (jax.lax.stop_gradient(each.hidden[..., : policy.hidden]) for each in (memory, decision))
         past = tentative.remember(past, before, memory.action)
         prediction = tentative(now, past, decisions + 1)
@@ -164,6 +164,11 @@ class TentativeSteps:
         step = self.rate * with_one(now)[..., None] * descent[..., None, :]
         change = change + jnp.where(pathways.reading[..., None, None], step, 0.0)
         return decision._replace(fast=Trials(past, decisions + 1, change, prediction))
+
+
+def actor_changes(change: jax.Array) -> Changes:
+    """Change the actor's kernel and bias, [..., H + 1, A]."""
+    return {"actor": lambda inputs: (inputs[..., None] * change).sum(axis=-2)}
 
 
 def tentative_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
