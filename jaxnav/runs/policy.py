@@ -22,6 +22,9 @@ from jaxnav.runs.policies import EstimatorName, read_export
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 
+#: Policies that come with the package, a folder each.
+WEIGHTS = Path(__file__).parents[1] / "weights"
+
 
 class EpisodeMemory(NamedTuple):
     """Hold what a policy carries through one episode.
@@ -180,14 +183,17 @@ def load_policy(
     """Load an exported policy.
 
     Args:
-      path: folder of one policy, such as `runs/rooms/policies/layout-0`.
+      path: folder of one policy, such as `runs/rooms/policies/layout-0`; or the name of one that comes with the
+        package: `rooms-org`.
       setting, hold: layout estimator to use instead of the policy's; see `Policies.estimating`.
       form: how sTDE combines the logits; None for that of the layout setting.
 
     Raises:
       InputError: no export there, a damaged one, one whose method cannot be found, or an impossible setting.
     """
-    policies = read_export(Path(path)).estimating(setting, hold)
+    packaged = WEIGHTS / path
+    folder = packaged if packaged.is_dir() and not Path(path).exists() else Path(path)
+    policies = read_export(folder).estimating(setting, hold)
     layout = policies.setting
     if layout is not None and form is not None:
         layout = dataclasses.replace(layout, form=form)

@@ -57,7 +57,7 @@ def test_damaged_exports_are_refused(export):
             "cannot be imported (ModuleNotFoundError: No module named ",
         ),
         ({"method": "jaxnav.layout:MINE"}, "cannot be imported (AttributeError: module 'jaxnav.layout' "),
-        ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, eotp, hoz, org, rgb, savn, sp"),
+        ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, eotp, hoz, org, rgb, savn, "),
         ({"method": "sp"}, "what method 'sp' learns before training is missing; train the run anew"),
         ({"sizes": {"depth": 3}}, "its spec does not fit this code (TypeError: "),
         ({"layout": {"rows": "some"}}, "its spec does not fit this code (ValueError: rows is 'some'"),
