@@ -80,7 +80,9 @@ class RowFormat:
         def zeros(number: int) -> Any:
             return xp.zeros((*poses, number), dtype=np.uint8)
 
-        cells = xp.concat([view.reshape(*poses, -1), zeros(4 * self._view_bytes - self.view * self.view)], axis=-1)
+        cells = xp.concat(
+            [view.reshape(*poses, self.view * self.view), zeros(4 * self._view_bytes - self.view * self.view)], axis=-1
+        )
         groups = cells.reshape(*poses, self._view_bytes, 4)
         packed = xp.sum(groups << _shifts(groups.ndim), axis=-1, dtype=np.uint8)
         rest = zeros(self.num_bytes - self._view_at - self._view_bytes)
