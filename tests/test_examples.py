@@ -26,6 +26,7 @@ def output(name, tmp_path):
     return result.stdout
 
 
+@pytest.mark.slow
 def test_the_packaged_policy_finds_what_it_looks_for(tmp_path):
     """Random actions find 8 %; the policy was measured at 90 % in other rooms, with up to 200 actions."""
     rates = [float(rate) for rate in re.findall(r": ([\d.]+) % of 256 episodes", output("packaged_policy", tmp_path))]

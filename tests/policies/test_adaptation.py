@@ -158,6 +158,7 @@ def test_the_loss_is_two_causal_convolutions_and_a_length():
 # Episodes
 
 
+@pytest.mark.slow
 def test_an_episode_ignores_the_others():
     """Every episode of a batch adapts as it does alone."""
     observation, action = given(3, 16)

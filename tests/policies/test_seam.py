@@ -138,6 +138,7 @@ def test_a_step_by_step_replay_is_the_parallel_one():
 # Each part
 
 
+@pytest.mark.slow
 def test_experience_attends_with_the_memory():
     acting = acting_with("ATTENTIVE")
     weights, before, _, _ = rolled("ATTENTIVE")

@@ -96,7 +96,12 @@ def bits(values):
 # Equations 1 and 2
 
 
-@pytest.mark.parametrize("method", HOSTS)
+#: The others take seconds each to compile.
+QUICK = ("org", "rgb", "anonymous", "eotp")
+EACH = [pytest.param(method, marks=() if method in QUICK else pytest.mark.slow) for method in HOSTS]
+
+
+@pytest.mark.parametrize("method", EACH)
 def test_removing_experience_leaves_the_direct_stream_to_the_bit(method):
     for seed in range(4):
         found = decisions(streams(method), seed)

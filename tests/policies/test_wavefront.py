@@ -38,6 +38,7 @@ def random_maps(count, size=SIZE):
     return targets, passable, generator.integers(0, size, (count, 2)).astype(np.int32)
 
 
+@pytest.mark.slow
 def test_ways_are_as_long_as_those_of_a_queue():
     targets, passable, start = random_maps(MAPS)
     found = np.asarray(find_ways(targets, passable, start).length)
