@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("jaxnav", "tests", "benchmarks", "configs", "docs", "results")
+FOLDERS = ("jaxnav", "tests", "benchmarks", "configs", "docs", "examples", "results")
 FILES = [path for path in ROOT.iterdir() if path.is_file() and not path.name.startswith(".")]
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
 

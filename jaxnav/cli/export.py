@@ -6,14 +6,16 @@ import json
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
+import jax
 import tyro
 from rich.console import Console
 
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import InputError
+from jaxnav.policies.methods import find_method
 from jaxnav.runs.directory import Run
 from jaxnav.runs.exported import program
-from jaxnav.runs.model_card import model_card
+from jaxnav.runs.model_card import SIGNATURE, model_card
 from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.policy import LoadedPolicy, load_policy
 from jaxnav.scenes.categories import ROOM_TYPES
@@ -21,7 +23,8 @@ from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_
 from jaxnav.scenes.task import ACTIONS
 from jaxnav.store.files import write_atomic
 
-CARD, PROGRAM, NAMES = "README.md", "step.stablehlo", "step.json"
+CARD = "README.md"
+FILES = PROGRAM, NAMES, PARAMS, POLICY = "step.stablehlo", "step.json", "params.safetensors", "policy.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +34,7 @@ class ExportConfig:
     Attributes:
       run: the run directory.
       format: `safetensors`, the parameters, for `jaxnav.load_policy`; or `stablehlo`, the whole step with sTDE as a
-        program that needs JAX alone.
+        program that needs JAX and flatbuffers alone.
       policy: a name in the run's `policies`; default: seed 0 of its last arm.
       out: folder to write; default: in the run directory.
     """
@@ -73,11 +76,13 @@ def _export(config: ExportConfig, console: Console) -> None:
     source = config.run / POLICIES / name
     policy = load_policy(source)
     out = config.out or config.run / "exports" / f"{name}-{config.format}"
-    if out.exists() and not (out / CARD).exists():
+    if not _is_replaceable(out):
         raise InputError(f"{out}: is there and holds no export; give another --out")
     export = _parameters(source) if config.format == "safetensors" else _program(policy, run)
     card = model_card(run, name, policy, export.about, export.use)
     try:
+        for file in (CARD, *FILES):  # without its card nothing of an earlier export is taken for one
+            (out / file).unlink(missing_ok=True)
         for file, data in (export.files | {CARD: card.encode()}).items():
             write_atomic(out / file, data)
     except OSError as error:
@@ -85,9 +90,17 @@ def _export(config: ExportConfig, console: Console) -> None:
     console.print(f"written to {out}", soft_wrap=True)
 
 
+def _is_replaceable(out: Path) -> bool:
+    """Return whether a folder is missing, empty or an earlier export."""
+    if not out.is_dir() or not any(out.iterdir()):
+        return not out.is_file()
+    card = out / CARD
+    return card.is_file() and SIGNATURE in card.read_text(encoding="utf-8", errors="replace")
+
+
 def _parameters(source: Path) -> Export:
     """Return the parameters as the run keeps them."""
-    about = {"params.safetensors": "parameters and what was learned before", "policy.json": "what they are built into"}
+    about = {PARAMS: "parameters and what was learned before", POLICY: "what they are built into"}
     return Export({name: (source / name).read_bytes() for name in about}, about, _code(_LOADING))
 
 
@@ -95,13 +108,14 @@ def _program(policy: LoadedPolicy, run: Run) -> Export:
     """Return the step as a program, and the names of what it takes."""
     written, task = program(policy), run.config.task
     names = {"categories": task.categories, "actions": ACTIONS, "rooms": [*ROOM_TYPES, "any other"]}
-    described = names | {"sha256": hashlib.sha256(written).hexdigest()}
+    described = names | {"jax": jax.__version__, "sha256": hashlib.sha256(written).hexdigest()}
     files = {PROGRAM: written, NAMES: (json.dumps(described, indent=2) + "\n").encode()}
     about = {
-        PROGRAM: "the step, for CPU, CUDA and TPU; needs JAX and flatbuffers",
+        PROGRAM: f"the step, for CPU, CUDA and TPU; written by JAX {jax.__version__}, runs with JAX and flatbuffers",
         NAMES: "names by index, and the digest",
     }
-    return Export(files, about, (*_code(_CALLING), "", *_INPUTS))
+    inputs = _INPUTS.format(choices=find_method(policy.spec.method).control.num_choices)
+    return Export(files, about, (*_code(_CALLING), *inputs.rstrip().split("\n")))
 
 
 def _code(text: str) -> tuple[str, ...]:
@@ -116,12 +130,16 @@ memory = policy.init()
 """
 
 _CALLING = """
+import hashlib
+import json
 from pathlib import Path
 
 import jax.export
 import numpy as np
 
-step = jax.export.deserialize(bytearray(Path("step.stablehlo").read_bytes()))
+program = Path("step.stablehlo").read_bytes()
+assert hashlib.sha256(program).hexdigest() == json.loads(Path("step.json").read_text())["sha256"]
+step = jax.export.deserialize(bytearray(program))
 (shapes, _), _ = jax.tree.unflatten(step.in_tree, step.in_avals)
 inputs = jax.tree.map(lambda each: np.zeros((8, *each.shape[1:]), each.dtype), shapes)  # eight episodes
 inputs["first"][:] = True  # they begin
@@ -142,6 +160,6 @@ Inputs, a row for each episode:
 * `memory`: what the step before returned; not read where an episode begins
 
 Outputs: `action` int32, the best one (where `logits` are of actions, you may sample one and give it as the next
-`action`); `logits`, `factual` and, where the policy uses the layout, `counterfactual` float32 [6]; there also the
-layout gap `gap` and the weights `weights` [K] of eq. 7; `memory`.
+`action`); `logits`, `factual` and, where the policy uses the layout, `counterfactual` float32 [{{choices}}]; there also
+the layout gap `gap` and the weights `weights` [K] of eq. 7; `memory`.
 """

@@ -18,6 +18,7 @@ from jaxnav.env.make import make
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.types import EnvParams, State
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
+from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import WORLDS
 
 Named = dict[str, Any]
@@ -132,7 +133,7 @@ class ObjectNavEnv(gymnasium.Env[Named, np.int64]):
           InputError: see `jaxnav.make`.
         """
         env, params = make(world, **options)
-        self._functions = _Functions(env, params)
+        self._functions, self._episodes = _Functions(env, params), None
         self.observation_space, self.action_space = observation_space(env), spaces.Discrete(env.num_actions)
         self.categories = env.categories
 
@@ -144,7 +145,8 @@ class ObjectNavEnv(gymnasium.Env[Named, np.int64]):
 
     def step(self, action: Any) -> tuple[Named, float, bool, bool, Named]:
         """Take an action; `info` says whether it was a Done that succeeds."""
-        self._episodes, named, told = self._functions.advance(self._episodes, np.array([action], np.int32))
+        actions = _checked(self.action_space, self._episodes, action)
+        self._episodes, named, told = self._functions.advance(self._episodes, actions[None])
         reward, terminated, truncated, success = (leaf.item() for leaf in told)
         return _at(_plain(named), 0), reward, terminated, truncated, {"success": success}
 
@@ -165,7 +167,7 @@ class ObjectNavVectorEnv(VectorEnv[Named, np.ndarray, np.ndarray]):
           InputError: see `jaxnav.make`.
         """
         env, params = make(world, **options)
-        self.num_envs, self._functions = num_envs, _Functions(env, params)
+        self.num_envs, self._functions, self._episodes = num_envs, _Functions(env, params), None
         self.single_observation_space, self.single_action_space = (
             observation_space(env),
             spaces.Discrete(env.num_actions),
@@ -185,8 +187,8 @@ class ObjectNavVectorEnv(VectorEnv[Named, np.ndarray, np.ndarray]):
 
         Where one ends, `final_obs` and `final_info`, which holds `success`, are of the episode that ended.
         """
-        keys = _keys(self.np_random, self.num_envs)
-        self._episodes, named, last, told = self._functions.step(keys, self._episodes, np.asarray(actions, np.int32))
+        actions, keys = _checked(self.action_space, self._episodes, actions), _keys(self.np_random, self.num_envs)
+        self._episodes, named, last, told = self._functions.step(keys, self._episodes, actions)
         told = jax.tree.map(np.array, told)
         ended, infos = told.terminated | told.truncated, {}
         if ended.any():
@@ -196,6 +198,21 @@ class ObjectNavVectorEnv(VectorEnv[Named, np.ndarray, np.ndarray]):
             infos = {"final_obs": final, "final_info": {"success": told.success, "_success": ended}}
             infos |= {"_final_obs": ended, "_final_info": ended}
         return _plain(named), told.reward, told.terminated, told.truncated, infos
+
+
+def _checked(space: spaces.Space, episodes: Episode | None, action: Any) -> np.ndarray:
+    """Return the actions int32 of a step.
+
+    Raises:
+      ResetNeeded: nothing was reset yet.
+      InvalidAction: the action is not in the space.
+    """
+    if episodes is None:
+        raise gymnasium.error.ResetNeeded("call reset() before step()")
+    array = np.asarray(action)
+    if array.shape != space.shape or array.dtype.kind not in "iu" or not ((array >= 0) & (array < NUM_ACTIONS)).all():
+        raise gymnasium.error.InvalidAction(f"{action!r}: give whole numbers from 0 to {NUM_ACTIONS - 1} as in {space}")
+    return array.astype(np.int32)
 
 
 def _keys(generator: np.random.Generator, number: int) -> jax.Array:

@@ -70,7 +70,7 @@ class Perception:
         estimator, spatial = self._estimator(knowledge, room), self._spatial_memory
         layout = None if estimator is None else estimator.init()
         explored = None if spatial is None else spatial.init()
-        return Perceived(layout, explored, None if self._tracker is None else self._tracker.init(knowledge))
+        return Perceived(layout, explored, None if self.tracker is None else self.tracker.init(knowledge))
 
     def update(self, perceived: Perceived, percept: Percept, knowledge: Any, room: jax.Array) -> Perceived:
         """Take in one view.
@@ -86,8 +86,8 @@ class Perception:
             layout = estimator.update(layout, self.row_format.presence(percept.row), percept.goal)
         if spatial is not None and explored is not None:
             explored = spatial.update(explored, percept.row, percept.heading, percept.moved, self.row_format)
-        if self._tracker is not None:
-            note = self._tracker.update(note, knowledge, percept)
+        if self.tracker is not None:
+            note = self.tracker.update(note, knowledge, percept)
         return Perceived(layout, explored, note)
 
     def view(self, perceived: Perceived, observation: Observation, knowledge: Any) -> View:
@@ -96,7 +96,7 @@ class Perception:
         weights = jnp.ones(self.row_format.num_categories)
         if layout is not None:
             weights = LayoutEstimator.goal_weights(layout, observation.goal)
-        reading = None if self._tracker is None else self._tracker.read(note, knowledge, observation.goal)
+        reading = None if self.tracker is None else self.tracker.read(note, knowledge, observation.goal)
         spatial = self._spatial_memory
         surroundings = None if spatial is None or explored is None else spatial.read(explored)
         return View(observation, weights, reading, surroundings)
@@ -104,10 +104,11 @@ class Perception:
     @property
     def uses_odometry(self) -> bool:
         """Return whether compass heading and motion are needed."""
-        return self._tracker is not None or self._spatial_memory is not None
+        return self.tracker is not None or self._spatial_memory is not None
 
     @property
-    def _tracker(self) -> Any:
+    def tracker(self) -> Any:
+        """Return the tracker of the policy's method; None without one."""
         return None if self.spec is None else find_method(self.spec.method).tracker
 
     @property

@@ -43,7 +43,8 @@ function makeSide(number) {
     doing.textContent = ended ? `ended at step ${at + 1}` : `step ${at + 1}: ${ACTIONS[action]}`;
     level.textContent = `D ${gap[at].toFixed(2)}, removed with weight ${weight[at].toFixed(2)}`;
     for (const end of ["x1", "x2"]) cursor.setAttribute(end, at + 0.5);
-    actions.replaceChildren(...ACTIONS.flatMap((name, i) => {
+    if (!chances.length) actions.replaceChildren(element("span", { className: "none" }, "the policy chooses places, not actions"));
+    else actions.replaceChildren(...ACTIONS.flatMap((name, i) => {
       const three = KINDS.map((_, kind) => chances[(at * 3 + kind) * ACTIONS.length + i]);
       return bar(name, three, KINDS, i === action ? "chosen" : "");
     }));

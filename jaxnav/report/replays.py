@@ -12,6 +12,7 @@ from jaxnav.report.plans import Plan, make_plan, pack
 from jaxnav.report.players import Player, choose, compare
 from jaxnav.runs.replay import replay, scene_named
 from jaxnav.scenes.tables.detector import MAX_RANGE
+from jaxnav.scenes.task import NUM_ACTIONS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Course:
       success: whether it ended with Done where that succeeds.
       gap, weight: packed [T], layout gap, and weight of the logits that are removed.
       layout: packed [T, K], weights towards the goal (eq. 7), at most 1; empty without the layout.
-      chances: packed [T, 3, A], of each action: of the factual, the counterfactual and the corrected logits.
+      chances: packed [T, 3, A], of each action: of the factual, the counterfactual and the corrected logits; empty
+        where the policy chooses no actions.
     """
 
     views: list[int]
@@ -145,5 +147,5 @@ def _course(trace: Trace, poses: np.ndarray, layout: bool) -> Course:
         gap=pack(trace.gap),
         weight=pack(np.asarray(how.weight)),
         layout=pack(np.asarray(how.layout)) if layout else "",
-        chances=pack(softmax(logits, axis=-1)),
+        chances=pack(softmax(logits, axis=-1)) if logits.shape[-1] == NUM_ACTIONS else "",
     )

@@ -37,7 +37,7 @@ def step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Array) ->
     earlier = _unnamed(inputs["memory"], began)
     earlier = earlier._replace(memory=earlier.memory._replace(action=inputs["action"]), room=inputs["room"])
     memory = jax.tree.map(functools.partial(jnp.where, inputs["first"]), began, earlier)
-    odometry = {name: inputs[name] for name in ("heading", "moved", "horizon")}
+    odometry = {"heading": inputs["heading"], "moved": inputs["moved"] & ~inputs["first"], "horizon": inputs["horizon"]}
     choice = policy.decide(observation, memory, epsilon, **odometry)
     action, memory = policy.follow(choice, jnp.argmax(choice.logits).astype(jnp.int32), memory.room)
     found = {"action": action, "logits": choice.logits, "factual": choice.factual, "memory": _named(memory)}
@@ -81,7 +81,7 @@ def input_shapes(policy: LoadedPolicy, batch: Any) -> dict[str, Any]:
 def program(policy: LoadedPolicy) -> bytes:
     """Export `step`, for any number of episodes side by side.
 
-    `jax.export.deserialize(program).call(inputs, epsilon)` runs it where JAX alone is installed.
+    `jax.export.deserialize(program).call(inputs, epsilon)` runs it where JAX and flatbuffers are installed.
 
     Raises:
       InputError: flatbuffers, which writes the program, is missing.

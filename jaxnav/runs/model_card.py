@@ -9,6 +9,8 @@ from jaxnav import __version__
 from jaxnav.runs.directory import Run
 from jaxnav.runs.policy import LoadedPolicy
 
+#: The sentence by which a card is known.
+SIGNATURE = "A policy for object navigation on a grid, exported by jaxnav."
 _LAYOUT = {"baseline": "no layout weights", "layout": "layout weights (eq. 7); experience is removed by sTDE (eq. 2)"}
 
 
@@ -43,7 +45,7 @@ def model_card(run: Run, name: str, policy: LoadedPolicy, files: Mapping[str, st
         [
             f"# {name} of {run.config.run_dir.name}",
             "",
-            "A policy for object navigation on a grid, exported by jaxnav.",
+            SIGNATURE,
             "",
             *(f"* **{what}**: {fact}" for what, fact in facts.items()),
             "",

@@ -1,6 +1,7 @@
 """A trained policy that acts on observations, one episode at a time."""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -107,7 +108,7 @@ class LoadedPolicy(struct.PyTreeNode):
         key: jax.Array | None = None,
         heading: jax.Array | int | None = None,
         moved: jax.Array | bool | None = None,
-        horizon: jax.Array | int = 0,
+        horizon: jax.Array | int | None = None,
     ) -> tuple[jax.Array, EpisodeMemory]:
         """Take in one observation and choose an action.
 
@@ -121,13 +122,13 @@ class LoadedPolicy(struct.PyTreeNode):
           heading: compass heading, and
           moved: whether the last action changed the cell; policies with a spatial memory and methods with a tracker
             need both.
-          horizon: index of the camera's horizon, 0 for level; `tpn` and `semexp` go by it too.
+          horizon: index of the camera's horizon, 0 for level; methods with a tracker need it too.
 
         Returns:
           The action int32 [], and the memory for the next step.
 
         Raises:
-          InputError: heading or moved is needed and missing.
+          InputError: heading, moved or horizon is needed and missing.
         """
         choice = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
         chosen = jnp.argmax(choice.logits) if key is None else jax.random.categorical(key, choice.logits)
@@ -147,18 +148,20 @@ class LoadedPolicy(struct.PyTreeNode):
         *,
         heading: jax.Array | int | None = None,
         moved: jax.Array | bool | None = None,
-        horizon: jax.Array | int = 0,
+        horizon: jax.Array | int | None = None,
     ) -> Choice:
         """Take in one observation; see `act`.
 
         Raises:
-          InputError: heading or moved is needed and missing.
+          InputError: heading, moved or horizon is needed and missing.
         """
         perception = self._perception
         if perception.uses_odometry and (heading is None or moved is None):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
+        if perception.tracker is not None and horizon is None:
+            raise InputError("act: this policy's method follows the camera too; give `horizon`")
         odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
-        position = odometry[0], memory.memory.action, odometry[1], jnp.int32(horizon)
+        position = odometry[0], memory.memory.action, odometry[1], jnp.int32(0 if horizon is None else horizon)
         percept = Percept(observation.row, *position, observation.goal)
         perceived = perception.update(memory.perceived, percept, self.knowledge, memory.room)
         view = perception.view(perceived, observation, self.knowledge)
@@ -193,6 +196,10 @@ def load_policy(
     """
     packaged = WEIGHTS / path
     folder = packaged if packaged.is_dir() and not Path(path).exists() else Path(path)
+    if not folder.exists():
+        raise InputError(
+            f"{path}: there is no such folder; of the package are {', '.join(sorted(os.listdir(WEIGHTS)))}"
+        )
     policies = read_export(folder).estimating(setting, hold)
     layout = policies.setting
     if layout is not None and form is not None:

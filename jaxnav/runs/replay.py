@@ -19,7 +19,11 @@ def replay(policies: Policies, world: CompiledWorld, episodes: EpisodeList, row:
       world: the scenes.
       episodes: of the first bank.
       row: of a table, with its arm among those of the policies.
+
+    Raises:
+      InputError: the method cannot act in the scenes.
     """
+    world.check(policies.spec.method, policies.knowledge)
     inference = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], policies.arms, policies.seeds))
     return play(
         inference,

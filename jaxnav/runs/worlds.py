@@ -16,6 +16,7 @@ from jaxnav.errors import InputError
 from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import most_common, unknown_types
+from jaxnav.scenes.scene import SPLITS
 from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank, concatenate
 from jaxnav.scenes.tables.shards import Shards, compile_shards
 from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
@@ -91,8 +92,12 @@ def evaluation_world(
     rules are the run's.
 
     Raises:
-      InputError: bad scene file, no scene of the split, a bad shift, or both a file and a world.
+      InputError: unknown split or world, bad scene file, no scene of the split, a bad shift, or both a file and a
+        world.
     """
+    for option, value, known in (("split", split, SPLITS), ("world", world or config.world, WORLDS)):
+        if value not in known:
+            raise InputError(f"--{option} {value}: choose one of {', '.join(known)}")
     if scenes and world:
         raise InputError(f"--scenes, --world: both are given ({scenes}, {world}); leave one out")
     name, path = world or config.world, scenes or (None if world else config.scenes)

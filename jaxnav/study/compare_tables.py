@@ -5,7 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.report_tables import COLUMNS
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.spec import Deciding
+from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.study.compare_config import CompareConfig, Entry, entries
 from jaxnav.study.compare_pairs import VARIANTS, TableRow, comparisons, run_label
 from jaxnav.study.compare_report import SCALE, Line, Scores
@@ -87,7 +89,8 @@ def _world(config: CompareConfig, world: str, parts: Parts, frontier: Scores | N
     """Return all sections of one world."""
     if not parts:
         return []
-    one = next(iter(parts.values()))
+    # Where a policy chooses no actions, random choices are no random actions.
+    one = next((part for run, part in parts.items() if _chooses_actions(run[0])), next(iter(parts.values())))
     untrained = [one, *([frontier] if frontier else [])]
     lines = [f"## {world}: {len(one.scenes)} scenes, {sum(one.episodes):,} episodes", ""]
     for decoding, name in DECODINGS.items():
@@ -97,6 +100,10 @@ def _world(config: CompareConfig, world: str, parts: Parts, frontier: Scores | N
             header = ("", "SR (points)", "SPL (points)", "DTS (m)")
             lines += [f"### Improvements, {name}", "", *markdown(header, improved), ""]
     return [*lines, "### What the runs took", "", *_training_table(parts), "", *_notes(parts), ""]
+
+
+def _chooses_actions(method: str) -> bool:
+    return find_method(method).control.num_choices == NUM_ACTIONS
 
 
 def _metrics_table(untrained: Iterable[Scores], parts: Parts, decoding: Decoding) -> list[str]:

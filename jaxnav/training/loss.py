@@ -41,7 +41,8 @@ def advantages(
       ended: bool [T, B], the episode ended with this step, either way.
       gamma: float32 [], discount.
       lambda_: float32 [].
-      due: bool [T, B], whether the choice counted; None where every choice does. Elsewhere estimates have no meaning.
+      due: bool [T, B], whether the choice counted; None where every choice does. Elsewhere the estimate is of
+        what is left of the macro-step.
     """
     delta = reward + gamma * next_value - value
     if due is not None:
@@ -130,7 +131,7 @@ def ppo_loss(
 
     Where `distil` holds, the counterfactual branch learns to act like the factual policy as well as experience and
     memory allow: KL(pi || counterfactual), the target fixed. The method's auxiliary loss is added. Choices that did not
-    count weigh nothing.
+    count weigh nothing; values are learned everywhere, for a rollout may end between two choices.
 
     Args:
       replayed: the decisions made again.
@@ -152,7 +153,7 @@ def ppo_loss(
     scaled = (advantage - mean) / (deviation + 1e-8)
     clipped = jnp.clip(ratio, 1.0 - scalars.clip, 1.0 + scalars.clip)
     policy_loss = -average(jnp.minimum(ratio * scaled, clipped * scaled), due)
-    value_loss = 0.5 * average(jnp.square(decisions.value - target), due)
+    value_loss = 0.5 * jnp.square(decisions.value - target).mean()
     entropy = -average((jnp.exp(log_pi) * log_pi).sum(axis=-1), due)
     loss = policy_loss + scalars.value * value_loss - scalars.entropy * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}

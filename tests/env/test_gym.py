@@ -119,3 +119,22 @@ def test_what_is_returned_may_be_written_to(scenes):
 def test_no_observation_holds_the_answer(single):
     """By name: what is seen, sought and felt. Whether Done would succeed is in none of them."""
     assert set(single.observation_space.spaces) == {"view", "detections", "goal", "heading", "horizon", "moved"}
+
+
+@pytest.mark.parametrize("wrong", [[0, 6], [0, -1], [0.9, 0.0], [[0], [1]], [0]])
+def test_what_is_no_action_is_refused(scenes, wrong):
+    vector = ObjectNavVectorEnv(2, scenes=scenes)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        vector.step(np.zeros(2, int))
+    vector.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction, match="give whole numbers from 0 to 5"):
+        vector.step(np.array(wrong))
+
+
+def test_the_single_environment_refuses_too(scenes):
+    env = ObjectNavEnv(scenes=scenes)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(0)
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction):
+        env.step(6)

@@ -85,3 +85,9 @@ def test_it_is_written_as_json_and_csv(evaluated, tmp_path):
     assert [row["goal"] for row in rows] == goals * (len(rows) // len(goals))
     with pytest.raises(OSError, match=r"table\.json"):
         evaluated.write(target / "table.json")
+
+
+@pytest.mark.parametrize(("option", "value"), [("world", "cellar"), ("split", "all")])
+def test_unknown_worlds_and_splits_are_refused(drawn_run, option, value):
+    with pytest.raises(InputError, match=rf"^--{option} {value}: choose one of "):
+        jaxnav.evaluate(drawn_run, **{option: value})

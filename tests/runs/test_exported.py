@@ -83,6 +83,7 @@ def acted(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[str, np.nd
             row = RowFormat(policy.spec.num_categories).pack(told["detections"], told["view"])
             observation = Observation(row, told["goal"])
             odometry = {name: told[name] for name in ("heading", "moved", "horizon")}
+            odometry["moved"] = told["moved"] & ~told["first"]
             choice = decide(policy, observation, memory, jnp.float32(0.1), **odometry)
             action, memory = policy.follow(choice, jnp.argmax(choice.logits).astype(jnp.int32), memory.room)
             names = ("logits", "factual", "counterfactual", "gap", "weights")
@@ -118,6 +119,8 @@ def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
     named = json.loads((out / "step.json").read_text())
     assert named["actions"][0] == "MoveAhead"
     assert named["categories"] == list(drawn_run.config.task.categories)
+    assert "* `detections` uint8 [K, 4]: for each category" in card
+    assert "`counterfactual` float32 [6]" in card
     assert "**Method**: `org`, decision `fused`, layout weights" in card
     assert f"**Parameters**: {sum(leaf.size for leaf in jax.tree.leaves(policy.params)):,}" in card
 
@@ -162,6 +165,9 @@ def test_exported_parameters_act_as_those_of_the_run(drawn_run, tmp_path):
     chex.assert_trees_all_equal(*policies)
     assert "no layout weights" in (out / "README.md").read_text()
     assert main(["export", str(run), "--policy", "baseline-0", "--out", str(out)]) == 0  # replaced
+    assert main(["export", str(run), "--format", "stablehlo", "--out", str(out)]) == 0
+    assert set(contents(out)) == {"README.md", "step.stablehlo", "step.json"}  # nothing of the other format is left
+    assert main(["export", str(run), "--policy", "baseline-0", "--out", str(out)]) == 0
     assert contents(out)["params.safetensors"] == contents(run / POLICIES / "baseline-0")["params.safetensors"]
 
 
@@ -170,15 +176,19 @@ def test_exported_parameters_act_as_those_of_the_run(drawn_run, tmp_path):
     [
         (["--policy", "layout-9"], "has baseline-0, baseline-1, layout-0, layout-1"),
         (["--out", "."], "is there and holds no export; give another --out"),
+        (["--out", "mine"], "is there and holds no export; give another --out"),
+        (["--out", "file"], "is there and holds no export; give another --out"),
         (["--out", "file/out"], "cannot be written"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(drawn_run, tmp_path, monkeypatch, capsys, options, mend):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "README.md").write_text("a project of one's own")
     assert main(["export", str(drawn_run.config.run_dir.absolute()), *options]) == 2
     assert mend in refusal(capsys)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert contents(tmp_path) == {"file": b"", "mine/README.md": b"a project of one's own"}
 
 
 def test_a_program_without_flatbuffers_names_the_extra(drawn_run, tmp_path, monkeypatch, capsys):

@@ -38,7 +38,7 @@ class LocalPolicy:
 
     A choice is a block of cells around the agent. The agent walks to the nearest cell there that it has not seen from
     nearby or, where none can be reached, to the nearest one of all. Where the goal is on the map it walks to where it
-    should be near enough, and says Done when it is in view at the same place from a second pose.
+    should be near enough, and says Done when it is in view at a place that was marked before.
 
     Attributes:
       interval: n, actions until the policy chooses again.
