@@ -197,9 +197,8 @@ def load_policy(
     packaged = WEIGHTS / path
     folder = packaged if packaged.is_dir() and not Path(path).exists() else Path(path)
     if not folder.exists():
-        raise InputError(
-            f"{path}: there is no such folder; of the package are {', '.join(sorted(os.listdir(WEIGHTS)))}"
-        )
+        names, what = ", ".join(sorted(os.listdir(WEIGHTS))), "not an exported policy (No such file or directory: "
+        raise InputError(f"{path}: {what}{folder}); export it, or load one of the package: {names}")
     policies = read_export(folder).estimating(setting, hold)
     layout = policies.setting
     if layout is not None and form is not None:

@@ -6,6 +6,8 @@ import json
 import numpy as np
 import pytest
 
+import jaxnav
+from jaxnav.errors import InputError
 from jaxnav.evaluation.notes import notes, spent
 from jaxnav.evaluation.variants import Row
 

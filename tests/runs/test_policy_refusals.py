@@ -74,6 +74,8 @@ def test_exports_of_other_code_are_refused(export, changes, problem):
 
 def test_a_policy_that_is_not_there_is_refused_with_those_that_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"^room-org: there is no such folder; of the package are rooms-org$"):
+    with pytest.raises(
+        InputError, match=r"^room-org: not an exported policy .*; export it, or load one of the package: rooms-org$"
+    ):
         jaxnav.load_policy("room-org")
     assert jaxnav.load_policy("rooms-org").spec.method == "org"
