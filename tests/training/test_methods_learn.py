@@ -23,6 +23,8 @@ SMALLER = {
     "vtnet": {"token_width": 8, "feedforward": 16, "tokens": 4, "encoder_layers": 1, "decoder_layers": 1, "queries": 3},
     "tpn": {"tentative_width": 16},
 }
+#: Updates in chunks of `CHUNK`, of a method that takes ten times as long as the others.
+CHUNKS_OF = {"savn": 5}
 
 
 @functools.cache
@@ -63,7 +65,7 @@ def test_a_method_learns(name):
     state, begin, metrics = None, 0, {}
     for stage in method.stages:
         learner = Learner(acting, CONFIG, "none", stage)
-        chunks = max(1, round(stage.share * CHUNKS))
+        chunks = max(1, round(stage.share * CHUNKS_OF.get(name, CHUNKS)))
         scalars = CONFIG.scalars(chunks * CHUNK, begin)
         train = jax.jit(functools.partial(learner.train, num_updates=CHUNK))
         if state is None:
@@ -72,4 +74,4 @@ def test_a_method_learns(name):
             state, metrics = train(state, scalars, params, knowledge)
         begin += chunks * CHUNK
     assert state is not None
-    assert float(metrics["success"]) > random_success() + 0.3
+    assert float(metrics["success"]) > random_success() + 0.3, (metrics["success"], random_success())
