@@ -9,6 +9,8 @@ from support.commands import CONFIG, contents, evaluate, refusal
 from jaxnav.cli import compare as command
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.policies.methods import METHODS
+from jaxnav.policies.methods.local_policy import LocalPolicy
+from jaxnav.runs.config import RunConfig
 from jaxnav.study import compare
 from jaxnav.study.compare_config import entries
 from jaxnav.study.compare_report import Line, Scores, Training
@@ -264,5 +266,13 @@ def test_table_2_has_every_method(monkeypatch):
 def test_the_ablations_have_the_baseline_alone():
     config = command.parse_compare(["--config", "ablations"])
     runs = entries(config)
-    assert len(runs) == 2 * 17
+    assert len(runs) == 17
     assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}
+
+
+def test_table_3_has_room_for_macro_steps():
+    runs = {entry.method: entry.run for entry in entries(command.parse_compare(["--config", "table3"]))}
+    assert set(runs) == {"anonymous", "rgb", "semexp", "jaxnav.policies.methods.semexp:NEAREST"}
+    for run in runs.values():  # the same for all, at least two choices in every rollout
+        assert (run.world, run.update_steps) == ("houses", RunConfig().update_steps)
+        assert run.ppo.rollout >= 2 * LocalPolicy.interval

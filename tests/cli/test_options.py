@@ -26,6 +26,7 @@ PRESETS = [
     "study",
     "study_quick",
     "table2",
+    "table3",
 ]
 
 
