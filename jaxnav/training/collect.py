@@ -127,6 +127,7 @@ def collect(
     params: EnvParams,
     knowledge: Knowledge,
     experience: jax.Array | float = 1.0,
+    every_step: bool = False,
 ) -> tuple[Agent, Rollout]:
     """Act for some steps with sampled actions and same-step auto-reset.
 
@@ -140,6 +141,7 @@ def collect(
       params: the environment's.
       knowledge: what was learned before training.
       experience: probability that an episode which begins has the stream of experience.
+      every_step: draw that at every step, not only where an episode begins.
 
     Returns:
       The episodes after the rollout, and the rollout. The values of truncated states and of the state after the
@@ -162,7 +164,7 @@ def collect(
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(decision.logits), choice[:, None], axis=-1)[:, 0]
         keys = jax.random.split(env_key, num_envs)
         after, taken = acting.step(agent, choice, knowledge, params, policy=policy, decision=decision, keys=keys)
-        after = after._replace(memory=draw_coins(carried(after), taken.ended, experience_key, experience))
+        after = after._replace(memory=draw_coins(carried(after), every_step | taken.ended, experience_key, experience))
         transition = Transition(
             pose=agent.state.pose,
             goal=agent.state.goal,

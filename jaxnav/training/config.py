@@ -31,6 +31,7 @@ class PPOConfig:
       alone: share of the updates of the last stage that does not imitate, the first of them, in which the direct stream
         acts and learns alone, where there are streams.
       experience: probability that an episode after that has the stream of experience.
+      experience_drawn: whether that is drawn once in an episode or at every step anew.
       experience_rate: factor on the learning rate after that, for what is added disturbs a policy that has learned.
     """
 
@@ -49,6 +50,7 @@ class PPOConfig:
     distil: float = 0.5
     alone: float = 0.5
     experience: float = 0.8
+    experience_drawn: Literal["episode", "step"] = "episode"
     experience_rate: float = 0.5
 
     def num_updates(self, total_steps: int) -> int:

@@ -132,7 +132,8 @@ class Learner:
         agent, fast = state.agent, carried(state.agent).fast
         if not self.stage.adapts:  # fast weights, which may be large, wait for a stage that has a use for them
             agent = _with_fast(agent, None)
-        arguments = agent, rollout_key, self.config.rollout, coin, params, knowledge, share
+        every_step = self.config.experience_drawn == "step"
+        arguments = agent, rollout_key, self.config.rollout, coin, params, knowledge, share, every_step
         agent, rollout = collect(acting, acting.bind(state.params), *arguments)
         if not self.stage.adapts:
             agent = _with_fast(agent, fast)

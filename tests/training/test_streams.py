@@ -99,6 +99,19 @@ def test_its_share_is_as_configured(share):
     np.testing.assert_array_equal(after.memory.experienced[~fresh], first[~fresh])
 
 
+@pytest.mark.parametrize("drawn", ["episode", "step"])
+def test_experience_comes_and_goes_within_an_episode_only_if_drawn_at_every_step(drawn):
+    learner = learner_with("org", experience=0.5, experience_drawn=drawn)
+    state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
+    before = np.asarray(state.agent.memory.experienced)
+    scalars = learner.config.scalars(num_updates=1)
+    agent = jax.jit(learner.update)(state, scalars, PARAMS, KNOWLEDGE)[0].agent
+    goes_on = np.asarray(agent.state.time) == LENGTH  # no episode has begun since
+    assert goes_on.sum() > ENVS / 4
+    other = agent.memory.experienced[goes_on] != before[goes_on]
+    assert other.mean() == (pytest.approx(0.5, abs=0.25) if drawn == "step" else 0.0)
+
+
 def moved(before, after):
     """Which parts of the parameters differ."""
     changed = jax.tree.map(lambda old, new: bool((old != new).any()), before, after)
