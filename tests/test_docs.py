@@ -2,6 +2,7 @@
 
 import doctest
 import re
+import sys
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 from support.commands import write_config
 
 import jaxnav
+from jaxnav.policies.methods import find_method
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -42,3 +44,34 @@ def test_the_code_of_use_runs(tmp_path, monkeypatch, capsys):
             exec(code.replace("import jaxnav\n", "import jaxnav\nimport jaxnav.runs.overlay\n"), {"__name__": "use"})
     assert "['detections', 'goal', 'heading', 'horizon', 'moved', 'view']" in capsys.readouterr().out
     assert jaxnav.Run.open("runs/org").config.seeds == 2
+
+
+BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+
+
+@pytest.fixture
+def own_modules(tmp_path, monkeypatch):
+    """A folder with the modules of the page on methods, in the path; returns the code that follows them."""
+    blocks = BLOCK.findall((DOCS / "add_a_method.md").read_text())
+    named = {name[1]: block for block in blocks if (name := re.match(r"# (\w+)\.py\n", block))}
+    assert sorted(named) == ["judged", "sectors"]
+    for name, block in named.items():
+        (tmp_path / f"{name}.py").write_text(block)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "".join(block for block in blocks if block not in named.values())
+    for name in named:
+        sys.modules.pop(name, None)
+    find_method.cache_clear()
+
+
+def test_the_methods_of_the_page_are_found(own_modules):
+    sectored, judged = find_method("sectors:SECTORED"), find_method("judged:JUDGED")
+    assert (sectored.control.num_choices, judged.adaptation is None) == (4, False)
+    assert 'check_method("sectors:SECTORED")' in own_modules
+    assert 'check_method("judged:JUDGED")' in own_modules
+
+
+@pytest.mark.slow
+def test_the_methods_of_the_page_keep_the_contract(own_modules):
+    """The page's own calls, under the suite's strict rules of types and ranks."""
+    exec(own_modules, {"__name__": "page"})
