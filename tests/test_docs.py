@@ -1,17 +1,22 @@
 """What the documentation shows is what happens."""
 
+import dataclasses
 import doctest
 import re
 import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import tiny_world as tiny
 from support.commands import write_config
 
 import jaxnav
+from jaxnav.env.types import Observation
 from jaxnav.policies.methods import find_method
+from jaxnav.policies.policy import bind, init_params
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -69,6 +74,25 @@ def test_the_methods_of_the_page_are_found(own_modules):
     assert (sectored.control.num_choices, judged.adaptation is None) == (4, False)
     assert 'check_method("sectors:SECTORED")' in own_modules
     assert 'check_method("judged:JUDGED")' in own_modules
+
+
+@pytest.mark.parametrize("decision", ["fused", "streams"])
+@pytest.mark.parametrize("name", ["sectors:SECTORED", "judged:JUDGED"])
+def test_the_methods_of_the_page_decide_in_both_ways(own_modules, name, decision):
+    """Shapes alone: nothing is computed."""
+    spec = dataclasses.replace(tiny.SPEC, method=name, method_sizes=(), decision=decision)
+    row = jax.ShapeDtypeStruct((5, tiny.BANK.rows.shape[-1]), np.uint8)
+
+    def decide(params, row, goal):
+        policy = bind(spec, params)
+        memory = policy.initial_memory(goal.shape)
+        reading = None if find_method(name).tracker is None else jnp.zeros((*goal.shape, 2))
+        pathways = policy.pathways(Observation(row, goal), jnp.ones((*goal.shape, 3)), reading, None, memory)
+        return policy.decide(pathways, memory)
+
+    params = jax.eval_shape(lambda key: init_params(spec, key), jax.random.key(0))
+    decided = jax.eval_shape(decide, params, row, jax.ShapeDtypeStruct((5,), np.int32))
+    assert decided.logits.shape == (5, find_method(name).control.num_choices)
 
 
 @pytest.mark.slow
