@@ -69,7 +69,8 @@ def plan(control: LocalPolicy, course: Course, choice: jax.Array, knowledge: Kno
 
     def go(body: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], jax.Array]:
         place, heading, horizon = body
-        action, _ = control.act(choice, course._replace(place=place, heading=heading, horizon=horizon), knowledge)
+        now = course._replace(place=place, heading=heading, horizon=horizon)
+        action = control.act(choice, now, knowledge)[0]
         ahead = (place + strides[heading]) % size
         turn = (action == ROTATE_RIGHT).astype(jnp.int32) - (action == ROTATE_LEFT).astype(jnp.int32)
         tilt = (action == LOOK_DOWN).astype(jnp.int32) - (action == LOOK_UP).astype(jnp.int32)
@@ -83,12 +84,11 @@ def _percepts(episode: Episode) -> Percept:
     """Return what the tracker was told, leaves [T, ...]."""
     rules, pose = episode.task.rules, episode.trace.pose
     moved = np.concatenate([[False], (np.diff(episode.places, axis=0) != 0).any(axis=1)])
-    told = Percept(
-        row=episode.rows,
-        heading=pose // len(rules.horizons) % rules.headings,
-        action=np.concatenate([[NO_ACTION], episode.trace.action[:-1]]).astype(np.int32),
-        moved=moved,
-        horizon=pose % len(rules.horizons),
-        goal=np.full(len(pose), episode.goal, np.int32),
+    return Percept(
+        row=jnp.asarray(episode.rows),
+        heading=jnp.asarray(pose // len(rules.horizons) % rules.headings),
+        action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), jnp.asarray(episode.trace.action[:-1], jnp.int32)]),
+        moved=jnp.asarray(moved),
+        horizon=jnp.asarray(pose % len(rules.horizons)),
+        goal=jnp.full(len(pose), episode.goal, jnp.int32),
     )
-    return jax.tree.map(jnp.asarray, told)

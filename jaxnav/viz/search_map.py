@@ -23,7 +23,7 @@ _EDGE = {"markeredgecolor": "white", "markeredgewidth": 0.5}
 _SAME_NAME = 1.0  # metres within which marks of one category share a name
 
 
-class _Frame:
+class Frame:
     """Lay a map, which goes on at the opposite edge, over a home."""
 
     def __init__(self, episode: Episode, search: Search) -> None:
@@ -60,7 +60,7 @@ def draw_search(episode: Episode, search: Search, step: int, path: Path) -> None
     """Write the picture of the search at a step, a PNG."""
     figure = Figure(figsize=(9.6, 5.4), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    axes, frame = figure.add_axes((0.015, 0.03, 0.7, 0.85)), _Frame(episode, search)
+    axes, frame = figure.add_axes((0.015, 0.03, 0.7, 0.85)), Frame(episode, search)
     figure.text(0.02, 0.945, episode.title, color=PALE, fontsize=9.5)
     goal = episode.task.categories[episode.goal]
     figure.text(0.02, 0.9, f"Looking for {goal}", color=GOAL, fontsize=14, weight="bold")
@@ -75,16 +75,16 @@ def draw_search(episode: Episode, search: Search, step: int, path: Path) -> None
     figure.savefig(path)
 
 
-def _draw_map(axes: Axes, search: Search, frame: _Frame) -> None:
+def _draw_map(axes: Axes, search: Search, frame: Frame) -> None:
     """Draw floor and walls as far as they are known."""
-    cells = frame.unroll(search.course.cells)
+    cells = frame.unroll(np.asarray(search.course.cells))
     image = np.zeros((*cells.shape, 4))
     for flags, colour in ((FREE, FAR), (FREE | EXPLORED, NEAR), (WALL, BLOCKED)):
         image[cells & flags == flags] = to_rgba(colour)
     axes.imshow(image, origin="lower", extent=frame.sides, interpolation="nearest", zorder=2.5)
 
 
-def _draw_plan(axes: Axes, episode: Episode, search: Search, step: int, frame: _Frame) -> None:
+def _draw_plan(axes: Axes, episode: Episode, search: Search, step: int, frame: Frame) -> None:
     """Draw the block that was chosen, the ways walked and meant, and the agent."""
     course, rules = search.course, episode.task.rules
     cells, side = frame.size // SIDE, CELL * (frame.size // SIDE)
@@ -100,7 +100,7 @@ def _draw_plan(axes: Axes, episode: Episode, search: Search, step: int, frame: _
     axes.apply_aspect()
 
 
-def _draw_marks(axes: Axes, episode: Episode, search: Search, frame: _Frame) -> None:
+def _draw_marks(axes: Axes, episode: Episode, search: Search, frame: Frame) -> None:
     """Draw and name the cells in which categories were seen."""
     categories = episode.task.categories
     marks = {k: frame.world(np.argwhere(search.course.cells & np.uint32(1 << k))) for k in range(len(categories))}

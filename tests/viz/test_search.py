@@ -20,6 +20,7 @@ from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods.home import learn_home
 from jaxnav.policies.methods.map_tracker import SIDE
 from jaxnav.policies.methods.semexp import SEMEXP
+from jaxnav.policies.semantic_map import VISITED
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.detector import PERFECT
@@ -28,7 +29,7 @@ from jaxnav.scenes.task import Task
 from jaxnav.viz.episode import Episode
 from jaxnav.viz.plan import GOAL
 from jaxnav.viz.search import search_at
-from jaxnav.viz.search_map import BLOCK, BLOCKED, NEAR, draw_search
+from jaxnav.viz.search_map import BLOCK, BLOCKED, NEAR, Frame, draw_search
 
 #: A corridor along z, one cell wide, a book at its north end.
 CORRIDOR = draw([["."]] * 24, ("Book", 0.0, 0.8, 5.75, *SMALL))
@@ -55,7 +56,7 @@ def walked():
         notes.append(note)
         agent, _ = step(agent, jnp.array([NORTH], jnp.int32), KNOWN, params)
     chosen = np.repeat(np.eye(SIDE**2, dtype=np.float32)[NORTH][None], STEPS, axis=0)
-    inferred = Inferred(*(np.zeros(STEPS),) * 3, chosen, chosen, chosen)
+    inferred = Inferred(*map(jnp.asarray, (np.zeros((STEPS, 1)), np.zeros(STEPS), np.zeros(STEPS), *3 * [chosen])))
     trace = Trace(np.array(poses), np.array(actions), inferred, success=False)
     episode = Episode(
         trace=trace,
@@ -84,6 +85,20 @@ def test_the_way_planned_is_walked_where_nothing_new_is_seen(walked):
     places = np.array([note.place for note in notes])
     np.testing.assert_array_equal(places[:, 0] - places[0, 0], [0, *range(STEPS - 1)])
     np.testing.assert_array_equal(search_at(episode, 0).planned[: STEPS - 1], places[1:])
+
+
+def test_the_map_lies_over_the_home(walked):
+    """Where the map says visited, there the agent was; by its cells, and by the pixels of its image."""
+    episode, notes = walked
+    frame = Frame(episode, search_at(episode, STEPS - 1))
+    np.testing.assert_allclose(frame.world(np.array([note.place for note in notes])), episode.places, atol=1e-9)
+    visited = np.argwhere(frame.unroll(np.asarray(notes[-1].cells)) & VISITED)
+    left, _, bottom, top = frame.sides
+    centres = np.array([left, bottom]) + (top - bottom) / SIZE * (visited[:, ::-1] + 0.5)
+    np.testing.assert_allclose(centres, np.unique(episode.places, axis=0), atol=1e-9)
+    # Beyond an edge it goes on: from line N - 1 to line 1 are two lines, not N - 2.
+    ways = np.diff(frame.along(np.array([[SIZE - 1, 3], [1, 3]])), axis=0)
+    np.testing.assert_allclose(ways, [[0.0, 0.5]], atol=1e-9)
 
 
 def test_the_picture_shows_what_is_known_and_chosen(walked, tmp_path):
