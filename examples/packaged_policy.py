@@ -13,8 +13,8 @@ import jaxnav
 
 EPISODES, STEPS = 256, 100
 
-policy = jaxnav.load_policy("rooms-org")
 env, params = jaxnav.make("rooms", split="val")
+policy = jaxnav.load_policy("rooms-org", env=env)
 horizons, headings = len(env.task.rules.horizons), env.task.rules.headings
 
 

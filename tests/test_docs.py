@@ -1,15 +1,22 @@
 """What the documentation shows is what happens."""
 
+import dataclasses
 import doctest
 import re
+import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import tiny_world as tiny
 from support.commands import write_config
 
 import jaxnav
+from jaxnav.env.types import Observation
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.policy import bind, init_params
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -42,3 +49,53 @@ def test_the_code_of_use_runs(tmp_path, monkeypatch, capsys):
             exec(code.replace("import jaxnav\n", "import jaxnav\nimport jaxnav.runs.overlay\n"), {"__name__": "use"})
     assert "['detections', 'goal', 'heading', 'horizon', 'moved', 'view']" in capsys.readouterr().out
     assert jaxnav.Run.open("runs/org").config.seeds == 2
+
+
+BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+
+
+@pytest.fixture
+def own_modules(tmp_path, monkeypatch):
+    """A folder with the modules of the page on methods, in the path; returns the code that follows them."""
+    blocks = BLOCK.findall((DOCS / "add_a_method.md").read_text())
+    named = {name[1]: block for block in blocks if (name := re.match(r"# (\w+)\.py\n", block))}
+    assert sorted(named) == ["judged", "sectors"]
+    for name, block in named.items():
+        (tmp_path / f"{name}.py").write_text(block)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "".join(block for block in blocks if block not in named.values())
+    for name in named:
+        sys.modules.pop(name, None)
+    find_method.cache_clear()
+
+
+def test_the_methods_of_the_page_are_found(own_modules):
+    sectored, judged = find_method("sectors:SECTORED"), find_method("judged:JUDGED")
+    assert (sectored.control.num_choices, judged.adaptation is None) == (4, False)
+    assert 'check_method("sectors:SECTORED")' in own_modules
+    assert 'check_method("judged:JUDGED")' in own_modules
+
+
+@pytest.mark.parametrize("decision", ["fused", "streams"])
+@pytest.mark.parametrize("name", ["sectors:SECTORED", "judged:JUDGED"])
+def test_the_methods_of_the_page_decide_in_both_ways(own_modules, name, decision):
+    """Shapes alone: nothing is computed."""
+    spec = dataclasses.replace(tiny.SPEC, method=name, method_sizes=(), decision=decision)
+    row = jax.ShapeDtypeStruct((5, tiny.BANK.rows.shape[-1]), np.uint8)
+
+    def decide(params, row, goal):
+        policy = bind(spec, params)
+        memory = policy.initial_memory(goal.shape)
+        reading = None if find_method(name).tracker is None else jnp.zeros((*goal.shape, 2))
+        pathways = policy.pathways(Observation(row, goal), jnp.ones((*goal.shape, 3)), reading, None, memory)
+        return policy.decide(pathways, memory)
+
+    params = jax.eval_shape(lambda key: init_params(spec, key), jax.random.key(0))
+    decided = jax.eval_shape(decide, params, row, jax.ShapeDtypeStruct((5,), np.int32))
+    assert decided.logits.shape == (5, find_method(name).control.num_choices)
+
+
+@pytest.mark.slow
+def test_the_methods_of_the_page_keep_the_contract(own_modules):
+    """The page's own calls, under the suite's strict rules of types and ranks."""
+    exec(own_modules, {"__name__": "page"})

@@ -51,12 +51,14 @@ def frontier_outcome(bank: Bank, episodes: EpisodeList, step_limit: np.ndarray) 
     reached = bank.best_length[last, episodes.goal] == 1
     end = successor[last, action] // bank.task.rules.poses_per_cell
     moves = [sum(action == MOVE_AHEAD for _, action in steps) for steps in walks]
+    length = jnp.asarray([len(steps) for steps in walks], jnp.int32)
     return Outcome(
         done=jnp.asarray(action == DONE),
         success=jnp.asarray((action == DONE) & reached),
-        length=jnp.asarray([len(steps) for steps in walks], jnp.int32),
+        length=length,
         moves=jnp.asarray(moves, jnp.int32),
         distance=jnp.asarray(bank.goal_distance[end, episodes.goal]),
+        choices=length,
         weight=jnp.zeros(len(walks)),
     )
 

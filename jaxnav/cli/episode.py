@@ -27,6 +27,9 @@ class EpisodeConfig:
       setting: layout estimator to use instead of the run's, as of `eval`.
       scenes: scene file to read instead of the run's own world or file.
       shift: layout shift of the scenes, from 0 to 1; default: the run's.
+      map: draw what the agent's own map holds instead, the block it chose and its way there (PNG; methods that search
+        with a map).
+      step: at which the map is drawn, from 1; default: the last.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -38,6 +41,8 @@ class EpisodeConfig:
     setting: EstimatorName | None = None
     scenes: Path | None = None
     shift: float | None = None
+    map: bool = False
+    step: int | None = None
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -51,10 +56,14 @@ def draw(config: EpisodeConfig, console: Console) -> None:
     require_pictures()
     from jaxnav.viz.episode import draw_episode
     from jaxnav.viz.play import play_episode
+    from jaxnav.viz.search import search_at
+    from jaxnav.viz.search_map import draw_search
 
-    path = config.out or config.run / "episode.gif"
-    if path.suffix not in (".gif", ".png"):
-        raise InputError(f"--out {path}: give a name that ends in .gif or .png")
+    path = config.out or config.run / ("map.png" if config.map else "episode.gif")
+    if path.suffix not in ((".png",) if config.map else (".gif", ".png")):
+        raise InputError(f"--out {path}: give a name that ends in {'.png' if config.map else '.gif or .png'}")
+    if config.step is not None and not config.map:
+        raise InputError(f"--step {config.step}: is for the map; give --map too")
     episode = play_episode(
         config.run,
         config.split,
@@ -66,5 +75,9 @@ def draw(config: EpisodeConfig, console: Console) -> None:
         config.shift,
         console,
     )
-    draw_episode(episode, path)
+    if config.map:
+        step = len(episode.trace.pose) if config.step is None else config.step
+        draw_search(episode, search_at(episode, step - 1), step - 1, path)
+    else:
+        draw_episode(episode, path)
     console.print(f"{len(episode.trace.pose)} steps; written to {path}", soft_wrap=True)

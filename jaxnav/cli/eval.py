@@ -96,8 +96,8 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
 
 def _target(config: EvalConfig) -> Path:
     """Return where the table goes, or refuse early."""
-    source = config.world or (config.scenes and config.scenes.name.split(".")[0])
-    name = f"eval-{source}-{config.split}" if source else f"eval-{config.split}"
+    file = config.scenes and f"scenes-{config.scenes.name.split('.')[0]}"  # no world is called that
+    name = "-".join(part for part in ("eval", config.world or file, config.split) if part)
     name += "" if config.shift is None else f"-shift{config.shift:g}"
     name += "" if config.setting is None else f"-{config.setting}"
     name += "" if config.inner_steps is None else f"-inner{config.inner_steps}"

@@ -4,6 +4,7 @@
 and `houses`; options are those of `jaxnav.make`. Importing this module registers the ids.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -176,10 +178,28 @@ class ObjectNavVectorEnv(VectorEnv[Named, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.categories = env.categories
 
-    def reset(self, *, seed: int | None = None, options: Named | None = None) -> tuple[Named, Named]:
-        """Begin all episodes."""
-        super().reset(seed=seed)
-        self._episodes, named = self._functions.reset(_keys(self.np_random, self.num_envs))
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Named | None = None
+    ) -> tuple[Named, Named]:
+        """Begin all episodes.
+
+        Args:
+          seed: of all of them; or one for each, of which each begins like the single environment.
+          options: unused.
+
+        Raises:
+          ValueError: not as many seeds as episodes.
+        """
+        if not isinstance(seed, Sequence):
+            super().reset(seed=seed)
+            keys = _keys(self.np_random, self.num_envs)
+        elif len(seed) != self.num_envs:
+            raise ValueError(f"seed holds {len(seed)} seeds; give one for each of the {self.num_envs} environments")
+        else:
+            generators = [np_random(each)[0] for each in seed]
+            keys = jnp.concatenate([_keys(each, 1) for each in generators])
+            self.np_random = generators[0]
+        self._episodes, named = self._functions.reset(keys)
         return _plain(named), {}
 
     def step(self, actions: np.ndarray) -> tuple[Named, np.ndarray, np.ndarray, np.ndarray, Named]:

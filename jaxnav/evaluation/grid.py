@@ -25,7 +25,8 @@ class Outcome(NamedTuple):
       length: int32, actions taken, Done included.
       moves: int32, MoveAheads chosen.
       distance: float32, metres from the last cell to the nearest goal object's centre.
-      weight: float32, mean weight of the counterfactual logits over the episode's steps.
+      choices: int32, steps at which what the policy chose counted; all of them unless a control takes its time.
+      weight: float32, mean weight of the counterfactual logits over these steps.
     """
 
     done: jax.Array
@@ -33,6 +34,7 @@ class Outcome(NamedTuple):
     length: jax.Array
     moves: jax.Array
     distance: jax.Array
+    choices: jax.Array
     weight: jax.Array
 
     @classmethod
@@ -44,10 +46,13 @@ class Outcome(NamedTuple):
             length=jnp.zeros(shape, jnp.int32),
             moves=jnp.zeros(shape, jnp.int32),
             distance=jnp.zeros(shape),
+            choices=jnp.zeros(shape, jnp.int32),
             weight=jnp.zeros(shape),
         )
 
-    def after(self, running: jax.Array, action: jax.Array, taken: Taken, weight: jax.Array) -> "Outcome":
+    def after(
+        self, running: jax.Array, action: jax.Array, taken: Taken, weight: jax.Array, due: jax.Array | None = None
+    ) -> "Outcome":
         """Return the outcome after one more step.
 
         Args:
@@ -55,13 +60,16 @@ class Outcome(NamedTuple):
           action: int32, taken.
           taken: what came of the step.
           weight: float32, of what was removed.
+          due: bool, whether the choice counted; None where every one does.
         """
+        counted = running if due is None else running & due
         return self._replace(
             done=self.done | (running & taken.terminated),
             success=self.success | (running & taken.success),
             length=self.length + running.astype(jnp.int32),
             moves=self.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
-            weight=self.weight + jnp.where(running, weight, 0.0),
+            choices=self.choices + counted.astype(jnp.int32),
+            weight=self.weight + jnp.where(counted, weight, 0.0),
         )
 
 
@@ -166,7 +174,7 @@ def _run_episodes(
     def step(progress: _Progress) -> _Progress:
         agent, running, outcome, keys = progress
         after, taken, inferred = act(cell, policy, agent, running, keys, acting, params, knowledge, removes)
-        outcome = outcome.after(running, carried(taken.agent).action, taken, inferred.weight)
+        outcome = outcome.after(running, carried(taken.agent).action, taken, inferred.weight, acting.due(agent))
         return _Progress(select(running, after, agent), running & ~taken.ended, outcome, keys)
 
     progress = _Progress(agent, jnp.ones(count, bool), Outcome.start(count), keys)
@@ -180,7 +188,7 @@ def _run_episodes(
     outcome, last = ended
     return outcome._replace(
         distance=params.tables.goal_distance[acting.env.cell(last.pose), last.goal],
-        weight=outcome.weight / outcome.length.astype(jnp.float32),
+        weight=outcome.weight / jnp.maximum(outcome.choices, 1).astype(jnp.float32),
     )
 
 

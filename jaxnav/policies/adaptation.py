@@ -65,18 +65,18 @@ class LearnedSteps:
     inner step of a rollout; what was stored before it is constant.
 
     Attributes:
-      steps: in an episode, at most.
+      inner_steps: in an episode, at most.
       rate: of an inner step.
       second_order: whether gradients of training pass the inner gradient; if not, they reach the learned loss alone.
     """
 
-    steps: int = 4
+    inner_steps: int = 4
     rate: float = 0.01
     second_order: bool = True
 
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> FastWeights:
         """Return an empty window and no change."""
-        rank = self.steps * WINDOW
+        rank = self.inner_steps * WINDOW
         return FastWeights(
             decisions=jnp.zeros(batch, jnp.int32),
             start=jnp.zeros((*batch, len(policy.recurrent_kernel))),
@@ -96,15 +96,15 @@ class LearnedSteps:
 
     def adapted(self, policy: "Policy", fast: FastWeights) -> FastWeights:
         """Take an inner step in the episodes whose window is full."""
-        full = (fast.decisions % WINDOW == 0) & (fast.decisions <= self.steps * WINDOW)
-        new = where_due(full, functools.partial(self.step, policy), fast)
+        full = (fast.decisions % WINDOW == 0) & (fast.decisions <= self.inner_steps * WINDOW)
+        new = where_due(full, functools.partial(self.inner_step, policy), fast)
 
         def append(past: jax.Array, new: jax.Array) -> jax.Array:
             return jnp.where(full[..., None, None], jnp.concatenate([past[..., WINDOW:, :], new], axis=-2), past)
 
         return fast._replace(factors=jax.tree.map(append, fast.factors, new))
 
-    def step(self, policy: "Policy", fast: FastWeights) -> dict[str, Factors]:
+    def inner_step(self, policy: "Policy", fast: FastWeights) -> dict[str, Factors]:
         """Return the factors of an inner step, [W, ...], of one episode."""
         loss = cast(Judging, policy.method).learned_loss
         if not self.second_order:  # not into the loss itself: nothing else would teach it
@@ -120,20 +120,20 @@ class LearnedSteps:
         return {layer: Factors(inputs[layer], -self.rate * by_output) for layer, by_output in gradient.items()}
 
 
-def limited(adaptation: "Adaptation | None", steps: int) -> "Adaptation | None":
+def limited(adaptation: "Adaptation | None", inner_steps: int) -> "Adaptation | None":
     """Return an adaptation that takes fewer inner steps.
 
     Raises:
       InputError: it takes no inner steps, or not so many; none at all is always possible.
     """
-    if steps == 0:
+    if inner_steps == 0:
         return None
     if not isinstance(adaptation, LearnedSteps):
-        raise InputError(f"inner_steps is {steps}; the method adapts in another way: give 0, or leave it out")
-    if not 0 < steps <= adaptation.steps:
-        most = f"an episode remembers {adaptation.steps} windows of {WINDOW} actions"
-        raise InputError(f"inner_steps is {steps}; {most}: give 0 to {adaptation.steps}")
-    return dataclasses.replace(adaptation, steps=steps)
+        raise InputError(f"inner_steps is {inner_steps}; the method adapts in another way: give 0, or leave it out")
+    if not 0 < inner_steps <= adaptation.inner_steps:
+        most = f"an episode remembers {adaptation.inner_steps} windows of {WINDOW} actions"
+        raise InputError(f"inner_steps is {inner_steps}; {most}: give 0 to {adaptation.inner_steps}")
+    return dataclasses.replace(adaptation, inner_steps=inner_steps)
 
 
 def replay_window(

@@ -88,7 +88,7 @@ class Policy(Stream):
         if surroundings is not None:
             scene = jnp.concatenate([scene, SpatialMemory.inputs(surroundings)], axis=-1)
         if self.method.geometry:
-            scene = jnp.concatenate([scene, self.method.surroundings(reading)], axis=-1)
+            scene = jnp.concatenate([scene, self.method.geometry_inputs(reading)], axis=-1)
         appearance = self.appearance.embedding[...]
         confidence = (seen.table[..., CONFIDENCE] * seen.goal).sum(axis=-1, keepdims=True)
         return Pathways(

@@ -81,7 +81,7 @@ def find_way(targets: jax.Array, passable: jax.Array, start: jax.Array) -> Way:
     return Way(jnp.where(holds(reached, start), length, -1), nearer)
 
 
-def follow(way: Way, start: jax.Array, heading: jax.Array, steps: jax.Array) -> jax.Array:
+def follow(way: Way, start: jax.Array, heading: jax.Array, strides: jax.Array) -> jax.Array:
     """Return the action int32 [] that follows a way of one step or more.
 
     Of several steps that lead nearer it takes the one that needs the fewest turns.
@@ -90,11 +90,11 @@ def follow(way: Way, start: jax.Array, heading: jax.Array, steps: jax.Array) -> 
       way: see `find_way`.
       start: int32 [2], (z, x).
       heading: int32 [].
-      steps: int32 [H, 2], the displacement of a step ahead by heading.
+      strides: int32 [H, 2], the displacement of a step ahead by heading.
     """
-    turns = (jnp.arange(len(steps)) - heading) % len(steps)
-    away = jnp.where(holds(way.nearer, start[None] + steps), jnp.minimum(turns, len(steps) - turns), len(steps))
-    return turn_to(away.argmin(), heading, len(steps))
+    turns = (jnp.arange(len(strides)) - heading) % len(strides)
+    away = jnp.where(holds(way.nearer, start[None] + strides), jnp.minimum(turns, len(strides) - turns), len(strides))
+    return turn_to(away.argmin(), heading, len(strides))
 
 
 def turn_to(wanted: jax.Array, heading: jax.Array, headings: int) -> jax.Array:

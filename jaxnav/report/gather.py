@@ -145,7 +145,7 @@ def _gaps(episodes: EpisodeList, policies: Policies, world: CompiledWorld, seed:
         policies.of("layout"),
         episodes,
         world.params(0),
-        policies.acting(world.env),
+        policies.acting(world),
         policies.knowledge,
         [policies.setting],
         layout_priors(policies.counts, policies.setting)[None],

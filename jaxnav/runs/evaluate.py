@@ -144,9 +144,8 @@ def run_rows(
     Returns:
       The episodes of each bank, outcomes with leaves [R, S, E], and the number of compilations.
     """
-    world.check(policies.spec.method, policies.knowledge)
     lists = episode_lists(world, episodes, seed)
-    evaluator = Evaluator(policies.acting(world.env))
+    evaluator = Evaluator(policies.acting(world))
     outcome = evaluator(
         inference_grid(rows, policies.arms, policies.seeds),
         policies.params,

@@ -38,11 +38,11 @@ def step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Array) ->
     earlier = earlier._replace(memory=earlier.memory._replace(action=inputs["action"]), room=inputs["room"])
     memory = jax.tree.map(functools.partial(jnp.where, inputs["first"]), began, earlier)
     odometry = {"heading": inputs["heading"], "moved": inputs["moved"] & ~inputs["first"], "horizon": inputs["horizon"]}
-    choice = policy.decide(observation, memory, epsilon, **odometry)
-    action, memory = policy.follow(choice, jnp.argmax(choice.logits).astype(jnp.int32), memory.room)
-    found = {"action": action, "logits": choice.logits, "factual": choice.factual, "memory": _named(memory)}
-    if choice.counterfactual is not None:
-        found |= {"counterfactual": choice.counterfactual, "gap": choice.gap, "weights": choice.weights}
+    made = policy.decide(observation, memory, epsilon, **odometry)
+    action, memory = policy.follow(made, jnp.argmax(made.logits).astype(jnp.int32), memory.room)
+    found = {"action": action, "logits": made.logits, "factual": made.factual, "memory": _named(memory)}
+    if made.counterfactual is not None:
+        found |= {"counterfactual": made.counterfactual, "gap": made.gap, "weights": made.weights}
     return found
 
 

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.gaps import Signs
 from jaxnav.layout import SETTINGS, Setting
@@ -20,6 +19,8 @@ from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.worlds import CompiledWorld
+from jaxnav.scenes.task import Task
 from jaxnav.store.export import export_params, load_params
 from jaxnav.store.manifest import differences
 from jaxnav.training.calibration import layout_priors
@@ -44,6 +45,7 @@ class Policies(NamedTuple):
       spec: what the policies are built from.
       setting: of the layout estimator, as calibrated; None without the arm `layout`.
       prior_steps: random steps that the priors were collected in.
+      task: that they were trained for.
       inner_steps: by which they may adapt in an episode; None for the method's usual number.
     """
 
@@ -54,6 +56,7 @@ class Policies(NamedTuple):
     spec: PolicySpec
     setting: Setting | None
     prior_steps: int
+    task: Task
     inner_steps: int | None = None
 
     @property
@@ -109,9 +112,14 @@ class Policies(NamedTuple):
         limited(adaptation, steps)
         return self._replace(inner_steps=steps)
 
-    def acting(self, env: ObjectNav) -> Acting:
-        """Return how they act in an environment."""
-        return Acting(env, self.spec, self.setting, self.inner_steps)
+    def acting(self, world: CompiledWorld) -> Acting:
+        """Return how they act in the scenes of a world.
+
+        Raises:
+          InputError: their method cannot act there.
+        """
+        world.check(self.spec.method, self.knowledge)
+        return Acting(world.env, self.spec, self.setting, self.inner_steps)
 
 
 def gap_settings(setting: Setting) -> dict[Gap, Setting]:
@@ -192,6 +200,7 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
             spec=PolicySpec(*built, *options),
             setting=None if spec["layout"] is None else Setting(**spec["layout"]),
             prior_steps=spec["prior_steps"],
+            task=Task.from_json(spec["task"]),
         )
     except InputError as error:
         raise InputError(f"{where}: {error}") from error

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.causal import Form, do, stde
-from jaxnav.env.objectnav import OTHER_ROOM, prior_index
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, prior_index
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
 from jaxnav.layout import Setting
@@ -22,6 +22,8 @@ from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.policies import EstimatorName, read_export
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.task import Task
+from jaxnav.store.manifest import differences
 
 #: Policies that come with the package, a folder each.
 WEIGHTS = Path(__file__).parents[1] / "weights"
@@ -41,7 +43,7 @@ class EpisodeMemory(NamedTuple):
     room: jax.Array
 
 
-class Choice(NamedTuple):
+class Deliberation(NamedTuple):
     """Hold what a policy makes of one observation.
 
     Attributes:
@@ -73,12 +75,14 @@ class LoadedPolicy(struct.PyTreeNode):
       knowledge: what was learned before training.
       spec: what the network is built from.
       setting: of the layout estimator; None where the policy does not use the layout.
+      task: that the policy was trained for.
     """
 
     params: Params
     knowledge: Knowledge
     spec: PolicySpec = struct.field(pytree_node=False)
     setting: Setting | None = struct.field(pytree_node=False)
+    task: Task = struct.field(pytree_node=False)
 
     def init(self, room_type: str | None = None) -> EpisodeMemory:
         """Begin an episode.
@@ -130,15 +134,15 @@ class LoadedPolicy(struct.PyTreeNode):
         Raises:
           InputError: heading, moved or horizon is needed and missing.
         """
-        choice = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
-        chosen = jnp.argmax(choice.logits) if key is None else jax.random.categorical(key, choice.logits)
-        return self.follow(choice, chosen.astype(jnp.int32), memory.room)
+        made = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
+        chosen = jnp.argmax(made.logits) if key is None else jax.random.categorical(key, made.logits)
+        return self.follow(made, chosen.astype(jnp.int32), memory.room)
 
-    def follow(self, choice: Choice, chosen: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
+    def follow(self, made: Deliberation, chosen: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
         """Return the action int32 [] of what was chosen, and the memory."""
-        control, perceived = find_method(self.spec.method).control, choice.perceived
+        control, perceived = find_method(self.spec.method).control, made.perceived
         action, note = control.act(chosen, perceived.note, self.knowledge)
-        return action, EpisodeMemory(choice.decision.memory(action), perceived._replace(note=note), room)
+        return action, EpisodeMemory(made.decision.memory(action), perceived._replace(note=note), room)
 
     def decide(
         self,
@@ -149,7 +153,7 @@ class LoadedPolicy(struct.PyTreeNode):
         heading: jax.Array | int | None = None,
         moved: jax.Array | bool | None = None,
         horizon: jax.Array | int | None = None,
-    ) -> Choice:
+    ) -> Deliberation:
         """Take in one observation; see `act`.
 
         Raises:
@@ -170,10 +174,10 @@ class LoadedPolicy(struct.PyTreeNode):
         decision = policy.decide(pathways, memory.memory)
         layout, setting = perceived.layout, self.setting
         if layout is None or setting is None:
-            return Choice(decision.logits, decision.logits, None, None, None, perceived, decision)
+            return Deliberation(decision.logits, decision.logits, None, None, None, perceived, decision)
         removed = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.memory).logits
         logits = stde(decision.logits, removed, layout.gap, epsilon, setting.form)
-        return Choice(logits, decision.logits, removed, layout.gap, view.weights, perceived, decision)
+        return Deliberation(logits, decision.logits, removed, layout.gap, view.weights, perceived, decision)
 
     @property
     def _perception(self) -> Perception:
@@ -181,7 +185,11 @@ class LoadedPolicy(struct.PyTreeNode):
 
 
 def load_policy(
-    path: str | Path, setting: EstimatorName | None = None, hold: bool = False, form: Form | None = None
+    path: str | Path,
+    setting: EstimatorName | None = None,
+    hold: bool = False,
+    form: Form | None = None,
+    env: ObjectNav | None = None,
 ) -> LoadedPolicy:
     """Load an exported policy.
 
@@ -190,9 +198,11 @@ def load_policy(
         package: `rooms-org`.
       setting, hold: layout estimator to use instead of the policy's; see `Policies.estimating`.
       form: how sTDE combines the logits; None for that of the layout setting.
+      env: the environment that it is to act in; None leaves it unchecked.
 
     Raises:
-      InputError: no export there, a damaged one, one whose method cannot be found, or an impossible setting.
+      InputError: no export there, a damaged one, one whose method cannot be found, an impossible setting, or one
+        trained with other categories or rules than those of `env`.
     """
     packaged = WEIGHTS / path
     folder = packaged if packaged.is_dir() and not Path(path).exists() else Path(path)
@@ -203,4 +213,21 @@ def load_policy(
     layout = policies.setting
     if layout is not None and form is not None:
         layout = dataclasses.replace(layout, form=form)
-    return LoadedPolicy(policies.params, policies.knowledge, policies.spec, layout)
+    if env is not None:
+        _check_task(path, policies.task, env.task)
+    return LoadedPolicy(policies.params, policies.knowledge, policies.spec, layout, policies.task)
+
+
+def _check_task(path: str | Path, trained: Task, asked: Task) -> None:
+    """Check that what a policy learned to see and do is asked of it.
+
+    Goals and the detector's errors may differ.
+    """
+    there, here = (
+        {"categories": task.categories, "rules": dataclasses.asdict(task.rules)} for task in (trained, asked)
+    )
+    if different := differences(there, here):
+        raise InputError(
+            f"{path}: was trained for another task than that of env (there != here): {'; '.join(different)}; "
+            "make one for this task: jaxnav.make(..., task=jaxnav.load_policy(...).task)"
+        )

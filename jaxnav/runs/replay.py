@@ -23,13 +23,12 @@ def replay(policies: Policies, world: CompiledWorld, episodes: EpisodeList, row:
     Raises:
       InputError: the method cannot act in the scenes.
     """
-    world.check(policies.spec.method, policies.knowledge)
     inference = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], policies.arms, policies.seeds))
     return play(
         inference,
         jax.tree.map(lambda leaf: leaf[inference.params], policies.params),
         first_states(episodes),
-        policies.acting(world.env),
+        policies.acting(world),
         world.params(0),
         policies.knowledge,
     )

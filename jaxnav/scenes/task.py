@@ -1,7 +1,8 @@
 """Tasks: categories, goals and the rules of an episode."""
 
 import dataclasses
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 
@@ -118,9 +119,20 @@ class Task:
     rules: Rules = Rules()
     detector: Detector = Detector()
 
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Task":
+        """Make the task of which JSON holds the fields."""
+        rules, detector = _tupled(values["rules"]), _tupled(values["detector"])
+        return cls(**_tupled(values) | {"rules": Rules(**rules), "detector": Detector(**detector)})
+
     def is_goal(self) -> np.ndarray:
         """Return which categories can be goals, bool [K]."""
         return np.array([not self.goals or name in self.goals for name in self.categories])
+
+
+def _tupled(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with tuples for lists."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 #: The tasks of AI2-THOR rooms, RoboTHOR apartments and Gibson houses.

@@ -69,9 +69,13 @@ class Bench:
         return dict(zip(trials, self.run(subject, setting, trials), strict=True))
 
     def run(self, subject: Subject, setting: Setting | None, trials: Sequence[Trial]) -> list[Outcome]:
-        """Run trials with a layout setting; outcomes are [S, E]."""
+        """Run trials with a layout setting; outcomes are [S, E].
+
+        Raises:
+          InputError: the method cannot act in the scenes.
+        """
         policies, world, episodes = subject
-        acting, seeds = Acting(world.env, policies.spec, setting), policies.seeds
+        acting, seeds = policies._replace(setting=setting).acting(world), policies.seeds
         evaluator = self._evaluators.setdefault(acting, Evaluator(acting))
         outcomes: list[Outcome] = []
         params = world.params(0)

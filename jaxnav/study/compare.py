@@ -23,6 +23,7 @@ from jaxnav.study.compare_config import CompareConfig, Entry, entries, entry_ide
 from jaxnav.study.compare_report import SCALE, Line, Scores, Training
 from jaxnav.study.compare_tables import frontier_name, write_comparison
 from jaxnav.study.document import check_document
+from jaxnav.study.paper_tables import write_paper_tables
 from jaxnav.study.results import is_written, write_record
 from jaxnav.study.runs import ensure_trained
 
@@ -39,7 +40,9 @@ def run_compare(config: CompareConfig, console: Console) -> None:
     Raises:
       InputError: the document is another one, or a run is impossible.
     """
-    check_document(config.document)
+    for document in (config.document, config.paper):
+        if document is not None:
+            check_document(document)
     jobs, found = _jobs(config, console), {}
     for name, identity, measure in jobs:
         path = config.results / config.split / f"{name}.json"
@@ -48,6 +51,8 @@ def run_compare(config: CompareConfig, console: Console) -> None:
             write_record(path, identity, measure())
         found[name] = from_json(Scores, json.loads(path.read_text()))
         write_comparison(config, found)
+        if config.paper is not None:
+            write_paper_tables(config.paper, config.results / config.split)
     console.print(f"written to {config.document}", soft_wrap=True)
 
 

@@ -25,6 +25,7 @@ class CompareConfig:
       title: of the document.
       results: folder of the results, one JSON file for each world, method and decision.
       document: Markdown file written from the results.
+      paper: Markdown file with the paper's Tables 1 to 3 beside all results in the folder; None for none.
       runs: folder of the training runs.
       worlds: by name, the settings that the runs in it change: some of `world`, `scenes`, `worlds`, `detector` and
         `total_steps`.
@@ -44,6 +45,7 @@ class CompareConfig:
     title: str = "Table 2: every method without and with the layout"
     results: Path = Path("results/table2")
     document: Path = Path("docs/table2.md")
+    paper: Path | None = None
     runs: Path = Path("runs/table2")
     worlds: dict[str, dict[str, Any]] = dataclasses.field(
         default_factory=lambda: {name: {"world": name} for name in ("rooms", "apartments")}

@@ -79,7 +79,7 @@ def _traces(
         policies.of("layout"),
         study_episodes(world, config),
         world.params(0),
-        policies.acting(world.env),
+        policies.acting(world),
         policies.knowledge,
         list(settings.values()),
         jnp.stack([layout_priors(policies.counts, setting) for setting in settings.values()]),

@@ -16,9 +16,9 @@ SCALES: Mapping[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
 
 
 def mean_weight(outcome: Outcome) -> float:
-    """Return the weight of the subtracted logits, averaged over steps."""
-    length = np.asarray(outcome.length, np.float64)
-    return float((np.asarray(outcome.weight, np.float64) * length).sum() / length.sum())
+    """Return the weight of the subtracted logits, averaged over choices."""
+    choices = np.asarray(outcome.choices, np.float64)
+    return float((np.asarray(outcome.weight, np.float64) * choices).sum() / choices.sum())
 
 
 class TrialOutcomes:

@@ -35,7 +35,7 @@ class TrialRow:
     Attributes:
       gap: of sTDE; `novelty` where there is none.
       trial: what is evaluated.
-      mean_weight: mean over all steps of the weight of the subtracted logits.
+      mean_weight: mean over all choices of the weight of the subtracted logits.
       sr, spl, dts: metrics.
       difference: of `layout` to the baseline, of the others to `layout`; None where that was not evaluated.
     """

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxnav.evaluation.playback import Trace
+from jaxnav.runs.policies import Policies
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.observation_row import RowFormat, detected_places
 from jaxnav.scenes.task import DONE, Task
@@ -36,6 +37,7 @@ class Episode(NamedTuple):
       best_length: L*.
       epsilon: threshold of sTDE; infinite where experience is kept.
       title: names the agent and the scene.
+      policies: of the run, one of which acted.
     """
 
     trace: Trace
@@ -47,6 +49,7 @@ class Episode(NamedTuple):
     best_length: int
     epsilon: float
     title: str
+    policies: Policies
 
 
 def draw_episode(episode: Episode, path: Path) -> None:
@@ -63,14 +66,14 @@ def draw_episode(episode: Episode, path: Path) -> None:
     figure.text(0.02, 0.945, episode.title, color=PALE, fontsize=9.5)
     goal = episode.task.categories[episode.goal]
     figure.text(0.02, 0.9, f"Looking for {goal}", color=GOAL, fontsize=14, weight="bold")
-    status = figure.text(0.98, 0.935, "", color=INK, fontsize=10.5, ha="right")
+    told = figure.text(0.98, 0.935, "", color=INK, fontsize=10.5, ha="right")
     draw_room(room, episode.scene, episode.task.categories, episode.goal)
 
     last = len(episode.trace.pose) - 1
     steps = range(0, last + 1, -(-(last + 1) // MAX_FRAMES)) if path.suffix == ".gif" else []
     images = []
     for step in [*(step for step in steps if step != last), last]:
-        status.set_text(_status(episode, step))
+        told.set_text(status(episode, step))
         moving = _draw_agent(room, episode, step)
         _draw_detected(detected, episode, step)
         _draw_gap(gap, episode, step)
@@ -97,7 +100,8 @@ def _write_gif(images: list[Image.Image], path: Path) -> None:
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
 
 
-def _status(episode: Episode, step: int) -> str:
+def status(episode: Episode, step: int) -> str:
+    """Return what is done at a step, and what comes of the last."""
     trace = episode.trace
     action = trace.action[step]
     text = f"step {step + 1}: {ACTIONS[action]}"

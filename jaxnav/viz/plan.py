@@ -34,21 +34,32 @@ def draw_room(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int |
     Taller boxes are darker. An object of a category is a dot with a name, an object of the category `goal` a star. The
     rooms of a home are tinted by their types and named.
     """
-    low, high = extent(scene)
-    nz, nx = scene.reach.shape
-    corner = np.asarray(scene.origin) - CELL / 2
-    sides = (corner[0], corner[0] + CELL * nx, corner[1], corner[1] + CELL * nz)
-    axes.imshow(_floor(scene), origin="lower", extent=sides, interpolation="nearest")
-    _draw_boxes(axes, scene)
-    low, high = low - _EDGE, high + _EDGE
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], facecolor=GROUND)
-    axes.spines[:].set_visible(False)
-    axes.apply_aspect()
+    draw_outline(axes, scene, alpha=1.0)
     labels = _draw_objects(axes, scene, categories, goal)
     for room in scene.rooms:
         iz, ix = np.nonzero(room.cells & scene.reach if (room.cells & scene.reach).any() else room.cells)
         places = np.asarray(scene.origin) + CELL * np.stack([ix, iz], axis=-1)
         labels.among(room.type.replace("_", " "), places, WALL)
+
+
+def draw_outline(axes: Axes, scene: Scene, alpha: float = 0.3) -> None:
+    """Draw walls, floor and furniture without names.
+
+    Args:
+      axes: get the limits of the plan.
+      scene: to draw.
+      alpha: opacity.
+    """
+    low, high = extent(scene)
+    nz, nx = scene.reach.shape
+    corner = np.asarray(scene.origin) - CELL / 2
+    sides = (corner[0], corner[0] + CELL * nx, corner[1], corner[1] + CELL * nz)
+    axes.imshow(_floor(scene), origin="lower", extent=sides, interpolation="nearest", alpha=alpha)
+    _draw_boxes(axes, scene, alpha)
+    low, high = low - _EDGE, high + _EDGE
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], facecolor=GROUND)
+    axes.spines[:].set_visible(False)
+    axes.apply_aspect()
 
 
 def draw_agent(axes: Axes, scene: Scene, rules: Rules, place: np.ndarray, yaw: float) -> tuple[Polygon, Line2D]:
@@ -104,14 +115,16 @@ def _floor(scene: Scene) -> np.ndarray:
     return colours
 
 
-def _draw_boxes(axes: Axes, scene: Scene) -> None:
+def _draw_boxes(axes: Axes, scene: Scene, alpha: float) -> None:
     """Draw the boxes of all objects, the highest on top."""
     x, y, z, sx, sy, sz = scene.boxes.T
     top = y + sy / 2
     order = np.argsort(top)
     boxes = [Rectangle((x[i] - sx[i] / 2, z[i] - sz[i] / 2), sx[i], sz[i]) for i in order]
     shades = HEIGHTS(np.clip(top[order] / TALL, 0.0, 1.0))
-    axes.add_collection(PatchCollection(boxes, facecolor=shades, edgecolor="white", linewidth=0.7, zorder=2))
+    axes.add_collection(
+        PatchCollection(boxes, facecolor=shades, edgecolor="white", linewidth=0.7, alpha=alpha, zorder=2)
+    )
 
 
 def _draw_objects(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int | None) -> Labels:

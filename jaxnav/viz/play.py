@@ -74,4 +74,5 @@ def play_episode(
         best_length=int(episodes.best_length[index]),
         epsilon=np.inf if threshold is None else threshold,
         title=f"{policies.spec.method.upper()}{title[variant]}  ·  {scene.name}",
+        policies=policies,
     )

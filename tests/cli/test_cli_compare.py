@@ -123,6 +123,17 @@ def test_the_numbers_of_the_document_are_those_of_an_evaluation(tmp_path):
 # The command alone, on given results
 
 
+def test_the_papers_tables_stand_beside_all_results_of_the_folder(steps, tmp_path):
+    paper, rooms = tmp_path / "paper.md", ("--worlds", "{rooms: {}}")
+    assert run(tmp_path, *rooms, "--paper", paper) == 0
+    row = next(line for line in paper.read_text().splitlines() if line.startswith("| `org` + w | 71.40"))
+    assert " | 41.7 [" in row  # 1 + 2 + 2 of 12 episodes
+    assert "rooms-org-fused" in steps
+    # Results that another call of the command has left stay on the page.
+    assert run(tmp_path, "--worlds", "{apartments: {}}", "--ablations", "{}", "--paper", paper) == 0
+    assert row in paper.read_text()
+
+
 def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
     assert run(tmp_path) == 0
     assert steps == PARTS

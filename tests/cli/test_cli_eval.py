@@ -5,11 +5,13 @@ import csv
 import io
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.commands import SEEDS, contents, evaluate, finished_run, refusal
 
+from jaxnav.cli.eval import EvalConfig, _target
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.worlds import generated
@@ -199,6 +201,13 @@ def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
     capsys.readouterr()
     assert evaluate(run, "--shift", 1.5, "--scenes", file) == 2
     assert "layout shift: seed 0, shift 1.5; give" in refusal(capsys)
+
+
+def test_a_world_and_a_file_of_its_name_have_reports_of_their_own():
+    run, file = Path("run"), Path("elsewhere/rooms.jsonl.gz")
+    configs = [EvalConfig(run), EvalConfig(run, world="rooms"), EvalConfig(run, scenes=file)]
+    names = [str(_target(config)) for config in configs]
+    assert names == ["run/eval-val.json", "run/eval-rooms-val.json", "run/eval-scenes-rooms-val.json"]
 
 
 @pytest.mark.slow

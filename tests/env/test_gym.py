@@ -107,6 +107,22 @@ def test_episodes_side_by_side_begin_anew_where_they_end(scenes):
     assert infos["final_info"]["_success"].tolist() == terminated.tolist()
 
 
+def test_a_seed_for_each_begins_each_like_the_single_environment(single, scenes):
+    vector, seeds = ObjectNavVectorEnv(3, scenes=scenes), [5, 2, 5]
+    together, _ = vector.reset(seed=seeds)
+    for number, seed in enumerate(seeds):
+        alone, _ = single.reset(seed=seed)
+        for name, value in alone.items():
+            np.testing.assert_array_equal(together[name][number], value)
+    assert str(single.reset(seed=5)) != str(single.reset(seed=2))
+    # What begins later is given by the seeds too.
+    following = [vector.step(np.full(3, DONE))[0]["view"].tobytes() for _ in range(2)]
+    vector.reset(seed=seeds)
+    assert following == [vector.step(np.full(3, DONE))[0]["view"].tobytes() for _ in range(2)]
+    with pytest.raises(ValueError, match="seed holds 2 seeds; give one for each of the 3 environments"):
+        vector.reset(seed=[1, 2])
+
+
 def test_what_is_returned_may_be_written_to(scenes):
     """Learners of other libraries do."""
     vector = ObjectNavVectorEnv(2, scenes=scenes)

@@ -140,6 +140,7 @@ def test_metrics_by_hand():
         length=jnp.array([10, 1, 30, 4], jnp.int32),
         moves=jnp.array([6, 0, 20, 3], jnp.int32),
         distance=jnp.array([1.4, 0.3, 3.5, 1.0], jnp.float32),
+        choices=jnp.array([10, 1, 30, 4], jnp.int32),
         weight=jnp.zeros(4),
     )
     outcome = jax.tree.map(np.asarray, leaves)  # as the evaluator returns it
@@ -159,9 +160,9 @@ def test_metrics_by_hand():
 
 
 def test_an_episode_fails_by_a_time_out_or_a_wrong_done():
-    zeros = jnp.zeros(3)
+    zeros, ones = jnp.zeros(3), jnp.ones(3, jnp.int32)
     done, success = jnp.array([True, True, False]), jnp.array([True, False, False])
-    outcome = Outcome(done, success, jnp.ones(3, jnp.int32), jnp.zeros(3, jnp.int32), zeros, zeros)
+    outcome = Outcome(done, success, ones, jnp.zeros(3, jnp.int32), zeros, ones, zeros)
     metrics = episode_metrics(jax.tree.map(np.asarray, outcome), np.ones(3, np.int32))
     np.testing.assert_array_equal(metrics["wrong_done"], [0, 1, 0])
     np.testing.assert_array_equal(metrics["timeout"], [0, 0, 1])

@@ -36,6 +36,7 @@ def test_a_picture_has_a_frame_per_step(tmp_path):
         best_length=int(episodes.best_length[0]),
         epsilon=0.1,
         title="test",
+        policies=tiny.untrained(),
     )
     draw_episode(episode, tmp_path / "new" / "a.gif")
     draw_episode(episode, tmp_path / "a.png")

@@ -215,7 +215,7 @@ def test_fast_weights_can_be_stored(name):
 def test_fewer_steps_are_possible_and_more_are_refused():
     adaptation = METHODS["savn"].adaptation
     assert limited(adaptation, 0) is None
-    assert limited(adaptation, 2) == LearnedSteps(steps=2)
+    assert limited(adaptation, 2) == LearnedSteps(inner_steps=2)
     for steps in (5, -1):
         with pytest.raises(
             InputError, match=rf"^inner_steps is {steps}; an episode remembers 4 windows of 6 actions: "
@@ -228,7 +228,7 @@ def test_fewer_steps_are_possible_and_more_are_refused():
 @pytest.mark.slow
 def test_fewer_steps_are_the_first_of_more():
     weights, (observation, action) = tiny.lively(0, SAVN), given(6)
-    two, _ = acted(SAVN, weights, LearnedSteps(steps=2, rate=RATE), observation, action)
+    two, _ = acted(SAVN, weights, LearnedSteps(inner_steps=2, rate=RATE), observation, action)
     four, _ = acted(SAVN, weights, LearnedSteps(rate=RATE), observation, action)
     none, fast = acted(SAVN, weights, limited(LearnedSteps(), 0), observation, action)
     assert fast is None

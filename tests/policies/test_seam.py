@@ -14,7 +14,8 @@ from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.grid import Evaluator
+from jaxnav.evaluation.grid import Evaluator, first_states
+from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import METHODS, Method, find_method
@@ -26,7 +27,7 @@ from jaxnav.training.loss import ppo_loss, replay
 
 SPECS = {
     name: dataclasses.replace(tiny.SPEC, method=f"support.methods:{name}", method_sizes=())
-    for name in ("ATTENTIVE", "COUNTING", "STAGED", "AUXILIARY", "ADAPTIVE", "CONTROLLED", "STEPWISE")
+    for name in ("ATTENTIVE", "COUNTING", "STAGED", "AUXILIARY", "ADAPTIVE", "CONTROLLED", "PATIENT", "STEPWISE")
 }
 KNOWN = KNOWLEDGE._replace(method={"table": jnp.linspace(0, 1, 9).reshape(3, 3)})
 
@@ -233,6 +234,22 @@ def test_methods_are_evaluated(name):
     assert outcome.length.shape == (2, 12)
     assert (outcome.length >= 1).all()
     assert (outcome.weight[1] > 0).any()
+
+
+@pytest.mark.slow
+def test_the_weight_of_an_episode_is_the_mean_over_choices_that_count():
+    """Every second one, the first included: those between are neither counted nor averaged."""
+    episodes, weights = episode_list(tiny.BANK, 4, seed=1), tiny.lively(0, SPECS["PATIENT"])
+    grid = inference_grid([table_row("stde", 0.0, "paper", "argmax")], ("layout",), 1)
+    stacked = jax.tree.map(lambda leaf: leaf[None], weights)
+    acting = acting_with("PATIENT")
+    outcome = tiny.at(Evaluator(acting)(grid, stacked, [(episodes, PARAMS)], KNOWN, jax.random.key(0)), 0)
+    traces = play(tiny.at(grid, 0), weights, first_states(episodes), acting, PARAMS, KNOWN)
+    np.testing.assert_array_equal(outcome.choices, [-(-len(trace.action) // 2) for trace in traces])
+    expected = [trace.inferred.weight[::2].mean() for trace in traces]
+    np.testing.assert_allclose(outcome.weight, expected, rtol=1e-5)
+    # Over all actions it is another number.
+    assert np.abs(outcome.weight - [trace.inferred.weight.mean() for trace in traces]).max() > 0.01
 
 
 def test_a_method_is_one_hashable_entry():

@@ -25,7 +25,7 @@ from jaxnav.policies.semantic_map import FREE, TRIED, WALL
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.detector import PERFECT
-from jaxnav.scenes.task import DONE, LOOK_DOWN, MOVE_AHEAD, Task
+from jaxnav.scenes.task import DONE, LOOK_DOWN, MOVE_AHEAD, Rules, Task
 from jaxnav.scenes.worlds import WORLDS, generated
 
 SPEC = dataclasses.replace(tiny.SPEC, method="semexp", method_sizes=())
@@ -181,6 +181,10 @@ def test_bad_input_is_refused_by_name():
     with pytest.raises(InputError, match="scene drawn needs a map of 35 cells, and that of the training homes has 32"):
         check_home(small, BANK)
     check_home(known(), BANK)
+    for headings in (4, 6):
+        turned = BANK._replace(task=Task(CATEGORIES, rules=Rules(headings=headings)), ahead=BANK.ahead[:, :headings])
+        with pytest.raises(InputError, match=f"has {headings} headings, .* eight neighbours; give 8 or 12"):
+            learn_home([turned], np.zeros(0))
     crowded = BANK._replace(task=Task(tuple(f"Thing{i}" for i in range(28))))
     with pytest.raises(InputError, match="28 categories, and a map holds 27; leave some out"):
         learn_home([crowded], np.zeros(0))

@@ -2,15 +2,23 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
 import jaxnav
 from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.variants import table_row
 from jaxnav.layout import SETTINGS
+from jaxnav.runs.evaluate import run_rows
 from jaxnav.runs.prepare import explore_world
-from jaxnav.runs.worlds import training_world
+from jaxnav.runs.replay import replay
+from jaxnav.runs.worlds import evaluation_world, training_world
+from jaxnav.study.bench import Bench, Subject
+from jaxnav.study.config import StudyConfig
+from jaxnav.study.trials import Trial
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exchange import chances
 
@@ -89,8 +97,30 @@ def test_policies_adapt_by_as_many_steps_as_they_can(drawn_run):
         InputError, match=r"^inner_steps is 5; an episode remembers 4 windows of 6 actions: give 0 to 4$"
     ):
         adaptive.adapting(5)
-    assert adaptive.adapting(0).acting(None).inner_steps == 0
-    assert adaptive.acting(None).inner_steps is None
+    world = evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    assert adaptive.adapting(0).acting(world).inner_steps == 0
+    assert adaptive.acting(world).inner_steps is None
+
+
+def test_scenes_that_a_method_cannot_act_in_are_refused_wherever_it_acts(drawn_run):
+    """A map of 12 lines holds a cell and the 11 of a view."""
+    world = evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    policies = drawn_run.policies()
+    searching = policies._replace(
+        spec=dataclasses.replace(policies.spec, method="semexp"),
+        knowledge=policies.knowledge._replace(method={"lines": jnp.arange(12)}),
+    )
+    subject = Subject(searching, world, episode_list(world.banks[0], 4))
+    row = table_row("baseline", None, None, "argmax")
+    config = StudyConfig(split="val", shifts=(0.0,), episodes=4)
+    for act in (
+        lambda: searching.acting(world),
+        lambda: run_rows([row], searching, world, 4, 0),
+        lambda: replay(searching, world, subject.episodes, row),
+        lambda: Bench(config).run(subject, None, [Trial("baseline", "argmax")]),
+    ):
+        with pytest.raises(InputError, match=r"needs a map of .* cells, and that of the training homes has 12"):
+            act()
 
 
 def test_a_pooled_prior_is_one_for_all_rooms(config):

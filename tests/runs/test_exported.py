@@ -145,7 +145,7 @@ def test_a_program_acts_as_its_policy(method, decision):
         learned = learn([tiny.BANK], np.ones((NUM_PRIORS, spec.num_categories, spec.num_categories)))
         known = known._replace(method=jax.tree.map(jnp.asarray, learned))
     setting = tiny.SETTING if METHODS[method].hosts_layout else None
-    policy = LoadedPolicy(tiny.lively(2, spec), known, spec, setting)
+    policy = LoadedPolicy(tiny.lively(2, spec), known, spec, setting, tiny.BANK.task)
     exported, steps = jax.export.deserialize(bytearray(program(policy))), walk(policy)
     memory = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in input_shapes(policy, 3)["memory"].items()}
     found = []

@@ -12,7 +12,7 @@ from rich.console import Console
 from support import tiny_world as tiny
 
 import jaxnav
-from jaxnav.env.objectnav import OTHER_ROOM
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav
 from jaxnav.env.types import State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list
@@ -21,13 +21,17 @@ from jaxnav.evaluation.playback import play
 from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.acting import Acting
+from jaxnav.policies.learned_loss import WINDOW
 from jaxnav.policies.methods import METHODS, Experience, Method
 from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.scenes.categories import ROOM_TYPES
+from jaxnav.scenes.tables.detector import Detector
+from jaxnav.scenes.task import APARTMENTS
 
 _compiled = jax.jit(LoadedPolicy.act)
+LONG = 15  # actions, of an episode in which a policy adapts twice
 
 
 def act(policy, observation, memory, epsilon=0.1, *, key=None, heading=0, moved=False, horizon=0):
@@ -92,7 +96,7 @@ def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, ep
         start = tiny.at(first_states(episodes), episode)
         weights = tiny.at(policies.of(arm), seed)
         cell = cell_of(variant, epsilon, decoding)
-        (trace,) = play(cell, weights, alone(start), policies.acting(world.env), params, policies.knowledge)
+        (trace,) = play(cell, weights, alone(start), policies.acting(world), params, policies.knowledge)
         room = bank.room_types[episodes.scene[episode]]
         steps, sampled = len(trace.action), key if decoding == "sample" else None
         actions = follow(policy, world.env, params, start, room, steps, key=sampled, epsilon=epsilon or 0.0)
@@ -109,7 +113,7 @@ def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setti
     switched = []
     for episode in range(0, 8, 2):
         start, room = tiny.at(first_states(episodes), episode), bank.room_types[episodes.scene[episode]]
-        (trace,) = play(cell, weights, alone(start), policies.acting(world.env), params, policies.knowledge)
+        (trace,) = play(cell, weights, alone(start), policies.acting(world), params, policies.knowledge)
         steps = len(trace.action)
         assert follow(policy, world.env, params, start, room, steps, epsilon=0.6) == trace.action.tolist()
         assert (np.diff(trace.gap) >= 0).all()
@@ -185,6 +189,19 @@ def test_a_policy_with_a_spatial_memory_needs_compass_and_odometry(drawn_run, wo
         policy.act(world.env.observe(start, world.params(0)), policy.init())
 
 
+def test_a_policy_knows_its_task_and_is_refused_for_another(drawn_run, world):
+    folder = drawn_run.config.run_dir / POLICIES / "layout-0"
+    policy = jaxnav.load_policy(folder, env=world.env)
+    assert policy.task == world.env.task
+    rules, detector = dataclasses.replace(policy.task.rules, success_distance=1.0), Detector(miss_near=0.5)
+    blind = dataclasses.replace(policy.task, detector=detector, goals=policy.task.categories[:2])
+    jaxnav.load_policy(folder, env=ObjectNav(blind))  # worse eyes and fewer goals are no other task
+    with pytest.raises(InputError, match=r"another task than that of env .*: rules.success_distance: 1.5 != 1.0; make"):
+        jaxnav.load_policy(folder, env=ObjectNav(dataclasses.replace(policy.task, rules=rules)))
+    with pytest.raises(InputError, match=r"layout-0: was trained .*categories: .*rules.headings: 8 != 12"):
+        jaxnav.load_policy(folder, env=ObjectNav(APARTMENTS))
+
+
 # Methods with a tracker
 
 
@@ -214,13 +231,47 @@ class Steered(Experience):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["semexp", "savn", "tpn"])
+def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
+    """Over a whole episode of more than a window of six actions: what is adapted changes the logits of both."""
+    setting = tiny.SETTING if METHODS[name].hosts_layout else None
+    spec = dataclasses.replace(tiny.SPEC, method=name, method_sizes=())
+    env, params = tiny.world()
+    params = params.replace(step_limit=jnp.full(2, LONG, jnp.int32))
+    learn = METHODS[name].learn
+    learned = {} if learn is None else learn([tiny.BANK], np.ones(tiny.knowledge().layout.shape))
+    knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
+    weights = tiny.lively(2, spec)
+    if METHODS[name].control.num_choices == env.num_actions:
+        weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
+    state = before = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(2), time=jnp.int32(0))
+    cell = cell_of("baseline" if setting is None else "stde", None if setting is None else 0.1)
+    played = functools.partial(play, cell, weights, alone(state), params=params, knowledge=knowledge)
+    (trace,) = played(acting=Acting(env, spec, setting))
+    assert len(trace.action) > WINDOW
+    policy, decide = LoadedPolicy(weights, knowledge, spec, setting, env.task), jax.jit(LoadedPolicy.decide)
+    memory, horizons = policy.init("kitchen"), len(env.task.rules.horizons)
+    for action, logits in zip(trace.action, trace.inferred.corrected, strict=True):
+        told = {"heading": state.pose // horizons % env.task.rules.headings, "horizon": state.pose % horizons}
+        told["moved"] = env.cell(state.pose) != env.cell(before.pose)
+        made = decide(policy, env.observe(state, params), memory, jnp.float32(0.1), **told)
+        np.testing.assert_allclose(made.logits, logits, rtol=1e-4, atol=1e-4)
+        taken, memory = policy.follow(made, jnp.argmax(made.logits).astype(jnp.int32), memory.room)
+        assert int(taken) == action
+        before, (state, *_) = state, env.advance(state, taken, params)
+    if METHODS[name].adaptation is not None:
+        (plain,) = played(acting=Acting(env, spec, setting, inner_steps=0))
+        assert np.abs(plain.inferred.factual[:LONG] - trace.inferred.factual[:LONG]).max() > 1e-3
+
+
+@pytest.mark.slow
 def test_a_tracker_takes_in_every_step(monkeypatch):
     monkeypatch.setitem(METHODS, "steered", Method(Steered, tracker=Compass()))
     spec = dataclasses.replace(tiny.SPEC, method="steered", method_sizes=())
     env, params = tiny.world()
     weights, knowledge = tiny.lively(2, spec), tiny.knowledge()
     weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
-    policy = LoadedPolicy(weights, knowledge, spec, tiny.SETTING)
+    policy = LoadedPolicy(weights, knowledge, spec, tiny.SETTING, env.task)
     start = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(1), time=jnp.int32(0))
     (trace,) = play(cell_of("stde", 0.1), weights, alone(start), Acting(env, spec, tiny.SETTING), params, knowledge)
     assert len(trace.action) == tiny.LIMITS[0]

@@ -26,7 +26,7 @@ def validated(drawn_run):
     """The validator of a run, and its policies as training holds them."""
     config, policies = dataclasses.replace(drawn_run.config, val_episodes=12), drawn_run.policies()
     training = training_world(config, QUIET)
-    validator = Validator(config, policies.acting(training.env), policies.knowledge, training, QUIET)
+    validator = Validator(config, policies.acting(training), policies.knowledge, training, QUIET)
     held = {
         arm: [
             jaxnav.load_policy(drawn_run.config.run_dir / "policies" / f"{arm}-{seed}").params

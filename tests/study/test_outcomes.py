@@ -40,6 +40,7 @@ def outcome(success, length=LENGTH, weight=WEIGHT) -> Outcome:
         length,
         np.ones_like(length),
         np.full(length.shape, 2.5),
+        length,
         weight,
     )
     return Outcome(*map(jnp.asarray, leaves))

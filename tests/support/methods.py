@@ -122,6 +122,20 @@ class TwoChoices:
 CONTROLLED = Method(Reading, tracker=Counter(), control=TwoChoices())
 
 
+@dataclasses.dataclass(frozen=True)
+class EverySecond(TwoChoices):
+    """Choose anew after every second action; what is chosen between does not count."""
+
+    def due(self, note):
+        return note["views"] % 2 == 1
+
+    def act(self, choice, note, knowledge):
+        return jnp.where(self.due(note), choice, 1), note
+
+
+PATIENT = Method(Reading, tracker=Counter(), control=EverySecond())
+
+
 class Known(Experience):
     """Make no experience."""
 

@@ -14,6 +14,7 @@ from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
 from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.policy import bind, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.runs.policies import Policies
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
@@ -46,6 +47,12 @@ def knowledge():
     """Some prior of each room type."""
     counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, *2 * [len(CATEGORIES)]))
     return Knowledge(jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts)))
+
+
+def untrained(spec=SPEC, known=None, task=BANK.task):
+    """Policies without parameters, for what asks for the method and what it has learned alone."""
+    known = knowledge() if known is None else known
+    return Policies({}, (), known, jnp.zeros_like(known.layout), spec, None, 0, task)
 
 
 def reading(name, count):

@@ -85,7 +85,7 @@ class Experience(nnx.Module):
       sizes: the method's own whole-number sizes and their defaults, beside those that all methods share.
       width: Z, the size of the experience.
       recurrent: whether `attend` reads the memory; training then unrolls the policy step by step.
-      geometry: so many numbers of the reading belong to the direct pathway of the scene, see `surroundings`.
+      geometry: so many numbers of the reading belong to the direct pathway of the scene, see `geometry_inputs`.
     """
 
     sizes: ClassVar[Mapping[str, int]] = {}
@@ -115,7 +115,7 @@ class Experience(nnx.Module):
         raise NotImplementedError
 
     @staticmethod
-    def surroundings(reading: Tree) -> jax.Array:
+    def geometry_inputs(reading: Tree) -> jax.Array:
         """Return what the reading tells of the scene without objects.
 
         It is float32 [..., geometry], and no part of Z.

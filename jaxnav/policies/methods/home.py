@@ -11,6 +11,7 @@ from jaxnav.policies.semantic_map import MAX_CATEGORIES
 from jaxnav.policies.wavefront import WORD
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.task import NEIGHBOURS
 
 SLACK = 0.05  # metres by which the goal must be nearer than required, since offsets are rounded
 
@@ -27,7 +28,7 @@ def learn_home(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarra
       the share of a goal's size by which it is reached earlier; `lines`, int32 [N], those of a map of the largest home.
 
     Raises:
-      InputError: the map has no bit for a category.
+      InputError: the map has no bit for a category, or the agent cannot walk to all eight neighbours.
     """
     banks = list(banks)
     task, size = banks[0].task, max(WORD, *(max(map_sizes(bank).values()) for bank in banks))
@@ -35,6 +36,9 @@ def learn_home(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarra
         many = f"the task has {len(task.categories)} categories, and a map holds {MAX_CATEGORIES}"
         raise InputError(f"method semexp: {many}; leave some out")
     rules = task.rules
+    if len(np.unique(rules.steps(), axis=0)) < len(NEIGHBOURS):
+        few = f"the task has {rules.headings} headings, and its ways lead to eight neighbours"
+        raise InputError(f"method semexp: {few}; give 8 or 12")
     learned = {
         "enough": np.array(rules.success_distance - SLACK, np.float32),
         "edge": np.array(0.25 if rules.success == "near" else 0.0, np.float32),
@@ -64,12 +68,12 @@ def map_sizes(bank: Bank) -> dict[str, int]:
     return dict(zip(bank.names, extents, strict=True))
 
 
-def cell_places(ahead: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def cell_places(ahead: np.ndarray, strides: np.ndarray) -> np.ndarray:
     """Return where cells lie, int [C, 2], (z, x) from their scene's first.
 
     Args:
       ahead: int [C, H], cell after MoveAhead.
-      steps: int [H, 2], the displacement of a step ahead by heading.
+      strides: int [H, 2], the displacement of a step ahead by heading.
     """
     places, known = np.zeros((len(ahead), 2), int), np.zeros(len(ahead), bool)
     for cell in range(len(ahead)):
@@ -77,10 +81,10 @@ def cell_places(ahead: np.ndarray, steps: np.ndarray) -> np.ndarray:
             continue
         known[cell], front = True, [cell]
         while len(front):
-            cells, headings = np.repeat(front, len(steps)), np.tile(np.arange(len(steps)), len(front))
+            cells, headings = np.repeat(front, len(strides)), np.tile(np.arange(len(strides)), len(front))
             after = ahead[cells, headings]
             new = ~known[after]
-            places[after[new]] = places[cells[new]] + steps[headings[new]]
+            places[after[new]] = places[cells[new]] + strides[headings[new]]
             known[after] = True
             front = np.unique(after[new])
     return places

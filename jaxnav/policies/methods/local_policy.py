@@ -63,19 +63,19 @@ class LocalPolicy:
 
     def act(self, choice: jax.Array, note: Course, knowledge: Knowledge) -> tuple[jax.Array, Course]:
         """Return the action, and the note with what was chosen."""
-        steps = knowledge.method["steps"]
+        strides = knowledge.method["steps"]
         note = self._chosen(choice, note)
         place = _place(note)
         unexplored = pack(note.cells & EXPLORED == 0)
         wanted = unexplored if self.nearest else unexplored & _block(note.aim, len(note.cells))
         way, reached = _way(jnp.where(place.known, pack(place.spots), wanted), unexplored, note)
         arrived, lost = way.length == 0, way.length < 0
-        facing = _bearing(note.place, place.at, len(steps), len(note.cells))
+        facing = _bearing(note.place, place.at, len(strides), len(note.cells))
         faced = arrived & (facing == note.heading)
         action = jnp.select(
             [note.sight == AGREED, note.horizon < note.sweep, note.horizon > note.sweep, lost | faced, arrived],
-            [DONE, LOOK_DOWN, LOOK_UP, ROTATE_RIGHT, turn_to(facing, note.heading, len(steps))],
-            follow(way, note.place, note.heading, steps),
+            [DONE, LOOK_DOWN, LOOK_UP, ROTATE_RIGHT, turn_to(facing, note.heading, len(strides))],
+            follow(way, note.place, note.heading, strides),
         )
         vain = faced & (note.sight == FAR) & (note.horizon == note.sweep)
         note = _anew(_given_up(note, place, vain), lost, knowledge)

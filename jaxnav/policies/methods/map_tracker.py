@@ -74,13 +74,13 @@ class MapTracker:
     def update(self, note: Course, knowledge: Knowledge, percept: Percept) -> Course:
         """Take in one view."""
         body, row_format = knowledge.method, RowFormat(knowledge.layout.shape[-1])
-        steps, around = body["steps"], SemanticMap(len(note.cells))
-        place = around.move(note.place, percept.moved, steps[percept.heading])
+        strides, around = body["steps"], SemanticMap(len(note.cells))
+        place = around.move(note.place, percept.moved, strides[percept.heading])
         look = Look(percept.row, place, percept.heading)
         turned = (percept.action != MOVE_AHEAD) | percept.moved
         sight, enough = self._sight(note, look, percept.goal, knowledge)
-        cells = around.update(note.cells, look, row_format, len(steps))
-        cells = around.bump(cells, place + steps[percept.heading], percept.action, percept.moved)
+        cells = around.update(note.cells, look, row_format, len(strides))
+        cells = around.bump(cells, place + strides[percept.heading], percept.action, percept.moved)
         return note._replace(
             cells=cells,
             place=place,

@@ -37,7 +37,7 @@ class MappedCategories(Experience):
         self.width = self.blocks * outputs
 
     @staticmethod
-    def surroundings(reading: MapReading) -> jax.Array:
+    def geometry_inputs(reading: MapReading) -> jax.Array:
         """Return the floor, walls and ways of each block, and the compass."""
         flags = [(reading.blocks & flag > 0).astype(jnp.float32) for flag in _FLAGS]
         return jnp.concatenate([*flags, reading.compass], axis=-1)

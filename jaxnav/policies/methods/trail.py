@@ -48,9 +48,9 @@ class PoseTracker:
 
     def update(self, note: Trail, knowledge: Knowledge, percept: Percept) -> Trail:
         """Go on to the present pose."""
-        steps, horizons = knowledge.method["steps"], knowledge.method["horizons"]
-        place = note.place + jnp.where(percept.moved, steps[percept.heading], 0)
-        pose = ((place[0] * _SIDE + place[1]) * len(steps) + percept.heading) * horizons + percept.horizon
+        strides, horizons = knowledge.method["steps"], knowledge.method["horizons"]
+        place = note.place + jnp.where(percept.moved, strides[percept.heading], 0)
+        pose = ((place[0] * _SIDE + place[1]) * len(strides) + percept.heading) * horizons + percept.horizon
         poses = jnp.concatenate([note.poses[1:], pose[None]])
         return Trail(poses, place, (note.poses == pose).any())
 
