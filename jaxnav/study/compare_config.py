@@ -43,7 +43,7 @@ class CompareConfig:
     """
 
     title: str = "Table 2: every method without and with the layout"
-    results: Path = Path("results/table2")
+    results: Path = Path("results/tables")
     document: Path = Path("docs/table2.md")
     paper: Path | None = None
     runs: Path = Path("runs/table2")

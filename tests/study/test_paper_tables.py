@@ -37,7 +37,7 @@ def page(tmp_path, **results):
 def test_the_committed_page_is_written_from_the_committed_results(tmp_path):
     committed = (ROOT / "docs" / "paper_tables.md").read_text()
     (tmp_path / "page.md").write_text(committed)
-    write_paper_tables(tmp_path / "page.md", ROOT / "results" / "table2" / "val")
+    write_paper_tables(tmp_path / "page.md", ROOT / "results" / "tables" / "val")
     assert (tmp_path / "page.md").read_text() == committed
 
 
