@@ -9,27 +9,30 @@ from rich.console import Console
 
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import InputError
+from jaxnav.runs.packaged import is_policy
 from jaxnav.runs.policies import EstimatorName
 from jaxnav.viz import require_pictures
 
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeConfig:
-    """Draw one episode of a training run.
+    """Draw one episode, at one or several layout shifts side by side.
 
     Attributes:
-      run: the run directory; its first seed acts, with the best action at every step.
+      source: a run directory, the folder of an exported policy, or a policy of the package (`rooms-org`). The first
+        seed acts, with the best action at every step.
       split: scenes to play in.
       index: of the episode in the default list of an evaluation (of the first shard, where scenes are streamed).
-      out: GIF (moving) or PNG (its end); default: episode.gif in the run directory.
+      out: GIF (moving) or PNG (its end); default: episode.gif in the run directory or, of a policy, here.
       variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
       epsilon: threshold of sTDE.
       setting: layout estimator to use instead of the run's, as of `eval`.
       scenes: scene file to read instead of the run's own world or file.
-      shift: layout shift of the scenes, from 0 to 1; default: the run's.
+      shift: layout shifts of the scenes, from 0 to 1, a panel each; default: the run's. With several, all episodes of
+        the list are played, and how many are found where is told.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
+    source: Annotated[str, tyro.conf.Positional]
     split: Literal["train", "val", "test"] = "val"
     index: int = 0
     out: Path | None = None
@@ -37,7 +40,7 @@ class EpisodeConfig:
     epsilon: float = 0.5
     setting: EstimatorName | None = None
     scenes: Path | None = None
-    shift: float | None = None
+    shift: tuple[float, ...] = ()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -52,19 +55,19 @@ def draw(config: EpisodeConfig, console: Console) -> None:
     from jaxnav.viz.episode import draw_episode
     from jaxnav.viz.play import play_episode
 
-    path = config.out or config.run / "episode.gif"
+    path = config.out or (Path() if is_policy(config.source) else Path(config.source)) / "episode.gif"
     if path.suffix not in (".gif", ".png"):
         raise InputError(f"--out {path}: give a name that ends in .gif or .png")
-    episode = play_episode(
-        config.run,
+    episodes = play_episode(
+        config.source,
         config.split,
         config.index,
         config.variant,
         config.epsilon,
         config.setting,
         config.scenes,
-        config.shift,
+        config.shift or (None,),
         console,
     )
-    draw_episode(episode, path)
-    console.print(f"{len(episode.trace.pose)} steps; written to {path}", soft_wrap=True)
+    draw_episode(episodes, path)
+    console.print(f"{max(len(each.trace.pose) for each in episodes)} steps; written to {path}", soft_wrap=True)
