@@ -12,6 +12,7 @@ COMMANDS = {
     "account": "say what experience is worth, beside a run of agents without any",
     "mixture": "remove experience where half of the scenes are shifted: what is kept, recovered, known",
     "report": "show a run on one page: tables, curves and replays side by side",
+    "log": "show a training log in TensorBoard or Weights & Biases, also while training goes on",
     "export": "export a policy with its model card, also as a program that runs without jaxnav",
     "episode": "draw one evaluation episode, at one or several layout shifts",
     "play": "look for an object yourself, in the terminal, with what an agent perceives",
