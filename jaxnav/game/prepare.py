@@ -6,7 +6,7 @@ from typing import Literal
 from rich.console import Console
 
 from jaxnav.errors import InputError
-from jaxnav.game.session import Game, choose_episode
+from jaxnav.game.episode import Game, choose_episode
 from jaxnav.layout import SETTINGS, Setting
 from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.methods.base import Primitive

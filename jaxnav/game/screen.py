@@ -6,7 +6,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from jaxnav.game.session import Ending, Game, Look
+from jaxnav.game.episode import Ending, Game, Look
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL, Scene
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE

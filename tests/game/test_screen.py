@@ -9,8 +9,8 @@ from rich.console import Console
 from support import tiny_world as tiny
 
 from jaxnav.evaluation.episodes import episode_list
+from jaxnav.game.episode import Ending, Game, Look
 from jaxnav.game.screen import end_screen, look_screen
-from jaxnav.game.session import Ending, Game, Look
 from jaxnav.layout import SETTINGS
 from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.worlds import CompiledWorld

@@ -11,8 +11,9 @@ from support import tiny_world as tiny
 from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import episode_list
+from jaxnav.game.episode import Game, choose_episode
 from jaxnav.game.prepare import prepare
-from jaxnav.game.session import KEYS, Game, choose_episode, play
+from jaxnav.game.session import KEYS, play
 from jaxnav.layout import LayoutEstimator
 from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.worlds import CompiledWorld
