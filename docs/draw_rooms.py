@@ -11,6 +11,7 @@ LAYERS = (
     ("report",),
     ("study",),
     ("viz",),
+    ("game",),
     ("runs",),
     ("baselines",),
     ("evaluation",),

@@ -1,4 +1,6 @@
-"""Let a trained policy that comes with jaxnav act in rooms it has never seen, with sTDE at several thresholds.
+"""Sweep the threshold of sTDE over a trained policy, in rooms it has never seen, with the layout as it was and shifted.
+
+The policy comes with jaxnav and is a pytree: the sweep is a vmap of one's own.
 
 python examples/packaged_policy.py
 """
@@ -10,15 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxnav
+from jaxnav.env.types import EnvParams
 
 EPISODES, STEPS = 256, 100
 
-env, params = jaxnav.make("rooms", split="val")
+env, unshifted = jaxnav.make("rooms", split="val")
 policy = jaxnav.load_policy("rooms-org", env=env)
 horizons, headings = len(env.task.rules.horizons), env.task.rules.headings
 
 
-def episode(key: jax.Array, epsilon: jax.Array) -> jax.Array:
+def episode(key: jax.Array, epsilon: jax.Array, params: EnvParams) -> jax.Array:
     """Act until Done; return whether it succeeds."""
 
     def step(carry, _):
@@ -37,13 +40,15 @@ def episode(key: jax.Array, epsilon: jax.Array) -> jax.Array:
 
 
 @jax.jit
-@functools.partial(jax.vmap, in_axes=(None, 0))  # over thresholds
-def success(keys: jax.Array, epsilon: jax.Array) -> jax.Array:
+@functools.partial(jax.vmap, in_axes=(None, 0, None))  # over thresholds
+def success(keys: jax.Array, epsilon: jax.Array, params: EnvParams) -> jax.Array:
     """Return the share of episodes that succeed."""
-    return jax.vmap(episode, (0, None))(keys, epsilon).mean()
+    return jax.vmap(episode, (0, None, None))(keys, epsilon, params).mean()
 
 
 thresholds = np.array([0.0, 0.25, 0.5, 1.0], np.float32)
-rates = success(jax.random.split(jax.random.key(0), EPISODES), thresholds)
-for epsilon, rate in zip(thresholds, rates, strict=True):
-    print(f"epsilon {epsilon:.2f}: {100 * rate:.1f} % of {EPISODES} episodes")
+for shift in (0, 1):
+    params = unshifted if shift == 0 else jaxnav.make("rooms", split="val", shift=1)[1]
+    rates = success(jax.random.split(jax.random.key(0), EPISODES), thresholds, params)
+    for epsilon, rate in zip(thresholds, rates, strict=True):
+        print(f"shift {shift}, epsilon {epsilon:.2f}: {100 * rate:.1f} % of {EPISODES} episodes")

@@ -46,7 +46,7 @@ def test_the_version_is_printed(capsys):
 
 @pytest.mark.parametrize(
     ("wrong", "mend"),
-    [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, mixture, report, export, ")],
+    [("epsiode", "did you mean 'episode'?"), ("zzz", "train, eval, account, mixture, report, log, export, ")],
 )
 def test_unknown_commands_are_refused_with_a_hint(wrong, mend, capsys):
     assert main([wrong]) == 2

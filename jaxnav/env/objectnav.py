@@ -152,7 +152,7 @@ class ObjectNav:
         return (params.tables.success[state.pose, byte] >> bit) & jnp.uint8(1) > 0
 
     def advance(
-        self, state: State, action: jax.Array, params: EnvParams
+        self, state: State, action: jax.Array | int, params: EnvParams
     ) -> tuple[State, jax.Array, jax.Array, jax.Array]:
         """Take an action, without reset.
 
@@ -165,6 +165,7 @@ class ObjectNav:
           The next state, reward float32 [], terminated bool [] (Done was chosen) and truncated bool [] (the step limit
           is reached without Done).
         """
+        action = jnp.asarray(action)  # a number of Python's too
         done = action == DONE
         time = state.time + 1
         reward = jnp.where(done & self.succeeds(state, params), params.success_reward, params.step_reward)
@@ -176,7 +177,7 @@ class ObjectNav:
             reward += self.shaping * (before - nearest)
         return state.replace(pose=pose, time=time, nearest=nearest), reward, done, truncated
 
-    def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
+    def step(self, key: jax.Array, state: State, action: jax.Array | int, params: EnvParams) -> StepResult:
         """Take an action, with same-step auto-reset.
 
         An episode that ends is followed by a new one at once.

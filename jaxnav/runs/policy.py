@@ -1,7 +1,6 @@
 """A trained policy that acts on observations, one episode at a time."""
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,14 +18,12 @@ from jaxnav.policies.pathways import Decision, Memory
 from jaxnav.policies.perception import Perceived, Perception
 from jaxnav.policies.policy import Params, bind
 from jaxnav.policies.spec import PolicySpec
+from jaxnav.runs.packaged import policy_folder
 from jaxnav.runs.policies import EstimatorName, read_export
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from jaxnav.store.manifest import differences
-
-#: Policies that come with the package, a folder each.
-WEIGHTS = Path(__file__).parents[1] / "weights"
 
 
 class EpisodeMemory(NamedTuple):
@@ -204,12 +201,7 @@ def load_policy(
       InputError: no export there, a damaged one, one whose method cannot be found, an impossible setting, or one
         trained with other categories or rules than those of `env`.
     """
-    packaged = WEIGHTS / path
-    folder = packaged if packaged.is_dir() and not Path(path).exists() else Path(path)
-    if not folder.exists():
-        names, what = ", ".join(sorted(os.listdir(WEIGHTS))), "not an exported policy (No such file or directory: "
-        raise InputError(f"{path}: {what}{folder}); export it, or load one of the package: {names}")
-    policies = read_export(folder).estimating(setting, hold)
+    policies = read_export(policy_folder(path)).estimating(setting, hold)
     layout = policies.setting
     if layout is not None and form is not None:
         layout = dataclasses.replace(layout, form=form)

@@ -15,7 +15,10 @@ from jaxnav.store.files import write_atomic
 #: Version of the layout of the two files.
 FORMAT_VERSION = 3
 
-_PARAMS, _POLICY = "params.safetensors", "policy.json"
+#: File that says what a policy is built from; it is written last.
+POLICY_FILE = "policy.json"
+
+_PARAMS = "params.safetensors"
 
 
 def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
@@ -38,7 +41,7 @@ def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, An
     policy = {"format_version": FORMAT_VERSION, "params_sha256": hashlib.sha256(tensors).hexdigest(), "spec": spec}
     text = json.dumps(policy, indent=2) + "\n"
     write_atomic(folder / _PARAMS, tensors)
-    write_atomic(folder / _POLICY, text.encode())
+    write_atomic(folder / POLICY_FILE, text.encode())
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -50,21 +53,23 @@ def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
       InputError: no export there, another format version, or files that do not belong together.
     """
     try:
-        policy = json.loads((folder / _POLICY).read_bytes())
+        policy = json.loads((folder / POLICY_FILE).read_bytes())
         tensors = (folder / _PARAMS).read_bytes()
     except OSError as error:
         raise InputError(f"{folder}: not an exported policy ({error.strerror}: {error.filename}); export it") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{folder / _POLICY}: not JSON ({error}); export the policy again") from error
+        raise InputError(f"{folder / POLICY_FILE}: not JSON ({error}); export the policy again") from error
     if not isinstance(policy, dict) or not {"format_version", "params_sha256", "spec"} <= policy.keys():
-        raise InputError(f"{folder / _POLICY}: lacks format_version, params_sha256 or spec; export the policy again")
+        raise InputError(
+            f"{folder / POLICY_FILE}: lacks format_version, params_sha256 or spec; export the policy again"
+        )
     if policy["format_version"] != FORMAT_VERSION:
         raise InputError(
-            f"{folder / _POLICY}: has format version {policy['format_version']!r}, this code reads version "
+            f"{folder / POLICY_FILE}: has format version {policy['format_version']!r}, this code reads version "
             f"{FORMAT_VERSION}; export the policy again"
         )
     if hashlib.sha256(tensors).hexdigest() != policy["params_sha256"]:
-        raise InputError(f"{folder / _PARAMS}: does not belong to {_POLICY} or is damaged; export the policy again")
+        raise InputError(f"{folder / _PARAMS}: does not belong to {POLICY_FILE} or is damaged; export the policy again")
     return _unflatten(safetensors.numpy.load(tensors)), policy["spec"]
 
 

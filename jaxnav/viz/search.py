@@ -12,7 +12,7 @@ from jaxnav.policies.methods.local_policy import LocalPolicy
 from jaxnav.policies.methods.map_tracker import Course
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
-from jaxnav.viz.episode import Episode
+from jaxnav.viz.panel import Episode
 
 AHEAD = 80  # actions to look ahead at most
 

@@ -13,9 +13,9 @@ from matplotlib.patches import Patch, Rectangle
 from jaxnav.policies.methods.map_tracker import SIDE
 from jaxnav.policies.semantic_map import EXPLORED, FREE, WALL
 from jaxnav.scenes.scene import CELL, extent
-from jaxnav.viz.episode import Episode, status
 from jaxnav.viz.labels import Labels
-from jaxnav.viz.plan import AGENT, GOAL, GROUND, INK, PALE, SEEN, draw_agent, draw_outline
+from jaxnav.viz.panel import Episode, status
+from jaxnav.viz.plan import AGENT, GOAL, GROUND, PALE, SEEN, draw_agent, draw_outline
 from jaxnav.viz.search import Search
 
 NEAR, FAR, BLOCKED, BLOCK = "#bcd9ea", "#e6f0f6", "#55524d", "#CC79A7"
@@ -64,7 +64,8 @@ def draw_search(episode: Episode, search: Search, step: int, path: Path) -> None
     figure.text(0.02, 0.945, episode.title, color=PALE, fontsize=9.5)
     goal = episode.task.categories[episode.goal]
     figure.text(0.02, 0.9, f"Looking for {goal}", color=GOAL, fontsize=14, weight="bold")
-    figure.text(0.98, 0.935, status(episode, step), color=INK, fontsize=10.5, ha="right")
+    text, colour = status(episode, step)
+    figure.text(0.98, 0.935, text, color=colour, fontsize=10.5, ha="right")
     draw_outline(axes, episode.scene)
     _draw_map(axes, search, frame)
     _draw_plan(axes, episode, search, step, frame)

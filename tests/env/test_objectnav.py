@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from jaxnav.env.objectnav import CANDIDATES
 from jaxnav.env.types import State
 from jaxnav.scenes.generate.rooms import generate_rooms
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, Task
+from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, Task
 
 BANK = compile_bank(generate_rooms(4, 0, 0), Task())  # one of each type
 # One cell: Done succeeds for the book at headings 7, 0 and 1, for the chair from behind.
@@ -160,3 +161,11 @@ def test_some_starts_are_near_the_goal(share):
         below = (one <= x).mean()
         expected = (1 - share) * below + share * (1 - (1 - below) ** CANDIDATES)
         assert (other <= x).mean() == pytest.approx(expected, abs=0.04)
+
+
+@pytest.mark.parametrize("action", [ROTATE_LEFT, DONE])
+def test_a_plain_number_is_an_action(action):
+    """Also where nothing is compiled, as wrappers of others call it."""
+    env, params = build(ONE_CELL, {}, 9)
+    plain, array = (env.step(jax.random.key(0), in_one_cell(), each, params) for each in (action, jnp.int32(action)))
+    chex.assert_trees_all_equal(plain, array)

@@ -26,7 +26,7 @@ from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.detector import PERFECT
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import Task
-from jaxnav.viz.episode import Episode
+from jaxnav.viz.panel import Episode
 from jaxnav.viz.plan import GOAL
 from jaxnav.viz.search import search_at
 from jaxnav.viz.search_map import BLOCK, BLOCKED, NEAR, Frame, draw_search

@@ -1,0 +1,1 @@
+"""An episode played by hand, in the terminal."""

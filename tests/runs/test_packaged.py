@@ -1,0 +1,78 @@
+"""An exported policy has the world of its task, and acts in it at several layout shifts."""
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import jaxnav
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.runs.packaged import WEIGHTS, as_run, is_policy, policy_folder, world_of
+from jaxnav.runs.policies import POLICIES
+from jaxnav.runs.worlds import evaluation_world
+from jaxnav.viz.play import play_episode
+
+
+def test_the_world_is_the_one_of_the_task(drawn_run, tmp_path):
+    assert world_of("rooms-org").world == "rooms"
+    baseline = world_of(drawn_run.config.run_dir / POLICIES / "baseline-0")
+    assert (baseline.world, baseline.arms) == ("rooms", ("baseline",))
+    export = shutil.copytree(WEIGHTS / "rooms-org", tmp_path / "mine")
+    policy = json.loads((export / "policy.json").read_text())
+    policy["spec"]["task"]["rules"]["headings"] = 12
+    (export / "policy.json").write_text(json.dumps(policy))
+    with pytest.raises(InputError, match=r"no generated world has; give the run that it comes from$"):
+        world_of(export)
+
+
+def test_a_policy_read_as_a_run_has_one_seed():
+    config, policies = as_run("rooms-org")
+    assert (config.arms, policies.arms, policies.seeds) == (("layout",), ("layout",), 1)
+    loaded = jaxnav.load_policy("rooms-org")
+    np.testing.assert_array_equal(policies.of("layout")["actor"]["bias"][0], loaded.params["actor"]["bias"])
+
+
+def test_a_folder_comes_before_a_policy_of_the_package(tmp_path, monkeypatch):
+    assert policy_folder("rooms-org") == WEIGHTS / "rooms-org"
+    assert is_policy("rooms-org")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rooms-org").mkdir()
+    assert policy_folder("rooms-org").resolve() == (tmp_path / "rooms-org").resolve()
+    assert not is_policy("rooms-org")
+
+
+@pytest.mark.slow
+def test_an_episode_is_the_same_but_for_the_layout(drawn_run):
+    """Room, goal and start of the second panel are those of the first; L* is that of its own scenes."""
+    console = Console(record=True, width=120, file=io.StringIO())
+    index = 5
+    plain, shifted = play_episode(drawn_run.config.run_dir, index=index, shifts=(0.0, 1.0), console=console)
+    assert (plain.shift, shifted.shift) == (0.0, 1.0)
+    assert plain.scene.name == shifted.scene.name
+    assert plain.scene.types != shifted.scene.types
+    assert plain.goal == shifted.goal
+    assert plain.trace.pose[0] == shifted.trace.pose[0]
+    worlds = [evaluation_world(drawn_run.config, "val", None, shift, Console(quiet=True)) for shift in (0.0, 1.0)]
+    episodes = episode_list(worlds[0].banks[0])
+    for episode, world in zip((plain, shifted), worlds, strict=True):
+        bank = world.banks[0]
+        assert episode.best_length == bank.best_length[episodes.pose[index], episodes.goal[index]]
+        np.testing.assert_array_equal(episode.rows, bank.rows[episode.trace.pose])
+    told = [line for line in console.export_text().splitlines() if line.startswith("shift")]
+    numbers = [[int(word) for word in line.replace(":", "").split() if word.isdigit()] for line in told]
+    (_, found, total, only), (_, others, _, others_only) = numbers
+    assert total <= len(episodes.goal)
+    assert found - only == others - others_only  # those that are found in both
+    (alone,) = play_episode(drawn_run.config.run_dir, index=index, shifts=(1.0,))
+    np.testing.assert_array_equal(alone.trace.action, shifted.trace.action)
+
+
+def test_what_a_policy_cannot_play_is_refused(drawn_run):
+    with pytest.raises(InputError, match="is a policy of the arm 'layout'; choose another --variant"):
+        play_episode("rooms-org", variant="baseline")
+    with pytest.raises(InputError, match="--index 1000: give a number from 0 to 999"):
+        play_episode(drawn_run.config.run_dir, index=1000)

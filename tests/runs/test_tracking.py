@@ -1,0 +1,175 @@
+"""A log reaches sinks whole and once, also while it is written, and no sink is needed to train."""
+
+import json
+import struct
+import sys
+import types
+
+import pytest
+from support.drawn_run import tiny_config
+
+from jaxnav.__main__ import main
+from jaxnav.errors import InputError
+from jaxnav.runs.directory import LOG_FILE, Run, claim
+from jaxnav.runs.tracking import send_log
+from jaxnav.store.runlog import append_row, truncate_after
+
+MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+
+
+def row(step, arm="layout", seed=0, **values):
+    return {"step": step, "arm": arm, "seed": seed, "env_steps": 128 * step} | values
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run of one arm and two seeds that has just begun: 4 updates, 2 of them in a row of the log."""
+    config = tiny_config(tmp_path / "tiny", arms=("layout",))
+    claim(config)
+    return Run(config)
+
+
+def log(run, *rows):
+    for each in rows:
+        append_row(run.config.run_dir / LOG_FILE, each)
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """What reaches libraries that are not there: (library, series, step, name) to value, and what is closed."""
+    numbers, closed = {}, []
+
+    def take(library, series, step, name, value):
+        assert (library, series, step, name) not in numbers  # nothing twice
+        numbers[library, series, step, name] = value
+
+    class Writer:
+        def __init__(self, logdir):
+            self.series = logdir.rsplit("/", 1)[1]
+
+        def add_scalar(self, name, value, step):
+            take("tensorboard", self.series, step, name, value)
+
+        def close(self):
+            closed.append(("tensorboard", self.series))
+
+    class WandBRun:
+        def __init__(self, **told):
+            self.told = told
+
+        def log(self, values, step):
+            for name, value in values.items():
+                take("wandb", self.told["name"], step, name, value)
+
+        def finish(self):
+            closed.append(("wandb", self.told["name"]))
+
+    monkeypatch.setitem(sys.modules, "tensorboardX", types.SimpleNamespace(SummaryWriter=Writer))
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=WandBRun))
+    return numbers, closed
+
+
+def test_every_row_goes_to_its_series(run, sent):
+    numbers, closed = sent
+    log(run, row(2, loss=0.5, val_success=None), row(2, seed=1, loss=0.25), row(4, loss=float("nan"), success=1.0))
+    assert send_log(run, ("tensorboard", "wandb")) == 3
+    expected = {("layout-0", 256, "loss"): 0.5, ("layout-1", 256, "loss"): 0.25, ("layout-0", 512, "success"): 1.0}
+    assert numbers == {(library, *key): value for library in MODULES for key, value in expected.items()}
+    assert sorted(closed) == [(library, f"layout-{seed}") for library in sorted(MODULES) for seed in (0, 1)]
+
+
+def test_a_run_that_goes_on_is_followed_to_its_end(run, sent):
+    """Killed after update 2 of 4 and resumed: the row after the checkpoint is dropped and written again, the same."""
+    numbers, closed = sent
+    log(run, row(1, loss=1.0), row(1, seed=1, loss=1.0), row(2, loss=2.0))
+    path = run.config.run_dir / LOG_FILE
+    parts = iter(
+        [
+            lambda: truncate_after(path, 1),
+            lambda: log(run, row(2, loss=2.0), row(2, seed=1, loss=2.5)),
+            lambda: path.write_bytes(path.read_bytes() + b'{"step": 4, "arm": "lay'),  # as it is being written
+            lambda: [truncate_after(path, 2), log(run, row(4, loss=4.0), row(4, seed=1, loss=4.5))],
+        ]
+    )
+    assert send_log(run, ("tensorboard",), follow=True, wait=lambda _: next(parts)()) == 6
+    assert next(parts, None) is None
+    by_seed = {seed: [value for key, value in numbers.items() if key[1] == f"layout-{seed}"] for seed in (0, 1)}
+    assert by_seed == {0: [1.0, 2.0, 4.0], 1: [1.0, 2.5, 4.5]}
+    assert len(closed) == 2
+
+
+def test_sinks_are_closed_where_the_log_is_damaged(run, sent):
+    log(run, row(2, loss=0.5))
+
+    def damage(_):
+        (run.config.run_dir / LOG_FILE).write_text("nothing\n\n")
+
+    with pytest.raises(InputError, match=r"metrics\.jsonl, line 1: not a JSON object"):
+        send_log(run, ("wandb",), follow=True, wait=damage)
+    assert sent[1] == [("wandb", "layout-0")]
+
+
+@pytest.mark.parametrize("extra", MODULES)
+def test_a_sink_that_is_not_installed_is_refused(run, extra, monkeypatch, capsys):
+    log(run, row(2, loss=0.5))
+    monkeypatch.setitem(sys.modules, MODULES[extra], None)
+    assert main(["log", str(run.config.run_dir), "--to", extra]) == 2
+    words = " ".join(capsys.readouterr().err.split())
+    assert words == f"error: --to {extra}: needs {MODULES[extra]}; install it by: pip install 'jaxnav[{extra}]'"
+
+
+def test_the_command_tells_what_it_sent(run, sent, capsys):
+    log(run, row(2, loss=0.5))
+    assert main(["log", str(run.config.run_dir), "--to", "tensorboard", "wandb"]) == 0
+    assert capsys.readouterr().err.split()[:2] == ["1", "rows"]
+
+
+# With the libraries themselves
+
+
+def test_event_files_hold_the_log(run):
+    """The records of a file: length uint64, its checksum, the event, its checksum; a second time replaces the first."""
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
+    log(run, row(2, loss=0.5, success=0.25), row(4, loss=0.125))
+    for _ in range(2):
+        send_log(run, ("tensorboard",))
+    (file,) = (run.config.run_dir / "tensorboard" / "layout-0").iterdir()
+    data, place, found = file.read_bytes(), 0, {}
+    while place < len(data):
+        (length,) = struct.unpack_from("<Q", data, place)
+        event = event_pb2.Event.FromString(data[place + 12 : place + 12 + length])
+        found |= {(event.step, value.tag): value.simple_value for value in event.summary.value}
+        place += 16 + length
+    assert found == {(256, "loss"): 0.5, (256, "success"): 0.25, (512, "loss"): 0.125}
+
+
+def wandb_records(file):
+    """The records of a file of wandb: LevelDB's log after 7 bytes, with blocks of 32 KiB."""
+    data, place, parts = file.read_bytes(), 7, []
+    while place < len(data):
+        left = 32768 - place % 32768
+        if left < 7:  # no room for a header: zeros
+            place += left
+            continue
+        _, length, kind = struct.unpack_from("<IHB", data, place)
+        parts.append(data[place + 7 : place + 7 + length])
+        place += 7 + length
+        if kind in (1, 4):  # whole, or the last part
+            yield b"".join(parts)
+            parts = []
+
+
+@pytest.mark.slow
+def test_wandb_keeps_the_log_offline(run, monkeypatch):
+    wandb_internal_pb2 = pytest.importorskip("wandb.proto.wandb_internal_pb2")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    log(run, row(2, loss=0.5, success=0.25), row(4, loss=0.125))
+    send_log(run, ("wandb",))
+    (file,) = (run.config.run_dir / "wandb").glob("offline-run-*/*.wandb")
+    found = {}
+    for data in wandb_records(file):
+        record = wandb_internal_pb2.Record.FromString(data)
+        items = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
+        found |= {(items["_step"], name): value for name, value in items.items() if not name.startswith("_")}
+    assert found == {(256, "loss"): 0.5, (256, "success"): 0.25, (512, "loss"): 0.125}
