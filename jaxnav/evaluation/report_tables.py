@@ -3,7 +3,6 @@
 from typing import Any
 
 from rich.table import Table
-from rich.text import Text
 
 from jaxnav.evaluation.statistics import Interval
 
@@ -21,7 +20,7 @@ def console_table(report: dict[str, Any]) -> Table:
     table = Table("Variant", *_titles(report))
     for heading, lines in _groups(report).items():
         table.add_section()
-        table.add_row(Text(heading, style="bold"))
+        table.add_row(heading, style="bold")
         for cells in lines:
             table.add_row(*cells)
     return table

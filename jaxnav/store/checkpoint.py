@@ -19,7 +19,7 @@ from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
 from jaxnav.errors import InputError
-from jaxnav.store.manifest import check_manifest, differences
+from jaxnav.store.manifest import check_manifest, describe, differences
 from jaxnav.store.signed import sign, verified
 
 _KEPT = 2
@@ -60,7 +60,8 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
       InputError: the run has this step or a later one already.
       TypeError: a leaf is no array, or an empty one.
     """
-    metadata = sign({"manifest": dict(manifest), "leaves": _describe(state), "digests": _digests(state)})
+    _check_leaves(state)
+    metadata = sign({"manifest": dict(manifest), "leaves": describe(state), "digests": _digests(state)})
     with _open(run_dir, cleanup_tmp_directories=True) as checkpointer:
         latest = checkpointer.latest
         if latest is not None and latest.step >= step:
@@ -127,7 +128,7 @@ def _load(
             raise ValueError("it holds no manifest")
     check_manifest(where, saved["manifest"], expected)
     # Orbax would cast another dtype silently, and names no leaf when a shape or the structure differs.
-    if different := differences(saved["leaves"], _describe(abstract_state)):
+    if different := differences(saved["leaves"], describe(abstract_state)):
         raise InputError(
             f"{where}: its state has other arrays than this code's (saved != asked for): {'; '.join(different)}; "
             f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
@@ -171,16 +172,12 @@ def _open(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.
     )
 
 
-def _describe(state: Any) -> dict[str, str]:
-    """Describe every leaf: `.params['kernel']: float32[3,4]`."""
-    leaves = {}
+def _check_leaves(state: Any) -> None:
+    """Refuse a state that could be saved, but not restored from an abstract one."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-        name = jax.tree_util.keystr(path)
-        # A Python number would be saved, but could not be restored from an abstract state.
         if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) or leaf.size == 0:
+            name = jax.tree_util.keystr(path)
             raise TypeError(f"state{name} is {leaf!r}; every leaf must be a non-empty jax.Array")
-        leaves[name] = f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
-    return leaves
 
 
 def _digests(state: Any) -> dict[str, str]:
