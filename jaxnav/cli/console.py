@@ -39,7 +39,7 @@ def exit_code(command: Callable[[Console], object]) -> int:
         raise  # nobody reads the result any more; see `__main__`
     except KeyboardInterrupt as end:
         number = end.signal if isinstance(end, Interrupted) else signal.SIGINT
-        how = f"{end}; the same command goes on from there" if isinstance(end, Interrupted) else "nothing was lost"
+        how = f"{end}; the same command goes on from there" if isinstance(end, Interrupted) else "before it was done"
         console.print(f"interrupted: {how}", soft_wrap=True, style="yellow")
         return 128 + number
     except Exception as error:
