@@ -72,7 +72,7 @@ class PlainConsole(Console):
 
     def __init__(self, **options: Any) -> None:
         """Prepare, with options as of `rich.console.Console`."""
-        super().__init__(highlight=False, emoji=False, **options)
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Return a text, made harmless."""

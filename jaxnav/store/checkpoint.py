@@ -5,7 +5,9 @@ killed at any moment leaves the earlier commits whole; what it was writing is ig
 """
 
 import contextlib
+import gc
 import hashlib
+import logging
 import shutil
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -89,7 +91,7 @@ def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str
     if not _folder(run_dir).is_dir():
         return None
     damaged: list[str] = []
-    with _open(run_dir) as checkpointer:
+    with _quiet_libraries(), _open(run_dir) as checkpointer:
         for step in sorted((saved.step for saved in checkpointer.checkpoints), reverse=True):
             try:
                 state = _load(checkpointer, _folder(run_dir) / str(step), step, abstract_state, expected_manifest)
@@ -139,6 +141,21 @@ def _load(
         if different := "digests" in saved and differences(saved["digests"], _digests(state)):
             raise ValueError(f"digests differ of {', '.join(line.split(':')[0] for line in different)}")
     return state
+
+
+@contextlib.contextmanager
+def _quiet_libraries() -> Iterator[None]:
+    """Keep Orbax from logging pages about damaged files, which are told in one line."""
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+        gc.collect()  # asyncio logs the error of a task when it is collected
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 @contextlib.contextmanager

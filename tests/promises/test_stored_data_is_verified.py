@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
-from support.commands import finished_run, train
+from support.commands import POLICIES, finished_run, train
 from support.corridors import build
 from support.damage import damage
 from support.drawn_run import tiny_config
@@ -222,7 +222,7 @@ def test_a_run_with_a_damaged_checkpoint_ends_as_one_without(tmp_path, tmp_path_
     assert "resumed after update 2 of 4" in told
     for path in (
         "metrics.jsonl",
-        *(f"policies/{name}/params.safetensors" for name in os.listdir(run_dir / "policies")),
+        *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES)),
     ):
         assert (hurt / path).read_bytes() == (run_dir / path).read_bytes(), path
 

@@ -43,6 +43,8 @@ class Record:
         """Return a value that must be a text, not empty."""
         if not isinstance(value, str) or not value:
             raise self.error(field, f"is {reprlib.repr(value)}; give a text")
+        if any("\ud800" <= character <= "\udfff" for character in value):
+            raise self.error(field, f"is {reprlib.repr(value)}, which holds half a character; write the whole one")
         return value
 
     def number(self, field: str, value: Any) -> float:
