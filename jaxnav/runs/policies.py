@@ -1,4 +1,4 @@
-"""The policies of a run: how they are exported and read again."""
+"""The policies of a run: how they are read again."""
 
 import dataclasses
 import json
@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.errors import InputError
@@ -20,11 +19,10 @@ from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.export_checks import check_arrays
-from jaxnav.store.export import export_params, load_params
+from jaxnav.runs.exports import check_arrays
+from jaxnav.store.export import load_params
 from jaxnav.store.manifest import differences
 from jaxnav.training.calibration import layout_priors
-from jaxnav.training.exploration import Exploration
 
 #: Folder of the exported policies in a run directory.
 POLICIES = "policies"
@@ -207,46 +205,3 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
         raise InputError(
             f"{where}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
         ) from error
-
-
-def export_policy(
-    folder: Path,
-    config: RunConfig,
-    params: dict[str, Any],
-    knowledge: Knowledge,
-    setting: Setting | None,
-    explored: Exploration,
-) -> None:
-    """Export one policy and what acting with it takes.
-
-    Args:
-      folder: made if missing.
-      config: of its run.
-      params: of the policy.
-      knowledge: what was learned before training.
-      setting: of the layout estimator; None without the layout.
-      explored: what the priors were made of.
-    """
-    policy = config.policy_spec(len(config.task.categories))
-    spec = {
-        "method": config.method,
-        "categories": list(config.task.categories),
-        "task": dataclasses.asdict(config.task),
-        "sizes": dataclasses.asdict(config.sizes),
-        "method_sizes": config.method_sizes,
-        "decision": config.decision,
-        "direct": config.direct,
-        "done_gate": config.done_gate,
-        "goal_row": config.goal_row,
-        "spatial_memory": None if policy.spatial_memory is None else dataclasses.asdict(policy.spatial_memory),
-        "layout": None if setting is None else dataclasses.asdict(setting),
-        "prior_steps": int(explored.steps),
-        "prior_poses": int(explored.poses),
-    }
-    layout = {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.counts)}
-    tensors = {"policy": jax.device_get(params), "layout": layout}
-    if knowledge.method:
-        tensors["knowledge"] = jax.device_get(knowledge.method)
-    if knowledge.signs is not None:
-        tensors["signs"] = jax.device_get(knowledge.signs._asdict())
-    export_params(folder, tensors, spec)

@@ -17,8 +17,9 @@ from jaxnav.policies.testing import check_method
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.directory import REACH_FILE, Run, claimed, settings
+from jaxnav.runs.exports import export_policy
 from jaxnav.runs.logs import TIMES_FILE, Logs
-from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.stopwatch import Stopwatch
 from jaxnav.runs.updates import do_updates

@@ -6,7 +6,6 @@ killed at any moment leaves the earlier commits whole; what it was writing is ig
 
 import contextlib
 import gc
-import hashlib
 import logging
 import shutil
 import textwrap
@@ -15,13 +14,11 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
 from jaxnav.errors import InputError
-from jaxnav.store.manifest import check_manifest, describe, differences
+from jaxnav.store.leaves import describe, digests
+from jaxnav.store.manifest import check_manifest, differences
 from jaxnav.store.signed import sign, verified
 
 _KEPT = 2
@@ -63,7 +60,7 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
       TypeError: a leaf is no array, or an empty one.
     """
     _check_leaves(state)
-    metadata = sign({"manifest": dict(manifest), "leaves": describe(state), "digests": _digests(state)})
+    metadata = sign({"manifest": dict(manifest), "leaves": describe(state), "digests": digests(state)})
     with _open(run_dir, cleanup_tmp_directories=True) as checkpointer:
         latest = checkpointer.latest
         if latest is not None and latest.step >= step:
@@ -138,7 +135,7 @@ def _load(
     with _damage_named(where):
         state = checkpointer.load(step, abstract_state=_placed(abstract_state))
         # Checkpoints of jaxnav 0.2.0 have no digests.
-        if different := "digests" in saved and differences(saved["digests"], _digests(state)):
+        if different := "digests" in saved and differences(saved["digests"], digests(state)):
             raise ValueError(f"digests differ of {', '.join(line.split(':')[0] for line in different)}")
     return state
 
@@ -195,19 +192,6 @@ def _check_leaves(state: Any) -> None:
         if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) or leaf.size == 0:
             name = jax.tree_util.keystr(path)
             raise TypeError(f"state{name} is {leaf!r}; every leaf must be a non-empty jax.Array")
-
-
-def _digests(state: Any) -> dict[str, str]:
-    """Return 16 hexadecimal digits of the SHA-256 of every leaf; equal on any number of devices."""
-    leaves = jax.tree_util.tree_leaves_with_path(state)
-    return {jax.tree_util.keystr(path): hashlib.sha256(_bytes(leaf)).hexdigest()[:16] for path, leaf in leaves}
-
-
-def _bytes(leaf: jax.Array) -> bytes:
-    data = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-    if not data.is_fully_addressable:
-        data = multihost_utils.process_allgather(data, tiled=True)
-    return np.asarray(data).tobytes()
 
 
 def _placed(abstract_state: State) -> State:

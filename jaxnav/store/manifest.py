@@ -5,8 +5,6 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
-import jax
-
 from jaxnav.errors import InputError
 
 #: Raised whenever the layout of the stored state changes in a way that older code cannot read.
@@ -67,12 +65,6 @@ def differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") ->
         elif left != right:
             lines.append(f"{prefix}{key}: {left!r} != {right!r}")
     return lines
-
-
-def describe(tree: Any) -> dict[str, str]:
-    """Describe the arrays of a tree: `['kernel']: float32[3,4]`."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path): f"{x.dtype}[{','.join(map(str, x.shape))}]" for path, x in leaves}
 
 
 class _Absent:

@@ -16,7 +16,8 @@ import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.exports import export_policy
+from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.training.exploration import Exploration
 
