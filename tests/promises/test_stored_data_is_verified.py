@@ -24,6 +24,7 @@ from support.drawn_run import tiny_config
 from jaxnav.errors import InputError
 from jaxnav.runs.directory import REACH_FILE, Run, claim, settings
 from jaxnav.runs.logs import Logs
+from jaxnav.runs.policy import WEIGHTS, load_policy
 from jaxnav.store import checkpoint
 from jaxnav.store.export import export_params, load_params
 from jaxnav.store.manifest import make_manifest
@@ -153,6 +154,27 @@ def test_no_damage_of_a_hundred_is_used_silently(name, tmp_path):
     assert outcomes["told"] >= 30
 
 
+@pytest.mark.parametrize(("name", "file"), [("config", CONFIG_FILE), ("reach", REACH_FILE), ("export", "policy.json")])
+def test_another_digit_in_a_record_is_told(name, file, tmp_path):
+    """Which a parser takes for another number."""
+    STORED[name].write(tmp_path / "whole")
+    path = tmp_path / "whole" / file
+    whole = path.read_bytes()
+    places = [at for at, byte in enumerate(whole) if chr(byte).isdigit()]
+    for at in places[:: len(places) // 8]:
+        path.write_bytes(whole[:at] + str((whole[at] - ord("0") + 1) % 10).encode() + whole[at + 1 :])
+        with pytest.raises(InputError, match=file):
+            STORED[name].read(path.parent)
+
+
+def test_another_digit_in_a_log_is_told(tmp_path):
+    log_rows(tmp_path)
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(path.read_bytes().replace(b"0.57", b"0.67"))  # success of 4 / 7
+    with pytest.raises(InputError, match=r"metrics.jsonl, line 3: is damaged or was changed by hand"):
+        Logs(in_run(tmp_path)).metrics()
+
+
 @pytest.mark.parametrize(
     "hurt",
     [
@@ -240,3 +262,34 @@ def test_a_finished_run_does_not_overwrite_an_export_that_differs(tmp_path, tmp_
     assert train(config_file, run) == 2
     assert f"{folder}: holds another policy than would be exported" in capsys.readouterr().err
     assert (folder / "params.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (
+            lambda params: params["policy"]["actor"]["bias"].fill(np.nan),
+            "policy/actor/bias holds numbers that are not fin",
+        ),
+        (
+            lambda params: params["layout"].update(prior=params["layout"]["prior"][:, :-1, :-1]),
+            "['layout']['prior']: 'float",
+        ),
+        (
+            lambda params: params["layout"].update(counts=params["layout"]["counts"].astype(np.int32)),
+            "'int32[5,22,22]' != ",
+        ),
+        (lambda params: params["policy"].pop("actor"), "['policy']['actor']['bias']: (absent) != 'float32["),
+    ],
+)
+def test_an_export_that_is_well_signed_but_wrong_is_refused(tmp_path, change, problem):
+    params, spec = load_params(WEIGHTS / "rooms-org")
+    params = jax.tree.map(np.array, params)
+    export_params(tmp_path / "whole", params, spec)
+    load_policy(tmp_path / "whole")
+    change(params)
+    export_params(tmp_path / "wrong", params, spec)
+    with pytest.raises(InputError) as error:
+        load_policy(tmp_path / "wrong")
+    assert str(error.value).startswith(f"{tmp_path}/wrong: ")
+    assert problem in str(error.value)

@@ -31,7 +31,20 @@ def _line_lost(data: bytes, draw: random.Random) -> bytes:
     return b"".join(lines)
 
 
-KINDS: tuple[Callable[[bytes, random.Random], bytes], ...] = (_flipped, _cut, _zeroed, _moved, _line_lost)
+def _digit_changed(data: bytes, draw: random.Random) -> bytes:
+    digits = [at for at, byte in enumerate(data) if chr(byte).isdigit() and byte < 128] or range(len(data))
+    at = draw.choice(digits)
+    return data[:at] + str(draw.randrange(10)).encode() + data[at + 1 :]
+
+
+KINDS: tuple[Callable[[bytes, random.Random], bytes], ...] = (
+    _flipped,
+    _cut,
+    _zeroed,
+    _moved,
+    _line_lost,
+    _digit_changed,
+)
 
 
 def damage(folder: Path, draw: random.Random) -> Path:
