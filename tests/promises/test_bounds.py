@@ -1,8 +1,7 @@
 """Sizes are checked before memory is taken, and what is missing is told in one line.
 
-Seen to fail: without `largest` in `read_bytes`, the compressed zeros are read whole (the test's limit of memory ends
-it); without `_MOST` of `check`, a run of 10**9 seeds is begun; without the case `MemoryError` of the console, a full
-memory ends in a traceback.
+Seen to fail, each planted alone: `largest` without a limit, pickles of any number of parts, lists of any number of
+episodes, a console that does not know `MemoryError`, a `jaxnav` that does not know `BrokenPipeError`.
 """
 
 import bz2

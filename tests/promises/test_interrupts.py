@@ -1,7 +1,6 @@
 """A training that is asked to end finishes its chunk, saves, and says how to go on.
 
-Seen to fail: without `Interrupts` around the updates, the process ends at once and has saved nothing; with a handler
-that does not step back after the first signal, the second Ctrl-C ends nothing.
+Seen to fail: with a handler that does not step back after the first signal, so that the second Ctrl-C ends nothing.
 """
 
 import re

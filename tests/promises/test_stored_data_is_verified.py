@@ -1,7 +1,7 @@
 """What a run reads back is what it wrote: damage is told, and never used.
 
-Seen to fail: with `_digests` of a checkpoint, the checksum of a shard, the digest of a record, or the SHA-256 of an
-export not compared (each planted alone), the campaign finds damages that are read as if nothing had happened.
+Seen to fail, each planted alone: the digests of a checkpoint, of a record, the checksum of a shard, the SHA-256 of an
+export not compared; rows of a log not counted; shapes or values of an export not checked.
 """
 
 import collections
@@ -22,7 +22,7 @@ from support.damage import damage
 from support.drawn_run import tiny_config
 
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import REACH_FILE, Run, claim, settings
+from jaxnav.runs.directory import CONFIG_FILE, REACH_FILE, Run, claim, settings
 from jaxnav.runs.logs import Logs
 from jaxnav.runs.policy import WEIGHTS, load_policy
 from jaxnav.store import checkpoint
