@@ -17,7 +17,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.store.checkpoint import save
-from jaxnav.store.runlog import append_row
+from jaxnav.store.runlog import append_rows
 
 
 class Training:
@@ -50,7 +50,7 @@ class Training:
         row = {"step": 1, **{str(number): 1.0 for number in range(12)}}
         began = time.perf_counter()
         for _ in range(100):
-            append_row(folder / "log", row)
+            append_rows(folder / "log", [row])
         return (time.perf_counter() - began) / 100
 
     def sizes(self) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 import difflib
 import importlib
+import os
 import sys
 
 from jaxnav import __version__
@@ -30,11 +31,26 @@ Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. The envi
 JAX_COMPILATION_CACHE_DIR names another folder; with JAX_ENABLE_COMPILATION_CACHE=0 none are kept."""
 
 
+#: Exit code where nobody reads the output any more: 128 and SIGPIPE, as of other commands.
+_CLOSED = 141
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command that the first argument names.
 
     Returns its exit code, 2 for an unknown one.
     """
+    try:
+        try:
+            return _run(arguments)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is written when Python ends
+        return _CLOSED
+
+
+def _run(arguments: list[str] | None) -> int:
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print(HELP + NOTES)

@@ -1,4 +1,4 @@
-"""Exceptions for input that a user can mend."""
+"""Exceptions for input that a user can mend, and for runs that a user ends."""
 
 
 class InputError(ValueError):
@@ -10,3 +10,16 @@ class InputError(ValueError):
 
 class MissingSplitError(InputError):
     """Refuse a scene file that holds no scene of a split."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """End a run that was asked to end; what it did is saved.
+
+    Attributes:
+      signal: number of the signal that asked for it.
+    """
+
+    def __init__(self, signal: int, told: str) -> None:
+        """Take the signal, and what to tell the user."""
+        super().__init__(told)
+        self.signal = signal

@@ -65,7 +65,7 @@ def _account(config: AccountConfig, console: Console, out: Console) -> None:
     found = {}
     for shift in config.shift:
         entries = account(run, without, shift=shift, console=console, **options)
-        out.print(f"Lead over {without.config.method} at shift {shift:g}, in points", markup=False)
+        out.print(f"Lead over {without.config.method} at shift {shift:g}, in points")
         out.print(accounting_table(entries))
         found[f"{shift:g}"] = [entry.to_json() for entry in entries]
     about = {"run": str(config.run), "without": str(config.without)} | options

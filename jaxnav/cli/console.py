@@ -3,40 +3,98 @@
 import ctypes
 import functools
 import os
+import signal
 import sys
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, Interrupted
 
 #: Where compiled programs are kept, unless JAX has been told another folder.
 PROGRAMS = "~/.cache/jaxnav/xla"
 
+#: Unicode categories of what controls a terminal, hides or turns text, ends a line, or is no character.
+_HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 _LONG_S = 0.5  # of a compilation that is worth the effort
 
 
 def exit_code(command: Callable[[Console], object]) -> int:
     """Run a command and return its exit code.
 
-    The command gets a console to tell of its progress on. The code is 0, or 2 after bad input, told in one line.
+    The command gets a console to tell of its progress on. What ends it is told in one line: bad input, a file that
+    cannot be read or written and a lack of memory with code 2, Ctrl-C and SIGTERM with 128 and the signal's number.
     """
-    console = Console(stderr=True, highlight=False)
+    console = PlainConsole(stderr=True)
     if "jax" in sys.modules:  # otherwise the command compiles nothing
         _keep_programs(console)
         _give_memory_back()
     try:
         command(console)
-    except InputError as error:
-        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+    except BrokenPipeError:
+        raise  # nobody reads the result any more; see `__main__`
+    except KeyboardInterrupt as end:
+        number = end.signal if isinstance(end, Interrupted) else signal.SIGINT
+        how = f"{end}; the same command goes on from there" if isinstance(end, Interrupted) else "before it was done"
+        console.print(f"interrupted: {how}", soft_wrap=True, style="yellow")
+        return 128 + number
+    except Exception as error:
+        if (problem := _problem(error)) is None:
+            raise
+        console.print(f"error: {problem}", soft_wrap=True, style="red")
         return 2
     return 0
 
 
+def _problem(error: Exception) -> str | None:
+    """Return what a user can mend; None for a mistake of the program."""
+    match error:
+        case InputError():
+            return str(error)
+        case MemoryError():
+            return f"there is not enough memory ({error}); give fewer or smaller scenes, seeds or environments"
+        case OSError(strerror=str()):
+            return f"{error.filename or 'a file'}: {error.strerror}; mend the path, its permissions or the disk"
+    if type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error):
+        return "there is not enough memory on the device; give fewer seeds or a smaller ppo.num_envs"
+    return None
+
+
+class PlainConsole(Console):
+    """Show every text as it is: a name may come from a file.
+
+    Brackets are no markup, and characters that control a terminal or turn the order of letters are shown by number.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        """Prepare, with options as of `rich.console.Console`."""
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text, made harmless."""
+        return super().render_str(printable(text), **options)
+
+
+def printable(text: str, kept: str = "") -> str:
+    """Return a text whose control characters are shown by number.
+
+    Args:
+      text: of any characters.
+      kept: control characters that stay.
+    """
+    return "".join(
+        each if each in kept or unicodedata.category(each) not in _HIDDEN else each.encode("unicode_escape").decode()
+        for each in text
+    )
+
+
 def result_console() -> Console:
     """Return the console for a result, 120 columns wide."""
-    return Console(width=120, highlight=False)
+    return PlainConsole(width=120)
 
 
 def _keep_programs(console: Console) -> None:
@@ -55,7 +113,7 @@ def _keep_programs(console: Console) -> None:
         if not os.access(folder, os.W_OK):
             raise PermissionError(f"{folder} cannot be written")
     except (OSError, RuntimeError) as error:
-        console.print(f"warning: compiled programs are not kept: {error}", style="yellow", markup=False, soft_wrap=True)
+        console.print(f"warning: compiled programs are not kept: {error}", soft_wrap=True, style="yellow")
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _LONG_S)

@@ -83,7 +83,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     if results.report["differences"]:
         out.print(difference_table(results.report))
     for note in results.report["notes"]:
-        out.print(note, markup=False)
+        out.print(note)
     try:
         results.write(target)
     except OSError as error:

@@ -110,7 +110,7 @@ def convert(config: ImportConfig, console: Console) -> None:
     """Import scenes and print what was refused or unknown."""
 
     def report(error: InputError) -> None:
-        console.print(f"refused: {error}", style="yellow", markup=False, soft_wrap=True)
+        console.print(f"refused: {error}", style="yellow", soft_wrap=True)
 
     scenes = read_format(
         config.format,
@@ -127,11 +127,11 @@ def convert(config: ImportConfig, console: Console) -> None:
         scenes, config.source, config.out, config.split, config.val, config.test, categories, report
     )
     for told in _told(summary):
-        console.print(told, style="yellow", markup=False, soft_wrap=True)
+        console.print(told, style="yellow", soft_wrap=True)
     if summary.unknown:
         objects, types = summary.unknown.total(), most_common(summary.unknown)
         told = f"objects of unknown types, which only block the sight: {objects:,}, of them {types}"
-        console.print(told, markup=False, soft_wrap=True)
+        console.print(told, soft_wrap=True)
     counts = f"{len(summary.scenes)} scenes imported, {summary.refused} refused"
     console.print(f"{counts}; written to {config.out}", soft_wrap=True)
 
@@ -161,8 +161,8 @@ def show(config: ShowConfig, console: Console) -> None:
         draw_scene(scene, config.task, path, config.pose)
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written ({error.strerror}); give another name") from error
-    console.print(f"{scene.name} drawn by the rules of {config.world_name}", markup=False, soft_wrap=True)
-    console.print(f"written to {path}", markup=False, soft_wrap=True)
+    console.print(f"{scene.name} drawn by the rules of {config.world_name}", soft_wrap=True)
+    console.print(f"written to {path}", soft_wrap=True)
 
 
 def print_statistics(config: StatsConfig, console: Console) -> None:
@@ -178,9 +178,9 @@ def print_statistics(config: StatsConfig, console: Console) -> None:
     statistics = [scene_statistics(scene, task) for scene in bar]
     out = result_console()
     world = run.world if run else config.world_name
-    out.print(f"{config.file}: {len(statistics)} scenes, by the categories and rules of {world}", markup=False)
+    out.print(f"{config.file}: {len(statistics)} scenes, by the categories and rules of {world}")
     for title, table in scene_tables(statistics, task, priors).items():
         out.print(title, style="bold")
         out.print(table, "")
     for remark in scene_remarks(statistics, task):
-        out.print(remark, markup=False)
+        out.print(remark)

@@ -10,6 +10,9 @@ from jaxnav.evaluation.statistics import Clusters, scene_clusters
 from jaxnav.scenes.scene import floor_plan
 from jaxnav.scenes.tables.compile import Bank
 
+#: Episodes of a bank at most: so many take a minute to draw, and memory in every row of a table.
+MAX_EPISODES = 10**6
+
 
 class EpisodeList(NamedTuple):
     """Hold E episodes, fixed before anything is run.
@@ -69,10 +72,10 @@ def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0, part: int = 0)
       part: number of the bank among those that are evaluated together; each has draws of its own.
 
     Raises:
-      InputError: fewer than one episode.
+      InputError: fewer than one episode, or too many.
     """
-    if episodes < 1:
-        raise InputError(f"--episodes {episodes}: give at least 1")
+    if not 1 <= episodes <= MAX_EPISODES:
+        raise InputError(f"--episodes {episodes}: give at least 1, and at most {MAX_EPISODES}")
     rooms = tuple(sorted(set(bank.room_types)))
     per_room = -(-episodes // len(rooms))
     generator = np.random.default_rng([seed, len(bank.names), part])

@@ -3,7 +3,6 @@
 from typing import Any
 
 from rich.table import Table
-from rich.text import Text
 
 from jaxnav.evaluation.statistics import Interval
 
@@ -21,9 +20,9 @@ def console_table(report: dict[str, Any]) -> Table:
     table = Table("Variant", *_titles(report))
     for heading, lines in _groups(report).items():
         table.add_section()
-        table.add_row(Text(heading, style="bold"))
+        table.add_row(heading, style="bold")
         for cells in lines:
-            table.add_row(*map(Text, cells))  # Text: brackets are not markup
+            table.add_row(*cells)
     return table
 
 
@@ -39,7 +38,7 @@ def difference_table(report: dict[str, Any]) -> Table:
         lines.setdefault((difference_label(entry), entry["decoding"]), []).append(cell)
     table = Table("Difference, paired on episodes", "decoding", *(title for title, _ in COLUMNS.values()))
     for names, cells in lines.items():
-        table.add_row(*map(Text, (*names, *cells)))
+        table.add_row(*names, *cells)
     return table
 
 

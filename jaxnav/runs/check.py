@@ -11,6 +11,19 @@ from jaxnav.runs.config import ARMS, RunConfig
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.devices import Devices
 
+#: The most that a run may be asked for; more would end for want of memory or of counters, not finish.
+_MOST = {
+    "seeds": 1024,
+    "total_steps": 10**12,
+    "chunk": 10**5,
+    "save_every": 10**6,
+    "validations": 10**4,
+    "val_episodes": 10**5,
+}
+_MOST_OF_A_GROUP = 10**6
+_MOST_STEPS = 2**28  # side by side, and kept
+_MOST_CHUNKS = 4 * 10**6
+
 
 def check(config: RunConfig) -> RunConfig:
     """Return the config, complete and possible.
@@ -72,10 +85,11 @@ def _check_stages(config: RunConfig, method: Method) -> None:
 
 
 def _check_numbers(config: RunConfig) -> None:
-    _need(config.validations >= 0, "validations", config.validations, "give at least 0")
-    for name in ("seeds", "total_steps", "chunk", "save_every", "val_episodes"):
+    for name, most in _MOST.items():
         value = getattr(config, name)
-        _need(value is None or value >= 1, name, value, "give at least 1")
+        least = 0 if name == "validations" else 1
+        _need(value is None or value >= least, name, value, f"give at least {least}")
+        _need(value is None or value <= most, name, value, f"give at most {most:,}")
     if config.devices is not None:
         forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
         _need(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), forms)
@@ -87,6 +101,15 @@ def _check_numbers(config: RunConfig) -> None:
             value = getattr(getattr(config, group), field.name)
             if isinstance(value, int) and field.name != "seed":
                 _need(value >= 1, f"{group}.{field.name}", value, "give at least 1")
+                _need(value <= _MOST_OF_A_GROUP, f"{group}.{field.name}", value, f"give at most {_MOST_OF_A_GROUP:,}")
+    together = {
+        "layout.walks x layout.steps": config.layout.walks * config.layout.steps,
+        "ppo.num_envs x ppo.rollout": config.update_steps,
+    }
+    for name, count in together.items():
+        _need(count <= _MOST_STEPS, name, count, f"give at most {_MOST_STEPS:,}")
+    chunks = config.total_updates // config.chunk
+    _need(chunks <= _MOST_CHUNKS, "total_steps", config.total_steps, f"makes {chunks:,} chunks; give a larger chunk")
 
 
 def _check_layout(config: RunConfig) -> None:

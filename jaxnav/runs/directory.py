@@ -1,21 +1,24 @@
 """Run directories: the settings and the exported policies of a run."""
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxnav.errors import InputError
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.overlay import apply_yaml
+from jaxnav.runs.logs import Logs
+from jaxnav.runs.overlay import apply_values
 from jaxnav.runs.policies import Policies, load_policies
-from jaxnav.store.files import write_atomic
+from jaxnav.store.lock import Lock
 from jaxnav.store.manifest import differences
-from jaxnav.store.runlog import read_rows
+from jaxnav.store.signed import read_signed, write_signed
+from jaxnav.training.devices import by_first_process
 
-CONFIG_FILE, LOG_FILE, TIMES_FILE = "config.json", "metrics.jsonl", "times.jsonl"
+CONFIG_FILE = "config.json"
 #: Success within budgets of actions, of the exported policies; see `Validator.reach`.
 REACH_FILE = "reach.json"
 
@@ -45,7 +48,7 @@ class Run:
 
     def log(self) -> list[dict[str, Any]]:
         """Return the training log, a row per chunk and seed."""
-        return read_rows(self.config.run_dir / LOG_FILE)
+        return Logs(self.config).metrics()
 
     def reach(self) -> dict[str, Any] | None:
         """Return success within budgets of actions, see `Validator.reach`.
@@ -53,14 +56,14 @@ class Run:
         None where the run had no val scenes.
         """
         path = self.config.run_dir / REACH_FILE
-        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        return read_signed(path, "remove it and train again with this --run-dir") if path.exists() else None
 
     def times(self) -> list[dict[str, Any]]:
         """Return the seconds that training took, a row per chunk.
 
         `wall_s` and `cpu_s` are since the start, with compilation, validation and what came before an interruption.
         """
-        return read_rows(self.config.run_dir / TIMES_FILE)
+        return Logs(self.config).times()
 
 
 def settings(config: RunConfig) -> dict[str, Any]:
@@ -73,8 +76,31 @@ def settings(config: RunConfig) -> dict[str, Any]:
     return {name: value for name, value in plain.items() if name not in ("run_dir", "save_every", "cache", "devices")}
 
 
+@contextlib.contextmanager
+def claimed(config: RunConfig) -> Iterator[Lock]:
+    """Hold the run directory for this run, and for no other process.
+
+    Of several processes of a run the first one holds it for all.
+
+    Raises:
+      InputError: it holds another run, or something else, or another process trains in it.
+    """
+    lock = Lock(config.run_dir)
+
+    def hold() -> None:
+        claim(config)
+        lock.acquire()
+        claim(config)  # another process may have claimed it since
+
+    try:
+        by_first_process(hold)
+        yield lock
+    finally:
+        lock.release()
+
+
 def claim(config: RunConfig) -> None:
-    """Claim the run directory for this run, or leave it.
+    """Write the settings to the run directory, or find them there.
 
     Raises:
       InputError: it holds another run, or something else.
@@ -92,7 +118,7 @@ def claim(config: RunConfig) -> None:
     # A kill while the config is written leaves its temporary file alone in the directory.
     if run_dir.exists() and any(not item.match(f".{CONFIG_FILE}.*.tmp") for item in run_dir.iterdir()):
         raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
-    write_atomic(path, (json.dumps(settings(config), indent=2) + "\n").encode())
+    write_signed(path, settings(config))
 
 
 def load_run(run_dir: Path) -> RunConfig:
@@ -104,11 +130,8 @@ def load_run(run_dir: Path) -> RunConfig:
     path = run_dir / CONFIG_FILE
     if not path.exists():
         raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
-    config = apply_yaml(RunConfig(), path)
-    try:
-        held = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error}); restore the file or train in another --run-dir") from error
-    if different := differences(held or {}, settings(config)):
+    held = read_signed(path, "restore the file or train in another --run-dir")
+    config = apply_values(RunConfig(), held, path)
+    if different := differences(held, settings(config)):
         raise InputError(f"{path}: lacks settings ({'; '.join(different)}); restore the file or train the run anew")
     return check(dataclasses.replace(config, run_dir=run_dir))

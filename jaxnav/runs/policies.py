@@ -1,4 +1,4 @@
-"""The policies of a run: how they are exported and read again."""
+"""The policies of a run: how they are read again."""
 
 import dataclasses
 import json
@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.gaps import Signs
@@ -19,12 +18,12 @@ from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.exports import check_arrays
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.task import Task
-from jaxnav.store.export import export_params, load_params
+from jaxnav.store.export import load_params
 from jaxnav.store.manifest import differences
 from jaxnav.training.calibration import layout_priors
-from jaxnav.training.exploration import Exploration
 
 #: Folder of the exported policies in a run directory.
 POLICIES = "policies"
@@ -151,10 +150,15 @@ def load_policies(run: RunConfig, arms: Sequence[str] | None = None) -> Policies
         raise InputError(f"{missing[0]}: is missing, so training has not finished; train again with this --run-dir")
     loaded = {arm: [load_params(folder) for folder in paths] for arm, paths in folders.items()}
     told = "layout" if "layout" in arms else arms[-1]  # its last seed says what holds for all
-    tensors, spec = loaded[told][-1]
-    where = folders[told][-1]
-    stacked = [seed["policy"] for seeds in loaded.values() for seed, _ in seeds]
-    policies = _policies_of(where, tensors, spec)
+    where, (_, spec) = folders[told][-1], loaded[told][-1]
+    stacked = []
+    for arm in arms:
+        for folder, (tensors, other) in zip(folders[arm], loaded[arm], strict=True):
+            policies = _policies_of(folder, tensors, other)
+            stacked.append(policies.params)
+            if different := differences(other if arm == told else other | {"layout": spec["layout"]}, spec):
+                raise InputError(f"{folder}: is not of the run of {where}: {'; '.join(different)}; train the run anew")
+    policies = _policies_of(where, *loaded[told][-1])
     policies = policies._replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked), arms=arms)
     if different := differences(spec["task"], json.loads(json.dumps(dataclasses.asdict(run.task)))):
         raise InputError(
@@ -188,6 +192,8 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
         spatial = None if spec["spatial_memory"] is None else SpatialMemory(**spec["spatial_memory"])
         options = spec["direct"], spec["done_gate"], spatial, spec["decision"], spec["goal_row"]
         built = spec["method"], len(spec["categories"]), sizes, method_sizes
+        policy = PolicySpec(*built, *options)
+        check_arrays(where, tensors, policy)
         return Policies(
             params=jax.tree.map(jnp.asarray, tensors["policy"]),
             arms=(),
@@ -197,57 +203,14 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
                 signs=jax.tree.map(jnp.asarray, Signs(**tensors["signs"])) if "signs" in tensors else None,
             ),
             counts=jnp.asarray(tensors["layout"]["counts"]),
-            spec=PolicySpec(*built, *options),
+            spec=policy,
             setting=None if spec["layout"] is None else Setting(**spec["layout"]),
             prior_steps=spec["prior_steps"],
             task=Task.from_json(spec["task"]),
         )
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{where}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
         ) from error
-
-
-def export_policy(
-    folder: Path,
-    config: RunConfig,
-    params: dict[str, Any],
-    knowledge: Knowledge,
-    setting: Setting | None,
-    explored: Exploration,
-) -> None:
-    """Export one policy and what acting with it takes.
-
-    Args:
-      folder: made if missing.
-      config: of its run.
-      params: of the policy.
-      knowledge: what was learned before training.
-      setting: of the layout estimator; None without the layout.
-      explored: what the priors were made of.
-    """
-    policy = config.policy_spec(len(config.task.categories))
-    spec = {
-        "method": config.method,
-        "categories": list(config.task.categories),
-        "task": dataclasses.asdict(config.task),
-        "sizes": dataclasses.asdict(config.sizes),
-        "method_sizes": config.method_sizes,
-        "decision": config.decision,
-        "direct": config.direct,
-        "done_gate": config.done_gate,
-        "goal_row": config.goal_row,
-        "spatial_memory": None if policy.spatial_memory is None else dataclasses.asdict(policy.spatial_memory),
-        "layout": None if setting is None else dataclasses.asdict(setting),
-        "prior_steps": int(explored.steps),
-        "prior_poses": int(explored.poses),
-    }
-    layout = {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.counts)}
-    tensors = {"policy": jax.device_get(params), "layout": layout}
-    if knowledge.method:
-        tensors["knowledge"] = jax.device_get(knowledge.method)
-    if knowledge.signs is not None:
-        tensors["signs"] = jax.device_get(knowledge.signs._asdict())
-    export_params(folder, tensors, spec)

@@ -1,16 +1,14 @@
 """Training of a run, from the prior to the exported policies."""
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from jaxnav.env.types import EnvParams
 from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.layout import Setting
 from jaxnav.policies.methods import METHODS, Knowledge
@@ -18,16 +16,19 @@ from jaxnav.policies.policy import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import LOG_FILE, REACH_FILE, TIMES_FILE, Run, claim, settings
-from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.directory import REACH_FILE, Run, claimed, settings
+from jaxnav.runs.exports import export_policy
+from jaxnav.runs.logs import TIMES_FILE, Logs
+from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.stopwatch import Stopwatch
-from jaxnav.runs.validation import SCORE, Validator
-from jaxnav.runs.worlds import CompiledWorld, bank_order, read_ahead, training_world
-from jaxnav.store.checkpoint import restore, save
-from jaxnav.store.files import write_atomic
+from jaxnav.runs.updates import do_updates
+from jaxnav.runs.validation import Validator
+from jaxnav.runs.worlds import CompiledWorld, bank_order, training_world
+from jaxnav.store.checkpoint import restore, set_aside_after
+from jaxnav.store.lock import Lock
 from jaxnav.store.manifest import make_manifest
-from jaxnav.store.runlog import append_row, truncate_after
+from jaxnav.store.signed import write_signed
 from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
 from jaxnav.training.exploration import Exploration
 from jaxnav.training.learner import LearnerState
@@ -49,7 +50,8 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
       The finished run.
 
     Raises:
-      InputError: an impossible setting, or a run directory that holds something else.
+      InputError: an impossible setting, a run directory that holds something else or is in use, or damaged files.
+      Interrupted: Ctrl-C or SIGTERM came while it trained; it is saved, and the same call goes on from there.
     """
     clock = Stopwatch.start()
     config = _checked(config)
@@ -60,36 +62,61 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     world = training_world(config, console)
     manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint, "budget": config.budget})
     check_agreement(json.dumps(manifest))
-    by_first_process(lambda: claim(config))
+    with claimed(config) as lock:
+        _train(config, world, manifest, mesh, lock, clock, console)
+    return Run(config)
 
+
+def _train(
+    config: RunConfig,
+    world: CompiledWorld,
+    manifest: dict[str, Any],
+    mesh: Mesh | None,
+    lock: Lock,
+    clock: Stopwatch,
+    console: Console,
+) -> None:
+    """Train in a run directory that is held."""
     explored = explore_world(config, world)
     console.print(f"layout prior from {int(explored.steps):,} random steps, {int(explored.poses):,} distinct poses")
     setting = calibrate_setting(config, world, explored, console)
     knowledge = learn_knowledge(config, world, explored, setting)
     trainer = make_trainer(config, world.env, setting, knowledge, mesh)
-    turns = config.total_updates // config.chunk
-    order = bank_order(world, config.seed, turns)
+    order = bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
         console.print(
             f"one shard after the other: {len(order)} turns in {len(set(order))} of {len(world.banks)} shards"
         )
-    first = world.params(order[0])
-    restored = restore(config.run_dir, trainer.abstract(first), manifest)
-    states, done = (trainer.pack(restored[0]), restored[1]) if restored else (trainer.init(first), 0)
-    by_first_process(lambda: [truncate_after(config.run_dir / name, done) for name in (LOG_FILE, TIMES_FILE)])
-    if restored:
-        console.print(f"resumed after update {done} of {config.total_updates}")
+    states, done = _resumed(config, trainer, world.params(order[0]), manifest, console)
     clock = clock.resume(config.run_dir / TIMES_FILE)
     finished = done == config.total_updates and (config.run_dir / REACH_FILE).exists()
     validator = None if finished else _validator(config, trainer, knowledge, world, console)
-    states = _do_updates(config, trainer, validator, world, order, states, done, manifest, clock, console)
+    states = do_updates(config, trainer, validator, world, order, states, done, manifest, lock, clock, console)
     kept = {name: [_exported(state) for state in seeds] for name, seeds in trainer.unpack(states).items()}
     by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
     if validator is not None:
         reach = validator.reach(kept)
-        by_first_process(lambda: write_atomic(config.run_dir / REACH_FILE, (json.dumps(reach) + "\n").encode()))
+        by_first_process(lambda: write_signed(config.run_dir / REACH_FILE, reach))
     console.print(f"{config.run_dir}: done in {clock.read()['wall_s']:.0f} s")
-    return Run(config)
+
+
+def _resumed(
+    config: RunConfig, trainer: Trainer, first: EnvParams, manifest: dict[str, Any], console: Console
+) -> tuple[States, int]:
+    """Return the state to go on from, and its updates.
+
+    What is later in the run directory is dropped: damaged checkpoints, and rows that will be logged again.
+    """
+    restored = restore(config.run_dir, trainer.abstract(first), manifest)
+    for problem in restored.damaged if restored else ():
+        console.print(f"{problem}; moved to {config.run_dir / 'damaged'}", soft_wrap=True)
+    done = restored.step if restored else 0
+    by_first_process(lambda: set_aside_after(config.run_dir, done))
+    by_first_process(lambda: Logs(config).rewind(done))
+    if restored is None:
+        return trainer.init(first), 0
+    console.print(f"resumed after update {done} of {config.total_updates}")
+    return trainer.pack(restored.state), done
 
 
 def _validator(
@@ -132,61 +159,6 @@ def connected(config: RunConfig) -> Mesh | None:
         return None
     devices.connect()
     return devices.mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
-
-
-def _do_updates(
-    config: RunConfig,
-    trainer: Trainer,
-    validator: Validator | None,
-    world: CompiledWorld,
-    order: Sequence[int],
-    states: States,
-    done: int,
-    manifest: dict[str, Any],
-    clock: Stopwatch,
-    console: Console,
-) -> States:
-    """Train chunk by chunk.
-
-    Each is in the next bank of scenes; between chunks the run measures its policies, logs, shows and saves.
-    """
-    steps, schedule = config.chunk * config.update_steps * config.seeds * len(states), config.schedule
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("compiling", total=config.total_updates, completed=done)
-        left = range(done // config.chunk, len(order))
-        began = time.monotonic()
-        for turn, params in zip(left, read_ahead(world, [order[turn] for turn in left]), strict=True):
-            if turn and order[turn] != order[turn - 1]:
-                states = trainer.restart(states, params, schedule[turn])
-            states, metrics = trainer.train(states, params, schedule[turn])
-            done += config.chunk
-            rate = steps / (time.monotonic() - began)
-            if validator is not None and done in config.validated:
-                present = {name: [each.params for each in seeds] for name, seeds in trainer.unpack(states).items()}
-                scores = validator.measure(present, config.stages[schedule[turn]].adapts)
-                if schedule[turn] == schedule[-1]:  # before that part of the policy has not learned
-                    found = {name: [row[SCORE] for row in rows] for name, rows in scores.items()}
-                    states = trainer.keep(states, found)
-                metrics = {name: [a | b for a, b in zip(metrics[name], scores[name], strict=True)] for name in metrics}
-            began = time.monotonic()
-            if first_process():
-                for name, seeds in metrics.items():
-                    for seed, values in enumerate(seeds):
-                        row = {"step": done, "arm": name, "seed": seed, "env_steps": done * config.update_steps}
-                        append_row(config.run_dir / LOG_FILE, row | values)
-                append_row(config.run_dir / TIMES_FILE, {"step": done} | clock.read())
-            if done % (config.chunk * config.save_every) == 0 or done == config.total_updates:
-                save(config.run_dir, done, trainer.unpack(states), manifest)
-            success = {name: np.mean([values["success"] for values in seeds]) for name, seeds in metrics.items()}
-            shares = ", ".join(f"{name} SR {100 * share:.0f} %" for name, share in success.items())
-            skipped = sum(values["skipped_steps"] for seeds in metrics.values() for values in seeds)
-            warning = f", {skipped:.0f} gradient steps skipped as not finite" if skipped else ""
-            line = f"update {done}/{config.total_updates}, {rate / 1000:.0f} k steps/s, {shares}{warning}"
-            progress.update(task, completed=done, description=line)
-            if not console.is_terminal and (done // config.chunk) % 4 == 0:
-                console.print(line)
-    return states
 
 
 def _exported(state: LearnerState) -> Params:

@@ -14,6 +14,9 @@ import numpy as np
 #: Lattice spacing in metres; MoveAhead goes to a neighbouring lattice point.
 CELL = 0.25
 
+#: Cells of a scene's side at most, 500 m; a larger extent is a mistake.
+MAX_SIDE = 2000
+
 #: What scenes are divided into.
 SPLITS = ("train", "val", "test")
 

@@ -1,24 +1,47 @@
 """Resumable state: one atomic Orbax commit per step, the latest two kept.
 
-A commit holds the arrays and the manifest together, so that neither exists without the other. A process killed at any
-moment leaves the earlier commits whole; what it was writing is ignored and cleared by the next save.
+A commit holds the arrays, a digest of each and the manifest together, so that none exists without the others. A process
+killed at any moment leaves the earlier commits whole; what it was writing is ignored and cleared by the next save.
 """
 
 import contextlib
+import gc
+import logging
+import shutil
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 from orbax.checkpoint import v1 as ocp
 
 from jaxnav.errors import InputError
+from jaxnav.store.leaves import describe, digests
 from jaxnav.store.manifest import check_manifest, differences
+from jaxnav.store.signed import sign, verified
 
 _KEPT = 2
 
 State = TypeVar("State")
+
+
+class Restored(NamedTuple, Generic[State]):
+    """Hold a restored state.
+
+    Attributes:
+      state: as it was saved.
+      step: of the checkpoint.
+      damaged: what is wrong with the later checkpoints, which cannot be used.
+    """
+
+    state: State
+    step: int
+    damaged: tuple[str, ...]
+
+
+class _DamageError(InputError):
+    """Refuse a checkpoint that is not what was saved."""
 
 
 def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> None:
@@ -36,7 +59,8 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
       InputError: the run has this step or a later one already.
       TypeError: a leaf is no array, or an empty one.
     """
-    metadata = {"manifest": dict(manifest), "leaves": _describe(state)}
+    _check_leaves(state)
+    metadata = sign({"manifest": dict(manifest), "leaves": describe(state), "digests": digests(state)})
     with _open(run_dir, cleanup_tmp_directories=True) as checkpointer:
         latest = checkpointer.latest
         if latest is not None and latest.step >= step:
@@ -47,8 +71,8 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
         checkpointer.save(step, state, force=True, custom_metadata=metadata)
 
 
-def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str, Any]) -> tuple[State, int] | None:
-    """Restore the latest committed state and its step.
+def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str, Any]) -> Restored[State] | None:
+    """Restore the latest undamaged state.
 
     Returns None if the run has none yet.
 
@@ -59,34 +83,83 @@ def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str
       expected_manifest: from `make_manifest`, with the config that the run is to go on with.
 
     Raises:
-      InputError: the checkpoint has another format version, config or state structure, or is damaged.
+      InputError: the checkpoint has another format version, config or state structure, or all are damaged.
     """
     if not _folder(run_dir).is_dir():
         return None
-    with _open(run_dir) as checkpointer:
-        latest = checkpointer.latest
-        if latest is None:
-            return None
-        where = _folder(run_dir) / str(latest.step)
-        with _damage_named(where):
-            saved = checkpointer.metadata(latest).custom_metadata
-        saved = saved if isinstance(saved, dict) else {}
-        check_manifest(where, saved.get("manifest"), expected_manifest)
-        # Orbax would cast another dtype silently, and names no leaf when a shape or the structure differs.
-        if different := differences(saved["leaves"], _describe(abstract_state)):
-            raise InputError(
-                f"{where}: its state has other arrays than this code's (saved != asked for): {'; '.join(different)}; "
-                f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
-            )
-        with _damage_named(where):
-            return checkpointer.load(latest, abstract_state=_placed(abstract_state)), latest.step
+    damaged: list[str] = []
+    with _quiet_libraries(), _open(run_dir) as checkpointer:
+        for step in sorted((saved.step for saved in checkpointer.checkpoints), reverse=True):
+            try:
+                state = _load(checkpointer, _folder(run_dir) / str(step), step, abstract_state, expected_manifest)
+            except _DamageError as error:
+                damaged.append(str(error))
+            else:
+                return Restored(state, step, tuple(damaged))
+    if damaged:
+        raise InputError(f"{'; '.join(damaged)}: no checkpoint is left; restore one or choose another run directory")
+    return None
+
+
+def set_aside_after(run_dir: Path, step: int) -> None:
+    """Move the checkpoints later than a step to `run_dir/damaged`."""
+    for folder in list(_folder(run_dir).glob("*")):
+        if folder.name.isdecimal() and int(folder.name) > step:
+            target = run_dir / "damaged" / folder.name
+            shutil.rmtree(target, ignore_errors=True)
+            target.parent.mkdir(exist_ok=True)
+            folder.rename(target)
+
+
+def _load(
+    checkpointer: ocp.training.Checkpointer, where: Path, step: int, abstract_state: State, expected: Mapping[str, Any]
+) -> State:
+    """Load the state of one step.
+
+    Raises:
+      _DamageError: a file is broken, or anything in it is not what was saved.
+      InputError: another format version, config or state structure.
+    """
+    with _damage_named(where):
+        metadata = checkpointer.metadata(step).custom_metadata
+        saved = verified(where, metadata if isinstance(metadata, dict) else {}, "the one before it is used")
+        if not {"manifest", "leaves"} <= saved.keys():
+            raise ValueError("it holds no manifest")
+    check_manifest(where, saved["manifest"], expected)
+    # Orbax would cast another dtype silently, and names no leaf when a shape or the structure differs.
+    if different := differences(saved["leaves"], describe(abstract_state)):
+        raise InputError(
+            f"{where}: its state has other arrays than this code's (saved != asked for): {'; '.join(different)}; "
+            f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
+        )
+    with _damage_named(where):
+        state = checkpointer.load(step, abstract_state=_placed(abstract_state))
+        # Checkpoints of jaxnav 0.2.0 have no digests.
+        if different := "digests" in saved and differences(saved["digests"], digests(state)):
+            raise ValueError(f"digests differ of {', '.join(line.split(':')[0] for line in different)}")
+    return state
+
+
+@contextlib.contextmanager
+def _quiet_libraries() -> Iterator[None]:
+    """Keep Orbax from logging pages about damaged files, which are told in one line."""
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+        gc.collect()  # asyncio logs the error of a task when it is collected
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 @contextlib.contextmanager
 def _damage_named(where: Path) -> Iterator[None]:
     """Turn what reading broken files raises into one message.
 
-    Orbax and TensorStore raise much over missing or broken files; the message names the mend.
+    Orbax and TensorStore raise much over missing or broken files.
     """
     try:
         yield
@@ -97,7 +170,7 @@ def _damage_named(where: Path) -> Iterator[None]:
         if not isinstance(reason, ValueError | KeyError | OSError):
             raise
         cause = textwrap.shorten(f"{type(reason).__name__}: {reason}", 300)
-        raise InputError(f"{where}: is damaged ({cause}); remove it to go on from the step before") from error
+        raise _DamageError(f"{where}: is damaged ({cause})") from error
 
 
 def _folder(run_dir: Path) -> Path:
@@ -113,16 +186,12 @@ def _open(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.
     )
 
 
-def _describe(state: Any) -> dict[str, str]:
-    """Describe every leaf: `.params['kernel']: float32[3,4]`."""
-    leaves = {}
+def _check_leaves(state: Any) -> None:
+    """Refuse a state that could be saved, but not restored from an abstract one."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-        name = jax.tree_util.keystr(path)
-        # A Python number would be saved, but could not be restored from an abstract state.
         if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) or leaf.size == 0:
+            name = jax.tree_util.keystr(path)
             raise TypeError(f"state{name} is {leaf!r}; every leaf must be a non-empty jax.Array")
-        leaves[name] = f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
-    return leaves
 
 
 def _placed(abstract_state: State) -> State:

@@ -11,6 +11,7 @@ import safetensors.numpy
 
 from jaxnav.errors import InputError
 from jaxnav.store.files import write_atomic
+from jaxnav.store.signed import verified, write_signed
 
 #: Version of the layout of the two files.
 FORMAT_VERSION = 3
@@ -24,10 +25,11 @@ _PARAMS = "params.safetensors"
 def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
     """Write parameters and what the policy is built from.
 
-    An earlier export is replaced.
+    An equal export stays, a damaged one is replaced, and another one is refused.
 
-    `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, `spec` and the SHA-256 of the
-    parameters; it is written last, so an export cut short is refused by `load_params` instead of being mixed.
+    `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, `spec`, the SHA-256 of the
+    parameters and a digest of its own; it is written last, so an export cut short is refused by `load_params` instead
+    of being mixed.
 
     Args:
       folder: made if missing.
@@ -35,13 +37,19 @@ def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, An
       spec: JSON values.
 
     Raises:
+      InputError: the folder holds another export.
       TypeError: a name in `params` is no string or holds `/`.
     """
     tensors = safetensors.numpy.save(_flatten(params))
     policy = {"format_version": FORMAT_VERSION, "params_sha256": hashlib.sha256(tensors).hexdigest(), "spec": spec}
-    text = json.dumps(policy, indent=2) + "\n"
-    write_atomic(folder / _PARAMS, tensors)
-    write_atomic(folder / POLICY_FILE, text.encode())
+    try:
+        held = _read_policy(folder)
+    except InputError:  # there is none, or a damaged one
+        write_atomic(folder / _PARAMS, tensors)
+        write_signed(folder / POLICY_FILE, policy)
+        return
+    if held != json.loads(json.dumps(policy)):
+        raise InputError(f"{folder}: holds another policy than would be exported; keep it elsewhere or remove it")
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -50,11 +58,26 @@ def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     The parameters are a nested dict of NumPy arrays.
 
     Raises:
-      InputError: no export there, another format version, or files that do not belong together.
+      InputError: no export there, another format version, or files that are damaged or do not belong together.
+    """
+    policy = _read_policy(folder)
+    try:
+        params = _unflatten(safetensors.numpy.load_file(folder / _PARAMS))
+    except Exception as error:  # safetensors and NumPy raise errors of many types
+        raise InputError(f"{folder / _PARAMS}: holds no arrays ({error}); export the policy again") from error
+    return params, policy["spec"]
+
+
+def _read_policy(folder: Path) -> dict[str, Any]:
+    """Read what an export says of itself, whose parameters are those that were written.
+
+    Raises:
+      InputError: as `load_params`.
     """
     try:
         policy = json.loads((folder / POLICY_FILE).read_bytes())
-        tensors = (folder / _PARAMS).read_bytes()
+        with (folder / _PARAMS).open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{folder}: not an exported policy ({error.strerror}: {error.filename}); export it") from error
     except (ValueError, RecursionError) as error:
@@ -68,9 +91,12 @@ def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             f"{folder / POLICY_FILE}: has format version {policy['format_version']!r}, this code reads version "
             f"{FORMAT_VERSION}; export the policy again"
         )
-    if hashlib.sha256(tensors).hexdigest() != policy["params_sha256"]:
+    policy = verified(folder / POLICY_FILE, policy, "export the policy again")
+    if not isinstance(policy["spec"], dict):
+        raise InputError(f"{folder / POLICY_FILE}: spec is no JSON object; export the policy again")
+    if sha256 != policy["params_sha256"]:
         raise InputError(f"{folder / _PARAMS}: does not belong to {POLICY_FILE} or is damaged; export the policy again")
-    return _unflatten(safetensors.numpy.load(tensors)), policy["spec"]
+    return policy
 
 
 def _flatten(params: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:

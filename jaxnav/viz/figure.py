@@ -50,4 +50,4 @@ def fix_placement(figure: Figure) -> Figure:
 
 def set_title(axes: Axes, *lines: str) -> None:
     """Set the title, left."""
-    axes.set_title("\n".join(lines), loc="left", fontsize=8.5, color=INK)
+    axes.set_title("\n".join(lines), loc="left", fontsize=8.5, color=INK, parse_math=False)  # may hold a file's name

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from rich.table import Table
-from rich.text import Text
 
 from jaxnav.evaluation.scene_statistics import (
     SceneStatistics,
@@ -98,4 +97,4 @@ def _table(*columns: str) -> Table:
 
 
 def _add(table: Table, *cells: str) -> None:
-    table.add_row(*(Text(cell) for cell in cells))
+    table.add_row(*cells)

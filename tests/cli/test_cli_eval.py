@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import SEEDS, contents, evaluate, finished_run, refusal
+from support.records import resigned
 
 from jaxnav.cli.eval import EvalConfig, _target
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
@@ -137,12 +138,12 @@ def test_a_run_that_is_not_finished_is_refused(tmp_path, run_dir, capsys):
 
 def test_a_run_whose_method_is_not_there_is_refused(tmp_path, run_dir, capsys):
     run = shutil.copytree(run_dir, tmp_path / "run")
-    config = json.loads((run / "config.json").read_text())
     for name, problem in {
         "no_such_package:MINE": "cannot be imported (ModuleNotFoundError: No module named 'no_such_package'); inst",
         "orgy": "is unknown; did you mean 'org'?",
     }.items():
-        (run / "config.json").write_text(json.dumps(config | {"method": name}))
+        with resigned(run / "config.json") as config:
+            config["method"] = name
         assert evaluate(run) == 2
         assert f"method {name!r}: {problem}" in refusal(capsys)
     assert not list(run.glob("eval*"))
@@ -187,9 +188,8 @@ def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys
 def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
     shutil.copytree(run_dir, run)
-    config = json.loads((run / "config.json").read_text())
-    config["worlds"]["shift"] = 0.5  # of the run's own scenes; a file is taken as it is
-    (run / "config.json").write_text(json.dumps(config))
+    with resigned(run / "config.json") as config:
+        config["worlds"]["shift"] = 0.5  # of the run's own scenes; a file is taken as it is
     write_scenes(file, (generated("rooms", "val")[i] for i in range(2)))
     told = {}
     for shift, options in ((0.0, ()), (1.0, ("--shift", 1))):
@@ -215,10 +215,9 @@ def test_a_policy_of_a_file_is_evaluated_in_a_generated_world(run_dir, tmp_path,
     run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
     shutil.copytree(run_dir, run)
     assert evaluate(run, "--episodes", 8) == 0  # in the run's own rooms
-    config = json.loads((run / "config.json").read_text())
-    config["scenes"] = str(file)
-    config["worlds"]["shift"] = 0.5  # of the scenes of the file
-    (run / "config.json").write_text(json.dumps(config))
+    with resigned(run / "config.json") as config:
+        config["scenes"] = str(file)
+        config["worlds"]["shift"] = 0.5  # of the scenes of the file
     write_scenes(file, (generated("rooms", "val", seed=1)[i] for i in range(2)))
     assert evaluate(run, "--episodes", 8, "--world", "rooms") == 0
     rooms, own = (json.loads((run / name).read_text()) for name in ("eval-rooms-val.json", "eval-val.json"))
@@ -238,8 +237,7 @@ def test_a_policy_of_a_file_is_evaluated_in_a_generated_world(run_dir, tmp_path,
 def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(run_dir, run)
-    config = json.loads((run / "config.json").read_text())
-    config["detector"]["false_alarm"] = 0.25
-    (run / "config.json").write_text(json.dumps(config))
+    with resigned(run / "config.json") as config:
+        config["detector"]["false_alarm"] = 0.25
     assert evaluate(run) == 2
     assert "was trained for another task than its run says" in refusal(capsys)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 from support.commands import contents, evaluate, finished_run, refusal
+from support.records import resigned
 
 from jaxnav import __main__ as commands
 from jaxnav.baselines.difficulty import expected_length, random_success
@@ -105,8 +106,8 @@ def test_a_run_on_scenes_of_a_file(run_dir, tmp_path, capsys):
     scenes = generated("rooms", "val", 4)
     write_scenes(file, [scenes[i] for i in range(4)])
     shutil.copytree(run_dir, run)
-    settings = json.loads((run / "config.json").read_text()) | {"scenes": str(file)}
-    (run / "config.json").write_text(json.dumps(settings))
+    with resigned(run / "config.json") as settings:
+        settings["scenes"] = str(file)
     assert instrument(run, "--shift", 0, 1, "--episodes", 20) == 0
     first, last = json.loads((run / "instrument-val.json").read_text())["shifts"]
     # Places are exchanged: paths and goals nearly stay, what is seen together does not.

@@ -1,9 +1,9 @@
 """What is no exported policy is refused in one line that names it."""
 
-import json
 import shutil
 
 import pytest
+from support.records import resigned
 
 import jaxnav
 from jaxnav.errors import InputError
@@ -27,9 +27,8 @@ def refused(folder):
 
 def respecified(export, **changes):
     """The export with something changed in its spec."""
-    policy = json.loads((export / "policy.json").read_text())
-    policy["spec"] |= changes
-    (export / "policy.json").write_text(json.dumps(policy))
+    with resigned(export / "policy.json") as policy:
+        policy["spec"] |= changes
     return export
 
 

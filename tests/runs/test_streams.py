@@ -1,7 +1,6 @@
 """Runs whose policies decide in two streams: their settings, their exports, training and evaluation."""
 
 import dataclasses
-import json
 import shutil
 
 import chex
@@ -10,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
+from support.records import resigned
 from support.tiny_world import lively
 
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.runs.check import check
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.exports import export_policy
+from jaxnav.runs.policies import POLICIES
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.training.exploration import Exploration
 
@@ -52,9 +53,8 @@ def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
 
 def test_exports_that_do_not_name_a_decision_are_refused(drawn_run, tmp_path):
     folder = shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
-    exported = json.loads((folder / "policy.json").read_text())
-    assert exported["spec"].pop("decision") == "fused"
-    (folder / "policy.json").write_text(json.dumps(exported))
+    with resigned(folder / "policy.json") as exported:
+        assert exported["spec"].pop("decision") == "fused"
     with pytest.raises(InputError, match=r"layout-0: its spec does not fit this code \(KeyError: 'decision'\)"):
         jaxnav.load_policy(folder)
 

@@ -1,5 +1,6 @@
 """A log reaches sinks whole and once, also while it is written, and no sink is needed to train."""
 
+import dataclasses
 import json
 import struct
 import sys
@@ -10,9 +11,10 @@ from support.drawn_run import tiny_config
 
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import LOG_FILE, Run, claim
+from jaxnav.runs.directory import Run, claim
+from jaxnav.runs.logs import LOG_FILE
 from jaxnav.runs.tracking import send_log
-from jaxnav.store.runlog import append_row, truncate_after
+from jaxnav.store.runlog import append_rows, truncate_after
 
 MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
@@ -23,15 +25,14 @@ def row(step, arm="layout", seed=0, **values):
 
 @pytest.fixture
 def run(tmp_path):
-    """A run of one arm and two seeds that has just begun: 4 updates, 2 of them in a row of the log."""
-    config = tiny_config(tmp_path / "tiny", arms=("layout",))
+    """A run of one arm and two seeds that has just begun: 4 updates, a row of each seed for every one."""
+    config = tiny_config(tmp_path / "tiny", arms=("layout",), chunk=1)
     claim(config)
     return Run(config)
 
 
 def log(run, *rows):
-    for each in rows:
-        append_row(run.config.run_dir / LOG_FILE, each)
+    append_rows(run.config.run_dir / LOG_FILE, rows)
 
 
 @pytest.fixture
@@ -71,9 +72,9 @@ def sent(monkeypatch):
 
 def test_every_row_goes_to_its_series(run, sent):
     numbers, closed = sent
-    log(run, row(2, loss=0.5, val_success=None), row(2, seed=1, loss=0.25), row(4, loss=float("nan"), success=1.0))
+    log(run, row(1, loss=0.5, val_success=None), row(1, seed=1, loss=0.25), row(2, loss=float("nan"), success=1.0))
     assert send_log(run, ("tensorboard", "wandb")) == 3
-    expected = {("layout-0", 256, "loss"): 0.5, ("layout-1", 256, "loss"): 0.25, ("layout-0", 512, "success"): 1.0}
+    expected = {("layout-0", 128, "loss"): 0.5, ("layout-1", 128, "loss"): 0.25, ("layout-0", 256, "success"): 1.0}
     assert numbers == {(library, *key): value for library in MODULES for key, value in expected.items()}
     assert sorted(closed) == [(library, f"layout-{seed}") for library in sorted(MODULES) for seed in (0, 1)]
 
@@ -87,19 +88,20 @@ def test_a_run_that_goes_on_is_followed_to_its_end(run, sent):
         [
             lambda: truncate_after(path, 1),
             lambda: log(run, row(2, loss=2.0), row(2, seed=1, loss=2.5)),
-            lambda: path.write_bytes(path.read_bytes() + b'{"step": 4, "arm": "lay'),  # as it is being written
-            lambda: [truncate_after(path, 2), log(run, row(4, loss=4.0), row(4, seed=1, loss=4.5))],
+            lambda: path.write_bytes(path.read_bytes() + b'{"step": 3, "arm": "lay'),  # as it is being written
+            lambda: [truncate_after(path, 2), log(run, row(3, loss=3.0), row(3, seed=1, loss=3.5))],
+            lambda: log(run, row(4, loss=4.0), row(4, seed=1, loss=4.5)),
         ]
     )
-    assert send_log(run, ("tensorboard",), follow=True, wait=lambda _: next(parts)()) == 6
+    assert send_log(run, ("tensorboard",), follow=True, wait=lambda _: next(parts)()) == 8
     assert next(parts, None) is None
     by_seed = {seed: [value for key, value in numbers.items() if key[1] == f"layout-{seed}"] for seed in (0, 1)}
-    assert by_seed == {0: [1.0, 2.0, 4.0], 1: [1.0, 2.5, 4.5]}
+    assert by_seed == {0: [1.0, 2.0, 3.0, 4.0], 1: [1.0, 2.5, 3.5, 4.5]}
     assert len(closed) == 2
 
 
 def test_sinks_are_closed_where_the_log_is_damaged(run, sent):
-    log(run, row(2, loss=0.5))
+    log(run, row(1, loss=0.5))
 
     def damage(_):
         (run.config.run_dir / LOG_FILE).write_text("nothing\n\n")
@@ -111,7 +113,7 @@ def test_sinks_are_closed_where_the_log_is_damaged(run, sent):
 
 @pytest.mark.parametrize("extra", MODULES)
 def test_a_sink_that_is_not_installed_is_refused(run, extra, monkeypatch, capsys):
-    log(run, row(2, loss=0.5))
+    log(run, row(1, loss=0.5))
     monkeypatch.setitem(sys.modules, MODULES[extra], None)
     assert main(["log", str(run.config.run_dir), "--to", extra]) == 2
     words = " ".join(capsys.readouterr().err.split())
@@ -119,7 +121,7 @@ def test_a_sink_that_is_not_installed_is_refused(run, extra, monkeypatch, capsys
 
 
 def test_the_command_tells_what_it_sent(run, sent, capsys):
-    log(run, row(2, loss=0.5))
+    log(run, row(1, loss=0.5))
     assert main(["log", str(run.config.run_dir), "--to", "tensorboard", "wandb"]) == 0
     assert capsys.readouterr().err.split()[:2] == ["1", "rows"]
 
@@ -130,7 +132,8 @@ def test_the_command_tells_what_it_sent(run, sent, capsys):
 def test_event_files_hold_the_log(run):
     """The records of a file: length uint64, its checksum, the event, its checksum; a second time replaces the first."""
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
-    log(run, row(2, loss=0.5, success=0.25), row(4, loss=0.125))
+    run = Run(dataclasses.replace(run.config, seeds=1))
+    log(run, row(1, loss=0.5, success=0.25), row(2, loss=0.125))
     for _ in range(2):
         send_log(run, ("tensorboard",))
     (file,) = (run.config.run_dir / "tensorboard" / "layout-0").iterdir()
@@ -140,7 +143,7 @@ def test_event_files_hold_the_log(run):
         event = event_pb2.Event.FromString(data[place + 12 : place + 12 + length])
         found |= {(event.step, value.tag): value.simple_value for value in event.summary.value}
         place += 16 + length
-    assert found == {(256, "loss"): 0.5, (256, "success"): 0.25, (512, "loss"): 0.125}
+    assert found == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
 
 
 def wandb_records(file):
@@ -164,7 +167,8 @@ def test_wandb_keeps_the_log_offline(run, monkeypatch):
     wandb_internal_pb2 = pytest.importorskip("wandb.proto.wandb_internal_pb2")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    log(run, row(2, loss=0.5, success=0.25), row(4, loss=0.125))
+    run = Run(dataclasses.replace(run.config, seeds=1))
+    log(run, row(1, loss=0.5, success=0.25), row(2, loss=0.125))
     send_log(run, ("wandb",))
     (file,) = (run.config.run_dir / "wandb").glob("offline-run-*/*.wandb")
     found = {}
@@ -172,4 +176,4 @@ def test_wandb_keeps_the_log_offline(run, monkeypatch):
         record = wandb_internal_pb2.Record.FromString(data)
         items = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
         found |= {(items["_step"], name): value for name, value in items.items() if not name.startswith("_")}
-    assert found == {(256, "loss"): 0.5, (256, "success"): 0.25, (512, "loss"): 0.125}
+    assert found == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}

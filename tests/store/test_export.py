@@ -27,15 +27,21 @@ def test_params_round_trip_and_read_with_safetensors_alone(tmp_path):
     chex.assert_trees_all_equal(params, PARAMS, strict=True)
     flat = safetensors.numpy.load_file(tmp_path / "policy" / "params.safetensors")
     assert sorted(flat) == ["scale", "torso/dense/kernel"]
-    export_params(tmp_path / "policy", PARAMS, SPEC)  # not contiguous: the transposed kernel keeps its order
-    chex.assert_trees_all_equal(load_params(tmp_path / "policy")[0], PARAMS)
+    export_params(tmp_path / "again", PARAMS, SPEC)  # not contiguous: the transposed kernel keeps its order
+    chex.assert_trees_all_equal(load_params(tmp_path / "again")[0], PARAMS)
 
 
-def test_an_export_is_replaced_and_leaves_two_files(tmp_path):
+def test_an_export_stays_is_mended_and_is_not_replaced_by_another(tmp_path):
     export_params(tmp_path, PARAMS, SPEC)
-    export_params(tmp_path, {"scale": np.float32(3)}, {"method": "org"})
-    assert load_params(tmp_path) == ({"scale": np.float32(3)}, {"method": "org"})
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["params.safetensors", "policy.json"]
+    written = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert sorted(written) == ["params.safetensors", "policy.json"]
+    for params, spec in (({"scale": np.float32(3)}, SPEC), (PARAMS, {"method": "org"})):
+        with pytest.raises(InputError, match="holds another policy than would be exported"):
+            export_params(tmp_path, params, spec)
+    for name in written:
+        (tmp_path / name).write_bytes(b"damaged")
+        export_params(tmp_path, PARAMS, SPEC)
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == written
 
 
 def test_reading_an_export_needs_no_jax(tmp_path):
@@ -79,6 +85,7 @@ def test_broken_exports_are_refused(tmp_path, file, content, problem):
 
 def test_an_export_killed_between_its_files_is_refused_not_mixed(tmp_path, monkeypatch):
     export_params(tmp_path, PARAMS, SPEC)
+    (tmp_path / "params.safetensors").write_bytes(b"damaged")  # or it would not be replaced
     replace = os.replace
 
     def killed_at_policy(source, target):

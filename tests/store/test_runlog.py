@@ -1,25 +1,39 @@
 """The run log: rows, torn lines, and resuming."""
 
+import hashlib
+import json
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.errors import InputError
-from jaxnav.store.runlog import append_row, read_rows, truncate_after
+from jaxnav.store.runlog import append_rows, read_rows, truncate_after
 
 
 @pytest.fixture
 def log(tmp_path):
     path = tmp_path / "metrics.jsonl"
     for step in (10, 20, 30):
-        append_row(path, {"step": step, "loss": step / 4})
+        append_rows(path, [{"step": step, "loss": step / 4}])
     return path
 
 
-def test_rows_are_one_json_object_per_line(log):
-    assert log.read_text() == '{"step": 10, "loss": 2.5}\n{"step": 20, "loss": 5.0}\n{"step": 30, "loss": 7.5}\n'
-    append_row(log, {"step": 40, "loss": float("nan"), "spl": float("inf"), "note": None})
+def test_rows_are_one_json_object_per_line_with_its_digest(log):
+    *_, row = map(json.loads, log.read_text().splitlines())
+    assert list(row) == ["step", "loss", "digest"]
+    # The SHA-256 of the row with sorted keys and without spaces, by hand.
+    assert row["digest"] == hashlib.sha256(b'{"loss":7.5,"step":30}').hexdigest()[:16]
+    append_rows(log, [{"step": 40, "loss": float("nan"), "spl": float("inf"), "note": None}])
     assert read_rows(log)[-1] == {"step": 40, "loss": None, "spl": None, "note": None}
+
+
+def test_a_log_of_an_earlier_version_is_read_and_signed_when_it_is_resumed(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n')
+    assert read_rows(path) == [{"step": 1}, {"step": 2}, {"step": 3}]
+    truncate_after(path, 2)
+    assert [list(json.loads(line)) for line in path.read_text().splitlines()] == [["step", "digest"]] * 2
 
 
 @pytest.mark.parametrize(("step", "kept"), [(0, 0), (10, 1), (25, 2), (30, 3), (99, 3)])
@@ -29,11 +43,11 @@ def test_rows_after_the_restored_step_are_dropped(log, step, kept):
     assert log.read_bytes() == b"".join(lines[:kept])  # what stays, stays to the byte
 
 
-@pytest.mark.parametrize("lost", range(1, 27))
+@pytest.mark.parametrize("lost", range(1, 57))
 def test_a_torn_last_line_is_dropped(log, lost):
-    # The last line has 26 bytes with its line end; without only the line end the row is whole and kept.
+    # The last line has 56 bytes with its line end; without only the line end the row is whole and kept.
     lines = log.read_bytes().splitlines(keepends=True)
-    assert len(lines[-1]) == 26
+    assert len(lines[-1]) == 56
     log.write_bytes(log.read_bytes()[:-lost])
     assert len(read_rows(log)) == (3 if lost == 1 else 2)
     truncate_after(log, 30)
@@ -58,7 +72,7 @@ def test_a_missing_log_has_no_rows(tmp_path):
 def test_any_row_reads_back_and_survives_truncation_to_the_byte(tmp_path_factory, row):
     path = tmp_path_factory.getbasetemp() / "any.jsonl"
     path.unlink(missing_ok=True)
-    append_row(path, row | {"step": 1})
+    append_rows(path, [row | {"step": 1}])
     before = path.read_bytes()
     assert read_rows(path) == [row | {"step": 1}]
     truncate_after(path, 1)

@@ -11,8 +11,9 @@ from jaxnav.layout import SETTINGS
 from jaxnav.policies.methods import Knowledge
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.directory import Run, claim
+from jaxnav.runs.exports import export_policy
 from jaxnav.runs.overlay import apply_yaml
-from jaxnav.runs.policies import POLICIES, export_policy
+from jaxnav.runs.policies import POLICIES
 from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import layout_priors
 from jaxnav.training.exchange import chances

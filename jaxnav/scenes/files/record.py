@@ -5,6 +5,7 @@ Every error says where the value is and how to mend it.
 
 import dataclasses
 import gzip
+import io
 import json
 import reprlib
 import zlib
@@ -42,6 +43,8 @@ class Record:
         """Return a value that must be a text, not empty."""
         if not isinstance(value, str) or not value:
             raise self.error(field, f"is {reprlib.repr(value)}; give a text")
+        if any("\ud800" <= character <= "\udfff" for character in value):
+            raise self.error(field, f"is {reprlib.repr(value)}, which holds half a character; write the whole one")
         return value
 
     def number(self, field: str, value: Any) -> float:
@@ -81,15 +84,30 @@ def read_bytes(path: Path) -> bytes:
     """Read a file, and decompress it if it is gzip.
 
     Raises:
-      InputError: the file is missing or damaged.
+      InputError: the file is missing or damaged, or too large when decompressed.
     """
     try:
         content = path.read_bytes()
-        return gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+        if content[:2] != b"\x1f\x8b":
+            return content
+        most = largest(len(content))
+        with gzip.open(io.BytesIO(content)) as file:
+            content = file.read(most + 1)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise InputError(f"{path}: is cut short or damaged ({error}); fetch or write it again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    if len(content) > most:
+        raise InputError(f"{path}: holds more than {most:,} bytes; split it, or give it uncompressed")
+    return content
+
+
+def largest(compressed: int) -> int:
+    """Return the most bytes that a file of so many compressed ones may hold.
+
+    Scenes hold 4 to 10 times as many; 64 MiB are allowed in any case.
+    """
+    return max(2**26, 50 * compressed)
 
 
 def parse_json(where: str, text: bytes) -> Any:

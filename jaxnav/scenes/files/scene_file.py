@@ -13,7 +13,7 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.files.record import Record, parse_json, read_bytes
 from jaxnav.scenes.files.walls import derive_walls
 from jaxnav.scenes.generate.sizes import typical_box
-from jaxnav.scenes.scene import CELL, SPLITS, Room, Scene
+from jaxnav.scenes.scene import CELL, MAX_SIDE, SPLITS, Room, Scene
 from jaxnav.store.files import write_atomic
 
 _POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
@@ -102,8 +102,8 @@ def _scene(record: Record) -> Scene:
         raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL} is known")
     origin = _origin(record)
     shape = record.sequence("shape", record.get("shape"), 2)
-    if not all(type(n) is int and n > 0 for n in shape):
-        raise record.error("shape", f"is {reprlib.repr(shape)}; give two positive whole numbers [nz, nx]")
+    if not all(type(n) is int and 0 < n <= MAX_SIDE for n in shape):
+        raise record.error("shape", f"is {reprlib.repr(shape)}; give two whole numbers [nz, nx] from 1 to {MAX_SIDE}")
     reach = _mask(record, "reach", shape)
     if "episode_starts" in record.fields:
         reach |= _mask(record, "episode_starts", shape)

@@ -1,7 +1,6 @@
 """Compilation of shards, in one process or in several."""
 
 import dataclasses
-import json
 import multiprocessing
 import os
 import shutil
@@ -18,6 +17,7 @@ import numpy as np
 
 from jaxnav.scenes.tables.compile import Bank, checksum, compile_scene, join
 from jaxnav.scenes.task import Task
+from jaxnav.store.signed import write_signed
 
 if TYPE_CHECKING:
     from jaxnav.scenes.worlds import Scenes
@@ -106,8 +106,11 @@ def _write(path: Path, texts: dict[str, Any], arrays: dict[str, np.ndarray]) -> 
     try:
         part.mkdir()
         for field, array in arrays.items():
-            np.save(part / f"{field}.npy", array)
-        (part / "shard.json").write_text(json.dumps(texts, indent=1))
+            with (part / f"{field}.npy").open("wb") as file:
+                np.save(file, array)
+                file.flush()
+                os.fsync(file.fileno())
+        write_signed(part / "shard.json", texts)
         part.rename(path)  # fails if the shard exists
     except OSError:
         # Another process that compiles the same shards may have finished first and removed this part.

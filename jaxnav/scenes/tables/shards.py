@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import itertools
-import json
 import os
 import shutil
 import zlib
@@ -14,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.tables.compile import Bank, no_goal
+from jaxnav.scenes.tables.compile import Bank, checksum, no_goal
 from jaxnav.scenes.tables.shard_workers import ARRAYS, TEXTS, ShardWork, compile_missing
 from jaxnav.scenes.task import Task
+from jaxnav.store.signed import read_signed
 
 if TYPE_CHECKING:
     from jaxnav.scenes.worlds import Scenes
@@ -28,6 +28,7 @@ _CODE = (
     *("files/record.py", "files/scene_file.py", "files/walls.py"),
 )
 _SOURCE = Path(__file__).parents[1]
+_MEND = "delete the folder {}, then it is compiled again"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,13 +119,17 @@ def compile_shards(
 
 
 def _open(folder: Path, work: ShardWork) -> Shards:
-    """Describe compiled shards by their texts."""
+    """Describe compiled shards by their texts, and compare their checksums.
+
+    Raises:
+      InputError: no scene has a reachable goal, or a shard is damaged.
+    """
     texts = [_read_texts(path) for path in work.paths]
     usable = [(path, text) for path, text in zip(work.paths, texts, strict=True) if text["names"]]
     if not usable:
         raise no_goal(len(work.scenes), work.task)
     counts = tuple(len(text["names"]) for _, text in usable)
-    return Shards(
+    shards = Shards(
         folder=folder,
         task=work.task,
         paths=tuple(path for path, _ in usable),
@@ -134,6 +139,10 @@ def _open(folder: Path, work: ShardWork) -> Shards:
         skipped=tuple(name for text in texts for name in text["skipped"]),
         checksum=zlib.crc32(repr([text["checksum"] for _, text in usable]).encode()),
     )
+    for bank, (path, text) in zip(shards, usable, strict=True):
+        if (len(bank.ahead), checksum(bank)) != (text["cells"], text["checksum"]):
+            raise InputError(f"{path}: is damaged (its checksum is another); {_MEND.format(path)}")
+    return shards
 
 
 def _key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
@@ -147,7 +156,7 @@ def _key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
 
 
 def _read_texts(path: Path) -> dict[str, Any]:
-    return _intact(path / "shard.json", lambda file: json.loads(file.read_bytes()))
+    return read_signed(path / "shard.json", _MEND.format(path))
 
 
 def _map(path: Path) -> np.ndarray:
@@ -163,6 +172,4 @@ def _intact(path: Path, read: Callable[[Path], Any]) -> Any:
     try:
         return read(path)
     except Exception as error:  # a damaged header can bring about any
-        raise InputError(
-            f"{path}: is missing or damaged ({error}); delete the folder {path.parent}, then it is compiled again"
-        ) from error
+        raise InputError(f"{path}: is missing or damaged ({error}); {_MEND.format(path.parent)}") from error

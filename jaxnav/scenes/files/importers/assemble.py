@@ -7,10 +7,9 @@ import numpy as np
 
 from jaxnav.scenes.files.record import Record
 from jaxnav.scenes.files.walls import derive_walls
-from jaxnav.scenes.scene import CELL, Room, Scene
+from jaxnav.scenes.scene import CELL, MAX_SIDE, Room, Scene
 
 SNAP = 0.02  # metres; a standable point may be this far off the lattice
-MAX_SIDE = 2000  # cells; a larger extent is a mistake
 MARGIN = 3  # cells around the standable ones; what lies beyond is indistinguishable from a wall
 
 

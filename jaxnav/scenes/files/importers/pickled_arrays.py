@@ -14,7 +14,9 @@ import numpy as np
 
 from jaxnav.errors import InputError
 
-_LIMIT = 2**32  # bytes of a file when decompressed
+#: Bytes of a file at most when decompressed: maps are nearly empty, so they compress well.
+_LEAST, _MOST, _RATIO = 2**26, 2**32, 2000
+_READS = 2**20  # of parts; a file of maps has some hundreds for each scene
 
 
 class PickledArray:
@@ -117,10 +119,11 @@ def _array(data: bytes, dtype: _Dtype, shape: tuple[int, ...], order: Literal["C
 
 
 class _Limited:
-    """Read `_LIMIT` bytes of a stream at most."""
+    """Read so many bytes and parts of a stream at most."""
 
     def __init__(self, path: Path, stream: IO[bytes]):
-        self._path, self._stream, self._left = path, stream, _LIMIT
+        self._path, self._stream, self._reads = path, stream, _READS
+        self._most = self._left = min(max(_LEAST, _RATIO * path.stat().st_size), _MOST)
 
     def read(self, size: int) -> bytes:
         self._take(size)
@@ -132,6 +135,8 @@ class _Limited:
         return line
 
     def _take(self, size: int) -> None:
-        self._left -= size
+        self._left, self._reads = self._left - size, self._reads - 1
         if self._left < 0:
-            raise InputError(f"{self._path}: holds more than {_LIMIT} bytes; split it")
+            raise InputError(f"{self._path}: holds more than {self._most:,} bytes; split it")
+        if self._reads < 0:
+            raise InputError(f"{self._path}: holds more than {_READS:,} parts; split it, or give arrays")

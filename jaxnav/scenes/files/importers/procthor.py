@@ -14,12 +14,12 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers import polygons
-from jaxnav.scenes.files.importers.assemble import MAX_SIDE, Note, Thing, lattice_cells, scene
+from jaxnav.scenes.files.importers.assemble import Note, Thing, lattice_cells, scene
 from jaxnav.scenes.files.importers.procthor_objects import read_assets, read_objects
 from jaxnav.scenes.files.importers.procthor_walls import read_rooms, read_walls
 from jaxnav.scenes.files.record import Record, parse_json, read_bytes
 from jaxnav.scenes.generate.rooms import AGENT_RADIUS, OBSTACLE_HEIGHTS
-from jaxnav.scenes.scene import CELL, Room, Scene
+from jaxnav.scenes.scene import CELL, MAX_SIDE, Room, Scene
 
 _FARTHEST = 2  # cells that an agent's place may be from free floor
 

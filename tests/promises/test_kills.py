@@ -1,4 +1,7 @@
-"""A training run that is killed and started again, against one that is left alone."""
+"""A run that is killed at any moment and started again ends as one that is left alone, bit for bit.
+
+The control is in the test: a run with another seed differs.
+"""
 
 import os
 import random

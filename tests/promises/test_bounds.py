@@ -1,0 +1,163 @@
+"""Sizes are checked before memory is taken, and what is missing is told in one line.
+
+Seen to fail, each planted alone: `largest` without a limit, pickles of any number of parts, lists of any number of
+episodes, a console that does not know `MemoryError`, a `jaxnav` that does not know `BrokenPipeError`.
+"""
+
+import bz2
+import errno
+import gzip
+import os
+import resource
+import subprocess
+import sys
+import tracemalloc
+
+import pytest
+from support.commands import train, write_config
+from support.fuzz import KINDS, fuzz
+from support.processes import REPOSITORY
+from support.tiny_world import BANK
+
+from jaxnav.cli.console import exit_code
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import MAX_EPISODES, episode_list
+from jaxnav.scenes.files.importers.pickled_arrays import read_pickle
+from jaxnav.scenes.files.record import largest, read_bytes
+
+MIB = 2**20
+
+
+def test_compressed_zeros_are_refused_within_a_limit_of_memory(tmp_path):
+    bomb = tmp_path / "rooms.jsonl.gz"
+    with gzip.GzipFile(bomb, "wb", compresslevel=1) as file:
+        for _ in range(192):
+            file.write(bytes(MIB))
+    # 192 MiB in less than one; 64 MiB and one byte are read, and copied once.
+    assert bomb.stat().st_size < MIB
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"rooms.jsonl.gz: holds more than 67,108,864 bytes; split it"):
+        read_bytes(bomb)
+    assert tracemalloc.get_traced_memory()[1] < 160 * MIB
+    tracemalloc.stop()
+
+
+def test_what_a_file_may_hold_grows_with_it():
+    assert [largest(size) // MIB for size in (0, MIB, 2 * MIB, 100 * MIB)] == [64, 64, 100, 5000]
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"N0" * 2**21, "holds more than 1,048,576 parts"),  # pushed and popped, two bytes at a time
+        (b"I" + b"1" * 2**27, "holds more than 67,108,864 bytes"),  # one line
+    ],
+)
+def test_a_pickle_of_nothing_is_refused_soon(tmp_path, content, problem):
+    path = tmp_path / "maps.pbz2"
+    path.write_bytes(bz2.compress(content, 1))
+    with pytest.raises(InputError, match=problem):
+        read_pickle(path)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--seeds", 10**9),
+        ("--total-steps", 10**18),
+        ("--chunk", 10**9),
+        ("--save-every", 10**9),
+        ("--validations", 10**9),
+        ("--val-episodes", 10**9),
+        ("--layout.walks", 10**9),
+        ("--ppo.num-envs", 10**9),
+        ("--ppo.rollout", 10**9),
+        ("--sizes.hidden", 10**9),
+        ("--worlds.num-train", 10**9),
+        ("--worlds.step-limit", 10**9),
+    ],
+)
+def test_absurd_sizes_are_refused_before_anything_is_made(tmp_path, capsys, option, value):
+    assert train(write_config(tmp_path), tmp_path / "run", option, value) == 2
+    error = capsys.readouterr().err
+    assert f"{option.removeprefix('--').replace('-', '_')} is {value}; give at most " in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_products_of_sizes_are_bounded_too(tmp_path, capsys):
+    config = write_config(tmp_path)
+    assert train(config, tmp_path / "run", "--layout.walks", 10**6, "--layout.steps", 10**6) == 2
+    assert "layout.walks x layout.steps is 1000000000000; give at most 268,435,456" in capsys.readouterr().err
+    assert train(config, tmp_path / "run", "--total-steps", 10**12, "--chunk", 1) == 2
+    assert "makes 7,812,500,000 chunks; give a larger chunk" in capsys.readouterr().err  # of 16 x 8 steps
+    with pytest.raises(InputError, match=f"--episodes 1000001: give at least 1, and at most {MAX_EPISODES}"):
+        episode_list(BANK, MAX_EPISODES + 1)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (
+            MemoryError("Unable to allocate 6 GiB"),
+            "error: there is not enough memory (Unable to allocate 6 GiB); give ",
+        ),
+        (OSError(errno.ENOSPC, "No space left on device", "a/b"), "error: a/b: No space left on device; mend the path"),
+        (OSError(errno.EROFS, "Read-only file system", "a/b"), "error: a/b: Read-only file system; mend the path"),
+        (PermissionError(errno.EACCES, "Permission denied", "a"), "error: a: Permission denied; mend the path, its"),
+    ],
+)
+def test_what_the_system_refuses_is_told_in_a_line(capsys, error, told):
+    def command(_):
+        raise error
+
+    assert exit_code(command) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(told)
+    assert message.count("\n") == 1
+
+
+def test_a_mistake_of_the_program_is_not_hidden():
+    def command(_):
+        raise KeyError("a bug")
+
+    with pytest.raises(KeyError):
+        exit_code(command)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        *(pytest.param(each, marks=pytest.mark.slow) for each in (["train", "--help"], ["scenes", "stats", "rooms"])),
+    ],
+)
+def test_a_reader_that_leaves_ends_the_command_quietly(arguments):
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run(
+        [sys.executable, "-m", "jaxnav", *arguments], cwd=REPOSITORY, stdout=write, stderr=subprocess.PIPE, check=False
+    )
+    os.close(write)
+    assert b"Traceback" not in ended.stderr
+    assert b"Exception ignored" not in ended.stderr
+    assert ended.returncode in (1, 141)  # 1 is what rich ends with
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_random_input_never_ends_a_command_otherwise_than_by_code(kind, tmp_path):
+    codes, slowest = fuzz(kind, tmp_path, 15, seed=0)
+    assert set(codes) <= {0, 2}, codes
+    assert codes[2] > 0
+    assert slowest < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_thousand_random_inputs_neither_crash_nor_hang_nor_fill_the_memory(kind, tmp_path):
+    codes, slowest = fuzz(kind, tmp_path, 1000, seed=1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # MiB
+    print(kind, dict(codes), f"slowest {slowest:.1f} s, peak {peak:.0f} MiB")
+    assert set(codes) <= {0, 2}, codes
+    assert slowest < 10
+    assert peak < 1024

@@ -1,0 +1,96 @@
+"""A training that is asked to end finishes its chunk, saves, and says how to go on.
+
+Seen to fail: with a handler that does not step back after the first signal, so that the second Ctrl-C ends nothing.
+"""
+
+import re
+import signal
+import threading
+import time
+
+import pytest
+from rich.console import Console
+from support.commands import train, write_config
+from support.processes import run
+
+from jaxnav.cli.console import exit_code
+from jaxnav.errors import Interrupted
+from jaxnav.runs.interrupts import Interrupts
+
+LIMIT_S = 30
+#: 60 updates; checkpoints are rare, so that the one after the signal is for the signal.
+LONG = ("--total-steps", 60 * 128, "--save-every", 7)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The directory of a run that is left alone."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert train(write_config(folder), folder / "run", *LONG) == 0
+    return folder / "run"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_run_that_is_asked_to_end_saves_and_goes_on_to_the_same_end(whole, tmp_path, capsys, number, code):
+    config_file, ended = write_config(tmp_path), tmp_path / "ended"
+    process = run(["train.py", "--config", config_file, "--run-dir", ended, *LONG])
+    while process.poll() is None and not (ended / "metrics.jsonl").exists():
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, error = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == code, error
+    told = error.splitlines()[-1]
+    found = re.fullmatch(
+        rf"interrupted: {ended}: stopped after update (\d+) of 60 and saved; the same command goes on from there", told
+    )
+    assert found, error
+    assert "Traceback" not in error
+    assert [path.name for path in (ended / "checkpoints").iterdir()] == [found[1]]
+    assert train(config_file, ended, *LONG) == 0
+    assert f"resumed after update {found[1]} of 60" in capsys.readouterr().err
+    for name in ("metrics.jsonl", "policies/baseline-1/params.safetensors", "policies/layout-0/params.safetensors"):
+        assert (ended / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_the_first_signal_is_noted_and_the_second_ends_the_process():
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before = signal.getsignal(number)
+        with Interrupts() as interrupts:
+            assert interrupts.asked() == 0
+            signal.raise_signal(number)
+            assert interrupts.asked() == number
+            # What the system does by itself: it ends the process, wherever it is.
+            assert {signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)} == {signal.SIG_DFL}
+        assert signal.getsignal(number) == before
+
+
+def test_threads_without_signals_train_too():
+    seen = []
+
+    def enter():
+        with Interrupts() as interrupts:
+            seen.append(interrupts.asked())
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert seen == [0]
+
+
+@pytest.mark.parametrize(
+    ("end", "code", "told"),
+    [
+        (Interrupted(signal.SIGTERM, "runs/a: saved"), 143, "interrupted: runs/a: saved; the same command goes on"),
+        (Interrupted(signal.SIGINT, "runs/a: saved"), 130, "interrupted: runs/a: saved; the same command goes on"),
+        (KeyboardInterrupt(), 130, "interrupted: "),
+    ],
+)
+def test_every_command_tells_an_interrupt_in_a_line(capsys, end, code, told):
+    def command(_: Console) -> None:
+        raise end
+
+    assert exit_code(command) == code
+    error = capsys.readouterr().err
+    assert error.startswith(told)
+    assert error.count("\n") == 1

@@ -1,0 +1,144 @@
+"""A name that comes from a file, a path or a command line is shown as text, whatever it holds.
+
+Seen to fail: with a console that takes markup, `[/x]` in a path ends the commands with a `MarkupError`; without
+`printable` escapes reach the terminal; with figures that parse mathematics, `$` in the name of a scene file ends the
+drawing of the learning curves.
+"""
+
+import dataclasses
+import gzip
+import unicodedata
+
+import pytest
+from rich.table import Table
+from support.scenes import SMALL, draw
+
+from jaxnav.__main__ import COMMANDS, main
+from jaxnav.cli.console import PlainConsole, exit_code, printable
+from jaxnav.errors import InputError
+from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
+from jaxnav.viz.learning import learning_figure
+
+#: Markup, a colour, a bell, a new line, letters turned round, and mathematics without an end.
+HOSTILE = "[/x][bold]\x1b[31m\x07\n\u202e$\\frac$"
+
+#: What each command is given besides a hostile name, in place of `@`.
+GIVEN = {
+    "train": [("--run-dir", "@", "--scenes", "@"), ("--config", "@"), ("--method", "@")],
+    "eval": [("@",), ("@", "--scenes", "@"), ("@", "--json", "@")],
+    "account": [("@", "--without", "@")],
+    "mixture": [("@", "--without", "@")],
+    "report": [("@",), ("@", "--beside", "@"), ("@", "--out", "@")],
+    "export": [("@",), ("@", "--policy", "@")],
+    "episode": [("@",), ("@", "--scenes", "@")],
+    "instrument": [("@",), ("--config", "@")],
+    "study": [("--config", "@")],
+    "compare": [("--config", "@")],
+    "scenes": [
+        ("stats", "@"),
+        ("show", "@"),
+        ("import", "procthor", "@", "@"),
+        ("import", "scenes", "@", "@.jsonl.gz"),
+    ],
+    "table": [("@",)],
+    "no such command @": [()],
+}
+
+
+def assert_harmless(told):
+    assert told
+    assert "Traceback" not in told
+    hidden = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+    assert not [each for each in told.replace("\n", "") if unicodedata.category(each) in hidden]
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [(name, given) for name, each in GIVEN.items() for given in each], ids=lambda value: str(value)
+)
+def test_every_command_shows_hostile_names_as_text(name, given, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = [each.replace("@", HOSTILE) for each in (name, *given)]
+    try:
+        code = main(arguments)
+    except SystemExit as end:  # from the parser
+        code = end.code
+    assert code == 2
+    told = capsys.readouterr()
+    assert_harmless(told.err or told.out)
+
+
+def test_every_command_is_given_hostile_names():
+    assert set(COMMANDS) <= set(GIVEN)
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    """A scene file whose every text is hostile."""
+    room = draw(["....", "...."], (HOSTILE, 0.25, 0.8, 0.0, *SMALL), ("Book", 0.75, 0.8, 0.0, *SMALL))
+    scenes = [
+        dataclasses.replace(room, name=f"{HOSTILE} {split}", room_type=HOSTILE, split=split, world=HOSTILE)
+        for split in ("train", "val")
+    ]
+    write_scenes(tmp_path / "rooms.jsonl.gz", scenes)
+    return tmp_path / "rooms.jsonl.gz"
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("stats",),
+        ("stats", "--split", "val"),
+        ("show", "--scene", "none"),
+        ("show", "--index", "0", "--out", "a.png"),
+        ("import", "scenes"),
+    ],
+    ids=str,
+)
+def test_hostile_names_in_a_scene_file_are_text(given, scene_file, monkeypatch, capsys):
+    monkeypatch.chdir(scene_file.parent)
+    command, *options = given
+    target = ["out.jsonl.gz"] if command == "import" else []
+    form = [options.pop(0)] if command == "import" else []
+    assert main(["scenes", command, *form, str(scene_file), *target, *options]) in (0, 2)
+    told = capsys.readouterr()
+    assert_harmless(told.out + told.err)
+
+
+def test_a_console_shows_markup_and_escapes_in_lines_tables_and_titles(capsys):
+    table = Table("[/x]", title=HOSTILE)
+    table.add_row(HOSTILE, style="bold")
+    console = PlainConsole(width=120)
+    console.print(f"{HOSTILE} :smile:", style="bold")
+    console.print(table)
+    told = capsys.readouterr().out
+    assert_harmless(told)
+    assert told.startswith(r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile:")
+
+
+def test_a_refusal_is_one_line(capsys):
+    def refused(_):
+        raise InputError(f"{HOSTILE}: mend it")
+
+    assert exit_code(refused) == 2
+    told = capsys.readouterr().err
+    assert_harmless(told)
+    assert told.count("\n") == 1
+
+
+def test_letters_of_any_language_stay():
+    assert printable("Küche, 台所, кухня, 🍳, ́") == "Küche, 台所, кухня, 🍳, ́"
+    assert printable("a\nb\x1bc", kept="\n") == "a\nb\\x1bc"
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")  # an escape is drawn as a box
+def test_a_title_in_a_figure_is_text():
+    row = {"arm": "layout", "env_steps": 1, "success": 0.5}
+    learning_figure([row], None, f"ORG in {HOSTILE}")
+
+
+def test_half_a_character_is_refused(scene_file):
+    text = gzip.decompress(scene_file.read_bytes()).replace(b"\\u202e", b"\\ud800")
+    scene_file.write_bytes(text)
+    with pytest.raises(InputError, match=r"name is .*, which holds half a character; write the whole one"):
+        read_scenes(scene_file)

@@ -1,0 +1,114 @@
+"""One process at a time writes to a run directory.
+
+Seen to fail: without `fcntl.flock` in `Lock.acquire` a second training is not refused; with a lock that counts as held
+wherever its file exists, one that was killed blocks the next; without `Lock.check` a run whose directory was removed
+ends as if all were well.
+"""
+
+import dataclasses
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from support.commands import train, write_config
+from support.drawn_run import tiny_config
+from support.processes import REPOSITORY, run
+
+from jaxnav.errors import InputError
+from jaxnav.runs.directory import claimed
+from jaxnav.store.lock import LOCK_FILE, Lock
+
+HOLDING = """
+import sys
+from pathlib import Path
+from jaxnav.runs.directory import claimed
+from jaxnav.store.lock import Lock
+Lock(Path(sys.argv[1])).acquire()
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that holds the folder."""
+    pipe = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", HOLDING, str(tmp_path)], cwd=REPOSITORY, **pipe) as process:
+        assert process.stdout
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def test_a_second_process_is_refused_in_a_line_that_names_the_first(tmp_path, holder):
+    with pytest.raises(InputError) as error:
+        Lock(tmp_path).acquire()
+    named = re.escape(f"process {holder.pid} on {socket.gethostname()}")
+    assert re.fullmatch(f"{tmp_path}: {named} writes to it; wait for that, end it, or choose .*", str(error.value))
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_the_lock_of_a_process_that_is_gone_holds_nothing(tmp_path, holder, end):
+    holder.send_signal(end)
+    holder.wait()
+    assert str(holder.pid) in (tmp_path / LOCK_FILE).read_text()
+    lock = Lock(tmp_path)
+    lock.acquire()
+    with pytest.raises(InputError, match=f"process {os.getpid()} on "):
+        Lock(tmp_path).acquire()
+    lock.release()
+    Lock(tmp_path).acquire()
+
+
+def test_a_folder_that_is_removed_or_replaced_is_told(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    lock = Lock(folder)
+    lock.check()  # of a process that holds nothing, such as the second of a run
+    lock.acquire()
+    lock.check()
+    shutil.rmtree(folder)
+    with pytest.raises(InputError, match=f"{folder}: was removed or replaced while this run wrote to it"):
+        lock.check()
+    folder.mkdir()
+    Lock(folder).acquire()
+    with pytest.raises(InputError, match="was removed or replaced"):
+        lock.check()
+
+
+def test_a_run_directory_is_held_while_it_is_claimed(tmp_path):
+    config = tiny_config(tmp_path)
+    with claimed(config):
+        before = (config.run_dir / "config.json").read_bytes()
+        with pytest.raises(InputError, match=f"process {os.getpid()} on .* writes to it"), claimed(config):
+            pass
+        with pytest.raises(InputError, match="holds another run"), claimed(dataclasses.replace(config, seed=5)):
+            pass
+        assert (config.run_dir / "config.json").read_bytes() == before
+    with pytest.raises(InputError, match="holds another run"), claimed(dataclasses.replace(config, seed=5)):
+        pass
+    with claimed(config):  # let go of, also after a refusal
+        pass
+
+
+@pytest.mark.slow
+def test_a_second_training_is_refused_and_one_whose_directory_is_removed_ends(tmp_path, capsys):
+    config_file, run_dir, long = write_config(tmp_path), tmp_path / "run", ("--total-steps", 10**6)
+    process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *long])
+    while process.poll() is None and not (run_dir / "checkpoints/2").exists():
+        time.sleep(0.05)
+    assert train(config_file, run_dir, *long) == 2
+    assert f"error: {run_dir}: process {process.pid} on " in capsys.readouterr().err
+    assert process.poll() is None
+    os.rename(run_dir, tmp_path / "elsewhere")
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 2, error
+    assert error.splitlines()[-1].startswith(f"error: {run_dir}: was removed or replaced while this run wrote to it")
+    assert "Traceback" not in error
+    assert not run_dir.exists()

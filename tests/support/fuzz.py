@@ -1,0 +1,102 @@
+"""Random input of every kind: scene files, exports, configurations, command lines, and what the importers read."""
+
+import collections
+import contextlib
+import dataclasses
+import gzip
+import json
+import random
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import yaml
+
+from jaxnav.__main__ import main
+from jaxnav.cli.console import exit_code
+from jaxnav.cli.options import parse
+from jaxnav.runs.check import check
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.packaged import WEIGHTS
+from jaxnav.runs.policy import load_policy
+from jaxnav.scenes.files.scene_file import write_scenes
+from support import fuzz_importers
+from support.fuzz_importers import NASTY, damaged, mutated
+from support.tiny_world import BEDROOM, KITCHEN
+
+#: Words of a command line, besides options and the names of commands.
+_WORDS = ("", "-1", "0", "7", "1e999", "nan", "10" * 40, "rooms", "val", "none", "a=b", "--", "-h", "[/x]", "\x1b[0m")
+_EVERYWHERE = ("--run-dir", "--seeds", "--config", "--split", "--epsilon", "--episodes", "--seed", "--scenes", "--out")
+_READING = ("eval", "account", "mixture", "report", "export", "episode", "table", "scenes")
+
+
+def _scene_file(folder: Path, draw: random.Random) -> int:
+    path = folder / "rooms.jsonl.gz"
+    write_scenes(path, [KITCHEN, BEDROOM])
+    if draw.random() < 0.3:
+        path.write_bytes(damaged(path.read_bytes(), draw))
+    else:
+        scenes = [mutated(json.loads(line), draw) for line in gzip.decompress(path.read_bytes()).splitlines()]
+        path.write_bytes(gzip.compress("\n".join(map(json.dumps, scenes)).encode()))
+    return main(["scenes", "stats", str(path)])
+
+
+def _export(folder: Path, draw: random.Random) -> int:
+    export = shutil.copytree(WEIGHTS / "rooms-org", folder / "export")
+    if draw.random() < 0.3:
+        file = draw.choice([export / "params.safetensors", export / "policy.json"])
+        file.write_bytes(damaged(file.read_bytes(), draw))
+    else:
+        policy = export / "policy.json"
+        policy.write_text(json.dumps(mutated(json.loads(policy.read_text()), draw)))
+    return exit_code(lambda _: load_policy(export))
+
+
+def _config(folder: Path, draw: random.Random) -> int:
+    path = folder / "run.yaml"
+    plain = json.loads(json.dumps(dataclasses.asdict(RunConfig()), default=str))
+    chosen = {name: plain[name] for name in draw.sample(sorted(plain), 8)}
+    text = yaml.safe_dump(mutated(chosen, draw), allow_unicode=draw.random() < 0.5).encode("utf-8", "replace")
+    path.write_bytes(damaged(text, draw) if draw.random() < 0.3 else text)
+    return exit_code(lambda _: check(parse(RunConfig(), ["--config", str(path)], "jaxnav train", "")))
+
+
+def _command_line(folder: Path, draw: random.Random) -> int:
+    values = [str(value) for value in NASTY if value != "\ud800"]
+    words = [draw.choice([*_WORDS, *_EVERYWHERE, *values]) for _ in range(draw.randrange(6))]
+    if draw.random() < 0.5:
+        return exit_code(lambda _: check(parse(RunConfig(), words, "jaxnav train", "")))
+    with contextlib.chdir(folder):
+        return main([draw.choice([*_READING, *_WORDS]), *words])
+
+
+_MADE: dict[str, Callable[[Path, random.Random], int]] = {
+    "scene file": _scene_file,
+    "export": _export,
+    "config": _config,
+    "command line": _command_line,
+}
+_IMPORTED = {" ".join((form.name, *form.options)): form for form in fuzz_importers.FORMATS}
+KINDS = (*_MADE, *_IMPORTED)
+
+
+def fuzz(kind: str, folder: Path, runs: int, seed: int) -> tuple[collections.Counter, float]:
+    """Return runs by exit code, or by the error that ended them, and the seconds of the slowest."""
+    if kind in _IMPORTED:
+        return fuzz_importers.fuzz(_IMPORTED[kind], runs, seed)
+    draw, codes, slowest = random.Random(f"{kind} {seed}"), collections.Counter(), 0.0
+    for number in range(runs):
+        place = folder / str(number)
+        place.mkdir()
+        began = time.perf_counter()
+        try:
+            code = _MADE[kind](place, draw)
+        except SystemExit as end:  # of the parser
+            code = end.code
+        except Exception as error:
+            code = f"{number}: {type(error).__name__}: {error}"
+        slowest = max(slowest, time.perf_counter() - began)
+        codes[code] += 1
+        shutil.rmtree(place)
+    return codes, slowest
