@@ -55,7 +55,9 @@ def main() -> bool:
                 raise SystemExit(f"{mistake.module} holds no {mistake.before!r}; bring the list up to date")
             alive = survives(folder, mistake.module, source.replace(mistake.before, mistake.after, 1), mistake.tests)
             noticed &= not alive
-            print("OVERLOOKED" if alive else "noticed   ", mistake.module, repr(mistake.after), mistake.tests, flush=True)
+            print(
+                "OVERLOOKED" if alive else "noticed   ", mistake.module, repr(mistake.after), mistake.tests, flush=True
+            )
     return noticed
 
 
