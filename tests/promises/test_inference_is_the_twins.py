@@ -28,6 +28,7 @@ from jaxnav.evaluation.variants import Row, inference_grid, table_row
 from jaxnav.layout import SETTINGS, prior_from_counts
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.methods import METHODS, Knowledge
+from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.generate.rooms import generate_rooms
@@ -127,7 +128,7 @@ def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: t
     for number, trace in enumerate(played.played(cell, episodes)):
         goal, scene, pose = (int(getattr(episodes, name)[number]) for name in ("goal", "scene", "pose"))
         prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.setting else None
-        episode = TwinEpisode(policy, bank, prior, goal, pose)
+        episode, action, success = TwinEpisode(policy, bank, prior, goal, pose), NO_ACTION, False
         for time, (expected_pose, action) in enumerate(zip(trace.pose.tolist(), trace.action.tolist(), strict=True)):
             inferred = episode.infer()
             corrected, weight = inferred.corrected(row.variant, row.epsilon, row.form)
@@ -175,8 +176,8 @@ def test_every_decision_is_the_twins(method, decision, count):
 class Unweighted(TwinRelations):
     """Leave the layout out."""
 
-    def encode(self, params, seen, appearance, weights, *others):
-        return super().encode(params, seen, appearance, np.ones_like(weights), *others)
+    def encode(self, params, seen, appearance, weights, reading, memory):
+        return super().encode(params, seen, appearance, np.ones_like(weights), reading, memory)
 
 
 class Mistaken(TwinRelations):

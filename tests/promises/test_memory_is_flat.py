@@ -30,6 +30,7 @@ def bytes_of(train, state, num_updates):
     """What a compiled chunk needs beside its arguments."""
     call = jax.jit(functools.partial(train, num_updates=num_updates))
     needed = call.lower(state, SCALARS, PARAMS, KNOWLEDGE).compile().memory_analysis()
+    assert needed is not None
     return needed.temp_size_in_bytes + needed.output_size_in_bytes
 
 

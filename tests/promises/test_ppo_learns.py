@@ -38,6 +38,7 @@ class Probe(ObjectNav):
     """Stay in place, and pay by a table."""
 
     def advance(self, state, action, params):
+        assert isinstance(params, ProbeParams)
         time = state.time + 1
         reward = params.pays[state.time, state.goal, action]
         return state.replace(time=time), reward, time >= params.length, jnp.bool_(False)

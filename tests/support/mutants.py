@@ -101,6 +101,7 @@ def mutants_of(module: str) -> Iterator[Mutant]:
     tree = ast.parse((ROOT / "jaxnav" / module).read_text())
     for put, node in list(places(tree)):
         for variant in variants(node):
+            assert isinstance(node, ast.expr)
             put(variant)
             yield Mutant(module, node.lineno, ast.unparse(node), ast.unparse(variant), ast.unparse(tree))
             put(node)

@@ -98,7 +98,7 @@ class TwinLearnedSteps(TwinMethod):
             logits, state = stream(params, inputs, state, changes, added)
             rows.append(np.concatenate([state, softmax(logits)], axis=-1))
         loss = _loss(params["method"]["learned_loss"], np.stack(rows, axis=-1))
-        gradient = np.split((loss.imag / TINY).reshape(WINDOW, -1), np.cumsum(sizes)[:-1], axis=-1)
+        gradient = np.split((np.imag(loss) / TINY).reshape(WINDOW, -1), np.cumsum(sizes)[:-1], axis=-1)
         return dict(zip(LAYERS, gradient, strict=True))
 
     @staticmethod
@@ -124,5 +124,5 @@ def _loss(params: Params, entries: np.ndarray) -> np.ndarray:
         earlier = np.zeros_like(entries)
         earlier[:, distance:] = entries[:, :-distance]
         values = linear(params[name], np.concatenate([earlier, entries], axis=-1))
-        entries = np.where(values.real > 0, values, 0.01 * values)
+        entries = np.where(np.real(values) > 0, values, 0.01 * values)
     return np.sqrt((entries**2).sum(axis=(-2, -1)) + 1e-12)

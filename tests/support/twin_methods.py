@@ -30,7 +30,9 @@ class TwinAnonymous(TwinMethod):
 class TwinRelations(TwinMethod):
     """Relate detections (`org`): rows [R^T X | T], each times its weight, through a perceptron."""
 
-    def encode(self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, *_: Any) -> np.ndarray:
+    def encode(
+        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+    ) -> np.ndarray:
         return self.relate(params, seen, appearance, weights, seen.table)
 
     def relate(
@@ -79,7 +81,9 @@ class TwinZones(TwinRelations):
 class TwinGraph(TwinMethod):
     """Convolve over the graph of categories (`sp`)."""
 
-    def encode(self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, *_: Any) -> np.ndarray:
+    def encode(
+        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+    ) -> np.ndarray:
         graph = self.knowledge["mixing"]
         nodes = relu(graph @ (seen.table @ params["seen"]["kernel"] + appearance @ params["named"]["kernel"]))
         nodes = relu(graph @ (nodes @ params["second"]["kernel"]))

@@ -86,11 +86,11 @@ def one_hot(index: int, size: int) -> np.ndarray:
 
 
 def relu(x: np.ndarray) -> np.ndarray:
-    return np.where(x.real > 0, x, 0)
+    return np.where(np.real(x) > 0, x, 0)
 
 
 def softmax(x: np.ndarray) -> np.ndarray:
-    exponential = np.exp(x - x.real.max(axis=-1, keepdims=True))
+    exponential = np.exp(x - np.real(x).max(axis=-1, keepdims=True))
     return exponential / exponential.sum(axis=-1, keepdims=True)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from support.twin_percept import Seen
-from support.twin_policy import Params, TwinMethod, linear, relu, softmax
+from support.twin_policy import Memory, Params, TwinMethod, linear, relu, softmax
 
 SIDE, VIEW = 5, 11
 
@@ -53,7 +53,9 @@ class TwinTransformer(TwinMethod):
 
     tokens = 4
 
-    def encode(self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, *_: Any) -> np.ndarray:
+    def encode(
+        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+    ) -> np.ndarray:
         goal = int(seen.goal.argmax())
         shown = [goal, *(k for k in np.flatnonzero(seen.visible).tolist() if k != goal)][: self.tokens]
         tokens = linear(params["token"], np.hstack([appearance[shown], seen.table[shown]]))
