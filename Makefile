@@ -3,18 +3,22 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-BENCHMARKS := $(filter-out _% table curves recipe success layout_value zones factors,$(basename $(notdir $(wildcard benchmarks/*.py))))
+BENCHMARKS := $(filter-out _% table curves recipe success layout_value zones factors gate,$(basename $(notdir $(wildcard benchmarks/*.py))))
 RESULTS := results/performance
 DOCUMENT = $(if $(filter results/performance,$(RESULTS)),docs/performance.md,$(RESULTS)/performance.md)
 # Neither peers, whose environments hold JAX for processors alone, nor what splits this machine's cores.
 ON_GPU := environment training utilisation inference seeds sweep growth
 
-.PHONY: help setup run test lint docs test-slow bench bench-gpu lock clean
+.PHONY: help setup run test lint docs test-slow coverage mutants gate versions bench bench-gpu lock clean
 
 help:
 	@echo 'make run        train on procedural rooms, then evaluate the run (runs/rooms)'
 	@echo 'make test       lint, import layers, types and the fast tests'
 	@echo 'make test-slow  the slow tests'
+	@echo 'make coverage   the fast tests, and which branches of the package they take'
+	@echo 'make mutants    planted mistakes and drawn mutants, which the tests have to notice'
+	@echo 'make gate       fails where the environment is far slower than the stored result'
+	@echo 'make versions   the fast tests on every Python, with the oldest and the newest packages'
 	@echo 'make docs       the documentation as a site, in site/'
 	@echo 'make bench      every benchmark into results/performance, then the tables of docs/performance.md'
 	@echo 'make bench-gpu  those that a GPU can run, into results/performance-gpu'
@@ -52,6 +56,28 @@ test: lint docs
 test-slow: $(READY)
 	$(BIN)/python -m pytest -n 2 -m slow --timeout 900
 
+coverage: $(READY)
+	$(BIN)/python -m pytest -n 2 --cov --cov-report=term:skip-covered
+
+mutants: $(READY)
+	cd tests && PYTHONPATH=.. ../$(BIN)/python -m support.planted && PYTHONPATH=.. ../$(BIN)/python -m support.mutants
+
+gate: $(READY)
+	$(BIN)/python benchmarks/environment.py | $(BIN)/python benchmarks/gate.py results/performance/environment.json
+
+# Needs uv and each Python, which uv can get.
+PYTHONS := 3.11 3.12 3.13
+RESOLUTIONS := lowest-direct highest
+TESTS :=
+
+versions:
+	@failed=; for python in $(PYTHONS); do for resolution in $(RESOLUTIONS); do \
+	  name=$$python-$$resolution; venv=.cache/versions/$$name; echo "== $$name"; \
+	  uv venv --quiet --clear --python $$python $$venv && \
+	  uv pip install --quiet --python $$venv --resolution $$resolution --editable . --group dev && \
+	  $$venv/bin/python -m pytest -n 2 $(TESTS) || failed="$$failed $$name"; \
+	done; done; test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+
 # A benchmark that fails leaves its last result as it is, and the others go on.
 bench: $(READY)
 	@mkdir -p $(RESULTS); failed=; for name in $(BENCHMARKS); do \
@@ -66,7 +92,7 @@ bench-gpu: $(READY)
 	  echo "JAX sees no GPU: $(BIN)/python -m pip install 'jax[cuda12]' adds what it needs" >&2; exit 1; }
 	@$(MAKE) bench RESULTS=results/performance-gpu BENCHMARKS="$(ON_GPU)"
 
-# For maintainers, and the one target that needs uv.
+# For maintainers; needs uv.
 lock:
 	uv pip compile pyproject.toml --group dev --universal --python-version 3.11 --fork-strategy fewest \
 	  --upgrade --no-header --no-annotate --generate-hashes --quiet --output-file requirements.lock

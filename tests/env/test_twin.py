@@ -30,7 +30,7 @@ from jaxnav.scenes.tables.detector import PERFECT
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, generated
 
-NUM_ENVS, NUM_STEPS = 20, 150  # 3,000 steps of each source and task
+NUM_ENVS, FEW, MANY = 20, 150, 5000  # 3,000 steps of a source and task, or 100,000
 LIVING_ROOM, OTHERS = 60, 30  # step limits
 SLOW = pytest.mark.slow
 TASKS = {
@@ -59,7 +59,7 @@ def guides_of(source: str, task: Task) -> list[Guide]:
 
 
 class Rollout(NamedTuple):
-    """Hold steps of several environments; leaves [NUM_STEPS, NUM_ENVS, ...]."""
+    """Hold steps of several environments; leaves [steps, NUM_ENVS, ...]."""
 
     before: State
     action: Any
@@ -73,7 +73,7 @@ class Rollout(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[time, env], self)
 
 
-def roll_out(env: ObjectNav, params: EnvParams, seed: int) -> Rollout:
+def roll_out(env: ObjectNav, params: EnvParams, seed: int, steps: int) -> Rollout:
     """Take random steps.
 
     Done is likelier where it succeeds or time is up.
@@ -94,7 +94,7 @@ def roll_out(env: ObjectNav, params: EnvParams, seed: int) -> Rollout:
     def run(key):
         first, rest = jax.random.split(key)
         _, state = jax.vmap(env.reset, (0, None))(jax.random.split(first, NUM_ENVS), params)
-        return jax.lax.scan(one_step, state, jax.random.split(rest, NUM_STEPS))[1]
+        return jax.lax.scan(one_step, state, jax.random.split(rest, steps))[1]
 
     return jax.device_get(run(jax.random.key(seed)))
 
@@ -119,14 +119,14 @@ def step_differences(
 
 
 @pytest.mark.parametrize(
-    ("source", "world"),
+    ("source", "world", "steps"),
     [
-        ("rooms", "rooms"),
-        ("ithor", "rooms"),
-        *(pytest.param("rooms", home, marks=SLOW) for home in ("apartments", "houses")),
+        ("rooms", "rooms", FEW),
+        ("ithor", "rooms", FEW),
+        *(pytest.param("rooms", world, MANY, marks=SLOW) for world in TASKS),
     ],
 )
-def test_random_steps(source, world):
+def test_random_steps(source, world, steps):
     task, scenes = TASKS[world], scenes_of(source)
     bank, guides = compile_bank(scenes, task), guides_of(source, task)
     assert bank.names == tuple(scene.name for scene in scenes)
@@ -134,10 +134,10 @@ def test_random_steps(source, world):
     # Padded: there are unused cells, and the first scenes again.
     env, params = build(bank, {"living_room": LIVING_ROOM}, OTHERS, len(bank.ahead) + 7, len(scenes) + 2)
     assert params.room.tolist() == [0, 1, 2, 3, 0, 1]
-    rollout = roll_out(env, params, seed=len(source))
+    rollout = roll_out(env, params, len(source), steps)
 
     differences, endings, drawn = collections.Counter(), collections.Counter(), set()
-    for i, time in itertools.product(range(NUM_ENVS), range(NUM_STEPS)):
+    for i, time in itertools.product(range(NUM_ENVS), range(steps)):
         step = rollout.at(time, i)
         drawn.add(int(step.before.scene))
         scene, goal = int(step.before.scene) % len(scenes), int(step.before.goal)

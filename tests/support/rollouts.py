@@ -10,6 +10,8 @@ import numpy as np
 from jaxnav.policies.acting import Acting
 from jaxnav.policies.pathways import NO_ACTION, Memory
 from jaxnav.training.collect import collect
+from jaxnav.training.config import PPOConfig
+from jaxnav.training.learner import Learner
 from jaxnav.training.loss import replay
 from support import tiny_world as tiny
 
@@ -19,6 +21,21 @@ ENV, PARAMS = tiny.world()
 KNOWLEDGE = tiny.knowledge()
 PRIORS = KNOWLEDGE.layout
 ACTING = Acting(ENV, tiny.SPEC, tiny.SETTING)
+CONFIG = PPOConfig(
+    num_envs=ENVS,
+    rollout=LENGTH,
+    epochs=4,
+    minibatches=2,
+    learning_rate=4e-3,
+    gamma=0.97,
+    gae_lambda=0.9,
+    clip=0.2,
+    entropy=0.05,
+    value=0.5,
+    max_grad_norm=0.5,
+    distil=0.02,
+)
+LEARNER = Learner(acting=ACTING, config=CONFIG, counterfactual="distil")
 ROWS, SUCCESSOR = tiny.BANK.rows, tiny.BANK.successor
 SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)  # of each pose
 

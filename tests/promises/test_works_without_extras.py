@@ -31,7 +31,7 @@ print("imported", file=sys.stderr)
 def without_pictures(script, folder):
     """Run a script where matplotlib and PIL cannot be imported."""
     command = [sys.executable, "-c", WITHOUT + script]
-    environment = {"PYTHONPATH": str(Path(__file__).parents[1])}
+    environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
 
 

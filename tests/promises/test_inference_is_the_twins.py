@@ -1,0 +1,194 @@
+"""The whole inference step of every method against its plain-NumPy twin, decision by decision.
+
+The twin goes along the episodes that the package plays: from the same bytes it makes features, belief, gap and weights,
+both decisions and what is left of them by equations 1 and 2, and has to choose the same action.
+"""
+
+import collections
+import dataclasses
+import functools
+import itertools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from support.twin_episode import TwinEpisode
+from support.twin_methods import TWINS, TwinRelations
+from support.twin_policy import TwinMethod, TwinPolicy
+
+from jaxnav.env.build import build
+from jaxnav.env.objectnav import NUM_PRIORS, prior_index
+from jaxnav.evaluation.episodes import EpisodeList, episode_list
+from jaxnav.evaluation.grid import first_states
+from jaxnav.evaluation.playback import Trace, play
+from jaxnav.evaluation.variants import Row, inference_grid, table_row
+from jaxnav.layout import SETTINGS, prior_from_counts
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import METHODS, Knowledge
+from jaxnav.policies.pathways import NO_ACTION
+from jaxnav.policies.spatial_memory import SpatialMemory
+from jaxnav.policies.spec import PolicySpec
+from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.task import DONE, Task
+
+LIMIT = 30
+#: Weak prior rows: a view changes the belief much, the gaps are large, and what is removed changes actions.
+SETTING = dataclasses.replace(SETTINGS["calibrated"], strength=0.3)
+SIZES = {
+    "vtnet": {"token_width": 8, "feedforward": 16, "tokens": 4, "encoder_layers": 1, "decoder_layers": 2},
+    "tpn": {"tentative_width": 16},
+}
+#: How the episodes are inferred, a quarter each.
+ROWS = (
+    table_row("stde", 0.05, "residual", "argmax"),
+    table_row("stde", 0.0, "paper", "sample"),
+    table_row("tde", None, None, "argmax"),
+    table_row("layout", None, None, "sample"),
+)
+TOLERANCE = 2e-3
+DECISIONS = ("fused", "streams")
+#: Of the episodes, where the twin takes thousands of derivatives a step.
+FEWER = {"savn": 100}
+
+
+@functools.cache
+def world() -> tuple[Any, Any, Any, Any]:
+    """Return a bank of four rooms, their environment, and poses at which categories are seen together [R, K, K]."""
+    bank = compile_bank(generate_rooms(4, 0, 0), Task())
+    env, params = build(bank, {}, LIMIT)
+    seen = env.row_format.presence(bank.rows).astype(np.float32)
+    counts = np.ones((NUM_PRIORS, len(env.categories), len(env.categories)), np.float32)
+    ends = (bank.first_cell + bank.num_cells) * bank.task.rules.poses_per_cell
+    for room, begin, end in zip(bank.room_types, bank.first_cell * bank.task.rules.poses_per_cell, ends, strict=True):
+        counts[prior_index(room)] += seen[begin:end].T @ seen[begin:end]
+    return bank, env, params, counts
+
+
+class Case(NamedTuple):
+    """Hold a policy of a method, and what the package plays with it."""
+
+    acting: Acting
+    weights: Any
+    knowledge: Knowledge
+
+    def played(self, cell: Any, episodes: EpisodeList) -> list[Trace]:
+        return play(cell, self.weights, first_states(episodes), self.acting, world()[2], self.knowledge)
+
+
+@functools.cache
+def case(name: str, decision: Any) -> Case:
+    bank, env, _, counts = world()
+    method = METHODS[name]
+    learned = {} if method.learn is None else method.learn([bank], counts)
+    prior = jax.vmap(lambda one: prior_from_counts(one, SETTING))(jnp.asarray(counts))
+    spec = PolicySpec(
+        name,
+        len(env.categories),
+        tiny.SIZES,
+        tuple(SIZES.get(name, {}).items()),
+        direct="goal" if decision == "streams" else "all",
+        spatial_memory=SpatialMemory(bank.task.rules.headings),
+        decision=decision,
+    )
+    knowledge = Knowledge(prior, jax.tree.map(jnp.asarray, learned))
+    return Case(Acting(env, spec, SETTING if method.hosts_layout else None), tiny.lively(3, spec), knowledge)
+
+
+class Compared(NamedTuple):
+    """Count what was compared, and hold by name how far the twin's numbers are from the package's at most."""
+
+    decisions: int
+    ties: int
+    removals: int
+    differences: list[str]
+    errors: dict[str, float]
+
+
+def noise(episode: int, time: int, size: int) -> np.ndarray:
+    """Return what a sampled choice adds to its logits: Gumbel noise by the episode's key."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), episode), time)
+    return np.asarray(jax.random.gumbel(key, (size,)))
+
+
+def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: type[TwinMethod]) -> Compared:
+    """Go along the episodes that the package plays.
+
+    Where the best two choices are equal within `TOLERANCE` and the twin takes the other one, it leaves the episode.
+    """
+    (bank, _, params, _), played = world(), case(method, decision)
+    (acting, weights, knowledge), cell = played, tiny.at(inference_grid([row], ("layout",), 1), 0)
+    assert acting.spec is not None
+    policy = TwinPolicy(acting.spec, jax.tree.map(lambda leaf: np.asarray(leaf, float), weights), twin(knowledge))
+    decisions, ties, removals, differences = 0, 0, 0, []
+    errors: dict[str, float] = collections.defaultdict(float)
+    for number, trace in enumerate(played.played(cell, episodes)):
+        goal, scene, pose = (int(getattr(episodes, name)[number]) for name in ("goal", "scene", "pose"))
+        prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.setting else None
+        episode, action, success = TwinEpisode(policy, bank, prior, goal, pose), NO_ACTION, False
+        for time, (expected_pose, action) in enumerate(zip(trace.pose.tolist(), trace.action.tolist(), strict=True)):
+            inferred = episode.infer()
+            corrected, weight = inferred.corrected(row.variant, row.epsilon, row.form)
+            for name, value in {**inferred._asdict(), "corrected": corrected, "weight": weight}.items():
+                expected = getattr(trace.inferred, name)[time]
+                errors[name] = max(errors[name], float(np.abs(expected - value).max()))
+            scores = corrected + (noise(number, time, len(corrected)) if row.decoding == "sample" else 0.0)
+            decisions, removals = decisions + 1, removals + int(corrected.argmax() != inferred.factual.argmax())
+            if (episode.pose, policy.method.act(int(scores.argmax()))) != (expected_pose, action):
+                if np.subtract(*np.sort(scores)[:-3:-1]) > TOLERANCE:
+                    differences.append(f"episode {number}, step {time}")
+                ties += 1
+                break
+            success = action == DONE and bank.best_length[episode.pose, goal] == 1
+            episode.go_on(action)
+        else:
+            if success != trace.success or (action != DONE and len(trace.pose) != LIMIT):
+                differences.append(f"end of episode {number}")
+    return Compared(decisions, ties, removals, differences, dict(errors))
+
+
+@pytest.mark.parametrize(
+    ("method", "decision", "count"),
+    [
+        ("org", "fused", 12),
+        ("org", "streams", 12),
+        *(
+            pytest.param(name, decision, FEWER.get(name, 1000), marks=pytest.mark.slow)
+            for name, decision in itertools.product(METHODS, DECISIONS)
+        ),
+    ],
+)
+def test_every_decision_is_the_twins(method, decision, count):
+    whole, removals = episode_list(world()[0], count), 0
+    for part, row in enumerate(ROWS):
+        found = compare(method, decision, row, whole.take(np.arange(part, count, len(ROWS))), TWINS[method])
+        print(method, decision, row.variant, row.decoding, found)
+        assert found.differences == []
+        assert found.ties <= 1 + found.decisions / 1000
+        assert max(found.errors.values()) < TOLERANCE
+        removals += found.removals
+    assert removals > 0
+
+
+class Unweighted(TwinRelations):
+    """Leave the layout out."""
+
+    def encode(self, params, seen, appearance, weights, reading, memory):
+        return super().encode(params, seen, appearance, np.ones_like(weights), reading, memory)
+
+
+class Mistaken(TwinRelations):
+    """Take another category for the goal."""
+
+    def perceive(self, seen):
+        return seen._replace(goal=np.roll(seen.goal, 1))
+
+
+@pytest.mark.parametrize("wrong", [Unweighted, Mistaken])
+def test_a_twin_that_is_wrong_is_noticed(wrong):
+    found = compare("org", "fused", ROWS[0], episode_list(world()[0], 4), wrong)
+    assert found.differences
+    assert found.errors["factual"] > 10 * TOLERANCE

@@ -1,0 +1,181 @@
+"""Mutants of the modules that hold the science, and whether their fast tests notice.
+
+`python -m support.mutants [COUNT [SEED]]` in `tests` draws so many of all mutants, runs the tests of each one's module
+in a copy of the project, and prints the survivors and the share that was killed. It ends with code 1 below `LEAST`.
+
+A mutant has one expression changed: an operator, a comparison, a number, a truth value, a term that is left out.
+"""
+
+import ast
+import collections
+import contextlib
+import functools
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[2]
+LEAST = 0.9
+SECONDS = 900  # after which a mutant counts as killed: it does not end
+#: The modules, and the files of `tests` that have to kill their mutants.
+TESTS = {
+    "causal.py": "test_causal.py",
+    "layout.py": "test_layout.py test_gaps.py test_evidence.py",
+    "numerics/dirichlet.py": "numerics/test_dirichlet.py",
+    "numerics/product.py": "numerics/test_product.py",
+    "numerics/recurrence.py": "numerics/test_recurrence.py",
+    "numerics/rounding.py": "numerics/test_rounding.py",
+    "numerics/sparse.py": "numerics/test_sparse.py",
+    "training/loss.py": "training/test_loss.py training/test_collect.py",
+    "evaluation/metrics.py": "evaluation/test_episodes.py",
+    "evaluation/statistics.py": "evaluation/test_statistics.py evaluation/test_interval.py",
+}
+OPERATORS: dict[type, type] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.MatMult: ast.Add,
+    ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
+#: What no test of behaviour is about: types, docstrings, messages.
+SKIPPED = (ast.Import, ast.ImportFrom, ast.Raise, ast.Assert, ast.JoinedStr)
+SKIPPED_FIELDS = {"annotation", "returns", "decorator_list"}
+
+
+class Mutant(NamedTuple):
+    """Name a changed expression, with the whole module as it is then."""
+
+    module: str
+    line: int
+    before: str
+    after: str
+    source: str
+
+    def __str__(self) -> str:
+        return f"{self.module}:{self.line}: {self.before}  ->  {self.after}"
+
+
+def variants(node: ast.AST) -> list[ast.expr]:
+    """Return what may stand in the place of an expression."""
+    match node:
+        case ast.BinOp(left, operator, right) if type(operator) in OPERATORS:
+            swapped = ast.BinOp(left, OPERATORS[type(operator)](), right)
+            return [swapped, left, right] if isinstance(operator, ast.Add | ast.Sub) else [swapped]
+        case ast.BoolOp(operator, values):
+            return [ast.BoolOp(OPERATORS[type(operator)](), values), *values]
+        case ast.Compare(left, [operator, *others], right) if type(operator) in OPERATORS:
+            return [ast.Compare(left, [OPERATORS[type(operator)](), *others], right)]
+        case ast.UnaryOp(_, operand):
+            return [operand]
+        case ast.IfExp(test, body, orelse):
+            return [ast.IfExp(test, orelse, body)]
+        case ast.Constant(bool() as value):
+            return [ast.Constant(not value)]
+        case ast.Constant(int() | float() as value):
+            return [ast.Constant(value + 1)]
+    return []
+
+
+def places(node: ast.AST) -> Iterator[tuple[Callable[[ast.AST], None], ast.AST]]:
+    """Yield all nodes below a node, and what puts another one there."""
+    for name, value in ast.iter_fields(node):
+        if name in SKIPPED_FIELDS:
+            continue
+        if isinstance(value, list):
+            children = [(functools.partial(value.__setitem__, i), child) for i, child in enumerate(value)]
+        else:
+            children = [(functools.partial(setattr, node, name), value)]
+        for put, child in children:
+            if isinstance(child, ast.AST) and not isinstance(child, SKIPPED):
+                yield put, child
+                yield from places(child)
+
+
+def mutants_of(module: str) -> Iterator[Mutant]:
+    """Yield all mutants of a module, a path in `jaxnav`."""
+    tree = ast.parse((ROOT / "jaxnav" / module).read_text())
+    for put, node in list(places(tree)):
+        for variant in variants(node):
+            assert isinstance(node, ast.expr)
+            put(variant)
+            yield Mutant(module, node.lineno, ast.unparse(node), ast.unparse(variant), ast.unparse(tree))
+            put(node)
+
+
+@contextlib.contextmanager
+def project() -> Iterator[Path]:
+    """Copy what the tests need to a folder of its own."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for part in ("jaxnav", "tests", "docs", "pyproject.toml"):
+            whole = ROOT / part
+            (shutil.copytree if whole.is_dir() else shutil.copy)(whole, folder / part)
+        yield folder
+
+
+def passes(folder: Path, tests: str) -> bool:
+    """Check whether tests, separated by spaces, pass in a copy of the project."""
+    environment = os.environ | {
+        "PYTHONPATH": str(folder),
+        "PYTEST_XDIST_WORKER": "mutants",  # what is compiled is kept here, from one mutant to the next
+        "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    }
+    tests_there = [str(folder / "tests" / name) for name in tests.split()]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "--timeout",
+        "0",
+        *tests_there,
+    ]
+    try:
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=SECONDS)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def survives(folder: Path, module: str, source: str, tests: str) -> bool:
+    """Check whether tests overlook another source of a module."""
+    path = folder / "jaxnav" / module
+    original = path.read_text()
+    path.write_text(source)
+    try:
+        return passes(folder, tests)
+    finally:
+        path.write_text(original)
+
+
+def main(count: int, seed: int) -> bool:
+    """Draw mutants, print what becomes of them, and return whether enough were killed."""
+    everything = [mutant for module in TESTS for mutant in mutants_of(module)]
+    drawn = random.Random(seed).sample(everything, min(count, len(everything)))
+    killed, of = collections.Counter(), collections.Counter(mutant.module for mutant in drawn)
+    with project() as folder:
+        for module in of:
+            if not passes(folder, TESTS[module]):
+                raise SystemExit(f"the tests of {module} fail without a mutant; mend them first")
+        for mutant in drawn:
+            alive = survives(folder, mutant.module, mutant.source, TESTS[mutant.module])
+            killed[mutant.module] += not alive
+            print("SURVIVED" if alive else "killed  ", mutant, flush=True)
+    for module, number in sorted(of.items()):
+        print(f"{module}: {killed[module]} of {number} killed")
+    print(f"{killed.total()} of {len(drawn)} killed; there are {len(everything)} mutants in all")
+    return killed.total() >= LEAST * len(drawn)
+
+
+if __name__ == "__main__":
+    sys.exit(not main(*(int(argument) for argument in [*sys.argv[1:], "120", "0"][:2])))

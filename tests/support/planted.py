@@ -1,0 +1,65 @@
+"""Mistakes, one or more a promise, that the tests of docs/promises.md have to notice.
+
+`python -m support.planted` in `tests` plants one after the other in a copy of the project, and ends with code 1 if the
+tests of one pass all the same.
+"""
+
+import sys
+from typing import NamedTuple
+
+from support.mutants import ROOT, passes, project, survives
+
+
+class Mistake(NamedTuple):
+    """Name a text of a module, what takes its place, and the tests that have to fail."""
+
+    module: str
+    before: str
+    after: str
+    tests: str
+
+
+INFERENCE = "promises/test_inference_is_the_twins.py"
+PROBES = "promises/test_ppo_learns.py"
+LEARNER = "training/test_learner.py"
+MISTAKES = (
+    Mistake("causal.py", "- s * counterfactual", "+ s * counterfactual", INFERENCE),
+    Mistake("layout.py", "state.gap * setting.decay", "state.gap * 1.01 * setting.decay", INFERENCE),
+    Mistake("policies/methods/org.py", "weights[..., None] * (aggregated", "(aggregated", INFERENCE),
+    Mistake("policies/spatial_memory.py", "stride: int = 2", "stride: int = 1", INFERENCE),
+    Mistake("training/loss.py", "policy_loss = -average(", "policy_loss = average(", PROBES),
+    Mistake("training/loss.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES),
+    Mistake("training/loss.py", "scalars.value * value_loss", "0.0 * value_loss", PROBES),
+    Mistake("causal.py", "jnp.where(s == 0, logits, combined)", "combined", "test_causal.py"),
+    Mistake("causal.py", "gap - epsilon)", "gap - float(epsilon))", "test_causal.py"),
+    Mistake("evaluation/metrics.py", "success * best_length / length", "success * length / best_length",
+            "evaluation/test_episodes.py"),
+    Mistake("evaluation/episodes.py", "default_rng([seed, len", "default_rng([len", "evaluation/test_episodes.py"),
+    Mistake("training/apply.py", "max_consecutive_errors=2**30", "max_consecutive_errors=0", LEARNER),
+    Mistake("store/export.py", '"""Exported', 'import jax  # noqa\n"""Exported', "store/test_export.py"),
+    Mistake("store/export.py", "FORMAT_VERSION = 3", "FORMAT_VERSION = 2", "promises/test_old_versions.py"),
+    Mistake("__init__.py", '"""', 'import matplotlib  # noqa\n"""', "promises/test_works_without_extras.py"),
+)  # fmt: skip
+
+
+def main() -> bool:
+    """Plant every mistake, print what becomes of it, and return whether all were noticed."""
+    noticed = True
+    with project() as folder:
+        for tests in dict.fromkeys(mistake.tests for mistake in MISTAKES):
+            if not passes(folder, tests):
+                raise SystemExit(f"{tests} fails without a mistake; mend it first")
+        for mistake in MISTAKES:
+            source = (ROOT / "jaxnav" / mistake.module).read_text()
+            if mistake.before not in source:
+                raise SystemExit(f"{mistake.module} holds no {mistake.before!r}; bring the list up to date")
+            alive = survives(folder, mistake.module, source.replace(mistake.before, mistake.after, 1), mistake.tests)
+            noticed &= not alive
+            print(
+                "OVERLOOKED" if alive else "noticed   ", mistake.module, repr(mistake.after), mistake.tests, flush=True
+            )
+    return noticed
+
+
+if __name__ == "__main__":
+    sys.exit(not main())
