@@ -37,8 +37,10 @@ def test_lock_pins_a_version_that_satisfies(line: str) -> None:
     assert _locked()[requirement.name] in requirement.specifier
 
 
-def test_all_extras_are_there_to_develop() -> None:
-    assert {line for extra in PROJECT["project"]["optional-dependencies"].values() for line in extra} <= set(DEV)
+def test_extras_are_there_to_develop() -> None:
+    """All but the client of a service, which brings a dozen packages; a job of its own installs that."""
+    extras = {name: lines for name, lines in PROJECT["project"]["optional-dependencies"].items() if name != "wandb"}
+    assert {line for lines in extras.values() for line in lines} <= set(DEV)
 
 
 def test_lock_names_packages_only() -> None:
