@@ -7,13 +7,13 @@ from rich.console import Console
 
 from jaxnav.errors import InputError
 from jaxnav.game.episode import Game, choose_episode
-from jaxnav.layout import SETTINGS, Setting
+from jaxnav.layout import Setting
 from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.methods.base import Primitive
 from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.runs.packaged import world_of
 from jaxnav.runs.policy import LoadedPolicy, load_policy
-from jaxnav.runs.prepare import explore_world
+from jaxnav.runs.prepare import calibrate_setting, explore_world
 from jaxnav.runs.worlds import evaluation_world, training_world
 from jaxnav.training.calibration import layout_priors
 
@@ -70,7 +70,8 @@ def _adviser(policy: str, world: str) -> LoadedPolicy:
 
 
 def _walked(config: RunConfig, console: Console) -> tuple[Knowledge, Setting]:
-    """Return the layout priors of random walks, and their setting."""
-    explored = explore_world(config, training_world(config, console))
-    setting = SETTINGS[config.layout.setting]
+    """Return the layout priors of random walks, and the setting that training would choose."""
+    world = training_world(config, console)
+    explored = explore_world(config, world)
+    setting = calibrate_setting(config, world, explored, console)
     return Knowledge(layout_priors(explored.counts, setting)), setting

@@ -22,7 +22,8 @@ class Interrupts:
         self._asked = 0
         self._earlier = {}
         if threading.current_thread() is threading.main_thread():
-            self._earlier = {number: signal.signal(number, self._note) for number in _SIGNALS}
+            heeded = [number for number in _SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+            self._earlier = {number: signal.signal(number, self._note) for number in heeded}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -37,5 +38,5 @@ class Interrupts:
 
     def _note(self, number: int, _: FrameType | None) -> None:
         self._asked = number
-        for each in _SIGNALS:
+        for each in self._earlier:
             signal.signal(each, signal.SIG_DFL)

@@ -64,10 +64,14 @@ def do_updates(
                 save(config.run_dir, done, trainer.unpack(states), manifest)
             shown.tell(metrics, done)
             if stopping:
-                raise Interrupted(
-                    stopping, f"{config.run_dir}: stopped after update {done} of {config.total_updates} and saved"
-                )
+                raise _interrupted(config, stopping, done)
+        if stopping := interrupts.asked():  # during the last save
+            raise _interrupted(config, stopping, done)
     return states
+
+
+def _interrupted(config: RunConfig, number: int, done: int) -> Interrupted:
+    return Interrupted(number, f"{config.run_dir}: stopped after update {done} of {config.total_updates} and saved")
 
 
 def _rows(config: RunConfig, metrics: Metrics, done: int) -> list[Row]:

@@ -132,12 +132,27 @@ def _load(
             f"{where}: its state has other arrays than this code's (saved != asked for): {'; '.join(different)}; "
             f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
         )
-    with _damage_named(where):
+    with _alone(where), _damage_named(where):
         state = checkpointer.load(step, abstract_state=_placed(abstract_state))
+    with _damage_named(where):
         # Checkpoints of jaxnav 0.2.0 have no digests.
         if different := "digests" in saved and differences(saved["digests"], digests(state)):
             raise ValueError(f"digests differ of {', '.join(line.split(':')[0] for line in different)}")
     return state
+
+
+@contextlib.contextmanager
+def _alone(where: Path) -> Iterator[None]:
+    """End the run where one of several processes cannot read its part.
+
+    The others wait in Orbax for it, so it cannot go on to an earlier checkpoint by itself.
+    """
+    try:
+        yield
+    except _DamageError as error:
+        if jax.process_count() == 1:
+            raise
+        raise InputError(f"{error}; start once with one process, which goes on from the one before it") from error
 
 
 @contextlib.contextmanager

@@ -34,7 +34,7 @@ class Lock:
           InputError: another process, or another lock of this one, holds it.
           OSError: the folder is missing or cannot be written.
         """
-        file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -46,9 +46,9 @@ class Lock:
             ) from error
         except OSError:
             pass
+        self._file = file
         os.truncate(file, 0)
         os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
-        self._file = file
 
     def check(self) -> None:
         """Make sure that the folder is still the one that is held.

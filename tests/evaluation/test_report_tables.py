@@ -76,7 +76,7 @@ def test_a_cell_without_an_interval_says_so():
 
 def test_console_table():
     report = fixed_report(fixed_row(method="[bold]X[/bold]"), fixed_row(decoding="sample", method="VTNet"))
-    console = Console(width=160, record=True, file=io.StringIO())
+    console = Console(width=160, record=True, file=io.StringIO(), markup=False)
     console.print(report_tables.console_table(report))
     lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines()]
     assert [cells for cells in lines if cells] == [

@@ -32,6 +32,8 @@ GIVEN = {
     "export": [("@",), ("@", "--policy", "@")],
     "episode": [("@",), ("@", "--scenes", "@")],
     "instrument": [("@",), ("--config", "@")],
+    "play": [("--scenes", "@"), ("--goal", "@"), ("--policy", "@")],
+    "log": [("@", "--to", "tensorboard")],
     "study": [("--config", "@")],
     "compare": [("--config", "@")],
     "scenes": [

@@ -44,6 +44,7 @@ def outcome(success, length=20, weight=0.0):
         done=jnp.ones(shape, bool),
         success=jnp.asarray(np.broadcast_to(lucky, shape)),
         length=jnp.full(shape, length),
+        choices=jnp.full(shape, length),
         weight=jnp.asarray(np.broadcast_to(np.where(SHIFT == 0, 0.0, weight), shape), jnp.float32),
     )
 
