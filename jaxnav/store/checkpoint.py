@@ -1,11 +1,13 @@
 """Resumable state: one atomic Orbax commit per step, the latest two kept.
 
 A commit holds the arrays, a digest of each and the manifest together, so that none exists without the others. A process
-killed at any moment leaves the earlier commits whole; what it was writing is ignored and cleared by the next save.
+killed at any moment leaves the earlier commits whole; what it was writing is ignored and cleared by the next save. A
+list of its files with their digests is added to a commit: damage is found before Orbax reads any of them.
 """
 
 import contextlib
 import gc
+import hashlib
 import logging
 import shutil
 import textwrap
@@ -19,9 +21,11 @@ from orbax.checkpoint import v1 as ocp
 from jaxnav.errors import InputError
 from jaxnav.store.leaves import describe, digests
 from jaxnav.store.manifest import check_manifest, differences
-from jaxnav.store.signed import sign, verified
+from jaxnav.store.signed import read_signed, sign, verified, write_signed
 
 _KEPT = 2
+#: File in a commit that lists the others.
+FILES_FILE = "files.json"
 
 State = TypeVar("State")
 
@@ -61,7 +65,7 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
     """
     _check_leaves(state)
     metadata = sign({"manifest": dict(manifest), "leaves": describe(state), "digests": digests(state)})
-    with _open(run_dir, cleanup_tmp_directories=True) as checkpointer:
+    with _quiet_libraries(), _open(run_dir, cleanup_tmp_directories=True) as checkpointer:
         latest = checkpointer.latest
         if latest is not None and latest.step >= step:
             raise InputError(
@@ -69,6 +73,9 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
                 "resume that run or choose another run directory"
             )
         checkpointer.save(step, state, force=True, custom_metadata=metadata)
+    if jax.process_index() == 0:
+        where = _folder(run_dir) / str(step)
+        write_signed(where / FILES_FILE, {"files": _file_digests(where)})
 
 
 def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str, Any]) -> Restored[State] | None:
@@ -121,6 +128,10 @@ def _load(
       InputError: another format version, config or state structure.
     """
     with _damage_named(where):
+        if (where / FILES_FILE).exists():  # a process may end before it is added
+            listed, found = read_signed(where / FILES_FILE, "the one before it is used")["files"], _file_digests(where)
+            if different := [name for name, digest in listed.items() if found.get(name) != digest]:
+                raise ValueError(f"missing or other than saved: {', '.join(different)}")
         metadata = checkpointer.metadata(step).custom_metadata
         saved = verified(where, metadata if isinstance(metadata, dict) else {}, "the one before it is used")
         if not {"manifest", "leaves"} <= saved.keys():
@@ -132,27 +143,22 @@ def _load(
             f"{where}: its state has other arrays than this code's (saved != asked for): {'; '.join(different)}; "
             f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
         )
-    with _alone(where), _damage_named(where):
-        state = checkpointer.load(step, abstract_state=_placed(abstract_state))
     with _damage_named(where):
+        state = checkpointer.load(step, abstract_state=_placed(abstract_state))
         # Checkpoints of jaxnav 0.2.0 have no digests.
         if different := "digests" in saved and differences(saved["digests"], digests(state)):
             raise ValueError(f"digests differ of {', '.join(line.split(':')[0] for line in different)}")
     return state
 
 
-@contextlib.contextmanager
-def _alone(where: Path) -> Iterator[None]:
-    """End the run where one of several processes cannot read its part.
-
-    The others wait in Orbax for it, so it cannot go on to an earlier checkpoint by itself.
-    """
-    try:
-        yield
-    except _DamageError as error:
-        if jax.process_count() == 1:
-            raise
-        raise InputError(f"{error}; start once with one process, which goes on from the one before it") from error
+def _file_digests(where: Path) -> dict[str, str]:
+    """Return the SHA-256 of every file of a commit, by its path in it."""
+    digests = {}
+    for path in sorted(where.rglob("*")):
+        if path.is_file() and path.name != FILES_FILE:
+            with path.open("rb") as file:
+                digests[path.relative_to(where).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests
 
 
 @contextlib.contextmanager

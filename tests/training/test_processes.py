@@ -72,6 +72,22 @@ def test_two_processes_train_the_run_of_one(tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_two_processes_go_on_before_a_damaged_checkpoint(tmp_path):
+    """In a part that one of them alone reads, where the other would wait for it."""
+    config_file, run_dir = write_config(tmp_path), tmp_path / "run"
+    codes, messages = two_processes(config_file, run_dir)
+    assert codes == [0, 0], messages
+    parts = [path for path in (run_dir / "checkpoints/4").rglob("ocdbt.process_1/d/*") if path.is_file()]
+    assert parts
+    for path in parts:
+        path.write_bytes(bytes(path.stat().st_size))
+    codes, messages = two_processes(config_file, run_dir)
+    assert codes == [0, 0], messages
+    assert "is damaged (ValueError: missing or other than saved: " in messages[0]
+    assert "resumed after update 2 of 4" in messages[0]
+
+
+@pytest.mark.slow
 def test_processes_that_disagree_are_refused(tmp_path):
     codes, messages = two_processes(write_config(tmp_path), tmp_path / "run", (), ("--seed", 1))
     assert codes == [2, 2], messages
