@@ -95,6 +95,9 @@ def claimed(config: RunConfig) -> Iterator[Lock]:
     try:
         by_first_process(hold)
         yield lock
+    except Exception:
+        lock.check()  # whatever fails while the folder is gone fails for that
+        raise
     finally:
         lock.release()
 

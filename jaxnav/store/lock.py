@@ -64,7 +64,8 @@ class Lock:
             there = False
         if not there:
             raise InputError(
-                f"{self._path.parent}: was removed or replaced while this run wrote to it; restore it, or train anew"
+                f"{self._path.parent}: was removed or replaced, or its {LOCK_FILE} was, while this run wrote to it; "
+                "restore it, or train anew"
             )
 
     def release(self) -> None:

@@ -74,7 +74,9 @@ def test_a_folder_that_is_removed_or_replaced_is_told(tmp_path):
     lock.acquire()
     lock.check()
     shutil.rmtree(folder)
-    with pytest.raises(InputError, match=f"{folder}: was removed or replaced while this run wrote to it"):
+    with pytest.raises(
+        InputError, match=f"{folder}: was removed or replaced, or its .lock was, while this run wrote to it"
+    ):
         lock.check()
     folder.mkdir()
     Lock(folder).acquire()
@@ -97,11 +99,21 @@ def test_a_run_directory_is_held_while_it_is_claimed(tmp_path):
         pass
 
 
+def test_what_fails_while_the_directory_is_gone_fails_for_that(tmp_path):
+    """A save, for one, of which Orbax tells much else."""
+    config = tiny_config(tmp_path)
+    with pytest.raises(InputError, match=f"{config.run_dir}: was removed or replaced"), claimed(config):
+        shutil.rmtree(config.run_dir)
+        raise ValueError("No ArrayMetadata found")
+    with pytest.raises(ValueError, match="No ArrayMetadata found"), claimed(config):
+        raise ValueError("No ArrayMetadata found")
+
+
 @pytest.mark.slow
 def test_a_second_training_is_refused_and_one_whose_directory_is_removed_ends(tmp_path, capsys):
     config_file, run_dir, long = write_config(tmp_path), tmp_path / "run", ("--total-steps", 10**6)
-    process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *long])
-    while process.poll() is None and not (run_dir / "checkpoints/2").exists():
+    process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *long, "--save-every", 1000])
+    while process.poll() is None and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.05)
     assert train(config_file, run_dir, *long) == 2
     assert f"error: {run_dir}: process {process.pid} on " in capsys.readouterr().err
@@ -109,6 +121,6 @@ def test_a_second_training_is_refused_and_one_whose_directory_is_removed_ends(tm
     os.rename(run_dir, tmp_path / "elsewhere")
     _, error = process.communicate(timeout=120)
     assert process.returncode == 2, error
-    assert error.splitlines()[-1].startswith(f"error: {run_dir}: was removed or replaced while this run wrote to it")
+    assert error.splitlines()[-1].startswith(f"error: {run_dir}: was removed or replaced, or its .lock was, while ")
     assert "Traceback" not in error
     assert not run_dir.exists()
