@@ -53,7 +53,7 @@ def learn_zones(banks: Iterable[Bank], counts: np.ndarray, num_zones: int = NUM_
       `mixing` float32 [rooms, Z, Z], the edges as a graph convolution takes them, with loops, symmetrically normalised.
       `next_zone` int32 [rooms, Z, Z], the first zone on the best path from one zone to another.
       `detected` float32 [rooms, K], log shares of the categories in what is detected in a room type.
-      `frequency` float32 [rooms], log shares of the room types among the scenes.
+      `frequency` float32 [rooms], log shares of the room types among the scenes; -87 for one without any.
 
     Raises:
       InputError: a scene has fewer poses than zones.
@@ -63,13 +63,11 @@ def learn_zones(banks: Iterable[Bank], counts: np.ndarray, num_zones: int = NUM_
     edges = near / np.maximum(near.max(axis=(-2, -1), keepdims=True), np.finfo(float).tiny)
     detected = graphs.seen.sum(axis=-2)
     shares = detected / np.maximum(detected.sum(axis=-1, keepdims=True), 1.0)
-    with np.errstate(divide="ignore"):  # a room type without scenes: -inf
-        frequency = np.log(scenes / scenes.sum())
     learned = {
         "nodes": np.where(graphs.poses[..., None] > 0, graphs.centres, -1.0),
         "mixing": normalised(edges),
         "detected": np.log((1.0 - UNIFORM) * shares + UNIFORM / shares.shape[-1]),
-        "frequency": frequency,
+        "frequency": np.log(np.maximum(scenes / scenes.sum(), np.finfo(np.float32).tiny)),
     }
     return {name: array.astype(np.float32) for name, array in learned.items()} | {"next_zone": next_zones(edges)}
 
