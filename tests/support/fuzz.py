@@ -7,6 +7,8 @@ import gzip
 import json
 import random
 import shutil
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -100,3 +102,15 @@ def fuzz(kind: str, folder: Path, runs: int, seed: int) -> tuple[collections.Cou
         codes[code] += 1
         shutil.rmtree(place)
     return codes, slowest
+
+
+def _alone(kind: str, runs: int, seed: int) -> dict[str, object]:
+    """Return what `fuzz` does, and the most memory in MiB that this process ever held."""
+    with tempfile.TemporaryDirectory() as folder:
+        codes, slowest = fuzz(kind, Path(folder), runs, seed)
+    (peak,) = (line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
+    return {"codes": list(codes.items()), "slowest": slowest, "peak": int(peak) / 1024}
+
+
+if __name__ == "__main__":
+    print(json.dumps(_alone(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))))
