@@ -50,6 +50,9 @@ ROWS = (
     table_row("layout", None, None, "sample"),
 )
 TOLERANCE = 2e-3
+#: Where rounding grows more: a change of VTNet's lively weights by half of float32's precision alone moves its logits by
+#: up to 2.6e-3, through two decoders whose scores reach 400.
+TOLERANCES = {"vtnet": 1e-2}
 DECISIONS = ("fused", "streams")
 #: Of the episodes, where the twin takes thousands of derivatives a step.
 FEWER = {"savn": 100}
@@ -99,13 +102,13 @@ def case(name: str, decision: Any) -> Case:
 
 
 class Compared(NamedTuple):
-    """Count what was compared, and hold by name how far the twin's numbers are from the package's at most."""
+    """Count what was compared, and hold by name how far the twin's numbers are from the package's, each time."""
 
     decisions: int
     ties: int
     removals: int
     differences: list[str]
-    errors: dict[str, float]
+    errors: dict[str, list[float]]
 
 
 def noise(episode: int, time: int, size: int) -> np.ndarray:
@@ -117,14 +120,14 @@ def noise(episode: int, time: int, size: int) -> np.ndarray:
 def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: type[TwinMethod]) -> Compared:
     """Go along the episodes that the package plays.
 
-    Where the best two choices are equal within `TOLERANCE` and the twin takes the other one, it leaves the episode.
+    Where the best two choices are equal within its tolerance and the twin takes the other one, it leaves the episode.
     """
     (bank, _, params, _), played = world(), case(method, decision)
     (acting, weights, knowledge), cell = played, tiny.at(inference_grid([row], ("layout",), 1), 0)
     assert acting.spec is not None
     policy = TwinPolicy(acting.spec, jax.tree.map(lambda leaf: np.asarray(leaf, float), weights), twin(knowledge))
     decisions, ties, removals, differences = 0, 0, 0, []
-    errors: dict[str, float] = collections.defaultdict(float)
+    errors: dict[str, list[float]] = collections.defaultdict(list)
     for number, trace in enumerate(played.played(cell, episodes)):
         goal, scene, pose = (int(getattr(episodes, name)[number]) for name in ("goal", "scene", "pose"))
         prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.setting else None
@@ -134,11 +137,11 @@ def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: t
             corrected, weight = inferred.corrected(row.variant, row.epsilon, row.form)
             for name, value in {**inferred._asdict(), "corrected": corrected, "weight": weight}.items():
                 expected = getattr(trace.inferred, name)[time]
-                errors[name] = max(errors[name], float(np.abs(expected - value).max()))
+                errors[name].append(float(np.abs(expected - value).max()))
             scores = corrected + (noise(number, time, len(corrected)) if row.decoding == "sample" else 0.0)
             decisions, removals = decisions + 1, removals + int(corrected.argmax() != inferred.factual.argmax())
             if (episode.pose, policy.method.act(int(scores.argmax()))) != (expected_pose, action):
-                if np.subtract(*np.sort(scores)[:-3:-1]) > TOLERANCE:
+                if np.subtract(*np.sort(scores)[:-3:-1]) > TOLERANCES.get(method, TOLERANCE):
                     differences.append(f"episode {number}, step {time}")
                 ties += 1
                 break
@@ -165,10 +168,12 @@ def test_every_decision_is_the_twins(method, decision, count):
     whole, removals = episode_list(world()[0], count), 0
     for part, row in enumerate(ROWS):
         found = compare(method, decision, row, whole.take(np.arange(part, count, len(ROWS))), TWINS[method])
-        print(method, decision, row.variant, row.decoding, found)
+        worst = {name: max(errors) for name, errors in found.errors.items()}
+        print(method, decision, row.variant, row.decoding, found._replace(errors={}), worst)
         assert found.differences == []
         assert found.ties <= 1 + found.decisions / 1000
-        assert max(found.errors.values()) < TOLERANCE
+        assert max(worst.values()) < TOLERANCES.get(method, TOLERANCE)
+        assert max(np.quantile(errors, 0.99) for errors in found.errors.values()) < TOLERANCE / 2
         removals += found.removals
     assert removals > 0
 
@@ -191,4 +196,4 @@ class Mistaken(TwinRelations):
 def test_a_twin_that_is_wrong_is_noticed(wrong):
     found = compare("org", "fused", ROWS[0], episode_list(world()[0], 4), wrong)
     assert found.differences
-    assert found.errors["factual"] > 10 * TOLERANCE
+    assert max(found.errors["factual"]) > 10 * TOLERANCE
