@@ -50,8 +50,8 @@ ROWS = (
     table_row("layout", None, None, "sample"),
 )
 TOLERANCE = 2e-3
-#: Where rounding grows more: a change of VTNet's lively weights by half of float32's precision alone moves its logits by
-#: up to 2.6e-3, through two decoders whose scores reach 400.
+#: Where rounding grows more: half of float32's precision in VTNet's lively weights moves its logits by up to 2.6e-3,
+#: through two decoders whose scores reach 400.
 TOLERANCES = {"vtnet": 1e-2}
 DECISIONS = ("fused", "streams")
 #: Of the episodes, where the twin takes thousands of derivatives a step.

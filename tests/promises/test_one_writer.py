@@ -102,11 +102,17 @@ def test_a_run_directory_is_held_while_it_is_claimed(tmp_path):
 def test_what_fails_while_the_directory_is_gone_fails_for_that(tmp_path):
     """A save, for one, of which Orbax tells much else."""
     config = tiny_config(tmp_path)
-    with pytest.raises(InputError, match=f"{config.run_dir}: was removed or replaced"), claimed(config):
-        shutil.rmtree(config.run_dir)
-        raise ValueError("No ArrayMetadata found")
-    with pytest.raises(ValueError, match="No ArrayMetadata found"), claimed(config):
-        raise ValueError("No ArrayMetadata found")
+
+    def failing(gone: bool) -> None:
+        with claimed(config):
+            if gone:
+                shutil.rmtree(config.run_dir)
+            raise ValueError("No ArrayMetadata found")
+
+    with pytest.raises(InputError, match=f"{config.run_dir}: was removed or replaced"):
+        failing(gone=True)
+    with pytest.raises(ValueError, match="No ArrayMetadata found"):
+        failing(gone=False)
 
 
 @pytest.mark.slow
