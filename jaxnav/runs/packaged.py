@@ -27,7 +27,7 @@ def policy_folder(path: str | Path) -> Path:
     Raises:
       InputError: there is neither; names those of the package.
     """
-    folder = Path(path) if Path(path).exists() else WEIGHTS / path
+    folder = _folder(path)
     if not folder.exists():
         names, what = ", ".join(sorted(os.listdir(WEIGHTS))), "not an exported policy (No such file or directory: "
         raise InputError(f"{path}: {what}{path}); export it, or load one of the package: {names}")
@@ -36,7 +36,11 @@ def policy_folder(path: str | Path) -> Path:
 
 def is_policy(path: str | Path) -> bool:
     """Return whether there is an exported policy; see `policy_folder`."""
-    return ((Path(path) if Path(path).exists() else WEIGHTS / path) / POLICY_FILE).exists()
+    return (_folder(path) / POLICY_FILE).exists()
+
+
+def _folder(path: str | Path) -> Path:
+    return Path(path) if Path(path).exists() else WEIGHTS / path
 
 
 def world_of(path: str | Path) -> RunConfig:

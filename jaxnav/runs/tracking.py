@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from jaxnav.errors import InputError
 from jaxnav.runs.directory import Run, settings
 from jaxnav.store.sinks import SINKS, Sink
 
@@ -36,15 +37,17 @@ def send_log(
       The number of rows.
 
     Raises:
-      InputError: a sink's library is not installed, or a damaged log.
+      InputError: no sink, one whose library is not installed, or a damaged log.
     """
+    if not to:
+        raise InputError(f"--to: names no sink; give {' or '.join(SINKS)}")
     sinks: dict[str, list[Sink]] = {}
     about, count = settings(run.config), 0
     try:
         for row in _rows(run, follow, wait):
             series = f"{row['arm']}-{row['seed']}"
             if series not in sinks:
-                sinks[series] = [SINKS[name](run.config.run_dir, series, project, about) for name in to]
+                sinks[series] = [SINKS[name](run.config.run_dir, series, project, about) for name in sorted(set(to))]
             values = {name: value for name, value in row.items() if name not in _PLACE and value is not None}
             for sink in sinks[series]:
                 sink.write(row["env_steps"], values)

@@ -22,6 +22,10 @@ POLICY_FILE = "policy.json"
 _PARAMS = "params.safetensors"
 
 
+class _OtherVersionError(InputError):
+    """Refuse an export of another format version."""
+
+
 def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
     """Write parameters and what the policy is built from.
 
@@ -37,13 +41,15 @@ def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, An
       spec: JSON values.
 
     Raises:
-      InputError: the folder holds another export.
+      InputError: the folder holds another export, or one of another format version.
       TypeError: a name in `params` is no string or holds `/`.
     """
     tensors = safetensors.numpy.save(_flatten(params))
     policy = {"format_version": FORMAT_VERSION, "params_sha256": hashlib.sha256(tensors).hexdigest(), "spec": spec}
     try:
         held = _read_policy(folder)
+    except _OtherVersionError:
+        raise
     except InputError:  # there is none, or a damaged one
         write_atomic(folder / _PARAMS, tensors)
         write_signed(folder / POLICY_FILE, policy)
@@ -87,7 +93,7 @@ def _read_policy(folder: Path) -> dict[str, Any]:
             f"{folder / POLICY_FILE}: lacks format_version, params_sha256 or spec; export the policy again"
         )
     if policy["format_version"] != FORMAT_VERSION:
-        raise InputError(
+        raise _OtherVersionError(
             f"{folder / POLICY_FILE}: has format version {policy['format_version']!r}, this code reads version "
             f"{FORMAT_VERSION}; export the policy again"
         )

@@ -58,8 +58,7 @@ training runs and scenes ([statistics.md](statistics.md)). [table2.md](table2.md
 
 **What can be compared.** Not the numbers. Agents of the paper see images through a trained detector and are tested in
 AI2-THOR, RoboTHOR and Gibson; ours see a grid through a simulated detector, have a map of where they have been, live
-in generated homes, and learn by PPO for about a thirtieth of the steps. Orderings that say something of the world, and
-not of a simulator, can be:
+in generated homes, and learn by PPO. Orderings that say something of the world, and not of a simulator, can be:
 
 * Random is far below everything, and RGB+RL below the methods that know more than a list of detections, as a group.
 * A host with the layout is above the host. What w does and what sTDE does are told apart.
@@ -147,7 +146,8 @@ def _levels(world: str, parts: Parts, printed: Mapping[Agent, Printed]) -> Itera
             continue
         name = "Random" if reference == "random" else f"`{reference}`"
         text = f"{world}: methods over {name}" + (f" ({len(there)} of {len(methods)})" if there else "")
-        level = sum(printed[method, "baseline"].sr for method in methods) / len(methods)
+        compared = [method for *_, method in there] or methods
+        level = sum(printed[method, "baseline"].sr for method in compared) / len(compared)
         other, effect = _line(parts, reference, variant), Interval(math.nan)
         if there and other:
             effect = there[0][0].difference(_mean([line for _, line, _ in there]), *other, "sr")
@@ -176,9 +176,7 @@ def _gain(parts: Parts, host: str, variant: str = "stde", reference: str = "base
 def _between(worlds: Mapping[str, Parts]) -> Iterable[tuple[str, ...]]:
     """Compare the gains of hosts between worlds."""
     printed = {"rooms": TABLE_2_AI2THOR, "apartments": TABLE_2_ROBOTHOR}
-    told = {
-        name: [table[host, "stde"].sr - table[host, "baseline"].sr for host in HOSTS] for name, table in printed.items()
-    }
+    told = {name: [_told(table, host) for host in _gaining(worlds[name]) or HOSTS] for name, table in printed.items()}
     paper = {name: sum(gains) / len(gains) for name, gains in told.items()}
     gains = {name: _group_gain(worlds[name]) for name in printed}
     semexp = TABLE_3["semexp", "stde"].sr - TABLE_3["semexp", "baseline"].sr
@@ -188,10 +186,15 @@ def _between(worlds: Mapping[str, Parts]) -> Iterable[tuple[str, ...]]:
     yield _row("gains: hosts in rooms over `semexp` in houses", paper["rooms"] - semexp, smaller)
 
 
+def _gaining(parts: Parts) -> dict[str, tuple[tuple[Scores, Line], tuple[Scores, Line]]]:
+    """Return results and lines with and without sTDE of the hosts that have both."""
+    pairs = {host: (_line(parts, host, "stde"), _line(parts, host, "baseline")) for host in HOSTS}
+    return {host: (one, other) for host, (one, other) in pairs.items() if one and other}
+
+
 def _group_gain(parts: Parts) -> Interval:
     """Return the mean gain of the hosts that are there."""
-    pairs = [(_line(parts, host, "stde"), _line(parts, host, "baseline")) for host in HOSTS]
-    there = [(one, other) for one, other in pairs if one and other]
+    there = list(_gaining(parts).values())
     if not there:
         return Interval(math.nan)
     part = there[0][0][0]

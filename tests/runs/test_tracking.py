@@ -177,3 +177,11 @@ def test_wandb_keeps_the_log_offline(run, monkeypatch):
         items = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
         found |= {(items["_step"], name): value for name, value in items.items() if not name.startswith("_")}
     assert found == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
+
+
+def test_a_sink_named_twice_is_sent_to_once_and_none_is_refused(run, sent):
+    log(run, row(1, loss=0.5))
+    assert send_log(run, ("tensorboard", "tensorboard")) == 1
+    assert len(sent[0]) == 1
+    with pytest.raises(InputError, match="names no sink; give tensorboard or wandb"):
+        send_log(run, ())
