@@ -76,8 +76,7 @@ def walk(bank: Bank, successor: np.ndarray, pose: int, goal: int, limit: int) ->
       limit: actions at most.
     """
     rules, row_format = bank.task.rules, RowFormat(len(bank.task.categories))
-    horizons = len(rules.horizons)
-    searcher = Searcher(rules, pose // horizons % rules.headings, pose % horizons)
+    searcher = Searcher(rules, *rules.split(pose)[1:])
     for _ in range(limit):
         row = bank.rows[pose]
         action = searcher.act(row_format.view_cells(row), row_format.detections(row)[goal])

@@ -124,7 +124,7 @@ def _seen(rules: Rules, centres: np.ndarray, rows: np.ndarray, categories: int, 
     detections = RowFormat(categories).detections(rows)
     pose, category = np.nonzero(detections[..., 0])
     ahead, right = relative_position(detections[pose, category])
-    cell, heading = np.divmod(pose // len(rules.horizons), rules.headings)
+    cell, heading, _ = rules.split(pose)
     forward = rules.directions()[heading]
     rightward = np.stack([forward[:, 1], -forward[:, 0]], axis=-1)
     at = centres[cell] + ahead[:, None] * forward + right[:, None] * rightward

@@ -108,15 +108,16 @@ class _Functions:
 
     def _named(self, episode: Episode) -> Named:
         env, state = self._env, episode.state
-        row, rules, view = env.observe(state, self._params).row, env.task.rules, env.row_format.view
+        row, view = env.observe(state, self._params).row, env.row_format.view
+        _, heading, horizon = env.task.rules.split(state.pose)
         detections = env.row_format.detections(row)
         values = (detections.astype(jnp.float32) - _ORIGIN[None]) / _SCALE[None]
         return {
             "view": env.row_format.view_cells(row).reshape(view, view),
             "detections": jnp.where(detections[:, :1] > 0, values, 0.0),
             "goal": state.goal,
-            "heading": state.pose // len(rules.horizons) % rules.headings,
-            "horizon": state.pose % len(rules.horizons),
+            "heading": heading,
+            "horizon": horizon,
             "moved": episode.moved.astype(jnp.int32),
         }
 

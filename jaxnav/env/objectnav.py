@@ -129,7 +129,7 @@ class ObjectNav:
         Both are int32 [].
         """
         headings, horizons = self.task.rules.headings, len(self.task.rules.horizons)
-        cell, heading, horizon = pose // (headings * horizons), pose // horizons % headings, pose % horizons
+        cell, heading, horizon = self.task.rules.split(pose)
 
         def when(chosen: int) -> jax.Array:
             return (action == chosen).astype(jnp.int32)
@@ -141,7 +141,7 @@ class ObjectNav:
 
     def cell(self, pose: jax.Array) -> jax.Array:
         """Return the global cell int32 [] of a pose."""
-        return pose // self.task.rules.poses_per_cell
+        return self.task.rules.split(pose)[0]
 
     def succeeds(self, state: State, params: EnvParams) -> jax.Array:
         """Return whether Done would succeed here, bool [].

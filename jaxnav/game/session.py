@@ -72,9 +72,8 @@ def _advise(
     """Return a policy's probabilities, and its memory after each action."""
     if game.policy is None or memory is None:
         return None, None
-    rules, pose = acting.env.task.rules, agent.state.pose[0]
     state = jax.tree.map(lambda leaf: leaf[0], agent.state)
-    heading, horizon = pose // len(rules.horizons) % rules.headings, pose % len(rules.horizons)
+    _, heading, horizon = acting.env.task.rules.split(state.pose)
     observation = acting.env.observe(state, params)
     advice, memories = _decide(game.policy, observation, memory, game.epsilon, heading, moved[0], horizon)
     return np.asarray(advice), memories
@@ -95,7 +94,8 @@ def _believed(acting: Acting, agent: Agent, knowledge: Knowledge, params: EnvPar
 
 def _look(game: Game, agent: Agent, acting: Acting, params: EnvParams, advice: np.ndarray | None) -> Look:
     rules, row_format = game.bank.task.rules, acting.env.row_format
-    pose, row = int(agent.state.pose[0]), game.bank.rows[int(agent.state.pose[0])]
+    pose = int(agent.state.pose[0])
+    row, (_, heading, horizon) = game.bank.rows[pose], rules.split(pose)
     detections = row_format.detections(row)
     ahead, right = relative_position(detections)
     seen = sorted(np.flatnonzero(detections[:, 0]), key=lambda k: np.hypot(ahead[k], right[k]))
@@ -103,8 +103,8 @@ def _look(game: Game, agent: Agent, acting: Acting, params: EnvParams, advice: n
     return Look(
         time=int(agent.state.time[0]),
         limit=int(params.step_limit[agent.state.scene[0]]),
-        heading=360.0 / rules.headings * (pose // len(rules.horizons) % rules.headings),
-        horizon=rules.horizons[pose % len(rules.horizons)],
+        heading=360.0 / rules.headings * heading,
+        horizon=rules.horizons[horizon],
         cells=row_format.view_cells(row).reshape(row_format.view, row_format.view),
         seen=[(names[k], float(ahead[k]), float(right[k]), float(detections[k, 0]) / 255) for k in seen],
         weights=np.asarray(weights[0]),

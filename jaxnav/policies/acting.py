@@ -177,9 +177,8 @@ class Acting:
           moved: bool [B], whether it changed the cell.
           knowledge, params: as in `step`.
         """
-        headings, horizons = self.env.task.rules.headings, len(self.env.task.rules.horizons)
         pose, room = agent.state.pose, params.room[agent.state.scene]
-        heading, horizon = pose // horizons % headings, pose % horizons
+        _, heading, horizon = self.env.task.rules.split(pose)
         percept = Percept(params.tables.rows[pose], heading, action, moved, horizon, agent.state.goal)
         update = jax.vmap(self._perception.update, (0, 0, None, 0))
         return agent._replace(perceived=update(agent.perceived, percept, knowledge, room))

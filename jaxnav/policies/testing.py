@@ -107,7 +107,6 @@ def _check_notes(
     tracker = method.tracker
     if tracker is None:
         return
-    headings, horizons = env.task.rules.headings, len(env.task.rules.horizons)
     update = jax.jit(lambda note, percept: tracker.update(note, knowledge, percept))
     control = jax.jit(lambda choice, note: method.control.act(choice, note, knowledge)[1])
     for i in range(_BATCH):
@@ -115,9 +114,9 @@ def _check_notes(
         for before, agent, choice in zip([None, *agents], agents, [None, *choices], strict=False):
             pose = agent.state.pose[i]
             note = note if choice is None else control(choice[i], note)
-            moved = jnp.bool_(before is not None and env.cell(before.state.pose[i]) != env.cell(pose))
-            heading = pose // horizons % headings
-            position = heading, carried(agent).action[i], moved, pose % horizons
+            cell, heading, horizon = env.task.rules.split(pose)
+            moved = jnp.bool_(before is not None and env.cell(before.state.pose[i]) != cell)
+            position = heading, carried(agent).action[i], moved, horizon
             percept = Percept(params.tables.rows[pose], *position, agent.state.goal[i])
             note = update(note, percept)
             kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.perceived.note)

@@ -114,8 +114,8 @@ def _views(scene: Scene, bank: Bank, index: int, poses: np.ndarray) -> list[View
     centres = cell_centres(scene, standable_cells(scene.reach))
     views = []
     for pose in poses:
-        place = centres[pose // rules.poses_per_cell - bank.first_cell[index]]
-        heading = int(pose) // len(rules.horizons) % rules.headings
+        cell, heading, _ = rules.split(int(pose))
+        place = centres[cell - bank.first_cell[index]]
         yaw = 360.0 / rules.headings * heading
         outline = view_cone(scene, rules, place, yaw)
         depth = np.linalg.norm(outline[1::2] - place, axis=1) / MAX_RANGE

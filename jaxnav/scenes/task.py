@@ -53,6 +53,14 @@ class Rules:
         """
         return self.headings * len(self.horizons)
 
+    def split(self, pose: Any) -> tuple[Any, Any, Any]:
+        """Return cell, heading and horizon of poses.
+
+        Each is an index, of the type and the shape of `pose`: an int or an array of ints.
+        """
+        horizons = len(self.horizons)
+        return pose // self.poses_per_cell, pose // horizons % self.headings, pose % horizons
+
     @property
     def half_view(self) -> tuple[float, float]:
         """Return the tangents of half the field of view.

@@ -109,7 +109,7 @@ def status(episode: Episode, step: int) -> tuple[str, str]:
 def _draw_agent(axes: Axes, episode: Episode, step: int) -> list[Artist]:
     """Draw the path, the agent and what is detected."""
     rules = episode.task.rules
-    place, heading = episode.places[step], episode.trace.pose[step] // len(rules.horizons) % rules.headings
+    place, (_, heading, _) = episode.places[step], rules.split(episode.trace.pose[step])
     agent = draw_agent(axes, episode.scene, rules, place, 360.0 / rules.headings * heading)
     path = axes.plot(*episode.places[: step + 1].T, color=AGENT, lw=2, solid_joinstyle="round", zorder=4)
     start = axes.plot(*episode.places[0], "o", color="white", markeredgecolor=AGENT, markersize=6, zorder=4)

@@ -82,13 +82,13 @@ def plan(control: LocalPolicy, course: Course, choice: jax.Array, knowledge: Kno
 
 def _percepts(episode: Episode) -> Percept:
     """Return what the tracker was told, leaves [T, ...]."""
-    rules, pose = episode.task.rules, episode.trace.pose
+    _, heading, horizon = episode.task.rules.split(episode.trace.pose)
     moved = np.concatenate([[False], (np.diff(episode.places, axis=0) != 0).any(axis=1)])
     return Percept(
         row=jnp.asarray(episode.rows),
-        heading=jnp.asarray(pose // len(rules.horizons) % rules.headings),
+        heading=jnp.asarray(heading),
         action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), jnp.asarray(episode.trace.action[:-1], jnp.int32)]),
         moved=jnp.asarray(moved),
-        horizon=jnp.asarray(pose % len(rules.horizons)),
-        goal=jnp.full(len(pose), episode.goal, jnp.int32),
+        horizon=jnp.asarray(horizon),
+        goal=jnp.full(len(heading), episode.goal, jnp.int32),
     )
