@@ -86,7 +86,7 @@ def play_episode(
 
 def _opened(source: str | Path, arm: str) -> tuple[RunConfig, Policies]:
     """Open a run, or an exported policy."""
-    if Path(source).exists() and not is_policy(source):
+    if not is_policy(source):
         config = load_run(Path(source))
         return config, load_policies(config, config.arms if arm in config.arms else (arm,))
     config, policies = as_run(source)

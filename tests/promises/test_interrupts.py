@@ -15,11 +15,20 @@ from support.processes import run
 
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import Interrupted
+from jaxnav.runs import updates
 from jaxnav.runs.interrupts import Interrupts
 
 LIMIT_S = 30
 #: 60 updates; checkpoints are rare, so that the one after the signal is for the signal.
 LONG = ("--total-steps", 60 * 128, "--save-every", 7)
+
+
+@pytest.fixture(autouse=True)
+def heeded():
+    """SIGINT as in a terminal: a shell that starts the tests in the background has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +72,35 @@ def test_the_first_signal_is_noted_and_the_second_ends_the_process():
             # What the system does by itself: it ends the process, wherever it is.
             assert {signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)} == {signal.SIG_DFL}
         assert signal.getsignal(number) == before
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    """As in a run that `nohup` or a script started in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with Interrupts() as interrupts:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupts.asked() == 0
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+
+
+@pytest.mark.slow
+def test_a_signal_during_the_last_save_is_told(tmp_path, capsys, monkeypatch):
+    """The run is saved and not exported; the same command exports it."""
+    config_file, run_dir, whole_save = write_config(tmp_path), tmp_path / "run", updates.save
+
+    def interrupted(folder, step, *rest):
+        if step == 4:  # the last
+            signal.raise_signal(signal.SIGTERM)
+        whole_save(folder, step, *rest)
+
+    monkeypatch.setattr(updates, "save", interrupted)
+    assert train(config_file, run_dir) == 143
+    told = f"interrupted: {run_dir}: stopped after update 4 of 4 and saved; the same command goes on from there"
+    assert told in capsys.readouterr().err
+    assert not (run_dir / "policies").exists()
+    monkeypatch.undo()
+    assert train(config_file, run_dir) == 0
+    assert (run_dir / "policies").exists()
 
 
 def test_threads_without_signals_train_too():
