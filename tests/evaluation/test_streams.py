@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from support import tiny_world as tiny
 from support.rollouts import ENV, KNOWLEDGE, PARAMS
 
@@ -14,6 +15,7 @@ from jaxnav.policies.acting import Acting
 EPISODES = 64
 
 
+@pytest.mark.slow
 def test_episodes_without_experience_are_those_of_the_direct_stream():
     """Sampled, in the whole grid: the same as those of a policy whose experience says nothing."""
     weights = tiny.lively(1, tiny.STREAMS)

@@ -114,7 +114,10 @@ def test_removing_experience_leaves_the_direct_stream_to_the_bit(method):
         assert np.std(found.counterfactual.logits) > 0.1
 
 
-@pytest.mark.parametrize("method", HOSTS)
+@pytest.mark.parametrize(
+    "method",
+    [name if name in ("rgb", "org", "hoz") else pytest.param(name, marks=pytest.mark.slow) for name in HOSTS],
+)
 def test_soft_removal_keeps_a_share_of_experience(method):
     found = decisions(streams(method), seed=5)
     direct, experience = found.direct.logits - found.nothing.logits, found.counterfactual.logits

@@ -54,6 +54,7 @@ def remembered(network, hidden, actions):
     return trials
 
 
+@pytest.mark.slow
 def test_the_trial_in_the_same_state_is_retrieved():
     draws, count = np.random.default_rng(0), 40
     hidden = jnp.asarray(draws.uniform(-1, 1, (count, HIDDEN)), jnp.float32)

@@ -135,6 +135,7 @@ def test_a_probe_has_its_value_and_its_choice(rollouts, name):
         assert (t.choice == np.array(case.right)[t.goal]).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_another_discount_has_another_value(rollouts):
     """So the delayed reward is discounted, and once: nothing else about the probes changes."""
     found = tiny.at(jax.device_get(trained(jnp.float32(0.9), UPDATES)), list(CASES).index("delayed"))

@@ -139,7 +139,9 @@ def campaign(name, folder, number, seed) -> collections.Counter[str]:
     return outcomes
 
 
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize(
+    "name", [name if name != "checkpoint" else pytest.param(name, marks=pytest.mark.slow) for name in STORED]
+)
 def test_no_damage_is_used_silently(name, tmp_path):
     outcomes = campaign(name, tmp_path, 8, seed=0)
     assert outcomes["silent"] == 0

@@ -19,6 +19,7 @@ def halved(evaluated):
     return evaluated._replace(outcome=evaluated.outcome._replace(success=success))
 
 
+@pytest.mark.slow
 def test_every_row_of_a_policy_has_a_lead_in_every_metric(evaluated, halved):
     entries = leads(evaluated, halved)
     assert {entry.metric for entry in entries} == {"sr", "spl", "sr@20", "sr@50"}
@@ -30,6 +31,7 @@ def test_every_row_of_a_policy_has_a_lead_in_every_metric(evaluated, halved):
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_only_rows_that_remove_something_have_a_share(evaluated, halved):
     shares = {entry.variant: entry.left for entry in leads(evaluated, halved) if entry.metric == "sr"}
     assert shares["ORG (baseline)"] is None
@@ -37,11 +39,13 @@ def test_only_rows_that_remove_something_have_a_share(evaluated, halved):
     assert shares["+ w + TDE"] is not None
 
 
+@pytest.mark.slow
 def test_an_agent_has_no_lead_over_itself(evaluated):
     baselines = [entry for entry in leads(evaluated, evaluated) if entry.variant == "ORG (baseline)"]
     assert [entry.lead.mean for entry in baselines] == [0.0] * 8
 
 
+@pytest.mark.slow
 def test_runs_that_cannot_be_compared_are_refused(evaluated):
     fewer = evaluated._replace(outcome=type(evaluated.outcome)(*(leaf[:, :1] for leaf in evaluated.outcome)))
     with pytest.raises(InputError, match="2 seeds with experience and 1 without"):

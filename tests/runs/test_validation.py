@@ -37,6 +37,7 @@ def validated(drawn_run):
     return config, policies, validator, held
 
 
+@pytest.mark.slow
 def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
     config, policies, validator, held = validated
     rows = [Row(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
@@ -53,6 +54,7 @@ def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
     assert 0 < np.asarray(outcome.done).mean() < 1
 
 
+@pytest.mark.slow
 def test_success_within_budgets_grows_to_the_whole(validated):
     _, policies, validator, held = validated
     reach, scores = validator.reach(held), validator.measure(held)

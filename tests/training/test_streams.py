@@ -99,7 +99,7 @@ def test_its_share_is_as_configured(share):
     np.testing.assert_array_equal(after.memory.experienced[~fresh], first[~fresh])
 
 
-@pytest.mark.parametrize("drawn", ["episode", "step"])
+@pytest.mark.parametrize("drawn", ["episode", pytest.param("step", marks=pytest.mark.slow)])
 def test_experience_comes_and_goes_within_an_episode_only_if_drawn_at_every_step(drawn):
     learner = learner_with("org", experience=0.5, experience_drawn=drawn)
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
