@@ -152,6 +152,7 @@ def test_experience_attends_with_the_memory():
         policy.pathways(*view)
 
 
+@pytest.mark.slow
 def test_a_tracker_takes_in_every_view_once():
     """Auto-resets begin a new note, whose first view counts; of the actions the first is `NO_ACTION`."""
     _, before, after, rollout = rolled("COUNTING")

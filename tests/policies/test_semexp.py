@@ -146,6 +146,7 @@ def test_where_the_goal_was_looked_at_in_vain_is_left():
     assert not int(last.cells[z + 1, x]) & 1 << BOOK
 
 
+@pytest.mark.slow
 def test_the_layout_enters_by_the_categories_on_the_map_alone():
     weights = tiny.lively(0, SPEC)
     policy = bind(SPEC, weights)

@@ -102,12 +102,9 @@ def given(spec, decisions=7, seed=0):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {},
-        pytest.param({"done_gate": True}, marks=pytest.mark.slow),
-        pytest.param({"decision": "streams", "direct": "goal"}, marks=pytest.mark.slow),
-    ],
+    [{}, {"done_gate": True}, {"decision": "streams", "direct": "goal"}],
 )
+@pytest.mark.slow
 def test_the_step_descends_the_cross_entropy_at_repeated_poses(options):
     policy, pathways, memory = given(dataclasses.replace(SPEC, **options))
     if "decision" in options:  # where experience is, no gradient is let through, though the step is the same

@@ -157,7 +157,6 @@ def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: t
     ("method", "decision", "count"),
     [
         ("org", "fused", 12),
-        ("org", "streams", 12),
         *(
             pytest.param(name, decision, FEWER.get(name, 1000), marks=pytest.mark.slow)
             for name, decision in itertools.product(METHODS, DECISIONS)

@@ -182,8 +182,8 @@ def test_another_digit_in_a_log_is_told(tmp_path):
     "hurt",
     [
         lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"),
-        lambda folder: (folder / "state/_METADATA").unlink(),
-        lambda folder: (folder / "state/_METADATA").write_text(""),
+        pytest.param(lambda folder: (folder / "state/_METADATA").unlink(), marks=pytest.mark.slow),
+        pytest.param(lambda folder: (folder / "state/_METADATA").write_text(""), marks=pytest.mark.slow),
         lambda folder: flip(max((folder / "state").rglob("d/*"), key=lambda path: path.stat().st_size)),
     ],
 )

@@ -177,7 +177,7 @@ for step in range(1, 10**6):
 """
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.01, 0.03, 0.1])
+@pytest.mark.parametrize("delay", [0.0, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.01, 0.03, 0.1))])
 def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, delay):
     command = [sys.executable, "-c", ENDLESS_SAVES, str(tmp_path)]
     with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:

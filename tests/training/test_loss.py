@@ -58,6 +58,7 @@ def test_advantages_of_a_macro_step_by_hand():
 
 
 @given(st.integers(0, 1000), st.floats(0, 1, width=32), st.floats(0, 1, width=32))
+@pytest.mark.slow
 def test_advantages_over_macro_steps_are_those_of_their_sums(seed, gamma, lambda_):
     """Generalised advantages of macro-steps, each with its discounted rewards and gamma to the power of its length."""
     reward, value, next_value, ended = random_steps(seed)

@@ -59,6 +59,7 @@ def rolled(method):
 # The coin
 
 
+@pytest.mark.slow
 def test_the_coin_is_constant_within_an_episode():
     _, rollouts = rolled("org")
     coins, ended = (
