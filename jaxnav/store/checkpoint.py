@@ -103,6 +103,7 @@ def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str
                 damaged.append(str(error))
             else:
                 return Restored(state, step, tuple(damaged))
+            gc.collect()  # asyncio logs the error of a task when it is collected
     if damaged:
         raise InputError(f"{'; '.join(damaged)}: no checkpoint is left; restore one or choose another run directory")
     return None
@@ -153,24 +154,23 @@ def _load(
 
 def _file_digests(where: Path) -> dict[str, str]:
     """Return the SHA-256 of every file of a commit, by its path in it."""
-    digests = {}
-    for path in sorted(where.rglob("*")):
+    found = {}
+    for path in where.rglob("*"):
         if path.is_file() and path.name != FILES_FILE:
             with path.open("rb") as file:
-                digests[path.relative_to(where).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
-    return digests
+                found[path.relative_to(where).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
 
 
 @contextlib.contextmanager
 def _quiet_libraries() -> Iterator[None]:
-    """Keep Orbax from logging pages about damaged files, which are told in one line."""
+    """Keep Orbax from logging pages about what is told in one line."""
     loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
-        gc.collect()  # asyncio logs the error of a task when it is collected
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)

@@ -27,6 +27,8 @@ STEPS = (("stde", "baseline"), ("layout", "baseline"), ("stde", "layout"), ("lay
 POINTS = 2.0  # of SR; the least effect that would matter
 #: Results of one world's methods, with one core, by method.
 Parts = Mapping[str, Scores]
+#: Results and lines of a host with and without sTDE.
+Pair = tuple[tuple[Scores, Line], tuple[Scores, Line]]
 
 
 class Table(NamedTuple):
@@ -176,9 +178,10 @@ def _gain(parts: Parts, host: str, variant: str = "stde", reference: str = "base
 def _between(worlds: Mapping[str, Parts]) -> Iterable[tuple[str, ...]]:
     """Compare the gains of hosts between worlds."""
     printed = {"rooms": TABLE_2_AI2THOR, "apartments": TABLE_2_ROBOTHOR}
-    told = {name: [_told(table, host) for host in _gaining(worlds[name]) or HOSTS] for name, table in printed.items()}
+    there = {name: _gaining(worlds[name]) for name in printed}
+    told = {name: [_told(table, host) for host in there[name] or HOSTS] for name, table in printed.items()}
     paper = {name: sum(gains) / len(gains) for name, gains in told.items()}
-    gains = {name: _group_gain(worlds[name]) for name in printed}
+    gains = {name: _group_gain(list(pairs.values())) for name, pairs in there.items()}
     semexp = TABLE_3["semexp", "stde"].sr - TABLE_3["semexp", "baseline"].sr
     larger = _apart(gains["apartments"], gains["rooms"])
     yield _row("gains of hosts: apartments over rooms", paper["apartments"] - paper["rooms"], larger)
@@ -186,15 +189,14 @@ def _between(worlds: Mapping[str, Parts]) -> Iterable[tuple[str, ...]]:
     yield _row("gains: hosts in rooms over `semexp` in houses", paper["rooms"] - semexp, smaller)
 
 
-def _gaining(parts: Parts) -> dict[str, tuple[tuple[Scores, Line], tuple[Scores, Line]]]:
+def _gaining(parts: Parts) -> dict[str, Pair]:
     """Return results and lines with and without sTDE of the hosts that have both."""
     pairs = {host: (_line(parts, host, "stde"), _line(parts, host, "baseline")) for host in HOSTS}
     return {host: (one, other) for host, (one, other) in pairs.items() if one and other}
 
 
-def _group_gain(parts: Parts) -> Interval:
-    """Return the mean gain of the hosts that are there."""
-    there = list(_gaining(parts).values())
+def _group_gain(there: list[Pair]) -> Interval:
+    """Return the mean gain of hosts."""
     if not there:
         return Interval(math.nan)
     part = there[0][0][0]
