@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.policies.methods.base import Knowledge, Percept
-from jaxnav.policies.semantic_map import EXPLORED, Look, SemanticMap
+from jaxnav.policies.semantic_map import EXPLORED, TRIED, Look, SemanticMap
 from jaxnav.scenes.scene import CELL
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, RowFormat
 from jaxnav.scenes.task import MOVE_AHEAD, Rules
@@ -81,6 +81,7 @@ class MapTracker:
         sight, enough = self._sight(note, look, percept.goal, knowledge)
         cells = around.update(note.cells, look, row_format, len(strides))
         cells = around.bump(cells, place + strides[percept.heading], percept.action, percept.moved)
+        cells = _once(note.cells, cells, place, percept.goal)
         return note._replace(
             cells=cells,
             place=place,
@@ -120,6 +121,18 @@ class MapTracker:
         detected = detection[0] > 0
         sight = jnp.where(detected & (away <= enough), jnp.where(agreed, AGREED, NEAR), FAR)
         return sight, jnp.where(detected, enough, note.enough)
+
+
+def _once(before: jax.Array, cells: jax.Array, place: jax.Array, goal: jax.Array) -> jax.Array:
+    """Let each cell clear the goal from the map in one view only.
+
+    Where it is detected from there again, but not at the next heading, the agent would turn to and fro.
+    """
+    none = np.uint32(0)
+    cleared = before & ~cells & (jnp.uint32(1) << goal.astype(jnp.uint32))
+    here = cells[place[0], place[1]]
+    cells = cells | jnp.where(here & TRIED > 0, cleared, none)
+    return cells.at[place[0], place[1]].set(here | jnp.where((cleared > 0).any(), TRIED, none))
 
 
 def marked(cells: jax.Array, goal: jax.Array) -> jax.Array:
