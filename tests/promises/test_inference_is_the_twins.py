@@ -50,9 +50,9 @@ ROWS = (
     table_row("layout", None, None, "sample"),
 )
 TOLERANCE = 2e-3
-#: Where rounding grows more: half of float32's precision in VTNet's lively weights moves its logits by up to 2.6e-3,
-#: through two decoders whose scores reach 400.
-TOLERANCES = {"vtnet": 1e-2}
+#: Factors on drawn weights that are too lively: with whole ones, scores of VTNet's attention reach 400, and rounding
+#: its weights alone would move logits by 2.6e-3.
+CALMER = {"vtnet": 0.5}
 DECISIONS = ("fused", "streams")
 #: Of the episodes, where the twin takes thousands of derivatives a step.
 FEWER = {"savn": 100}
@@ -98,7 +98,8 @@ def case(name: str, decision: Any) -> Case:
         decision=decision,
     )
     knowledge = Knowledge(prior, jax.tree.map(jnp.asarray, learned))
-    return Case(Acting(env, spec, SETTING if method.hosts_layout else None), tiny.lively(3, spec), knowledge)
+    weights = jax.tree.map(lambda leaf: CALMER.get(name, 1.0) * leaf, tiny.lively(3, spec))
+    return Case(Acting(env, spec, SETTING if method.hosts_layout else None), weights, knowledge)
 
 
 class Compared(NamedTuple):
@@ -141,7 +142,7 @@ def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: t
             scores = corrected + (noise(number, time, len(corrected)) if row.decoding == "sample" else 0.0)
             decisions, removals = decisions + 1, removals + int(corrected.argmax() != inferred.factual.argmax())
             if (episode.pose, policy.method.act(int(scores.argmax()))) != (expected_pose, action):
-                if np.subtract(*np.sort(scores)[:-3:-1]) > TOLERANCES.get(method, TOLERANCE):
+                if np.subtract(*np.sort(scores)[:-3:-1]) > TOLERANCE:
                     differences.append(f"episode {number}, step {time}")
                 ties += 1
                 break
@@ -171,7 +172,7 @@ def test_every_decision_is_the_twins(method, decision, count):
         print(method, decision, row.variant, row.decoding, found._replace(errors={}), worst)
         assert found.differences == []
         assert found.ties <= 1 + found.decisions / 1000
-        assert max(worst.values()) < TOLERANCES.get(method, TOLERANCE)
+        assert max(worst.values()) < TOLERANCE
         assert max(np.quantile(errors, 0.99) for errors in found.errors.values()) < TOLERANCE / 2
         removals += found.removals
     assert removals > 0
