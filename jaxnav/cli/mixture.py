@@ -31,6 +31,8 @@ class MixtureConfig:
       run: the run directory; its policies use the layout.
       without: that of agents which cannot know any layout: trained in the same world, with as many seeds, by
         `--method anonymous`.
+      hand_over: removal leaves the policies of `without`, not what the run's own decide without experience; eq. 2's
+        switch is then a hand-over from one agent to another.
       split: scenes to evaluate on.
       shift: layout shift of the other half of the scenes, above 0, at most 1.
       decoding: take the best action, or sample.
@@ -42,6 +44,7 @@ class MixtureConfig:
 
     run: Annotated[Path, tyro.conf.Positional]
     without: Annotated[Path, tyro.conf.Positional]
+    hand_over: bool = False
     split: Literal["val", "test"] = "val"
     shift: float = 1.0
     decoding: Decoding = "sample"
@@ -65,10 +68,13 @@ def _mixture(config: MixtureConfig, console: Console) -> None:
     given = {name: getattr(config, name) for name in ("split", "episodes", "steps", "seed")}
     study = check_study(StudyConfig(shifts=(0.0, config.shift), **given))
     run = load_run(config.run)
-    mixture = measure_mixture(run, load_run(config.without), config.decoding, Bench(study), console)
+    mixture = measure_mixture(
+        run, load_run(config.without), config.decoding, Bench(study), console, hand_over=config.hand_over
+    )
     course = gap_course(run, study, console)
     print("\n".join([*mixture_sections([mixture]), "### Does the gap track the layout?", "", *gap_tables(course)]))
-    target = config.json or config.run / f"mixture-{config.split}-{config.decoding}.json"
+    handed = "-handed" if config.hand_over else ""
+    target = config.json or config.run / f"mixture-{config.split}-{config.decoding}{handed}.json"
     about = {name: str(value) for name, value in dataclasses.asdict(config).items() if name != "json"}
     report = rounded(
         {"settings": about, "versions": versions(), "mixture": to_json(mixture), "course": to_json(course)}

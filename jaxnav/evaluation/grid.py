@@ -12,7 +12,8 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.inference import Inference, Inferred, counterfactual_logits, gap_used, remove
 from jaxnav.policies.acting import Acting, Agent, Taken, carried, select
 from jaxnav.policies.methods import Knowledge
-from jaxnav.policies.policy import Params, Policy
+from jaxnav.policies.pair import Decider
+from jaxnav.policies.policy import Params
 from jaxnav.scenes.task import MOVE_AHEAD
 
 
@@ -136,7 +137,7 @@ class Evaluator:
         self.compilations += 1  # traced once per shape
 
         def one(cell: Inference) -> Outcome:
-            policy = self._acting.bind(jax.tree.map(lambda leaf: leaf[cell.params], weights))
+            policy = self._acting.decider(jax.tree.map(lambda leaf: leaf[cell.params], weights))
             return _run_episodes(cell, policy, start, self._acting, self._removes, params, knowledge, key)
 
         return jax.lax.map(one, grid)
@@ -154,7 +155,7 @@ def first_states(episodes: EpisodeList) -> State:
 
 def _run_episodes(
     cell: Inference,
-    policy: Policy,
+    policy: Decider,
     start: State,
     acting: Acting,
     removes: bool,
@@ -194,7 +195,7 @@ def _run_episodes(
 
 def act(
     cell: Inference,
-    policy: Policy,
+    policy: Decider,
     agent: Agent,
     running: jax.Array,
     keys: jax.Array,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.causal import FORMS, do, removal_weight, stde, tde
+from jaxnav.policies.pair import Decider
 from jaxnav.policies.pathways import Memory, Pathways
-from jaxnav.policies.policy import Policy
 
 #: Folded into an episode's key; no time is that late.
 _NOISE, _ORDER = 2**30, 2**30 + 1
@@ -141,7 +141,7 @@ def remove(
 
 
 def counterfactual_logits(
-    cell: Inference, policy: Policy, pathways: Pathways, memory: Memory, keys: jax.Array, step_keys: jax.Array
+    cell: Inference, policy: Decider, pathways: Pathways, memory: Memory, keys: jax.Array, step_keys: jax.Array
 ) -> jax.Array:
     """Return the logits to remove from E decisions.
 

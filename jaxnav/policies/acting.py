@@ -11,6 +11,7 @@ from jaxnav.env.types import EnvParams, State
 from jaxnav.layout import Setting
 from jaxnav.policies.adaptation import limited
 from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
+from jaxnav.policies.pair import Decider, Pair
 from jaxnav.policies.pathways import NO_ACTION, Decision, Memory
 from jaxnav.policies.perception import Perceived, Perception, View
 from jaxnav.policies.policy import Params, Policy, bind
@@ -67,12 +68,14 @@ class Acting:
       spec: of the policy; None where actions are given.
       setting: of the layout estimator; None leaves the layout out.
       inner_steps: by which the method's adaptation may change the policy in an episode; 0: none, None: as usual.
+      without: spec of a policy without experience that is handed over to; None without one.
     """
 
     env: ObjectNav
     spec: PolicySpec | None = None
     setting: Setting | None = None
     inner_steps: int | None = None
+    without: PolicySpec | None = None
 
     @property
     def method(self) -> Method | None:
@@ -87,6 +90,16 @@ class Acting:
         if self.inner_steps is not None:
             policy.adaptation = limited(policy.adaptation, self.inner_steps)
         return policy
+
+    def decider(self, params: Params) -> Decider:
+        """Return what decides: the policy, or the pair of it and another.
+
+        Args:
+          params: of the policy; of a pair {"agent": ..., "without": ...}.
+        """
+        if self.without is None:
+            return self.bind(params)
+        return Pair(self.bind(params["agent"]), bind(self.without, params["without"]))
 
     def view(self, agent: Agent, knowledge: Knowledge | None, params: EnvParams) -> View:
         """Return what the policy gets in the present states."""
@@ -129,7 +142,7 @@ class Acting:
         knowledge: Knowledge | None,
         params: EnvParams,
         *,
-        policy: Policy | None = None,
+        policy: Decider | None = None,
         decision: Decision | None = None,
         keys: jax.Array | None = None,
     ) -> tuple[Agent, Taken]:

@@ -46,6 +46,7 @@ class Policies(NamedTuple):
       prior_steps: random steps that the priors were collected in.
       task: that they were trained for.
       inner_steps: by which they may adapt in an episode; None for the method's usual number.
+      without: what the policies that they hand over to are built from; None without any.
     """
 
     params: dict[str, Any]
@@ -57,6 +58,7 @@ class Policies(NamedTuple):
     prior_steps: int
     task: Task
     inner_steps: int | None = None
+    without: PolicySpec | None = None
 
     @property
     def seeds(self) -> int:
@@ -111,6 +113,27 @@ class Policies(NamedTuple):
         limited(adaptation, steps)
         return self._replace(inner_steps=steps)
 
+    def handing_over(self, without: "Policies") -> "Policies":
+        """Return pairs with policies that have no experience.
+
+        Removal of experience then leaves these. Parameters are {"agent": ..., "without": ...}.
+
+        Args:
+          without: as many policies, of the same task.
+
+        Raises:
+          InputError: they note, choose or remember otherwise than agents of `anonymous`.
+        """
+        method, other = find_method(self.spec.method), find_method(without.spec.method)
+        if other.tracker is not None or method.control.num_choices != other.control.num_choices:
+            raise InputError(
+                f"handing over: {self.spec.method!r} cannot hand over to {without.spec.method!r}; train a run with "
+                "--method anonymous, and let a method that chooses actions hand over to it"
+            )
+        if self.spec.spatial_memory != without.spec.spatial_memory:
+            raise InputError("handing over: one of the runs has no spatial memory; train both alike")
+        return self._replace(params={"agent": self.params, "without": without.params}, without=without.spec)
+
     def acting(self, world: CompiledWorld) -> Acting:
         """Return how they act in the scenes of a world.
 
@@ -118,7 +141,7 @@ class Policies(NamedTuple):
           InputError: their method cannot act there.
         """
         world.check(self.spec.method, self.knowledge)
-        return Acting(world.env, self.spec, self.setting, self.inner_steps)
+        return Acting(world.env, self.spec, self.setting, self.inner_steps, self.without)
 
 
 def gap_settings(setting: Setting) -> dict[Gap, Setting]:

@@ -145,6 +145,8 @@ def measure_mixture(
     bench: Bench,
     console: Console,
     ways: Sequence[Way] = WAYS,
+    *,
+    hand_over: bool = False,
 ) -> Mixture:
     """Evaluate removals and their controls in a mixed population.
 
@@ -155,9 +157,11 @@ def measure_mixture(
       bench: evaluates.
       console: shows the progress.
       ways: of removal, besides TDE and clocks.
+      hand_over: whether removal leaves the agents of `without`, and not the run's own direct effect.
 
     Raises:
-      InputError: a run is not finished, they differ in world, goals or number of seeds, or see `mixed_population`.
+      InputError: a run is not finished, they differ in world, goals or number of seeds, cannot hand over, or see
+        `mixed_population`.
     """
     for name in ("world", "scenes", "worlds", "task", "seeds"):
         if getattr(run, name) != getattr(without, name):
@@ -165,9 +169,10 @@ def measure_mixture(
     config, budgets = bench.config, WORLDS[run.world].budgets
     shifts = (config.shifts[0], config.shifts[-1])
     world, episodes, shift = mixed_population(run, shifts, config, console)
-    subject = Subject(load_policies(run, ("layout",)), world, episodes)
     ledger = Ledger(episodes, shift, budgets)
     unaware = Subject(load_policies(without, ("baseline",)), world, episodes)
+    policies = load_policies(run, ("layout",))
+    subject = Subject(policies.handing_over(unaware.policies) if hand_over else policies, world, episodes)
     nobody = ledger.measure(bench.run(unaware, None, [Trial("baseline", decoding)])[0])
     known = {"plain": Trial("layout", decoding), "TDE": Trial("tde", decoding)} | clock_trials(decoding, budgets[-1])
     console.print("TDE and clocks")
@@ -204,6 +209,7 @@ def measure_mixture(
         rows.append(removal(str(way), own, dict(zip(controls, others, strict=True)) | {best: timed[best]}))
     return Mixture(
         run=run.run_dir.name,
+        heir=without.run_dir.name if hand_over else None,
         decoding=decoding,
         world=world.scenes[0].world,
         shifts=shifts,

@@ -63,6 +63,7 @@ class Mixture:
       agent: without removal.
       lead: of the agent on them.
       removals: of experience.
+      heir: name of the run that removal hands over to; None where it leaves the run's own direct effect.
     """
 
     run: str
@@ -76,6 +77,7 @@ class Mixture:
     agent: Mapping[str, ByShift]
     lead: Mapping[str, ByShift]
     removals: tuple[Removal, ...]
+    heir: str | None = dataclasses.field(default=None, metadata=OPTIONAL)
 
     def removal(self, name: str) -> Removal:
         """Return a removal by its name.

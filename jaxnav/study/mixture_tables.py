@@ -27,7 +27,8 @@ def mixture_sections(mixtures: Sequence[Mixture]) -> list[str]:
     ]
     for mixture in mixtures:
         how = "best" if mixture.decoding == "argmax" else "sampled"
-        lines += [f"### Removal from `{mixture.run}`, {how} actions", ""]
+        heir = "" if mixture.heir is None else f", which hands over to `{mixture.heir}`"
+        lines += [f"### Removal from `{mixture.run}`{heir}, {how} actions", ""]
         lines += ["Change against the same policies without removal:", "", *removal_table(mixture), ""]
         lines += ["What the gap knows, over the mixture:", "", *controls_table(mixture), ""]
         lines += ["The order of time:", "", *order_table(mixture), ""]

@@ -52,6 +52,20 @@ def test_every_removal_is_measured_at_both_shifts(drawn_run):
         assert sum(control in clock for control in by_name[str(way)].compared or ()) == 1
 
 
+@pytest.mark.slow
+def test_a_hand_over_leaves_the_agents_without_experience(drawn_run):
+    """The run's own baseline stands in for them: told to hand over at once, the agent is worth what they are."""
+    config = drawn_run.config
+    found = measure_mixture(config, config, "argmax", BENCH, QUIET, (), hand_over=True)
+    hard = found.removal("TDE")
+    assert found.heir == config.run_dir.name
+    for metric, without in found.without.items():
+        left = [
+            agent.mean + change.mean for agent, change in zip(found.agent[metric], hard.change[metric], strict=True)
+        ]
+        assert left == pytest.approx([each.mean for each in without])
+
+
 def test_runs_that_differ_are_refused(drawn_run):
     config = drawn_run.config
     for name, value in {"seeds": config.seeds + 1, "world": "houses"}.items():
@@ -81,9 +95,9 @@ MIXTURE = Mixture(
 def test_the_command_prints_tables_and_writes_json(drawn_run, tmp_path, monkeypatch, capsys):
     asked = {}
 
-    def measured(run, without, decoding, bench, console):
-        asked.update(run=run, without=without, decoding=decoding, study=bench.config)
-        return MIXTURE
+    def measured(run, without, decoding, bench, console, *, hand_over):
+        asked.update(run=run, without=without, decoding=decoding, study=bench.config, hand_over=hand_over)
+        return dataclasses.replace(MIXTURE, heir="anonymous") if hand_over else MIXTURE
 
     monkeypatch.setattr(command, "measure_mixture", measured)
     monkeypatch.setattr(command, "gap_course", lambda run, study, console: study_results.course())
@@ -98,6 +112,10 @@ def test_the_command_prints_tables_and_writes_json(drawn_run, tmp_path, monkeypa
     report = json.loads(target.read_text())
     assert from_json(Mixture, report["mixture"]) == MIXTURE
     assert report["settings"]["shift"] == "0.5"
+    assert not asked["hand_over"]
+    assert command.main([folder, folder, "--hand-over", "--json", str(target)]) == 0
+    assert asked["hand_over"]
+    assert "### Removal from `streams`, which hands over to `anonymous`, sampled actions" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

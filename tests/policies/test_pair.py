@@ -1,0 +1,120 @@
+"""Two policies of which one acts: a hand-over leaves the one without experience, as if it had acted all along."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+
+from jaxnav.causal import do
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.grid import Evaluator
+from jaxnav.evaluation.inference import Source
+from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.numerics.rounding import rounded
+from jaxnav.policies.acting import Acting
+from jaxnav.policies.methods import Knowledge
+from jaxnav.policies.spatial_memory import SpatialMemory
+from jaxnav.runs.policies import Policies
+
+ENV, PARAMS = tiny.world()
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
+ANONYMOUS = dataclasses.replace(tiny.SPEC, method="anonymous", method_sizes=())
+PAIR = Acting(ENV, tiny.SPEC, tiny.SETTING, without=ANONYMOUS)
+ALONE = Acting(ENV, ANONYMOUS)
+AGENT, WITHOUT = tiny.lively(6), tiny.lively(9, ANONYMOUS)
+BOTH = {"agent": AGENT, "without": WITHOUT}
+EPISODES, KEY = episode_list(tiny.BANK, 24, seed=1), jax.random.key(3)
+
+
+def outcome(acting, weights, row, **changes):
+    """How the episodes go."""
+    cells = inference_grid([row], ("layout",), 1)
+    cells = cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
+    stacked = jax.tree.map(lambda leaf: leaf[None], weights)
+    return Evaluator(acting)(cells, stacked, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+
+
+def alike(one, other):
+    """Check that episodes went alike, whatever was removed in them."""
+    chex.assert_trees_all_equal(one._replace(weight=0), other._replace(weight=0))
+
+
+@pytest.fixture(scope="module")
+def unaware():
+    """Episodes of the policy without experience, which wears the name of the one arm that is there."""
+    return outcome(ALONE, WITHOUT, table_row("layout", None, None, "argmax"))
+
+
+def test_what_removal_leaves_is_the_policy_without_experience_to_the_bit():
+    decider = PAIR.decider(BOTH)
+    batch = jnp.arange(8)
+    agent = PAIR.start(KEY, len(batch), decider.initial_memory(batch.shape), KNOWLEDGE, PARAMS)
+    memory = agent.memory
+    assert memory is not None
+    view = PAIR.view(agent, KNOWLEDGE, PARAMS)
+    pathways = decider.pathways(*view, memory)
+    factual = decider.decide(pathways, memory)
+    removed = decider.decide(do(pathways, scene=0.0, goal=0.0), memory)
+    own, other = PAIR.bind(AGENT), ALONE.bind(WITHOUT)
+    knowing = own.decide(own.pathways(*view), own.initial_memory(batch.shape))
+    unknowing = other.decide(
+        other.pathways(view.observation, jnp.ones_like(view.weights), None, view.surroundings),
+        other.initial_memory(batch.shape),
+    )
+    chex.assert_trees_all_equal(factual.logits - removed.logits, rounded(unknowing.logits))
+    chex.assert_trees_all_equal(factual.logits, rounded(knowing.logits))
+    chex.assert_trees_all_equal(factual.hidden, jnp.concatenate([knowing.hidden, unknowing.hidden], axis=-1))
+    assert np.abs(knowing.logits - unknowing.logits).max() > 0.1
+
+
+def test_without_removal_the_policy_with_experience_acts():
+    row = table_row("layout", None, None, "argmax")
+    alike(outcome(PAIR, BOTH, row), outcome(Acting(ENV, tiny.SPEC, tiny.SETTING), AGENT, row))
+
+
+def test_under_tde_the_policy_without_experience_acts(unaware):
+    alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), unaware)
+
+
+def test_handed_over_at_the_first_step_it_is_the_same(unaware):
+    switch = table_row("stde", 0.5, "switch", "argmax")
+    at_once = outcome(PAIR, BOTH, switch, source=Source.GIVEN, gap=1.0, begin=0, end=2**30)
+    alike(at_once, unaware)
+    # Two steps later it is neither of the two, but begins as the one with experience.
+    later = outcome(PAIR, BOTH, switch, source=Source.GIVEN, gap=1.0, begin=2, end=2**30)
+    assert (np.asarray(later.length) != np.asarray(at_once.length)).any()
+    assert (np.asarray(later.weight) > 0).any()
+    assert (np.asarray(later.weight) < 1).all()
+
+
+def policies(spec, params):
+    known = Knowledge(KNOWLEDGE.layout)
+    return Policies(params, ("layout",), known, known.layout, spec, None, 0, tiny.BANK.task)
+
+
+def test_parameters_stand_side_by_side():
+    one, other = (jax.tree.map(lambda leaf: leaf[None], tree) for tree in (AGENT, WITHOUT))
+    pair = policies(tiny.SPEC, one).handing_over(policies(ANONYMOUS, other))
+    assert pair.without == ANONYMOUS
+    assert pair.seeds == 1
+    chex.assert_trees_all_equal(pair.params, {"agent": one, "without": other})
+
+
+@pytest.mark.parametrize(
+    ("changes", "mend"),
+    [
+        ({"method": "hoz"}, "'org' cannot hand over to 'hoz'; train a run with --method anonymous"),
+        ({"method": "semexp"}, "'org' cannot hand over to 'semexp'"),
+        ({"spatial_memory": None}, "one of the runs has no spatial memory; train both alike"),
+    ],
+)
+def test_what_cannot_be_handed_over_to_is_refused(changes, mend):
+    own = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
+    other = dataclasses.replace(ANONYMOUS, **{"spatial_memory": own.spatial_memory} | changes)
+    with pytest.raises(InputError, match=mend):
+        policies(own, AGENT).handing_over(policies(other, WITHOUT))
