@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from jaxnav.evaluation.report import FORMAT, Decoding, versions
+from jaxnav.scenes import worlds as presets
 from jaxnav.store.files import write_atomic
 from jaxnav.study.codec import from_json, to_json
 from jaxnav.study.compare_report import Scores
@@ -96,7 +97,8 @@ def load_results(folder: Path) -> StudyResults | None:
     }
     mixtures = tuple(from_json(Mixture, part) for name, part in parts.items() if name.startswith("mixture-"))
     base, shifts = study["base"], tuple(study["shifts"])
-    return StudyResults(shifts, study["episodes"], base["seeds"], base["total_steps"], worlds, runs, mixtures)
+    steps = base["total_steps"] or presets.WORLDS[base["world"]].total_steps
+    return StudyResults(shifts, study["episodes"], base["seeds"], steps, worlds, runs, mixtures)
 
 
 def load_condition(path: Path) -> Condition:

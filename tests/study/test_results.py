@@ -87,6 +87,15 @@ def test_parts_of_another_study_are_not_read(tmp_path):
     assert to_json_of(load_results(tmp_path)) == to_json_of(study_results.results())
 
 
+def test_a_study_of_the_usual_length_tells_its_steps(tmp_path):
+    """Where no number is given runs take that of their world, 1.2 million in rooms."""
+    usual = study_results.STUDY | {"base": {"seeds": 3, "total_steps": None, "world": "rooms"}}
+    study_results.write(tmp_path, study_results.parts(), usual)
+    results = load_results(tmp_path)
+    assert results is not None
+    assert results.total_steps == 1_200_000
+
+
 def test_a_run_that_misses_a_shift_is_not_read(tmp_path):
     parts = study_results.parts()
     del parts["gate-shift1"]
