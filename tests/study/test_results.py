@@ -17,7 +17,12 @@ from jaxnav.study.records import Condition, FullCondition
 from jaxnav.study.results import is_written, load_condition, load_results, write_record
 
 ROOT = Path(__file__).parents[2]
-COMMITTED = sorted((ROOT / "results" / "val").glob("*.json")) + sorted((ROOT / "results" / "quick").rglob("*.json"))
+STUDIES = {
+    "results": "docs/study.md",
+    "results/quick": "results/quick/study.md",
+    "results/ai2thor": "results/ai2thor/study.md",
+}
+COMMITTED = sorted(path for folder in STUDIES for path in (ROOT / folder / "val").glob("*.json"))
 HEADER = {"study", "versions", "format"}
 
 
@@ -55,9 +60,7 @@ def test_committed_parts_are_read_and_written_with_the_same_keys(path):
     assert json.dumps(without_nulls({name: written[name] for name in part})) == json.dumps(without_nulls(part))
 
 
-@pytest.mark.parametrize(
-    ("results", "document"), [("results", "docs/study.md"), ("results/quick", "results/quick/study.md")]
-)
+@pytest.mark.parametrize(("results", "document"), STUDIES.items())
 def test_committed_documents_are_those_of_their_results(tmp_path, results, document):
     write_document(ROOT / results, tmp_path / "study.md")
     (head, _, tail), (written, _, rest) = (
