@@ -24,7 +24,7 @@ from jaxnav.study.compare_report import SCALE, Line, Scores, Training
 from jaxnav.study.compare_tables import frontier_name, write_comparison
 from jaxnav.study.document import check_document
 from jaxnav.study.paper_tables import write_paper_tables
-from jaxnav.study.results import is_written, write_record
+from jaxnav.study.results import is_written, kept_note, write_record
 from jaxnav.study.runs import ensure_trained
 
 #: Name, settings that decide the numbers, and how they are measured.
@@ -43,16 +43,20 @@ def run_compare(config: CompareConfig, console: Console) -> None:
     for document in (config.document, config.paper):
         if document is not None:
             check_document(document)
-    jobs, found = _jobs(config, console), {}
-    for name, identity, measure in jobs:
-        path = config.results / config.split / f"{name}.json"
-        if not is_written(path, identity):
+    folder, kept, found = config.results / config.split, 0, {}
+    for name, identity, measure in _jobs(config, console):
+        path = folder / f"{name}.json"
+        if is_written(path, identity):
+            kept += 1
+        else:
             console.print(f"{path}", soft_wrap=True)
             write_record(path, identity, measure())
         found[name] = from_json(Scores, json.loads(path.read_text()))
         write_comparison(config, found)
         if config.paper is not None:
-            write_paper_tables(config.paper, config.results / config.split)
+            write_paper_tables(config.paper, folder)
+    if kept:
+        console.print(kept_note(kept, folder), soft_wrap=True)
     console.print(f"written to {config.document}", soft_wrap=True)
 
 

@@ -70,6 +70,11 @@ def mixture_name(run: str, decoding: Decoding) -> str:
     return f"mixture-{run}-{decoding}"
 
 
+def kept_note(count: int, folder: Path) -> str:
+    """Return what to say of results that were not measured again."""
+    return f"{count} results in {folder} were there already; measure them anew with another --results"
+
+
 def load_results(folder: Path) -> StudyResults | None:
     """Load the results in a folder, if there are any.
 

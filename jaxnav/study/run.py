@@ -12,7 +12,7 @@ from jaxnav.study.gap_course import gap_course
 from jaxnav.study.instrument import instrument_report, study_instrument
 from jaxnav.study.measure import DECODINGS, chosen_epsilon, measure_condition
 from jaxnav.study.mixture import measure_mixture
-from jaxnav.study.results import WORLDS, Record, condition_name, is_written, mixture_name, write_record
+from jaxnav.study.results import WORLDS, Record, condition_name, is_written, kept_note, mixture_name, write_record
 from jaxnav.study.runs import ensure_trained, study_runs
 from jaxnav.viz import require_pictures
 
@@ -41,10 +41,13 @@ def run_study(config: StudyConfig, console: Console) -> None:
     for run in runs.values():
         ensure_trained(run, console)
     folder, study, bench = config.results / config.split, study_identity(config), Bench(config)
+    kept: list[str] = []
 
     def write(name: str, measure: Callable[[], Record]) -> None:
         path = folder / f"{name}.json"
-        if not is_written(path, study):
+        if is_written(path, study):
+            kept.append(name)
+        else:
             console.print(f"{path}")
             write_record(path, study, measure())
 
@@ -65,4 +68,6 @@ def run_study(config: StudyConfig, console: Console) -> None:
     if config.split == "val":
         draw_figures(folder, config.document.parent / "images" / "study")
     write_document(config.results, config.document)
+    if kept:
+        console.print(kept_note(len(kept), folder), soft_wrap=True)
     console.print(f"written to {config.document}")

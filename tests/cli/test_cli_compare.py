@@ -166,7 +166,7 @@ def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
     assert found["What the runs took"]["`org`, streams"] == ["1,280", "0", "512", "1.5", "10.0 → 12.5"]
 
 
-def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path):
+def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path, capsys):
     def again(*options):
         steps.clear()
         assert run(tmp_path, *options) == 0
@@ -176,7 +176,9 @@ def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path):
     document = tmp_path / "docs" / "table.md"
     document.write_text(document.read_text().replace(f"{READING}\n\n{READING}", f"{READING}\nBy hand.\n{READING}"))
     before = contents(tmp_path)
+    assert "were there already" not in capsys.readouterr().err
     assert again() == []
+    assert f"{len(PARTS)} results in" in " ".join(capsys.readouterr().err.split())
     assert contents(tmp_path) == before
     (tmp_path / "results" / "val" / "near-org-fused.json").unlink()
     (tmp_path / "results" / "val" / "far-rgb-fused.json").write_text("{")

@@ -138,7 +138,7 @@ MAIN, COIN = ["main-shift0", "main-shift1", "instrument", "gap"], ["coin-shift0"
 DRAWN = ["figures of val"]
 
 
-def test_only_what_is_missing_or_of_another_study_is_done(steps, tmp_path):
+def test_only_what_is_missing_or_of_another_study_is_done(steps, tmp_path, capsys):
     def again(*options):
         steps.clear()
         assert study(tmp_path, *options) == 0
@@ -149,7 +149,10 @@ def test_only_what_is_missing_or_of_another_study_is_done(steps, tmp_path):
     text = document.read_text().replace(f"{READING}\n\n{READING}", f"{READING}\nBy hand.\n{READING}")
     document.write_text(text)
     before = contents(tmp_path)
+    assert "were there already" not in capsys.readouterr().err
     assert again() == ASKED + DRAWN
+    assert "6 results in" in (told := " ".join(capsys.readouterr().err.split()))
+    assert "were there already; measure them anew with another --results" in told
     assert contents(tmp_path) == before
     assert "By hand." in document.read_text()
     # A part that is missing, and one that is damaged.
