@@ -22,7 +22,8 @@ STUDIES = {
     "results/quick": "results/quick/study.md",
     "results/ai2thor": "results/ai2thor/study.md",
 }
-COMMITTED = sorted(path for folder in STUDIES for path in (ROOT / folder / "val").glob("*.json"))
+SPLITS = ("val", "test")
+COMMITTED = sorted(path for folder in STUDIES for split in SPLITS for path in (ROOT / folder / split).glob("*.json"))
 HEADER = {"study", "versions", "format"}
 
 
