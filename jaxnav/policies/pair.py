@@ -32,22 +32,12 @@ class Pair:
         return agent._replace(hidden=jnp.concatenate([agent.hidden, without.hidden], axis=-1))
 
     def pathways(
-        self,
-        observation: Observation,
-        weights: jax.Array,
-        reading: Any = None,
-        surroundings: jax.Array | None = None,
-        memory: Memory | None = None,
+        self, observation: Observation, weights: jax.Array, reading: Any, surroundings: jax.Array | None, memory: Memory
     ) -> Pathways:
         """Embed for both, which are the experience of the pair.
 
-        Scene and goal are 1 [..., 1]; 0 takes the policy without experience out.
-
-        Raises:
-          ValueError: there is no memory.
+        Scene and goal are 1 [..., 1]; 0 takes the policy without experience out. Arguments: see `Policy.pathways`.
         """
-        if memory is None:
-            raise ValueError("pathways: a pair of policies needs its memory; give it")
         agent, without = self._split(memory)
         both: Any = (
             self.agent.pathways(observation, weights, reading, surroundings, agent),

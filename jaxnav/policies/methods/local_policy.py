@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.policies.methods.base import Knowledge
-from jaxnav.policies.methods.map_tracker import AGREED, FAR, SIDE, Course, marked
+from jaxnav.policies.methods.map_tracker import AGREED, FAR, SIDE, Course, mark, marked
 from jaxnav.policies.semantic_map import EXPLORED, TRIED, WALL, SemanticMap
 from jaxnav.policies.wavefront import Way, find_way, follow, pack, turn_to
 from jaxnav.scenes.scene import CELL
@@ -147,8 +147,7 @@ def _given_up(note: Course, place: Place, vain: jax.Array) -> Course:
     tries = note.tries + vain.astype(jnp.int32)
     gone = tries >= PATIENCE
     z, x = SemanticMap(len(cells)).around(place.at)
-    mark = jnp.where(gone, jnp.uint32(1) << note.goal.astype(jnp.uint32), np.uint32(0))
-    cells = cells.at[z, x].set(cells[z, x] & ~mark)
+    cells = cells.at[z, x].set(cells[z, x] & ~jnp.where(gone, mark(note.goal), np.uint32(0)))
     return note._replace(cells=cells, tries=jnp.where(gone, 0, tries))
 
 

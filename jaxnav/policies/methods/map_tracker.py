@@ -129,7 +129,7 @@ def _once(before: jax.Array, cells: jax.Array, place: jax.Array, goal: jax.Array
     Where it is detected from there again, but not at the next heading, the agent would turn to and fro.
     """
     none = np.uint32(0)
-    cleared = before & ~cells & (jnp.uint32(1) << goal.astype(jnp.uint32))
+    cleared = before & ~cells & mark(goal)
     here = cells[place[0], place[1]]
     cells = cells | jnp.where(here & TRIED > 0, cleared, none)
     return cells.at[place[0], place[1]].set(here | jnp.where((cleared > 0).any(), TRIED, none))
@@ -137,4 +137,9 @@ def _once(before: jax.Array, cells: jax.Array, place: jax.Array, goal: jax.Array
 
 def marked(cells: jax.Array, goal: jax.Array) -> jax.Array:
     """Return where a category int32 [] is on the map, bool [...]."""
-    return (cells >> goal.astype(jnp.uint32)) & np.uint32(1) > 0
+    return cells & mark(goal) > 0
+
+
+def mark(goal: jax.Array) -> jax.Array:
+    """Return the bit uint32 [] of a category int32 []."""
+    return jnp.uint32(1) << goal.astype(jnp.uint32)
