@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import study_results
-from support.commands import CONFIG, contents, refusal
+from support.commands import SHIFTS, contents, refusal, study_command
 
 from jaxnav import __main__ as commands
 from jaxnav.cli import study as command
@@ -20,19 +20,6 @@ from jaxnav.study.runs import run_config
 from jaxnav.study.trials import USES
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, layout_priors
 
-SHIFTS = (0.0, 1.0)
-STUDY = f"""
-trainings: [coin]
-shifts: {list(SHIFTS)}
-epsilon: [0.0, 0.5, 1.0]
-episodes: 24
-steps: 6
-base:
-  direct: goal
-  done_gate: true
-{"".join(f"  {line}{chr(10)}" for line in CONFIG.strip().splitlines())}
-"""
-
 #: Variant, decoding, epsilon and form of the rows of a run of the layout arm alone.
 LAYOUT_ARM = [(variant, "argmax", None, None) for variant in ("layout", "tde")]
 LAYOUT_ARM += [("stde", "argmax", *use) for use in USES.values()]
@@ -40,11 +27,7 @@ LAYOUT_ARM += [("stde", "argmax", *use) for use in USES.values()]
 
 def study(folder, *options):
     """Run the command with all its files below a folder."""
-    config = folder / "study.yaml"
-    config.write_text(STUDY)
-    places = {"results": "results", "document": "docs/study.md", "runs": "runs"}
-    given = [part for name, place in places.items() for part in (f"--{name}", str(folder / place))]
-    return command.main(["--config", str(config), *given, *map(str, options)])
+    return command.main([*map(str, study_command(folder)), *map(str, options)])
 
 
 @pytest.fixture

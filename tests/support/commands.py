@@ -17,6 +17,18 @@ sizes: {hidden: 16, view_outputs: 8, appearance: 4, row_hidden: 8, row_outputs: 
 method_sizes: {relation_layers: 1}
 ppo: {num_envs: 16, rollout: 8, epochs: 1, minibatches: 2, learning_rate: 1e-2, distil: 0.1}
 """
+SHIFTS = (0.0, 1.0)
+STUDY = f"""
+trainings: [coin]
+shifts: {list(SHIFTS)}
+epsilon: [0.0, 0.5, 1.0]
+episodes: 24
+steps: 6
+base:
+  direct: goal
+  done_gate: true
+{"".join(f"  {line}{chr(10)}" for line in CONFIG.strip().splitlines())}
+"""
 SEEDS, POLICIES = 2, {"baseline-0", "baseline-1", "layout-0", "layout-1"}
 
 
@@ -32,6 +44,14 @@ def write_config(folder):
     path = folder / "tiny.yaml"
     path.write_text(CONFIG)
     return path
+
+
+def study_command(folder):
+    """Options of a small study with all its files below a folder."""
+    config = folder / "study.yaml"
+    config.write_text(STUDY)
+    places = {"results": "results", "document": "docs/study.md", "runs": "runs"}
+    return ["--config", config, *(part for name, place in places.items() for part in (f"--{name}", folder / place))]
 
 
 def finished_run(tmp_path_factory):

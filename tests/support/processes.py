@@ -1,6 +1,7 @@
 """Python processes of this repository's code."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -19,3 +20,27 @@ def run(command, **environment):
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def free_address():
+    """A port of this machine that nothing listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+def start(address, index, config_file, run_dir, *options, **environment):
+    """One of two processes on this machine that train one run."""
+    command = ["train.py", "--config", config_file, "--run-dir", run_dir, "--seeds", 1]
+    devices = f"--devices={address},{index},2"
+    return run([*command, devices, *options], JAX_COORDINATOR_BIND_ADDRESS=address, XLA_FLAGS="", **environment)
+
+
+def ends(*processes, timeout=600):
+    """Exit codes and messages of processes."""
+    try:
+        messages = [process.communicate(timeout=timeout)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [process.returncode for process in processes], messages

@@ -2,41 +2,17 @@
 
 import re
 import shutil
-import socket
 import time
 
 import chex
 import pytest
 from support.commands import evaluate, train, write_config
-from support.processes import run
+from support.processes import ends, free_address, start
 
 from jaxnav.store.export import load_params
 from jaxnav.store.runlog import read_rows
 
 TOLERANCE = 1e-5
-
-
-def free_address():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{probe.getsockname()[1]}"
-
-
-def start(address, index, config_file, run_dir, *options):
-    """One of two processes on this machine that train one run."""
-    command = ["train.py", "--config", config_file, "--run-dir", run_dir, "--seeds", 1]
-    devices = f"--devices={address},{index},2"
-    return run([*command, devices, *options], JAX_COORDINATOR_BIND_ADDRESS=address, XLA_FLAGS="")
-
-
-def ends(*processes, timeout=600):
-    """Exit codes and messages of processes."""
-    try:
-        messages = [process.communicate(timeout=timeout)[1] for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    return [process.returncode for process in processes], messages
 
 
 def two_processes(config_file, run_dir, *options):
