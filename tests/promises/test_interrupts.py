@@ -11,7 +11,7 @@ import time
 import pytest
 from rich.console import Console
 from support.commands import train, write_config
-from support.processes import run
+from support.processes import ends, free_address, run, start
 
 from jaxnav.cli.console import exit_code
 from jaxnav.errors import Interrupted
@@ -60,6 +60,24 @@ def test_a_run_that_is_asked_to_end_saves_and_goes_on_to_the_same_end(whole, tmp
     assert f"resumed after update {found[1]} of 60" in capsys.readouterr().err
     for name in ("metrics.jsonl", "policies/baseline-1/params.safetensors", "policies/layout-0/params.safetensors"):
         assert (ended / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_two_processes_end_together_when_one_is_asked(tmp_path):
+    """Both save the same chunk, end with the code of the signal, and go on together."""
+    config_file, ended = write_config(tmp_path), tmp_path / "ended"
+    address, again = free_address(), free_address()
+    both = [start(address, index, config_file, ended, *LONG) for index in range(2)]
+    while all(process.poll() is None for process in both) and not (ended / "metrics.jsonl").exists():
+        time.sleep(0.02)
+    both[1].send_signal(signal.SIGTERM)
+    codes, messages = ends(*both, timeout=2 * LIMIT_S)
+    assert codes == [143, 143], messages
+    updates_done = {re.search(r"stopped after update (\d+) of 60 and saved", message)[1] for message in messages}
+    assert [path.name for path in (ended / "checkpoints").iterdir()] == [*updates_done]
+    codes, messages = ends(*(start(again, index, config_file, ended, *LONG) for index in range(2)))
+    assert codes == [0, 0], messages
+    assert f"resumed after update {updates_done.pop()} of 60" in messages[0]
 
 
 def test_the_first_signal_is_noted_and_the_second_ends_the_process():
