@@ -152,6 +152,15 @@ def test_other_readings_of_equation_5(rows, reduction):
     np.testing.assert_allclose(state.gap, np.tanh(expected), rtol=1e-4)
 
 
+def test_the_mean_over_a_single_category_is_its_own():
+    """It counts itself, so its row learns something alone."""
+    setting = Setting(reduction="mean_visible", own_column=True, gate=False)
+    prior = np.asarray(prior_from_counts(random_counts(6), setting))
+    (view,) = views_of({1})
+    (state,) = run(LayoutEstimator(jnp.asarray(prior), setting), [view])
+    np.testing.assert_allclose(state.gap, np.tanh(exact_kl(prior[1] + np.eye(K)[1], view.astype(int))), rtol=1e-4)
+
+
 def test_shut_gate_leaves_the_belief_and_decays_the_gap():
     alpha = prior_from_counts(random_counts())
     state = belief(alpha, views_of({0, 1})[0], 0.5)

@@ -237,5 +237,5 @@ def _std(means: np.ndarray) -> float:
 def _satterthwaite(variance: float, parts: tuple[float, ...], degrees: tuple[int, ...]) -> float:
     """Return the degrees of freedom of a sum of variances."""
     spread = sum(part**2 / of for part, of in zip(parts, degrees, strict=True))
-    least, most = min(degrees[:2]), sum(degrees[:2])
-    return min(max(variance**2 / spread, least), most) if spread > 0 else float(most)
+    least = float(min(degrees))
+    return max(variance**2 / spread, least) if spread > 0 else least

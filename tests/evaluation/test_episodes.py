@@ -137,25 +137,25 @@ def test_metrics_by_hand():
     leaves = Outcome(
         done=jnp.array([True, True, False, True]),
         success=jnp.array([True, True, False, True]),
-        length=jnp.array([10, 1, 30, 4], jnp.int32),
-        moves=jnp.array([6, 0, 20, 3], jnp.int32),
+        length=jnp.array([10, 1, 30, 2], jnp.int32),
+        moves=jnp.array([6, 0, 20, 1], jnp.int32),
         distance=jnp.array([1.4, 0.3, 3.5, 1.0], jnp.float32),
-        choices=jnp.array([10, 1, 30, 4], jnp.int32),
+        choices=jnp.array([10, 1, 30, 2], jnp.int32),
         weight=jnp.zeros(4),
     )
     outcome = jax.tree.map(np.asarray, leaves)  # as the evaluator returns it
-    metrics = episode_metrics(outcome, np.array([5, 1, 6, 4]), budgets=(4, 9))
+    metrics = episode_metrics(outcome, np.array([5, 1, 6, 2]), budgets=(2, 9))
     np.testing.assert_array_equal(metrics["sr"], [1, 1, 0, 1])
-    # Success x L* / length: 5 / 10, 1 / 1, no success, 4 / 4.
+    # Success x L* / length: 5 / 10, 1 / 1, no success, 2 / 2.
     np.testing.assert_array_equal(metrics["spl"], [0.5, 1, 0, 1])
     # Distance less 1 m, at least 0.
     np.testing.assert_allclose(metrics["dts"], [0.4, 0, 2.5, 0], atol=1e-6)
-    # MoveAheads / (length - 1): 6 / 9; an episode of Done alone has none; no success; 3 / 3.
+    # MoveAheads / (length - 1): 6 / 9; an episode of Done alone has none; no success; 1 / 1.
     np.testing.assert_allclose(metrics["sae"], [2 / 3, 0, 0, 1])
     np.testing.assert_array_equal(metrics["timeout"], [0, 0, 1, 0])
     np.testing.assert_array_equal(metrics["wrong_done"], [0, 0, 0, 0])
-    # Successes after 10, 1 and 4 actions; Done counts as one.
-    np.testing.assert_array_equal(metrics["sr@4"], [0, 1, 0, 1])
+    # Successes after 10, 1 and 2 actions; Done counts as one.
+    np.testing.assert_array_equal(metrics["sr@2"], [0, 1, 0, 1])
     np.testing.assert_array_equal(metrics["sr@9"], [0, 1, 0, 1])
 
 

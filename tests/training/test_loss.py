@@ -1,5 +1,6 @@
 """Advantages by hand and in NumPy; the PPO loss in NumPy; which parameters the counterfactual branch's loss reaches."""
 
+import dataclasses
 import functools
 
 import chex
@@ -181,6 +182,16 @@ def test_with_the_policy_that_acted_nothing_is_clipped():
     # All ratios are 1, so the policy loss is minus the mean of the scaled advantages: 0.
     _, parts = loss(rolled(True).weights, some_advantage(), scalars(), False)
     assert parts["policy_loss"] == pytest.approx(0, abs=1e-5)
+
+
+def test_a_term_of_the_method_is_added():
+    run, named = rolled(True), {"told": jnp.float32(3)}
+    method = dataclasses.replace(METHODS["org"], auxiliary=lambda _: (jnp.float32(0.25), named))
+    replayed = replay(ACTING.bind(NEW), run.transitions, run.memory, PARAMS)
+    without, parts = loss(NEW, some_advantage(), scalars(), False)
+    total, more = ppo_loss(replayed, some_advantage(), scalars(), False, method)
+    assert total == pytest.approx(float(without) + 0.25, rel=1e-5)
+    assert more.keys() - parts.keys() == {"told"}
 
 
 # The counterfactual branch
