@@ -150,14 +150,14 @@ def alone(env: ObjectNav, world: World, episodes: int) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def worker(arrays: dict[str, np.ndarray]) -> Iterator[tuple[dict[str, Any], Callable[[str, int], list[float]]]]:
+def worker(arrays: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Callable[[str, int], list[float]]]]:
     """Run the transcription in a process of its own.
 
     Yields what it is, and a call `(network, threads) -> gaps of the walk`.
     """
     with tempfile.TemporaryDirectory() as folder:
         inputs = Path(folder, "walk.npz")
-        np.savez(inputs, allow_pickle=False, **arrays)
+        np.savez(inputs, **arrays)
         command = [PYTHON, WORKER, inputs, json.dumps(SIZES)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             requests, answers = process.stdin, process.stdout

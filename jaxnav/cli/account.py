@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from jaxnav.causal import Form
-from jaxnav.cli.console import exit_code, result_console
+from jaxnav.cli.console import command_line, exit_code, result_console
 from jaxnav.errors import InputError
 from jaxnav.evaluation.accounting import accounting_table
 from jaxnav.runs.account import account
@@ -52,7 +52,7 @@ class AccountConfig:
 def main(arguments: list[str] | None = None, prog: str = "jaxnav account") -> int:
     """Run the command and return its exit code."""
     what = "Say what experience is worth to a run where the layout holds, and what it costs where it is shifted."
-    config = tyro.cli(AccountConfig, args=arguments, prog=prog, description=what)
+    config = command_line(AccountConfig, arguments, prog, what)
     return exit_code(lambda console: _account(config, console, result_console()))
 
 

@@ -1,19 +1,24 @@
 """What all commands share."""
 
+import contextlib
 import ctypes
 import functools
+import io
 import os
 import signal
 import sys
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import tyro
 from rich.console import Console
 from rich.text import Text
 
 from jaxnav.errors import InputError, Interrupted
+
+Config = TypeVar("Config")
 
 #: Where compiled programs are kept, unless JAX has been told another folder.
 PROGRAMS = "~/.cache/jaxnav/xla"
@@ -90,6 +95,39 @@ def printable(text: str, kept: str = "") -> str:
         each if each in kept or unicodedata.category(each) not in _HIDDEN else each.encode("unicode_escape").decode()
         for each in text
     )
+
+
+def command_line(
+    kind: Callable[..., Config], arguments: list[str] | None, prog: str, description: str, **options: Any
+) -> Config:
+    """Return the settings that a command line gives.
+
+    Args:
+      kind: dataclass of the settings.
+      arguments: the options; None for those of the process.
+      prog: the command, as the help names it.
+      description: of the command, for its help.
+      options: more of `tyro.cli`.
+
+    Raises:
+      SystemExit: with code 2 after a bad option, 0 after --help.
+    """
+    with harmless_refusals():
+        return tyro.cli(kind, args=arguments, prog=prog, description=description, **options)
+
+
+@contextlib.contextmanager
+def harmless_refusals() -> Iterator[None]:
+    """Show what a parser refuses a command line with as text.
+
+    It quotes the command line, which may come from a file.
+    """
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            yield
+    finally:
+        sys.stderr.write(printable(told.getvalue(), kept="\n"))
 
 
 def result_console() -> Console:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import command_line, exit_code
 from jaxnav.errors import InputError
 from jaxnav.runs.packaged import is_policy
 from jaxnav.runs.policies import EstimatorName
@@ -50,7 +50,7 @@ class EpisodeConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; return 0, or 2 after bad input."""
-    config = tyro.cli(EpisodeConfig, args=arguments, prog="jaxnav episode", description="Draw one episode.")
+    config = command_line(EpisodeConfig, arguments, "jaxnav episode", "Draw one episode.")
     return exit_code(lambda console: draw(config, console))
 
 

@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from jaxnav.causal import Form
-from jaxnav.cli.console import exit_code, result_console
+from jaxnav.cli.console import command_line, exit_code, result_console
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report_tables import console_table, difference_table
 from jaxnav.runs.directory import Run
@@ -57,7 +57,7 @@ class EvalConfig:
 
 def main(arguments: list[str] | None = None, prog: str = "jaxnav eval") -> int:
     """Run the command and return its exit code."""
-    config = tyro.cli(EvalConfig, args=arguments, prog=prog, description="Evaluate a training run.")
+    config = command_line(EvalConfig, arguments, prog, "Evaluate a training run.")
     return exit_code(lambda console: _evaluate(config, console, result_console()))
 
 

@@ -10,7 +10,7 @@ import jax
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import command_line, exit_code
 from jaxnav.errors import InputError
 from jaxnav.policies.methods import find_method
 from jaxnav.runs.directory import Run
@@ -48,7 +48,7 @@ class ExportConfig:
 def main(arguments: list[str] | None = None, prog: str = "jaxnav export") -> int:
     """Run the command and return its exit code."""
     what = "Export a policy of a run with its model card: as parameters, or as a program that runs without jaxnav."
-    config = tyro.cli(ExportConfig, args=arguments, prog=prog, description=what)
+    config = command_line(ExportConfig, arguments, prog, what)
     return exit_code(lambda console: _export(config, console))
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import command_line, exit_code
 from jaxnav.runs.directory import Run
 from jaxnav.runs.tracking import send_log
 
@@ -31,7 +31,7 @@ class LogConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; return 0, or 2 after bad input."""
-    config = tyro.cli(LogConfig, args=arguments, prog="jaxnav log", description="Show a training log elsewhere.")
+    config = command_line(LogConfig, arguments, "jaxnav log", "Show a training log elsewhere.")
     return exit_code(lambda console: _send(config, console))
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import command_line, exit_code
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import Decoding, versions
 from jaxnav.runs.directory import load_run
@@ -57,7 +57,7 @@ class MixtureConfig:
 def main(arguments: list[str] | None = None, prog: str = "jaxnav mixture") -> int:
     """Run the command and return its exit code."""
     what = "Measure what every removal of experience keeps of its value and recovers of its cost; prints Markdown."
-    config = tyro.cli(MixtureConfig, args=arguments, prog=prog, description=what)
+    config = command_line(MixtureConfig, arguments, prog, what)
     return exit_code(lambda console: _mixture(config, console))
 
 

@@ -10,6 +10,7 @@ import tyro
 import yaml
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from jaxnav.cli.console import command_line
 from jaxnav.errors import InputError
 from jaxnav.runs.overlay import CONFIGS, RENAMED, apply_yaml, from_text
 
@@ -69,10 +70,7 @@ def parse_options(
     fields = [settings, config] if default is None else [config, (*settings, default)]
     options = dataclasses.make_dataclass("Options", fields)
     positional = (tyro.conf.PositionalRequiredArgs,)
-    parsed = tyro.cli(
-        options, args=arguments, prog=prog, description=description, registry=_REGISTRY, config=positional
-    )
-    return parsed.settings
+    return command_line(options, arguments, prog, description, registry=_REGISTRY, config=positional).settings
 
 
 def _refuse_renamed(arguments: Sequence[str]) -> None:

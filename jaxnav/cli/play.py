@@ -5,11 +5,10 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-import tyro
 from rich.console import Console
 from rich.live import Live
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import command_line, exit_code
 from jaxnav.errors import InputError
 from jaxnav.game.keys import pressed
 from jaxnav.game.prepare import prepare
@@ -46,7 +45,7 @@ class PlayConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; return 0, or 2 after bad input."""
-    config = tyro.cli(PlayConfig, args=arguments, prog="jaxnav play", description="Play an episode by hand.")
+    config = command_line(PlayConfig, arguments, "jaxnav play", "Play an episode by hand.")
     return exit_code(lambda console: _play(config, console))
 
 

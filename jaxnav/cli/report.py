@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import command_line, exit_code
 from jaxnav.errors import InputError
 from jaxnav.runs.directory import Run
 from jaxnav.store.files import write_atomic
@@ -46,9 +46,7 @@ class ReportConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = tyro.cli(
-        ReportConfig, args=arguments, prog="jaxnav report", description="Show a training run on one page."
-    )
+    config = command_line(ReportConfig, arguments, "jaxnav report", "Show a training run on one page.")
     return exit_code(lambda console: _report(config, console))
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.cli.console import exit_code, printable
+from jaxnav.cli.console import command_line, exit_code, printable
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import FORMAT
 from jaxnav.evaluation.report_tables import markdown_table
@@ -26,7 +26,7 @@ class TableConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = tyro.cli(TableConfig, args=arguments, prog="jaxnav table", description="Print an evaluation as Markdown.")
+    config = command_line(TableConfig, arguments, "jaxnav table", "Print an evaluation as Markdown.")
     return exit_code(lambda _: print(printable(markdown_table(_read(config.file)), kept="\n"), end=""))
 
 

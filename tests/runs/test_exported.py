@@ -108,9 +108,10 @@ def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
     options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out)]
     assert main(["export", str(drawn_run.config.run_dir), *options]) == 0
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1")
-    steps, card = walk(policy), (out / "README.md").read_text()
+    steps: dict[str, Any] = walk(policy)
+    card = (out / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
-    np.savez(out / "steps.npz", allow_pickle=False, **steps)
+    np.savez(out / "steps.npz", **steps)
     subprocess.run([sys.executable, "-c", ALONE.format(code=code)], cwd=out, check=True, timeout=200)
     found = np.load(out / "found.npz")
     assert_same({name: found[name] for name in found.files}, expected := acted(policy, steps))

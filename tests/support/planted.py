@@ -21,6 +21,8 @@ class Mistake(NamedTuple):
 
 INFERENCE = "promises/test_inference_is_the_twins.py"
 PROBES = "promises/test_ppo_learns.py"
+STORED = "promises/test_stored_data_is_verified.py"
+NAMES = "promises/test_names_are_text.py"
 LEARNER = "training/test_learner.py"
 MISTAKES = (
     Mistake("causal.py", "- s * counterfactual", "+ s * counterfactual", INFERENCE),
@@ -38,6 +40,14 @@ MISTAKES = (
     Mistake("training/apply.py", "max_consecutive_errors=2**30", "max_consecutive_errors=0", LEARNER),
     Mistake("store/export.py", '"""Exported', 'import jax  # noqa\n"""Exported', "store/test_export.py"),
     Mistake("store/export.py", "FORMAT_VERSION = 3", "FORMAT_VERSION = 2", "promises/test_old_versions.py"),
+    Mistake("store/checkpoint.py", "if found.get(name) != digest", "if False", STORED),
+    Mistake("store/export.py", 'if sha256 != policy["params_sha256"]', "if False", STORED),
+    Mistake("store/runlog.py", 'verified(where, row, "restore the file, or remove the line")', "row", STORED),
+    Mistake("store/lock.py", "fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)", "pass", "promises/test_one_writer.py"),
+    Mistake("runs/interrupts.py", "signal.signal(each, signal.SIG_DFL)", "pass", "promises/test_interrupts.py"),
+    Mistake("cli/console.py", "markup=False", "markup=True", NAMES),
+    Mistake("cli/console.py", 'printable(told.getvalue(), kept="\\n")', "told.getvalue()", NAMES),
+    Mistake("cli/console.py", "case MemoryError():", "case ZeroDivisionError():", "promises/test_bounds.py"),
     Mistake("__init__.py", '"""', 'import matplotlib  # noqa\n"""', "promises/test_works_without_extras.py"),
 )  # fmt: skip
 

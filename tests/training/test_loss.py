@@ -189,7 +189,7 @@ def test_a_term_of_the_method_is_added():
     method = dataclasses.replace(METHODS["org"], auxiliary=lambda _: (jnp.float32(0.25), named))
     replayed = replay(ACTING.bind(NEW), run.transitions, run.memory, PARAMS)
     without, parts = loss(NEW, some_advantage(), scalars(), False)
-    total, more = ppo_loss(replayed, some_advantage(), scalars(), False, method)
+    total, more = ppo_loss(replayed, jnp.asarray(some_advantage()), scalars(), False, method)
     assert total == pytest.approx(float(without) + 0.25, rel=1e-5)
     assert more.keys() - parts.keys() == {"told"}
 
