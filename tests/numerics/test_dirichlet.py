@@ -1,5 +1,7 @@
 """The divergence of equation 5 in float32."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,3 +115,13 @@ def test_presence_kl_is_update_kl_for_equal_counts(increment):
         error = np.abs(value - np.maximum(exact_kl(prior, counts), 0)) / np.maximum(total, 1e-30)
         print(f"increment {increment}, {name}: worst error {error.max():.1e} of the sum of g")
         assert error.max() < 2e-5
+
+
+def test_rows_of_a_batch_of_matrices_are_rows():
+    """Categories are the last axis, however many there are before it."""
+    draw = np.random.default_rng(0)
+    prior = jnp.asarray(draw.uniform(0.1, 5, (3, 4, 6)), jnp.float32)
+    counts = jnp.asarray(draw.random((3, 4, 6)) < 0.5, jnp.float32)
+    for function in (update_kl, functools.partial(presence_kl, increment=1)):
+        rows = function(prior.reshape(12, 6), counts.reshape(12, 6))
+        np.testing.assert_allclose(function(prior, counts), rows.reshape(3, 4), rtol=1e-6)
