@@ -3,30 +3,21 @@
 The control is in the test: a run with another seed differs.
 """
 
-import os
 import random
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 from support.commands import POLICIES, SEEDS, write_config
+from support.processes import run
 
 from jaxnav.store.runlog import read_rows
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def start(config_file, run_dir, cache, *options):
     """The command in a process of its own; compiled code is kept, or every start would take its time."""
-    command = [sys.executable, "train.py", "--config", str(config_file), "--run-dir", str(run_dir), *options]
-    environment = os.environ | {
-        "JAX_COMPILATION_CACHE_DIR": str(cache),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    }
-    return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.PIPE, text=True)
+    command = ["train.py", "--config", config_file, "--run-dir", run_dir, *options]
+    return run(command, JAX_COMPILATION_CACHE_DIR=cache, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
 
 
 def finish(process):

@@ -43,7 +43,8 @@ def graph_from_file(path: str | Path, banks: Iterable[Bank], counts: np.ndarray)
 
     A line is `Book,Desk` or `Book,Desk,0.5`: two categories and a weight above 0, at most 1, which is 1 unless given.
     What follows a # is a comment. Edges have no direction.
-    The file is read again whenever a run goes on, and is no part of the settings by which a run is known: leave it as it
+
+    The file is no part of the settings by which a run is known, and is read again when a run goes on: leave it as it
     is until the run has ended.
 
     Args:
