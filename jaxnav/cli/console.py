@@ -112,22 +112,25 @@ def command_line(
     Raises:
       SystemExit: with code 2 after a bad option, 0 after --help.
     """
-    with harmless_refusals():
+    with harmless():
         return tyro.cli(kind, args=arguments, prog=prog, description=description, **options)
 
 
 @contextlib.contextmanager
-def harmless_refusals() -> Iterator[None]:
-    """Show what a parser refuses a command line with as text.
+def harmless() -> Iterator[None]:
+    """Show what a parser prints as text, without colours.
 
-    It quotes the command line, which may come from a file.
+    Refusals quote the command line, and the help quotes a configuration file.
     """
-    told = io.StringIO()
+    streams = (sys.stdout, sys.stderr)
+    pages = [io.TextIOWrapper(io.BytesIO(), each.encoding, each.errors, write_through=True) for each in streams]
     try:
-        with contextlib.redirect_stderr(told):
+        with contextlib.redirect_stdout(pages[0]), contextlib.redirect_stderr(pages[1]):
             yield
     finally:
-        sys.stderr.write(printable(told.getvalue(), kept="\n"))
+        for stream, page in zip(streams, pages, strict=True):
+            page.seek(0)
+            stream.write(printable(page.read(), kept="\n"))
 
 
 def result_console() -> Console:

@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from jaxnav.cli.console import exit_code, harmless_refusals, result_console
+from jaxnav.cli.console import exit_code, harmless, result_console
 from jaxnav.errors import InputError
 from jaxnav.evaluation.scene_statistics import scene_statistics
 from jaxnav.runs.directory import load_run
@@ -93,7 +93,7 @@ class StatsConfig(SceneSource):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; return 0, or 2 after bad input."""
-    with harmless_refusals():
+    with harmless():
         config = tyro.extras.subcommand_cli_from_dict(
             {"import": ImportConfig, "show": ShowConfig, "stats": StatsConfig},
             args=arguments,

@@ -5,8 +5,13 @@ Seen to fail: with a console that takes markup, `[/x]` in a path ends the comman
 drawing of the learning curves.
 """
 
+import contextlib
 import dataclasses
 import gzip
+import json
+import os
+import subprocess
+import sys
 import unicodedata
 
 import pytest
@@ -68,13 +73,51 @@ def test_every_command_shows_hostile_names_as_text(name, given, tmp_path, monkey
     assert_harmless("".join(capsys.readouterr()))
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-@pytest.mark.parametrize("given", ["--no-such@", "--seed=@"])
-def test_what_a_parser_quotes_is_text(name, given, capsys):
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("train", "--no-such@"),
+        ("train", "--seed=@"),
+        ("eval", "a", "--split=@"),
+        ("account", "a", "b", "--seed=@"),
+        ("table", "a", "--no-such@"),
+        ("scenes", "stats", "a", "--run", "b", "@"),
+        ("scenes", "import", "@"),
+    ],
+)
+def test_what_a_parser_quotes_is_text(words, capsys):
     with pytest.raises(SystemExit) as end:
-        main([name, "a", "b", "c", given.replace("@", HOSTILE)])
+        main([word.replace("@", HOSTILE) for word in words])
     assert end.value.code == 2
-    assert_harmless("".join(capsys.readouterr()))
+    assert_harmless(told := "".join(capsys.readouterr()))
+    assert "[/x]" in told
+
+
+def test_a_help_quotes_a_configuration_as_text(tmp_path, capsys):
+    config = tmp_path / "run.yaml"
+    config.write_text(json.dumps({"scenes": f"rooms{HOSTILE}.jsonl.gz"}))
+    with pytest.raises(SystemExit) as end:
+        main(["train", "--config", str(config), "--help"])
+    assert end.value.code == 0
+    assert_harmless(told := capsys.readouterr().out)
+    assert "[/x]" in told
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
+def test_a_refusal_is_legible_on_a_terminal():
+    """What a parser adds for a terminal is not taken for a part of a name."""
+    ours, theirs = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jaxnav", "table", "a", "--no-such"], stdout=theirs, stderr=theirs
+    )
+    os.close(theirs)
+    told = b""
+    with contextlib.suppress(OSError):  # the other end is closed
+        while part := os.read(ours, 4096):
+            told += part
+    assert process.wait() == 2
+    assert b"--no-such" in told
+    assert b"\\x1b" not in told
 
 
 def test_every_command_is_given_hostile_names():

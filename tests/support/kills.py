@@ -13,9 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from support.commands import contents, study_command, write_config
-from support.processes import free_address, run, start
+from support.processes import ends, free_address, run, start
 
-LATE_S = 300  # after which a process hangs
+LATE_S = 300  # after which a process counts as hanging
 LONG = ("--total-steps", 60 * 128)
 
 
@@ -41,34 +41,38 @@ _STARTED: dict[str, Callable[[Path, dict[str, object]], list[subprocess.Popen]]]
 
 def kept(folder: Path) -> dict[str, bytes]:
     """Return the files of a command that do not tell the time or where they are."""
-    ends = ("metrics.jsonl", "reach.json", "params.safetensors", "study.md")
+    those = ("metrics.jsonl", "reach.json", "params.safetensors", "study.md")
     files = contents(folder)
-    return {name: files[name] for name in files if name.endswith(ends) or name.startswith("results")}
-
-
-def codes(processes: list[subprocess.Popen]) -> list[int]:
-    """Wait for processes and return their exit codes."""
-    messages = [process.communicate(timeout=LATE_S)[1] for process in processes]
-    found = [process.returncode for process in processes]
-    if not set(found) <= {0, 2, -9}:
-        raise SystemExit(f"ended with {found}: {messages}")
-    return found
+    return {name: files[name] for name in files if name.endswith(those) or name.startswith("results")}
 
 
 def killed(processes: list[subprocess.Popen], moment: float, draw: random.Random) -> bool:
-    """Kill one of the processes, or all, at a moment; return whether one was still there to be killed."""
+    """Kill one of the processes, or all, at a moment; return whether one was still there to be killed.
+
+    One of two that is left alone may refuse to go on; nothing else may be refused.
+    """
     while time.monotonic() < moment and any(process.poll() is None for process in processes):
         time.sleep(0.001)
     for victim in draw.choice([processes, processes[:1], processes[-1:]]):
         victim.kill()
-    return -9 in codes(processes)
+    codes, messages = ends(*processes, timeout=LATE_S)
+    if not set(codes) <= ({0, 2, -9} if -9 in codes and len(codes) > 1 else {0, -9}):
+        raise SystemExit(f"ended with {codes}: {messages}")
+    return -9 in codes
+
+
+def finish(processes: list[subprocess.Popen]) -> None:
+    """Wait for processes that end well."""
+    codes, messages = ends(*processes, timeout=LATE_S)
+    if any(codes):
+        raise SystemExit(f"ended with {codes}: {messages}")
 
 
 def main(kind: str, count: int, seed: int) -> bool:
     """Kill so often, print what becomes of it, and return whether all that ended are equal."""
     draw, start_all = random.Random(seed), _STARTED[kind]
     with tempfile.TemporaryDirectory() as name:
-        folder, kills, runs, same = Path(name), 0, 0, True
+        folder, kills, begun, runs, same = Path(name), 0, 0, 0, True
         cache = {"JAX_COMPILATION_CACHE_DIR": folder / "cache", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0}
 
         def place(name: str) -> Path:
@@ -78,7 +82,7 @@ def main(kind: str, count: int, seed: int) -> bool:
         seconds = 0.0
         for alone in ("compiled", "whole"):
             began = time.monotonic()
-            assert not any(codes(start_all(place(alone), cache)))
+            finish(start_all(place(alone), cache))
             seconds = time.monotonic() - began
         whole = kept(folder / "whole")
         assert whole
@@ -87,13 +91,14 @@ def main(kind: str, count: int, seed: int) -> bool:
             runs += 1
             here = place(str(runs))
             while kills < count and killed(start_all(here, cache), time.monotonic() + draw.uniform(0, seconds), draw):
-                kills += 1
-                print(f"{kind}: kill {kills}, run {runs}", flush=True)
-            assert not any(codes(start_all(here, cache)))  # what is finished ends at once
+                kills, saved = kills + 1, [path.name for path in sorted(here.rglob("checkpoints/*"))]
+                begun += bool(saved)
+                print(f"{kind}: kill {kills} in run {runs}, with checkpoints {saved}", flush=True)
+            finish(start_all(here, cache))  # what is finished ends at once
             equal = kept(here) == whole
             same &= equal
             print(f"{kind}: run {runs} ended {'equal' if equal else 'OTHERWISE'}", flush=True)
-    print(f"{kind}: {kills} kills with seed {seed} in {runs} runs of {seconds:.0f} s; all ended equal: {same}")
+    print(f"{kind}: {kills} kills with seed {seed} in {runs} runs, {begun} after a checkpoint; all equal: {same}")
     return same
 
 

@@ -46,7 +46,7 @@ MISTAKES = (
     Mistake("store/lock.py", "fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)", "pass", "promises/test_one_writer.py"),
     Mistake("runs/interrupts.py", "signal.signal(each, signal.SIG_DFL)", "pass", "promises/test_interrupts.py"),
     Mistake("cli/console.py", "markup=False", "markup=True", NAMES),
-    Mistake("cli/console.py", 'printable(told.getvalue(), kept="\\n")', "told.getvalue()", NAMES),
+    Mistake("cli/console.py", 'printable(page.read(), kept="\\n")', "page.read()", NAMES),
     Mistake("cli/console.py", "case MemoryError():", "case ZeroDivisionError():", "promises/test_bounds.py"),
     Mistake("__init__.py", '"""', 'import matplotlib  # noqa\n"""', "promises/test_works_without_extras.py"),
 )  # fmt: skip

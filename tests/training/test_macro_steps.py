@@ -56,16 +56,15 @@ def test_where_to_search_is_learned():
     """The book is always north: who chooses at random goes south as often, and finds it too late.
 
     A learning rate of 0 teaches nothing and finds it in 43 % of the episodes, the usual one in 62 %: a difference of
-    0.19 between 1,700 episodes each, with a standard error of 0.017. The bound is 5 of them lower.
+    0.19 between 1,700 episodes each, whose drawing alone has a standard error of 0.017.
     """
-    untrained, _ = _success(0.0, 20)
-    start, learned = _success(PPOConfig().learning_rate, 60)
-    assert start < learned
+    untrained = _success(0.0, 20)
+    learned = _success(PPOConfig().learning_rate, 60)
     assert learned > untrained + 0.1
 
 
-def _success(learning_rate: float, updates: int) -> tuple[float, float]:
-    """Return the success of the first and of the last 20 updates."""
+def _success(learning_rate: float, updates: int) -> float:
+    """Return the success of the last 20 updates."""
     env, params = build(BANK, {}, LIMIT)
     knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_home([BANK], np.zeros(0))))
     spec = dataclasses.replace(tiny.SPEC, method="semexp", method_sizes=())
@@ -73,8 +72,7 @@ def _success(learning_rate: float, updates: int) -> tuple[float, float]:
     learner = Learner(Acting(env, spec, tiny.SETTING), config, "none")
     state = jax.jit(learner.init)(jax.random.key(0), params, knowledge)
     train = jax.jit(functools.partial(learner.train, num_updates=20))
-    success = []
+    metrics = {}
     for _ in range(updates // 20):
         state, metrics = train(state, config.scalars(updates), params, knowledge)
-        success.append(float(metrics["success"]))
-    return success[0], success[-1]
+    return float(metrics["success"])
