@@ -47,9 +47,10 @@ def kept(folder: Path) -> dict[str, bytes]:
 
 
 def killed(processes: list[subprocess.Popen], moment: float, draw: random.Random) -> bool:
-    """Kill one of the processes, or all, at a moment; return whether one was still there to be killed.
+    """Return whether any process was there to be killed.
 
-    One of two that is left alone may refuse to go on; nothing else may be refused.
+    One of them is killed, or all, at a moment. One of two that is left alone may refuse to go on; nothing else may be
+    refused.
     """
     while time.monotonic() < moment and any(process.poll() is None for process in processes):
         time.sleep(0.001)
@@ -71,12 +72,12 @@ def finish(processes: list[subprocess.Popen]) -> None:
 def main(kind: str, count: int, seed: int) -> bool:
     """Kill so often, print what becomes of it, and return whether all that ended are equal."""
     draw, start_all = random.Random(seed), _STARTED[kind]
-    with tempfile.TemporaryDirectory() as name:
-        folder, kills, begun, runs, same = Path(name), 0, 0, 0, True
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, kills, begun, runs, same = Path(temporary), 0, 0, 0, True
         cache = {"JAX_COMPILATION_CACHE_DIR": folder / "cache", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0}
 
         def place(name: str) -> Path:
-            (folder / name).mkdir(exist_ok=True)
+            (folder / name).mkdir()
             return folder / name
 
         seconds = 0.0
@@ -91,7 +92,7 @@ def main(kind: str, count: int, seed: int) -> bool:
             runs += 1
             here = place(str(runs))
             while kills < count and killed(start_all(here, cache), time.monotonic() + draw.uniform(0, seconds), draw):
-                kills, saved = kills + 1, [path.name for path in sorted(here.rglob("checkpoints/*"))]
+                kills, saved = kills + 1, [path.name for path in here.rglob("checkpoints/*") if path.name.isdigit()]
                 begun += bool(saved)
                 print(f"{kind}: kill {kills} in run {runs}, with checkpoints {saved}", flush=True)
             finish(start_all(here, cache))  # what is finished ends at once
