@@ -34,14 +34,12 @@ def main(names: list[str]) -> None:
             call = program(dataclasses.replace(learner, stage=kind).update, *arguments).call
             calls[name if stage == len(config.stages) - 1 else f"{name}, stage {stage + 1}"] = call
     taken = in_turns(calls, TURNS)
-    report(
-        {
-            "update_steps": steps,
-            "methods": about,
-            "steps_per_s": {name: rates(seconds, steps) for name, seconds in taken.items()},
-            "over_org": {name: ratios(taken[REFERENCE], seconds) for name, seconds in taken.items()},
-        }
-    )
+    rows = {
+        name: {"steps_per_s": rates(seconds, steps), "over_org": ratios(taken[REFERENCE], seconds)}
+        | about.get(name, {})
+        for name, seconds in taken.items()
+    }
+    report({"update_steps": steps, "methods": rows})
 
 
 def size(name: str, params: dict[str, Any]) -> dict[str, int]:

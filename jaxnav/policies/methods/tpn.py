@@ -10,11 +10,11 @@ import numpy as np
 from flax import nnx
 
 from jaxnav.numerics.product import Linear
+from jaxnav.policies.methods.attention import FeedForward
 from jaxnav.policies.methods.base import Method, Stage
 from jaxnav.policies.methods.imitation import expert_actions, imitation_loss
 from jaxnav.policies.methods.org import ObjectRelations
 from jaxnav.policies.methods.trail import PoseTracker, learn_motion
-from jaxnav.policies.methods.vtnet import FeedForward
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.policies.stream import Changes, with_one
 from jaxnav.scenes.task import NUM_ACTIONS
