@@ -43,6 +43,7 @@ def make(
     bank = compile_bank((chosen[i] for i in range(len(chosen))), task)
     if split == "train":
         env, params = build(bank, {}, usual.train_step_limit, shaping=usual.shaping)
+        env = dataclasses.replace(env, near_starts=usual.near_starts)
     else:
         env, params = build(bank, {"living_room": usual.large_step_limit}, usual.step_limit)
     return dataclasses.replace(env, made_with=params), params

@@ -144,7 +144,7 @@ def _check_world(config: RunConfig) -> None:
     _need(0.0 <= shift <= 1.0, "worlds.shift", shift, "give a number from 0 to 1")
     _need(shaping is None or 0.0 <= shaping < float("inf"), "worlds.shaping", shaping, "give 0 or more")
     near = config.worlds.near_starts
-    _need(0.0 <= near <= 1.0, "worlds.near_starts", near, "give a probability from 0 to 1")
+    _need(near is None or 0.0 <= near <= 1.0, "worlds.near_starts", near, "give a probability from 0 to 1")
     _need(len(task.categories) >= 2, "worlds.categories", task.categories, "give at least 2")
     _need(len(set(task.categories)) == len(task.categories), "worlds.categories", task.categories, "give each once")
     unknown = [goal for goal in task.goals if goal not in task.categories]

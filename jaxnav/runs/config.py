@@ -49,7 +49,7 @@ class WorldConfig:
     step_limit: int | None = None
     large_step_limit: int | None = None
     shaping: float | None = None
-    near_starts: float = 0.0
+    near_starts: float | None = None
     shard_scenes: int = 128
 
 
@@ -169,6 +169,12 @@ class RunConfig:
     def train_step_limit(self) -> int:
         """Return the actions of a training episode."""
         return self.worlds.train_step_limit or WORLDS[self.world].train_step_limit
+
+    @property
+    def near_starts(self) -> float:
+        """Return the share of training episodes that start near their goals."""
+        usual = WORLDS[self.world].near_starts
+        return usual if self.worlds.near_starts is None else self.worlds.near_starts
 
     @property
     def stages(self) -> tuple[Stage, ...]:

@@ -89,7 +89,7 @@ def make_trainer(
       knowledge: what was learned before training.
       mesh: of devices; None for one device.
     """
-    spec, env = config.policy_spec(len(env.categories)), dataclasses.replace(env, near_starts=config.worlds.near_starts)
+    spec, env = config.policy_spec(len(env.categories)), dataclasses.replace(env, near_starts=config.near_starts)
     settings = {"baseline": None, "layout": dataclasses.replace(setting, gap="none")}
     learners = {
         name: Learner(Acting(env, spec, settings[name]), config.ppo, config.counterfactual) for name in config.arms

@@ -30,6 +30,7 @@ class World:
       large_step_limit: the same in living rooms.
       shaping: reward in training for every metre nearer to the goal than before in the episode, needed where goals are
         rarely reached by chance.
+      near_starts: probability that a training episode starts near its goal, for the same reason.
       budgets: actions within which success is counted too: where experience is worth most, and later.
     """
 
@@ -41,6 +42,7 @@ class World:
     step_limit: int
     large_step_limit: int
     shaping: float
+    near_starts: float
     budgets: tuple[int, int]
 
 
@@ -55,6 +57,7 @@ WORLDS = {
         step_limit=100,
         large_step_limit=200,
         shaping=0.0,
+        near_starts=0.0,
         budgets=(20, 50),
     ),
     "apartments": World(
@@ -66,6 +69,7 @@ WORLDS = {
         step_limit=500,
         large_step_limit=500,
         shaping=1.0,
+        near_starts=0.5,
         budgets=(50, 150),
     ),
     "houses": World(
@@ -77,6 +81,7 @@ WORLDS = {
         step_limit=500,
         large_step_limit=500,
         shaping=1.0,
+        near_starts=0.5,
         budgets=(50, 150),
     ),
 }

@@ -81,7 +81,7 @@ def _reading_help(config: CompareConfig) -> list[str]:
     if "streams" in config.decisions:
         lines.append("`streams`: logits are the sum of two streams (docs/methods.md); else there is one core.")
     if config.ablations:
-        lines.append("`method:ABLATION`: the method without what is special to it (docs/methods.md).")
+        lines.append("`method:NAME`: a variant of the method (docs/methods.md).")
     return lines
 
 

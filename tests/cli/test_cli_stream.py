@@ -92,6 +92,7 @@ def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     config = RunConfig(ppo=ppo, seeds=1, sizes=tiny.SIZES, worlds=WorldConfig(near_starts=0.5))
     trainer = make_trainer(config, world.env, Setting(), Knowledge(jnp.ones((NUM_PRIORS, 22, 22))))
     assert (trainer.learners["layout"].acting.env.near_starts, world.env.near_starts) == (0.5, 0.0)
+    assert [RunConfig(world=name).near_starts for name in ("rooms", "apartments", "houses")] == [0.0, 0.5, 0.5]
     before = trainer.init(world.params(0))
     kept = jax.tree.map(np.array, before["layout"][0].replace(key=None))
     after = trainer.restart(before, world.params(1))["layout"][0]

@@ -130,6 +130,7 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("detector: {seed: -1}", "detector.seed is -1; give a whole number from 0"),
         ("worlds: {shift: 1.5}", "worlds.shift is 1.5; give a number from 0 to 1"),
         ("worlds: {shaping: .inf}", "worlds.shaping is inf; give 0 or more"),
+        ("worlds: {near_starts: 1.5}", "worlds.near_starts is 1.5; give a probability from 0 to 1"),
         ("worlds: {categories: [Chair]}", "worlds.categories is ('Chair',); give at least 2"),
         (
             "worlds: {categories: [Chair, Sink, Chair]}",
