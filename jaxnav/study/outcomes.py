@@ -16,9 +16,9 @@ SCALES: Mapping[Metric, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
 
 
 def mean_weight(outcome: Outcome) -> float:
-    """Return the weight of the subtracted logits, averaged over choices."""
+    """Return the weight of the subtracted logits, averaged over choices; 0 where none counted."""
     choices = np.asarray(outcome.choices, np.float64)
-    return float((np.asarray(outcome.weight, np.float64) * choices).sum() / choices.sum())
+    return float((np.asarray(outcome.weight, np.float64) * choices).sum() / max(choices.sum(), 1.0))
 
 
 class TrialOutcomes:

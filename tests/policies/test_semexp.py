@@ -19,7 +19,7 @@ from jaxnav.policies.acting import Acting, select
 from jaxnav.policies.methods.base import Percept
 from jaxnav.policies.methods.home import cell_places, check_home, learn_home, map_sizes
 from jaxnav.policies.methods.local_policy import LocalPolicy
-from jaxnav.policies.methods.map_tracker import AGREED, SIDE, MapTracker
+from jaxnav.policies.methods.map_tracker import AGREED, SIDE, MapTracker, mark
 from jaxnav.policies.methods.semexp import SEMEXP
 from jaxnav.policies.policy import bind
 from jaxnav.policies.semantic_map import FREE, TRIED, WALL
@@ -105,6 +105,16 @@ def test_choices_count_only_when_they_are_due():
     assert second <= LocalPolicy().interval
     others = walk(at(2, 4, goal), [block_ahead(20), *range(second - 1)])
     assert north[1][:second] == others[1]
+
+
+def test_nothing_is_chosen_while_the_goal_is_on_the_map():
+    """It is in the first view, so no choice counts; as soon as the mark is cleared one is due."""
+    agents, actions, _ = walk(at(10, 0), [block_ahead(10)] * 60)
+    notes = [jax.tree.map(lambda leaf: leaf[0], agent.perceived.note) for agent in agents]
+    assert not any(bool(LocalPolicy().due(note)) for note in notes)
+    assert walk(at(10, 0), range(60))[1] == actions
+    forgotten = notes[0]._replace(cells=notes[0].cells & ~mark(notes[0].goal))
+    assert bool(LocalPolicy().due(forgotten))
 
 
 def test_the_planner_goes_by_the_map_and_not_by_the_walls():

@@ -58,8 +58,11 @@ class LocalPolicy:
         return SIDE**2
 
     def due(self, note: Course) -> jax.Array:
-        """Return whether the policy chooses a block now, bool []."""
-        return note.left == 0
+        """Return whether the policy chooses a block now, bool [...].
+
+        While the goal is on the map nothing is searched for, so nothing is chosen.
+        """
+        return (note.left == 0) & ~marked(note.cells, note.goal[..., None, None]).any(axis=(-2, -1))
 
     def act(self, choice: jax.Array, note: Course, knowledge: Knowledge) -> tuple[jax.Array, Course]:
         """Return the action, and the note with what was chosen."""
