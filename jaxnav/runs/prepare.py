@@ -77,6 +77,16 @@ def learn_knowledge(config: RunConfig, world: CompiledWorld, explored: Explorati
     return Knowledge(layout, method, signs)
 
 
+def say_what_is_cut(config: RunConfig, console: Console) -> None:
+    """Say so if no rollout holds a whole choice."""
+    interval, rollout = find_method(config.method).control.interval, config.ppo.rollout
+    if rollout < interval:
+        console.print(
+            f"{config.method} chooses every {interval} actions: in rollouts of {rollout} it learns little of what a "
+            f"choice leads to; give --ppo.rollout {2 * interval} or more, and fewer --ppo.num-envs"
+        )
+
+
 def make_trainer(
     config: RunConfig, env: ObjectNav, setting: Setting, knowledge: Knowledge, mesh: Mesh | None = None
 ) -> Trainer:

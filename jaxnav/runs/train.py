@@ -20,7 +20,7 @@ from jaxnav.runs.directory import REACH_FILE, Run, claimed, settings
 from jaxnav.runs.exports import export_policy
 from jaxnav.runs.logs import TIMES_FILE, Logs
 from jaxnav.runs.policies import POLICIES
-from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer
+from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer, say_what_is_cut
 from jaxnav.runs.stopwatch import Stopwatch
 from jaxnav.runs.updates import do_updates
 from jaxnav.runs.validation import Validator
@@ -77,6 +77,7 @@ def _train(
     console: Console,
 ) -> None:
     """Train in a run directory that is held."""
+    say_what_is_cut(config, console)
     explored = explore_world(config, world)
     console.print(f"layout prior from {int(explored.steps):,} random steps, {int(explored.poses):,} distinct poses")
     setting = calibrate_setting(config, world, explored, console)

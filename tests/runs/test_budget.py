@@ -5,6 +5,7 @@ import json
 
 import chex
 import pytest
+from support.stopping import train_in_two
 
 import jaxnav
 from jaxnav.errors import InputError
@@ -16,7 +17,6 @@ from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.runs.train import train
 from jaxnav.runs.validation import Validator
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.trainer import Trainer
 
 #: Ten chunks of two updates of 64 x 10 steps.
 CONFIG = RunConfig(
@@ -98,20 +98,7 @@ def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(method
         metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
         assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "imitation": 256, "learning": 256}
 
-    done = []
-
-    def stop_after_the_first(self, *arguments):
-        if done:
-            raise KeyboardInterrupt
-        done.append(arguments)
-        return once(self, *arguments)
-
-    once = Trainer.train
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train", stop_after_the_first)
-        with pytest.raises(KeyboardInterrupt):
-            train(dataclasses.replace(config, run_dir=tmp_path / "resumed"))
-    resumed = train(dataclasses.replace(config, run_dir=tmp_path / "resumed"))
+    resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "resumed"), monkeypatch)
     assert resumed.log() == run.log()
     policies = [jaxnav.load_policy(each.config.run_dir / "policies" / "baseline-0").params for each in (run, resumed)]
     chex.assert_trees_all_equal(*policies)

@@ -111,6 +111,7 @@ class TwoChoices:
     """Choose between the actions with even and odd numbers, by the number of views."""
 
     num_choices: int = 2
+    interval: int = 1
 
     def due(self, note):
         return None
@@ -125,6 +126,8 @@ CONTROLLED = Method(Reading, tracker=Counter(), control=TwoChoices())
 @dataclasses.dataclass(frozen=True)
 class EverySecond(TwoChoices):
     """Choose anew after every second action; what is chosen between does not count."""
+
+    interval: int = 2
 
     def due(self, note):
         return note["views"] % 2 == 1

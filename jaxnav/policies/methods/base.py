@@ -136,6 +136,11 @@ class Control(Protocol):
         """Return the size of the policy's output."""
         ...
 
+    @property
+    def interval(self) -> int:
+        """Return the most actions from a choice that counts to the next."""
+        ...
+
     def due(self, note: Tree) -> jax.Array | None:
         """Return whether the choice counts now, bool [...].
 
@@ -156,6 +161,7 @@ class Primitive:
     """Choose the actions themselves."""
 
     num_choices: int = NUM_ACTIONS
+    interval: int = 1
 
     def due(self, note: Tree) -> None:
         """Return that every choice counts."""

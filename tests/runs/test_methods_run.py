@@ -1,0 +1,47 @@
+"""Methods from training to evaluation, export and action; those with more to show are tested beside that."""
+
+import dataclasses
+
+import chex
+import pytest
+from rich.console import Console
+from support.drawn_run import tiny_config
+from support.stopping import train_in_two
+
+import jaxnav
+from jaxnav.__main__ import main
+from jaxnav.policies.methods import find_method
+from jaxnav.runs.prepare import say_what_is_cut
+from jaxnav.runs.train import train
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["rgb", "eotp", "savn", "semexp"])
+def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
+    """Two chunks, stopped between them; what is exported decides as the run's policy, from the same knowledge."""
+    config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1)
+    worlds = dataclasses.replace(config.worlds, num_train=16)  # among them rooms as large as those of val, for maps
+    config = dataclasses.replace(config, arms=("baseline",), worlds=worlds)
+    whole = train(config)
+    resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "two"), monkeypatch)
+    assert resumed.log() == whole.log()
+    runs = [jaxnav.load_policy(run.config.run_dir / "policies" / "baseline-0") for run in (whole, resumed)]
+    chex.assert_trees_all_equal(*runs)
+    assert main(["export", str(tmp_path / "two"), "--policy", "baseline-0", "--out", str(tmp_path / "out")]) == 0
+    exported = jaxnav.load_policy(tmp_path / "out")
+    chex.assert_trees_all_equal(exported, runs[0])
+    assert bool(exported.knowledge.method) == (find_method(method).learn is not None)
+
+    results = jaxnav.evaluate(resumed, episodes=8)
+    assert {leaf.shape[-1] for leaf in results.outcome} == {8}
+    assert main(["export", str(tmp_path / "two"), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
+
+
+@pytest.mark.parametrize(("rollout", "told"), [(24, True), (25, False)])
+def test_rollouts_that_hold_no_whole_choice_are_told(rollout, told, tmp_path, capsys):
+    config = dataclasses.replace(tiny_config(tmp_path), method="semexp", method_sizes={})
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout=rollout))
+    say_what_is_cut(config, Console(width=200))
+    assert ("give --ppo.rollout 50 or more" in capsys.readouterr().out) == told
+    say_what_is_cut(dataclasses.replace(config, method="org"), Console())
+    assert capsys.readouterr().out == ""
