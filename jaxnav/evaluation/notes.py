@@ -89,5 +89,5 @@ def _no_better(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList) 
             continue
         gain = paired_difference(random, values, clusters, trained=False)
         if not (gain.low if gain.bounded else gain.mean) > 0:
-            found.append(f"{row.variant} ({row.decoding}) is no better than Random: train it for longer.")
+            found.append(f"{row.variant} ({row.decoding}) is no better than Random.")
     return found

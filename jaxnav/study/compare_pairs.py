@@ -3,11 +3,15 @@
 import itertools
 from typing import NamedTuple
 
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.spec import Deciding
+from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.study.compare_config import CompareConfig
 
 #: Uses of a run's policies, and how they are printed.
 VARIANTS = {"baseline": "", "layout": " + w", "stde": " + w + sTDE"}
+#: Those and, of a method whose choices are no actions, random choices.
+LABELS = {**VARIANTS, "random": ", random choices"}
 #: The agents that cannot know any layout.
 WITHOUT = "anonymous"
 #: What is improved within a run: an agent and what it is compared with.
@@ -19,7 +23,7 @@ class TableRow(NamedTuple):
 
     Attributes:
       method, decision: of its run.
-      variant: a key of `VARIANTS`.
+      variant: a key of `LABELS`.
     """
 
     method: str
@@ -27,12 +31,17 @@ class TableRow(NamedTuple):
     variant: str
 
     def __str__(self) -> str:
-        return run_label(self.method, self.decision) + VARIANTS[self.variant]
+        return run_label(self.method, self.decision) + LABELS[self.variant]
 
 
 def run_label(method: str, decision: Deciding) -> str:
     """Return the name of a run as printed."""
     return f"`{method.rpartition('.')[2]}`" + (f", {decision}" if decision != "fused" else "")
+
+
+def chooses_actions(method: str) -> bool:
+    """Return whether the policy's choices are the actions themselves."""
+    return find_method(method).control.num_choices == NUM_ACTIONS
 
 
 def comparisons(config: CompareConfig) -> list[tuple[TableRow, TableRow]]:
@@ -46,6 +55,9 @@ def comparisons(config: CompareConfig) -> list[tuple[TableRow, TableRow]]:
             pairs.append((TableRow(method, decision, variant), TableRow(method, decision, reference)))
         for decision, variant in itertools.product(others, VARIANTS):
             pairs.append((TableRow(method, decision, variant), TableRow(method, first, variant)))
+        if not chooses_actions(method):
+            for decision, variant in itertools.product(config.decisions, VARIANTS):
+                pairs.append((TableRow(method, decision, variant), TableRow(method, decision, "random")))
         for ablation, decision, variant in itertools.product(
             config.ablations.get(method, ()), config.decisions, VARIANTS
         ):

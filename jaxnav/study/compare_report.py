@@ -99,7 +99,8 @@ class Scores:
           metric: SR and SPL are in percentage points.
         """
         a, b = other._values(reference, metric), self._values(line, metric)
-        same = self is other and "baseline" not in (line.variant, reference.variant)
+        untrained = reference.variant in REFERENCES  # no other networks than those of the agent
+        same = self is other and (untrained or "baseline" not in (line.variant, reference.variant))
         return paired_difference(a, b, self.clusters(), same_runs=same)
 
     def _values(self, line: Line, metric: Metric) -> np.ndarray:

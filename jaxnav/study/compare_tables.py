@@ -5,11 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.report_tables import COLUMNS
-from jaxnav.policies.methods import find_method
 from jaxnav.policies.spec import Deciding
-from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.study.compare_config import CompareConfig, Entry, entries
-from jaxnav.study.compare_pairs import VARIANTS, TableRow, comparisons, run_label
+from jaxnav.study.compare_pairs import LABELS, VARIANTS, TableRow, chooses_actions, comparisons, run_label
 from jaxnav.study.compare_report import SCALE, Line, Scores
 from jaxnav.study.document import reading_section, write_lines
 from jaxnav.study.tables import markdown
@@ -54,7 +52,8 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scor
         "",
         "Numbers are means over seeds and episodes with 95 % intervals over training runs and scenes "
         "(docs/statistics.md), not corrected for their number. Differences are paired on the episodes. DTS is better "
-        "where it is lower.",
+        "where it is lower. Each policy is the best of several that its training passed through, by other episodes in "
+        "scenes of `val`.",
         "",
     ]
     if missing := [name for name in config.expected if name not in config.methods]:
@@ -90,11 +89,11 @@ def _world(config: CompareConfig, world: str, parts: Parts, frontier: Scores | N
     if not parts:
         return []
     # Where a policy chooses no actions, random choices are no random actions.
-    one = next((part for run, part in parts.items() if _chooses_actions(run[0])), next(iter(parts.values())))
+    one = next((part for run, part in parts.items() if chooses_actions(run[0])), next(iter(parts.values())))
     untrained = [one, *([frontier] if frontier else [])]
     lines = [f"## {world}: {len(one.scenes)} scenes, {sum(one.episodes):,} episodes", ""]
     for decoding, name in DECODINGS.items():
-        lines += [f"### Success, {name}", "", *_metrics_table(untrained, parts, decoding), ""]
+        lines += [f"### Success, {name}", "", *_metrics_table(config, untrained, parts, decoding), ""]
     for decoding, name in DECODINGS.items():
         if improved := _improvements(config, parts, decoding):
             header = ("", "SR (points)", "SPL (points)", "DTS (m)")
@@ -102,11 +101,12 @@ def _world(config: CompareConfig, world: str, parts: Parts, frontier: Scores | N
     return [*lines, "### What the runs took", "", *_training_table(parts), "", *_notes(parts), ""]
 
 
-def _chooses_actions(method: str) -> bool:
-    return find_method(method).control.num_choices == NUM_ACTIONS
+def _searches(config: CompareConfig, method: str) -> bool:
+    """Return whether random choices are another agent than Random."""
+    return method in config.methods and not chooses_actions(method)
 
 
-def _metrics_table(untrained: Iterable[Scores], parts: Parts, decoding: Decoding) -> list[str]:
+def _metrics_table(config: CompareConfig, untrained: Iterable[Scores], parts: Parts, decoding: Decoding) -> list[str]:
     """Return SR, SPL and DTS of every agent."""
     rows = [
         (title, part, line)
@@ -115,8 +115,8 @@ def _metrics_table(untrained: Iterable[Scores], parts: Parts, decoding: Decoding
     ]
     rows += [
         (str(TableRow(*run, variant)), part, line)
-        for (run, part), variant in itertools.product(parts.items(), VARIANTS)
-        if (line := part.line(variant, decoding))
+        for (run, part), variant in itertools.product(parts.items(), LABELS)
+        if (line := part.line(variant, decoding)) and (variant in VARIANTS or _searches(config, run[0]))
     ]
     cells = [
         (title, *(f"{part.summary(line, metric):.{COLUMNS[metric][1]}f}" for metric in SCALE))
@@ -161,9 +161,12 @@ def _notes(parts: Parts) -> list[str]:
     told: dict[str, list[str]] = {}
     for run, part in parts.items():
         for note in part.training.notes if part.training else ():
-            told.setdefault(note, []).append(run_label(*run))
+            said = note if chooses_actions(run[0]) else note.replace("Random", "random choices")
+            told.setdefault(said, []).append(run_label(*run))
     return [
-        "Exploration, imitation and learning are the environment steps behind each policy. The wall time is that of "
+        "Exploration, imitation and learning are the environment steps behind each policy; exploration serves the "
+        "layout's priors and the graph of `sp`. What else methods know before training they read from the training "
+        "scenes themselves (docs/methods.md). The wall time is that of "
         "the whole run, all its seeds, without and with w, side by side. Val SR is that of best actions, the mean of "
         "all policies, before the last quarter of training and at its end: where it rises, longer training pays.",
         "",

@@ -5,10 +5,12 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from jaxnav.errors import InputError
 from jaxnav.evaluation.report_tables import COLUMNS
 from jaxnav.evaluation.statistics import Interval
+from jaxnav.store.manifest import differences
 from jaxnav.study.claims import Claim
 from jaxnav.study.codec import from_json
 from jaxnav.study.compare_pairs import VARIANTS
@@ -24,6 +26,8 @@ HOSTS = ("eotp", "org", "vtnet", "hoz")
 #: Uses of policies as printed, and what is gained by one over another.
 USES = {**VARIANTS, "tde": " + w + TDE"}
 STEPS = (("stde", "baseline"), ("layout", "baseline"), ("stde", "layout"), ("layout", "tde"))
+#: Settings of a run that belong to its method.
+OF_A_METHOD = ("method", "method_sizes", "arms", "imitation", "decision")
 POINTS = 2.0  # of SR; the least effect that would matter
 #: Results of one world's methods, with one core, by method.
 Parts = Mapping[str, Scores]
@@ -84,9 +88,12 @@ def write_paper_tables(document: Path, results: Path) -> None:
       results: folder of a split, with files WORLD-METHOD-DECISION.json of `jaxnav compare`.
 
     Raises:
-      InputError: the document is another one.
+      InputError: the document is another one, or a world's methods were compared with different settings.
     """
-    found = {path.stem: from_json(Scores, json.loads(path.read_text())) for path in results.glob("*.json")}
+    records = {path.stem: json.loads(path.read_text()) for path in sorted(results.glob("*.json"))}
+    for table in TABLES:
+        _check_alike(table.world, results, records)
+    found = {name: from_json(Scores, record) for name, record in records.items()}
     worlds = {table.world: _parts(table.world, found) for table in TABLES}
     lines = [HEAD.format(split=results.name, points=POINTS), *reading_section(document)]
     lines += ["## Which orderings hold", "", *_orderings(worlds), ""]
@@ -95,11 +102,32 @@ def write_paper_tables(document: Path, results: Path) -> None:
     write_lines(document, lines)
 
 
+def _of_one_core(world: str, names: Iterable[str]) -> dict[str, str]:
+    """Return the names of a world's results with one core, by method."""
+    first, last = f"{world}-", "-fused"
+    there = (name for name in names if name.startswith(first) and name.endswith(last))
+    return {name.removeprefix(first).removesuffix(last): name for name in there}
+
+
+def _check_alike(world: str, results: Path, records: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse methods of a world that differ in more than what a method is."""
+    shared = {}
+    for name in _of_one_core(world, records).values():
+        study = records[name].get("study", {})
+        run = {key: value for key, value in study.get("run", {}).items() if key not in OF_A_METHOD}
+        shared[name] = {**study, "run": run}
+    for name, settings in shared.items():
+        first = next(iter(shared))
+        if different := differences(settings, shared[first]):
+            raise InputError(
+                f"{results / name}.json: was compared with other settings than {first}.json "
+                f"({'; '.join(different)}); compare both with the same ones"
+            )
+
+
 def _parts(world: str, found: Mapping[str, Scores]) -> Parts:
     """Return the results of a world's methods with one core."""
-    first, last = f"{world}-", "-fused"
-    names = [name for name in found if name.startswith(first) and name.endswith(last)]
-    return {name.removeprefix(first).removesuffix(last): found[name] for name in names}
+    return {method: found[name] for method, name in _of_one_core(world, found).items()}
 
 
 def _beside(table: Table, parts: Parts) -> list[str]:

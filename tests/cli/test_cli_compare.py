@@ -281,7 +281,7 @@ def test_table_2_has_every_method_of_the_paper_s():
 def test_the_ablations_have_the_baseline_alone():
     config = command.parse_compare(["--config", "ablations"])
     runs = entries(config)
-    assert len(runs) == 17
+    assert len(runs) == 15
     assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxnav.errors import InputError
 from jaxnav.study.compare_report import Line, Scores
 from jaxnav.study.paper_numbers import TABLE_1, TABLE_2_AI2THOR, TABLE_2_ROBOTHOR, TABLE_3
 from jaxnav.study.paper_tables import write_paper_tables
@@ -39,6 +40,20 @@ def test_the_committed_page_is_written_from_the_committed_results(tmp_path):
     (tmp_path / "page.md").write_text(committed)
     write_paper_tables(tmp_path / "page.md", ROOT / "results" / "tables" / "val")
     assert (tmp_path / "page.md").read_text() == committed
+
+
+def test_methods_of_other_settings_are_not_compared(tmp_path):
+    """Method and arms may differ, and worlds; steps may not."""
+    one = {"episodes": 9, "run": {"method": "rgb", "arms": ["baseline"], "total_steps": 5}}
+    other = {"episodes": 9, "run": {"method": "org", "arms": ["layout"], "total_steps": 5}}
+    for name, study in (("rooms-rgb-fused", one), ("rooms-org-fused", other), ("houses-rgb-fused", {"episodes": 8})):
+        write_record(tmp_path / "val" / f"{name}.json", study, scores(baseline=6.0))
+    write_paper_tables(tmp_path / "page.md", tmp_path / "val")
+    other["run"]["total_steps"] = 6
+    write_record(tmp_path / "val" / "rooms-org-fused.json", other, scores(baseline=6.0))
+    message = r"rooms-rgb-fused.json: was .* than rooms-org-fused.json \(run.total_steps: 5 != 6\); compare both"
+    with pytest.raises(InputError, match=message):
+        write_paper_tables(tmp_path / "page.md", tmp_path / "val")
 
 
 def test_orderings_are_judged_by_their_intervals(tmp_path):
