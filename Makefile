@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-BENCHMARKS := $(filter-out _% table curves recipe success layout_value zones factors gate,$(basename $(notdir $(wildcard benchmarks/*.py))))
+BENCHMARKS := $(filter-out _% table curves recipe success layout_value zones factors gate adaptation,$(basename $(notdir $(wildcard benchmarks/*.py))))
 RESULTS := results/performance
 DOCUMENT = $(if $(filter results/performance,$(RESULTS)),docs/performance.md,$(RESULTS)/performance.md)
 # Neither peers, whose environments hold JAX for processors alone, nor what splits this machine's cores.

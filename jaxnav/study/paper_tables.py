@@ -246,4 +246,4 @@ def _row(text: str, paper: float, effect: Interval) -> tuple[str, ...]:
     told = "-" if math.isnan(paper) else f"{paper:+.1f}"
     if math.isnan(effect.mean):
         return text, told, "-", "not run"
-    return text, told, f"{effect:+.1f}", Claim(text, "points", effect, POINTS).verdict
+    return text, told, f"{effect:+z.1f}", Claim(text, "points", effect, POINTS).verdict
