@@ -74,6 +74,12 @@ class LearnedSteps:
     rate: float = 0.01
     second_order: bool = True
 
+    def __post_init__(self) -> None:
+        if self.inner_steps < 1:
+            raise InputError(
+                f"LearnedSteps: inner_steps is {self.inner_steps}; give 1 or more, or no adaptation at all"
+            )
+
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> FastWeights:
         """Return an empty window and no change."""
         rank = self.inner_steps * WINDOW
