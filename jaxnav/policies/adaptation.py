@@ -76,9 +76,7 @@ class LearnedSteps:
 
     def __post_init__(self) -> None:
         if self.inner_steps < 1:
-            raise InputError(
-                f"LearnedSteps: inner_steps is {self.inner_steps}; give 1 or more, or no adaptation at all"
-            )
+            raise InputError(f"LearnedSteps: inner_steps is {self.inner_steps}; give 1 or more, or no adaptation")
 
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> FastWeights:
         """Return an empty window and no change."""

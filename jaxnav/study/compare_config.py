@@ -31,6 +31,7 @@ class CompareConfig:
         `total_steps`.
       methods: that are compared.
       ablations: of a method, the methods that it is compared with besides.
+      unlearned: of all of them, those that act by nothing that is learned; they are trained for one chunk.
       expected: methods of which the document says that they are missing where they are not compared.
       decisions: how pathways become logits. With `streams` the layout's policies alone are trained, of the methods that
         host the layout.
@@ -52,6 +53,7 @@ class CompareConfig:
     )
     methods: tuple[str, ...] = tuple(METHODS)
     ablations: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    unlearned: tuple[str, ...] = ()
     expected: tuple[str, ...] = ()
     decisions: tuple[Deciding, ...] = ("fused", "streams")
     split: Literal["val", "test"] = "val"
@@ -103,6 +105,9 @@ def check_compare(config: CompareConfig) -> CompareConfig:
             raise InputError(f"worlds: {world!r}: is part of file names; give letters, digits and underscores")
     if unknown := set(config.ablations) - set(config.methods):
         raise InputError(f"ablations: {sorted(unknown)[0]!r} is none of the methods {', '.join(config.methods)}")
+    compared = {*config.methods, *(each for group in config.ablations.values() for each in group)}
+    if unknown := set(config.unlearned) - compared:
+        raise InputError(f"unlearned: {sorted(unknown)[0]!r} is not compared; leave it out")
     if not 0.0 <= config.epsilon < float("inf"):
         raise InputError(f"epsilon: {config.epsilon}: give a number from 0 to below infinity")
     for name, place in GIVEN.items():
@@ -141,7 +146,9 @@ def entries(config: CompareConfig) -> list[Entry]:
             trained = _arms(method, decision)
             arms = tuple(arm for arm in shared.arms if arm in trained)
             if arms:
-                entry = Entry(world, method, decision, dataclasses.replace(shared, method=method, arms=arms))
+                steps = 1 if method in config.unlearned else shared.total_steps
+                run = dataclasses.replace(shared, method=method, arms=arms, total_steps=steps)
+                entry = Entry(world, method, decision, run)
                 found.append(entry._replace(run=_run(entry, config.runs)))
     return found
 

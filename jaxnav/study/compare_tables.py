@@ -42,7 +42,8 @@ def write_comparison(config: CompareConfig, found: Mapping[str, Scores]) -> None
 
 def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scores]) -> list[str]:
     """Return the title and what holds for all tables."""
-    steps = {entry.world: entry.run.total_updates * entry.run.update_steps for entry in runs}
+    learning = [entry for entry in runs if entry.method not in config.unlearned]
+    steps = {entry.world: entry.run.total_updates * entry.run.update_steps for entry in learning}
     text = [
         f"{config.base.seeds} seeds of each policy. Environment steps of each, imitation included: "
         + ", ".join(f"{number:,} in {world}" for world, number in steps.items())
@@ -81,6 +82,9 @@ def _reading_help(config: CompareConfig) -> list[str]:
         lines.append("`streams`: logits are the sum of two streams (docs/methods.md); else there is one core.")
     if config.ablations:
         lines.append("`method:NAME`: a variant of the method (docs/methods.md).")
+    if config.unlearned:
+        names = ", ".join(run_label(method, "fused") for method in config.unlearned)
+        lines.append(f"{names} acts by nothing that is learned, and is trained for one chunk of updates only.")
     return lines
 
 

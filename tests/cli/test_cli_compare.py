@@ -223,6 +223,7 @@ def test_an_interrupted_comparison_says_so_and_goes_on(steps, tmp_path, monkeypa
         (["--methods"], "methods: empty: give one or more, each once"),
         (["--methods", "org", "org"], "methods: org, org: give one or more, each once"),
         (["--ablations", "{vtnet: [rgb]}"], "ablations: 'vtnet' is none of the methods anonymous, org"),
+        (["--unlearned", "eotp"], "unlearned: 'eotp' is not compared; leave it out"),
         (["--worlds", "{}"], "worlds: empty: give one or more"),
         (["--worlds", "{a/b: {}}"], "worlds: 'a/b': is part of file names; give letters"),
         (["--worlds", "{flat: {world: flats}}"], "worlds.flat: world must be one of 'rooms', 'apartments'"),
@@ -288,6 +289,8 @@ def test_the_ablations_have_the_baseline_alone():
 def test_table_3_has_room_for_macro_steps():
     runs = {entry.method: entry.run for entry in entries(command.parse_compare(["--config", "table3"]))}
     assert set(runs) == {"anonymous", "rgb", "semexp", "jaxnav.policies.methods.semexp:NEAREST"}
-    for run in runs.values():  # the same for all, at least two choices in every rollout
+    nearest = runs["jaxnav.policies.methods.semexp:NEAREST"]
+    for run in runs.values():  # the same for all that learn, at least two choices in every rollout
         assert (run.world, run.update_steps) == ("houses", RunConfig().update_steps)
+        assert run.total_updates == (run.chunk if run is nearest else runs["rgb"].total_updates)
         assert run.ppo.rollout >= 2 * LocalPolicy.interval
