@@ -5,7 +5,7 @@
 
   falls       percent of the windows of 60 steps of 64 episodes, whose actions are sampled, after which the learned loss
               is lower than before the step, of each seed
-  others      percent of the episodes that end in another way without adaptation, by decoding
+  others      percent of the episodes that go another way without adaptation, by decoding
   adapted     success, SPL and DTS with adaptation less without it, by decoding, with intervals over runs and scenes
 
 The result goes to stdout as JSON.

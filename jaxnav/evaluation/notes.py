@@ -10,7 +10,9 @@ from jaxnav.evaluation.statistics import LEAST_SCENES, paired_difference
 from jaxnav.evaluation.variants import Row
 
 
-def notes(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, room_prior: bool) -> list[str]:
+def notes(
+    rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, room_prior: bool, random: str = "Random"
+) -> list[str]:
     """Return what limits the table, a sentence each.
 
     Args:
@@ -18,11 +20,12 @@ def notes(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, ro
       success: float64 [R, S, E].
       episodes: the E episodes.
       room_prior: whether the layout's prior is that of the room's own type, not one for all.
+      random: what to call the agent that chooses at random.
     """
     found = _missing_intervals(success.shape[1], episodes)
     if room_prior and any(row.arm == "layout" for row in rows):
         found.append("Rows with w are told the type of the room by their prior, others are not.")
-    return found + _no_better(rows, success, episodes)
+    return found + _no_better(rows, success, episodes, random)
 
 
 def spent(budget: Mapping[str, int]) -> str:
@@ -78,7 +81,7 @@ def _missing_intervals(seeds: int, episodes: EpisodeList) -> list[str]:
     return found
 
 
-def _no_better(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList) -> list[str]:
+def _no_better(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, name: str) -> list[str]:
     """Name the policies that no interval over scenes tells from Random."""
     random = next((success[i] for i, row in enumerate(rows) if row.variant == "random"), None)
     if random is None:
@@ -89,5 +92,5 @@ def _no_better(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList) 
             continue
         gain = paired_difference(random, values, clusters, trained=False)
         if not (gain.low if gain.bounded else gain.mean) > 0:
-            found.append(f"{row.variant} ({row.decoding}) is no better than Random.")
+            found.append(f"{row.variant} ({row.decoding}) is no better than {name}.")
     return found

@@ -56,6 +56,9 @@ def check_method(name: str, method_sizes: Mapping[str, int] | None = None, steps
     knowledge, key = _knowledge(method, env, bank), jax.random.key(seed)
     weights = _lively(jax.jit(init_params, static_argnums=0)(spec, key), key)
 
+    interval = getattr(method.control, "interval", 0)
+    _promise(isinstance(interval, int) and interval >= 1, "a control that does not say how long a choice lasts")
+
     @jax.jit
     def start() -> Agent:
         memory = acting.bind(weights).initial_memory((_BATCH,))

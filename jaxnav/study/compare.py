@@ -20,6 +20,7 @@ from jaxnav.runs.evaluate import Results, episode_lists, evaluate
 from jaxnav.runs.worlds import evaluation_world
 from jaxnav.study.codec import from_json
 from jaxnav.study.compare_config import CompareConfig, Entry, entries, entry_identity, frontier_identity, world_runs
+from jaxnav.study.compare_pairs import chooses_actions
 from jaxnav.study.compare_report import SCALE, Line, Scores, Training
 from jaxnav.study.compare_tables import frontier_name, write_comparison
 from jaxnav.study.document import check_document
@@ -27,6 +28,8 @@ from jaxnav.study.paper_tables import write_paper_tables
 from jaxnav.study.results import is_written, kept_note, write_record
 from jaxnav.study.runs import ensure_trained
 
+#: What random choices are called where they are no actions, and where they are.
+RANDOM_AGENTS = ("random choices", "Random")
 #: Name, settings that decide the numbers, and how they are measured.
 Job = tuple[str, Mapping[str, Any], Callable[[], Scores]]
 
@@ -90,7 +93,8 @@ def measure_entry(config: CompareConfig, entry: Entry, console: Console) -> Scor
         console=console,
     )
     success = results.metrics()["sr"]
-    told = notes(results.rows, success, results.episodes, room_prior=entry.run.layout.prior == "room")
+    random, room_prior = RANDOM_AGENTS[chooses_actions(entry.method)], entry.run.layout.prior == "room"
+    told = notes(results.rows, success, results.episodes, room_prior=room_prior, random=random)
     budget, wall = results.report["run"]["budget"], run.times()[-1]["wall_s"]
     return by_scene(results, Training(budget, wall, last_quarter(run.log()), tuple(told)))
 

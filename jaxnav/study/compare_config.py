@@ -43,7 +43,7 @@ class CompareConfig:
       base: settings that all runs share.
     """
 
-    title: str = "Table 2: every method without and with the layout"
+    title: str = "Table 2: methods without and with the layout"
     results: Path = Path("results/tables")
     document: Path = Path("docs/table2.md")
     paper: Path | None = None

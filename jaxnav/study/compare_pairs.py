@@ -4,8 +4,8 @@ import itertools
 from typing import NamedTuple
 
 from jaxnav.policies.methods import find_method
+from jaxnav.policies.methods.base import Primitive
 from jaxnav.policies.spec import Deciding
-from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.study.compare_config import CompareConfig
 
 #: Uses of a run's policies, and how they are printed.
@@ -41,7 +41,7 @@ def run_label(method: str, decision: Deciding) -> str:
 
 def chooses_actions(method: str) -> bool:
     """Return whether the policy's choices are the actions themselves."""
-    return find_method(method).control.num_choices == NUM_ACTIONS
+    return find_method(method).control == Primitive()
 
 
 def comparisons(config: CompareConfig) -> list[tuple[TableRow, TableRow]]:

@@ -115,7 +115,7 @@ def _metrics_table(config: CompareConfig, untrained: Iterable[Scores], parts: Pa
     rows = [
         (title, part, line)
         for (variant, title), part in itertools.product(REFERENCE_TITLES.items(), untrained)
-        if (line := part.line(variant, decoding))
+        if (line := part.line(variant, decoding)) and (variant != "random" or any(chooses_actions(m) for m, _ in parts))
     ]
     rows += [
         (str(TableRow(*run, variant)), part, line)
@@ -165,8 +165,7 @@ def _notes(parts: Parts) -> list[str]:
     told: dict[str, list[str]] = {}
     for run, part in parts.items():
         for note in part.training.notes if part.training else ():
-            said = note if chooses_actions(run[0]) else note.replace("Random", "random choices")
-            told.setdefault(said, []).append(run_label(*run))
+            told.setdefault(note, []).append(run_label(*run))
     return [
         "Exploration, imitation and learning are the environment steps behind each policy; exploration serves the "
         "layout's priors and the graph of `sp`. What else methods know before training they read from the training "

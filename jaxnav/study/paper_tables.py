@@ -27,7 +27,7 @@ HOSTS = ("eotp", "org", "vtnet", "hoz")
 USES = {**VARIANTS, "tde": " + w + TDE"}
 STEPS = (("stde", "baseline"), ("layout", "baseline"), ("stde", "layout"), ("layout", "tde"))
 #: Settings of a run that belong to its method.
-OF_A_METHOD = ("method", "method_sizes", "arms", "imitation", "decision")
+OF_A_METHOD = ("method", "method_sizes", "arms", "imitation")
 POINTS = 2.0  # of SR; the least effect that would matter
 #: Results of one world's methods, with one core, by method.
 Parts = Mapping[str, Scores]
@@ -92,7 +92,7 @@ def write_paper_tables(document: Path, results: Path) -> None:
     """
     records = {path.stem: json.loads(path.read_text()) for path in sorted(results.glob("*.json"))}
     for table in TABLES:
-        _check_alike(table.world, results, records)
+        _check_alike(table, results, records)
     found = {name: from_json(Scores, record) for name, record in records.items()}
     worlds = {table.world: _parts(table.world, found) for table in TABLES}
     lines = [HEAD.format(split=results.name, points=POINTS), *reading_section(document)]
@@ -109,10 +109,12 @@ def _of_one_core(world: str, names: Iterable[str]) -> dict[str, str]:
     return {name.removeprefix(first).removesuffix(last): name for name in there}
 
 
-def _check_alike(world: str, results: Path, records: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse methods of a world that differ in more than what a method is."""
-    shared = {}
-    for name in _of_one_core(world, records).values():
+def _check_alike(table: Table, results: Path, records: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse methods of a table that differ in more than what a method is."""
+    shared, printed = {}, {method for method, _ in table.printed}
+    for method, name in _of_one_core(table.world, records).items():
+        if method not in printed:
+            continue
         study = records[name].get("study", {})
         run = {key: value for key, value in study.get("run", {}).items() if key not in OF_A_METHOD}
         shared[name] = {**study, "run": run}

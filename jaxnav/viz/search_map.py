@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from jaxnav.policies.methods.map_tracker import SIDE
+from jaxnav.policies.methods.map_tracker import SIDE, Course
 from jaxnav.policies.semantic_map import EXPLORED, FREE, WALL
 from jaxnav.scenes.scene import CELL, extent
 from jaxnav.viz.labels import Labels
@@ -70,7 +70,13 @@ def draw_search(episode: Episode, search: Search, step: int, path: Path) -> None
     _draw_map(axes, search, frame)
     _draw_plan(axes, episode, search, step, frame)
     _draw_marks(axes, episode, search, frame)
-    figure.legend(handles=_legend(goal), loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
+    figure.legend(
+        handles=_legend(goal, search.searching),
+        loc="center left",
+        bbox_to_anchor=(0.73, 0.5),
+        fontsize=9,
+        frameon=False,
+    )
     canvas.draw()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
@@ -86,19 +92,25 @@ def _draw_map(axes: Axes, search: Search, frame: Frame) -> None:
 
 
 def _draw_plan(axes: Axes, episode: Episode, search: Search, step: int, frame: Frame) -> None:
-    """Draw the block that was chosen, the ways walked and meant, and the agent."""
+    """Draw the ways walked and meant, the agent and, while it searches, the block that was chosen."""
     course, rules = search.course, episode.task.rules
-    cells, side = frame.size // SIDE, CELL * (frame.size // SIDE)
-    corner = frame.along(np.stack([course.place, course.aim + cells // 2]))[1] - CELL * (cells // 2) - CELL / 2
-    axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=BLOCK, lw=2.2, zorder=5))
     axes.plot(*episode.places[: step + 1].T, color=AGENT, lw=2, solid_joinstyle="round", zorder=4)
     axes.plot(*episode.places[0], "o", color="white", markeredgecolor=AGENT, markersize=6, zorder=4)
     axes.plot(*frame.along(np.stack([course.place, *search.planned])).T, ":", color=AGENT, lw=2, zorder=4)
     draw_agent(axes, episode.scene, rules, episode.places[step], 360.0 / rules.headings * float(course.heading))
+    if search.searching:
+        _draw_block(axes, course, frame)
+    axes.apply_aspect()
+
+
+def _draw_block(axes: Axes, course: Course, frame: Frame) -> None:
+    """Draw the block that was chosen, which may lie beyond the home."""
+    cells, side = frame.size // SIDE, CELL * (frame.size // SIDE)
+    corner = frame.along(np.stack([course.place, course.aim + cells // 2]))[1] - CELL * (cells // 2) - CELL / 2
+    axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=BLOCK, lw=2.2, zorder=5))
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     axes.set_xlim(min(left, corner[0] - CELL), max(right, corner[0] + side + CELL))
     axes.set_ylim(min(bottom, corner[1] - CELL), max(top, corner[1] + side + CELL))
-    axes.apply_aspect()
 
 
 def _draw_marks(axes: Axes, episode: Episode, search: Search, frame: Frame) -> None:
@@ -119,15 +131,16 @@ def _draw_marks(axes: Axes, episode: Episode, search: Search, frame: Frame) -> N
             named.append(place)
 
 
-def _legend(goal: str) -> list[Patch | Line2D]:
+def _legend(goal: str, searching: bool) -> list[Patch | Line2D]:
     """Return what the colours mean."""
+    block = [Patch(fill=False, edgecolor=BLOCK, lw=2, label="block chosen to search in")]
     return [
         Patch(color=NEAR, label="floor seen from nearby"),
         Patch(color=FAR, label="floor seen from afar"),
         Patch(color=BLOCKED, label="walls and furniture as known"),
         Line2D([], [], marker="s", ls="", color=SEEN, label="a category was seen here"),
         Line2D([], [], marker="*", ls="", color=GOAL, markersize=12, label=f"{goal}, as known"),
-        Patch(fill=False, edgecolor=BLOCK, lw=2, label="block chosen to search in"),
+        *(block if searching else []),
         Line2D([], [], color=AGENT, lw=2, label="way so far"),
         Line2D([], [], color=AGENT, lw=2, ls=":", label="way planned"),
         Patch(facecolor=GROUND, edgecolor=PALE, label="faint: the home as it is"),

@@ -167,6 +167,22 @@ def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
     assert found["What the runs took"]["`org`, streams"] == ["1,280", "0", "512", "1.5", "10.0 → 12.5"]
 
 
+def test_random_choices_stand_beside_the_method_that_makes_them(steps, tmp_path):
+    """1 of 12 episodes against 5; no method here chooses actions, so there are no random ones."""
+    only = ("--methods", "semexp", "--ablations", "{}", "--worlds", "{near: {}}", "--decisions", "fused")
+    assert run(tmp_path, *only) == 0
+    found = tables(tmp_path)
+    rows = ["`semexp`", "`semexp` + w", "`semexp` + w + sTDE", "`semexp`, random choices"]
+    assert list(found["Success, best actions"])[2:] == ["Frontier search", *rows]
+    assert found["Success, best actions"][rows[-1]][0].startswith("8.3 [")
+    improved = found["Improvements, best actions"]
+    # By scene 1 - 0, 2 - 1 and 2 - 0 of four: all runs are alike, so their number does not widen the interval.
+    assert improved["`semexp` over `semexp`, random choices"][0].startswith("+33.3 [")
+    assert "`semexp` + w + sTDE over `semexp`, random choices" in improved
+    assert run(tmp_path, *only[:1], "semexp", "rgb", *only[2:]) == 0
+    assert "Random" in tables(tmp_path)["Success, best actions"]
+
+
 def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path, capsys):
     def again(*options):
         steps.clear()
@@ -263,7 +279,7 @@ def test_a_mapping_of_another_kind_is_refused(tmp_path, capsys):
 # The configs that come with it
 
 
-def test_table_2_has_every_method_of_the_paper_s():
+def test_table_2_has_the_methods_of_the_paper():
     config = command.parse_compare(["--config", "table2"])
     adapted = "jaxnav.policies.methods.eotp:ADAPTED"
     printed = {method for method, _ in TABLE_2_AI2THOR} - {"random"}

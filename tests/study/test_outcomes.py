@@ -58,6 +58,8 @@ def few():
 def test_the_mean_weight_is_over_steps():
     # 0.5 in 2 steps and 0.1 in 10, of 2 x 20 steps: (1 + 1) / 40. Over episodes it would be 0.6 / 8.
     assert mean_weight(outcome(SUCCESS[2])) == pytest.approx(0.05)
+    one = outcome(SUCCESS[2])
+    assert mean_weight(one._replace(choices=np.zeros_like(one.choices))) == 0.0
 
 
 def test_success_of_a_trial(few):

@@ -43,7 +43,9 @@ def test_the_committed_page_is_written_from_the_committed_results(tmp_path):
 
 
 def test_methods_of_other_settings_are_not_compared(tmp_path):
-    """Method and arms may differ, and worlds; steps may not."""
+    """Method and arms may differ, and worlds, and what is not on the page; steps may not."""
+    nearest = {"episodes": 8, "run": {"total_steps": 1}}
+    write_record(tmp_path / "val" / "houses-semexp-NEAREST-fused.json", nearest, scores(baseline=6.0))
     one = {"episodes": 9, "run": {"method": "rgb", "arms": ["baseline"], "total_steps": 5}}
     other = {"episodes": 9, "run": {"method": "org", "arms": ["layout"], "total_steps": 5}}
     for name, study in (("rooms-rgb-fused", one), ("rooms-org-fused", other), ("houses-rgb-fused", {"episodes": 8})):

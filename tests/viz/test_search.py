@@ -102,18 +102,23 @@ def test_the_map_lies_over_the_home(walked):
 
 
 def test_the_picture_shows_what_is_known_and_chosen(walked, tmp_path):
+    """The goal is in the first view; where another is sought that was never seen, a block is shown."""
     episode, _ = walked
-    shares = {}
-    for step in (0, STEPS - 1):
-        path = tmp_path / "new" / f"{step}.png"
-        draw_search(episode, search_at(episode, step), step, path)
+    shares, first, last = {}, search_at(episode, 0), search_at(episode, STEPS - 1)
+    cells = last.course.cells
+    unseen = next(k for k in range(len(episode.task.categories)) if not (cells >> np.uint32(k) & np.uint32(1)).any())
+    other = last._replace(course=last.course._replace(goal=np.int32(unseen)))
+    for name, search, step in (("first", first, 0), ("last", last, STEPS - 1), ("other", other, STEPS - 1)):
+        path = tmp_path / "new" / f"{name}.png"
+        draw_search(episode, search, step, path)
         with Image.open(path) as image:
             assert image.size == (960, 540)
             pixels = np.asarray(image.convert("RGB"))[:, :670]  # without the legend
-        for name, colour in {"near": NEAR, "blocked": BLOCKED, "block": BLOCK, "goal": GOAL}.items():
-            shares[name, step] = (pixels == np.rint(255 * np.array(to_rgb(colour)))).all(axis=-1).sum()
-    assert shares["near", STEPS - 1] > shares["near", 0] > 0
-    assert min(shares["block", 0], shares["goal", STEPS - 1]) > 0
+        for part, colour in {"near": NEAR, "blocked": BLOCKED, "block": BLOCK, "goal": GOAL}.items():
+            shares[part, name] = (pixels == np.rint(255 * np.array(to_rgb(colour)))).all(axis=-1).sum()
+    assert shares["near", "last"] > shares["near", "first"] > 0
+    assert min(shares["block", "other"], shares["goal", "last"]) > 0
+    assert shares["block", "first"] == shares["block", "last"] == 0
 
 
 def test_what_has_no_map_or_no_such_step_is_refused(walked):

@@ -138,7 +138,7 @@ class Control(Protocol):
 
     @property
     def interval(self) -> int:
-        """Return the most actions from a choice that counts to the next."""
+        """Return how many actions a choice lasts at most."""
         ...
 
     def due(self, note: Tree) -> jax.Array | None:

@@ -41,7 +41,7 @@ class LocalPolicy:
     should be near enough, and says Done when it is in view at a place that was marked before.
 
     Attributes:
-      interval: n, actions until the policy chooses again.
+      interval: n, actions until the policy chooses again, at most, while it searches.
       nearest: whether to search in the nearest cell whatever is chosen.
     """
 

@@ -29,7 +29,7 @@ class Course(NamedTuple):
       sight: int32 [], `FAR`, `NEAR` or `AGREED`.
       enough: float32 [], metres to the goal's centre at which Done succeeds.
       aim: int32 [2], first cell of the block to search in.
-      left: int32 [], actions until the policy chooses another; 0 where it does now.
+      left: int32 [], actions until the policy chooses another; at 0 it does unless the goal is on the map.
       sweep: int32 [], index of the horizon to search with, the lowest first; -1 before anything is seen.
       tries: int32 [], cells from which the goal was looked at in vain since it was last near.
     """
