@@ -9,7 +9,7 @@ import numpy as np
 from jaxnav.errors import InputError
 from jaxnav.policies.methods import Knowledge, Percept, find_method
 from jaxnav.policies.methods.local_policy import LocalPolicy
-from jaxnav.policies.methods.map_tracker import Course, marked
+from jaxnav.policies.methods.map_tracker import Course, found
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 from jaxnav.viz.panel import Episode
@@ -31,7 +31,7 @@ class Search(NamedTuple):
     @property
     def searching(self) -> bool:
         """Return whether the goal is not on the map."""
-        return not np.asarray(marked(self.course.cells, jnp.asarray(self.course.goal))).any()
+        return not found(jax.tree.map(jnp.asarray, self.course))
 
 
 def search_at(episode: Episode, step: int) -> Search:

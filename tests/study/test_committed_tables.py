@@ -7,10 +7,14 @@ from pathlib import Path
 import pytest
 
 from jaxnav.cli.compare import parse_compare
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.methods.local_policy import LocalPolicy
+from jaxnav.runs.config import RunConfig
 from jaxnav.study.codec import from_json
 from jaxnav.study.compare_config import CompareConfig, entries, entry_identity, frontier_identity, world_runs
 from jaxnav.study.compare_report import Scores
 from jaxnav.study.compare_tables import frontier_name, write_comparison
+from jaxnav.study.paper_numbers import TABLE_2_AI2THOR
 from jaxnav.study.results import is_written
 
 ROOT = Path(__file__).parents[2]
@@ -35,3 +39,36 @@ def test_a_committed_table_is_written_from_the_committed_results(name, tmp_path)
     (tmp_path / "page.md").write_text(text)
     write_comparison(dataclasses.replace(config, document=tmp_path / "page.md"), found)
     assert (tmp_path / "page.md").read_text() == text
+
+
+def test_table_2_has_the_methods_of_the_paper():
+    config = parse_compare(["--config", "table2"])
+    adapted = "jaxnav.policies.methods.eotp:ADAPTED"
+    printed = {method for method, _ in TABLE_2_AI2THOR} - {"random"}
+    assert set(config.methods) == printed | {"anonymous", adapted}
+    runs = entries(config)
+    assert {entry.world for entry in runs} == {"rooms", "apartments"}
+    assert len(runs) == 2 * (2 * len(config.methods) - 2)  # `anonymous` and `savn` host no layout, so have no streams
+    for entry in runs:
+        assert (entry.run.method, entry.run.world, entry.run.seeds) == (entry.method, entry.world, 3)
+        hosts = find_method(entry.method).hosts_layout
+        assert entry.run.arms == (("layout",) if entry.decision == "streams" else ("baseline", "layout")[: 1 + hosts])
+    for world in {entry.world for entry in runs}:  # the same steps for all
+        assert len({entry.run.total_updates * entry.run.update_steps for entry in runs if entry.world == world}) == 1
+
+
+def test_the_ablations_have_the_baseline_alone():
+    config = parse_compare(["--config", "ablations"])
+    runs = entries(config)
+    assert len(runs) == 15
+    assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}
+
+
+def test_table_3_has_room_for_macro_steps():
+    runs = {entry.method: entry.run for entry in entries(parse_compare(["--config", "table3"]))}
+    assert set(runs) == {"anonymous", "rgb", "semexp", "jaxnav.policies.methods.semexp:NEAREST"}
+    nearest = runs["jaxnav.policies.methods.semexp:NEAREST"]
+    for run in runs.values():  # the same for all that learn, at least two choices in every rollout
+        assert (run.world, run.update_steps) == ("houses", RunConfig().update_steps)
+        assert run.total_updates == (run.chunk if run is nearest else runs["rgb"].total_updates)
+        assert run.ppo.rollout >= 2 * LocalPolicy.interval

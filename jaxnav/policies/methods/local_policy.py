@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.policies.methods.base import Knowledge
-from jaxnav.policies.methods.map_tracker import AGREED, FAR, SIDE, Course, mark, marked
+from jaxnav.policies.methods.map_tracker import AGREED, FAR, SIDE, Course, found, mark, marked
 from jaxnav.policies.semantic_map import EXPLORED, TRIED, WALL, SemanticMap
 from jaxnav.policies.wavefront import Way, find_way, follow, pack, turn_to
 from jaxnav.scenes.scene import CELL
@@ -62,7 +62,7 @@ class LocalPolicy:
 
         While the goal is on the map nothing is searched for, so nothing is chosen.
         """
-        return (note.left == 0) & ~marked(note.cells, note.goal[..., None, None]).any(axis=(-2, -1))
+        return (note.left == 0) & ~found(note)
 
     def act(self, choice: jax.Array, note: Course, knowledge: Knowledge) -> tuple[jax.Array, Course]:
         """Return the action, and the note with what was chosen."""

@@ -140,6 +140,11 @@ def marked(cells: jax.Array, goal: jax.Array) -> jax.Array:
     return cells & mark(goal) > 0
 
 
+def found(note: Course) -> jax.Array:
+    """Return whether the goal is on the map, bool [...]."""
+    return marked(note.cells, note.goal[..., None, None]).any(axis=(-2, -1))
+
+
 def mark(goal: jax.Array) -> jax.Array:
     """Return the bit uint32 [] of a category int32 []."""
     return jnp.uint32(1) << goal.astype(jnp.uint32)
