@@ -32,7 +32,6 @@ class CompareConfig:
       methods: that are compared.
       ablations: of a method, the methods that it is compared with besides.
       unlearned: of all of them, those that act by nothing that is learned; they are trained for one chunk.
-      expected: methods of which the document says that they are missing where they are not compared.
       decisions: how pathways become logits. With `streams` the layout's policies alone are trained, of the methods that
         host the layout.
       split: scenes to evaluate on.
@@ -54,7 +53,6 @@ class CompareConfig:
     methods: tuple[str, ...] = tuple(METHODS)
     ablations: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     unlearned: tuple[str, ...] = ()
-    expected: tuple[str, ...] = ()
     decisions: tuple[Deciding, ...] = ("fused", "streams")
     split: Literal["val", "test"] = "val"
     episodes: int = 1000

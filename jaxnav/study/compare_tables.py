@@ -57,8 +57,6 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scor
         "scenes of `val`.",
         "",
     ]
-    if missing := [name for name in config.expected if name not in config.methods]:
-        text += [f"Missing here, as they are not made yet or were left out: {', '.join(missing)}.", ""]
     if left := [entry.name for entry in runs if entry.name not in found]:
         text += [f"**Not finished:** {len(left)} of {len(runs)} runs are missing.", ""]
     return [f"# {config.title}", "", *text]
