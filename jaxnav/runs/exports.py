@@ -11,12 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.env.types import Observation
 from jaxnav.errors import InputError
 from jaxnav.layout import Setting
-from jaxnav.policies.methods import Knowledge
-from jaxnav.policies.policy import init_params
+from jaxnav.policies.methods import Knowledge, Percept, find_method
+from jaxnav.policies.perception import Perception
+from jaxnav.policies.policy import Params, bind, init_params
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.config import RunConfig
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.store.export import export_params
 from jaxnav.store.leaves import describe
 from jaxnav.store.manifest import differences
@@ -87,6 +90,35 @@ def check_arrays(where: Path, tensors: Mapping[str, Any], spec: PolicySpec) -> N
         if not np.isfinite(leaf).all():
             name = jax.tree_util.keystr(path, simple=True, separator="/")
             raise InputError(f"{where}: {name} holds numbers that are not finite; train the run anew")
+
+
+def check_knowledge(params: Params, spec: PolicySpec, knowledge: Knowledge) -> None:
+    """Refuse what a method learned if its policy cannot act by it.
+
+    One step is traced, not computed.
+
+    Raises:
+      InputError: says what does not fit.
+    """
+    row_format, none = RowFormat(spec.num_categories), jnp.int32(0)
+    perception = Perception(row_format, spec)
+
+    def act(params: Params, knowledge: Knowledge) -> Any:
+        policy, row = bind(spec, params), jnp.zeros(row_format.num_bytes, jnp.uint8)
+        percept = Percept(row, heading=none, action=none, moved=jnp.bool_(False), horizon=none, goal=none)
+        perceived = perception.update(perception.init(knowledge, none), percept, knowledge, none)
+        view = perception.view(perceived, Observation(row, goal=none), knowledge)
+        pathways = policy.pathways(*view, policy.initial_memory())
+        return pathways, find_method(spec.method).control.act(none, perceived.note, knowledge)
+
+    try:
+        jax.eval_shape(act, params, knowledge)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        reason = str(error).split("\n", maxsplit=1)[0]
+        raise InputError(
+            f"what method {spec.method!r} learned before training does not fit it ({type(error).__name__}: {reason}); "
+            "train the run anew"
+        ) from error
 
 
 @functools.lru_cache(maxsize=16)

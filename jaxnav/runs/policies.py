@@ -18,7 +18,7 @@ from jaxnav.policies.methods import Knowledge, find_method
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.exports import check_arrays
+from jaxnav.runs.exports import check_arrays, check_knowledge
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.task import Task
 from jaxnav.store.export import load_params
@@ -217,14 +217,18 @@ def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> 
         built = spec["method"], len(spec["categories"]), sizes, method_sizes
         policy = PolicySpec(*built, *options)
         check_arrays(where, tensors, policy)
+        params = jax.tree.map(jnp.asarray, tensors["policy"])
+        knowledge = Knowledge(
+            layout=jnp.asarray(tensors["layout"]["prior"]),
+            method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
+            signs=jax.tree.map(jnp.asarray, Signs(**tensors["signs"])) if "signs" in tensors else None,
+        )
+        if knowledge.method:
+            check_knowledge(params, policy, knowledge)
         return Policies(
-            params=jax.tree.map(jnp.asarray, tensors["policy"]),
+            params=params,
             arms=(),
-            knowledge=Knowledge(
-                layout=jnp.asarray(tensors["layout"]["prior"]),
-                method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
-                signs=jax.tree.map(jnp.asarray, Signs(**tensors["signs"])) if "signs" in tensors else None,
-            ),
+            knowledge=knowledge,
             counts=jnp.asarray(tensors["layout"]["counts"]),
             spec=policy,
             setting=None if spec["layout"] is None else Setting(**spec["layout"]),

@@ -1,13 +1,18 @@
 """What is no exported policy is refused in one line that names it."""
 
+import dataclasses
 import shutil
 
+import jax
+import numpy as np
 import pytest
 from support.records import resigned
 
 import jaxnav
 from jaxnav.errors import InputError
+from jaxnav.policies.policy import init_params
 from jaxnav.runs.policies import POLICIES
+from jaxnav.store.export import export_params, load_params
 
 
 @pytest.fixture
@@ -69,6 +74,25 @@ def test_exports_of_other_code_are_refused(export, changes, problem):
     message = refused(respecified(export, **changes))
     assert problem in message
     assert any(mend in message for mend in ("install or mend its package", "choose one of", "train the run anew"))
+
+
+@pytest.mark.parametrize(
+    ("method", "learned", "problem"),
+    [
+        ("sp", {"links": np.eye(19, dtype=np.float32)}, "KeyError: 'mixing'"),
+        ("sp", {"mixing": np.eye(18, dtype=np.float32)}, "TypeError: "),
+        ("semexp", {"reach": np.zeros(3, np.int32)}, "KeyError: 'lines'"),
+    ],
+)
+def test_what_a_method_learned_has_to_fit_it(drawn_run, export, tmp_path, method, learned, problem):
+    tensors, spec = load_params(export)
+    config = dataclasses.replace(drawn_run.config, method=method)
+    policy = init_params(config.policy_spec(len(spec["categories"])), jax.random.key(0))
+    folder = tmp_path / "other"
+    export_params(folder, tensors | {"policy": policy, "knowledge": learned}, spec | {"method": method})
+    message = refused(folder)
+    assert f"what method {method!r} learned before training does not fit it ({problem}" in message
+    assert message.endswith("; train the run anew")
 
 
 def test_a_policy_that_is_not_there_is_refused_with_those_that_are(tmp_path, monkeypatch):
