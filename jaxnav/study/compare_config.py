@@ -1,6 +1,7 @@
 """Settings of a comparison of methods, and the runs that it takes."""
 
 import dataclasses
+import fnmatch
 import itertools
 import re
 from pathlib import Path
@@ -31,6 +32,8 @@ class CompareConfig:
         `total_steps`.
       methods: that are compared.
       ablations: of a method, the methods that it is compared with besides.
+      left_out: patterns of names of runs, `world-method-decision` as their results are called, that are not compared;
+        the document names them.
       unlearned: of all of them, those that act by nothing that is learned; they are trained for one chunk.
       decisions: how pathways become logits. With `streams` the layout's policies alone are trained, of the methods that
         host the layout.
@@ -52,6 +55,7 @@ class CompareConfig:
     )
     methods: tuple[str, ...] = tuple(METHODS)
     ablations: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
     unlearned: tuple[str, ...] = ()
     decisions: tuple[Deciding, ...] = ("fused", "streams")
     split: Literal["val", "test"] = "val"
@@ -111,7 +115,8 @@ def check_compare(config: CompareConfig) -> CompareConfig:
     for name, place in GIVEN.items():
         if getattr(config.base, name) != getattr(RunConfig(), name):
             raise InputError(f"base.{name}: every run has its own; leave it out and give `{place}`")
-    entries(config)
+    if not entries(config):
+        raise InputError(f"left_out: {', '.join(config.left_out)}: leaves no run to compare; give fewer patterns")
     return config
 
 
@@ -136,6 +141,20 @@ def entries(config: CompareConfig) -> list[Entry]:
     Raises:
       InputError: an unknown method, or a run whose settings are impossible.
     """
+    return [entry for entry in _possible(config) if not _is_left_out(config, entry)]
+
+
+def left_out(config: CompareConfig) -> list[Entry]:
+    """Return the runs that a comparison leaves out."""
+    return [entry for entry in _possible(config) if _is_left_out(config, entry)]
+
+
+def _is_left_out(config: CompareConfig, entry: Entry) -> bool:
+    return any(fnmatch.fnmatchcase(entry.name, pattern) for pattern in config.left_out)
+
+
+def _possible(config: CompareConfig) -> list[Entry]:
+    """Return the runs of all worlds, methods and decisions."""
     groups = [(method, *config.ablations.get(method, ())) for method in config.methods]
     methods = dict.fromkeys(method for group in groups for method in group)
     found = []

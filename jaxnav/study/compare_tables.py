@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.report_tables import COLUMNS
 from jaxnav.policies.spec import Deciding
-from jaxnav.study.compare_config import CompareConfig, Entry, entries
+from jaxnav.study.compare_config import CompareConfig, Entry, entries, left_out
 from jaxnav.study.compare_pairs import LABELS, VARIANTS, TableRow, chooses_actions, comparisons, run_label
 from jaxnav.study.compare_report import SCALE, Line, Scores
 from jaxnav.study.document import reading_section, write_lines
@@ -57,6 +57,9 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scor
         "scenes of `val`.",
         "",
     ]
+    if never := left_out(config):
+        names = ", ".join(f"{run_label(entry.method, entry.decision)} in {entry.world}" for entry in never)
+        text += [f"Left out, for what they would take: {names}.", ""]
     if left := [entry.name for entry in runs if entry.name not in found]:
         text += [f"**Not finished:** {len(left)} of {len(runs)} runs are missing.", ""]
     return [f"# {config.title}", "", *text]

@@ -160,6 +160,15 @@ def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
     assert found["What the runs took"]["`org`, streams"] == ["1,280", "0", "512", "1.5", "10.0 → 12.5"]
 
 
+def test_runs_are_left_out_by_their_names_and_the_document_says_so(steps, tmp_path):
+    assert run(tmp_path, "--left-out", "far-*-fused", "*rgb-streams") == 0
+    assert steps == [part for part in PARTS if "rgb-streams" not in part and part[:4] + part[-6:] != "far--fused"]
+    text = (tmp_path / "docs" / "table.md").read_text()
+    names = "`rgb`, streams in near, `anonymous` in far, `org` in far, `rgb` in far, `rgb`, streams in far"
+    assert f"Left out, for what they would take: {names}." in text
+    assert "Not finished" not in text
+
+
 def test_random_choices_stand_beside_the_method_that_makes_them(steps, tmp_path):
     """1 of 12 episodes against 5; no method here chooses actions, so there are no random ones."""
     only = ("--methods", "semexp", "--ablations", "{}", "--worlds", "{near: {}}", "--decisions", "fused")
@@ -233,6 +242,7 @@ def test_an_interrupted_comparison_says_so_and_goes_on(steps, tmp_path, monkeypa
         (["--methods", "org", "org"], "methods: org, org: give one or more, each once"),
         (["--ablations", "{vtnet: [rgb]}"], "ablations: 'vtnet' is none of the methods anonymous, org"),
         (["--unlearned", "eotp"], "unlearned: 'eotp' is not compared; leave it out"),
+        (["--left-out", "near-*", "far-*"], "left_out: near-*, far-*: leaves no run to compare; give fewer patterns"),
         (["--worlds", "{}"], "worlds: empty: give one or more"),
         (["--worlds", "{a/b: {}}"], "worlds: 'a/b': is part of file names; give letters"),
         (["--worlds", "{flat: {world: flats}}"], "worlds.flat: world must be one of 'rooms', 'apartments'"),
