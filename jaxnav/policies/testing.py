@@ -29,10 +29,16 @@ _SIZES = Sizes(hidden=16, view_outputs=8, appearance=4, row_hidden=8, row_output
 _BATCH = 6
 
 
-def check_method(name: str, method_sizes: Mapping[str, int] | None = None, steps: int = 8, seed: int = 0) -> None:
+def check_method(
+    name: str,
+    method_sizes: Mapping[str, int] | None = None,
+    steps: int = 8,
+    seed: int = 0,
+    bank: Bank | None = None,
+) -> None:
     """Check that a method keeps the promises of the seam.
 
-    It acts in two generated rooms and checks: shapes and dtypes of pathways and decisions, all of them finite; a batch
+    It acts in a few scenes and checks: shapes and dtypes of pathways and decisions, all of them finite; a batch
     equals its single members; `do` leaves the experience as it is; logits are deaf to the view and to the goal's
     detection when both direct pathways are zero and the experience is given; the tracker takes in every step once, its
     first view included, and its notes and readings keep their shapes; a choice becomes a legal action.
@@ -42,15 +48,17 @@ def check_method(name: str, method_sizes: Mapping[str, int] | None = None, steps
       method_sizes: the method's own sizes, where they are not the usual ones.
       steps: environment steps to act for.
       seed: of parameters, episodes and actions.
+      bank: of the scenes; None for two generated rooms.
 
     Raises:
       InputError: there is no such method.
       AssertionError: a promise is broken.
     """
-    method, world = find_method(name), WORLDS["rooms"]
-    scenes = generated("rooms", "train", 2, seed)
-    bank = compile_bank([scenes[0], scenes[1]], world.task)
-    env, params = build(bank, {}, world.step_limit)
+    method, rooms = find_method(name), WORLDS["rooms"]
+    if bank is None:
+        scenes = generated("rooms", "train", 2, seed)
+        bank = compile_bank([scenes[0], scenes[1]], rooms.task)
+    env, params = build(bank, {}, rooms.step_limit)
     spec = PolicySpec(name, len(env.categories), _SIZES, tuple(sorted((method_sizes or {}).items())))
     acting = Acting(env, spec, SETTINGS["calibrated"] if method.hosts_layout else None)
     knowledge, key = _knowledge(method, env, bank), jax.random.key(seed)

@@ -24,7 +24,7 @@ from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledg
 from jaxnav.runs.stopwatch import Stopwatch
 from jaxnav.runs.updates import do_updates
 from jaxnav.runs.validation import Validator
-from jaxnav.runs.worlds import CompiledWorld, bank_order, training_world
+from jaxnav.runs.worlds import CompiledWorld, bank_order, sample_bank, training_world
 from jaxnav.store.checkpoint import restore, set_aside_after
 from jaxnav.store.lock import Lock
 from jaxnav.store.manifest import make_manifest
@@ -142,8 +142,9 @@ def _checked(config: RunConfig) -> RunConfig:
     """
     config = check(config)
     if config.method not in METHODS:
+        bank = sample_bank(config)
         try:
-            check_method(config.method, method_sizes=config.method_sizes)
+            check_method(config.method, method_sizes=config.method_sizes, bank=bank)
         except Exception as error:  # whatever another's module raises
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise InputError(f"method {config.method!r}: fails check_method ({reason}); mend it") from error

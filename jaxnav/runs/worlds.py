@@ -78,6 +78,12 @@ def training_world(config: RunConfig, console: Console) -> CompiledWorld:
     return dataclasses.replace(world, expert=any(stage.imitates for stage in config.stages))
 
 
+def sample_bank(config: RunConfig, count: int = 4) -> Bank:
+    """Compile the first few training scenes of a run."""
+    scenes = _scenes(config, config.world, "train", config.scenes, config.worlds.shift, Console(quiet=True))
+    return compile_bank((scenes[i] for i in range(min(count, len(scenes)))), config.task)
+
+
 def evaluation_world(
     config: RunConfig,
     split: str,

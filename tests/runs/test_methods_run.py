@@ -10,13 +10,14 @@ from support.stopping import train_in_two
 
 import jaxnav
 from jaxnav.__main__ import main
+from jaxnav.errors import InputError
 from jaxnav.policies.methods import find_method
 from jaxnav.runs.prepare import say_what_is_cut
 from jaxnav.runs.train import train
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["rgb", "eotp", "savn", "semexp"])
+@pytest.mark.parametrize("method", ["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"])
 def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
     """Two chunks, stopped between them; what is exported decides as the run's policy, from the same knowledge."""
     config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1)
@@ -35,6 +36,33 @@ def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
     results = jaxnav.evaluate(resumed, episodes=8)
     assert {leaf.shape[-1] for leaf in results.outcome} == {8}
     assert main(["export", str(tmp_path / "two"), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
+
+
+PRIORS = """
+import dataclasses, functools
+from jaxnav.policies.methods import METHODS
+from jaxnav.policies.methods.graphs import graph_from_file
+
+PRIORS = dataclasses.replace(METHODS["sp"], learn=functools.partial(graph_from_file, "edges.csv"))
+"""
+
+
+@pytest.mark.slow
+def test_edges_of_ones_own_are_of_the_categories_of_the_world(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my_priors.py").write_text(PRIORS)
+    (tmp_path / "edges.csv").write_text("Mug,DiningTable")  # which rooms do not know
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    method = "my_priors:PRIORS"
+    config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1, validations=0)
+    with pytest.raises(InputError, match=r"fails check_method \(InputError: edges.csv:1: category 'Mug' is unknown"):
+        train(config)
+    worlds = dataclasses.replace(config.worlds, num_train=2)
+    config = dataclasses.replace(config, world="apartments", arms=("baseline",), worlds=worlds, total_steps=256)
+    learned = train(config).policies().knowledge.method["mixing"]
+    edge = [config.task.categories.index(name) for name in ("Mug", "DiningTable")]
+    assert learned[edge[0], edge[1]] == 0.5  # one of two: the edge and the loop
+    assert float(learned.sum()) == len(learned)
 
 
 @pytest.mark.parametrize(("rollout", "told"), [(24, True), (25, False)])
