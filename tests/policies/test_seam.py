@@ -62,9 +62,23 @@ def some(names, quick):
 
 
 THEIRS = [f"support.methods:{name}" for name in (*SPECS, "LEARNED")]
+ABLATIONS = [
+    f"jaxnav.policies.methods.{name}"
+    for name in (
+        "eotp:UNIFORM",
+        "hoz:PERMUTED",
+        "savn:UNADAPTED",
+        "semexp:NEAREST",
+        "sp:PERMUTED",
+        "tpn:INDISCRIMINATE",
+        "tpn:UNTRIED",
+        "vtnet:AVERAGED",
+        "vtnet:UNTAUGHT",
+    )
+]
 
 
-@pytest.mark.parametrize("name", some([*METHODS, *THEIRS], quick=("anonymous",)))
+@pytest.mark.parametrize("name", some([*METHODS, *ABLATIONS, *THEIRS], quick=("anonymous",)))
 def test_methods_keep_the_contract(name):
     check_method(name, steps=4)
 

@@ -22,7 +22,6 @@ from jaxnav.policies.methods.trail import learn_motion
 from jaxnav.policies.pathways import Memory
 from jaxnav.policies.policy import bind
 from jaxnav.policies.stream import NO_CHANGES
-from jaxnav.policies.testing import check_method
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.collect import collect
 from jaxnav.training.config import PPOConfig
@@ -222,9 +221,3 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     np.testing.assert_allclose(change[running], np.asarray(again.fast.change[-1])[running], rtol=1e-3, atol=1e-4)
     assert np.abs(change[running]).max() > 0.01
     assert not change[~running].any()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ablation", ["UNTRIED", "INDISCRIMINATE"])
-def test_ablations_keep_the_contract(ablation):
-    check_method(f"jaxnav.policies.methods.tpn:{ablation}", steps=3)

@@ -81,6 +81,7 @@ def test_exports_of_other_code_are_refused(export, changes, problem):
     [
         ("sp", {"links": np.eye(19, dtype=np.float32)}, "KeyError: 'mixing'"),
         ("sp", {"mixing": np.eye(18, dtype=np.float32)}, "TypeError: "),
+        ("hoz", {"nodes": np.zeros((5, 8, 18), np.float32)}, "KeyError: '"),
         ("semexp", {"reach": np.zeros(3, np.int32)}, "KeyError: 'lines'"),
     ],
 )

@@ -170,6 +170,26 @@ def test_zones_are_learned_in_the_training_scenes_alone_and_exported(config, tmp
 
 
 @pytest.mark.slow
+def test_nothing_that_is_known_before_training_is_of_val_or_test(config, tmp_path):
+    """Priors, signs, calibration and zones: other training scenes change all of them, other val scenes nothing."""
+
+    def known(name, **worlds):
+        changed = dataclasses.replace(config.worlds, **worlds)
+        policies = jaxnav.train(
+            small(config, tmp_path / name, method="hoz", method_sizes={}, arms=("layout",), worlds=changed)
+        ).policies()
+        return (policies.knowledge, policies.counts), policies.setting
+
+    worlds = config.worlds
+    one, setting = known("one")
+    elsewhere, of_elsewhere = known("val", num_val=worlds.num_val + 3, num_test=worlds.num_test + 3)
+    chex.assert_trees_all_equal(one, elsewhere)
+    assert setting == of_elsewhere
+    same, _ = jax.tree.map(np.array_equal, one, known("train", num_train=worlds.num_train + 3)[0])
+    assert not any(jax.tree.leaves((same.layout, same.signs, same.method["nodes"])))
+
+
+@pytest.mark.slow
 def test_scene_priors_are_learned_in_the_training_scenes_alone_and_exported(config, tmp_path):
     sp, console = small(config, tmp_path / "run", method="sp", method_sizes={}), Console(quiet=True)
     exported = jaxnav.train(sp).policies().knowledge.method
