@@ -58,7 +58,7 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scor
         "",
     ]
     if never := left_out(config):
-        names = ", ".join(f"{run_label(entry.method, entry.decision)} in {entry.world}" for entry in never)
+        names = "; ".join(f"{run_label(entry.method, entry.decision)} in {entry.world}" for entry in never)
         text += [f"Left out, for what they would take: {names}.", ""]
     if left := [entry.name for entry in runs if entry.name not in found]:
         text += [f"**Not finished:** {len(left)} of {len(runs)} runs are missing.", ""]
