@@ -2,7 +2,8 @@
 
 `python benchmarks/methods.py [METHOD ...]` times one update of every stage of the methods (all of this package's unless
 some are named) in turns with ORG's: environment steps per second, learning included, on the default networks, rooms and
-arm `baseline`. Beside them stand parameters of the policy and of its method alone, and lines of the method's file.
+arm `baseline`. Beside them stand parameters of the policy and of its method alone, and lines: of the files that hold
+its experience, tracker, knowledge, adaptation and control, without what these use.
 """
 
 import dataclasses
@@ -18,6 +19,7 @@ from _phases import program
 from _setup import set_up
 
 from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.methods.base import Primitive
 from jaxnav.runs.config import RunConfig, WorldConfig
 
 TURNS, REFERENCE = 5, "org"
@@ -45,8 +47,15 @@ def main(names: list[str]) -> None:
 def size(name: str, params: dict[str, Any]) -> dict[str, int]:
     """Return parameters and lines of a method."""
     counts = {part: sum(np.size(leaf) for leaf in jax.tree.leaves(tree)) for part, tree in params.items()}
-    lines = Path(inspect.getfile(find_method(name).experience)).read_text(encoding="utf-8").count("\n")
-    return {"parameters": sum(counts.values()), "of_the_method": counts.get("method", 0), "lines": lines}
+    return {"parameters": sum(counts.values()), "of_the_method": counts.get("method", 0), "lines": lines(name)}
+
+
+def lines(name: str) -> int:
+    """Return the lines of the files that are a method's own."""
+    method = find_method(name)
+    parts = [method.experience, method.learn, *map(type, (method.tracker, method.adaptation, method.control))]
+    files = {inspect.getfile(part) for part in parts if part not in (None, type(None), Primitive)}
+    return sum(Path(file).read_text(encoding="utf-8").count("\n") for file in files)
 
 
 if __name__ == "__main__":
