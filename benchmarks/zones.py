@@ -6,6 +6,7 @@ without arguments) and tries them in val scenes. Columns:
   indirect             shares of the pairs of zones, and of the pairs of a zone and a goal, whose best path has another
                        zone between
   absolute             the same where edges are not taken relative to the strongest
+  shuffled             the first share where each room type's edges are dealt out anew to its pairs of zones
   next zone            of poses and goals drawn at random, where the best path leaves the zone: how often the zone that
                        it enters is the graph's next one, the one of the same graph permuted, or the goal's
   room type            is it recognised after so many views of a random walk
@@ -15,7 +16,7 @@ The result goes to stdout as JSON, the table to stderr.
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE
 from jaxnav.scenes.worlds import WORLDS, generated
 
-PAIRS, WALKS, VIEWS = 20_000, 2_000, (1, 10, 50)
+PAIRS, WALKS, VIEWS, DEALS = 20_000, 2_000, (1, 10, 50), 200
 Zones = Mapping[str, np.ndarray]
 
 
@@ -54,14 +55,26 @@ def measured(world: str, num_zones: int, scenes: int | None) -> dict[str, Any]:
     nothing = np.zeros((NUM_PRIORS, size, size))
     zones, permuted = learn_zones([train], nothing, num_zones), learn_permuted([train], nothing, num_zones)
     graphs, _ = room_graphs([train], size, num_zones)
-    absolute = indirect_shares(zones["nodes"], next_zones(adjacency(graphs)), is_goal)
+    near = adjacency(graphs)
+    absolute = indirect_shares(zones["nodes"], next_zones(near), is_goal)
     return {
         "scenes": len(train.names),
         "indirect": indirect_shares(zones["nodes"], zones["next_zone"], is_goal),
         "absolute": absolute,
+        "shuffled": float(np.mean([indirect_shares(zones["nodes"], dealt, is_goal)[0] for dealt in shuffled(near)])),
         "next_zone": entered(val, zones, permuted),
         "room_type": recognised(val, zones),
     }
+
+
+def shuffled(near: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the next zones of graphs whose edges, relative to the strongest, are dealt out anew."""
+    draws, (one, other) = np.random.default_rng(2), np.triu_indices(near.shape[-1], 1)
+    strongest = np.maximum(near.max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
+    for _ in range(DEALS):
+        edges = np.zeros_like(near)
+        edges[:, one, other] = draws.permuted((near / strongest)[:, one, other], axis=1)
+        yield next_zones(edges + np.swapaxes(edges, 1, 2))
 
 
 def compiled(world: str, split: str, scenes: int | None) -> Bank:
@@ -122,6 +135,7 @@ def table(results: Mapping[str, Mapping[str, Any]]) -> str:
         "indirect pairs of zones",
         "of a zone and a goal",
         "both, absolute",
+        "zones, shuffled",
         "next zone: graph",
         "permuted",
         "goal's",
@@ -131,7 +145,7 @@ def table(results: Mapping[str, Mapping[str, Any]]) -> str:
         "| --- |" + " ---: |" * (len(heads) + 1),
     ]
     for world, one in results.items():
-        share = [*one["indirect"], max(one["absolute"]), *one["next_zone"].values()]
+        share = [*one["indirect"], max(one["absolute"]), one["shuffled"], *one["next_zone"].values()]
         cells = [f"{100 * each:.0f}" for each in share]
         lines.append(
             f"| {world} | {' | '.join(cells)} | {', '.join(f'{100 * v:.0f}' for v in one['room_type'].values())} |"
