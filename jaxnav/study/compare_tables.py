@@ -167,11 +167,13 @@ def _notes(parts: Parts) -> list[str]:
     for run, part in parts.items():
         for note in part.training.notes if part.training else ():
             told.setdefault(note, []).append(run_label(*run))
+    minutes = sum(part.training.wall_s for part in parts.values() if part.training) / 60
     return [
         "Exploration, imitation and learning are the environment steps behind each policy; exploration serves the "
         "layout's priors and the graph of `sp`. What else methods know before training they read from the training "
         "scenes themselves (docs/methods.md). The wall time is that of "
-        "the whole run, all its seeds, without and with w, side by side. Val SR is that of best actions, the mean of "
+        f"the whole run, all its seeds, without and with w, side by side; all runs together took {minutes:,.0f} "
+        "minutes of training. Val SR is that of best actions, the mean of "
         "all policies, before the last quarter of training and at its end: where it rises, longer training pays.",
         "",
         *(f"* {'; '.join(runs) if len(runs) < len(parts) else 'All runs'}: {note}" for note, runs in told.items()),
