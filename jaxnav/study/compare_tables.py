@@ -57,9 +57,9 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scor
         "scenes of `val`.",
         "",
     ]
-    if never := left_out(config):
-        names = "; ".join(f"{run_label(entry.method, entry.decision)} in {entry.world}" for entry in never)
-        text += [f"Left out, for what they would take: {names}.", ""]
+    for world, never in itertools.groupby(left_out(config), lambda entry: entry.world):
+        names = "; ".join(run_label(entry.method, entry.decision) for entry in never)
+        text += [f"Left out in {world}, for what they would take: {names}.", ""]
     if left := [entry.name for entry in runs if entry.name not in found]:
         text += [f"**Not finished:** {len(left)} of {len(runs)} runs are missing.", ""]
     return [f"# {config.title}", "", *text]

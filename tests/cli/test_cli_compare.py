@@ -164,8 +164,8 @@ def test_runs_are_left_out_by_their_names_and_the_document_says_so(steps, tmp_pa
     assert run(tmp_path, "--left-out", "far-*-fused", "*rgb-streams") == 0
     assert steps == [part for part in PARTS if "rgb-streams" not in part and part[:4] + part[-6:] != "far--fused"]
     text = (tmp_path / "docs" / "table.md").read_text()
-    names = "`rgb`, streams in near; `anonymous` in far; `org` in far; `rgb` in far; `rgb`, streams in far"
-    assert f"Left out, for what they would take: {names}." in text
+    assert "\nLeft out in near, for what they would take: `rgb`, streams.\n" in text
+    assert "\nLeft out in far, for what they would take: `anonymous`; `org`; `rgb`; `rgb`, streams.\n" in text
     assert "Not finished" not in text
 
 

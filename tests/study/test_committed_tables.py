@@ -62,7 +62,13 @@ def test_table_2_has_the_methods_of_the_paper():
 def test_the_ablations_have_the_baseline_alone():
     config = parse_compare(["--config", "ablations"])
     runs = entries(config)
-    assert len(runs) == 15
+    assert {world: sum(entry.world == world for entry in runs) for world in config.worlds} == {
+        "rooms": 15,
+        "apartments": 3,
+    }
+    assert {entry.method.rpartition(".")[2].partition(":")[0] for entry in runs if entry.world == "apartments"} == {
+        "tpn"
+    }
     assert {(entry.decision, entry.run.arms) for entry in runs} == {("fused", ("baseline",))}
 
 
