@@ -23,6 +23,8 @@ def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
     config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1)
     worlds = dataclasses.replace(config.worlds, num_train=16)  # among them rooms as large as those of val, for maps
     config = dataclasses.replace(config, arms=("baseline",), worlds=worlds)
+    if any(stage.imitates for stage in find_method(method).stages):
+        config = dataclasses.replace(config, imitation=0.5)  # a chunk for each stage
     whole = train(config)
     resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "two"), monkeypatch)
     assert resumed.log() == whole.log()
