@@ -17,7 +17,7 @@ from jaxnav.evaluation.scene_statistics import scene_statistics
 from jaxnav.runs.directory import load_run
 from jaxnav.runs.policies import load_policies
 from jaxnav.scenes.categories import most_common
-from jaxnav.scenes.files.importing import Format, ImportSummary, Split, import_scenes, read_format
+from jaxnav.scenes.files.importing import Format, ImportSummary, Split, import_scenes, read_format, select
 from jaxnav.scenes.sources import SceneSource
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.viz import require_pictures
@@ -37,6 +37,8 @@ class ImportConfig:
       out: scene file to write (`*.jsonl.gz`).
       split: of the scenes that none of the following patterns fits.
       val, test: patterns of scene names, such as `FloorPlan_Train11_*`, that make up these splits.
+      room_types: of the scenes to keep, such as `house`; default: all.
+      largest: cells along the longer side of the largest scene to keep (`shape` in the file); default: any.
       world: world whose vocabulary the types are compared with; default: that which the scenes stand for.
       categories: vocabulary to compare with instead.
       assets: asset database of ProcTHOR (`procthor/databases/asset-database.json` of github.com/allenai/procthor), for
@@ -54,6 +56,8 @@ class ImportConfig:
     split: Split = "train"
     val: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
+    room_types: tuple[str, ...] = ()
+    largest: int | None = None
     world: Literal["rooms", "apartments", "houses"] | None = None
     categories: tuple[str, ...] | None = None
     assets: Path | None = None
@@ -124,6 +128,7 @@ def convert(config: ImportConfig, console: Console) -> None:
         agent_part=config.agent_part,
     )
     categories = config.categories or (WORLDS[config.world].task.categories if config.world else None)
+    scenes = select(scenes, config.room_types, config.largest)
     summary = import_scenes(
         scenes, config.source, config.out, config.split, config.val, config.test, categories, report
     )

@@ -7,7 +7,7 @@ import pytest
 from support.commands import refusal
 from support.fuzz_importers import CRASHED, FORMATS, fuzz
 from support.importer_inputs.ai2thor import METADATA
-from support.importer_inputs.procthor import ASSETS, HOUSE, door
+from support.importer_inputs.procthor import ASSETS, HOUSE, build, door, item
 
 from jaxnav.__main__ import main
 from jaxnav.env.make import make
@@ -81,6 +81,37 @@ def test_what_is_not_connected_is_counted(tmp_path, capsys):
     told = capsys.readouterr().err
     assert "121 cells are not connected with the agent and left out" in told  # it stands in the smaller room
     assert "largest" not in told
+
+
+def test_homes_are_kept_by_room_type_and_size(tmp_path, capsys):
+    room = build(
+        ("Kitchen", [(0, 0), (0, 3), (3, 3), (3, 0)]), objects=(item("2|0", "Dining_Table_27_1", 1.5, 0.4, 1),)
+    )
+    source, target = tmp_path / "houses.jsonl", tmp_path / "scenes.jsonl.gz"
+    source.write_text("\n".join(json.dumps(house) for house in (HOUSE, HOUSE, room)))
+    # A house is 6 m by 3 m: 25 lattice points from wall to wall, and a cell beyond at either end.
+    assert run("procthor", source, target, "--room-types", "house", "--largest", "27") == 0
+    told = capsys.readouterr().err
+    assert [scene.name for scene in read_scenes(target)] == ["houses-0", "houses-1"]
+    assert "1 scenes are left out, for their room type is not house\n" in told
+    assert "2 scenes imported, 0 refused" in told
+    assert run("procthor", source, target, "--room-types", "kitchen") == 0
+    assert [scene.name for scene in read_scenes(target)] == ["houses-2"]
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--room-types", "house", "--largest", "26"], "--largest 26: leaves no scene; the smallest is 27 cells long"),
+        (["--room-types", "bedroom"], "--room-types bedroom: leaves no scene; there are house\n"),
+    ],
+)
+def test_a_choice_that_leaves_no_home_is_refused(tmp_path, capsys, options, problem):
+    source, target = tmp_path / "houses.jsonl", tmp_path / "scenes.jsonl.gz"
+    source.write_text(json.dumps(HOUSE))
+    assert run("procthor", source, target, *options) == 2
+    assert problem in capsys.readouterr().err
+    assert not target.exists()
 
 
 def test_many_unknown_types_take_one_line(tmp_path, capsys):

@@ -102,6 +102,39 @@ def read_format(
             yield from iterate_scenes(path)
 
 
+def select(scenes: Imported, room_types: tuple[str, ...] = (), largest: int | None = None) -> Imported:
+    """Leave out scenes of other room types or sizes.
+
+    Args:
+      scenes: see `read_format`.
+      room_types: of the scenes to keep; empty for all.
+      largest: cells along the longer side of the largest scene to keep; None for any.
+
+    Yields:
+      Scenes to keep, a note for each scene that is left out, and all else.
+
+    Raises:
+      InputError: no scene is kept.
+    """
+    kept, others, sides = 0, set[str](), set[int]()
+    for scene in scenes:
+        if not isinstance(scene, Scene):
+            yield scene
+        elif room_types and scene.room_type not in room_types:
+            others.add(scene.room_type)
+            yield Note(f"scenes are left out, for their room type is not {' or '.join(room_types)}", 1)
+        elif largest is not None and max(scene.reach.shape) > largest:
+            sides.add(max(scene.reach.shape))
+            yield Note(f"scenes are left out, for they are longer than {largest} cells", 1)
+        else:
+            kept += 1
+            yield scene
+    if sides and not kept:
+        raise InputError(f"--largest {largest}: leaves no scene; the smallest is {min(sides)} cells long")
+    if others and not kept:
+        raise InputError(f"--room-types {' '.join(room_types)}: leaves no scene; there are {', '.join(sorted(others))}")
+
+
 def import_scenes(
     scenes: Iterable[Scene | InputError | Note],
     source: str,
