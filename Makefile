@@ -51,13 +51,13 @@ docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 test: lint docs
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow --timeout 900
+	$(BIN)/python -m pytest -n 2 -m slow --timeout 900
 
 coverage: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered
+	$(BIN)/python -m pytest -n 2 --cov --cov-report=term:skip-covered
 
 mutants: $(READY)
 	cd tests && PYTHONPATH=.. ../$(BIN)/python -m support.planted && PYTHONPATH=.. ../$(BIN)/python -m support.mutants
