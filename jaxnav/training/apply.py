@@ -37,7 +37,7 @@ def apply_gradient(
     optimizer: Any,
     gradient: Params,
     rate: jax.Array,
-    trainable: Callable[[tuple[str, ...]], bool] | None = None,
+    rates: Callable[[tuple[str, ...]], float] | None = None,
 ) -> tuple[Params, Any]:
     """Take one step of the optimizer.
 
@@ -47,24 +47,28 @@ def apply_gradient(
       optimizer: its state.
       gradient: by the parameters.
       rate: float32 [], learning rate.
-      trainable: whether the parameter at a path of names moves; None for all.
+      rates: factor on `rate` of the parameter at a path of names, 0 for one that does not move; None for 1.
 
     Returns:
       Parameters and state after the step.
     """
-    gradient = _restricted(gradient, trainable)
+    gradient = _scaled(gradient, rates and (lambda path: rates(path) > 0))
     with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
         step, optimizer = make_optimizer(config).update(gradient, optimizer, weights)
-    step = _restricted(step, trainable)  # what was trained before still has momentum
+    step = _scaled(step, rates)  # what was trained before still has momentum
     return jax.tree.map(lambda w, s: w - rate * s, weights, step), optimizer
 
 
-def _restricted(tree: Any, trainable: Callable[[tuple[str, ...]], bool] | None) -> Any:
-    """Zero the leaves that are not trained."""
-    if trainable is None:
+def _scaled(tree: Any, factors: Callable[[tuple[str, ...]], float] | None) -> Any:
+    """Multiply the leaves by factors of their paths.
+
+    A factor of 0 gives zeros, whatever the leaf.
+    """
+    if factors is None:
         return tree
 
-    def keep(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
-        return leaf if trainable(tuple(str(entry.key) for entry in path)) else jnp.zeros_like(leaf)
+    def scale(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
+        factor = float(factors(tuple(str(entry.key) for entry in path)))
+        return factor * leaf if factor else jnp.zeros_like(leaf)
 
-    return jax.tree_util.tree_map_with_path(keep, tree)
+    return jax.tree_util.tree_map_with_path(scale, tree)

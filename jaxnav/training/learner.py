@@ -160,7 +160,7 @@ class Learner:
 
         def learn(carry: tuple[Params, Any], part: tuple[Any, ...]) -> tuple[tuple[Params, Any], Metrics]:
             gradient, parts = differentiate(carry[0], part, params, scalars)
-            carry = apply_gradient(config, *carry, gradient, rate, self.stage.trainable)
+            carry = apply_gradient(config, *carry, gradient, rate, self.stage.rates)
             return carry, parts | {"gradient_norm": optax.tree.norm(gradient)}
 
         def epoch(carry: tuple[Params, Any], key: jax.Array) -> tuple[tuple[Params, Any], Metrics]:

@@ -73,6 +73,7 @@ ABLATIONS = [
         "tpn:INDISCRIMINATE",
         "tpn:UNTRIED",
         "vtnet:AVERAGED",
+        "vtnet:SLOWER",
         "vtnet:UNTAUGHT",
     )
 ]

@@ -175,7 +175,7 @@ def test_the_first_stage_is_orgs_and_the_second_teaches_the_tentative_policy_alo
     assert "method.tentative" not in moved(begin.params, middle.params)
     chex.assert_trees_all_equal(carried(middle.agent).fast, carried(begin.agent).fast)
     # No gradient reaches the rest, even where all of it might be trained.
-    open_to_all = dataclasses.replace(IMITATE, trainable=None)
+    open_to_all = dataclasses.replace(IMITATE, rates=None)
     after, metrics = jax.jit(learner(open_to_all).update)(begin, scalars, params, KNOWN)
     assert moved(begin.params, after.params) == {"method.tentative"}
     chex.assert_trees_all_equal_shapes_and_dtypes(begin, middle, after)

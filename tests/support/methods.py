@@ -76,7 +76,7 @@ class Reading(Experience):
 COUNTING = Method(Reading, tracker=Counter())
 
 #: First the critic alone, then everything.
-STAGED = Method(ObjectRelations, stages=(Stage(0.25, trainable=lambda path: path[0] == "critic"), Stage(0.75)))
+STAGED = Method(ObjectRelations, stages=(Stage(0.25, rates=lambda path: path[0] == "critic"), Stage(0.75)))
 
 
 def squared_values(replayed):

@@ -203,17 +203,17 @@ class Stage:
     Attributes:
       share: of all updates, above 0; the shares of a method add up to 1.
       loss: the loss in place of PPO's, with the arguments and results of `jaxnav.training.loss.ppo_loss`.
-      trainable: whether the parameter at a path of names is trained; None for all.
+      rates: factor on the learning rate of the parameter at a path of names, 0 for one that is not trained; None for 1.
       imitates: whether the loss reads what shortest paths do, `Tables.expert`, which only then are there.
       alone: whether the direct stream acts without that of experience, where there are streams.
-      rate: factor on the learning rate.
+      rate: factor on the learning rate of all parameters.
       adapts: whether the method's adaptation changes the policy while it acts and learns; if not, fast weights stay as
         they are.
     """
 
     share: float = 1.0
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None
-    trainable: Callable[[tuple[str, ...]], bool] | None = None
+    rates: Callable[[tuple[str, ...]], float] | None = None
     imitates: bool = False
     alone: bool = False
     rate: float = 1.0

@@ -188,7 +188,7 @@ TPN = Method(
     learn=learn_motion,
     stages=(
         Stage(1.0 - IMITATION, adapts=False),
-        Stage(IMITATION, tentative_loss, trainable=lambda path: path[:2] == ("method", "tentative"), imitates=True),
+        Stage(IMITATION, tentative_loss, rates=lambda path: path[:2] == ("method", "tentative"), imitates=True),
     ),
     adaptation=TentativeSteps(),
 )

@@ -157,10 +157,14 @@ def expert_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]
 VTNET = Method(
     Transformer,
     stages=(
-        Stage(IMITATION, expert_loss, trainable=lambda path: path[0] == "method", imitates=True),
+        Stage(IMITATION, expert_loss, rates=lambda path: path[0] == "method", imitates=True),
         Stage(1.0 - IMITATION),
     ),
 )
 #: The ablations that it must beat: without attention, and without imitation.
 AVERAGED = dataclasses.replace(VTNET, experience=AveragingTransformer)
 UNTAUGHT = dataclasses.replace(VTNET, stages=(Stage(),))
+#: VTNet whose transformer, once it has imitated, learns at a tenth of the rate, as in the released code.
+SLOWER = dataclasses.replace(
+    VTNET, stages=(VTNET.stages[0], Stage(1.0 - IMITATION, rates=lambda path: 0.1 if path[0] == "method" else 1.0))
+)
