@@ -44,7 +44,7 @@ class FastWeights(NamedTuple):
       start: float32 [..., H], the hidden state before the window.
       pathways: float32 [..., W, P], all pathways of the last decisions, joined; the latest is at the end.
       action: int32 [..., W], the action before each of them.
-      factors: of each layer, a row for every step of the windows so far; the latest are at the end.
+      factors: of each layer, a row for every step of the windows so far, in order; 0 for those to come.
     """
 
     decisions: jax.Array
@@ -101,12 +101,17 @@ class LearnedSteps:
     def adapted(self, policy: "Policy", fast: FastWeights) -> FastWeights:
         """Take an inner step in the episodes whose window is full."""
         full = (fast.decisions % WINDOW == 0) & (fast.decisions <= self.inner_steps * WINDOW)
-        new = where_due(full, functools.partial(self.inner_step, policy), fast)
+        graph, params = nnx.split(policy)
 
-        def append(past: jax.Array, new: jax.Array) -> jax.Array:
-            return jnp.where(full[..., None, None], jnp.concatenate([past[..., WINDOW:, :], new], axis=-2), past)
+        def step(params: Any, window: FastWeights, factors: dict[str, Factors]) -> dict[str, Factors]:
+            new = self.inner_step(nnx.merge(graph, params), window._replace(factors=factors))
+            write = functools.partial(
+                jax.lax.dynamic_update_slice_in_dim, start_index=window.decisions - WINDOW, axis=0
+            )
+            return jax.tree.map(write, factors, new)
 
-        return fast._replace(factors=jax.tree.map(append, fast.factors, new))
+        factors = where_due(full, step, params, fast._replace(factors={}), fast.factors)
+        return fast._replace(factors=factors)
 
     def inner_step(self, policy: "Policy", fast: FastWeights) -> dict[str, Factors]:
         """Return the factors of an inner step, [W, ...], of one episode."""
