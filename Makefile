@@ -54,7 +54,7 @@ test: lint docs
 	$(BIN)/python -m pytest -n 2
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -n 2 -m slow --timeout 900
+	$(BIN)/python -m pytest -n 2 -m slow --timeout 900 --durations 20
 
 coverage: $(READY)
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term:skip-covered
