@@ -19,7 +19,7 @@ def cubes(weight, known, state):
 def random_batch(seed, *shape):
     """What is known of each member, with a number that no gradient reaches, and its state."""
     draws = np.random.default_rng(seed)
-    a, rows, sums = (jnp.asarray(draws.normal(size=(*shape, *own)), jnp.float32) for own in ((3,), (3,), ()))
+    a, rows, sums = (jnp.asarray(draws.normal(size=(*shape, *inner)), jnp.float32) for inner in ((3,), (3,), ()))
     return {"a": a, "count": jnp.zeros(shape, jnp.int32)}, {"sum": sums, "rows": rows}
 
 

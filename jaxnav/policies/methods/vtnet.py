@@ -165,6 +165,6 @@ VTNET = Method(
 AVERAGED = dataclasses.replace(VTNET, experience=AveragingTransformer)
 UNTAUGHT = dataclasses.replace(VTNET, stages=(Stage(),))
 #: VTNet whose transformer, once it has imitated, learns at a tenth of the rate, as in the released code.
-SLOWER = dataclasses.replace(
-    VTNET, stages=(VTNET.stages[0], Stage(1.0 - IMITATION, rates=lambda path: 0.1 if path[0] == "method" else 1.0))
-)
+_imitate, _reinforce = VTNET.stages
+_slowly = dataclasses.replace(_reinforce, rates=lambda path: 0.1 if path[0] == "method" else 1.0)
+SLOWER = dataclasses.replace(VTNET, stages=(_imitate, _slowly))
