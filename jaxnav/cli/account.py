@@ -73,4 +73,4 @@ def _account(config: AccountConfig, console: Console, out: Console) -> None:
         write_atomic(target, (json.dumps({"settings": about, "shifts": found}, indent=2) + "\n").encode())
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
-    console.print(f"written to {target}", soft_wrap=True)
+    console.print(f"written to {target}")

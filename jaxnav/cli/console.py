@@ -31,10 +31,11 @@ _LONG_S = 0.5  # of a compilation that is worth the effort
 def exit_code(command: Callable[[Console], object]) -> int:
     """Run a command and return its exit code.
 
-    The command gets a console to tell of its progress on. What ends it is told in one line: bad input, a file that
-    cannot be read or written and a lack of memory with code 2, Ctrl-C and SIGTERM with 128 and the signal's number.
+    The command gets a console to tell of its progress on, where each message is a line, however long. What ends it is
+    told in one: bad input, a file that cannot be read or written and a lack of memory with code 2, Ctrl-C and SIGTERM
+    with 128 and the signal's number.
     """
-    console = PlainConsole(stderr=True)
+    console = PlainConsole(stderr=True, soft_wrap=True)
     if "jax" in sys.modules:  # otherwise the command compiles nothing
         _keep_programs(console)
         _give_memory_back()
@@ -45,12 +46,12 @@ def exit_code(command: Callable[[Console], object]) -> int:
     except KeyboardInterrupt as end:
         number = end.signal if isinstance(end, Interrupted) else signal.SIGINT
         how = f"{end}; the same command goes on from there" if isinstance(end, Interrupted) else "before it was done"
-        console.print(f"interrupted: {how}", soft_wrap=True, style="yellow")
+        console.print(f"interrupted: {how}", style="yellow")
         return 128 + number
     except Exception as error:
         if (problem := _problem(error)) is None:
             raise
-        console.print(f"error: {problem}", soft_wrap=True, style="red")
+        console.print(f"error: {problem}", style="red")
         return 2
     return 0
 
@@ -154,7 +155,7 @@ def _keep_programs(console: Console) -> None:
         if not os.access(folder, os.W_OK):
             raise PermissionError(f"{folder} cannot be written")
     except (OSError, RuntimeError) as error:
-        console.print(f"warning: compiled programs are not kept: {error}", soft_wrap=True, style="yellow")
+        console.print(f"warning: compiled programs are not kept: {error}", style="yellow")
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _LONG_S)

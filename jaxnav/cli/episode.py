@@ -87,4 +87,4 @@ def draw(config: EpisodeConfig, console: Console) -> None:
         draw_search(episodes[0], search_at(episodes[0], step), step, path)
     else:
         draw_episode(episodes, path)
-    console.print(f"{steps} steps; written to {path}", soft_wrap=True)
+    console.print(f"{steps} steps; written to {path}")

@@ -89,9 +89,7 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
     compilations = results.report["compilations"]
-    console.print(
-        f"{len(results.episodes.goal)} episodes, {compilations} compilation; written to {target}", soft_wrap=True
-    )
+    console.print(f"{len(results.episodes.goal)} episodes, {compilations} compilation; written to {target}")
 
 
 def _target(config: EvalConfig) -> Path:

@@ -87,7 +87,7 @@ def _export(config: ExportConfig, console: Console) -> None:
             write_atomic(out / file, data)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
-    console.print(f"written to {out}", soft_wrap=True)
+    console.print(f"written to {out}")
 
 
 def _is_replaceable(out: Path) -> bool:

@@ -41,4 +41,4 @@ def _send(config: LogConfig, console: Console) -> None:
     except KeyboardInterrupt:
         console.print("stopped; what was logged so far has been sent")
         return
-    console.print(f"{count} rows of {config.run} sent to {' and '.join(config.to)}", soft_wrap=True)
+    console.print(f"{count} rows of {config.run} sent to {' and '.join(config.to)}")

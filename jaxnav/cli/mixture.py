@@ -83,4 +83,4 @@ def _mixture(config: MixtureConfig, console: Console) -> None:
         write_atomic(target, (json.dumps(report, allow_nan=False) + "\n").encode())
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
-    console.print(f"written to {target}", soft_wrap=True)
+    console.print(f"written to {target}")

@@ -67,4 +67,4 @@ def _report(config: ReportConfig, console: Console) -> None:
         write_atomic(target, page)
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); give another --out") from error
-    console.print(f"{len(page) / 1e6:.1f} MB, written to {target}", soft_wrap=True)
+    console.print(f"{len(page) / 1e6:.1f} MB, written to {target}")

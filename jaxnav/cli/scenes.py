@@ -115,7 +115,7 @@ def convert(config: ImportConfig, console: Console) -> None:
     """Import scenes and print what was refused or unknown."""
 
     def report(error: InputError) -> None:
-        console.print(f"refused: {error}", style="yellow", soft_wrap=True)
+        console.print(f"refused: {error}", style="yellow")
 
     scenes = read_format(
         config.format,
@@ -133,13 +133,13 @@ def convert(config: ImportConfig, console: Console) -> None:
         scenes, config.source, config.out, config.split, config.val, config.test, categories, report
     )
     for told in _told(summary):
-        console.print(told, style="yellow", soft_wrap=True)
+        console.print(told, style="yellow")
     if summary.unknown:
         objects, types = summary.unknown.total(), most_common(summary.unknown)
         told = f"objects of unknown types, which only block the sight: {objects:,}, of them {types}"
-        console.print(told, soft_wrap=True)
+        console.print(told)
     counts = f"{len(summary.scenes)} scenes imported, {summary.refused} refused"
-    console.print(f"{counts}; written to {config.out}", soft_wrap=True)
+    console.print(f"{counts}; written to {config.out}")
 
 
 def _told(summary: ImportSummary) -> Iterator[str]:
@@ -167,8 +167,8 @@ def show(config: ShowConfig, console: Console) -> None:
         draw_scene(scene, config.task, path, config.pose)
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written ({error.strerror}); give another name") from error
-    console.print(f"{scene.name} drawn by the rules of {config.world_name}", soft_wrap=True)
-    console.print(f"written to {path}", soft_wrap=True)
+    console.print(f"{scene.name} drawn by the rules of {config.world_name}")
+    console.print(f"written to {path}")
 
 
 def print_statistics(config: StatsConfig, console: Console) -> None:

@@ -34,7 +34,7 @@ def _draw(run: Run, console: Console) -> None:
     try:
         require_pictures()
     except InputError as error:
-        console.print(f"no learning curves: {error}", soft_wrap=True)
+        console.print(f"no learning curves: {error}")
         return
     from jaxnav.viz.figure import save_figure
     from jaxnav.viz.learning import learning_figure
@@ -42,4 +42,4 @@ def _draw(run: Run, console: Console) -> None:
     config, path = run.config, run.config.run_dir / LEARNING
     title = f"{config.method.upper()} in {Path(config.source).name}, {config.seeds} seed{'s' * (config.seeds > 1)}"
     save_figure(learning_figure(run.log(), run.reach(), title), path)
-    console.print(f"learning curves: {path}", soft_wrap=True)
+    console.print(f"learning curves: {path}")

@@ -110,7 +110,7 @@ def _resumed(
     """
     restored = restore(config.run_dir, trainer.abstract(first), manifest)
     for problem in restored.damaged if restored else ():
-        console.print(f"{problem}; moved to {config.run_dir / 'damaged'}", soft_wrap=True)
+        console.print(f"{problem}; moved to {config.run_dir / 'damaged'}")
     done = restored.step if restored else 0
     by_first_process(lambda: set_aside_after(config.run_dir, done))
     by_first_process(lambda: Logs(config).rewind(done))
@@ -130,7 +130,7 @@ def _validator(
     try:
         return Validator(config, acting, knowledge, world, console)
     except MissingSplitError as error:
-        console.print(f"no val scenes, so the last policies are exported ({error})", soft_wrap=True)
+        console.print(f"no val scenes, so the last policies are exported ({error})")
         return None
 
 

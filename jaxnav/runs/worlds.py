@@ -143,7 +143,7 @@ def _scenes(config: RunConfig, world: str, split: str, path: Path | None, shift:
     scenes = from_file(path, split)
     if counts := unknown_types(scenes.scenes, task.categories):
         types = most_common(counts)
-        console.print(f"{path}: types that are no category and only block the sight: {types}", soft_wrap=True)
+        console.print(f"{path}: types that are no category and only block the sight: {types}")
     return shifted(scenes, task, shift, seed)
 
 
@@ -176,7 +176,6 @@ def _compiled(
     console.print(
         f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size:.2f} GB in {shards.folder}"
         f"{_left_out(shards.skipped)}",
-        soft_wrap=True,
     )
     about = shards.num_cells, shards.num_scenes, f"{shards.checksum:08x}"
     return CompiledWorld(scenes, env, shards, step_limits, step_limit, *about)

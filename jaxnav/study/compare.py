@@ -52,15 +52,15 @@ def run_compare(config: CompareConfig, console: Console) -> None:
         if is_written(path, identity):
             kept += 1
         else:
-            console.print(f"{path}", soft_wrap=True)
+            console.print(f"{path}")
             write_record(path, identity, measure())
         found[name] = from_json(Scores, json.loads(path.read_text()))
         write_comparison(config, found)
         if config.paper is not None:
             write_paper_tables(config.paper, folder)
     if kept:
-        console.print(kept_note(kept, folder), soft_wrap=True)
-    console.print(f"written to {config.document}", soft_wrap=True)
+        console.print(kept_note(kept, folder))
+    console.print(f"written to {config.document}")
 
 
 def _jobs(config: CompareConfig, console: Console) -> list[Job]:

@@ -80,7 +80,7 @@ def prove_instrument(config: InstrumentConfig, console: Console, out: Console) -
         write_report(target, to_json(report) | {"versions": versions(), "format": FORMAT})
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror})") from error
-    console.print(f"written to {target}", soft_wrap=True)
+    console.print(f"written to {target}")
 
 
 def instrument_report(config: InstrumentConfig, run: RunConfig, console: Console) -> InstrumentReport:

@@ -201,7 +201,7 @@ def measure_mixture(
     best = max(rows, key=lambda row: row.mixture[score].mean).name
     rows = [removal("TDE", hard), removal(ORACLE, ledger.told(plain, hard)), *rows]
     for way in ways:
-        console.print(str(way), soft_wrap=True)
+        console.print(str(way))
         setting = dataclasses.replace(gap_settings(layout_setting(subject.policies))[way.gap], hold=way.hold)
         trial = Trial("stde", decoding, *way.use)
         controls = CONTROLS[way.use.form]

@@ -69,5 +69,5 @@ def run_study(config: StudyConfig, console: Console) -> None:
         draw_figures(folder, config.document.parent / "images" / "study")
     write_document(config.results, config.document)
     if kept:
-        console.print(kept_note(len(kept), folder), soft_wrap=True)
+        console.print(kept_note(len(kept), folder))
     console.print(f"written to {config.document}")
