@@ -41,3 +41,19 @@ class ByFixtures(LoadScopeScheduling):
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFixtures:
     """Divide the tests among workers."""
     return ByFixtures(config, log)
+
+
+@pytest.fixture
+def optimised():
+    """Compile as users do, for a test that computes for longer than it compiles."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def programs_of_a_module_are_let_go():
+    """A program holds memory maps; a process dies at 65,530 of them, which the slow tests together reach."""
+    yield
+    jax.clear_caches()

@@ -206,6 +206,7 @@ def test_the_loss_is_the_cross_entropy_to_the_expert():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_imitation_lowers_its_loss_and_leaves_the_policy_as_it_is():
     spec = dataclasses.replace(tiny.SPEC, method="vtnet", method_sizes=tuple(SIZES.items()))
     expert = jnp.asarray(tiny.BANK.expert)

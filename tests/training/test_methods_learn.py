@@ -64,6 +64,7 @@ def test_random_actions_seldom_succeed():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.control == Primitive()])
 def test_a_method_learns(name):
     method = METHODS[name]
