@@ -1,4 +1,4 @@
-"""Calls timed in turns, spreads, and a benchmark's report."""
+"""Timing calls in turns, summarizing the times, and printing the report of a benchmark."""
 
 import contextlib
 import importlib.metadata
@@ -16,9 +16,10 @@ from typing import Any
 
 import jax
 
+#: Median, minimum and maximum.
 Spread = dict[str, float]
 
-#: Makes glibc keep large buffers instead of giving them back to be faulted in again; read when a process starts.
+#: Makes glibc reuse large buffers instead of returning them to the system; read when a process starts.
 TUNED_ALLOCATOR = {
     "MALLOC_MMAP_THRESHOLD_": "8589934592",
     "MALLOC_TRIM_THRESHOLD_": "8589934592",
@@ -26,52 +27,60 @@ TUNED_ALLOCATOR = {
 }
 
 
-def seconds(call: Callable[[], Any]) -> float:
-    """Return the wall seconds until a call's arrays are there."""
-    began = time.perf_counter()
+def time_call(call: Callable[[], Any]) -> float:
+    """Return the wall seconds until the arrays of a call are ready."""
+    start_time = time.perf_counter()
     jax.block_until_ready(call())
-    return time.perf_counter() - began
+    return time.perf_counter() - start_time
 
 
-def in_turns(calls: Mapping[str, Callable[[], Any]], turns: int = 9) -> dict[str, list[float]]:
-    """Time calls in turns (A B A B ...).
+def time_in_turns(calls: Mapping[str, Callable[[], Any]], turns: int = 9) -> dict[str, list[float]]:
+    """Return the wall seconds of calls timed in turns (A B A B ...), after a warm-up of each.
 
-    Load hits all alike. Returns wall seconds, after a warm-up of each.
+    Taking turns exposes all calls to the same load of the machine.
     """
     for call in calls.values():
-        seconds(call)
-    rounds = [{name: seconds(call) for name, call in calls.items()} for _ in range(turns)]
-    return {name: [one[name] for one in rounds] for name in calls}
+        time_call(call)
+
+    times = {name: [] for name in calls}
+    for _ in range(turns):
+        for name, call in calls.items():
+            times[name].append(time_call(call))
+    return times
 
 
-def spread(values: Sequence[float], digits: int = 4) -> Spread:
-    """Return median, least and greatest to some significant digits."""
-    statistics_of = {"median": statistics.median(values), "min": min(values), "max": max(values)}
-    return {name: float(f"{value:.{digits}g}") for name, value in statistics_of.items()}
+def summarize(values: Sequence[float], digits: int = 4) -> Spread:
+    """Return median, minimum and maximum, rounded to some significant digits."""
+    summary = {"median": statistics.median(values), "min": min(values), "max": max(values)}
+    return {name: float(f"{value:.{digits}g}") for name, value in summary.items()}
 
 
-def rates(taken: Sequence[float], steps: int) -> Spread:
-    """Return steps per second of calls of so many steps."""
-    return spread([steps / one for one in taken])
+def steps_per_second(call_times: Sequence[float], num_steps: int) -> Spread:
+    """Return the rates of calls of `num_steps` steps."""
+    return summarize([num_steps / call_time for call_time in call_times])
 
 
-def ratios(above: Sequence[float], below: Sequence[float]) -> Spread:
-    """Return ratios turn by turn of what was timed together."""
-    return spread([a / b for a, b in zip(above, below, strict=True)])
+def ratio_by_turn(numerators: Sequence[float], denominators: Sequence[float]) -> Spread:
+    """Return ratios of two series that were timed in the same turns."""
+    ratios = [above / below for above, below in zip(numerators, denominators, strict=True)]
+    return summarize(ratios)
 
 
 def peak_resident_gb() -> float:
-    """Return the most memory that this process has held."""
+    """Return the peak of this process's resident memory."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3)
 
 
-def machine() -> dict[str, Any]:
-    """Return the processor, devices, settings and versions."""
+def describe_machine() -> dict[str, Any]:
+    """Return processor, devices, settings and versions."""
+    cpu_model = platform.processor()
     cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    if cpuinfo.exists():
+        model_lines = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        if model_lines:
+            cpu_model = model_lines[0].split(":", 1)[1].strip()
     return {
-        "cpu": models[0] if models else platform.processor(),
+        "cpu": cpu_model,
         "cores": os.cpu_count(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
@@ -81,13 +90,14 @@ def machine() -> dict[str, Any]:
     }
 
 
-def report(results: dict[str, Any]) -> None:
+def print_report(results: dict[str, Any]) -> None:
     """Print the machine and the results as one JSON object."""
-    print(json.dumps({"machine": machine(), **results}, indent=2))
+    print(json.dumps({"machine": describe_machine(), **results}, indent=2))
 
 
-def in_folder(main: Callable[[Path, Path], None]) -> None:
-    """Call with the file of the command line, and its folder or a temporary one."""
-    file, *folder = map(Path, sys.argv[1:])
-    with contextlib.nullcontext(folder[0]) if folder else tempfile.TemporaryDirectory() as chosen:
-        main(file, Path(chosen))
+def run_in_folder(main: Callable[[Path, Path], None]) -> None:
+    """Call `main` with the file and the folder of the command line; without a folder, with a temporary one."""
+    file, *folders = map(Path, sys.argv[1:])
+    context = contextlib.nullcontext(folders[0]) if folders else tempfile.TemporaryDirectory()
+    with context as folder:
+        main(file, Path(folder))

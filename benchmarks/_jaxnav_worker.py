@@ -8,25 +8,28 @@ layout estimator beside the rollout, and the counterfactual branch distilled).
 import dataclasses
 import sys
 
-from _setup import set_up
+from _setup import set_up_training
 from _worker import serve
 
 from jaxnav.runs.config import RunConfig
 
 
-def main(arm: str, epochs: int, minibatches: int, updates: int) -> None:
+def main(arm: str, epochs: int, minibatches: int, num_updates: int) -> None:
     ppo = dataclasses.replace(RunConfig().ppo, epochs=epochs, minibatches=minibatches)
-    plain = {"counterfactual": "none", "spatial_memory": False} if arm == "baseline" else {}
-    config = dataclasses.replace(RunConfig(), arms=(arm,), ppo=ppo, **plain)
-    setup = set_up(config)
-    learner, (state, _, params, knowledge) = setup.trainer.learners[arm], setup.arguments(arm)
-    scalars = ppo.scalars(10**9)  # so many updates that the learning rate stays as it is
+    config = dataclasses.replace(RunConfig(), arms=(arm,), ppo=ppo)
+    if arm == "baseline":
+        config = dataclasses.replace(config, counterfactual="none", spatial_memory=False)
+
+    setup = set_up_training(config)
+    learner = setup.trainer.learners[arm]
+    state, _, env_params, knowledge = setup.update_arguments(arm)
+    scalars = ppo.scalars(10**9)  # so many updates that the learning rate stays constant
 
     def train(state):
-        state, metrics = learner.train(state, scalars, params, knowledge, updates)
+        state, metrics = learner.train(state, scalars, env_params, knowledge, num_updates)
         return state, (metrics["episodes"], metrics["episodes"] * metrics["success"])
 
-    serve(train, state, updates * config.update_steps, state.params)
+    serve(train, state, num_updates * config.steps_per_update, state.params)
 
 
 if __name__ == "__main__":

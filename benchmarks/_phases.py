@@ -1,7 +1,7 @@
 """One update and its rollout as compiled programs.
 
-Learning, forward and backward, is no program: it is the update less the rollout, in operations and in seconds of the
-same turn.
+Learning, forward and backward, is not a program of its own: its operations and seconds are those of the update less
+those of the rollout in the same turn.
 """
 
 import time
@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 
 import jax
 from _flops import matmul_flops
-from _setup import Setup
+from _setup import TrainingSetup
 
-from jaxnav.training.collect import collect
+from jaxnav.training.ppo import collect_rollout
 
 
 class Program(NamedTuple):
-    """Hold a compiled program with its arguments.
+    """A compiled program with its arguments.
 
     Attributes:
       call: runs it once.
       flops: floating-point operations of its matrix products.
       compile_s: seconds to trace and to compile it.
-      temp_gb: memory that it takes beside arguments and results, where the device tells.
+      temp_gb: temporary memory besides arguments and results; None if the device does not report it.
     """
 
     call: Callable[[], Any]
@@ -31,37 +31,49 @@ class Program(NamedTuple):
     temp_gb: float | None
 
 
-def program(function: Callable[..., Any], *arguments: Any) -> Program:
+def compile_program(function: Callable[..., Any], *arguments: Any) -> Program:
     """Compile a function for these arguments."""
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     traced = jax.jit(function).trace(*arguments)
     compiled = traced.lower().compile()
-    taken = time.perf_counter() - began
+    compile_s = round(time.perf_counter() - start_time, 2)
+
     memory = compiled.memory_analysis()
     temp_gb = round(memory.temp_size_in_bytes / 2**30, 3) if memory else None
-    return Program(lambda: compiled(*arguments), matmul_flops(traced.jaxpr.jaxpr), round(taken, 2), temp_gb)
+    return Program(lambda: compiled(*arguments), matmul_flops(traced.jaxpr.jaxpr), compile_s, temp_gb)
 
 
-def update(setup: Setup, arm: str) -> Program:
+def compile_update(setup: TrainingSetup, arm: str) -> Program:
     """Compile one update of a fresh seed: rollout and learning."""
-    return program(setup.trainer.learners[arm].update, *setup.arguments(arm))
+    return compile_program(setup.trainer.learners[arm].update, *setup.update_arguments(arm))
 
 
-def rollout(setup: Setup, arm: str) -> Program:
+def compile_rollout(setup: TrainingSetup, arm: str) -> Program:
     """Compile the rollout of the same update."""
-    learner, (state, _, params, knowledge) = setup.trainer.learners[arm], setup.arguments(arm)
+    learner = setup.trainer.learners[arm]
+    state, _, env_params, knowledge = setup.update_arguments(arm)
 
-    def act(state: Any, params: Any, knowledge: Any) -> Any:
-        policy, coin = learner.acting.bind(state.params), learner.counterfactual == "coin"
-        return collect(learner.acting, policy, state.agent, state.key, learner.config.rollout, coin, params, knowledge)
+    def act(state: Any, env_params: Any, knowledge: Any) -> Any:
+        policy = learner.agent_loop.bind(state.params)
+        use_coin = learner.counterfactual == "coin"
+        return collect_rollout(
+            learner.agent_loop,
+            policy,
+            state.agent,
+            state.key,
+            learner.config.rollout,
+            use_coin,
+            env_params,
+            knowledge,
+        )
 
-    return program(act, state, params, knowledge)
+    return compile_program(act, state, env_params, knowledge)
 
 
-def phases(setup: Setup) -> dict[str, Program]:
+def compile_phases(setup: TrainingSetup) -> dict[str, Program]:
     """Compile `ARM update` and `ARM rollout` of every arm."""
-    return {
-        f"{arm} {what}": compile_part(setup, arm)
-        for arm in setup.trainer.learners
-        for what, compile_part in (("update", update), ("rollout", rollout))
-    }
+    programs = {}
+    for arm in setup.trainer.learners:
+        programs[f"{arm} update"] = compile_update(setup, arm)
+        programs[f"{arm} rollout"] = compile_rollout(setup, arm)
+    return programs

@@ -1,7 +1,7 @@
 """Recurrent PPO in purejaxrl's style as a process.
 
-Started as `python benchmarks/_purejaxrl_style.py EPOCHS MINIBATCHES UPDATES`. Written here in the usual way: everything
-in one jitted function, a flax.linen cell scanned over time with resets, observations kept in the trajectory as float32
+Started as `python benchmarks/_purejaxrl_style.py EPOCHS MINIBATCHES UPDATES`. The code follows purejaxrl: everything in
+one jitted function, a flax.linen cell scanned over time with resets, observations stored in the trajectory as float32
 vectors, minibatches of whole sequences. The network is jaxnav's.
 """
 
@@ -12,21 +12,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from _adapter import Adapter, Slot, Torso, action_head, ended, vector
+from _adapter import Adapter, EpisodeSlot, Torso, count_ended, make_action_head, to_vector
 from _worker import serve
 from flax import linen as nn
 from flax.training.train_state import TrainState
 
 from jaxnav.env.make import make
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.training.config import PPOConfig
 
-SPEC = PolicySpec()
+SPEC = PolicySpec(find_method("org"))
 
 
 class ScannedGRU(nn.Module):
-    """Scan a recurrent cell that each episode starts anew."""
+    """Recurrent cell over time, reset at the start of each episode."""
 
     @functools.partial(nn.scan, variable_broadcast="params", split_rngs={"params": False})
     @nn.compact
@@ -39,13 +40,15 @@ class ScannedGRU(nn.Module):
 class ActorCritic(nn.Module):
     @nn.compact
     def __call__(self, hidden: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
-        """Map memory and inputs to memory, logits and values.
+        """Return hidden state [B, H], logits [T, B, A] and values [T, B].
 
-        Memory [B, H], observations [T, B, N] and starts [T, B] to memory, logits [T, B, A] and values [T, B].
+        Args:
+          hidden: state before the first step, [B, H].
+          inputs: observations [T, B, N], and where episodes start, bool [T, B].
         """
         obs, starts = inputs
         hidden, outputs = ScannedGRU()(hidden, (Torso(SPEC)(obs), starts))
-        return hidden, action_head()(outputs), nn.Dense(1)(outputs)[..., 0]
+        return hidden, make_action_head()(outputs), nn.Dense(1)(outputs)[..., 0]
 
 
 class Transition(NamedTuple):
@@ -60,7 +63,7 @@ class Transition(NamedTuple):
 
 class Runner(NamedTuple):
     train: TrainState
-    slots: Slot
+    slots: EpisodeSlot
     obs: jax.Array
     start: jax.Array
     hidden: jax.Array
@@ -71,7 +74,9 @@ def log_prob_of(logits: jax.Array, action: jax.Array) -> jax.Array:
     return jnp.take_along_axis(jax.nn.log_softmax(logits), action[..., None], axis=-1)[..., 0]
 
 
-def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, updates: int):
+def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, num_updates: int):
+    """Return a function that trains for some updates; see `_worker.Train`."""
+
     def env_step(runner: Runner, _: None) -> tuple[Runner, Transition]:
         key, action_key, step_key = jax.random.split(runner.key, 3)
         hidden, logits, value = network.apply(
@@ -84,74 +89,82 @@ def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, updat
         transition = Transition(runner.obs, runner.start, action, log_prob, value[0], reward, done)
         return Runner(runner.train, slots, obs, done, hidden, key), transition
 
-    def advantages(trajectory: Transition, last_value: jax.Array) -> jax.Array:
-        def back(carry, step: Transition):
+    def estimate_advantages(trajectory: Transition, last_value: jax.Array) -> jax.Array:
+        def step_back(carry, step: Transition):
             advantage, next_value = carry
-            going_on = 1.0 - step.done
-            delta = step.reward + config.gamma * next_value * going_on - step.value
-            advantage = delta + config.gamma * config.gae_lambda * going_on * advantage
+            continues = 1.0 - step.done
+            delta = step.reward + config.gamma * next_value * continues - step.value
+            advantage = delta + config.gamma * config.gae_lambda * continues * advantage
             return (advantage, step.value), advantage
 
-        return jax.lax.scan(back, (jnp.zeros_like(last_value), last_value), trajectory, reverse=True)[1]
+        start = (jnp.zeros_like(last_value), last_value)
+        return jax.lax.scan(step_back, start, trajectory, reverse=True)[1]
 
     def loss(weights, hidden, trajectory: Transition, advantage: jax.Array) -> jax.Array:
         _, logits, value = network.apply(weights, hidden, (trajectory.obs, trajectory.start))
-        log_pi = jax.nn.log_softmax(logits)
+        log_probs = jax.nn.log_softmax(logits)
         ratio = jnp.exp(log_prob_of(logits, trajectory.action) - trajectory.log_prob)
-        scaled = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
-        policy_loss = -jnp.minimum(ratio * scaled, clipped * scaled).mean()
+        normalized = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        clipped_ratio = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+        policy_loss = -jnp.minimum(ratio * normalized, clipped_ratio * normalized).mean()
         value_loss = 0.5 * jnp.square(value - (advantage + trajectory.value)).mean()
-        entropy = -(jnp.exp(log_pi) * log_pi).sum(axis=-1).mean()
+        entropy = -(jnp.exp(log_probs) * log_probs).sum(axis=-1).mean()
         return policy_loss + config.value * value_loss - config.entropy * entropy
 
-    def minibatch(train: TrainState, batch) -> tuple[TrainState, None]:
+    def update_minibatch(train: TrainState, batch) -> tuple[TrainState, None]:
         return train.apply_gradients(grads=jax.grad(loss)(train.params, *batch)), None
 
     def update(runner: Runner, _: None) -> tuple[Runner, None]:
-        first = runner.hidden
+        # Collect a rollout, leaves [T, B, ...], and estimate advantages.
+        initial_hidden = runner.hidden
         runner, trajectory = jax.lax.scan(env_step, runner, None, config.rollout)
         _, _, last_value = network.apply(runner.train.params, runner.hidden, (runner.obs[None], runner.start[None]))
-        advantage = advantages(trajectory, last_value[0])
+        advantage = estimate_advantages(trajectory, last_value[0])
 
         def epoch(carry: tuple[TrainState, jax.Array], _: None) -> tuple[tuple[TrainState, jax.Array], None]:
             train, key = carry
-            key, shuffle = jax.random.split(key)
-            order = jax.random.permutation(shuffle, config.num_envs)
+            key, shuffle_key = jax.random.split(key)
+            order = jax.random.permutation(shuffle_key, config.num_envs)
 
-            def split(x: jax.Array) -> jax.Array:
-                parts = jnp.take(x, order, axis=1).reshape(x.shape[0], config.minibatches, -1, *x.shape[2:])
+            # Shuffle the sequences and divide them, [T, B, ...] -> [minibatches, T, B / minibatches, ...].
+            def split(leaf: jax.Array) -> jax.Array:
+                shuffled = jnp.take(leaf, order, axis=1)
+                parts = shuffled.reshape(leaf.shape[0], config.minibatches, -1, *leaf.shape[2:])
                 return jnp.swapaxes(parts, 0, 1)
 
-            hidden, *batches = jax.tree.map(split, (first[None], trajectory, advantage))
-            train, _ = jax.lax.scan(minibatch, train, (hidden[:, 0], *batches))
+            hidden, *batches = jax.tree.map(split, (initial_hidden[None], trajectory, advantage))
+            train, _ = jax.lax.scan(update_minibatch, train, (hidden[:, 0], *batches))
             return (train, key), None
 
         (train, key), _ = jax.lax.scan(epoch, (runner.train, runner.key), None, config.epochs)
         return runner._replace(train=train, key=key), None
 
     def train(runner: Runner) -> tuple[Runner, tuple[jax.Array, jax.Array]]:
-        after, _ = jax.lax.scan(update, runner, None, updates)
-        return after, ended(runner.slots, after.slots)
+        next_runner, _ = jax.lax.scan(update, runner, None, num_updates)
+        return next_runner, count_ended(runner.slots, next_runner.slots)
 
     return train
 
 
-def main(epochs: int, minibatches: int, updates: int) -> None:
+def main(epochs: int, minibatches: int, num_updates: int) -> None:
     env, params = make("rooms")
     config = PPOConfig(epochs=epochs, minibatches=minibatches)
     row_format = RowFormat(SPEC.num_categories)
-    adapter = Adapter(env, lambda observation, action: vector(observation, action, row_format))
+    adapter = Adapter(env, lambda observation, action: to_vector(observation, action, row_format))
     network: Any = ActorCritic()
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate, eps=1e-5))
+
+    # Start the episodes, all of them in one batch, and initialize the network.
     reset_key, init_key, key = jax.random.split(jax.random.key(0), 3)
     obs, slots = jax.jit(jax.vmap(adapter.reset, (0, None)))(jax.random.split(reset_key, config.num_envs), params)
-    hidden, start = jnp.zeros((config.num_envs, SPEC.sizes.hidden)), jnp.ones(config.num_envs, bool)
+    hidden = jnp.zeros((config.num_envs, SPEC.sizes.hidden))
+    start = jnp.ones(config.num_envs, bool)
     weights = jax.jit(network.init)(init_key, hidden, (obs[None], start[None]))
     train = TrainState.create(apply_fn=network.apply, params=weights, tx=optimizer)
     runner = Runner(train, slots, obs, start, hidden, key)
-    steps = updates * config.num_envs * config.rollout
-    serve(make_train(config, adapter, params, network, updates), runner, steps, weights)
+
+    num_steps = num_updates * config.num_envs * config.rollout
+    serve(make_train(config, adapter, params, network, num_updates), runner, num_steps, weights)
 
 
 if __name__ == "__main__":

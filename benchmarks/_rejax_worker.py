@@ -10,7 +10,7 @@ more floating-point work per observation than jaxnav).
 import sys
 
 import jax
-from _adapter import Adapter, Torso, action_head, ended, packed, unpacked
+from _adapter import Adapter, Torso, count_ended, make_action_head, pack_observation, unpack_observation
 from _worker import serve
 from flax import linen as nn
 from gymnax.environments import spaces
@@ -18,12 +18,13 @@ from rejax import PPO
 from rejax.networks import DiscretePolicy
 
 from jaxnav.env.make import make
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 
-SPEC = PolicySpec()
+SPEC = PolicySpec(find_method("org"))
 ROW_FORMAT = RowFormat(SPEC.num_categories)
 
 
@@ -36,19 +37,20 @@ class GymnaxObjectNav(Adapter):
 
 
 class FeedForward(nn.Module):
-    """Apply the policy's layers without any memory."""
+    """The policy's layers without any memory."""
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
         cell = nn.GRUCell(SPEC.sizes.hidden)
-        fused = Torso(SPEC)(unpacked(obs, ROW_FORMAT))
-        return cell(cell.initialize_carry(jax.random.key(0), fused.shape), fused)[0]
+        fused = Torso(SPEC)(unpack_observation(obs, ROW_FORMAT))
+        initial_hidden = cell.initialize_carry(jax.random.key(0), fused.shape)
+        return cell(initial_hidden, fused)[0]
 
 
 class Actor(DiscretePolicy):
     def setup(self) -> None:
         self.features = FeedForward()
-        self.action_logits = action_head()
+        self.action_logits = make_action_head()
 
 
 class TorsoCritic(nn.Module):
@@ -60,17 +62,17 @@ class TorsoCritic(nn.Module):
 class LinearCritic(nn.Module):
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        return nn.Dense(1)(unpacked(obs, ROW_FORMAT)).squeeze(1)
+        return nn.Dense(1)(unpack_observation(obs, ROW_FORMAT)).squeeze(1)
 
 
 CRITICS = {"torso": TorsoCritic, "linear": LinearCritic}
 
 
-def main(critic: str, epochs: int, minibatches: int, updates: int) -> None:
+def main(critic: str, epochs: int, minibatches: int, num_updates: int) -> None:
     env, params = make("rooms")
     config = PPOConfig()
     trainer = PPO(
-        env=GymnaxObjectNav(env, packed),
+        env=GymnaxObjectNav(env, pack_observation),
         env_params=params,
         eval_callback=lambda *_: None,  # `train_iteration` never evaluates
         actor=Actor(NUM_ACTIONS, hidden_layer_sizes=(), activation=nn.relu),
@@ -89,11 +91,12 @@ def main(critic: str, epochs: int, minibatches: int, updates: int) -> None:
     )
 
     def train(state):
-        after, _ = jax.lax.scan(lambda state, _: (trainer.train_iteration(state), None), state, None, updates)
-        return after, ended(state.env_state, after.env_state)
+        next_state, _ = jax.lax.scan(lambda state, _: (trainer.train_iteration(state), None), state, None, num_updates)
+        return next_state, count_ended(state.env_state, next_state.env_state)
 
     state = jax.jit(trainer.init_state)(jax.random.key(0))
-    serve(train, state, updates * config.num_envs * config.rollout, (state.actor_ts.params, state.critic_ts.params))
+    num_steps = num_updates * config.num_envs * config.rollout
+    serve(train, state, num_steps, (state.actor_ts.params, state.critic_ts.params))
 
 
 if __name__ == "__main__":

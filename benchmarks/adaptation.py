@@ -1,4 +1,4 @@
-"""What adaptation within the episode does to trained policies.
+"""Effect of adaptation within the episode on trained policies.
 
 `python benchmarks/adaptation.py RUN [--episodes 1000]` takes a run of a method that adapts by a learned loss (`savn`,
 `eotp:ADAPTED`), arm `baseline`, in its val scenes:
@@ -14,26 +14,28 @@ The result goes to stdout as JSON.
 import argparse
 import dataclasses
 import functools
+import operator
 from pathlib import Path
 from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import report
+from _common import print_report
 from rich.console import Console
 
 import jaxnav
-from jaxnav.env.types import EnvParams
+from jaxnav.env.objectnav import EnvParams
 from jaxnav.evaluation.statistics import paired_difference
-from jaxnav.policies.acting import Acting, Agent, carried
-from jaxnav.policies.adaptation import WINDOW, FastWeights, LearnedSteps, replay_window
-from jaxnav.policies.learned_loss import Judging
-from jaxnav.policies.methods import Knowledge
-from jaxnav.policies.policy import Params
-from jaxnav.runs.worlds import evaluation_world
+from jaxnav.policies.adaptation import WINDOW, FastWeights, HasLearnedLoss, LearnedLossAdaptation, replay_window
+from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.network import Params
+from jaxnav.runs.evaluate import Results
+from jaxnav.runs.worlds import compile_evaluation_world
 
-EPISODES, STEPS = 64, 60
+NUM_EPISODES = 64
+NUM_STEPS = 60
 
 
 def main() -> None:
@@ -41,54 +43,90 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--episodes", type=int, default=1000)
     options = parser.parse_args()
+
+    # Evaluate without adaptation and with the method's usual number of inner steps.
     run = jaxnav.Run.open(options.run)
-    plain, adapted = (jaxnav.evaluate(run, episodes=options.episodes, inner_steps=steps) for steps in (0, None))
-    clusters, before, after = adapted.episodes.clusters(), plain.metrics(), adapted.metrics()
-    others, differences = {}, {}
-    for i, row in enumerate(adapted.rows):
-        if row.variant == "baseline":
-            ends = [np.stack(jax.tree.leaves(each.outcome._replace(weight=None)))[:, i] for each in (plain, adapted)]
-            others[row.decoding] = round(100.0 * float((ends[0] != ends[1]).any(axis=0).mean()), 1)
-            differences[row.decoding] = {
-                name: f"{paired_difference(before[name][i], after[name][i], clusters, same_runs=True):+.4f}"
-                for name in ("sr", "spl", "dts")
-            }
-    report({"falls": falls(run), "others": others, "adapted": differences})
+    plain = jaxnav.evaluate(run, episodes=options.episodes, inner_steps=0)
+    adapted = jaxnav.evaluate(run, episodes=options.episodes)
+    clusters = adapted.episodes.clusters()
+    plain_metrics = plain.metrics()
+    adapted_metrics = adapted.metrics()
+
+    changed_episodes = {}
+    differences = {}
+    for row_index, row in enumerate(adapted.rows):
+        if row.variant != "baseline":
+            continue
+        plain_outcomes = stack_outcomes(plain, row_index)
+        adapted_outcomes = stack_outcomes(adapted, row_index)
+        is_changed = (plain_outcomes != adapted_outcomes).any(axis=0)
+        changed_episodes[row.decoding] = round(100.0 * float(is_changed.mean()), 1)
+
+        differences[row.decoding] = {}
+        for name in ("sr", "spl", "dts"):
+            difference = paired_difference(
+                plain_metrics[name][row_index], adapted_metrics[name][row_index], clusters, same_runs=True
+            )
+            differences[row.decoding][name] = f"{difference:+.4f}"
+    print_report({"falls": percent_falling(run), "others": changed_episodes, "adapted": differences})
 
 
-def falls(run: jaxnav.Run) -> list[float]:
-    """Return the share of windows whose loss falls, in percent, of each seed."""
-    policies, world = run.policies(), evaluation_world(run.config, "val", None, None, Console(quiet=True))
-    acting = dataclasses.replace(policies.acting(world), setting=None)
-    found = []
-    for seed in range(policies.seeds):
-        weights = jax.tree.map(lambda leaf, seed=seed: leaf[seed], policies.of("baseline"))
-        full, before, after = map(np.asarray, windows(acting, weights, policies.knowledge, world.params(0)))
-        found.append(round(100.0 * float((after < before)[full].mean()), 2))
-    return found
+def stack_outcomes(results: Results, row_index: int) -> np.ndarray:
+    """Return all outcomes of a row but the mean weight, [outcomes, S, E]."""
+    leaves = jax.tree.leaves(results.outcome._replace(mean_weight=None))
+    return np.stack(leaves)[:, row_index]
+
+
+def percent_falling(run: jaxnav.Run) -> list[float]:
+    """Return the percentage of windows whose loss falls, for each seed."""
+    policies = run.policies()
+    world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
+    agent_loop = dataclasses.replace(policies.make_agent_loop(world), estimator=None)
+    arm_params = policies.arm_params("baseline")
+
+    percentages = []
+    for seed in range(policies.num_seeds):
+        weights = jax.tree.map(operator.itemgetter(seed), arm_params)
+        window_losses = measure_windows(agent_loop, weights, policies.knowledge, world.make_env_params(0))
+        is_full, loss_before, loss_after = map(np.asarray, window_losses)
+        percentages.append(round(100.0 * float((loss_after < loss_before)[is_full].mean()), 2))
+    return percentages
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def windows(acting: Acting, weights: Params, knowledge: Knowledge, params: EnvParams) -> tuple[jax.Array, ...]:
-    """Return which windows are full, bool [T, B], and the learned loss of each before and after its step."""
-    policy = acting.bind(weights)
-    adaptation = cast(LearnedSteps, policy.adaptation)
+def measure_windows(
+    agent_loop: AgentLoop, weights: Params, knowledge: Knowledge, params: EnvParams
+) -> tuple[jax.Array, ...]:
+    """Return where windows are full, bool [T, B], and the learned loss of each before and after its inner step."""
+    policy = agent_loop.bind(weights)
+    adaptation = cast(LearnedLossAdaptation, policy.adaptation)
 
-    def loss(fast: FastWeights) -> jax.Array:
-        nothing = {layer: jnp.zeros_like(factors.outputs[:WINDOW]) for layer, factors in fast.factors.items()}
-        return cast(Judging, policy.method).learned_loss(replay_window(policy, fast, nothing)[0])
+    def learned_loss(fast: FastWeights) -> jax.Array:
+        zero_changes = {}
+        for layer, factors in fast.layer_changes.items():
+            zero_changes[layer] = jnp.zeros_like(factors.outputs[:WINDOW])
+        return cast(HasLearnedLoss, policy.method).learned_loss(replay_window(policy, fast, zero_changes)[0])
 
     def step(agent: Agent, key: jax.Array) -> tuple[Agent, tuple[jax.Array, ...]]:
-        memory = carried(agent)
-        decision = policy.decide(policy.pathways(*acting.view(agent, knowledge, params), memory), memory)
-        after, before = decision.fast, decision.fast._replace(factors=memory.fast.factors)
-        choice, keys = jax.random.categorical(key, decision.logits), jax.random.split(key, EPISODES)
-        agent, _ = acting.step(agent, choice, knowledge, params, policy=policy, decision=decision, keys=keys)
-        full = (after.decisions % WINDOW == 0) & (after.decisions <= adaptation.inner_steps * WINDOW)
-        return agent, (full, jax.vmap(loss)(before), jax.vmap(loss)(after))
+        memory = policy_memory(agent)
+        pathways = policy.pathways(*agent_loop.view(agent, knowledge, params), memory)
+        decision = policy.decide(pathways, memory)
 
-    agent = acting.start(jax.random.key(0), EPISODES, policy.initial_memory((EPISODES,)), knowledge, params)
-    return jax.lax.scan(step, agent, jax.random.split(jax.random.key(1), STEPS))[1]
+        # The same window with the weights before and after the inner step.
+        fast_after = decision.fast
+        fast_before = decision.fast._replace(layer_changes=memory.fast.layer_changes)
+        is_complete = fast_after.num_decisions % WINDOW == 0
+        is_adapting = fast_after.num_decisions <= adaptation.inner_steps * WINDOW
+
+        choice = jax.random.categorical(key, decision.logits)
+        keys = jax.random.split(key, NUM_EPISODES)
+        agent, _ = agent_loop.step(agent, choice, knowledge, params, policy=policy, decision=decision, keys=keys)
+        losses = (jax.vmap(learned_loss)(fast_before), jax.vmap(learned_loss)(fast_after))
+        return agent, (is_complete & is_adapting, *losses)
+
+    memory = policy.initial_memory((NUM_EPISODES,))
+    agent = agent_loop.start(jax.random.key(0), NUM_EPISODES, memory, knowledge, params)
+    return jax.lax.scan(step, agent, jax.random.split(jax.random.key(1), NUM_STEPS))[1]
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Seconds to compile every public entry.
 
-`python benchmarks/compile_time.py` prints for each entry its first call less its second, so tracing and lowering are in
-it; `calibrate` and `play` compile anew at every call and their work is short, so theirs is the first call. *Cold* is a
-new process; *cached* is a new process that has JAX's persistent cache (`jax_compilation_cache_dir`) as another one left
-it. Sizes are the defaults of `train.py` and `eval.py`; `train` is the main training step, the compiled chunk of updates
-that `Trainer` runs, for each arm alone and for both, compiled one after the other. The chunk is of 2 updates and one
-seed is trained, so that the calls are short: neither changes the program but for the length of its loop.
+`python benchmarks/compile_time.py` prints for each entry its first call less its second, which includes tracing and
+lowering; `calibrate` and `play` compile at every call and their work is short, so theirs is the first call. *Cold* is a
+new process; *cached* is a new process with JAX's persistent cache (`jax_compilation_cache_dir`) that another process
+has filled. Sizes are the defaults of `train.py` and `eval.py`; `train` is the main training step, the compiled chunk of
+updates that `Trainer` runs, for each arm alone and for both, compiled one after the other. The chunk is of 2 updates
+and one seed is trained, so that the calls are short; both change only the length of the program's loop.
 """
 
 import dataclasses
@@ -21,112 +21,122 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import report, seconds
-from _setup import set_up
+from _common import print_report, time_call
+from _setup import set_up_training
 
-from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.grid import Evaluator, first_states
-from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.evaluation.grid import Evaluator, start_states
+from jaxnav.evaluation.playback import play_episodes
 from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.policy import init_params
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.network import init_params
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.prepare import make_trainer
-from jaxnav.training.calibration import calibrate
-from jaxnav.training.exploration import explore
+from jaxnav.runs.train import make_trainer
+from jaxnav.training.calibration import calibrate, explore
 from jaxnav.training.trainer import Trainer
 
-EPISODES, CHUNK = 2048, 2
+NUM_EPISODES = 2048
+CHUNK = 2
 GOALS = {"train_both_arms_cold_s": 15.0}
 COMPILED_EVERY_TIME = ("calibrate", "play")
 
 
-def entries() -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Yield calls of the entries, prepared when their turn comes."""
-    config = dataclasses.replace(RunConfig(), chunk=CHUNK, seeds=1)
-    setup = set_up(config, explore=False)
-    env, params, setting, knowledge = setup.world.env, setup.params, setup.setting, setup.knowledge
-
-    key = jax.random.key(0)
-    keys = jax.random.split(key, EPISODES)
-    yield "env_reset", partial(jax.jit(jax.vmap(env.reset, (0, None))), keys, params)
-    _, state = jax.vmap(env.reset, (0, None))(keys, params)
-    step = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
-    yield "env_step", partial(step, keys, state, jnp.zeros(EPISODES, jnp.int32), params)
-    yield "explore", partial(jax.jit(explore, static_argnums=0), env, params, key)
-    yield "calibrate", lambda: np.asarray(calibrate(env, params, setup.explored.counts, setting, key).early)
-
-    trainer = setup.trainer
-    yield (
-        "learner_init",
-        partial(jax.jit(trainer.learners["layout"].init), key, params, knowledge),
-    )
-    for name in config.arms:
-        alone = make_trainer(dataclasses.replace(config, arms=(name,)), env, setting, knowledge)
-        yield f"train_{name}", training(alone, params)
-    yield "train_both_arms", training(trainer, params)
-
-    spec = config.policy_spec(len(env.categories))
-    acting = Acting(env, spec, setting)
-    weights = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), init_params(spec, key))
-    rows = [table_row("layout", None, None, "sample"), table_row("stde", 0.5, "residual", "sample")]
-    grid, episodes = inference_grid(rows, config.arms, 1), episode_list(setup.world.banks[0])
-    yield "evaluate", partial(Evaluator(acting), grid, weights, [(episodes, params)], knowledge, key)
-    cell, one = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (grid, weights))
-    start = jax.tree.map(lambda leaf: leaf[:1], first_states(episodes))
-    yield "play", lambda: play(cell, one, start, acting, params, knowledge)[0].action
-
-
-def training(trainer: Trainer, params: Any) -> Callable[[], Any]:
-    """Return a call that trains one more chunk."""
-    kept = [trainer.init(params)]
-
-    def train() -> list[jax.Array]:
-        kept[0], _ = trainer.train(kept[0], params)
-        return [states[0].update for states in kept[0].values()]
-
-    return train
-
-
-def measured() -> dict[str, float]:
-    """Return seconds that each entry takes to compile here."""
-    compiling = {}
-    for name, call in entries():
-        first = seconds(call)
-        again = 0.0 if name in COMPILED_EVERY_TIME else seconds(call)
-        compiling[name] = round(first - again, 2)
-        print(f"{name}: first {first:.2f} s, then {again:.2f} s", file=sys.stderr)
-    return compiling
-
-
-def in_new_process(cache: str | None) -> dict[str, float]:
-    """Measure in a new process that has this compilation cache."""
-    kept = {
-        "JAX_COMPILATION_CACHE_DIR": cache,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-    }
-    command = [sys.executable, __file__, "--measure"]
-    environment = os.environ | (kept if cache else {})
-    return json.loads(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout)
-
-
 def main() -> None:
-    cold = in_new_process(None)
-    with tempfile.TemporaryDirectory() as cache:
-        in_new_process(cache)
-        cached = in_new_process(cache)
-    report(
+    cold = measure_in_new_process(cache_dir=None)
+    with tempfile.TemporaryDirectory() as cache_dir:
+        measure_in_new_process(cache_dir)  # fills the cache
+        cached = measure_in_new_process(cache_dir)
+    print_report(
         {
-            "episodes": EPISODES,
+            "episodes": NUM_EPISODES,
             "goals": GOALS,
             "compile_s": {name: {"cold": cold[name], "cached": cached[name]} for name in cold},
         }
     )
 
 
+def measure_in_new_process(cache_dir: str | None) -> dict[str, float]:
+    """Return the result of `measure` in a new process with this compilation cache."""
+    environment = dict(os.environ)
+    if cache_dir:
+        environment |= {
+            "JAX_COMPILATION_CACHE_DIR": cache_dir,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+    command = [sys.executable, __file__, "--measure"]
+    output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
+    return json.loads(output)
+
+
+def measure() -> dict[str, float]:
+    """Return the seconds that each entry takes to compile in this process."""
+    compile_times = {}
+    for name, call in make_calls():
+        first_time = time_call(call)
+        second_time = 0.0 if name in COMPILED_EVERY_TIME else time_call(call)
+        compile_times[name] = round(first_time - second_time, 2)
+        print(f"{name}: first {first_time:.2f} s, then {second_time:.2f} s", file=sys.stderr)
+    return compile_times
+
+
+def make_calls() -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Yield name and call of every entry; each is prepared when its turn comes."""
+    config = dataclasses.replace(RunConfig(), chunk=CHUNK, seeds=1)
+    setup = set_up_training(config, explore=False)
+    env = setup.world.env
+    params = setup.params
+    estimator_config = setup.estimator_config
+    knowledge = setup.knowledge
+
+    # The environment.
+    key = jax.random.key(0)
+    keys = jax.random.split(key, NUM_EPISODES)
+    yield "env_reset", partial(jax.jit(jax.vmap(env.reset, (0, None))), keys, params)
+    _, state = jax.vmap(env.reset, (0, None))(keys, params)
+    step = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
+    yield "env_step", partial(step, keys, state, jnp.zeros(NUM_EPISODES, jnp.int32), params)
+
+    # Before training.
+    yield "explore", partial(jax.jit(explore, static_argnums=0), env, params, key)
+    yield "calibrate", lambda: np.asarray(calibrate(env, params, setup.exploration.counts, estimator_config, key).early)
+
+    # Training, each arm alone and both.
+    trainer = setup.trainer
+    yield "learner_init", partial(jax.jit(trainer.learners["layout"].init), key, params, knowledge)
+    for arm in config.arms:
+        arm_trainer = make_trainer(dataclasses.replace(config, arms=(arm,)), env, estimator_config, knowledge)
+        yield f"train_{arm}", make_training_call(arm_trainer, params)
+    yield "train_both_arms", make_training_call(trainer, params)
+
+    # Evaluation, of the whole grid and of one episode.
+    spec = config.policy_spec(len(env.categories))
+    agent_loop = AgentLoop(env, spec, estimator_config)
+    weights = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), init_params(spec, key))
+    rows = [table_row("layout", None, None, "sample"), table_row("stde", 0.5, "residual", "sample")]
+    grid = inference_grid(rows, config.arms, 1)
+    episodes = draw_episodes(setup.world.banks[0])
+    yield "evaluate", partial(Evaluator(agent_loop), grid, weights, [(episodes, params)], knowledge, key)
+    first_cell = jax.tree.map(lambda leaf: leaf[0], grid)
+    first_weights = jax.tree.map(lambda leaf: leaf[0], weights)
+    start = jax.tree.map(lambda leaf: leaf[:1], start_states(episodes))
+    yield "play", lambda: play_episodes(first_cell, first_weights, start, agent_loop, params, knowledge)[0].action
+
+
+def make_training_call(trainer: Trainer, params: Any) -> Callable[[], Any]:
+    """Return a call that trains one more chunk."""
+    states = trainer.init(params)
+
+    def train() -> list[jax.Array]:
+        nonlocal states
+        states, _ = trainer.train(states, params)
+        return [arm_states[0].update for arm_states in states.values()]
+
+    return train
+
+
 if __name__ == "__main__":
     if sys.argv[1:] == ["--measure"]:
-        print(json.dumps(measured()))
+        print(json.dumps(measure()))
     else:
         main()

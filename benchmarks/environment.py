@@ -1,4 +1,4 @@
-"""Steps per second of the environment alone, and its limit.
+"""Steps per second of the environment alone, and their upper limit.
 
 In `python benchmarks/environment.py` 2,048 parallel episodes take random actions with auto-reset. They deliver poses
 (by which an update gathers rows again), the last rows, their sum, or all. The limit is a loop that gathers the same
@@ -10,63 +10,76 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from _common import in_turns, rates, ratios, report
+from _common import print_report, ratio_by_turn, steps_per_second, time_in_turns
 
 from jaxnav.env.make import make
 
-EPISODES, STEPS = 2048, 500
+NUM_EPISODES = 2048
+NUM_STEPS = 500
 
+#: By what a step delivers: function of the rows carried so far, the step's rows and poses to the next carry and output.
 KEEP: dict[str, Callable] = {
-    "poses": lambda kept, row, pose: (kept, pose),
-    "last_row": lambda kept, row, pose: (row, None),
-    "sum_of_rows": lambda kept, row, pose: (kept + row, None),
-    "all_rows": lambda kept, row, pose: (kept, row),
+    "poses": lambda carried_row, row, pose: (carried_row, pose),
+    "last_row": lambda carried_row, row, pose: (row, None),
+    "sum_of_rows": lambda carried_row, row, pose: (carried_row + row, None),
+    "all_rows": lambda carried_row, row, pose: (carried_row, row),
 }
 
 
 def main() -> None:
     env, params = make("rooms")
     key = jax.random.key(0)
-    actions = jax.random.randint(key, (STEPS, EPISODES), 0, env.num_actions)
-    observation, start = jax.vmap(env.reset, (0, None))(jax.random.split(key, EPISODES), params)
+    actions = jax.random.randint(key, (NUM_STEPS, NUM_EPISODES), 0, env.num_actions)
+    observation, start = jax.vmap(env.reset, (0, None))(jax.random.split(key, NUM_EPISODES), params)
 
     @partial(jax.jit, static_argnums=(0, 1))
-    def act(keep, keys_first, state, row, actions, params):
-        def split(time):
-            return jax.random.split(jax.random.fold_in(key, time), EPISODES)
+    def act(keep, split_keys_first, state, row, actions, params):
+        def split(time_index):
+            return jax.random.split(jax.random.fold_in(key, time_index), NUM_EPISODES)
 
         def step(carry, inputs):
-            action, keys = inputs
-            keys = keys if keys_first else split(keys)
-            observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, carry[0], action, params)
-            kept, out = KEEP[keep](carry[1], observation.row, state.pose)
-            return (state, kept), out
+            state, carried_row = carry
+            action, step_input = inputs
+            keys = step_input if split_keys_first else split(step_input)
+            observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, state, action, params)
+            carried_row, output = KEEP[keep](carried_row, observation.row, state.pose)
+            return (state, carried_row), output
 
-        keys = jnp.arange(STEPS)
-        return jax.lax.scan(step, (state, row), (actions, jax.vmap(split)(keys) if keys_first else keys))
+        time_indices = jnp.arange(NUM_STEPS)
+        step_inputs = jax.vmap(split)(time_indices) if split_keys_first else time_indices
+        return jax.lax.scan(step, (state, row), (actions, step_inputs))
 
     @partial(jax.jit, static_argnums=0)
     def gather(keep, row, poses, rows):
-        return jax.lax.scan(lambda kept, pose: KEEP[keep](kept, rows[pose], pose), row, poses)
+        return jax.lax.scan(lambda carried_row, pose: KEEP[keep](carried_row, rows[pose], pose), row, poses)
 
+    # The environment, with every kind of output.
+    calls = {}
+    for name in KEEP:
+        calls[f"steps_{name}"] = partial(act, name, False, start, observation.row, actions, params)
+    calls["steps_sum_of_rows_keys_first"] = partial(act, "sum_of_rows", True, start, observation.row, actions, params)
+
+    # The limit: gather the rows of the same poses.
     _, poses = act("poses", False, start, observation.row, actions, params)
-    calls = {f"steps_{name}": partial(act, name, False) for name in KEEP}
-    calls |= {"steps_sum_of_rows_keys_first": partial(act, "sum_of_rows", True)}
-    calls = {name: partial(call, start, observation.row, actions, params) for name, call in calls.items()}
     for name in ("sum_of_rows", "all_rows"):
         calls[f"gather_{name}"] = partial(gather, name, observation.row, poses, params.tables.rows)
-    taken = in_turns(calls)
-    report(
+
+    times = time_in_turns(calls)
+    print_report(
         {
-            "episodes": EPISODES,
-            "steps": STEPS,
+            "episodes": NUM_EPISODES,
+            "steps": NUM_STEPS,
             "row_bytes": env.row_format.num_bytes,
             "table_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)),
-            "steps_per_s": {name: rates(values, EPISODES * STEPS) for name, values in taken.items()},
+            "steps_per_s": {
+                name: steps_per_second(call_times, NUM_EPISODES * NUM_STEPS) for name, call_times in times.items()
+            },
             "over_gather": {
-                "sum_of_rows": ratios(taken["gather_sum_of_rows"], taken["steps_sum_of_rows"]),
-                "sum_of_rows_keys_first": ratios(taken["gather_sum_of_rows"], taken["steps_sum_of_rows_keys_first"]),
-                "all_rows": ratios(taken["gather_all_rows"], taken["steps_all_rows"]),
+                "sum_of_rows": ratio_by_turn(times["gather_sum_of_rows"], times["steps_sum_of_rows"]),
+                "sum_of_rows_keys_first": ratio_by_turn(
+                    times["gather_sum_of_rows"], times["steps_sum_of_rows_keys_first"]
+                ),
+                "all_rows": ratio_by_turn(times["gather_all_rows"], times["steps_all_rows"]),
             },
         }
     )

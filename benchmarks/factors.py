@@ -1,4 +1,4 @@
-"""What a difference between two agents is made of, factor by factor.
+"""Effect of each factor in the difference between two agents.
 
 `python benchmarks/factors.py FACTORS.yaml [FOLDER]` trains agents with some of the factors of the file and evaluates
 them on the same episodes. The effect of a factor is measured alone (on the base), in turn (on the base with all factors
@@ -13,95 +13,116 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from _common import in_folder, report
+from _common import print_report, run_in_folder
 
 import jaxnav
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.statistics import Interval, paired_difference, summary
-from jaxnav.evaluation.variants import Row
-from jaxnav.runs.overlay import apply_values
-from jaxnav.study.codec import to_json
+from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
+from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.runs.config_files import apply_values
+from jaxnav.study.records import to_json
 
 METRICS = ("sr", "spl")
 DECODINGS = ("argmax", "sample")
 
 
-class Scores(NamedTuple):
-    """Hold the results of one agent, float64 [S, E] in percent, by decoding and metric."""
+class AgentScores(NamedTuple):
+    """Results of one agent.
+
+    Attributes:
+      values: by metric and decoding, float64 [S, E] in percent.
+      episodes: the E episodes.
+    """
 
     values: dict[tuple[str, str], np.ndarray]
     episodes: EpisodeList
 
 
-def main(given: Path, folder: Path) -> None:
-    asked = yaml.safe_load(given.read_text())
-    base = apply_values(jaxnav.RunConfig(), asked["base"], given)
-    found = {}
-    for name, changes in asked.get("bases", {"base": {}}).items():
-        found[name] = effects(apply_values(base, changes, given), asked["factors"], folder / name, given)
-        print("\n".join(table(name, found[name])), file=sys.stderr)
-    report(to_json({"asked": asked, "bases": found}))
+def main(factors_file: Path, folder: Path) -> None:
+    settings = yaml.safe_load(factors_file.read_text())
+    default_base = apply_values(jaxnav.RunConfig(), settings["base"], factors_file)
+
+    results = {}
+    for name, changes in settings.get("bases", {"base": {}}).items():
+        base = apply_values(default_base, changes, factors_file)
+        results[name] = measure_effects(base, settings["factors"], folder / name, factors_file)
+        print("\n".join(format_table(name, results[name])), file=sys.stderr)
+    print_report(to_json({"asked": settings, "bases": results}))
 
 
-def effects(base: jaxnav.RunConfig, factors: dict[str, Any], folder: Path, given: Path) -> dict[str, Any]:
-    """Train and evaluate what the factors' effects on a base are made of."""
-    names, trained = list(factors), dict[str, Scores]()
+def measure_effects(
+    base: jaxnav.RunConfig, factors: dict[str, Any], folder: Path, factors_file: Path
+) -> dict[str, Any]:
+    """Train and evaluate the agents whose differences are the effects of the factors on a base."""
+    factor_names = list(factors)
+    scores_by_config = dict[str, AgentScores]()
 
-    def agent(*chosen: str) -> Scores:
+    def score_agent(*names: str) -> AgentScores:
+        """Return the scores of the base with some factors; equal agents are trained once."""
         config = base
-        for name in chosen:
-            config = apply_values(config, factors[name], given)
-        if repr(config) not in trained:
-            trained[repr(config)] = measured(config, folder / ("+".join(chosen) or "base"))
-        return trained[repr(config)]
+        for name in names:
+            config = apply_values(config, factors[name], factors_file)
+        config_text = repr(config)
+        if config_text not in scores_by_config:
+            scores_by_config[config_text] = train_and_score(config, folder / ("+".join(names) or "base"))
+        return scores_by_config[config_text]
 
-    ladder = [agent(*names[:number]) for number in range(len(names) + 1)]
-    found = {}
-    for number, name in enumerate(names):
-        others = agent(*(other for other in names if other != name))
-        found[name] = {
-            "alone": difference(ladder[0], agent(name)),
-            "in turn": difference(ladder[number], ladder[number + 1]),
-            "last": difference(others, ladder[-1]),
+    # The ladder adds one factor after the other to the base.
+    ladder = [score_agent(*factor_names[:count]) for count in range(len(factor_names) + 1)]
+    effects = {}
+    for index, name in enumerate(factor_names):
+        all_others = score_agent(*(other for other in factor_names if other != name))
+        effects[name] = {
+            "alone": score_difference(ladder[0], score_agent(name)),
+            "in turn": score_difference(ladder[index], ladder[index + 1]),
+            "last": score_difference(all_others, ladder[-1]),
         }
-    agents = {name: means(each) for name, each in zip(["base", *names], ladder, strict=True)}
-    return {"agents": agents, "effects": found, "whole": difference(ladder[0], ladder[-1])}
+
+    agents = {name: mean_scores(scores) for name, scores in zip(["base", *factor_names], ladder, strict=True)}
+    return {"agents": agents, "effects": effects, "whole": score_difference(ladder[0], ladder[-1])}
 
 
-def measured(config: jaxnav.RunConfig, folder: Path) -> Scores:
-    """Train an agent and evaluate it; the arm of the layout where there is one."""
+def train_and_score(config: jaxnav.RunConfig, folder: Path) -> AgentScores:
+    """Train and evaluate an agent: the run's last arm, which uses the layout if any does."""
     run = jaxnav.train(dataclasses.replace(config, run_dir=folder))
     results = jaxnav.evaluate(run)
-    metrics, arm = results.metrics(), config.arms[-1]
-    values = {
-        (metric, decoding): 100.0 * metrics[metric][results.rows.index(Row(arm, None, None, decoding))]
-        for metric in METRICS
-        for decoding in DECODINGS
-    }
-    print(folder.name, {key: round(float(each.mean()), 1) for key, each in values.items()}, file=sys.stderr, flush=True)
-    return Scores(values, results.episodes)
+    metrics = results.metrics()
+    arm = config.arms[-1]
+
+    values = {}
+    for metric in METRICS:
+        for decoding in DECODINGS:
+            row_index = results.rows.index(EvaluationRow(arm, None, None, decoding))
+            values[metric, decoding] = 100.0 * metrics[metric][row_index]
+    means = {key: round(float(scores.mean()), 1) for key, scores in values.items()}
+    print(folder.name, means, file=sys.stderr, flush=True)
+    return AgentScores(values, results.episodes)
 
 
-def difference(one: Scores, other: Scores) -> dict[str, Interval]:
-    """Return what the other has more, by metric and decoding."""
-    scenes = one.episodes.clusters()
-    return {" ".join(key): paired_difference(one.values[key], other.values[key], scenes) for key in one.values}
+def score_difference(agent: AgentScores, better_agent: AgentScores) -> dict[str, Interval]:
+    """Return the gain of the second agent over the first, by metric and decoding."""
+    clusters = agent.episodes.clusters()
+    differences = {}
+    for key, values in agent.values.items():
+        differences[" ".join(key)] = paired_difference(values, better_agent.values[key], clusters)
+    return differences
 
 
-def means(agent: Scores) -> dict[str, Interval]:
-    """Return the results of an agent."""
-    scenes = agent.episodes.clusters()
-    return {" ".join(key): summary(values, scenes) for key, values in agent.values.items()}
+def mean_scores(agent: AgentScores) -> dict[str, Interval]:
+    """Return the mean results of an agent, by metric and decoding."""
+    clusters = agent.episodes.clusters()
+    return {" ".join(key): mean_interval(values, clusters) for key, values in agent.values.items()}
 
 
-def table(name: str, found: dict[str, Any]) -> list[str]:
+def format_table(name: str, results: dict[str, Any]) -> list[str]:
     """Return the effects on SR with best actions in Markdown."""
     key = "sr argmax"
     lines = [f"| {name} | alone | in turn | last |", "| --- | ---: | ---: | ---: |"]
-    for factor, by_order in found["effects"].items():
-        lines.append(f"| {factor} | {' | '.join(f'{each[key]:+.1f}' for each in by_order.values())} |")
-    return [*lines, f"| all | | {found['whole'][key]:+.1f} | |"]
+    for factor, effect_by_order in results["effects"].items():
+        cells = [f"{effect[key]:+.1f}" for effect in effect_by_order.values()]
+        lines.append(f"| {factor} | {' | '.join(cells)} |")
+    return [*lines, f"| all | | {results['whole'][key]:+.1f} | |"]
 
 
 if __name__ == "__main__":
-    in_folder(main)
+    run_in_folder(main)

@@ -4,8 +4,8 @@
 own: random steps of the environment alone, the row consumed and not stored, and whole updates of the arm with the
 layout. Peaks are of resident memory, with Python, JAX, its compiler and the scenes. Scenes beyond the default are
 copies of the default bank's tables under indices of their own, which the host holds besides; categories beyond it are
-names that nothing has. `chunks` trains on in one process, whose memory must not grow. Runs stop after three, or once
-they have taken a few seconds: the largest points are timed once, without warm-up.
+names without objects. `chunks` trains on in one process, whose memory must not grow. Timing stops after three runs or a
+few seconds: the largest points are timed once, without warm-up.
 """
 
 import dataclasses
@@ -16,13 +16,12 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import peak_resident_gb, report, seconds, spread
-from _phases import Program, program, update
-from _setup import set_up
+from _common import peak_resident_gb, print_report, summarize, time_call
+from _phases import Program, compile_program, compile_update
+from _setup import TrainingSetup, set_up_training
 
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.scenes.tables.compile import Bank
@@ -35,8 +34,12 @@ AXES = {
     "hidden": (64, 128, 256, 1024),
     "chunks": (4, 40),
 }
-ENVIRONMENTS, STEPS = 2048, 2**20  # of the environment alone: episodes side by side, and steps of a call
-RUNS, ENOUGH_S = 3, 4.0
+# Of the environment alone: parallel episodes, and steps of a call.
+NUM_EPISODES = 2048
+NUM_STEPS = 2**20
+# Timing stops after so many runs or seconds.
+MAX_RUNS = 3
+MAX_SECONDS = 4.0
 
 
 def main() -> None:
@@ -44,96 +47,121 @@ def main() -> None:
     for axis, values in AXES.items():
         for value in values:
             print(f"{axis} {value}", file=sys.stderr, flush=True)
-            done = subprocess.run([sys.executable, __file__, axis, str(value)], stdout=subprocess.PIPE, check=True)
-            points.setdefault(axis, {})[str(value)] = json.loads(done.stdout)
-    report({"arm": ARM, "episodes_of_the_environment_alone": ENVIRONMENTS, **points})
+            command = [sys.executable, __file__, axis, str(value)]
+            completed = subprocess.run(command, stdout=subprocess.PIPE, check=True)
+            points.setdefault(axis, {})[str(value)] = json.loads(completed.stdout)
+    print_report({"arm": ARM, "episodes_of_the_environment_alone": NUM_EPISODES, **points})
 
 
-def point(axis: str, value: int) -> dict:
+def measure_point(axis: str, value: int) -> dict:
     """Return the figures of one point."""
+    config = make_config(axis, value)
+    setup = set_up_training(config, explore=False)
+    if axis == "scenes":
+        bank = repeat_scenes(setup.world.banks[0], value)
+        _, env_params = build_environment(bank, {}, config.train_step_limit)
+        setup = setup._replace(params=env_params)
+    if axis == "chunks":
+        train_chunks(setup, value)
+        return {"peak_resident_gb": peak_resident_gb()}
+
+    table_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(setup.params.tables))
+    figures = {"tables_gb": round(table_bytes / 2**30, 3)}
+
+    # The environment alone, which knows nothing of the hidden size, then whole updates.
+    if axis != "hidden":
+        num_episodes = value if axis == "environments" else NUM_EPISODES
+        walk = compile_walk(setup.world.env, setup.params, num_episodes)
+        figures |= measure_program("environment", walk, NUM_STEPS)
+    update = compile_update(setup, ARM)
+    figures |= measure_program("training", update, config.steps_per_update)
+    return figures | {"gflop_per_update": round(update.flops / 1e9, 1)}
+
+
+def make_config(axis: str, value: int) -> RunConfig:
+    """Return the default run with one setting changed; `scenes` and `chunks` are no settings."""
     config = dataclasses.replace(RunConfig(), arms=(ARM,), seeds=1, chunk=1)
-    categories = (*ITHOR_CATEGORIES, *(f"Unseen{i}" for i in range(len(ITHOR_CATEGORIES), 200)))
     match axis:
         case "environments":
             config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=value))
         case "categories":
+            unseen_categories = [f"Unseen{index}" for index in range(len(ITHOR_CATEGORIES), 200)]
+            categories = (*ITHOR_CATEGORIES, *unseen_categories)
             config = dataclasses.replace(config, worlds=WorldConfig(categories=categories[:value]))
         case "hidden":
             config = dataclasses.replace(config, sizes=dataclasses.replace(config.sizes, hidden=value))
-    setup = set_up(config, explore=False)
-    if axis == "scenes":
-        bank = tiled(setup.world.banks[0], value)
-        setup = setup._replace(params=build(bank, {}, config.train_step_limit)[1])
-    if axis == "chunks":
-        states = setup.trainer.init(setup.params)
-        for _ in range(value):
-            states, _ = setup.trainer.train(states, setup.params)
-        return {"peak_resident_gb": peak_resident_gb()}
-
-    env, params = setup.world.env, setup.params
-    measured = {"tables_gb": round(sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)) / 2**30, 3)}
-    if axis != "hidden":
-        episodes = value if axis == "environments" else ENVIRONMENTS
-        measured |= figures("environment", walking(env, params, episodes), STEPS)
-    learning = update(setup, ARM)
-    measured |= figures("training", learning, config.update_steps)
-    return measured | {"gflop_per_update": round(learning.flops / 1e9, 1)}
+    return config
 
 
-def tiled(bank: Bank, scenes: int) -> Bank:
-    """Repeat a bank's scenes, to so many.
+def train_chunks(setup: TrainingSetup, num_chunks: int) -> None:
+    """Train for some chunks of updates, one after the other."""
+    states = setup.trainer.init(setup.params)
+    for _ in range(num_chunks):
+        states, _ = setup.trainer.train(states, setup.params)
 
-    What the environment does not read is left as it is.
+
+def repeat_scenes(bank: Bank, num_scenes: int) -> Bank:
+    """Return a bank with copies of its scenes.
+
+    Tables that the environment does not read stay as they are.
     """
-    copies = scenes // len(bank.names)
-    shift = (np.arange(copies, dtype=np.int32) * len(bank.ahead)).reshape(-1, 1, 1)
-    names = ("rows", "goal_distance", "num_cells", "goals", "num_goals")
+    num_copies = num_scenes // len(bank.names)
+
+    # The cells of each copy have indices of their own.
+    index_shift = (np.arange(num_copies, dtype=np.int32) * len(bank.ahead)).reshape(-1, 1, 1)
+    repeated = {}
+    for name in ("rows", "goal_distance", "num_cells", "goals", "num_goals"):
+        repeated[name] = np.concatenate([getattr(bank, name)] * num_copies)
     return bank._replace(
-        names=bank.names * copies,
-        room_types=bank.room_types * copies,
-        ahead=(bank.ahead + shift).reshape(-1, bank.ahead.shape[1]),
-        first_cell=(bank.first_cell + shift[..., 0]).reshape(-1),
-        **{name: np.concatenate([getattr(bank, name)] * copies) for name in names},
+        names=bank.names * num_copies,
+        room_types=bank.room_types * num_copies,
+        ahead=(bank.ahead + index_shift).reshape(-1, bank.ahead.shape[1]),
+        first_cell=(bank.first_cell + index_shift[..., 0]).reshape(-1),
+        **repeated,
     )
 
 
-def walking(env: ObjectNav, params: EnvParams, episodes: int) -> Program:
+def compile_walk(env: ObjectNav, params: EnvParams, num_episodes: int) -> Program:
     """Compile random steps that keep a row until the next."""
     key = jax.random.key(0)
-    actions = jax.random.randint(key, (STEPS // episodes, episodes), 0, env.num_actions)
-    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, episodes), params)
+    actions = jax.random.randint(key, (NUM_STEPS // num_episodes, num_episodes), 0, env.num_actions)
+    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, num_episodes), params)
 
     def walk(state, row, actions, params):
         def step(carry, inputs):
-            time, action = inputs
-            keys = jax.random.split(jax.random.fold_in(key, time), episodes)
-            observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, carry[0], action, params)
+            state, _ = carry
+            time_index, action = inputs
+            keys = jax.random.split(jax.random.fold_in(key, time_index), num_episodes)
+            observation, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, state, action, params)
             return (state, observation.row), None
 
         return jax.lax.scan(step, (state, row), (jnp.arange(len(actions)), actions))[0]
 
-    return program(walk, state, observation.row, actions, params)
+    return compile_program(walk, state, observation.row, actions, params)
 
 
-def figures(name: str, program: Program, steps: int) -> dict:
+def measure_program(name: str, program: Program, num_steps: int) -> dict:
     """Return speed, compile time and memory of a program."""
-    taken = [seconds(program.call)]
-    while len(taken) <= RUNS and sum(taken) < ENOUGH_S:
-        taken.append(seconds(program.call))
-    timed = taken[1:] or taken
-    device = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
-    return {
-        f"{name}_steps_per_s": spread([steps / one for one in timed]),
-        f"{name}_runs": len(timed),
+    call_times = [time_call(program.call)]
+    while len(call_times) <= MAX_RUNS and sum(call_times) < MAX_SECONDS:
+        call_times.append(time_call(program.call))
+    timed_runs = call_times[1:] or call_times  # the first warms up, if time allows another
+
+    figures = {
+        f"{name}_steps_per_s": summarize([num_steps / call_time for call_time in timed_runs]),
+        f"{name}_runs": len(timed_runs),
         f"{name}_compile_s": program.compile_s,
         f"{name}_temp_gb": program.temp_gb,
         f"{name}_peak_resident_gb": peak_resident_gb(),
-        **({f"{name}_peak_device_gb": round(device / 2**30, 3)} if device else {}),
     }
+    device_bytes = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    if device_bytes:
+        figures[f"{name}_peak_device_gb"] = round(device_bytes / 2**30, 3)
+    return figures
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        print(json.dumps(point(sys.argv[1], int(sys.argv[2]))))
+        print(json.dumps(measure_point(sys.argv[1], int(sys.argv[2]))))
     else:
         main()

@@ -1,9 +1,9 @@
-"""What a layout is worth to a planner: the same search with and without a prior.
+"""Value of the layout to a planner: the same search with and without a prior.
 
 `python benchmarks/layout_value.py [WORLD or SCENE FILE ...] [--scenes 48] [--episodes 320] [--shift 0]
-[--goals CATEGORY ...]` searches in the
-scenes of generated worlds (all three without arguments) and of scene files. Every scene is searched with a prior fitted
-to the others: the scenes are divided into folds by floor plan, within room types. The detector makes no errors. Rows:
+[--goals CATEGORY ...]` searches in the scenes of generated worlds (all three without arguments) and of scene files.
+Every scene is searched with a prior fitted to other scenes: the scenes are divided into folds by floor plan, within
+room types. The detector makes no errors. Rows:
 
   flat    all sites are equally likely
   places  knows where objects stand at all (on furniture, at walls), but tells no category from another
@@ -20,179 +20,249 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from _common import report
+from _common import print_report
 
-from jaxnav.baselines.layout_model import Glimpse, LayoutModel, detection_counts, detection_rates, fit, flat
-from jaxnav.baselines.planner import Home, Search, search
+from jaxnav.baselines.layout_model import (
+    LayoutModel,
+    SearchSnapshot,
+    detection_counts,
+    detection_rates,
+    fit_layout_model,
+    uniform_layout_model,
+)
+from jaxnav.baselines.planner import PlannerScene, SearchResult, search_for_goal
 from jaxnav.baselines.sites import find_sites
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import EpisodeList, episode_list
-from jaxnav.evaluation.statistics import Clusters, Interval, paired_difference, scene_clusters, summary
-from jaxnav.scenes.lattice import successors
-from jaxnav.scenes.scene import Scene, floor_plan
-from jaxnav.scenes.tables.compile import Bank, compile_scene, join
-from jaxnav.scenes.tables.detector import PERFECT
-from jaxnav.scenes.worlds import WORLDS, World, from_file, generated, shifted, world_named
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference, scene_clusters
+from jaxnav.scenes.lattice import pose_successors
+from jaxnav.scenes.scene import Scene, floor_plan_name
+from jaxnav.scenes.tables.compile import Bank, compile_scene, join_scenes
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
+from jaxnav.scenes.worlds import WORLDS, World, load_scenes, make_generated_scenes, shift_scenes, world_name_of_origin
 
-FOLDS = 4
+NUM_FOLDS = 4
+#: Variants to compare.
 PAIRS = (("flat", "layout"), ("places", "layout"))
 
 
-class Place(NamedTuple):
-    """Hold the scenes of a world, ready to be searched."""
+class SearchWorld(NamedTuple):
+    """Compiled scenes of a world with a list of episodes.
+
+    Attributes:
+      world: rules and step limits.
+      bank: tables of the scenes.
+      planner_scenes: the S scenes as the planner needs them.
+      fold: of every scene, int [S].
+      episodes: the E episodes.
+    """
 
     world: World
     bank: Bank
-    homes: list[Home]
-    fold: np.ndarray  # int [S]
+    planner_scenes: list[PlannerScene]
+    fold: np.ndarray
     episodes: EpisodeList
 
 
-def main(sources: Sequence[str], scenes: int, episodes: int, shift: float, goals: Sequence[str]) -> None:
+def main(sources: Sequence[str], num_scenes: int, num_episodes: int, shift: float, goals: Sequence[str]) -> None:
     results = {}
     for source in sources:
-        results[Path(source).name] = values = measured(prepared(source, scenes, episodes, shift, goals))
-        print(table(Path(source).name, values), file=sys.stderr, flush=True)
-    report({"shift": shift, "goals": list(goals), "worlds": results})
+        name = Path(source).name
+        search_world = compile_search_world(source, num_scenes, num_episodes, shift, goals)
+        results[name] = compare_priors(search_world)
+        print(format_table(name, results[name]), file=sys.stderr, flush=True)
+    print_report({"shift": shift, "goals": list(goals), "worlds": results})
 
 
-def prepared(source: str, most: int, episodes: int, shift: float, goals: Sequence[str]) -> Place:
-    """Compile at most so many scenes, evenly spread over a file.
+# Scenes
 
-    Without goals, those of the world are searched for.
+
+def compile_search_world(
+    source: str, max_scenes: int, num_episodes: int, shift: float, goals: Sequence[str]
+) -> SearchWorld:
+    """Compile scenes and draw episodes.
+
+    Args:
+      source: name of a generated world, or scene file.
+      max_scenes: number of scenes, evenly spread over a file.
+      num_episodes: E.
+      shift: layout shift of the scenes, from 0 to 1.
+      goals: categories to search for; those of the world if empty.
     """
-    every = generated(source, "train", most) if source in WORLDS else from_file(source, None)
-    world = WORLDS[source if source in WORLDS else world_named(every[0].world)]
-    task = dataclasses.replace(world.task, detector=PERFECT, goals=tuple(goals) or world.task.goals)
-    scenes = shifted(every, task, shift)
-    chosen = [scenes[int(i)] for i in np.unique(np.linspace(0, len(scenes) - 1, most).astype(int))]
-    tables = [compile_scene(scene, task) for scene in chosen]
-    bank, kept = join(tables, task), [i for i, table in enumerate(tables) if (table.best_length > 0).any()]
-    homes = [
-        Home(
-            find_sites(chosen[i], task, tables[i].rows),
-            successors(tables[i].ahead, task.rules),
-            tables[i].best_length,
-        )
-        for i in kept
-    ]
-    return Place(world, bank, homes, folds([chosen[i] for i in kept]), episode_list(bank, episodes))
+    if source in WORLDS:
+        all_scenes = make_generated_scenes(source, "train", max_scenes)
+        world = WORLDS[source]
+    else:
+        all_scenes = load_scenes(source, None)
+        world = WORLDS[world_name_of_origin(all_scenes[0].world)]
+    task = dataclasses.replace(world.task, detector=PERFECT_DETECTOR, goals=tuple(goals) or world.task.goals)
+    shifted_scenes = shift_scenes(all_scenes, task, shift)
+
+    indices = np.unique(np.linspace(0, len(shifted_scenes) - 1, max_scenes).astype(int))
+    scenes = [shifted_scenes[int(index)] for index in indices]
+    tables = [compile_scene(scene, task) for scene in scenes]
+    bank = join_scenes(tables, task)
+
+    # As in the bank, scenes without any reachable goal are left out.
+    searchable_scenes = []
+    planner_scenes = []
+    for scene, table in zip(scenes, tables, strict=True):
+        if (table.best_length > 0).any():
+            sites = find_sites(scene, task, table.rows)
+            successors = pose_successors(table.ahead, task.rules)
+            searchable_scenes.append(scene)
+            planner_scenes.append(PlannerScene(sites, successors, table.best_length))
+    return SearchWorld(world, bank, planner_scenes, assign_folds(searchable_scenes), draw_episodes(bank, num_episodes))
 
 
-def folds(scenes: Sequence[Scene]) -> np.ndarray:
-    """Deal floor plans out to the folds, within room types."""
-    dealt: dict[str, dict[str, int]] = {}
+def assign_folds(scenes: Sequence[Scene]) -> np.ndarray:
+    """Return the fold of every scene, int [S]: floor plans are dealt out to the folds within each room type."""
+    fold_by_plan: dict[str, dict[str, int]] = {}
     for scene in scenes:
-        plans = dealt.setdefault(scene.room_type, {})
-        plans.setdefault(floor_plan(scene.name), len(plans) % FOLDS)
-    return np.array([dealt[scene.room_type][floor_plan(scene.name)] for scene in scenes])
+        plans = fold_by_plan.setdefault(scene.room_type, {})
+        plans.setdefault(floor_plan_name(scene.name), len(plans) % NUM_FOLDS)
+    return np.array([fold_by_plan[scene.room_type][floor_plan_name(scene.name)] for scene in scenes])
 
 
-def measured(place: Place) -> dict[str, Any]:
-    """Search with each prior, and compare."""
-    counts = np.stack([detection_counts(home.sites) for home in place.homes])
-    rates = [detection_rates(counts[place.fold != fold].sum(axis=0)) for fold in range(FOLDS)]
-    blank = flat(len(place.bank.task.categories))
-    searches = {"flat": searched(place, rates, [blank] * FOLDS)}
-    scene, clusters = place.episodes.scene, place.episodes.clusters()
-    glimpses = [
-        [glimpse for i in np.flatnonzero(place.fold[scene] != fold) for glimpse in searches["flat"][i].glimpses]
-        for fold in range(FOLDS)
-    ]
+# Searches
+
+
+def compare_priors(search_world: SearchWorld) -> dict[str, Any]:
+    """Search with each prior, and return means and differences with intervals."""
+    episodes = search_world.episodes
+    episode_fold = search_world.fold[episodes.scene]
+
+    # Detection rates of each fold come from the scenes of the other folds.
+    counts = np.stack([detection_counts(planner_scene.sites) for planner_scene in search_world.planner_scenes])
+    rates = []
+    for fold in range(NUM_FOLDS):
+        rates.append(detection_rates(counts[search_world.fold != fold].sum(axis=0)))
+
+    # Searches with a flat belief give the snapshots to which the models of the other folds are fitted.
+    uniform_model = uniform_layout_model(len(search_world.bank.task.categories))
+    flat_searches = run_searches(search_world, rates, [uniform_model] * NUM_FOLDS)
+    snapshots_by_fold = []
+    for fold in range(NUM_FOLDS):
+        snapshots = []
+        for episode_index in np.flatnonzero(episode_fold != fold):
+            snapshots += flat_searches[episode_index].snapshots
+        snapshots_by_fold.append(snapshots)
+
+    searches = {"flat": flat_searches}
     bits = {}
-    for name, relations in (("places", False), ("layout", True)):
-        models = [fit(glimpses[fold], rates[fold], relations=relations) for fold in range(FOLDS)]
-        searches[name] = searched(place, rates, models)
-        bits[name] = [
-            gained(models[fold], rates[fold], glimpse)
-            for fold, one in zip(place.fold[scene], searches["flat"], strict=True)
-            for glimpse in one.glimpses
-        ]
-    measures = {name: measures_of(place, outcomes) for name, outcomes in searches.items()}
+    for name, use_relations in (("places", False), ("layout", True)):
+        models = []
+        for fold in range(NUM_FOLDS):
+            models.append(fit_layout_model(snapshots_by_fold[fold], rates[fold], use_relations=use_relations))
+        searches[name] = run_searches(search_world, rates, models)
+        bits[name] = []
+        for fold, search in zip(episode_fold, flat_searches, strict=True):
+            for snapshot in search.snapshots:
+                bits[name].append(information_gain(models[fold], rates[fold], snapshot))
 
-    def over_scenes(values: np.ndarray, clusters: Clusters) -> dict[str, Any]:
-        return summary(values[None], clusters, trained=False).to_json()
+    # Intervals are over floor plans, for episodes and for the snapshots in them.
+    clusters = episodes.clusters()
+    num_snapshots = [len(search.snapshots) for search in flat_searches]
+    snapshot_episode = np.repeat(np.arange(len(episodes.scene)), num_snapshots)
+    snapshot_clusters = scene_clusters(episodes.floor_plans[snapshot_episode], episodes.room[snapshot_episode])
 
-    of = np.repeat(np.arange(len(scene)), [len(one.glimpses) for one in searches["flat"]])
-    told_in = scene_clusters(place.episodes.plan[of], place.episodes.room[of])
+    def interval_json(values: np.ndarray, clusters: Clusters) -> dict[str, Any]:
+        return mean_interval(values[None], clusters, trained=False).to_json()
+
+    measures = {name: compute_measures(search_world, results) for name, results in searches.items()}
+    variants = {}
+    for name, values_by_measure in measures.items():
+        variants[name] = {measure: interval_json(values, clusters) for measure, values in values_by_measure.items()}
+
+    differences = {}
+    for base, variant in PAIRS:
+        row = {}
+        for measure in measures[base]:
+            base_values = measures[base][measure][None]
+            variant_values = measures[variant][measure][None]
+            row[measure] = paired_difference(base_values, variant_values, clusters, trained=False).to_json()
+        differences[f"{variant} - {base}"] = row
 
     return {
-        "scenes": len(place.homes),
-        "floor_plans": len(set(place.episodes.plan.tolist())),
-        "episodes": len(scene),
-        "best_length": float(place.episodes.best_length.mean()),
-        "variants": {
-            name: {measure: over_scenes(values, clusters) for measure, values in row.items()}
-            for name, row in measures.items()
-        },
-        "bits": {name: over_scenes(np.array(told), told_in) for name, told in bits.items()},
-        "differences": {
-            f"{b} - {a}": {
-                measure: paired_difference(
-                    measures[a][measure][None], measures[b][measure][None], clusters, trained=False
-                ).to_json()
-                for measure in measures[a]
-            }
-            for a, b in PAIRS
-        },
+        "scenes": len(search_world.planner_scenes),
+        "floor_plans": len(set(episodes.floor_plans.tolist())),
+        "episodes": len(episodes.scene),
+        "best_length": float(episodes.best_length.mean()),
+        "variants": variants,
+        "bits": {name: interval_json(np.array(values), snapshot_clusters) for name, values in bits.items()},
+        "differences": differences,
     }
 
 
-def searched(place: Place, rates: Sequence[np.ndarray], models: Sequence[LayoutModel]) -> list[Search]:
-    """Search in every episode with the model of its scene's fold."""
-    episodes, world, bank = place.episodes, place.world, place.bank
-    first = bank.first_cell * bank.task.rules.poses_per_cell
-    found = []
-    starts = zip(*(part.tolist() for part in (episodes.scene, episodes.goal, episodes.pose)), strict=True)
-    for scene, goal, pose in starts:
-        fold = int(place.fold[scene])
-        limit = world.large_step_limit if bank.room_types[scene] == "living_room" else world.step_limit
-        found.append(search(place.homes[scene], rates[fold], models[fold], goal, pose - int(first[scene]), limit))
-    return found
+def run_searches(
+    search_world: SearchWorld, rates: Sequence[np.ndarray], models: Sequence[LayoutModel]
+) -> list[SearchResult]:
+    """Search in every episode with the rates and the model of its scene's fold."""
+    world = search_world.world
+    bank = search_world.bank
+    episodes = search_world.episodes
+    first_pose = bank.first_cell * bank.task.rules.poses_per_cell
+
+    results = []
+    for scene, goal, pose in zip(episodes.scene.tolist(), episodes.goal.tolist(), episodes.pose.tolist(), strict=True):
+        fold = int(search_world.fold[scene])
+        step_limit = world.large_step_limit if bank.room_types[scene] == "living_room" else world.step_limit
+        start = pose - int(first_pose[scene])
+        planner_scene = search_world.planner_scenes[scene]
+        results.append(search_for_goal(planner_scene, rates[fold], models[fold], goal, start, step_limit))
+    return results
 
 
-def gained(model: LayoutModel, rates: np.ndarray, glimpse: Glimpse) -> float:
-    """Return the bits that a model tells of where a goal is.
+def information_gain(model: LayoutModel, rates: np.ndarray, snapshot: SearchSnapshot) -> float:
+    """Return the bits of information about a goal's sites that a model has beyond the flat belief.
 
-    They are those beyond the flat belief, in the mean over the categories that have not been detected; 0 without any.
+    The mean is over the categories that have not been detected; 0 if there are none.
     """
-    there, told = glimpse.sites.objects, []
-    for goal in np.flatnonzero(there.any(axis=1) & ~glimpse.detected):
-        missed = np.log1p(-rates[goal]) @ glimpse.looks
-        with_model = missed + model.scores(int(goal), glimpse.features, glimpse.sites)
-        told.append(share(with_model, there[goal]) - share(missed, there[goal]))
-    return float(np.mean(told)) / np.log(2) if told else 0.0
+    object_sites = snapshot.sites.object_sites
+    gains = []
+    for goal in np.flatnonzero(object_sites.any(axis=1) & ~snapshot.detected):
+        flat_scores = np.log1p(-rates[goal]) @ snapshot.look_counts
+        model_scores = flat_scores + model.scores(int(goal), snapshot.features, snapshot.sites)
+        goal_sites = object_sites[goal]
+        gains.append(log_probability(model_scores, goal_sites) - log_probability(flat_scores, goal_sites))
+    return float(np.mean(gains)) / np.log(2) if gains else 0.0
 
 
-def share(scores: np.ndarray, there: np.ndarray) -> float:
-    """Return the log probability that scores give to some sites."""
-    return float(np.logaddexp.reduce(scores[there]) - np.logaddexp.reduce(scores))
+def log_probability(scores: np.ndarray, sites: np.ndarray) -> float:
+    """Return the log probability that scores give to some of the sites.
+
+    Args:
+      scores: unnormalized log probabilities, [sites].
+      sites: bool [sites].
+    """
+    return float(np.logaddexp.reduce(scores[sites]) - np.logaddexp.reduce(scores))
 
 
-def measures_of(place: Place, searches: Sequence[Search]) -> dict[str, np.ndarray]:
-    """Return SPL, success within limit and budgets, and actions."""
-    success = np.array([one.success for one in searches])
-    length, best = np.array([one.length for one in searches]), place.episodes.best_length
-    budgets = {f"sr_{budget}": 100.0 * (success & (length <= budget)) for budget in place.world.budgets}
-    return {
-        "spl": 100.0 * success * best / np.maximum(length, best),
-        **budgets,
-        "sr": 100.0 * success,
-        "actions": length.astype(float),
-    }
+def compute_measures(search_world: SearchWorld, results: Sequence[SearchResult]) -> dict[str, np.ndarray]:
+    """Return SPL, success within budgets and limit in percent, and actions, each float [E]."""
+    success = np.array([result.success for result in results])
+    length = np.array([result.length for result in results])
+    best_length = search_world.episodes.best_length
+
+    measures: dict[str, np.ndarray] = {"spl": 100.0 * success * best_length / np.maximum(length, best_length)}
+    for budget in search_world.world.budgets:
+        measures[f"sr_{budget}"] = 100.0 * (success & (length <= budget))
+    return measures | {"sr": 100.0 * success, "actions": length.astype(float)}
 
 
-def table(name: str, values: dict[str, Any]) -> str:
+def format_table(name: str, results: dict[str, Any]) -> str:
     """Return the results of a world in Markdown."""
-    measures = list(values["variants"]["flat"])
-    heads = [measure.upper().replace("_", " within ").replace("ACTIONS", "actions") for measure in measures]
-    about = f"{name}: {values['episodes']} episodes, {values['scenes']} scenes, L* {values['best_length']:.1f}"
-    lines = [f"| {about} | {' | '.join(heads)} | bits |", "| --- |" + " ---: |" * (len(heads) + 1)]
-    for label, row in (values["variants"] | values["differences"]).items():
-        sign = "+.1f" if " - " in label else ".1f"
-        told = values["bits"].get(label)
-        cells = [f"{Interval.from_json(row[measure]):{sign}}" for measure in measures]
-        lines.append(f"| {label} | {' | '.join(cells)} | {f'{Interval.from_json(told):+.2f}' if told else ''} |")
+    measures = list(results["variants"]["flat"])
+    headings = [measure.upper().replace("_", " within ").replace("ACTIONS", "actions") for measure in measures]
+    title = f"{name}: {results['episodes']} episodes, {results['scenes']} scenes, L* {results['best_length']:.1f}"
+    lines = [f"| {title} | {' | '.join(headings)} | bits |", "| --- |" + " ---: |" * (len(headings) + 1)]
+
+    for label, row in (results["variants"] | results["differences"]).items():
+        number_format = "+.1f" if " - " in label else ".1f"
+        cells = [f"{Interval.from_json(row[measure]):{number_format}}" for measure in measures]
+        bits = results["bits"].get(label)
+        cells.append(f"{Interval.from_json(bits):+.2f}" if bits else "")
+        lines.append(f"| {label} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -203,8 +273,8 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=320)
     parser.add_argument("--shift", type=float, default=0.0)
     parser.add_argument("--goals", nargs="+", default=())
-    given = parser.parse_args()
+    options = parser.parse_args()
     try:
-        main(given.sources, given.scenes, given.episodes, given.shift, given.goals)
+        main(options.sources, options.scenes, options.episodes, options.shift, options.goals)
     except InputError as error:
         sys.exit(f"error: {error}")

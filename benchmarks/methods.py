@@ -1,9 +1,9 @@
-"""What each method costs.
+"""Training speed and size of each method.
 
 `python benchmarks/methods.py [METHOD ...]` times one update of every stage of the methods (all of this package's unless
 some are named) in turns with ORG's: environment steps per second, learning included, on the default networks, rooms and
-arm `baseline`. Beside them stand parameters of the policy and of its method alone, and lines: of the files that hold
-its experience, tracker, knowledge, adaptation and control, without what these use.
+arm `baseline`. The report adds the numbers of parameters of the policy and of its method alone, and the lines of the
+files that define its experience, tracker, knowledge, adaptation and control.
 """
 
 import dataclasses
@@ -14,47 +14,58 @@ from typing import Any
 
 import jax
 import numpy as np
-from _common import in_turns, rates, ratios, report
-from _phases import program
-from _setup import set_up
+from _common import print_report, ratio_by_turn, steps_per_second, time_in_turns
+from _phases import compile_program
+from _setup import set_up_training
 
+from jaxnav.policies.method import ActionControl
 from jaxnav.policies.methods import METHODS, find_method
-from jaxnav.policies.methods.base import Primitive
 from jaxnav.runs.config import RunConfig, WorldConfig
 
-TURNS, REFERENCE = 5, "org"
+TURNS = 5
+REFERENCE = "org"
 
 
 def main(names: list[str]) -> None:
-    calls, about, steps = {}, {}, RunConfig().update_steps
+    # Compile one update of every stage; the last stage goes by the method's name.
+    calls = {}
+    sizes = {}
     for name in dict.fromkeys([REFERENCE, *(names or METHODS)]):
         config = RunConfig(method=name, arms=("baseline",), seeds=1, worlds=WorldConfig(num_train=16))
-        setup = set_up(config, explore=False)
-        learner, arguments = setup.trainer.learners["baseline"], setup.arguments("baseline")
-        about[name] = size(name, arguments[0].params)
-        for stage, kind in enumerate(config.stages):
-            call = program(dataclasses.replace(learner, stage=kind).update, *arguments).call
-            calls[name if stage == len(config.stages) - 1 else f"{name}, stage {stage + 1}"] = call
-    taken = in_turns(calls, TURNS)
-    rows = {
-        name: {"steps_per_s": rates(seconds, steps), "over_org": ratios(taken[REFERENCE], seconds)}
-        | about.get(name, {})
-        for name, seconds in taken.items()
-    }
-    report({"update_steps": steps, "methods": rows})
+        setup = set_up_training(config, explore=False)
+        learner = setup.trainer.learners["baseline"]
+        arguments = setup.update_arguments("baseline")
+        sizes[name] = measure_size(name, arguments[0].params)
+        for number, stage in enumerate(config.stages, start=1):
+            program = compile_program(dataclasses.replace(learner, stage=stage).update, *arguments)
+            is_last = number == len(config.stages)
+            calls[name if is_last else f"{name}, stage {number}"] = program.call
+
+    times = time_in_turns(calls, TURNS)
+    num_steps = RunConfig().steps_per_update
+    rows = {}
+    for name, call_times in times.items():
+        rows[name] = {
+            "steps_per_s": steps_per_second(call_times, num_steps),
+            "over_org": ratio_by_turn(times[REFERENCE], call_times),
+            **sizes.get(name, {}),
+        }
+    print_report({"update_steps": num_steps, "methods": rows})
 
 
-def size(name: str, params: dict[str, Any]) -> dict[str, int]:
-    """Return parameters and lines of a method."""
-    counts = {part: sum(np.size(leaf) for leaf in jax.tree.leaves(tree)) for part, tree in params.items()}
-    return {"parameters": sum(counts.values()), "of_the_method": counts.get("method", 0), "lines": lines(name)}
+def measure_size(name: str, params: dict[str, Any]) -> dict[str, int]:
+    """Return the numbers of parameters and lines of a method."""
+    counts = {}
+    for part, tree in params.items():
+        counts[part] = sum(np.size(leaf) for leaf in jax.tree.leaves(tree))
+    return {"parameters": sum(counts.values()), "of_the_method": counts.get("method", 0), "lines": count_lines(name)}
 
 
-def lines(name: str) -> int:
-    """Return the lines of the files that are a method's own."""
+def count_lines(name: str) -> int:
+    """Return the number of lines of the files that define a method's own parts."""
     method = find_method(name)
-    parts = [method.experience, method.learn, *map(type, (method.tracker, method.adaptation, method.control))]
-    files = {inspect.getfile(part) for part in parts if part not in (None, type(None), Primitive)}
+    parts = [method.experience, method.learn, type(method.tracker), type(method.adaptation), type(method.control)]
+    files = {inspect.getfile(part) for part in parts if part not in (None, type(None), ActionControl)}
     return sum(Path(file).read_text(encoding="utf-8").count("\n") for file in files)
 
 

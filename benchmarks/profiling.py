@@ -1,9 +1,8 @@
-"""Where the time of one training update goes.
+"""Profile of one training update.
 
 `python benchmarks/profiling.py [ARM]` runs a compiled chunk of updates of one seed under JAX's profiler. Every XLA
 operation of the trace is looked up in the compiled program for its kind, its shape and the part of the program it comes
-from. Milliseconds are of an update: the median of an operation's runs times their number, so that a disturbance of some
-does not count.
+from. Milliseconds are per update: the median of an operation's runs times their number, which is robust to outliers.
 """
 
 import collections
@@ -15,14 +14,17 @@ import sys
 import tempfile
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
-from _common import report, seconds, spread
-from _setup import set_up
+from _common import print_report, summarize, time_call
+from _setup import set_up_training
 
 from jaxnav.runs.config import RunConfig
 
-CHUNK, RUNS, LONGEST = 4, 5, 15
+CHUNK = 4
+NUM_RUNS = 5
+NUM_LISTED = 15
 OPERATION = re.compile(r"\s*(?:ROOT )?%?([\w.\-]+) = (\S+) ([\w\-]+)\(")
 METADATA = re.compile(r'op_name="([^"]*)"')
 
@@ -30,68 +32,96 @@ METADATA = re.compile(r'op_name="([^"]*)"')
 def main() -> None:
     arm = sys.argv[1] if len(sys.argv) > 1 else "layout"
     config = RunConfig(chunk=CHUNK, seeds=1)
-    setup = set_up(config)
-    learner, inputs = setup.trainer.learners[arm], setup.arguments(arm)
-    compiled = jax.jit(partial(learner.train, num_updates=CHUNK)).lower(*inputs).compile()
-    wall = [1e3 * seconds(lambda: compiled(*inputs)) / CHUNK for _ in range(RUNS + 1)][1:]
+    setup = set_up_training(config)
+    learner = setup.trainer.learners[arm]
+    arguments = setup.update_arguments(arm)
+
+    # Time the compiled chunk without the profiler; the first run warms up.
+    compiled = jax.jit(partial(learner.train, num_updates=CHUNK)).lower(*arguments).compile()
+    wall_ms = [1e3 * time_call(lambda: compiled(*arguments)) / CHUNK for _ in range(NUM_RUNS + 1)][1:]
+
+    # Trace one more run.
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
-            jax.block_until_ready(compiled(*inputs))
+            jax.block_until_ready(compiled(*arguments))
         (trace,) = Path(folder).rglob("*.trace.json.gz")
         events = json.loads(gzip.decompress(trace.read_bytes()))["traceEvents"]
-    rows = operations(compiled.as_text() or "", events, config)
-    kinds: collections.Counter[str] = collections.Counter()
-    for one in rows:
-        kinds[one["kind"]] += one["ms"]
-    report(
+
+    rows = list_operations(compiled.as_text() or "", events, config)
+    ms_by_kind: collections.Counter[str] = collections.Counter()
+    for row in rows:
+        ms_by_kind[row["kind"]] += row["ms"]
+    print_report(
         {
             "arm": arm,
-            "wall_ms_per_update": spread(wall),
-            "ms_by_kind": {kind: round(ms, 1) for kind, ms in kinds.most_common()},
-            "longest": rows[:LONGEST],
+            "wall_ms_per_update": summarize(wall_ms),
+            "ms_by_kind": {kind: round(ms, 1) for kind, ms in ms_by_kind.most_common()},
+            "longest": rows[:NUM_LISTED],
         }
     )
 
 
-def operations(program: str, events: list[dict], config: RunConfig) -> list[dict]:
-    """List the operations of a trace, the longest first."""
-    known = {}
-    for line in program.splitlines():
-        if match := OPERATION.match(line):
-            name, shape, operation = match.groups()
-            origin = METADATA.search(line)
-            known[name] = (shape.split("{")[0], operation, origin[1] if origin else "")
-    runs: dict[str, list[float]] = collections.defaultdict(list)
-    for event in events:
-        # Loops and conditions hold other operations, which are there themselves.
-        if event.get("ph") == "X" and known.get(event["name"], ("", "while", ""))[1] not in ("while", "conditional"):
-            runs[event["name"]].append(event["dur"])
-    rows = [
-        {
-            "operation": name,
-            "shape": known[name][0],
-            "kind": kind(known[name][1], name, known[name][2], len(durations) / CHUNK, config),
-            "calls": round(len(durations) / CHUNK),
-            "ms": round(statistics.median(durations) * len(durations) / CHUNK / 1e3, 3),
-        }
-        for name, durations in runs.items()
-    ]
-    return sorted(rows, key=lambda one: -one["ms"])
+class Operation(NamedTuple):
+    """An operation of a compiled program.
 
-
-def kind(operation: str, name: str, origin: str, calls: float, config: RunConfig) -> str:
-    """Say what an operation is for.
-
-    How often it runs tells the loop that it is in.
+    Attributes:
+      shape: of the result, with its dtype.
+      opcode: kind of operation in XLA.
+      origin: path of the JAX operation that it comes from; empty if unknown.
     """
-    backward = "backward" if "transpose(jvp" in origin else "forward"
-    if calls >= config.ppo.minibatches * config.ppo.rollout:
-        return f"loop over steps, {backward}"
-    if calls >= config.ppo.rollout:
+
+    shape: str
+    opcode: str
+    origin: str
+
+
+def list_operations(program_text: str, events: list[dict], config: RunConfig) -> list[dict]:
+    """Return the operations of a trace, the longest first."""
+    # Operations of the program, by name.
+    operations = {}
+    for line in program_text.splitlines():
+        match = OPERATION.match(line)
+        if match:
+            name, shape, opcode = match.groups()
+            metadata = METADATA.search(line)
+            operations[name] = Operation(shape.split("{")[0], opcode, metadata[1] if metadata else "")
+
+    # Durations of their runs, without loops and conditions: the operations in them have events of their own.
+    durations_by_name: dict[str, list[float]] = collections.defaultdict(list)
+    for event in events:
+        if event.get("ph") != "X" or event["name"] not in operations:
+            continue
+        if operations[event["name"]].opcode not in ("while", "conditional"):
+            durations_by_name[event["name"]].append(event["dur"])
+
+    rows = []
+    for name, durations in durations_by_name.items():
+        operation = operations[name]
+        calls_per_update = len(durations) / CHUNK
+        rows.append(
+            {
+                "operation": name,
+                "shape": operation.shape,
+                "kind": classify_operation(name, operation, calls_per_update, config),
+                "calls": round(calls_per_update),
+                "ms": round(statistics.median(durations) * len(durations) / CHUNK / 1e3, 3),
+            }
+        )
+    return sorted(rows, key=lambda row: -row["ms"])
+
+
+def classify_operation(name: str, operation: Operation, calls_per_update: float, config: RunConfig) -> str:
+    """Return the part of the update that an operation belongs to; the number of its calls reveals its loop."""
+    direction = "backward" if "transpose(jvp" in operation.origin else "forward"
+    if calls_per_update >= config.ppo.minibatches * config.ppo.rollout:
+        return f"loop over steps, {direction}"
+    if calls_per_update >= config.ppo.rollout:
         return "rollout"
-    if operation == "dot" or name.startswith("ynn_fusion"):
-        return f"products, {backward}"
-    return "transposed copies" if "copy" in name or "transpose" in name else f"element by element, {backward}"
+    if operation.opcode == "dot" or name.startswith("ynn_fusion"):
+        return f"products, {direction}"
+    if "copy" in name or "transpose" in name:
+        return "transposed copies"
+    return f"element by element, {direction}"
 
 
 if __name__ == "__main__":

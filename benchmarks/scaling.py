@@ -4,13 +4,13 @@
 
 Weak scaling: every device brings as many episodes as the default run has, of one seed of the arm with the layout.
 
-- `processes`: two processes, each held to one core, that train alone (one at a time), apart (both, each for itself),
-  as one run that shares out two seeds, and as one that shares the episodes of a seed, in turns. As one against apart is
-  the price of being one run; apart against alone that of sharing the machine's memory and power. A call does as many
-  updates as the default run's; where episodes are shared, which is slow, it does one.
+- `processes`: two processes, each pinned to one core, that train alone (one at a time), apart (both, each for itself),
+  as one run that divides two seeds, and as one that divides the episodes of a seed, in turns. One run against apart is
+  the cost of being one run; apart against alone that of sharing the machine's memory and power. A call does as many
+  updates as the default run's, and one where episodes are divided, which is slow.
 - `all_reduce`: seconds of a mean over both processes by its bytes, its latency and its bandwidth; with each process
   held to one core (`pinned`), where it takes until the scheduler's next tick, and free to use both.
-- `exchanged`: what one call of either exchanges, counted in the compiled program.
+- `exchanged`: arrays and bytes that one call of either run exchanges, counted in the compiled program.
 - `update`: seconds of its rollout and of its learning (what a second epoch adds) alone; bytes of the parameters and of
   a device's episodes; seconds to join, to compile, to save a checkpoint and to log.
 - `jitter`: seconds of the work between two sums, over and over; spread of their logarithms.
@@ -29,134 +29,170 @@ import time
 from functools import partial
 from pathlib import Path
 
-EPISODES, CALL, TURNS, SUMS, SHORT = 256, 16, 4, 20, 100  # CALL: updates of a call, as in the default run
-BYTES = [2**9, 2**12, 2**14, 2**16, 2**20, 2**24]
+NUM_EPISODES = 256
+#: Updates of a call, as in the default run.
+UPDATES_PER_CALL = 16
+TURNS = 4
+#: Means in a timed call, and bytes of the arrays.
+NUM_MEANS = 20
+MEAN_BYTES = [2**9, 2**12, 2**14, 2**16, 2**20, 2**24]
+#: Short updates that measure the jitter.
+NUM_JITTER_RUNS = 100
+
+# Each process imports JAX only after its cores and devices are set, so imports are in the functions.
 
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        results = pair("process", folder)
-    results["all_reduce"]["free"] = pair("network")
-    simulated = start(["simulated"], flags="--xla_force_host_platform_device_count=4")
-    results["simulated"] = json.loads(simulated.communicate()[0])
+        results = run_pair("process", folder)
+    results["all_reduce"]["free"] = run_pair("network")
+    simulation = start_process(["simulated"], xla_flags="--xla_force_host_platform_device_count=4")
+    results["simulated"] = json.loads(simulation.communicate()[0])
 
-    from _common import report
+    from _common import print_report
 
-    report({"episodes_per_device": EPISODES, "updates_per_call": CALL, **results})
+    print_report({"episodes_per_device": NUM_EPISODES, "updates_per_call": UPDATES_PER_CALL, **results})
 
 
-def pair(role: str, *arguments: str) -> dict:
-    """Return what the first of two processes measures."""
+def run_pair(role: str, *arguments: str) -> dict:
+    """Run two processes and return the measurements of the first."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
     cores = sorted(os.sched_getaffinity(0))
-    both = [start([role, address, index, cores[index], *arguments], address) for index in (0, 1)]
-    said, _ = [process.communicate()[0] for process in both]
-    return json.loads(said.splitlines()[-1])  # gloo speaks first
+    processes = [start_process([role, address, index, cores[index], *arguments], address) for index in (0, 1)]
+    first_output, _ = [process.communicate()[0] for process in processes]
+    return json.loads(first_output.splitlines()[-1])  # gloo prints lines before
 
 
-def start(arguments: list, address: str = "", flags: str = "") -> subprocess.Popen:
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_COORDINATOR_BIND_ADDRESS": address or "127.0.0.1:0"}
+def start_process(arguments: list, address: str = "", xla_flags: str = "") -> subprocess.Popen:
+    """Start this script in a role of `ROLES`."""
+    environment = os.environ | {"XLA_FLAGS": xla_flags, "JAX_COORDINATOR_BIND_ADDRESS": address or "127.0.0.1:0"}
     command = [sys.executable, __file__, *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
-def process(address: str, index: str, core: str, folder: str) -> None:
-    """Be one of two processes; the first one prints."""
+def measure_processes(address: str, index: str, core: str, folder: str) -> None:
+    """Train as one of two processes; the first prints the results."""
     os.sched_setaffinity(0, {int(core)})  # before JAX counts the cores
-    began = time.perf_counter()
-    from _common import in_turns, rates, ratios, spread
-    from _scaling import Training, collectives, local_mesh, log_spread
+    start_time = time.perf_counter()
+    from _common import ratio_by_turn, steps_per_second, summarize, time_in_turns
+    from _scaling import Training, count_collectives, log_spread, make_local_mesh
     from jax.experimental.multihost_utils import sync_global_devices
 
-    from jaxnav.training.devices import Devices, first_process
+    from jaxnav.training.devices import Devices, is_first_process
 
     devices = Devices(address=address, process=int(index), processes=2)
     devices.connect()
-    joining = time.perf_counter() - began
-    trainings = {
-        "alone": Training(local_mesh(), EPISODES, updates=CALL),
-        "apart": Training(local_mesh(), EPISODES, updates=CALL),
-        "shared_seeds": Training(devices.mesh(2, EPISODES, 1), EPISODES, seeds=2, updates=CALL),
-        "shared_episodes": Training(devices.mesh(1, 2 * EPISODES, 1), 2 * EPISODES),
-        "two_epochs_alone": Training(local_mesh(), EPISODES, updates=CALL, epochs=2),
-    }
-    together = trainings["shared_episodes"]
-    compiling = together.seconds()
+    join_s = time.perf_counter() - start_time
 
-    def turn(name: str) -> None:
-        if first_process() or not name.endswith("alone"):
+    # Both processes compile all trainings.
+    trainings = {
+        "alone": Training(make_local_mesh(), NUM_EPISODES, num_updates=UPDATES_PER_CALL),
+        "apart": Training(make_local_mesh(), NUM_EPISODES, num_updates=UPDATES_PER_CALL),
+        "shared_seeds": Training(devices.mesh(2, NUM_EPISODES, 1), NUM_EPISODES, seeds=2, num_updates=UPDATES_PER_CALL),
+        "shared_episodes": Training(devices.mesh(1, 2 * NUM_EPISODES, 1), 2 * NUM_EPISODES),
+        "two_epochs_alone": Training(make_local_mesh(), NUM_EPISODES, num_updates=UPDATES_PER_CALL, epochs=2),
+    }
+    shared_training = trainings["shared_episodes"]
+    first_call_s = shared_training.time_train()
+
+    def train_in_turn(name: str) -> None:
+        # The second process waits while the first trains alone.
+        if is_first_process() or not name.endswith("alone"):
             trainings[name].train()
         sync_global_devices("turn")
 
-    calls = in_turns({name: partial(turn, name) for name in trainings}, TURNS)
-    taken = {name: [one / trainings[name].updates for one in times] for name, times in calls.items()}
-    sums = means(together.mesh)
-    saving, logging = together.save(Path(folder)), together.log(Path(folder))
-    short = Training(local_mesh(), EPISODES // 16, minibatches=1)
-    short.train()  # compiles
-    jitter = [short.seconds() for _ in range(SHORT)]
-    if not first_process():
+    call_times = time_in_turns({name: partial(train_in_turn, name) for name in trainings}, TURNS)
+    update_times = {}
+    for name, times in call_times.items():
+        update_times[name] = [call_time / trainings[name].num_updates for call_time in times]
+
+    # Constants of an update, for `simulate.py`.
+    all_reduce = measure_all_reduce(shared_training.mesh)
+    save_s = shared_training.time_save(Path(folder))
+    log_s = shared_training.time_log(Path(folder))
+    short_training = Training(make_local_mesh(), NUM_EPISODES // 16, minibatches=1)
+    short_training.train()  # compiles
+    jitter = [short_training.time_train() for _ in range(NUM_JITTER_RUNS)]
+    if not is_first_process():
         return
-    update = {name: statistics.median(times) for name, times in taken.items()}
-    as_one = ("shared_seeds", "shared_episodes")
-    steps = {name: trainings[name].steps * (2 if name == "apart" else 1) for name in ("alone", "apart", *as_one)}
+
+    median_update = {name: statistics.median(times) for name, times in update_times.items()}
+    shared = ("shared_seeds", "shared_episodes")
+    rates = {}
+    for name in ("alone", "apart", *shared):
+        num_runs = 2 if name == "apart" else 1
+        rates[name] = steps_per_second(update_times[name], trainings[name].steps_per_update * num_runs)
     results = {
         "processes": {
-            "steps_per_s": {name: rates(taken[name], count) for name, count in steps.items()},
-            "to_apart": {name: ratios(taken["apart"], taken[name]) for name in as_one},
-            "to_alone": {name: ratios(taken["alone"], taken[name]) for name in ("apart", *as_one)},
+            "steps_per_s": rates,
+            "to_apart": {name: ratio_by_turn(update_times["apart"], update_times[name]) for name in shared},
+            "to_alone": {name: ratio_by_turn(update_times["alone"], update_times[name]) for name in ("apart", *shared)},
         },
-        "all_reduce": {"pinned": sums},
-        "exchanged": {name: collectives(trainings[name].program) for name in as_one},
+        "all_reduce": {"pinned": all_reduce},
+        "exchanged": {name: count_collectives(trainings[name].program_text) for name in shared},
         "update": {
-            "rollout_s": round(2 * update["alone"] - update["two_epochs_alone"], 4),
-            "learning_s": round(update["two_epochs_alone"] - update["alone"], 4),
-            **together.sizes(),
-            "join_s": round(joining, 2),
-            "compile_s": round(compiling - update["shared_episodes"], 2),
-            "save_s": round(saving, 3),
-            "log_s": round(logging, 6),
+            "rollout_s": round(2 * median_update["alone"] - median_update["two_epochs_alone"], 4),
+            "learning_s": round(median_update["two_epochs_alone"] - median_update["alone"], 4),
+            **shared_training.count_bytes(),
+            "join_s": round(join_s, 2),
+            "compile_s": round(first_call_s - median_update["shared_episodes"], 2),
+            "save_s": round(save_s, 3),
+            "log_s": round(log_s, 6),
         },
-        "jitter": {"seconds": spread(jitter), "log_standard_deviation": log_spread(jitter)},
+        "jitter": {"seconds": summarize(jitter), "log_standard_deviation": log_spread(jitter)},
     }
     print(json.dumps(results))
 
 
-def means(mesh) -> dict:
-    """Return the seconds of means over a mesh."""
-    from _common import spread
-    from _scaling import all_reduce, line
+def measure_all_reduce(mesh) -> dict:
+    """Return the seconds of means over a mesh by their bytes, with latency and bandwidth."""
+    from _common import summarize
+    from _scaling import fit_latency_and_bandwidth, time_all_reduce
 
-    sums = {size: all_reduce(mesh, size, SUMS) for size in BYTES}
-    return {"seconds": {str(size): spread(times) for size, times in sums.items()}, **line(sums)}
+    times_by_size = {size: time_all_reduce(mesh, size, NUM_MEANS) for size in MEAN_BYTES}
+    seconds = {str(size): summarize(times) for size, times in times_by_size.items()}
+    return {"seconds": seconds, **fit_latency_and_bandwidth(times_by_size)}
 
 
-def network(address: str, index: str, _: str) -> None:
-    """Be one of two processes that only take means."""
+def measure_network(address: str, index: str, _: str) -> None:
+    """Compute means over the mesh as one of two processes, free to use all cores."""
     from jaxnav.training.devices import Devices
 
     devices = Devices(address=address, process=int(index), processes=2)
     devices.connect()
-    print(json.dumps(means(devices.mesh(1, 2, 1))))
+    print(json.dumps(measure_all_reduce(devices.mesh(1, 2, 1))))
 
 
-def simulated() -> None:
-    """Train on 1, 2 and 4 devices of one process."""
-    from _common import in_turns, rates, ratios
+def measure_simulated_devices() -> None:
+    """Train on 1, 2 and 4 simulated devices of one process."""
+    from _common import ratio_by_turn, steps_per_second, time_in_turns
     from _scaling import Training
 
     from jaxnav.training.devices import Devices
 
-    trainings = {n: Training(Devices(count=n).mesh(1, n * EPISODES // 2, 1), n * EPISODES // 2) for n in (1, 2, 4)}
-    taken = in_turns({str(n): training.train for n, training in trainings.items()}, TURNS)
-    results = {name: {"steps_per_s": rates(times, trainings[int(name)].steps)} for name, times in taken.items()}
-    for name in ("2", "4"):
-        results[name]["efficiency_of_the_same_cores"] = ratios([int(name) * one for one in taken["1"]], taken[name])
+    trainings = {}
+    for num_devices in (1, 2, 4):
+        num_episodes = num_devices * NUM_EPISODES // 2
+        trainings[num_devices] = Training(Devices(count=num_devices).mesh(1, num_episodes, 1), num_episodes)
+
+    # All share the same cores, so n devices ideally take n times as long as one.
+    times = time_in_turns({str(num_devices): training.train for num_devices, training in trainings.items()}, TURNS)
+    results = {}
+    for num_devices, training in trainings.items():
+        device_times = times[str(num_devices)]
+        results[str(num_devices)] = {"steps_per_s": steps_per_second(device_times, training.steps_per_update)}
+        if num_devices > 1:
+            ideal_times = [num_devices * seconds for seconds in times["1"]]
+            efficiency = ratio_by_turn(ideal_times, device_times)
+            results[str(num_devices)]["efficiency_of_the_same_cores"] = efficiency
     print(json.dumps(results))
 
 
+#: Functions that a process of this script may run.
+ROLES = {"process": measure_processes, "network": measure_network, "simulated": measure_simulated_devices}
+
 if __name__ == "__main__":
-    role = {"process": process, "network": network, "simulated": simulated}[sys.argv[1]] if len(sys.argv) > 1 else main
+    role = ROLES[sys.argv[1]] if len(sys.argv) > 1 else main
     role(*sys.argv[2:])

@@ -10,48 +10,58 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from _common import in_turns, rates, ratios, report
-from _setup import set_up
+from _common import print_report, ratio_by_turn, steps_per_second, time_in_turns
+from _setup import set_up_training
 
-from jaxnav.env.types import EnvParams
+from jaxnav.env.objectnav import EnvParams
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.prepare import make_trainer
+from jaxnav.runs.train import make_trainer
 from jaxnav.training.trainer import Trainer
 
-ARM, SEEDS, TURNS = "layout", (1, 2, 4, 8), 5
+ARM = "layout"
+NUM_SEEDS = (1, 2, 4, 8)
+TURNS = 5
 GOALS = {"8_seeds_together_over_apart": 0.95}
 
 
 def main() -> None:
     config = dataclasses.replace(RunConfig(), arms=(ARM,), chunk=1)
-    setup = set_up(config)
-    world, params, given = setup.world, setup.params, (setup.setting, setup.knowledge)
-    runs = {seeds: make_trainer(dataclasses.replace(config, seeds=seeds), world.env, *given) for seeds in SEEDS}
-    calls = {f"together {seeds}": training(run, run.init(params), params) for seeds, run in runs.items()}
-    for seed, state in enumerate(runs[SEEDS[-1]].init(params)[ARM]):
-        calls[f"seed {seed}"] = training(runs[1], {ARM: [state]}, params)
-    taken = in_turns(calls, TURNS)
+    setup = set_up_training(config)
+    params = setup.params
+    trainers = {}
+    for num_seeds in NUM_SEEDS:
+        run_config = dataclasses.replace(config, seeds=num_seeds)
+        trainers[num_seeds] = make_trainer(run_config, setup.world.env, setup.estimator_config, setup.knowledge)
+
+    # One call for each number of seeds, and one for each seed of the largest run on its own.
+    calls = {}
+    for num_seeds, trainer in trainers.items():
+        calls[f"together {num_seeds}"] = make_training_call(trainer, trainer.init(params), params)
+    for seed, state in enumerate(trainers[NUM_SEEDS[-1]].init(params)[ARM]):
+        calls[f"seed {seed}"] = make_training_call(trainers[1], {ARM: [state]}, params)
+    times = time_in_turns(calls, TURNS)
 
     results = {}
-    for seeds in SEEDS:
-        together = taken[f"together {seeds}"]
-        alone = [taken[f"seed {seed}"] for seed in range(seeds)]
-        apart = [sum(turn) for turn in zip(*alone, strict=True)]
-        results[str(seeds)] = {
-            "together_steps_per_s": rates(together, seeds * config.update_steps),
-            "apart_steps_per_s": rates(apart, seeds * config.update_steps),
-            "together_over_apart": ratios(apart, together),
+    for num_seeds in NUM_SEEDS:
+        together_times = times[f"together {num_seeds}"]
+        seed_times = [times[f"seed {seed}"] for seed in range(num_seeds)]
+        apart_times = [sum(turn_times) for turn_times in zip(*seed_times, strict=True)]
+        num_steps = num_seeds * config.steps_per_update
+        results[str(num_seeds)] = {
+            "together_steps_per_s": steps_per_second(together_times, num_steps),
+            "apart_steps_per_s": steps_per_second(apart_times, num_steps),
+            "together_over_apart": ratio_by_turn(apart_times, together_times),
         }
-    report({"arm": ARM, "updates_per_call": config.chunk, "goals": GOALS, "seeds": results})
+    print_report({"arm": ARM, "updates_per_call": config.chunk, "goals": GOALS, "seeds": results})
 
 
-def training(run: Trainer, states: Any, params: EnvParams) -> Callable[[], Any]:
+def make_training_call(trainer: Trainer, states: Any, params: EnvParams) -> Callable[[], Any]:
     """Return a call that trains these states one more chunk."""
-    kept = [states]
 
     def train() -> jax.Array:
-        kept[0], _ = run.train(kept[0], params)
-        return kept[0][ARM][0].update
+        nonlocal states
+        states, _ = trainer.train(states, params)
+        return states[ARM][0].update
 
     return train
 

@@ -1,9 +1,9 @@
-"""The cost of 10^11 environment steps on many hosts.
+"""Cost of 10^11 environment steps on many hosts.
 
 `python benchmarks/simulate.py [--document]` computes it for 1 to 1,000 hosts. From the constants that
-benchmarks/scaling.py measured (results/performance/scaling.json) and those stated in `NETWORKS` and `Assumed`, it adds
-up an update, term by term, and simulates a run: noise that makes every sum over the hosts wait for the slowest of them,
-and hosts that fail, after which all start again from the last checkpoint. A host is one process on one core.
+benchmarks/scaling.py measured (results/performance/scaling.json) and those stated in `make_networks` and `Assumptions`,
+it adds up an update, term by term, and simulates a run: noise that makes every sum over the hosts wait for the slowest
+of them, and hosts that fail, after which all start again from the last checkpoint. A host is one process on one core.
 `--document` puts the tables into docs/scaling.md instead of printing JSON.
 """
 
@@ -20,37 +20,45 @@ from jaxnav.runs.config import RunConfig
 
 ROOT = Path(__file__).parents[1]
 MEASURED = "results/performance/scaling.json"
-STEPS, HOSTS = 10**11, (1, 2, 8, 64, 1000)
-DEFAULT = RunConfig()
-UPDATES_PER_SAVE = DEFAULT.chunk * DEFAULT.save_every
-SHARED_EPISODES = 16384  # where the batch does not grow with the hosts
-SAMPLES = 2000  # waits that are drawn
+NUM_STEPS = 10**11
+NUM_HOSTS = (1, 2, 8, 64, 1000)
+DEFAULT_CONFIG = RunConfig()
+UPDATES_PER_SAVE = DEFAULT_CONFIG.chunk * DEFAULT_CONFIG.save_every
+#: Episodes of all hosts if the batch does not grow with their number.
+SHARED_EPISODES = 16384
+#: Waits that are drawn.
+NUM_SAMPLES = 2000
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """Describe a network.
+    """A network between hosts.
 
-    Seconds of one message, bytes per second, and whether a sum goes around in a tree or a ring.
+    Attributes:
+      message_s: seconds of one message.
+      bytes_per_s: bandwidth.
+      tree: whether sums are exchanged along a tree rather than a ring.
     """
 
     message_s: float
     bytes_per_s: float
     tree: bool = False
 
-    def all_reduce(self, hosts: int, size: float) -> tuple[float, float]:
-        """Return the seconds of latency and transfer of a sum."""
-        rounds = 2 * math.ceil(math.log2(hosts)) if self.tree else 2 * (hosts - 1)
-        return rounds * self.message_s, 2 * (hosts - 1) / hosts * size / self.bytes_per_s
+    def all_reduce(self, num_hosts: int, num_bytes: float) -> tuple[float, float]:
+        """Return the seconds of latency and of transfer of a sum."""
+        num_rounds = 2 * math.ceil(math.log2(num_hosts)) if self.tree else 2 * (num_hosts - 1)
+        latency = num_rounds * self.message_s
+        transfer = 2 * (num_hosts - 1) / num_hosts * num_bytes / self.bytes_per_s
+        return latency, transfer
 
 
 @dataclasses.dataclass(frozen=True)
-class Assumed:
-    """Hold what cannot be measured on one machine.
+class Assumptions:
+    """Constants that cannot be measured on one machine.
 
     Attributes:
-      days_between_failures: of one host, in the mean.
-      detect_s: until a silent process is noticed.
+      days_between_failures: mean, of one host.
+      detect_s: seconds until a silent process is noticed.
       disk_bytes_per_s: that all hosts write to the shared file system together.
     """
 
@@ -59,128 +67,162 @@ class Assumed:
     disk_bytes_per_s: float = 1e9
 
 
-def networks(measured: dict) -> dict[str, Network]:
-    """Return the networks: one measured, the others stated.
-
-    The loopback of this machine, Ethernet of 25 Gb/s, and what GPUs have.
-    """
-    line = measured["all_reduce"]["free"]
+def make_networks(measured: dict) -> dict[str, Network]:
+    """Return the measured loopback of this machine, Ethernet of 25 Gb/s, and InfiniBand as between GPUs."""
+    loopback = measured["all_reduce"]["free"]
     return {
-        "loopback, ring": Network(line["latency_s"] / 2, line["bytes_per_s"]),
+        "loopback, ring": Network(loopback["latency_s"] / 2, loopback["bytes_per_s"]),
         "ethernet, ring": Network(30e-6, 2.5e9),
         "ethernet, tree": Network(30e-6, 2.5e9, tree=True),
         "infiniband, tree": Network(5e-6, 20e9, tree=True),
     }
 
 
-def update(measured: dict, network: Network, hosts: int, share: float, generator: np.random.Generator) -> dict:
-    """Return the seconds of each part of an update.
+# The model
 
-    Every host has `share` of the default run's episodes.
+
+def simulate_hosts(measured: dict, network: Network, shared_batch: bool) -> list[dict]:
+    """Return a row for every number of hosts.
+
+    Args:
+      measured: results of benchmarks/scaling.py.
+      network: between the hosts.
+      shared_batch: whether the hosts divide `SHARED_EPISODES`, rather than adding episodes to the batch.
     """
-    alone = measured["update"]
-    rollout, learning = share * alone["rollout_s"], share * alone["learning_s"]
-    sigma = measured["jitter"]["log_standard_deviation"]
-    # Between two minibatches noise slows every host independently, and all wait for the slowest.
-    noise = np.exp(sigma * generator.standard_normal((SAMPLES, hosts)) - sigma**2 / 2)
-    slowest = noise.max(axis=1).mean() / noise.mean()
-    exchanged = measured["exchanged"]["shared_episodes"]["all-reduce"]
-    sums = exchanged["arrays"]
-    latency, transfer = network.all_reduce(hosts, exchanged["bytes"] / sums) if hosts > 1 else (0, 0)
-    saving = alone["save_s"] + hosts * share * alone["agent_bytes"] / Assumed().disk_bytes_per_s
-    return {
-        "rollout": rollout,
-        "learning": learning,
-        "waiting": (slowest - 1) * (rollout + learning),
-        "latency": sums * latency,
-        "transfer": sums * transfer,
-        "checkpoint": saving / UPDATES_PER_SAVE,
-        "log": alone["log_s"],
-    }
+    rng = np.random.default_rng(0)
+    host_episodes = measured["episodes_per_device"]
+    restart_s = Assumptions().detect_s + measured["update"]["join_s"] + measured["update"]["compile_s"]
 
+    rows = []
+    single_host_s = 0.0
+    for num_hosts in NUM_HOSTS:
+        # Share of the measured episodes that each host has; every minibatch needs an episode of every host.
+        share = SHARED_EPISODES / num_hosts / host_episodes if shared_batch else 1.0
+        if share * host_episodes < DEFAULT_CONFIG.ppo.minibatches:
+            break
 
-def run(parts: dict, updates: int, hosts: int, restart_s: float, generator: np.random.Generator) -> tuple[float, int]:
-    """Return the seconds and the failures of a run."""
-    stretch = UPDATES_PER_SAVE * sum(parts.values())  # from checkpoint to checkpoint
-    between = Assumed().days_between_failures * 86400 / hosts
-    stretches = math.ceil(updates / UPDATES_PER_SAVE)
-    # Failures before a stretch is through: each loses what was done of it. Their number is geometric.
-    tries = generator.geometric(math.exp(-stretch / between), stretches)
-    failures = int(tries.sum()) - stretches
-    lost = -between * np.log1p(generator.random(failures) * math.expm1(-stretch / between))  # given that it fails
-    return stretches * stretch + lost.sum() + failures * restart_s, failures
-
-
-def simulate(measured: dict, network: Network, shared_batch: bool) -> list[dict]:
-    """Return a row for every number of hosts."""
-    generator = np.random.default_rng(0)
-    episodes = measured["episodes_per_device"]
-    restart_s = Assumed().detect_s + measured["update"]["join_s"] + measured["update"]["compile_s"]
-    rows, alone = [], 0.0
-    for hosts in HOSTS:
-        share = SHARED_EPISODES / hosts / episodes if shared_batch else 1.0
-        if share * episodes < DEFAULT.ppo.minibatches:
-            break  # less than an episode of each minibatch for a host
-        parts = update(measured, network, hosts, share, generator)
-        steps = hosts * share * episodes * DEFAULT.ppo.rollout
-        updates = math.ceil(STEPS / steps)
-        seconds, failures = run(parts, updates, hosts, restart_s, generator)
-        alone = alone or seconds
-        total = sum(parts.values())
+        parts = estimate_update(measured, network, num_hosts, share, rng)
+        update_s = sum(parts.values())
+        steps_per_update = num_hosts * share * host_episodes * DEFAULT_CONFIG.ppo.rollout
+        num_updates = math.ceil(NUM_STEPS / steps_per_update)
+        run_s, num_failures = simulate_run(update_s, num_updates, num_hosts, restart_s, rng)
+        single_host_s = single_host_s or run_s
         rows.append(
             {
-                "hosts": hosts,
-                "steps_per_update": round(steps),
-                "updates": updates,
-                "update_s": round(total, 4),
-                "share_percent": {name: round(100 * part / total, 2) for name, part in parts.items()},
-                "failures": failures,
-                "days": float(f"{seconds / 86400:.3g}"),
-                "steps_per_s": round(STEPS / seconds),
-                "efficiency": round(alone / seconds / hosts, 3),
+                "hosts": num_hosts,
+                "steps_per_update": round(steps_per_update),
+                "updates": num_updates,
+                "update_s": round(update_s, 4),
+                "share_percent": {name: round(100 * part / update_s, 2) for name, part in parts.items()},
+                "failures": num_failures,
+                "days": float(f"{run_s / 86400:.3g}"),
+                "steps_per_s": round(NUM_STEPS / run_s),
+                "efficiency": round(single_host_s / run_s / num_hosts, 3),
             }
         )
     return rows
 
 
-def results() -> dict:
-    measured = json.loads((ROOT / MEASURED).read_text())
-    known = networks(measured)
+def estimate_update(
+    measured: dict, network: Network, num_hosts: int, share: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Return the seconds of each part of an update, if every host has `share` of the measured episodes."""
+    update = measured["update"]
+    rollout = share * update["rollout_s"]
+    learning = share * update["learning_s"]
+
+    # Between two minibatches noise slows every host independently, and all wait for the slowest.
+    sigma = measured["jitter"]["log_standard_deviation"]
+    noise = np.exp(sigma * rng.standard_normal((NUM_SAMPLES, num_hosts)) - sigma**2 / 2)
+    slowdown = noise.max(axis=1).mean() / noise.mean()
+
+    # Every array is summed over the hosts on its own.
+    all_reduce = measured["exchanged"]["shared_episodes"]["all-reduce"]
+    num_sums = all_reduce["arrays"]
+    latency = 0.0
+    transfer = 0.0
+    if num_hosts > 1:
+        latency, transfer = network.all_reduce(num_hosts, all_reduce["bytes"] / num_sums)
+    save_s = update["save_s"] + num_hosts * share * update["agent_bytes"] / Assumptions().disk_bytes_per_s
     return {
-        "steps": STEPS,
-        "networks": {name: dataclasses.asdict(network) for name, network in known.items()},
-        "assumed": dataclasses.asdict(Assumed()),
-        "batch_grows": {name: simulate(measured, network, False) for name, network in known.items()},
-        "batch_shared": {name: simulate(measured, network, True) for name, network in known.items()},
+        "rollout": rollout,
+        "learning": learning,
+        "waiting": (slowdown - 1) * (rollout + learning),
+        "latency": num_sums * latency,
+        "transfer": num_sums * transfer,
+        "checkpoint": save_s / UPDATES_PER_SAVE,
+        "log": update["log_s"],
     }
 
 
-def table(rows: list[dict]) -> str:
+def simulate_run(
+    update_s: float, num_updates: int, num_hosts: int, restart_s: float, rng: np.random.Generator
+) -> tuple[float, int]:
+    """Return the seconds and the number of failures of a run."""
+    # The run consists of intervals from checkpoint to checkpoint.
+    interval_s = UPDATES_PER_SAVE * update_s
+    num_intervals = math.ceil(num_updates / UPDATES_PER_SAVE)
+    mean_time_to_failure = Assumptions().days_between_failures * 86400 / num_hosts
+
+    # The number of failures before an interval completes is geometric; each loses the time since the checkpoint.
+    attempts = rng.geometric(math.exp(-interval_s / mean_time_to_failure), num_intervals)
+    num_failures = int(attempts.sum()) - num_intervals
+    failure_quantiles = rng.random(num_failures) * math.expm1(-interval_s / mean_time_to_failure)
+    lost_s = -mean_time_to_failure * np.log1p(failure_quantiles)
+    return num_intervals * interval_s + lost_s.sum() + num_failures * restart_s, num_failures
+
+
+def compute_results() -> dict:
+    measured = json.loads((ROOT / MEASURED).read_text())
+    networks = make_networks(measured)
+    return {
+        "steps": NUM_STEPS,
+        "networks": {name: dataclasses.asdict(network) for name, network in networks.items()},
+        "assumed": dataclasses.asdict(Assumptions()),
+        "batch_grows": {name: simulate_hosts(measured, network, False) for name, network in networks.items()},
+        "batch_shared": {name: simulate_hosts(measured, network, True) for name, network in networks.items()},
+    }
+
+
+# The document
+
+
+def format_simulation(rows: list[dict]) -> str:
     """Return a Markdown table of updates and runs."""
-    names = ("rollout", "learning", "waiting", "latency", "transfer", "checkpoint")
-    head = ["hosts", "steps an update", *(f"{name} %" for name in names), "failures", "days", "efficiency"]
-    lines = [" | ".join(head), " | ".join("--:" for _ in head)]
+    parts = ("rollout", "learning", "waiting", "latency", "transfer", "checkpoint")
+    headings = ["hosts", "steps an update", *(f"{part} %" for part in parts), "failures", "days", "efficiency"]
+    lines = [" | ".join(headings), " | ".join("--:" for _ in headings)]
     for row in rows:
-        parts = [f"{row['share_percent'][name]:.1f}" for name in names]
-        numbers = [f"{row['hosts']:,}", f"{row['steps_per_update']:,}", *parts, f"{row['failures']:,}"]
-        lines.append(" | ".join([*numbers, f"{row['days']:,.3g}", f"{row['efficiency']:.2f}"]))
+        shares = [f"{row['share_percent'][part]:.1f}" for part in parts]
+        cells = [f"{row['hosts']:,}", f"{row['steps_per_update']:,}", *shares, f"{row['failures']:,}"]
+        lines.append(" | ".join([*cells, f"{row['days']:,.3g}", f"{row['efficiency']:.2f}"]))
     return "\n".join(f"| {line} |" for line in lines)
 
 
-def measured_table(measured: dict) -> str:
-    """Return Markdown tables of what was measured."""
-    processes, simulated, alone = measured["processes"], measured["simulated"], measured["update"]
-    rates, to_apart, to_alone = (processes[name] for name in ("steps_per_s", "to_apart", "to_alone"))
+def format_measurements(measured: dict) -> str:
+    """Return Markdown tables of the measured constants."""
+    simulated = measured["simulated"]
+    update = measured["update"]
+    rates = measured["processes"]["steps_per_s"]
+    to_apart = measured["processes"]["to_apart"]
+    to_alone = measured["processes"]["to_alone"]
 
     def row(name: str, rate: dict, efficiency: dict | None) -> str:
-        shown = f"{efficiency['median']:.2f} ({efficiency['min']:.2f}-{efficiency['max']:.2f})" if efficiency else ""
-        return f"| {name} | {rate['median']:,.0f} | {shown} |"
+        cell = f"{efficiency['median']:.2f} ({efficiency['min']:.2f}-{efficiency['max']:.2f})" if efficiency else ""
+        return f"| {name} | {rate['median']:,.0f} | {cell} |"
 
-    free, pinned = measured["all_reduce"]["free"], measured["all_reduce"]["pinned"]
+    # Sums over the processes, and exchanges of seeds that are divided over them.
+    free = measured["all_reduce"]["free"]
+    pinned = measured["all_reduce"]["pinned"]
     sums = measured["exchanged"]["shared_episodes"]["all-reduce"]
-    seeds = measured["exchanged"]["shared_seeds"].values()
-    calls, arrays = (sum(kind[unit] for kind in seeds) for unit in ("calls", "arrays"))
-    jitter, megabytes = measured["jitter"]["log_standard_deviation"], free["bytes_per_s"] / 1e6
+    seed_exchanges = measured["exchanged"]["shared_seeds"].values()
+    calls = sum(exchange["calls"] for exchange in seed_exchanges)
+    arrays = sum(exchange["arrays"] for exchange in seed_exchanges)
+    jitter = measured["jitter"]["log_standard_deviation"]
+    join_s = update["join_s"]
+    compile_s = update["compile_s"]
+    save_s = update["save_s"]
+    megabytes = free["bytes_per_s"] / 1e6
     return "\n".join(
         [
             "| weak scaling | steps/s | efficiency |",
@@ -201,33 +243,34 @@ def measured_table(measured: dict) -> str:
             "",
             "| constant | measured |",
             "| :-- | --: |",
-            f"| an update alone: rollout, learning | {alone['rollout_s']:.3f} s, {alone['learning_s']:.3f} s |",
-            f"| parameters | {alone['parameter_bytes']:,} bytes |",
+            f"| an update alone: rollout, learning | {update['rollout_s']:.3f} s, {update['learning_s']:.3f} s |",
+            f"| parameters | {update['parameter_bytes']:,} bytes |",
             f"| sums in an update of one seed | {sums['calls']}, of {sums['arrays']} arrays, {sums['bytes']:,} bytes |",
             f"| exchanges in {measured['updates_per_call']} updates of a seed each | {calls}, of {arrays} arrays |",
             f"| a sum of an array (gloo), each process held to one core | {1e6 * pinned['latency_s']:,.0f} us |",
             f"| the same, free to use both; bandwidth | {1e6 * free['latency_s']:.0f} us, {megabytes:,.0f} MB/s |",
             f"| noise between two minibatches, log-normal sigma | {jitter:.3f} |",
-            f"| join, compile, save | {alone['join_s']:.1f} s, {alone['compile_s']:.1f} s, {alone['save_s']:.2f} s |",
+            f"| join, compile, save | {join_s:.1f} s, {compile_s:.1f} s, {save_s:.2f} s |",
         ]
     )
 
 
-def document(computed: dict) -> None:
+def fill_document(results: dict) -> None:
     """Replace every table of docs/scaling.md that a comment names."""
     path = ROOT / "docs/scaling.md"
     measured = json.loads((ROOT / MEASURED).read_text())
 
-    def fill(match: re.Match) -> str:
+    def make_table(match: re.Match) -> str:
         kind, _, network = match[2].partition(": ")
-        return f"{match[1]}\n{table(computed[kind][network]) if network else measured_table(measured)}\n"
+        table = format_simulation(results[kind][network]) if network else format_measurements(measured)
+        return f"{match[1]}\n{table}\n"
 
-    named = r"(<!-- (measured|batch_\w+: .+?) -->)\n(?:\|.*\n|\n(?=\| constant))*"
-    path.write_text(re.sub(named, fill, path.read_text()))
+    pattern = r"(<!-- (measured|batch_\w+: .+?) -->)\n(?:\|.*\n|\n(?=\| constant))*"
+    path.write_text(re.sub(pattern, make_table, path.read_text()))
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--document"]:
-        document(results())
+        fill_document(compute_results())
     else:
-        print(json.dumps(results(), indent=2))
+        print(json.dumps(compute_results(), indent=2))

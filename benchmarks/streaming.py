@@ -1,4 +1,4 @@
-"""Homes by the ten thousand: compiled, streamed and trained on.
+"""Compiling ten thousand homes, and streaming them into training.
 
 `python benchmarks/streaming.py [HOUSES]` prints the time and the disk that compiling takes, and steps per second of
 training (both arms, one seed each) from the stream against the same training within one bank, chunk by chunk in turns.
@@ -6,64 +6,74 @@ Resident memory is the peak of the whole process. 1,000 houses by default; the c
 """
 
 import dataclasses
+import math
 import sys
 import time
 
 import jax
-from _common import in_turns, peak_resident_gb, rates, ratios, report
+from _common import peak_resident_gb, print_report, ratio_by_turn, steps_per_second, time_in_turns
 from rich.console import Console
 
-from jaxnav.layout import SETTINGS
+from jaxnav.layout import ESTIMATORS
 from jaxnav.runs.config import RunConfig, WorldConfig
-from jaxnav.runs.prepare import explore_world, learn_knowledge, make_trainer
-from jaxnav.runs.worlds import bank_order, read_ahead, training_world
+from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
+from jaxnav.runs.worlds import compile_training_world, draw_bank_order, prefetch_env_params
 from jaxnav.scenes.tables.shards import Shards
 
-TURNS, CHUNK = 7, 8
+TURNS = 7
+CHUNK = 8
 
 
 def main() -> None:
-    houses = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
-    worlds = WorldConfig(num_train=houses, shard_scenes=min(128, -(-houses // 4)))
+    num_houses = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    shard_scenes = min(128, math.ceil(num_houses / 4))  # at least four shards
+    worlds = WorldConfig(num_train=num_houses, shard_scenes=shard_scenes)
     config = dataclasses.replace(RunConfig(), world="houses", seeds=1, chunk=CHUNK, worlds=worlds)
-    began = time.perf_counter()
-    world = training_world(config, Console(stderr=True))
-    compiling = time.perf_counter() - began
+
+    # Compile the houses; rooms are counted in a sample of them.
+    start_time = time.perf_counter()
+    world = compile_training_world(config, Console(stderr=True))
+    compile_s = time.perf_counter() - start_time
     assert isinstance(world.banks, Shards)
-    disk = sum(file.stat().st_size for path in world.banks.paths for file in path.rglob("*"))
-    rooms = sum(len(world.scenes[i].rooms) for i in range(min(houses, 200))) / min(houses, 200)
+    disk_bytes = sum(file.stat().st_size for path in world.banks.paths for file in path.rglob("*"))
+    num_sampled = min(num_houses, 200)
+    rooms_per_house = sum(len(world.scenes[index].rooms) for index in range(num_sampled)) / num_sampled
 
-    began = time.perf_counter()
-    explored = jax.block_until_ready(explore_world(config, world))
-    exploring = time.perf_counter() - began
-    setting = SETTINGS[config.layout.setting]
-    trainer = make_trainer(config, world.env, setting, learn_knowledge(config, world, explored, setting))
-    still = world.params(0)
-    coming = read_ahead(world, bank_order(world, config.seed, TURNS + 1))  # one more for the warm-up
-    states = {name: trainer.init(still) for name in ("in_memory", "streamed")}
+    # Prepare the training.
+    start_time = time.perf_counter()
+    exploration = jax.block_until_ready(explore_world(config, world))
+    explore_s = time.perf_counter() - start_time
+    estimator_config = ESTIMATORS[config.layout.setting]
+    knowledge = learn_knowledge(config, world, exploration, estimator_config)
+    trainer = make_trainer(config, world.env, estimator_config, knowledge)
 
-    def in_memory() -> None:
-        states["in_memory"], _ = trainer.train(states["in_memory"], still)
+    # One training stays within a bank; the other takes the next bank for each chunk, one more for the warm-up.
+    first_params = world.make_env_params(0)
+    next_params = prefetch_env_params(world, draw_bank_order(world, config.seed, TURNS + 1))
+    states = {name: trainer.init(first_params) for name in ("in_memory", "streamed")}
 
-    def streamed() -> None:
-        params = next(coming)
+    def train_in_memory() -> None:
+        states["in_memory"], _ = trainer.train(states["in_memory"], first_params)
+
+    def train_streamed() -> None:
+        params = next(next_params)
         states["streamed"], _ = trainer.train(trainer.restart(states["streamed"], params), params)
 
-    taken = in_turns({"in_memory": in_memory, "streamed": streamed}, TURNS)
-    steps = CHUNK * config.update_steps * len(trainer.learners)
-    report(
+    times = time_in_turns({"in_memory": train_in_memory, "streamed": train_streamed}, TURNS)
+    num_steps = CHUNK * config.steps_per_update * len(trainer.learners)
+    print_report(
         {
-            "houses": houses,
+            "houses": num_houses,
             "shards": len(world.banks),
             "scenes_per_shard": world.num_scenes,
-            "compile_s": round(compiling, 1),
-            "houses_per_s": round(houses / compiling, 1),
-            "disk_gb": round(disk / 1e9, 2),
-            "disk_kb_per_house": round(disk / 1e3 / houses),
-            "disk_kb_per_room": round(disk / 1e3 / houses / rooms),
-            "explore_s": round(exploring, 1),
-            "steps_per_s": {name: rates(seconds, steps) for name, seconds in taken.items()},
-            "streamed_over_in_memory": ratios(taken["in_memory"], taken["streamed"]),
+            "compile_s": round(compile_s, 1),
+            "houses_per_s": round(num_houses / compile_s, 1),
+            "disk_gb": round(disk_bytes / 1e9, 2),
+            "disk_kb_per_house": round(disk_bytes / 1e3 / num_houses),
+            "disk_kb_per_room": round(disk_bytes / 1e3 / num_houses / rooms_per_house),
+            "explore_s": round(explore_s, 1),
+            "steps_per_s": {name: steps_per_second(call_times, num_steps) for name, call_times in times.items()},
+            "streamed_over_in_memory": ratio_by_turn(times["in_memory"], times["streamed"]),
             "peak_resident_gb": peak_resident_gb(),
         }
     )

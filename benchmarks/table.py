@@ -1,9 +1,9 @@
 """Tables of the performance document, from the benchmarks' results.
 
-`python benchmarks/table.py [RESULTS [DOCUMENT]]` fills them. Between `<!-- table NAME -->` and `<!-- end -->` goes what
-RESULTS/NAME.json holds, or with `NAME.key.key` a part of it; a result that is missing is named there. By default from
-results/performance into docs/performance.md; a document that does not exist is made, with a table of every result.
-Charts go to docs/images/performance, or beside such a document.
+`python benchmarks/table.py [RESULTS [DOCUMENT]]` writes a table between each `<!-- table NAME -->` and `<!-- end -->`:
+the contents of RESULTS/NAME.json, or with `NAME.key.key` a part of them; a missing result is named there. By default
+results/performance is read and docs/performance.md written; a document that does not exist is created, with a table of
+every result. Charts go to docs/images/performance, or beside such a document.
 """
 
 import json
@@ -13,10 +13,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from _charts import draw
+from _charts import draw_charts
 
-RESULTS, DOCUMENT, IMAGES = (Path(p) for p in ("results/performance", "docs/performance.md", "docs/images/performance"))
-MARKED = re.compile(r"<!-- table (\S+) -->\n.*?<!-- end -->", re.DOTALL)
+RESULTS = Path("results/performance")
+DOCUMENT = Path("docs/performance.md")
+IMAGES = Path("docs/images/performance")
+TABLE_MARKS = re.compile(r"<!-- table (\S+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
 def main(results: Path = RESULTS, document: Path = DOCUMENT) -> None:
@@ -25,11 +27,11 @@ def main(results: Path = RESULTS, document: Path = DOCUMENT) -> None:
         parts = [f"## {name}\n\n<!-- table {name} -->\n<!-- end -->\n" for name in names]
         document.write_text("\n".join(["# Performance\n", *parts]))
     text = document.read_text()
-    document.write_text(MARKED.sub(lambda mark: filled(mark[1], results), text))
-    draw(results, IMAGES if document == DOCUMENT else document.parent)
+    document.write_text(TABLE_MARKS.sub(lambda match: fill_table(match[1], results), text))
+    draw_charts(results, IMAGES if document == DOCUMENT else document.parent)
 
 
-def filled(name: str, results: Path) -> str:
+def fill_table(name: str, results: Path) -> str:
     """Return one table between its marks."""
     file, *keys = name.split(".")
     path = results / f"{file}.json"
@@ -41,51 +43,54 @@ def filled(name: str, results: Path) -> str:
             part = part[key]
         if not keys:
             part = {key: value for key, value in part.items() if key != "machine"}
-        body = table(part)
+        body = format_table(part)
     return f"<!-- table {name} -->\n{body}\n<!-- end -->"
 
 
-def table(part: Any) -> str:
+def format_table(part: Any) -> str:
     """Return a Markdown table of a result.
 
-    Entries that all have parts are rows with a column for each part, else an entry is a row.
+    If all entries have parts, each is a row with a column for each part; otherwise each leaf is a row.
     """
-    rows = {str(i): row for i, row in enumerate(part, start=1)} if isinstance(part, list) else part
-    if all(isinstance(row, Mapping) and not is_spread(row) for row in rows.values()):
-        flat = {name: dict(leaves(row)) for name, row in rows.items()}
-        columns = list(dict.fromkeys(column for row in flat.values() for column in row))
+    entries = {str(number): entry for number, entry in enumerate(part, start=1)} if isinstance(part, list) else part
+    if all(isinstance(entry, Mapping) and not is_spread(entry) for entry in entries.values()):
+        rows = {name: dict(iterate_leaves(entry)) for name, entry in entries.items()}
     else:
-        flat = {name: {"value": value} for name, value in leaves(rows)}
-        columns = ["value"]
-    head = ["", *(column.replace("_", " ") for column in columns)]
-    lines = [head, ["---"] + ["---:"] * len(columns)]
-    for name, row in flat.items():
-        lines.append([name.replace("_", " "), *(shown(row.get(column)) for column in columns)])
+        rows = {name: {"value": value} for name, value in iterate_leaves(entries)}
+
+    # Columns in the order in which they first occur; a row may lack some.
+    columns = []
+    for row in rows.values():
+        columns += [column for column in row if column not in columns]
+
+    lines = [["", *(column.replace("_", " ") for column in columns)], ["---"] + ["---:"] * len(columns)]
+    for name, row in rows.items():
+        lines.append([name.replace("_", " "), *(format_cell(row.get(column)) for column in columns)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def leaves(part: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield entries by path, spreads and lists as they are."""
+def iterate_leaves(part: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield path and value of all leaves; spreads and lists are leaves."""
     for name, value in part.items():
         if isinstance(value, Mapping) and not is_spread(value):
-            yield from leaves(value, f"{before}{name}: ")
+            yield from iterate_leaves(value, f"{prefix}{name}: ")
         else:
-            yield f"{before}{name}", value
+            yield f"{prefix}{name}", value
 
 
 def is_spread(value: Any) -> bool:
-    """Return whether this is a median with its bounds."""
+    """True for a median with its bounds."""
     return isinstance(value, Mapping) and {"median", "min", "max"} <= set(value)
 
 
-def shown(value: Any) -> str:
-    """Return one cell; a spread as `median (least to greatest)`."""
+def format_cell(value: Any) -> str:
+    """Return one cell; a spread as `median (minimum to maximum)`."""
     if is_spread(value):
-        return f"{shown(value['median'])} ({shown(value['min'])} to {shown(value['max'])})"
+        return f"{format_cell(value['median'])} ({format_cell(value['min'])} to {format_cell(value['max'])})"
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: ""}[value]
     if isinstance(value, list):
-        return ", ".join(shown(item) for item in value)
+        return ", ".join(format_cell(item) for item in value)
     if isinstance(value, int | float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return str(value).replace("|", "\\|")

@@ -1,10 +1,10 @@
-"""Where the seconds of `make run` go.
+"""Seconds of each part of `make run`.
 
 `python benchmarks/time_to_result.py [OVERLAY]` trains the default run, or that of a YAML file laid over it, as
 `train.py` does, and evaluates it as `eval.py` does, each in a process of its own, in a temporary run directory.
-Functions are timed from outside, compilation by JAX's own events; where spans overlap a second belongs to the label
-that stands first in `LABELS`. Training cannot be looked into from outside: it is divided by the rollout's share of an
-update, which is measured afterwards.
+Functions are timed from outside, compilation by JAX's own events; where spans overlap a second belongs to the first
+label in `LABELS`. Training is one compiled program, so its time is divided by the rollout's share of an update, which
+is measured afterwards.
 """
 
 import dataclasses
@@ -18,66 +18,72 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from _common import in_turns, report
-from _phases import phases
-from _setup import set_up
+from _common import print_report, time_in_turns
+from _phases import compile_phases
+from _setup import set_up_training
 from rich.console import Console
 
 import jaxnav.runs.evaluate
 import jaxnav.runs.train
 from jaxnav.evaluation.grid import Evaluator
-from jaxnav.runs.check import check
-from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Run
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import apply_yaml
 from jaxnav.runs.evaluate import Results
-from jaxnav.runs.overlay import apply_yaml
+from jaxnav.runs.run import Run
 from jaxnav.training.trainer import Trainer
 
-#: Owner and name of the functions that each label times.
+#: Owner and name of the functions that are timed under each label.
 TIMED: dict[str, tuple[tuple[Any, str], ...]] = {
-    "scenes": ((jaxnav.runs.train, "training_world"), (jaxnav.runs.evaluate, "evaluation_world")),
+    "scenes": ((jaxnav.runs.train, "compile_training_world"), (jaxnav.runs.evaluate, "compile_evaluation_world")),
     "prior": ((jaxnav.runs.train, "explore_world"),),
-    "calibration": ((jaxnav.runs.train, "calibrate_setting"),),
+    "calibration": ((jaxnav.runs.train, "calibrate_estimator"),),
     "training": ((Trainer, "init"), (Trainer, "train")),
-    "checkpoints": tuple((jaxnav.runs.train, name) for name in ("restore", "save", "export_policy")),
+    "checkpoints": tuple(
+        (jaxnav.runs.train, name) for name in ("restore_checkpoint", "save_checkpoint", "export_policy")
+    ),
     "evaluation": ((Evaluator, "__call__"),),
     "report": (
-        *((jaxnav.runs.evaluate, name) for name in ("oracle_outcome", "build_row", "build_difference", "build_report")),
+        *((jaxnav.runs.evaluate, name) for name in ("run_oracle", "build_row", "build_difference", "build_report")),
         (Results, "write"),
     ),
 }
 LABELS = ("imports", "compile", *TIMED)
 TURNS = 5
+#: Start and end times of the calls under each label.
 Spans = dict[str, list[tuple[float, float]]]
 
 
 def main(options: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        run = str(Path(folder) / "run")
+        run_dir = str(Path(folder) / "run")
         seconds = {
-            "train.py": timed("train.py", [run, *options], Path(folder) / "train.json"),
-            "eval.py": timed("eval.py", [run], Path(folder) / "eval.json"),
+            "train.py": time_command("train.py", [run_dir, *options], Path(folder) / "train.json"),
+            "eval.py": time_command("eval.py", [run_dir], Path(folder) / "eval.json"),
         }
-    share = rollout_share(run_config(*options))
-    training = seconds["train.py"].pop("training")
-    seconds["train.py"] |= {"rollout": round(share * training, 2), "learning": round((1 - share) * training, 2)}
-    wall = {command: round(sum(parts.values()), 2) for command, parts in seconds.items()}
-    report(
+
+    # Divide training into rollout and learning.
+    rollout_share = measure_rollout_share(make_run_config(*options))
+    training_s = seconds["train.py"].pop("training")
+    seconds["train.py"]["rollout"] = round(rollout_share * training_s, 2)
+    seconds["train.py"]["learning"] = round((1 - rollout_share) * training_s, 2)
+
+    wall_s = {command: round(sum(parts.values()), 2) for command, parts in seconds.items()}
+    print_report(
         {
             "options": options,
-            "wall_s": wall | {"both": round(sum(wall.values()), 2)},
-            "rollout_share_of_update": round(share, 3),
+            "wall_s": wall_s | {"both": round(sum(wall_s.values()), 2)},
+            "rollout_share_of_update": round(rollout_share, 3),
             "seconds": seconds,
         }
     )
 
 
-def run_config(overlay: str | None = None) -> RunConfig:
-    return check(apply_yaml(RunConfig(), overlay) if overlay else RunConfig())
+def make_run_config(overlay: str | None = None) -> RunConfig:
+    return check_config(apply_yaml(RunConfig(), overlay) if overlay else RunConfig())
 
 
 def train(run_dir: str, *overlay: str) -> None:
-    config = dataclasses.replace(run_config(*overlay), run_dir=Path(run_dir))
+    config = dataclasses.replace(make_run_config(*overlay), run_dir=Path(run_dir))
     jaxnav.runs.train.train(config, Console(stderr=True))
 
 
@@ -86,64 +92,79 @@ def evaluate(run_dir: str) -> None:
     results.write(Path(run_dir) / "eval-val.json")
 
 
-def timed(command: str, arguments: list[str], target: Path) -> dict[str, float]:
-    """Return the seconds of every label, and of the rest."""
+def time_command(command: str, arguments: list[str], target: Path) -> dict[str, float]:
+    """Run a command in a process of its own, and return the seconds of every label and of the rest."""
     print(command, *arguments, file=sys.stderr, flush=True)
-    began = time.time()
-    process = [sys.executable, __file__, "--timed", command, str(target), str(began), *arguments]
+    start_time = time.time()
+    process = [sys.executable, __file__, "--timed", command, str(target), str(start_time), *arguments]
     subprocess.run(process, check=True, stdout=subprocess.DEVNULL)
-    wall = time.time() - began
-    seconds = {label: taken for label, taken in json.loads(target.read_text()).items() if taken}
-    return {name: round(taken, 2) for name, taken in (seconds | {"other": wall - sum(seconds.values())}).items()}
+    wall_s = time.time() - start_time
+
+    seconds = {label: label_s for label, label_s in json.loads(target.read_text()).items() if label_s}
+    seconds["other"] = wall_s - sum(seconds.values())
+    return {label: round(label_s, 2) for label, label_s in seconds.items()}
 
 
-def run_timed(command: str, target: str, began: str, *arguments: str) -> None:
-    """Run one command here and write where its seconds went.
+def run_timed(command: str, target: str, process_start: str, *arguments: str) -> None:
+    """Run one command in this process and write the seconds of every label.
 
-    The parent started this process at `began`.
+    Args:
+      command: `train.py` or `eval.py`.
+      target: JSON file to write.
+      process_start: time at which the parent started this process.
+      arguments: of the command.
     """
-    spans: Spans = {"imports": [(float(began), time.time())]}
+    spans: Spans = {"imports": [(float(process_start), time.time())]}
 
-    def timer(label: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def add_timer(label: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            began = time.time()
+            start_time = time.time()
             result = function(*args, **kwargs)
-            spans.setdefault(label, []).append((began, time.time()))
+            spans.setdefault(label, []).append((start_time, time.time()))
             return result
 
         return call
 
-    def compiled(event: str, duration_secs: float, **kwargs: str | int) -> None:
+    def on_duration(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
             spans.setdefault("compile", []).append((time.time() - duration_secs, time.time()))
 
-    jax.monitoring.register_event_duration_secs_listener(compiled)
-    for label, places in TIMED.items():
-        for owner, name in places:
-            setattr(owner, name, timer(label, getattr(owner, name)))
-    {"train.py": train, "eval.py": evaluate}[command](*arguments)
-    Path(target).write_text(json.dumps(painted(spans)))
+    # Add the timers, then run the command.
+    jax.monitoring.register_event_duration_secs_listener(on_duration)
+    for label, functions in TIMED.items():
+        for owner, name in functions:
+            setattr(owner, name, add_timer(label, getattr(owner, name)))
+
+    run_command = {"train.py": train, "eval.py": evaluate}[command]
+    run_command(*arguments)
+    Path(target).write_text(json.dumps(attribute_seconds(spans)))
 
 
-def painted(spans: Spans) -> dict[str, float]:
-    """Return the seconds of each label that none before has."""
-    seen: list[tuple[float, float]] = []
-    seconds, before = {}, 0.0
+def attribute_seconds(spans: Spans) -> dict[str, float]:
+    """Return the seconds of each label that are not in a span of an earlier label."""
+    seconds = {}
+    spans_so_far: list[tuple[float, float]] = []
+    total_before = 0.0
     for label in LABELS:
-        seen += spans.get(label, [])
-        total, reached = 0.0, 0.0
-        for start, stop in sorted(seen):
-            total += max(0.0, stop - max(start, reached))
-            reached = max(reached, stop)
-        seconds[label], before = total - before, total
+        # A label adds to the length of the union of all spans.
+        spans_so_far += spans.get(label, [])
+        total = 0.0
+        covered_until = 0.0
+        for start, stop in sorted(spans_so_far):
+            total += max(0.0, stop - max(start, covered_until))
+            covered_until = max(covered_until, stop)
+        seconds[label] = total - total_before
+        total_before = total
     return seconds
 
 
-def rollout_share(config: RunConfig) -> float:
+def measure_rollout_share(config: RunConfig) -> float:
     """Return the rollout's share of the arms' updates."""
-    taken = in_turns({name: program.call for name, program in phases(set_up(config)).items()}, TURNS)
-    rolling = sum(min(seconds) for name, seconds in taken.items() if name.endswith("rollout"))
-    return rolling / sum(min(seconds) for name, seconds in taken.items() if name.endswith("update"))
+    programs = compile_phases(set_up_training(config))
+    times = time_in_turns({name: program.call for name, program in programs.items()}, TURNS)
+    rollout_s = sum(min(call_times) for name, call_times in times.items() if name.endswith("rollout"))
+    update_s = sum(min(call_times) for name, call_times in times.items() if name.endswith("update"))
+    return rollout_s / update_s
 
 
 if __name__ == "__main__":

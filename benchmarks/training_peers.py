@@ -2,12 +2,12 @@
 
 `python benchmarks/training_peers.py` prints steps per second. jaxnav's learner, rejax's PPO (feed-forward) and a
 recurrent PPO in purejaxrl's style train the same network on the same rooms with the same episodes, rollout, epochs,
-minibatches and losses. Each is a process of its own that compiles first and then trains for some whole updates when its
-turn comes (A B A B), going on from where it was; the success of the episodes of its last turn shows that it learns.
-rejax lives in a virtual environment of its own, made on first use. Takes about four minutes.
+minibatches and losses. Each is a process of its own that compiles first, then trains for some whole updates in each of
+its turns (A B A B) and continues where it stopped; the success of the episodes of its last turn shows that it learns.
+rejax has a virtual environment of its own, created on first use. The benchmark takes about four minutes.
 
-jaxnav and purejaxrl's style also differentiate through time, rejax does not. rejax wants two networks: `rejax, two
-torsos` uses it as it is meant, `rejax, linear critic` gives it no more floating-point work than jaxnav has.
+jaxnav and purejaxrl's style also differentiate through time, rejax does not. rejax needs two networks: `rejax, two
+torsos` is its intended use, `rejax, linear critic` gives it no more floating-point work than jaxnav has.
 """
 
 import json
@@ -16,79 +16,126 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from _common import TUNED_ALLOCATOR, in_turns, rates, ratios, report
+from _common import TUNED_ALLOCATOR, print_report, ratio_by_turn, steps_per_second, time_in_turns
 
 from jaxnav.training.config import PPOConfig
 
-HERE = Path(__file__).parent
-PEERS = HERE.parent / ".cache" / "peers"
+FOLDER = Path(__file__).parent
+REJAX_DIR = FOLDER.parent / ".cache" / "peers" / "rejax"
 PINNED = ("rejax==0.1.3", "gymnax==0.0.9", "jax==0.10.2", "jaxlib==0.10.2", "flax==0.12.8")
 TURNS = 5
-OURS, DEFAULT = "jaxnav, baseline", "jaxnav, the default run"
-REJAX, LEAN, RECURRENT = "rejax, two torsos", "rejax, linear critic", "purejaxrl style"
+
+# Names of the trainers.
+JAXNAV_BASELINE = "jaxnav, baseline"
+JAXNAV_DEFAULT = "jaxnav, the default run"
+REJAX_TWO_TORSOS = "rejax, two torsos"
+REJAX_LINEAR_CRITIC = "rejax, linear critic"
+PUREJAXRL_STYLE = "purejaxrl style"
+
+#: Script of each trainer, and its first argument.
 SCRIPTS = {
-    OURS: ("_jaxnav_worker.py", "baseline"),
-    DEFAULT: ("_jaxnav_worker.py", "layout"),
-    REJAX: ("_rejax_worker.py", "torso"),
-    LEAN: ("_rejax_worker.py", "linear"),
-    RECURRENT: ("_purejaxrl_style.py",),
+    JAXNAV_BASELINE: ("_jaxnav_worker.py", "baseline"),
+    JAXNAV_DEFAULT: ("_jaxnav_worker.py", "layout"),
+    REJAX_TWO_TORSOS: ("_rejax_worker.py", "torso"),
+    REJAX_LINEAR_CRITIC: ("_rejax_worker.py", "linear"),
+    PUREJAXRL_STYLE: ("_purejaxrl_style.py",),
 }
-#: Allocator, epochs, minibatches, updates of one turn, trainers.
+
+
+class Case(NamedTuple):
+    """A comparison of trainers.
+
+    Attributes:
+      allocator: `default` or `tuned`.
+      epochs, minibatches: of an update.
+      num_updates: of one turn.
+      trainers: names of the trainers.
+    """
+
+    allocator: str
+    epochs: int
+    minibatches: int
+    num_updates: int
+    trainers: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        return f"epochs {self.epochs}, minibatches {self.minibatches}, {self.allocator} allocator"
+
+
+#: The default run learns in another way, so it is compared once.
+COMPARABLE = (JAXNAV_BASELINE, REJAX_TWO_TORSOS, REJAX_LINEAR_CRITIC, PUREJAXRL_STYLE)
 CASES = (
-    ("default", 1, 8, 16, tuple(SCRIPTS)),
-    ("tuned", 1, 8, 16, (OURS, REJAX, LEAN, RECURRENT)),
-    ("default", 4, 8, 6, (OURS, REJAX, LEAN, RECURRENT)),
+    Case("default", epochs=1, minibatches=8, num_updates=16, trainers=tuple(SCRIPTS)),
+    Case("tuned", epochs=1, minibatches=8, num_updates=16, trainers=COMPARABLE),
+    Case("default", epochs=4, minibatches=8, num_updates=6, trainers=COMPARABLE),
 )
+#: Ratio of our speed to that of rejax that we want to reach.
 GOAL = 1.5
 
 
-class Trainer:
-    """Run a trainer as a process that answers with `words`."""
+class TrainerProcess:
+    """A trainer in a process of its own.
 
-    def __init__(self, name: str, allocator: str, *settings: int) -> None:
-        script, *kind = SCRIPTS[name]
-        python = PEERS / "rejax" / "bin" / "python" if name in (REJAX, LEAN) else sys.executable
-        kept = {key: value for key, value in os.environ.items() if key not in TUNED_ALLOCATOR}
+    Attributes:
+      answers: all that the process has answered, the latest value of each key.
+    """
+
+    def __init__(self, name: str, case: Case) -> None:
+        script, *script_arguments = SCRIPTS[name]
+        is_rejax = name in (REJAX_TWO_TORSOS, REJAX_LINEAR_CRITIC)
+        python = REJAX_DIR / "bin" / "python" if is_rejax else sys.executable
+        settings = map(str, (case.epochs, case.minibatches, case.num_updates))
+
+        environment = {key: value for key, value in os.environ.items() if key not in TUNED_ALLOCATOR}
+        environment["PYTHONPATH"] = str(FOLDER.parent)
+        if case.allocator == "tuned":
+            environment |= TUNED_ALLOCATOR
+
         self._process = subprocess.Popen(
-            [python, HERE / script, *kind, *map(str, settings)],
-            env=kept | {"PYTHONPATH": str(HERE.parent)} | (TUNED_ALLOCATOR if allocator == "tuned" else {}),
+            [python, FOLDER / script, *script_arguments, *settings],
+            env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.words = {}
+        self.answers = {}
 
     def train(self) -> None:
         """Train for one turn."""
         print("train", file=self._process.stdin, flush=True)
-        self.listen()
+        self.read_answer()
 
-    def listen(self) -> None:
-        """Wait for its next words."""
+    def read_answer(self) -> None:
+        """Wait for the next answer."""
         assert self._process.stdout is not None
-        self.words |= json.loads(self._process.stdout.readline())
+        self.answers |= json.loads(self._process.stdout.readline())
 
     def close(self) -> None:
         self._process.communicate()
 
 
 def main() -> None:
-    install()
-    cases = {}
-    for allocator, epochs, minibatches, updates, names in CASES:
-        case = f"epochs {epochs}, minibatches {minibatches}, {allocator} allocator"
-        print(case, file=sys.stderr, flush=True)
-        cases[case] = compare(allocator, epochs, minibatches, updates, names)
-    by_what = {
-        what: {case: results[what] for case, results in cases.items()} for what in ("steps_per_s", "ratios", "trainers")
-    }
-    reached = {
-        case: {peer: ratio[f"{OURS} / {peer}"]["median"] >= GOAL for peer in (REJAX, LEAN)}
-        for case, ratio in by_what["ratios"].items()
-    }
+    install_rejax()
+    results = {}
+    for case in CASES:
+        print(case.title, file=sys.stderr, flush=True)
+        results[case.title] = compare_trainers(case)
+
+    # The report groups the results of all cases by kind.
+    results_by_kind = {}
+    for kind in ("steps_per_s", "ratios", "trainers"):
+        results_by_kind[kind] = {title: case_results[kind] for title, case_results in results.items()}
+    goal_reached = {}
+    for title, ratios in results_by_kind["ratios"].items():
+        goal_reached[title] = {}
+        for peer in (REJAX_TWO_TORSOS, REJAX_LINEAR_CRITIC):
+            goal_reached[title][peer] = ratios[f"{JAXNAV_BASELINE} / {peer}"]["median"] >= GOAL
+
     config = PPOConfig()
-    report(
+    print_report(
         {
             "world": "rooms",
             "episodes": config.num_envs,
@@ -99,40 +146,46 @@ def main() -> None:
             "differs": {
                 "rejax": "no memory, no backpropagation through time; minibatches over steps; two optimisers; clips "
                 "the value loss, and gradients by element; an episode cut at its step limit counts as ended",
-                RECURRENT: "one more bias in its recurrent cell; an episode cut at its step limit counts as ended",
-                DEFAULT: "also estimates the layout and distils the counterfactual branch",
+                PUREJAXRL_STYLE: "one more bias in its recurrent cell; "
+                "an episode cut at its step limit counts as ended",
+                JAXNAV_DEFAULT: "also estimates the layout and distils the counterfactual branch",
             },
             "not_installable": {"XLand-MiniGrid's trainer": "not in its package, only in its repository"},
-            **by_what,
-            "goal": {"at_least": GOAL, "reached": reached},
+            **results_by_kind,
+            "goal": {"at_least": GOAL, "reached": goal_reached},
         }
     )
 
 
-def compare(allocator: str, epochs: int, minibatches: int, updates: int, names: tuple[str, ...]) -> dict:
-    """Time trainers in turns, and compare the first with each."""
-    trainers = {name: Trainer(name, allocator, epochs, minibatches, updates) for name in names}
-    for trainer in trainers.values():
-        trainer.listen()  # until it has compiled
-    taken = in_turns({name: trainer.train for name, trainer in trainers.items()}, TURNS)
-    for trainer in trainers.values():
-        trainer.close()
+def compare_trainers(case: Case) -> dict:
+    """Time trainers in turns, and compare jaxnav's with each."""
+    processes = {name: TrainerProcess(name, case) for name in case.trainers}
+    for process in processes.values():
+        process.read_answer()  # once compiled
+    times = time_in_turns({name: process.train for name, process in processes.items()}, TURNS)
+    for process in processes.values():
+        process.close()
+
     config = PPOConfig()
-    steps = updates * config.num_envs * config.rollout
-    about = {"updates_per_turn": updates, "steps_trained": (TURNS + 1) * steps}
+    num_steps = case.num_updates * config.num_envs * config.rollout
+    trainers: dict[str, Any] = {"updates_per_turn": case.num_updates, "steps_trained": (TURNS + 1) * num_steps}
+    trainers |= {name: process.answers for name, process in processes.items()}
+    ratios = {}
+    for name in case.trainers:
+        if name != JAXNAV_BASELINE:
+            ratios[f"{JAXNAV_BASELINE} / {name}"] = ratio_by_turn(times[name], times[JAXNAV_BASELINE])
     return {
-        "steps_per_s": {name: rates(taken[name], steps) for name in names},
-        "trainers": about | {name: trainer.words for name, trainer in trainers.items()},
-        "ratios": {f"{OURS} / {name}": ratios(taken[name], taken[OURS]) for name in names if name != OURS},
+        "steps_per_s": {name: steps_per_second(times[name], num_steps) for name in case.trainers},
+        "trainers": trainers,
+        "ratios": ratios,
     }
 
 
-def install() -> None:
+def install_rejax() -> None:
     """Install rejax in a virtual environment of its own."""
-    home = PEERS / "rejax"
-    if not home.exists():
-        venv.create(home, with_pip=True)
-        command = [home / "bin" / "python", "-m", "pip", "install", "--quiet", *PINNED]
+    if not REJAX_DIR.exists():
+        venv.create(REJAX_DIR, with_pip=True)
+        command = [REJAX_DIR / "bin" / "python", "-m", "pip", "install", "--quiet", *PINNED]
         subprocess.run(command, check=True, stdout=sys.stderr)
 
 

@@ -1,61 +1,78 @@
-"""How much of the processor training uses.
+"""Share of the processor's peak that training uses.
 
 `python benchmarks/utilisation.py` prints floating-point operations of the matrix products of one default update per
 second, over the rate of a bare product of 1,024 x 1,024 matrices in the same turns: float32, and bfloat16 inputs summed
-in float32. Operations are counted from the program as traced; everything that is no matrix product counts as none.
+in float32. Operations are counted in the traced program; only matrix products count.
 `learning`, the recurrent forward and backward pass over the minibatches with the optimiser, is the update less the
 rollout.
 """
 
 import jax
 import jax.numpy as jnp
-from _common import in_turns, ratios, report, spread
-from _phases import phases
-from _setup import set_up
+from _common import print_report, ratio_by_turn, summarize, time_in_turns
+from _phases import compile_phases
+from _setup import set_up_training
 
 from jaxnav.runs.config import RunConfig
 
-SIDE, PRODUCTS, TURNS = 1024, 16, 31
+MATRIX_SIZE = 1024
+NUM_PRODUCTS = 16
+TURNS = 31
 GOALS = {"learning_over_f32_peak": 0.45, "rollout_share_of_update": 0.35}
 
 
 def main() -> None:
     config = RunConfig()
-    programs = phases(set_up(config))
+    programs = compile_phases(set_up_training(config))
 
-    product = jax.jit(lambda a, b: jnp.matmul(a, b, preferred_element_type=jnp.float32))
-    full = jax.random.normal(jax.random.key(0), (2, SIDE, SIDE))
-    half = full.astype(jnp.bfloat16)
-    peaks = {
-        "f32": lambda: [product(*full) for _ in range(PRODUCTS)],
-        "bf16_to_f32": lambda: [product(*half) for _ in range(PRODUCTS)],
+    # Bare products, whose rate is the peak.
+    matmul = jax.jit(lambda lhs, rhs: jnp.matmul(lhs, rhs, preferred_element_type=jnp.float32))
+    f32_matrices = jax.random.normal(jax.random.key(0), (2, MATRIX_SIZE, MATRIX_SIZE))
+    bf16_matrices = f32_matrices.astype(jnp.bfloat16)
+    calls = {
+        "f32": lambda: [matmul(*f32_matrices) for _ in range(NUM_PRODUCTS)],
+        "bf16_to_f32": lambda: [matmul(*bf16_matrices) for _ in range(NUM_PRODUCTS)],
     }
-    taken = in_turns(peaks | {name: program.call for name, program in programs.items()}, TURNS)
-    rates = {name: [PRODUCTS * 2 * SIDE**3 / 1e9 / one for one in taken[name]] for name in peaks}
+    calls |= {name: program.call for name, program in programs.items()}
+    times = time_in_turns(calls, TURNS)
+
+    product_gflop = NUM_PRODUCTS * 2 * MATRIX_SIZE**3 / 1e9
+    peak_rates = {}
+    for name in ("f32", "bf16_to_f32"):
+        peak_rates[name] = [product_gflop / call_time for call_time in times[name]]
 
     parts = {}
     for arm in config.arms:
-        whole, rolling = programs[f"{arm} update"].flops, programs[f"{arm} rollout"].flops
-        times = {what: taken[f"{arm} {what}"] for what in ("update", "rollout")}
-        learning = [a - b for a, b in zip(times["update"], times["rollout"], strict=True)]
-        flops = {"update": whole, "rollout": rolling, "learning": whole - rolling}
-        for what, seconds in (times | {"learning": learning}).items():
-            achieved = [flops[what] / 1e9 / one for one in seconds]
-            parts[f"{arm} {what}"] = {
-                "gflop": round(flops[what] / 1e9, 2),
-                "ms": spread([1e3 * one for one in seconds]),
-                "share_of_update": ratios(seconds, times["update"]),
-                "gflop_per_s": spread(achieved),
-                "over_f32_peak": ratios(achieved, rates["f32"]),
-                "over_bf16_to_f32_peak": ratios(achieved, rates["bf16_to_f32"]),
+        # Learning is the update less the rollout, in operations and in the seconds of each turn.
+        update = programs[f"{arm} update"]
+        rollout = programs[f"{arm} rollout"]
+        update_times = times[f"{arm} update"]
+        rollout_times = times[f"{arm} rollout"]
+        learning_times = [
+            update_time - rollout_time for update_time, rollout_time in zip(update_times, rollout_times, strict=True)
+        ]
+        phases = {
+            "update": (update.flops, update_times),
+            "rollout": (rollout.flops, rollout_times),
+            "learning": (update.flops - rollout.flops, learning_times),
+        }
+        for phase, (flops, phase_times) in phases.items():
+            phase_rates = [flops / 1e9 / phase_time for phase_time in phase_times]
+            parts[f"{arm} {phase}"] = {
+                "gflop": round(flops / 1e9, 2),
+                "ms": summarize([1e3 * phase_time for phase_time in phase_times]),
+                "share_of_update": ratio_by_turn(phase_times, update_times),
+                "gflop_per_s": summarize(phase_rates),
+                "over_f32_peak": ratio_by_turn(phase_rates, peak_rates["f32"]),
+                "over_bf16_to_f32_peak": ratio_by_turn(phase_rates, peak_rates["bf16_to_f32"]),
             }
-    report(
+    print_report(
         {
             "episodes": config.ppo.num_envs,
             "rollout_steps": config.ppo.rollout,
             "hidden": config.sizes.hidden,
             "goals": GOALS,
-            "product_gflop_per_s": {name: spread(values) for name, values in rates.items()},
+            "product_gflop_per_s": {name: summarize(values) for name, values in peak_rates.items()},
             "parts": parts,
         }
     )

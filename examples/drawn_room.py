@@ -1,4 +1,6 @@
-"""Draw a kitchen of your own, and let the packaged policy look for the Toaster in it, beside a shortest path.
+"""Draw a kitchen of your own, and let the packaged policy look for the Toaster in it.
+
+The script prints the policy's path on the drawing, and the length of a shortest path.
 
 python examples/drawn_room.py
 """
@@ -8,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxnav
-from jaxnav.env.build import build
-from jaxnav.env.types import State
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import State
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.scene import CELL_SIZE, Scene
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import ACTIONS, DONE, ROOMS
 
-#: A mark is a quarter of a metre; # is wall, . is floor, @ the start, the rest is furniture.
-DRAWN = """
+#: A mark is a quarter of a metre; # is wall, . is floor, @ the start, all other marks are furniture.
+DRAWING = """
 ####################
 #FF.............CC.#
 #FF.............CC.#
@@ -45,8 +47,15 @@ OBJECTS = {
 }
 GOAL = "Toaster"
 
-marks = np.array([list(line) for line in DRAWN.strip().splitlines()])[::-1]  # row 0 has the smallest z
-boxes = {mark: np.argwhere(marks == mark).mean(axis=0) for mark in OBJECTS}  # centre (iz, ix) of each patch
+# Turn the drawing upside down: row 0 has the smallest z.
+marks = np.array([list(line) for line in DRAWING.strip().splitlines()])[::-1]
+
+# Place each object at the centre of its patch; a box is x, y, z of the centre, then width, height, depth.
+boxes = []
+for mark, (_, underside, width, height, depth) in OBJECTS.items():
+    row, column = np.argwhere(marks == mark).mean(axis=0)
+    boxes.append((CELL_SIZE * column, underside + height / 2, CELL_SIZE * row, width, height, depth))
+
 scene = Scene(
     name="my-kitchen",
     world="drawn",
@@ -55,45 +64,55 @@ scene = Scene(
     origin=(0.0, 0.0),
     reach=(marks == ".") | (marks == "@"),
     walls=marks == "#",
-    types=tuple(OBJECTS[mark][0] for mark in boxes),
-    boxes=np.array(
-        [
-            (CELL * ix, low + height / 2, CELL * iz, width, height, depth)
-            for (iz, ix), (_, low, width, height, depth) in zip(boxes.values(), OBJECTS.values(), strict=True)
-        ]
-    ),
+    types=tuple(name for name, *_ in OBJECTS.values()),
+    boxes=np.array(boxes),
     yaws=np.zeros(len(boxes)),
     parents=np.full(len(boxes), -1),
 )
+
+# Compile the scene, and load the policy.
 bank = compile_bank([scene], ROOMS)
-env, params = build(bank, {}, default_limit=100)
+env, params = build_environment(bank, {}, default_limit=100)
 policy = jaxnav.load_policy("rooms-org")
+
+# The start is the cell marked @, with the first of its poses: heading 0 looks up the page.
 cells = standable_cells(scene.reach)
-start = int(np.flatnonzero((cells == np.argwhere(marks == "@")[0]).all(axis=1))[0]) * ROOMS.rules.poses_per_cell
+(start_mark,) = np.argwhere(marks == "@")
+start_cell = np.flatnonzero((cells == start_mark).all(axis=1))[0]
+start_pose = int(start_cell) * ROOMS.rules.poses_per_cell
 goal = ROOMS.categories.index(GOAL)
 
 
 @jax.jit
 def act(state, memory, moved):
-    """Take one step; heading 0 looks up the page."""
-    rules = ROOMS.rules
-    heading, horizon = state.pose // len(rules.horizons) % rules.headings, state.pose % len(rules.horizons)
-    told = {"heading": heading, "moved": moved, "horizon": horizon}
-    action, memory = policy.act(env.observe(state, params), memory, 0.5, **told)
-    after, _, _, ended = env.advance(state, action, params)
-    moved = env.cell(after.pose) != env.cell(state.pose)
-    return action, after, memory, moved, env.succeeds(state, params), ended
+    """Take one step."""
+    _, heading, horizon = ROOMS.rules.split_pose(state.pose)
+    observation = env.observe(state, params)
+    action, memory = policy.act(observation, memory, 0.5, heading=heading, moved=moved, horizon=horizon)
+    next_state, _, terminated, truncated = env.advance(state, action, params)
+    moved = env.cell_of_pose(next_state.pose) != env.cell_of_pose(state.pose)
+    return action, next_state, memory, moved, env.done_succeeds(state, params), terminated | truncated
 
 
-state = State(pose=jnp.int32(start), scene=jnp.int32(0), goal=jnp.int32(goal), time=jnp.int32(0))
-memory, moved, actions, action, ended = policy.init("kitchen"), jnp.bool_(False), [], None, False
-while action != DONE and not ended:
-    row, column = cells[int(env.cell(state.pose))]
-    marks[row, column] = "*" if marks[row, column] == "." else marks[row, column]
-    action, state, memory, moved, near, ended = act(state, memory, moved)
+# Act until Done or the time limit, and mark every cell of the path.
+state = State(pose=jnp.int32(start_pose), scene=jnp.int32(0), goal=jnp.int32(goal), time=jnp.int32(0))
+memory = policy.init("kitchen")
+moved = jnp.bool_(False)
+success = False
+ended = False
+actions = []
+while not ended:
+    row, column = cells[int(env.cell_of_pose(state.pose))]
+    if marks[row, column] == ".":
+        marks[row, column] = "*"
+    action, state, memory, moved, success, ended = act(state, memory, moved)
     actions.append(int(action))
 
+outcome = "out of time"
+if actions[-1] == DONE:
+    outcome = "found" if success else "wrong Done"
+action_counts = [f"{actions.count(index)} x {name}" for index, name in enumerate(ACTIONS) if index in actions]
+
 print("\n".join("".join(row) for row in marks[::-1]))
-outcome = "found" if action == DONE and near else "wrong Done" if action == DONE else "out of time"
-print(f"{GOAL}: {outcome} after {len(actions)} actions; a shortest path takes {bank.best_length[start, goal]}")
-print(", ".join(f"{actions.count(i)} x {name}" for i, name in enumerate(ACTIONS) if i in actions))
+print(f"{GOAL}: {outcome} after {len(actions)} actions; a shortest path takes {bank.best_length[start_pose, goal]}")
+print(", ".join(action_counts))

@@ -1,4 +1,4 @@
-"""Run the layout estimator on detections of your own: here three views of a kitchen, then of something else.
+"""Run the layout estimator on detections of your own: three views of a kitchen, then one that does not fit.
 
 python examples/own_detections.py
 """
@@ -9,14 +9,21 @@ import numpy as np
 from jaxnav.layout import LayoutEstimator, prior_from_counts
 
 NAMES = ("Fridge", "Sink", "Mug", "Bed", "Pillow")
-#: How often two of them were seen together before, in homes that you know.
+GOAL = "Mug"
+#: How often two categories were seen together before, in homes that you know.
 COUNTS = jnp.array([[0, 9, 6, 0, 0], [9, 0, 8, 0, 0], [6, 8, 0, 1, 1], [0, 0, 1, 0, 9], [0, 0, 1, 9, 0]])
 VIEWS = ({"Fridge", "Sink"}, {"Sink", "Mug"}, {"Mug", "Pillow"}, {"Bed", "Fridge"})
 
 estimator = LayoutEstimator(prior_from_counts(COUNTS))
-belief, goal = estimator.init(), jnp.int32(NAMES.index("Mug"))
+belief = estimator.init()
+goal_index = jnp.int32(NAMES.index(GOAL))
 for view in VIEWS:
-    belief = estimator.update(belief, jnp.array([name in view for name in NAMES]))
-    weights = np.asarray(LayoutEstimator.goal_weights(belief, goal))
-    expected = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(NAMES, weights, strict=True) if name != "Mug")
-    print(f"{' and '.join(sorted(view)):18} gap {float(belief.gap):.2f}   the Mug is expected beside: {expected}")
+    # Update the belief by the visible categories, bool [K].
+    presence = jnp.array([name in view for name in NAMES])
+    belief = estimator.update(belief, presence)
+
+    # The weights say beside which categories the goal is expected.
+    weights = np.asarray(LayoutEstimator.goal_weights(belief, goal_index))
+    weight_texts = [f"{name} {weight:.2f}" for name, weight in zip(NAMES, weights, strict=True) if name != GOAL]
+    visible = " and ".join(sorted(view))
+    print(f"{visible:18} gap {float(belief.gap):.2f}   the {GOAL} is expected beside: {', '.join(weight_texts)}")

@@ -5,6 +5,7 @@ python examples/stable_baselines3_ppo.py [STEPS]
 """
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -15,8 +16,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 ROOMS = "jaxnav.env.gym:jaxnav/rooms-v0"
 
 
-class SideBySide(VecEnv):
-    """A Gymnasium vector environment for Stable-Baselines3, which has a type of its own."""
+class GymnasiumVecEnv(VecEnv):
+    """Adapter from Gymnasium's vector environments to those of Stable-Baselines3."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
@@ -30,14 +31,17 @@ class SideBySide(VecEnv):
 
     def step_wait(self) -> Any:
         observations, rewards, terminated, truncated, infos = self.env.step(self.actions)
-        ended, told = terminated | truncated, [{} for _ in range(self.num_envs)]
-        for number in np.flatnonzero(ended):
-            told[number] = {
-                "terminal_observation": infos["final_obs"][number],
-                "TimeLimit.truncated": bool(truncated[number]),
-                "success": bool(infos["final_info"]["success"][number]),
+        ended = terminated | truncated
+
+        # Stable-Baselines3 expects one dictionary per environment, filled where an episode ended.
+        env_infos = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(ended):
+            env_infos[index] = {
+                "terminal_observation": infos["final_obs"][index],
+                "TimeLimit.truncated": bool(truncated[index]),
+                "success": bool(infos["final_info"]["success"][index]),
             }
-        return observations, rewards, ended, told
+        return observations, rewards, ended, env_infos
 
     def close(self) -> None:
         self.env.close()
@@ -55,22 +59,30 @@ class SideBySide(VecEnv):
         return [False] * self.num_envs
 
 
-def success_rate(env: VecEnv, act: Any, episodes: int = 1000) -> float:
+def success_rate(env: VecEnv, choose_actions: Callable[[Any], np.ndarray], num_episodes: int = 1000) -> float:
     """Return the share of episodes that succeed, in percent."""
-    observations, found = env.reset(), []
-    while len(found) < episodes:
-        observations, _, ended, infos = env.step(act(observations))
-        found += [info["success"] for info, over in zip(infos, ended, strict=True) if over]
-    return 100 * float(np.mean(found))
+    observations = env.reset()
+    successes = []
+    while len(successes) < num_episodes:
+        observations, _, ended, infos = env.step(choose_actions(observations))
+        successes += [infos[index]["success"] for index in np.flatnonzero(ended)]
+    return 100 * float(np.mean(successes))
 
 
-def main(steps: int) -> None:
-    train, val = (SideBySide(gymnasium.make_vec(ROOMS, num_envs=64, split=split)) for split in ("train", "val"))
-    model = PPO("MultiInputPolicy", train, n_steps=64, batch_size=512, n_epochs=4, ent_coef=0.01, seed=0, device="cpu")
-    model.learn(steps)
-    print(f"PPO after {steps:,} steps: {success_rate(val, lambda seen: model.predict(seen)[0]):.1f} % of val episodes")
+def main(num_steps: int) -> None:
+    train_env = GymnasiumVecEnv(gymnasium.make_vec(ROOMS, num_envs=64, split="train"))
+    val_env = GymnasiumVecEnv(gymnasium.make_vec(ROOMS, num_envs=64, split="val"))
+
+    model = PPO(
+        "MultiInputPolicy", train_env, n_steps=64, batch_size=512, n_epochs=4, ent_coef=0.01, seed=0, device="cpu"
+    )
+    model.learn(num_steps)
+    ppo_rate = success_rate(val_env, lambda observations: model.predict(observations)[0])
+    print(f"PPO after {num_steps:,} steps: {ppo_rate:.1f} % of val episodes")
+
     rng = np.random.default_rng(0)
-    print(f"random actions: {success_rate(val, lambda _: rng.integers(0, 6, 64)):.1f} %")
+    random_rate = success_rate(val_env, lambda _: rng.integers(0, 6, 64))
+    print(f"random actions: {random_rate:.1f} %")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The jaxnav command."""
+"""The `jaxnav` command: `main` imports the module of a sub-command and runs it."""
 
 import difflib
 import importlib
@@ -24,34 +24,36 @@ COMMANDS = {
     "table": "print an evaluation as a Markdown table",
 }
 
-HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {what}\n" for name, what in COMMANDS.items())
+HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {summary}\n" for name, summary in COMMANDS.items())
 NOTES = """
 Each has its own --help; --version prints the version.
 Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. The environment variable
 JAX_COMPILATION_CACHE_DIR names another folder; with JAX_ENABLE_COMPILATION_CACHE=0 none are kept."""
 
+#: Modules of `jaxnav.cli` for the commands that share one; there the entry point of NAME is `NAME_main`.
+_SHARED_MODULES = {"compare": "study", "instrument": "study", "mixture": "study"}
 
-#: Exit code where nobody reads the output any more: 128 and SIGPIPE, as of other commands.
-_CLOSED = 141
+#: Exit code if the reader of the output has gone: 128 plus SIGPIPE, as of other programs.
+_BROKEN_PIPE = 141
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command that the first argument names.
-
-    Returns its exit code, 2 for an unknown one.
-    """
+    """Run the command named by the first argument and return its exit code; 2 for an unknown command."""
     try:
         try:
-            return _run(arguments)
+            return _dispatch(arguments)
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is written when Python ends
-        return _CLOSED
+        # Python flushes stdout when it ends, so let that go nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BROKEN_PIPE
 
 
-def _run(arguments: list[str] | None) -> int:
-    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+def _dispatch(arguments: list[str] | None) -> int:
+    """Print help or version, or import the command's module and call its entry point."""
+    words = sys.argv[1:] if arguments is None else arguments
+    name, *command_arguments = words or ["--help"]
     if name in ("-h", "--help"):
         print(HELP + NOTES)
         return 0
@@ -59,13 +61,17 @@ def _run(arguments: list[str] | None) -> int:
         print(f"jaxnav {__version__}")
         return 0
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        mend = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(COMMANDS)}"
-        print(f"error: unknown command {name!r}; {mend}", file=sys.stderr)
+        matches = difflib.get_close_matches(name, COMMANDS, n=1)
+        advice = f"did you mean {matches[0]!r}?" if matches else f"choose one of {', '.join(COMMANDS)}"
+        print(f"error: unknown command {name!r}; {advice}", file=sys.stderr)
         return 2
+
+    # Find methods in the working directory, as `python -m jaxnav` does.
     if "" not in sys.path:
-        sys.path.insert(0, "")  # methods of the working directory are found as by `python -m jaxnav`
-    return importlib.import_module(f"jaxnav.cli.{name}").main(rest)
+        sys.path.insert(0, "")
+    module = importlib.import_module(f"jaxnav.cli.{_SHARED_MODULES.get(name, name)}")
+    entry_point = getattr(module, f"{name}_main" if name in _SHARED_MODULES else "main")
+    return entry_point(command_arguments)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,15 @@
 """Interventions and causal effects on a policy's logits: equations 1 and 2.
 
-The causal graph has three pathways into the action: scene, goal, and the experience that scene and goal produce.
-A counterfactual keeps the factual experience and replaces the other two: `do(pathways, scene=0, goal=0)`.
+In the causal graph three pathways lead to the action: the scene S, the goal G, and the mediator Z that both produce,
+the paper's *experience*: features of what tends to stand near what, learned in training.
+
+    S ------> A        a      logits of the factual decision
+    G ------> A        a_bar  logits under do(S = 0, G = 0), with the factual experience Z
+    S, G -> Z -> A     D      layout gap; epsilon, its threshold
+
+    counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
+    tde(logits, counterfactual)                    # eq. 1: a - a_bar
+    stde(logits, counterfactual, gap, epsilon)     # eq. 2: subtracts a_bar, weighted by how far D exceeds epsilon
 """
 
 import typing
@@ -10,16 +18,14 @@ from typing import Any, Literal, TypeVar
 import jax
 import jax.numpy as jnp
 
-#: How equation 2 combines logits, see `stde`.
+#: Form in which equation 2 combines the logits, see `stde`.
 Form = Literal["paper", "residual", "switch"]
 FORMS: tuple[Form, ...] = typing.get_args(Form)
 Pathways = TypeVar("Pathways", bound=Any)
 
 
 def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
-    """Set pathways to given values: the do-operator.
-
-    The others keep their factual values.
+    """Set pathways to given values (the do-operator); those not named keep their factual values.
 
     Args:
       pathways: a `NamedTuple` of arrays, such as (scene, goal, experience).
@@ -31,12 +37,12 @@ def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
     Raises:
       ValueError: a name is not a field of `pathways`.
     """
-    for name in interventions:
+    replaced = {}
+    for name, value in interventions.items():
         if name not in pathways._fields:
             raise ValueError(f"do({name}=...): no such pathway; choose from {', '.join(pathways._fields)}")
-    return pathways._replace(
-        **{name: jnp.full_like(getattr(pathways, name), value) for name, value in interventions.items()}
-    )
+        replaced[name] = jnp.full_like(getattr(pathways, name), value)
+    return pathways._replace(**replaced)
 
 
 def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
@@ -44,7 +50,7 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
 
     Args:
       logits: float [..., A], factual logits a.
-      counterfactual: float [..., A], logits a_bar under `do(scene, goal)` with the factual experience.
+      counterfactual: float [..., A], logits a_bar under do(scene = 0, goal = 0) with the factual experience.
 
     Returns:
       float [..., A].
@@ -53,12 +59,12 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
 
 
 def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "residual") -> jax.Array:
-    """Return the weight s of what is removed in eq. 2.
+    """Return the weight s of the removed logits in eq. 2.
 
     Args:
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more the weight is 0.
-      form: `switch` weighs by 1 where D > epsilon and else by 0; the others by ReLU(D - epsilon).
+      form: `paper` and `residual` weigh by ReLU(D - epsilon), `switch` by 1 where D > epsilon and by 0 elsewhere.
 
     Returns:
       float32 [...], in [0, 1].
@@ -68,7 +74,9 @@ def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "res
     """
     if form not in FORMS:
         raise ValueError(f"form={form!r}: choose one of {', '.join(FORMS)}")
-    return (gap > epsilon).astype(jnp.float32) if form == "switch" else jax.nn.relu(gap - epsilon)
+    if form == "switch":
+        return (gap > epsilon).astype(jnp.float32)
+    return jax.nn.relu(gap - epsilon)
 
 
 def stde(
@@ -85,9 +93,10 @@ def stde(
       counterfactual: float [..., A], counterfactual logits a_bar.
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
-      form: with s = ReLU(D - epsilon), `paper`: a - s a_bar (`tde` at s = 1); `residual`: (1 + s) a - s a_bar, which
-        keeps the temperature of a. The two rank actions alike when the paper's weight is s / (1 + s). `switch`: `tde`
-        where D > epsilon, else a.
+      form: with s = `removal_weight`,
+        `paper` and `switch`: a - s a_bar, which is `tde` at s = 1;
+        `residual`: (1 + s) a - s a_bar, whose coefficients add up to 1, so that logits keep their scale. The ranking of
+        actions is that of the paper's form with the weight s / (1 + s).
 
     Returns:
       float [..., A], bit-identical to `logits` where s is 0.
@@ -96,5 +105,6 @@ def stde(
       ValueError: unknown form.
     """
     s = removal_weight(gap, epsilon, form)[..., None].astype(logits.dtype)
-    combined = ((1 + s) * logits if form == "residual" else logits) - s * counterfactual
-    return jnp.where(s == 0, logits, combined)  # 0 * a_bar may still flip the sign of a zero
+    factual = (1 + s) * logits if form == "residual" else logits
+    removed = factual - s * counterfactual
+    return jnp.where(s == 0, logits, removed)  # 0 * a_bar may still flip the sign of a zero

@@ -2,24 +2,24 @@
 
 
 class InputError(ValueError):
-    """Refuse bad input that a user can mend.
+    """Bad input that a user can mend: a config, a scene file, a checkpoint or an argument.
 
-    A config, a scene file, a checkpoint or an argument; the message names the place and the mend.
+    The message names the place and the mend.
     """
 
 
 class MissingSplitError(InputError):
-    """Refuse a scene file that holds no scene of a split."""
+    """A scene file without any scene of a split."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """End a run that was asked to end; what it did is saved.
+    """End of a run that was asked to end; its state is saved.
 
     Attributes:
-      signal: number of the signal that asked for it.
+      signal: number of the signal that asked for the end.
     """
 
-    def __init__(self, signal: int, told: str) -> None:
-        """Take the signal, and what to tell the user."""
-        super().__init__(told)
+    def __init__(self, signal: int, message: str) -> None:
+        """Store the signal, and the message for the user."""
+        super().__init__(message)
         self.signal = signal

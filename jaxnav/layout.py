@@ -1,10 +1,17 @@
-"""The layout estimator, equations 3 to 6.
+"""The Dirichlet layout estimator, equations 3 to 6.
 
-It holds a Dirichlet belief about which categories are seen together. Row i of `alpha` [K, K] parametrises a Dirichlet
-over the categories j != i seen together with category i. The belief starts at the prior alpha*, gains counts as the
-episode shows categories (eqs. 3, 4), and yields the gap D (eq. 5, or `evidence_gap`) and the expected co-occurrence w
-(eq. 6). Only the gaps `learned` and `overdue` know more than the prior (`Signs`). Functions take one episode; callers
-`vmap`.
+The estimator holds a belief about which categories are seen together: row i of `alpha` [K, K] parametrises a Dirichlet
+distribution over the categories j != i that are visible together with category i. `LayoutEstimator.init` starts at the
+prior alpha*, `LayoutEstimator.update` adds counts for the categories visible at a step (eqs. 3, 4) and measures the
+layout gap D (eq. 5, or a gap of `jaxnav.gaps`), and `LayoutEstimator.expectation` is the expected co-occurrence w (eq.
+6):
+
+    estimator = LayoutEstimator(prior_from_counts(counts))
+    state = estimator.init()
+    state = estimator.update(state, presence)
+    weights = LayoutEstimator.goal_weights(state, goal)
+
+The estimator handles one episode; use `jax.vmap` for batches.
 """
 
 import dataclasses
@@ -16,37 +23,42 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.gaps import Signs, evidence_gap, learned_gap, overdue_gap, seen_together
+from jaxnav.gaps import CooccurrenceEvidence, evidence_gap, learned_gap, overdue_gap, seen_together
 from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, presence_kl
 
-#: Over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
+#: Reduction over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
 Reduction = Literal["mean_visible", "mean", "sum"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
-    """Say how the estimator reads equations 4 to 6.
+class EstimatorConfig:
+    """How equations 3 to 6 are interpreted; a value out of range raises a ValueError.
 
-    The defaults are `calibrated`. A value out of range raises a ValueError.
+    The defaults equal `ESTIMATORS["calibrated"]`.
 
     Attributes:
-      rows: rows that are updated: those of `visible` categories, or `all` (eq. 4 to the letter).
+      rows: rows that gain counts (eq. 3): those of `visible` categories, or `all`, as the equation is printed.
       reduction: over the rows' divergences in eq. 5: `mean_visible`, `mean` over all K, or `sum`.
-      increment: whole number from 1 to 50 added to alpha per visible category.
-      own_column: a row also counts its own category; its Dirichlet then has one more entry, of concentration 1.
-      gate: update only if two or more categories are visible and the set differs from the last accepted one.
-      gap: what D measures: `novelty`, how much the last view changed the belief (eq. 5), or `evidence`, how badly all
-        that was seen so far fits the prior (`evidence_gap`; `reduction`, `decay` and `passes` then have no effect),
-        `learned`, how surely what was seen together is not of the layout of training (`learned_gap`), `overdue`, how
-        surely the goal would have been seen by now in that layout (`overdue_gap`), `clock`, 1 when the gate opens:
-        what the sum over all rows in `released` comes to, for tanh is saturated there, or `none`: D stays 0, so that
-        sTDE takes nothing out. Training has no use for D.
+      increment: whole number from 1 to 50, added to alpha per visible category.
+      own_column: a row also counts its own category, as in the released code; in the divergence of eq. 5 this entry
+        has a concentration of 1 more.
+      gate: update only where two or more categories are visible and the set differs from the last accepted one.
+      gap: measure of the layout gap D, used only in evaluation. `reduction` acts on `novelty` alone, `decay` and
+        `passes` on `novelty` and `clock`.
+        `novelty`: how much the last view changed the belief (eq. 5).
+        `evidence`: how badly everything seen so far fits the prior (`evidence_gap`).
+        `learned`: how surely the pairs seen together are not of the training layout (`learned_gap`).
+        `overdue`: how surely the goal would have been seen by now in the training layout (`overdue_gap`).
+        `clock`: 1 when the gate opens, then decays. In `released` the sum over all rows saturates tanh, so that its
+        `novelty` comes to the same.
+        `none`: D stays 0, so that sTDE removes nothing.
       hold: the gap never falls within an episode.
-      decay: factor in [0, 1] on the gap per estimator call at which the gate is shut.
-      passes: estimator calls per step, >= 1. All but the first find nothing new, so an accepted gap is already decayed.
+      decay: the gap is multiplied by this factor in [0, 1] at each call with the gate shut.
+      passes: estimator calls per step, >= 1. The released code calls the estimator twice; the second call sees the same
+        set, so that a new gap is already decayed once.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
       uniform: share of the uniform distribution mixed into every prior row, in [0, 1].
-      form: how inference combines factual and counterfactual logits, see `jaxnav.causal.stde`.
+      form: of eq. 2 in evaluation, unless asked otherwise; see `jaxnav.causal.stde`.
     """
 
     rows: Literal["visible", "all"] = "visible"
@@ -63,10 +75,13 @@ class Setting:
     form: Literal["paper", "residual", "switch"] = "residual"
 
     def __post_init__(self):
+        # Words must be among the options of the field.
         for name, hint in typing.get_type_hints(type(self)).items():
             options = typing.get_args(hint)
             if typing.get_origin(hint) is Literal and getattr(self, name) not in options:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: choose one of {', '.join(options)}")
+
+        # Numbers must lie in the ranges that the docstring gives.
         for name, valid, mend in (
             ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
             ("decay", 0 <= self.decay <= 1, "a number from 0 to 1"),
@@ -78,38 +93,40 @@ class Setting:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give {mend}")
 
 
-#: `paper`: equations 3 to 6, with presence for the counts n. `released`: what the authors' estimator computes.
+#: `paper`: equations 3 to 6, with 0/1 visibility as the counts n. `released`: the estimator of the authors' code.
 #: `evidence`: `calibrated` with another gap; priors and weights w are the same.
-SETTINGS = {
-    "paper": Setting(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
-    "released": Setting(
+ESTIMATORS = {
+    "paper": EstimatorConfig(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
+    "released": EstimatorConfig(
         rows="all", reduction="sum", increment=5, own_column=True, passes=2, strength=None, uniform=0.0
     ),
-    "calibrated": Setting(),
-    "evidence": Setting(gap="evidence"),
+    "calibrated": EstimatorConfig(),
+    "evidence": EstimatorConfig(gap="evidence"),
 }
 
 
-def named_setting(setting: str | Setting) -> Setting:
-    """Return the setting of a name; a `Setting` passes through.
+def resolve_estimator(config: str | EstimatorConfig) -> EstimatorConfig:
+    """Return the configuration of a name; an `EstimatorConfig` passes through.
 
     Raises:
       ValueError: unknown name; the message gives the nearest.
     """
-    if isinstance(setting, Setting):
-        return setting
-    if setting not in SETTINGS:
-        nearest = difflib.get_close_matches(setting, SETTINGS, n=1, cutoff=0.0)[0]
-        raise ValueError(f"setting {setting!r} is unknown: did you mean {nearest!r}? Known: {', '.join(SETTINGS)}")
-    return SETTINGS[setting]
+    if isinstance(config, EstimatorConfig):
+        return config
+    if config not in ESTIMATORS:
+        nearest_name = difflib.get_close_matches(config, ESTIMATORS, n=1, cutoff=0.0)[0]
+        raise ValueError(
+            f"setting {config!r} is unknown: did you mean {nearest_name!r}? Known: {', '.join(ESTIMATORS)}"
+        )
+    return ESTIMATORS[config]
 
 
-def prior_from_counts(counts: jax.Array, setting: str | Setting = "calibrated") -> jax.Array:
+def prior_from_counts(counts: jax.Array, setting: str | EstimatorConfig = "calibrated") -> jax.Array:
     """Make the prior alpha* from co-occurrence counts of exploration.
 
     Args:
       counts: real [K, K], how often j was seen with i; the diagonal is ignored.
-      setting: gives the share of uniform mixed in and the strength rows are rescaled to.
+      setting: name or configuration of the estimator; `uniform` and `strength` are read.
 
     Returns:
       float32 [K, K], >= 0.01 off the diagonal and 0 on it. A row without counts is all ones before rescaling.
@@ -119,63 +136,67 @@ def prior_from_counts(counts: jax.Array, setting: str | Setting = "calibrated") 
     """
     if counts.shape[-1] < 2:
         raise ValueError(f"counts has shape {counts.shape}: co-occurrence takes two or more categories")
-    setting = named_setting(setting)
-    others = 1 - jnp.eye(counts.shape[-1], dtype=jnp.float32)
-    counts = counts.astype(jnp.float32) * others
-    counts = jnp.where(counts.sum(-1, keepdims=True) == 0, others, counts)
-    total = counts.sum(-1, keepdims=True)
-    alpha = counts + setting.uniform * (total / others.sum(-1, keepdims=True) - counts)
-    if setting.strength is not None:
-        alpha = alpha * (setting.strength / total)
-    return jnp.maximum(alpha, MIN_CONCENTRATION) * others
+    config = resolve_estimator(setting)
+
+    # Off-diagonal counts; a category that was never seen with any other has a uniform row.
+    off_diagonal = 1 - jnp.eye(counts.shape[-1], dtype=jnp.float32)
+    counts = counts.astype(jnp.float32) * off_diagonal
+    counts = jnp.where(counts.sum(-1, keepdims=True) == 0, off_diagonal, counts)
+
+    # Mix in the uniform distribution, then rescale the rows.
+    row_total = counts.sum(-1, keepdims=True)
+    alpha = counts + config.uniform * (row_total / off_diagonal.sum(-1, keepdims=True) - counts)
+    if config.strength is not None:
+        alpha = alpha * (config.strength / row_total)
+    return jnp.maximum(alpha, MIN_CONCENTRATION) * off_diagonal
 
 
 class LayoutState(struct.PyTreeNode):
-    """Hold the belief within one episode.
+    """The layout belief within one episode.
 
     Attributes:
-      alpha: float32 [K, K], concentrations; 0 on the diagonal unless the setting counts a row's own category.
-      last: bool [K], the visible set accepted last.
+      alpha: float32 [K, K], concentrations; 0 on the diagonal unless a row counts its own category.
+      last_visible: bool [K], the visible set accepted last.
       gap: float32 [], layout gap D in [0, 1] (1 only by rounding).
-      together: bool [K, K], what was seen together so far (`seen_together`), for the gaps `learned` and `overdue`; None
-        for the others.
+      co_seen: bool [K, K], pairs that were visible together so far (`seen_together`), for the gaps `learned` and
+        `overdue`; None for the rest.
     """
 
     alpha: jax.Array
-    last: jax.Array
+    last_visible: jax.Array
     gap: jax.Array
-    together: jax.Array | None = None
+    co_seen: jax.Array | None = None
 
 
 class LayoutEstimator(struct.PyTreeNode):
-    """Estimate the layout of one episode (eqs. 3 to 6).
+    """Estimator of the layout of one episode (eqs. 3 to 6).
 
     Attributes:
       prior: float32 [K, K], alpha* as from `prior_from_counts`.
-      setting: a name in `SETTINGS` or a `Setting`; static. An unknown name raises a ValueError.
-      signs: what the gaps `learned` and `overdue` know, leaves [K, K]; None for the others.
+      config: a name in `ESTIMATORS` or an `EstimatorConfig`; static. An unknown name raises a ValueError.
+      cooccurrence: evidence for the gaps `learned` and `overdue`, leaves [K, K]; None for the rest.
     """
 
     prior: jax.Array
-    setting: str | Setting = struct.field(pytree_node=False, default="calibrated")
-    signs: Signs | None = None
+    config: str | EstimatorConfig = struct.field(pytree_node=False, default="calibrated")
+    cooccurrence: CooccurrenceEvidence | None = None
 
     def __post_init__(self):
-        named_setting(self.setting)
+        resolve_estimator(self.config)  # raises on an unknown name
 
     def init(self) -> LayoutState:
-        """Return the belief at an episode's start."""
-        size = self.prior.shape[-1]
-        recorded = named_setting(self.setting).gap in ("learned", "overdue")
+        """Return the belief at the start of an episode."""
+        num_categories = self.prior.shape[-1]
+        records_pairs = resolve_estimator(self.config).gap in ("learned", "overdue")
         return LayoutState(
             alpha=self.prior,
-            last=jnp.zeros(size, dtype=bool),
+            last_visible=jnp.zeros(num_categories, dtype=bool),
             gap=jnp.zeros((), dtype=jnp.float32),
-            together=jnp.zeros((size, size), dtype=bool) if recorded else None,
+            co_seen=jnp.zeros((num_categories, num_categories), dtype=bool) if records_pairs else None,
         )
 
     def update(self, state: LayoutState, presence: jax.Array, goal: jax.Array | int | None = None) -> LayoutState:
-        """Take in the categories visible at one step (eqs. 3-5).
+        """Update belief and gap with the categories visible at one step (eqs. 3-5).
 
         Args:
           state: the belief before the step.
@@ -183,52 +204,55 @@ class LayoutEstimator(struct.PyTreeNode):
           goal: int [], what is sought; only the gap `overdue` needs it.
 
         Returns:
-          The belief after the step. Its gap is the divergence of the one from the other, or as the setting says.
+          The belief after the step, with its gap.
 
         Raises:
-          ValueError: the gap needs signs or a goal, and there are none.
+          ValueError: the gap needs `cooccurrence` or a goal, and there is none.
         """
-        setting = named_setting(self.setting)
-        seen = presence.astype(bool)
-        visible = seen.astype(jnp.float32)
-        diagonal = jnp.eye(seen.shape[0], dtype=jnp.float32)
-        rows = visible if setting.rows == "visible" else jnp.ones_like(visible)
-        counts = setting.increment * rows[:, None] * visible[None, :]
-        alpha = state.alpha
-        if setting.own_column:
-            kl_prior = alpha + diagonal
-        else:
-            kl_prior, counts = alpha, counts * (1 - diagonal)
-        accept = (seen.sum() >= 2) & (seen != state.last).any() if setting.gate else jnp.bool_(True)
-        posterior = jnp.where(accept, alpha + counts, alpha)  # eq. 4
-        last = jnp.where(accept, seen, state.last)
-        after = LayoutState(alpha=posterior, last=last, gap=state.gap, together=state.together)
-        match setting.gap:
+        config = resolve_estimator(self.config)
+        is_visible = presence.astype(bool)
+        visible = is_visible.astype(jnp.float32)
+        diagonal = jnp.eye(len(is_visible), dtype=jnp.float32)
+
+        # Eq. 3: counts of this view, n_ij > 0 where j is visible (and i too, with `visible` rows).
+        updated_rows = visible if config.rows == "visible" else jnp.ones_like(visible)
+        counts = config.increment * updated_rows[:, None] * visible[None, :]
+        if not config.own_column:
+            counts = counts * (1 - diagonal)
+
+        # Eq. 4: the posterior adds them, where the gate is open.
+        is_accepted = jnp.bool_(True)
+        if config.gate:
+            is_accepted = (is_visible.sum() >= 2) & (is_visible != state.last_visible).any()
+        next_state = LayoutState(
+            alpha=jnp.where(is_accepted, state.alpha + counts, state.alpha),
+            last_visible=jnp.where(is_accepted, is_visible, state.last_visible),
+            gap=state.gap,
+            co_seen=state.co_seen,
+        )
+
+        # Eq. 5, or another measure of the gap.
+        match config.gap:
             case "none":
-                return after
+                return next_state
             case "evidence":
-                gap = evidence_gap(self.prior, posterior)
+                gap = evidence_gap(self.prior, next_state.alpha)
             case "learned" | "overdue":
-                assert state.together is not None
-                after = after.replace(together=state.together | seen_together(seen[None]))
-                gap = self._gap_by_signs(after, goal)
+                assert state.co_seen is not None
+                next_state = next_state.replace(co_seen=state.co_seen | seen_together(is_visible[None]))
+                gap = self._cooccurrence_gap(next_state, goal)
             case "novelty" | "clock":
-                kl = presence_kl(kl_prior, counts, setting.increment)  # [K]
-                if setting.reduction == "mean_visible":
-                    mean_kl = (kl * visible).sum() / jnp.maximum(visible.sum(), 1)
-                else:
-                    mean_kl = kl.mean() if setting.reduction == "mean" else kl.sum()
-                fresh = jnp.float32(1.0) if setting.gap == "clock" else jnp.tanh(mean_kl)
-                new_gap = fresh * setting.decay ** (setting.passes - 1)  # eq. 5
-                gap = jnp.where(accept, new_gap, state.gap * setting.decay**setting.passes)
-        return after.replace(gap=jnp.maximum(gap, state.gap) if setting.hold else gap)
+                row_alpha = state.alpha + diagonal if config.own_column else state.alpha
+                new_gap = self._novelty(row_alpha, counts, visible) * config.decay ** (config.passes - 1)
+                gap = jnp.where(is_accepted, new_gap, state.gap * config.decay**config.passes)
+        return next_state.replace(gap=jnp.maximum(gap, state.gap) if config.hold else gap)
 
     @staticmethod
     def expectation(state: LayoutState, goal: jax.Array | int | None = None) -> jax.Array:
         """Return the expected co-occurrence w (eq. 6).
 
-        w_ij = p(j seen given i seen) and w_ii = 1. With `own_column` w_ii is 1 + the share of i in its own row, as in
-        the released code.
+        w_ij = p(j visible given i visible) and w_ii = 1. With `own_column` w_ii is 1 + the share of i in its own row,
+        as in the released code.
 
         Args:
           state: the belief.
@@ -239,22 +263,37 @@ class LayoutEstimator(struct.PyTreeNode):
         """
         if goal is None:
             return jax.vmap(LayoutEstimator.expectation, (None, 0), 1)(state, jnp.arange(state.alpha.shape[-1]))
-        share = state.alpha[:, goal] / state.alpha.sum(-1)
-        return share.at[goal].add(1)
+        goal_share = state.alpha[:, goal] / state.alpha.sum(-1)
+        return goal_share.at[goal].add(1)
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """Return w x g of eq. 7, float32 [K]."""
+        """Return w x g of eq. 7, float32 [K]: the goal's column of w, for g is one-hot."""
         return LayoutEstimator.expectation(state, goal)
 
-    def _gap_by_signs(self, state: LayoutState, goal: jax.Array | int | None) -> jax.Array:
-        """Return the gap that learned signs tell."""
-        setting = named_setting(self.setting)
-        assert state.together is not None
-        if self.signs is None:
-            raise ValueError(f"gap={setting.gap!r}: needs `signs`, learned before training")
-        if setting.gap == "learned":
-            return learned_gap(state.together, self.signs.odds)
+    def _novelty(self, alpha: jax.Array, counts: jax.Array, visible: jax.Array) -> jax.Array:
+        """Return tanh of the mean divergence between posterior and belief (eq. 5); 1 for the gap `clock`."""
+        config = resolve_estimator(self.config)
+        if config.gap == "clock":
+            return jnp.float32(1.0)
+        row_kl = presence_kl(alpha, counts, config.increment)  # [K]
+        match config.reduction:
+            case "mean_visible":
+                mean_kl = (row_kl * visible).sum() / jnp.maximum(visible.sum(), 1)
+            case "mean":
+                mean_kl = row_kl.mean()
+            case "sum":
+                mean_kl = row_kl.sum()
+        return jnp.tanh(mean_kl)
+
+    def _cooccurrence_gap(self, state: LayoutState, goal: jax.Array | int | None) -> jax.Array:
+        """Return the gap `learned` or `overdue`, from the pairs seen so far."""
+        config = resolve_estimator(self.config)
+        assert state.co_seen is not None
+        if self.cooccurrence is None:
+            raise ValueError(f"gap={config.gap!r}: needs `cooccurrence`, learned before training")
+        if config.gap == "learned":
+            return learned_gap(state.co_seen, self.cooccurrence.log_odds)
         if goal is None:
             raise ValueError("gap='overdue': needs the goal; give it to `update`")
-        return overdue_gap(state.together, self.signs.chance, goal)
+        return overdue_gap(state.co_seen, self.cooccurrence.co_visibility, goal)

@@ -14,9 +14,9 @@ from support import tiny_world as tiny
 from support.commands import write_config
 
 import jaxnav
-from jaxnav.env.types import Observation
+from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import find_method
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.policies.network import bind, init_params
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -39,14 +39,16 @@ def test_the_worked_divergences_are_those_of_the_text():
 def test_the_code_of_use_runs(tmp_path, monkeypatch, capsys):
     """In a folder of its own, in the order of the page, with a run of a few updates."""
     monkeypatch.chdir(tmp_path)
-    small = "jaxnav.runs.overlay.apply_yaml(jaxnav.RunConfig(run_dir=Path('runs/org')), Path('tiny.yaml'))"
+    small = "jaxnav.runs.config_files.apply_yaml(jaxnav.RunConfig(run_dir=Path('runs/org')), Path('tiny.yaml'))"
     write_config(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "use.md").read_text(), re.DOTALL)
     assert len(blocks) == 3
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         for block in blocks:
             code = re.sub(r"jaxnav\.RunConfig\(.*?\)(?=\))", small.replace("\\", "\\\\"), block, flags=re.DOTALL)
-            exec(code.replace("import jaxnav\n", "import jaxnav\nimport jaxnav.runs.overlay\n"), {"__name__": "use"})
+            exec(
+                code.replace("import jaxnav\n", "import jaxnav\nimport jaxnav.runs.config_files\n"), {"__name__": "use"}
+            )
     assert "['detections', 'goal', 'heading', 'horizon', 'moved', 'view']" in capsys.readouterr().out
     assert jaxnav.Run.open("runs/org").config.seeds == 2
 
@@ -80,7 +82,7 @@ def test_the_methods_of_the_page_are_found(own_modules):
 @pytest.mark.parametrize("name", ["sectors:SECTORED", "judged:JUDGED"])
 def test_the_methods_of_the_page_decide_in_both_ways(own_modules, name, decision):
     """Shapes alone: nothing is computed."""
-    spec = dataclasses.replace(tiny.SPEC, method=name, method_sizes=(), decision=decision)
+    spec = dataclasses.replace(tiny.SPEC, method=find_method(name), method_sizes=(), decision=decision)
     row = jax.ShapeDtypeStruct((5, tiny.BANK.rows.shape[-1]), np.uint8)
 
     def decide(params, row, goal):

@@ -10,7 +10,7 @@ from hypothesis import given
 from scipy.stats import dirichlet, dirichlet_multinomial, mannwhitneyu, multinomial, norm
 
 from jaxnav.gaps import evidence_gap
-from jaxnav.layout import SETTINGS, LayoutEstimator, Setting, prior_from_counts
+from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, prior_from_counts
 
 K, EPISODES, STEPS = 12, 200, 20
 VIEWS = hnp.arrays(np.bool_, (5, K))
@@ -141,9 +141,9 @@ def test_a_shut_gate_keeps_what_the_evidence_says():
     states = [LayoutEstimator(zoned_prior(), name) for name in ("evidence", "calibrated")]
     ours, theirs = (estimator.update(estimator.init(), jnp.asarray(views[0])) for estimator in states)
     np.testing.assert_array_equal(ours.alpha, theirs.alpha)
-    np.testing.assert_array_equal(ours.last, theirs.last)
+    np.testing.assert_array_equal(ours.last_visible, theirs.last_visible)
     assert ours.gap != theirs.gap
-    assert SETTINGS["evidence"] == Setting(gap="evidence")
+    assert ESTIMATORS["evidence"] == EstimatorConfig(gap="evidence")
 
 
 @pytest.mark.parametrize("independent", [False, True])

@@ -30,9 +30,11 @@ def run(script, tmp_path):
 @pytest.mark.slow
 def test_the_packaged_policy_finds_what_it_looks_for(tmp_path):
     """Random actions find 8 %; the policy was measured at 90 % in other rooms, with up to 200 actions."""
-    found = re.findall(r"shift (\d), epsilon ([\d.]+): ([\d.]+) % of 256 episodes", output("packaged_policy", tmp_path))
-    assert [row[:2] for row in found] == [(shift, f"{e:.2f}") for shift in "01" for e in (0, 0.25, 0.5, 1)]
-    rates = [float(rate) for *_, rate in found]
+    matches = re.findall(
+        r"shift (\d), epsilon ([\d.]+): ([\d.]+) % of 256 episodes", output("packaged_policy", tmp_path)
+    )
+    assert [row[:2] for row in matches] == [(shift, f"{e:.2f}") for shift in "01" for e in (0, 0.25, 0.5, 1)]
+    rates = [float(rate) for *_, rate in matches]
     assert min(rates[:4]) > 70
     assert min(rates) > 60
     assert max(rates[4:]) < min(rates[:4])  # by 7 points where this was written
@@ -43,10 +45,10 @@ def test_a_drawn_room_is_walked_in(tmp_path):
     """The way on the page goes from the start to within 1.5 m, six marks, of the toaster; no way is shorter than L*."""
     printed = output("drawn_room", tmp_path)
     *page, outcome, actions = printed.splitlines()
-    (found,) = re.findall(r"found after (\d+) actions; a shortest path takes (\d+)", outcome)
-    taken, best = map(int, found)
-    assert taken >= best > 1
-    assert sum(map(int, re.findall(r"(\d+) x", actions))) == taken
+    (matches,) = re.findall(r"found after (\d+) actions; a shortest path takes (\d+)", outcome)
+    num_actions, best = map(int, matches)
+    assert num_actions >= best > 1
+    assert sum(map(int, re.findall(r"(\d+) x", actions))) == num_actions
     places = {mark: [(r, c) for r, row in enumerate(page) for c, m in enumerate(row) if m == mark] for mark in "@*o"}
     (goal,) = places["o"]
     assert len(places["@"]) == 1

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxnav.gaps import Signs, learned_gap, overdue_gap, seen_together
-from jaxnav.layout import LayoutEstimator, Setting, prior_from_counts
+from jaxnav.gaps import CooccurrenceEvidence, learned_gap, overdue_gap, seen_together
+from jaxnav.layout import EstimatorConfig, LayoutEstimator, prior_from_counts
 
 K = 5
 VIEWS = hnp.arrays(np.bool_, (6, K))
 GENERATOR = np.random.default_rng(0)
 PRIOR = prior_from_counts(jnp.asarray(GENERATOR.integers(0, 50, (K, K))))
-SIGNS = Signs(
-    odds=jnp.triu(jnp.asarray(GENERATOR.normal(size=(K, K)), jnp.float32), 1),
-    chance=jnp.asarray(GENERATOR.random((K, K)) * (1 - np.eye(K)), jnp.float32),
+SIGNS = CooccurrenceEvidence(
+    log_odds=jnp.triu(jnp.asarray(GENERATOR.normal(size=(K, K)), jnp.float32), 1),
+    co_visibility=jnp.asarray(GENERATOR.random((K, K)) * (1 - np.eye(K)), jnp.float32),
 )
 
 
@@ -35,7 +35,7 @@ def walk(setting, views):
 
 
 def course(views, **changes):
-    return np.asarray(walk(Setting(**changes), jnp.asarray(views)))
+    return np.asarray(walk(EstimatorConfig(**changes), jnp.asarray(views)))
 
 
 def test_learned_by_hand():
@@ -58,9 +58,9 @@ def test_overdue_by_hand():
 @given(VIEWS)
 def test_overdue_rises_until_the_goal_is_seen(views):
     gaps = course(views, gap="overdue")
-    found = np.maximum.accumulate(views[:, 0])
-    assert (gaps[found] == 0).all()
-    assert (np.diff(gaps[~found]) >= 0).all()
+    expected = np.maximum.accumulate(views[:, 0])
+    assert (gaps[expected] == 0).all()
+    assert (np.diff(gaps[~expected]) >= 0).all()
     assert ((gaps >= 0) & (gaps <= 1)).all()
 
 
@@ -68,7 +68,7 @@ def test_overdue_rises_until_the_goal_is_seen(views):
 def test_overdue_is_the_share_of_episodes_that_meet_independent_chances(views):
     """Each category seen shows the goal or not, independently: the mean over all 2^K outcomes, in float64."""
     seen = views[:, 1:].any(axis=0)
-    chance = np.asarray(SIGNS.chance, np.float64)[1:, 0]
+    chance = np.asarray(SIGNS.co_visibility, np.float64)[1:, 0]
     outcomes = np.array(list(np.ndindex(*[2] * (K - 1))), bool)
     weight = np.where(outcomes, chance, 1 - chance).prod(axis=1)
     expected = weight[(outcomes & seen).any(axis=1)].sum()
@@ -78,7 +78,7 @@ def test_overdue_is_the_share_of_episodes_that_meet_independent_chances(views):
 
 @given(VIEWS)
 def test_learned_goes_by_the_pairs_seen_so_far(views):
-    odds = np.asarray(SIGNS.odds, np.float64)
+    odds = np.asarray(SIGNS.log_odds, np.float64)
     for t, gap in enumerate(course(views, gap="learned")):
         pairs = {(i, j) for view in views[: t + 1] for i in range(K) for j in range(i + 1, K) if view[i] and view[j]}
         np.testing.assert_allclose(gap, 1 / (1 + np.exp(-sum(odds[pair] for pair in pairs))), rtol=1e-5)
@@ -96,21 +96,21 @@ def test_other_gaps_leave_the_belief(gap):
     views = GENERATOR.random((4, K)) < 0.5
     beliefs = []
     for name in (gap, "novelty"):
-        estimator = LayoutEstimator(PRIOR, Setting(gap=name), SIGNS)
+        estimator = LayoutEstimator(PRIOR, EstimatorConfig(gap=name), SIGNS)
         state = estimator.init()
         for view in views:
             state = estimator.update(state, jnp.asarray(view), 0)
         beliefs.append(state)
     np.testing.assert_array_equal(beliefs[0].alpha, beliefs[1].alpha)
-    np.testing.assert_array_equal(beliefs[0].last, beliefs[1].last)
-    assert beliefs[1].together is None
+    np.testing.assert_array_equal(beliefs[0].last_visible, beliefs[1].last_visible)
+    assert beliefs[1].co_seen is None
 
 
 def test_what_is_missing_is_named():
     for setting in ("learned", "overdue"):
-        estimator = LayoutEstimator(PRIOR, Setting(gap=setting))
-        with pytest.raises(ValueError, match="needs `signs`"):
+        estimator = LayoutEstimator(PRIOR, EstimatorConfig(gap=setting))
+        with pytest.raises(ValueError, match="needs `cooccurrence`"):
             estimator.update(estimator.init(), jnp.ones(K, bool), 0)
-    estimator = LayoutEstimator(PRIOR, Setting(gap="overdue"), SIGNS)
+    estimator = LayoutEstimator(PRIOR, EstimatorConfig(gap="overdue"), SIGNS)
     with pytest.raises(ValueError, match="needs the goal"):
         estimator.update(estimator.init(), jnp.ones(K, bool))

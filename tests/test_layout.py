@@ -11,7 +11,7 @@ from hypothesis import given
 from scipy.special import digamma
 from support.dirichlet import exact_kl
 
-from jaxnav.layout import SETTINGS, LayoutEstimator, LayoutState, Setting, prior_from_counts
+from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutState, prior_from_counts
 
 K = 6
 PRESENCE = hnp.arrays(np.bool_, (4, K))
@@ -25,9 +25,9 @@ def random_counts(seed: int = 0, k: int = K) -> jax.Array:
     return jnp.asarray(np.random.default_rng(seed).integers(1, 200, (k, k)))
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", ESTIMATORS)
 def test_prior_rows(name):
-    counts, setting = random_counts(), SETTINGS[name]
+    counts, setting = random_counts(), ESTIMATORS[name]
     alpha = np.asarray(prior_from_counts(counts, name))
     off = ~np.eye(K, dtype=bool)
     assert (np.diag(alpha) == 0).all()
@@ -44,7 +44,7 @@ def test_prior_rows(name):
 
 def test_prior_of_unseen_rows_is_uniform_and_bounded_below():
     counts = jnp.zeros((K, K)).at[0, 1].set(1e6)
-    alpha = np.asarray(prior_from_counts(counts, Setting(strength=10.0, uniform=0.0)))
+    alpha = np.asarray(prior_from_counts(counts, EstimatorConfig(strength=10.0, uniform=0.0)))
     np.testing.assert_allclose(alpha[0], [0, 10, 0.01, 0.01, 0.01, 0.01])
     np.testing.assert_allclose(alpha[1], [2, 0, 2, 2, 2, 2], rtol=1e-6)
 
@@ -94,7 +94,7 @@ def views_of(*sets) -> np.ndarray:
 
 def test_belief_without_a_gap_is_the_same_belief():
     counts = jnp.arange(16.0).reshape(4, 4) + 1.0
-    setting = SETTINGS["calibrated"]
+    setting = ESTIMATORS["calibrated"]
     plain, without = (
         LayoutEstimator(prior_from_counts(counts, setting), own)
         for own in (setting, dataclasses.replace(setting, gap="none"))
@@ -103,7 +103,7 @@ def test_belief_without_a_gap_is_the_same_belief():
     for seen in ([1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]):
         one, other = (est.update(belief, jnp.array(seen)) for est, belief in ((plain, one), (without, other)))
         np.testing.assert_array_equal(one.alpha, other.alpha)
-        np.testing.assert_array_equal(one.last, other.last)
+        np.testing.assert_array_equal(one.last_visible, other.last_visible)
         assert one.gap > 0.0
         assert other.gap == 0.0
 
@@ -144,17 +144,17 @@ def test_paper_is_equation_5_to_the_letter():
 
 @pytest.mark.parametrize(("rows", "reduction"), [("all", "mean_visible"), ("visible", "sum"), ("visible", "mean")])
 def test_other_readings_of_equation_5(rows, reduction):
-    prior, view = np.asarray(prior_from_counts(random_counts(5), Setting())), views_of({0, 2, 3})[0]
+    prior, view = np.asarray(prior_from_counts(random_counts(5), EstimatorConfig())), views_of({0, 2, 3})[0]
     counts = np.outer(view if rows == "visible" else np.ones(K, bool), view) & ~np.eye(K, dtype=bool)
     kl = np.array([exact_kl(np.delete(prior[i], i), np.delete(counts[i], i).astype(int)) for i in range(K)])
     expected = {"mean_visible": kl[view].mean(), "sum": kl.sum(), "mean": kl.mean()}[reduction]
-    (state,) = run(LayoutEstimator(jnp.asarray(prior), Setting(rows=rows, reduction=reduction)), [view])
+    (state,) = run(LayoutEstimator(jnp.asarray(prior), EstimatorConfig(rows=rows, reduction=reduction)), [view])
     np.testing.assert_allclose(state.gap, np.tanh(expected), rtol=1e-4)
 
 
 def test_the_mean_over_a_single_category_is_its_own():
     """It counts itself, so its row learns something alone."""
-    setting = Setting(reduction="mean_visible", own_column=True, gate=False)
+    setting = EstimatorConfig(reduction="mean_visible", own_column=True, gate=False)
     prior = np.asarray(prior_from_counts(random_counts(6), setting))
     (view,) = views_of({1})
     (state,) = run(LayoutEstimator(jnp.asarray(prior), setting), [view])
@@ -168,7 +168,7 @@ def test_shut_gate_leaves_the_belief_and_decays_the_gap():
     for visible in ((), {3}, {0, 1}):
         after = estimator.update(state, jnp.asarray(views_of(visible)[0]))
         np.testing.assert_array_equal(after.alpha, alpha)
-        np.testing.assert_array_equal(after.last, state.last)
+        np.testing.assert_array_equal(after.last_visible, state.last_visible)
         np.testing.assert_allclose(after.gap, 0.4)
     assert float(estimator.update(state, jnp.asarray(views_of({0, 2})[0])).alpha.sum()) > float(alpha.sum()) + 1
 
@@ -197,7 +197,7 @@ def test_goal_weights_are_the_column_not_the_row():
     assert float(q[2]) == 1
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", ESTIMATORS)
 def test_vmap_equals_single_and_traces_once(name):
     priors = jnp.stack([prior_from_counts(random_counts(seed), name) for seed in range(3)])
     views = jax.random.bernoulli(jax.random.key(1), 0.5, (3, 5, K))
@@ -230,9 +230,9 @@ def test_settings_are_those_of_the_methods_table():
         "calibrated": calibrated | {"gap": "novelty"},
         "evidence": calibrated | {"gap": "evidence"},
     }
-    assert expected.keys() == SETTINGS.keys()
+    assert expected.keys() == ESTIMATORS.keys()
     for name, fields in expected.items():
-        assert fields.items() <= dataclasses.asdict(SETTINGS[name]).items()
+        assert fields.items() <= dataclasses.asdict(ESTIMATORS[name]).items()
 
 
 @pytest.mark.parametrize(
@@ -247,10 +247,10 @@ def test_settings_are_those_of_the_methods_table():
 )
 def test_settings_out_of_range_are_refused_by_name(field, good, bad):
     for value in good:
-        assert getattr(Setting(**{field: value}), field) == value
+        assert getattr(EstimatorConfig(**{field: value}), field) == value
     for value in bad:
         with pytest.raises(ValueError, match=f"{field} is {value}: give a "):
-            Setting(**{field: value})
+            EstimatorConfig(**{field: value})
 
 
 def test_one_category_has_no_prior():

@@ -17,8 +17,9 @@ from support.commands import write_config
 
 import jaxnav
 from jaxnav.__main__ import main
-from jaxnav.env.types import Observation
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.env.objectnav import Observation
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import bind, init_params
 from jaxnav.scenes.task import NUM_ACTIONS
 
 ROOT = Path(__file__).parent.parent
@@ -100,7 +101,7 @@ def test_the_method_of_the_readme_is_short_and_clean(folder):
 
 def test_the_method_of_the_readme_makes_experience(folder, monkeypatch):
     monkeypatch.syspath_prepend(folder)
-    spec = dataclasses.replace(tiny.SPEC, method="my_method:MINE", method_sizes=())
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("my_method:MINE"), method_sizes=())
     params = jax.jit(init_params, static_argnums=0)(spec, jax.random.key(0))
     observation = Observation(row=jnp.asarray(tiny.BANK.rows[:4]), goal=jnp.zeros(4, jnp.int32))
     pathways = jax.jit(lambda params, weights: bind(spec, params).pathways(observation, weights))

@@ -1,28 +1,28 @@
 """A planner that searches where it believes the goal to be.
 
-It knows the floor plan and how often a look detects an object of the goal's category, and holds a belief over the sites
-of the goal: a prior, times the probability that all looks so far were in vain. It walks to the pose that gains most
-detection probability for every action, and, once the goal has been detected, the shortest way to success.
+The planner knows the floor plan and how often a look detects an object of the goal's category. Its belief over the
+sites of the goal is a prior times the probability that all looks so far were in vain. `search_for_goal` walks to the
+pose that gains most detection probability per action. Once the goal is detected, it takes a shortest path to success.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxnav.baselines.layout_model import Glimpse, LayoutModel
+from jaxnav.baselines.layout_model import LayoutModel, SearchSnapshot
 from jaxnav.baselines.sites import NUM_RELATIONS, Sites
 from jaxnav.scenes.task import DONE
 
-REPLAN = 4  # actions after which the planner thinks again
+REPLAN_INTERVAL = 4  # actions after which the planner replans
 
 
-class Home(NamedTuple):
-    """Hold what is known of a scene before a search.
+class PlannerScene(NamedTuple):
+    """Knowledge of a scene before a search.
 
     Attributes:
-      sites: of the scene.
+      sites: sites of the scene.
       successor: int [P, 6], pose after every action.
-      best_length: int [P, K], L*, read only for a goal that has been detected.
+      best_length: int [P, K], shortest path lengths L*, used only for a goal that has been detected.
     """
 
     sites: Sites
@@ -30,107 +30,135 @@ class Home(NamedTuple):
     best_length: np.ndarray
 
 
-class Search(NamedTuple):
-    """Hold how a search went.
+class SearchResult(NamedTuple):
+    """Result of a search.
 
     Attributes:
-      length: actions, Done included; the limit where it ran out.
-      success: whether Done succeeded within the limit.
-      glimpses: what the planner knew after 0, 1, 3, 7, ... actions.
+      length: number of actions, Done included; the limit if the search failed.
+      success: True if Done succeeded within the limit.
+      snapshots: the planner's knowledge after 0, 1, 3, 7, ... actions.
     """
 
     length: int
     success: bool
-    glimpses: list[Glimpse]
+    snapshots: list[SearchSnapshot]
 
 
-def search(home: Home, rates: np.ndarray, model: LayoutModel, goal: int, pose: int, limit: int) -> Search:
+def search_for_goal(
+    scene: PlannerScene, rates: np.ndarray, model: LayoutModel, goal: int, pose: int, limit: int
+) -> SearchResult:
     """Search for a goal.
 
     Args:
-      home: the scene.
+      scene: the scene.
       rates: float32 [K, L], see `detection_rates`.
       model: the prior.
       goal: index of the category.
       pose: start of the search.
-      limit: actions at most.
+      limit: greatest number of actions.
     """
-    sites, glimpses = home.sites, []
-    categories, num_sites = sites.objects.shape
-    views, chance = sites.views, rates[goal, sites.views.look]
-    features = np.zeros((categories, NUM_RELATIONS, num_sites), bool)
-    looks = np.zeros((rates.shape[1], num_sites), np.uint16)
-    visited, detected = np.zeros(len(home.successor), bool), np.zeros(categories, bool)
-    scores, missed, path = model.scores(goal, features, sites), np.zeros(num_sites), []
+    sites = scene.sites
+    views = sites.views
+    num_categories, num_sites = sites.object_sites.shape
+    num_poses = len(scene.successor)
+    view_rates = rates[goal, views.look]  # [M]
+
+    # Knowledge: relations to detected objects, looks and visited poses.
+    features = np.zeros((num_categories, NUM_RELATIONS, num_sites), bool)
+    look_counts = np.zeros((rates.shape[1], num_sites), np.uint16)
+    visited = np.zeros(num_poses, bool)
+    detected = np.zeros(num_categories, bool)
+
+    # Log belief of each site: score of the prior, and log probability of the looks in vain.
+    scores = model.scores(goal, features, sites)
+    log_miss = np.zeros(num_sites)
+    snapshots = []
+    path = []
     for time in range(limit):
-        seen = sites.seen[pose]
-        if seen[goal] >= 0:
-            length = time + int(home.best_length[pose, goal])
-            return Search(min(length, limit), length <= limit, glimpses)
+        # A detected goal ends the search: the shortest path is known.
+        detected_site = sites.detected_site[pose]
+        if detected_site[goal] >= 0:
+            length = time + int(scene.best_length[pose, goal])
+            return SearchResult(min(length, limit), length <= limit, snapshots)
+
+        # Take in the looks and the detections of a new pose. A new clue makes the path obsolete.
         if not visited[pose]:
             visited[pose] = True
-            at, how = views.at(pose)
-            looks[how, at] += 1
-            missed[at] += np.log1p(-rates[goal, how])
-            for category in np.flatnonzero(seen >= 0):
+            site, look = views.from_pose(pose)
+            look_counts[look, site] += 1
+            log_miss[site] += np.log1p(-rates[goal, look])
+            for category in np.flatnonzero(detected_site >= 0):
                 detected[category] = True
-                if not features[category, 0, seen[category]]:  # else it is one that was detected nearby
-                    features[category] |= sites.relations[:, seen[category]]
-                    scores, path = model.scores(goal, features, sites), []
+                if not features[category, 0, detected_site[category]]:  # else an object that was detected nearby
+                    features[category] |= sites.relations[:, detected_site[category]]
+                    scores = model.scores(goal, features, sites)
+                    path = []
         if time & (time + 1) == 0:
-            glimpses.append(Glimpse(sites, features.copy(), looks.copy(), detected.copy()))
+            snapshots.append(SearchSnapshot(sites, features.copy(), look_counts.copy(), detected.copy()))
+
+        # Plan towards the pose with the best chance to detect the goal, unless a path is left to walk.
         if not path:
-            found = np.bincount(views.pose, chance * _belief(scores + missed)[views.site], len(visited))
-            found[visited] = 0.0
-            path = _plan(home.successor, found, pose)
-            if not path:  # the goal is in view from nowhere
+            site_gain = view_rates * _belief(scores + log_miss)[views.site]
+            gain = np.bincount(views.pose, site_gain, num_poses)
+            gain[visited] = 0.0
+            path = _plan_path(scene.successor, gain, pose)
+            if not path:  # no unvisited pose can show the goal
                 break
         pose = path.pop(0)
-    return Search(limit, False, glimpses)
+    return SearchResult(limit, False, snapshots)
 
 
 def _belief(scores: np.ndarray) -> np.ndarray:
+    """Return the softmax of scores."""
     weights = np.exp(scores - scores.max())
     return weights / weights.sum()
 
 
-def _plan(successor: np.ndarray, gain: np.ndarray, pose: int) -> list[int]:
-    """Return the next poses towards the best viewpoint, if any.
+def _plan_path(successor: np.ndarray, gain: np.ndarray, pose: int) -> list[int]:
+    """Return the next poses towards the pose with the highest gain per action; empty if no pose gains anything.
 
     Args:
       successor: int [P, 6].
       gain: float64 [P], probability to detect the goal from each pose.
-      pose: of the planner.
+      pose: pose of the planner.
     """
-    length, before = shortest_ways(successor, pose)
-    rate = np.where(length > 0, gain / np.maximum(length, 1), 0.0)
-    if not rate.any():
+    length, predecessor = shortest_paths(successor, pose)
+    gain_per_action = np.where(length > 0, gain / np.maximum(length, 1), 0.0)
+    if not gain_per_action.any():
         return []
-    target, path = int(rate.argmax()), []
-    while target != pose:
-        path.append(target)
-        target = int(before[target])
-    return path[::-1][:REPLAN]
+
+    # Follow the path back from the target.
+    path_pose = int(gain_per_action.argmax())
+    path = []
+    while path_pose != pose:
+        path.append(path_pose)
+        path_pose = int(predecessor[path_pose])
+    return path[::-1][:REPLAN_INTERVAL]
 
 
-def shortest_ways(successor: np.ndarray, pose: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return lengths of shortest ways, and the poses before.
+def shortest_paths(successor: np.ndarray, pose: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return lengths and predecessors of shortest paths from a pose, by breadth-first search.
 
     Args:
       successor: int [P, 6].
-      pose: where all ways start.
+      pose: start of all paths.
 
     Returns:
-      int32 [P] each: actions from `pose`, -1 where there is no way; the last pose but one.
+      int32 [P] each: number of actions from `pose`, and the last pose but one; -1 without a path.
     """
-    length, before = np.full((2, len(successor)), -1, np.int32)
-    length[pose], frontier = 0, np.array([pose])
-    for away in range(1, len(successor)):
-        after, source = successor[frontier, :DONE].ravel(), np.repeat(frontier, DONE)
-        new = length[after] < 0
-        after, source = after[new], source[new]
-        if not len(after):
+    length = np.full(len(successor), -1, np.int32)
+    predecessor = np.full(len(successor), -1, np.int32)
+    length[pose] = 0
+    frontier = np.array([pose])
+    for distance in range(1, len(successor)):
+        # Poses that are reached for the first time, with the poses that lead there.
+        next_poses = successor[frontier, :DONE].ravel()
+        sources = np.repeat(frontier, DONE)
+        is_new = length[next_poses] < 0
+        next_poses = next_poses[is_new]
+        if not len(next_poses):
             break
-        length[after], before[after] = away, source
-        frontier = np.unique(after)
-    return length, before
+        length[next_poses] = distance
+        predecessor[next_poses] = sources[is_new]
+        frontier = np.unique(next_poses)
+    return length, predecessor

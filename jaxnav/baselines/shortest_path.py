@@ -1,6 +1,6 @@
-"""The shortest-path oracle, an upper bound and a check.
+"""The shortest-path oracle: an upper bound for agents, and a check of the environment and its metrics.
 
-It walks a shortest path in the environment, which checks environment and metrics.
+`oracle_actions` plans with the compiled tables, `run_oracle` executes the plans in the environment.
 """
 
 import functools
@@ -10,78 +10,85 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, State
+from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.grid import Outcome, first_states
-from jaxnav.policies.acting import Acting, Agent
+from jaxnav.evaluation.grid import EpisodeOutcome, start_states
+from jaxnav.policies.agent_loop import Agent, AgentLoop
 from jaxnav.scenes.lattice import best_actions
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.task import DONE
+
+
+def run_oracle(
+    banks: Iterable[Bank], lists: Sequence[EpisodeList], params: Iterable[EnvParams], env: ObjectNav
+) -> EpisodeOutcome:
+    """Run the oracle in the environment.
+
+    Args:
+      banks: the scenes.
+      lists: episodes of each bank.
+      params: environment parameters of each bank.
+      env: the environment.
+
+    Returns:
+      Leaves [E], over the episodes of all banks.
+    """
+    # Pad the plans of all banks to one length, so that banks of equal sizes share one compilation.
+    plans = [oracle_actions(bank, episodes) for bank, episodes in zip(banks, lists, strict=True)]
+    max_length = max(map(len, plans))
+    outcomes = []
+    for plan, episodes, bank_params in zip(plans, lists, params, strict=True):
+        actions = np.pad(plan, ((0, max_length - len(plan)), (0, 0)), constant_values=DONE)
+        outcomes.append(replay_actions(jnp.asarray(actions), start_states(episodes), bank_params, env))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *outcomes)
 
 
 def oracle_actions(bank: Bank, episodes: EpisodeList) -> np.ndarray:
     """Return a shortest sequence of actions for each episode.
 
     Returns:
-      int32 [T, E], each sequence filled up with Done to the longest one.
+      int32 [T, E], each sequence padded with Done to the longest one.
     """
-    successor, goal = bank.successor, episodes.goal
-    pose, left, actions = episodes.pose, episodes.best_length, []
-    while (left > 0).any():
-        action = np.where(left > 0, best_actions(successor, bank.best_length, pose, goal), DONE)
-        pose, left = successor[pose, action], np.maximum(left - 1, 0)
+    successor = bank.successor
+    pose = episodes.pose
+    remaining = episodes.best_length
+    actions = []
+    while (remaining > 0).any():
+        best_action = best_actions(successor, bank.best_length, pose, episodes.goal)
+        action = np.where(remaining > 0, best_action, DONE)
         actions.append(action)
+        pose = successor[pose, action]
+        remaining = np.maximum(remaining - 1, 0)
     return np.array(actions, np.int32)
 
 
-def oracle_outcome(
-    banks: Iterable[Bank], lists: Sequence[EpisodeList], params: Iterable[EnvParams], env: ObjectNav
-) -> Outcome:
-    """Run the oracle in the environment.
-
-    Args:
-      banks: of scenes.
-      lists: episodes in each.
-      params: the environment's, bank by bank.
-      env: the environment.
-
-    Returns:
-      Leaves [E], over the episodes of all banks.
-    """
-    actions = [oracle_actions(bank, episodes) for bank, episodes in zip(banks, lists, strict=True)]
-    longest = max(map(len, actions))
-    padded = [np.pad(steps, ((0, longest - len(steps)), (0, 0)), constant_values=DONE) for steps in actions]
-    outcomes = [
-        replay(jnp.asarray(steps), first_states(episodes), bank_params, env)
-        for steps, episodes, bank_params in zip(padded, lists, params, strict=True)
-    ]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *outcomes)
-
-
 @functools.partial(jax.jit, static_argnums=3)
-def replay(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) -> Outcome:
-    """Run fixed actions in the environment.
+def replay_actions(actions: jax.Array, state: State, params: EnvParams, env: ObjectNav) -> EpisodeOutcome:
+    """Run given actions in the environment.
 
     Args:
       actions: int32 [T, E].
-      state: the first states, leaves [E].
-      params: the environment's.
+      state: start states, leaves [E].
+      params: environment parameters.
       env: the environment.
 
     Returns:
       Leaves [E].
     """
+    agent_loop = AgentLoop(env)
+    batch_shape = state.pose.shape
+    no_weight = jnp.zeros(batch_shape)  # no logits are removed
 
-    acting, nothing = Acting(env), jnp.zeros(state.pose.shape)
-
-    def step(carry: tuple[Agent, jax.Array, Outcome], action: jax.Array) -> tuple[tuple, None]:
+    def step(carry: tuple[Agent, jax.Array, EpisodeOutcome], action: jax.Array) -> tuple[tuple, None]:
         agent, running, outcome = carry
-        agent, taken = acting.step(agent, action, None, params)
-        return (agent, running & ~taken.ended, outcome.after(running, action, taken, nothing)), None
+        agent, result = agent_loop.step(agent, action, None, params)
+        outcome = outcome.add_step(running, action, result, no_weight)
+        return (agent, running & ~result.ended, outcome), None
 
-    agent = acting.begin(state, None, None, params)
-    first = (agent, jnp.ones(state.pose.shape, bool), Outcome.start(state.pose.shape))
-    (agent, _, outcome), _ = jax.lax.scan(step, first, actions)
-    last = agent.state
-    return outcome._replace(distance=params.tables.goal_distance[env.cell(last.pose), last.goal])
+    agent = agent_loop.begin(state, None, None, params)
+    initial_carry = (agent, jnp.ones(batch_shape, bool), EpisodeOutcome.start(batch_shape))
+    (agent, _, outcome), _ = jax.lax.scan(step, initial_carry, actions)
+
+    final_state = agent.state
+    final_cell = env.cell_of_pose(final_state.pose)
+    return outcome._replace(distance=params.tables.goal_distance[final_cell, final_state.goal])

@@ -1,4 +1,10 @@
-"""Sites: squares of the floor plan where objects may stand."""
+"""Sites: squares of the floor plan where objects may stand, as the planner sees them.
+
+`find_sites` divides the floor plan of a scene into squares and records from which poses each can be seen, where the
+detector reports categories, and how sites are related.
+
+Symbols in shapes: N sites, P poses, K categories, C cells, M pairs of a pose and a site in view, L kinds of looks.
+"""
 
 from typing import NamedTuple
 
@@ -7,145 +13,188 @@ from scipy.spatial import KDTree
 
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.scene import CELL, Scene, extent
-from jaxnav.scenes.tables.detector import MAX_RANGE
-from jaxnav.scenes.tables.observation_row import RowFormat, relative_position
+from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent
+from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, relative_position
 from jaxnav.scenes.tables.visibility import SIGHT_MARGIN, cell_centres, clear_of_walls
 from jaxnav.scenes.task import Rules, Task
 
-SPACING = 0.5  # metres between sites, and the width of a distance bin
-BINS = int(MAX_RANGE / SPACING) + 1
-NEAR, AROUND = 1.0, 2.0  # metres between related sites
-SHARED = 0.25  # share of the cells that see either of two sites and see both, where they are in one place
+SITE_SPACING = 0.5  # metres between sites, and the width of a distance bin
+NUM_DISTANCE_BINS = int(MAX_RANGE / SITE_SPACING) + 1
+NEAR_DISTANCE, AROUND_DISTANCE = 1.0, 2.0  # greatest distances of related sites, metres
+SAME_PLACE_OVERLAP = 0.25  # sites are in one place if at least this share of the cells that see either sees both
 NUM_RELATIONS, NUM_SURROUNDINGS = 3, 3
 
 
-class Views(NamedTuple):
-    """Hold what is in the horizontal field of view, past no wall and in range.
+class SiteViews(NamedTuple):
+    """Pairs of a pose and a site in its horizontal field of view, in range and not hidden by walls.
 
-    Looks are numbered by horizon and distance bin, horizon * `BINS` + bin; there are L.
+    The kind of a look is horizon * `NUM_DISTANCE_BINS` + distance bin.
 
     Attributes:
-      pose: int32 [M], in order.
+      pose: int32 [M], ascending.
       site: int32 [M].
-      look: int16 [M], at the site from the pose.
-      begin: int32 [P + 1], the first entry of each pose.
+      look: int16 [M], kind of the look at the site from the pose.
+      first_entry: int32 [P + 1], index of the first pair of each pose.
     """
 
     pose: np.ndarray
     site: np.ndarray
     look: np.ndarray
-    begin: np.ndarray
+    first_entry: np.ndarray
 
-    def at(self, pose: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sites in view from a pose, and how."""
-        entries = slice(self.begin[pose], self.begin[pose + 1])
+    def from_pose(self, pose: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sites in view from a pose, and the kinds of the looks at them."""
+        entries = slice(self.first_entry[pose], self.first_entry[pose + 1])
         return self.site[entries], self.look[entries]
 
 
 class Sites(NamedTuple):
-    """Hold the N sites of a scene of P poses.
+    """The N sites of a scene.
 
     Attributes:
       views: the sites in view from each pose.
-      seen: int16 [P, K], the site at which a category is detected; -1 without a detection.
-      objects: bool [K, N], where the objects of a category stand. Nothing but the fit reads it.
-      relations: bool [3, N, N], whether two sites are within `NEAR`, within `AROUND`, and in one place.
-      surroundings: float32 [3, N], in [0, 1]: the share that is standable, the share that is wall, how openly it lies.
+      detected_site: int16 [P, K], site at which a category is detected; -1 without a detection.
+      object_sites: bool [K, N], True for the sites with an object of a category. Only the fit of the prior reads them.
+      relations: bool [3, N, N], True for pairs within `NEAR_DISTANCE`, within `AROUND_DISTANCE`, and in one place.
+      surroundings: float32 [3, N], in [0, 1]: standable share, wall share, and openness of each site.
     """
 
-    views: Views
-    seen: np.ndarray
-    objects: np.ndarray
+    views: SiteViews
+    detected_site: np.ndarray
+    object_sites: np.ndarray
     relations: np.ndarray
     surroundings: np.ndarray
 
 
 def find_sites(scene: Scene, task: Task, rows: np.ndarray) -> Sites:
-    """Find the sites of a scene.
-
-    A site is a square of `SPACING` that can be seen from a standable cell.
+    """Find the sites of a scene, the squares that can be seen from a standable cell.
 
     Args:
-      scene: whose walls hide sites.
-      task: the categories and rules.
-      rows: uint8 [P, R], what is perceived at each pose.
+      scene: the scene, whose walls hide sites.
+      task: categories and rules.
+      rows: uint8 [P, R], observation row of each pose.
     """
-    rules, cells = task.rules, standable_cells(scene.reach)
-    centres, places = cell_centres(scene, cells), _squares(scene)
-    apart = np.linalg.norm(places - centres[:, None], axis=-1)
-    cell, place = np.nonzero(apart <= MAX_RANGE)
-    line = places[place] - centres[cell]
-    seen = np.maximum(1.0 - SIGHT_MARGIN / np.maximum(apart[cell, place], SIGHT_MARGIN), 0.0)
-    clear = clear_of_walls(scene, centres[cell], centres[cell] + seen[:, None] * line, centres[cell])
-    visible = np.zeros(apart.shape, np.float32)
-    visible[cell[clear], place[clear]] = 1.0
-    kept = visible.any(axis=0)
-    visible, places, apart = visible[:, kept], places[kept], apart[:, kept]
-    nearest = KDTree(places)
-    objects = np.zeros((len(task.categories), len(places)), bool)
+    rules = task.rules
+    num_categories = len(task.categories)
+    centres = cell_centres(scene, standable_cells(scene.reach))  # [C, 2]
+    squares = _square_centres(scene)
+    distance = np.linalg.norm(squares - centres[:, None], axis=-1)  # [C, N]
+
+    # Lines of sight from cells to squares end before the centre of the square.
+    cell, square = np.nonzero(distance <= MAX_RANGE)
+    line = squares[square] - centres[cell]
+    sight_share = np.maximum(1.0 - SIGHT_MARGIN / np.maximum(distance[cell, square], SIGHT_MARGIN), 0.0)
+    line_end = centres[cell] + sight_share[:, None] * line
+    clear = clear_of_walls(scene, centres[cell], line_end, centres[cell])
+    visible = np.zeros(distance.shape, np.float32)
+    visible[cell[clear], square[clear]] = 1.0
+
+    # Sites are the squares that are visible from anywhere.
+    is_site = visible.any(axis=0)
+    visible = visible[:, is_site]
+    positions = squares[is_site]
+    distance = distance[:, is_site]
+    nearest_site = KDTree(positions)
+
+    # Objects belong to the site nearest to them.
     category = np.array(category_ids(scene.types, task.categories), int)
-    objects[category[category >= 0], nearest.query(scene.boxes[category >= 0][:, [0, 2]])[1]] = True
+    has_category = category >= 0
+    _, site = nearest_site.query(scene.boxes[has_category][:, [0, 2]])
+    object_sites = np.zeros((num_categories, len(positions)), bool)
+    object_sites[category[has_category], site] = True
+
     return Sites(
-        views=_views(rules, centres, places, visible > 0, apart),
-        seen=_seen(rules, centres, rows, len(task.categories), nearest),
-        objects=objects,
-        relations=_relations(places, visible),
-        surroundings=_surroundings(scene, places, visible),
+        views=_find_views(rules, centres, positions, visible > 0, distance),
+        detected_site=_find_detected_sites(rules, centres, rows, num_categories, nearest_site),
+        object_sites=object_sites,
+        relations=_relate_sites(positions, visible),
+        surroundings=_describe_surroundings(scene, positions, visible),
     )
 
 
-def _squares(scene: Scene) -> np.ndarray:
-    """Return the centres of the squares over a scene, [N, 2]."""
-    low, high = extent(scene)
-    x, z = (np.arange(a + SPACING / 2, b + SPACING / 2, SPACING) for a, b in zip(low, high, strict=True))
+def _square_centres(scene: Scene) -> np.ndarray:
+    """Return the centres of the squares that cover a scene, float64 [N, 2]."""
+    low, high = scene_extent(scene)
+    x = np.arange(low[0] + SITE_SPACING / 2, high[0] + SITE_SPACING / 2, SITE_SPACING)
+    z = np.arange(low[1] + SITE_SPACING / 2, high[1] + SITE_SPACING / 2, SITE_SPACING)
     return np.stack(np.meshgrid(x, z), axis=-1).reshape(-1, 2)
 
 
-def _views(rules: Rules, centres: np.ndarray, places: np.ndarray, visible: np.ndarray, apart: np.ndarray) -> Views:
-    cell, place = np.nonzero(visible)
-    v, directions = places[place] - centres[cell], rules.directions()
-    ahead, right = v @ directions.T, v @ np.stack([directions[:, 1], -directions[:, 0]])
-    pair, heading = np.nonzero(np.abs(right) <= rules.half_view[0] * ahead)
+def _find_views(
+    rules: Rules, centres: np.ndarray, positions: np.ndarray, visible: np.ndarray, distance: np.ndarray
+) -> SiteViews:
+    """Return the sites in view from each pose; `visible` and `distance` are [C, N]."""
+    # Pairs of a cell and a site, and the headings whose field of view holds the site.
+    cell, site = np.nonzero(visible)
+    offset = positions[site] - centres[cell]
+    directions = rules.heading_directions()
+    ahead = offset @ directions.T
+    right = offset @ np.stack([directions[:, 1], -directions[:, 0]])
+    pair, heading = np.nonzero(np.abs(right) <= rules.half_view_tangents[0] * ahead)
+
+    # Every horizon sees the same sites, but its looks count separately.
     horizon = np.arange(len(rules.horizons))[:, None]
-    pose = (cell[pair] * rules.headings + heading) * len(horizon) + horizon  # [T, M]
-    look = (apart[cell, place][pair] / SPACING).astype(np.int16) + (horizon * BINS).astype(np.int16)
-    order, site = np.argsort(pose, axis=None, kind="stable"), np.broadcast_to(place[pair], pose.shape)
-    counts = np.bincount(pose.ravel(), minlength=len(centres) * rules.poses_per_cell)
-    return Views(
+    pose = (cell[pair] * rules.headings + heading) * len(horizon) + horizon  # [T, pairs]
+    distance_bin = (distance[cell, site][pair] / SITE_SPACING).astype(np.int16)
+    look = distance_bin + (horizon * NUM_DISTANCE_BINS).astype(np.int16)
+    pose_site = np.broadcast_to(site[pair], pose.shape)
+
+    order = np.argsort(pose, axis=None, kind="stable")
+    num_poses = len(centres) * rules.poses_per_cell
+    views_per_pose = np.bincount(pose.ravel(), minlength=num_poses)
+    return SiteViews(
         pose=pose.ravel()[order].astype(np.int32),
-        site=site.ravel()[order].astype(np.int32),
+        site=pose_site.ravel()[order].astype(np.int32),
         look=look.ravel()[order],
-        begin=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        first_entry=np.concatenate([[0], np.cumsum(views_per_pose)]).astype(np.int32),
     )
 
 
-def _seen(rules: Rules, centres: np.ndarray, rows: np.ndarray, categories: int, nearest: KDTree) -> np.ndarray:
-    detections = RowFormat(categories).detections(rows)
+def _find_detected_sites(
+    rules: Rules, centres: np.ndarray, rows: np.ndarray, num_categories: int, nearest_site: KDTree
+) -> np.ndarray:
+    """Return the site at which each pose detects a category, int16 [P, K], -1 without a detection."""
+    detections = RowFormat(num_categories).detections(rows)
     pose, category = np.nonzero(detections[..., 0])
     ahead, right = relative_position(detections[pose, category])
-    cell, heading, _ = rules.split(pose)
-    forward = rules.directions()[heading]
+
+    # World positions of the detections.
+    cell, heading, _ = rules.split_pose(pose)
+    forward = rules.heading_directions()[heading]
     rightward = np.stack([forward[:, 1], -forward[:, 0]], axis=-1)
-    at = centres[cell] + ahead[:, None] * forward + right[:, None] * rightward
-    seen = np.full(detections.shape[:2], -1, np.int16)
-    seen[pose, category] = nearest.query(at)[1]
-    return seen
+    positions = centres[cell] + ahead[:, None] * forward + right[:, None] * rightward
+
+    detected_site = np.full(detections.shape[:2], -1, np.int16)
+    detected_site[pose, category] = nearest_site.query(positions)[1]
+    return detected_site
 
 
-def _relations(places: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    both, each = visible.T @ visible, visible.sum(axis=0)
-    apart = np.linalg.norm(places - places[:, None], axis=-1)
-    shared = both / (each + each[:, None] - both)
-    return np.stack([(apart <= NEAR) & (both > 0), (apart <= AROUND) & (both > 0), shared >= SHARED])
+def _relate_sites(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Return the three relations of sites, bool [3, N, N], see `Sites`."""
+    # Numbers of cells that see both sites of a pair, and either of them.
+    num_both = visible.T @ visible
+    num_each = visible.sum(axis=0)
+    num_either = num_each + num_each[:, None] - num_both
+
+    distance = np.linalg.norm(positions - positions[:, None], axis=-1)
+    is_near = (distance <= NEAR_DISTANCE) & (num_both > 0)
+    is_around = (distance <= AROUND_DISTANCE) & (num_both > 0)
+    return np.stack([is_near, is_around, num_both / num_either >= SAME_PLACE_OVERLAP])
 
 
-def _surroundings(scene: Scene, places: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * CELL / 2
-    column, row = np.moveaxis(np.rint((places[:, None] + corners - scene.origin) / CELL).astype(int), -1, 0)
+def _describe_surroundings(scene: Scene, positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Return the surroundings of each site, float32 [3, N], see `Sites`."""
+    # The four cells around the centre of each site.
+    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * CELL_SIZE / 2
+    cells = np.rint((positions[:, None] + corners - scene.origin) / CELL_SIZE).astype(int)
+    column, row = np.moveaxis(cells, -1, 0)
     nz, nx = scene.reach.shape
     inside = (row >= 0) & (row < nz) & (column >= 0) & (column < nx)
-    row, column = row.clip(0, nz - 1), column.clip(0, nx - 1)
-    standable, wall = (np.mean(inside & mask[row, column], axis=1) for mask in (scene.reach, scene.walls))
-    seen_from = visible.sum(axis=0)
-    return np.stack([standable, wall, seen_from / seen_from.max()]).astype(np.float32)
+    row = row.clip(0, nz - 1)
+    column = column.clip(0, nx - 1)
+
+    standable_share = np.mean(inside & scene.reach[row, column], axis=1)
+    wall_share = np.mean(inside & scene.walls[row, column], axis=1)
+    num_viewing_cells = visible.sum(axis=0)
+    openness = num_viewing_cells / num_viewing_cells.max()
+    return np.stack([standable_share, wall_share, openness]).astype(np.float32)

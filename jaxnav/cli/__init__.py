@@ -1,1 +1,1 @@
-"""Typed configuration and the train, eval, play and import commands."""
+"""Command line: one module per command, imported by `jaxnav.__main__` when the command is called."""

@@ -1,4 +1,4 @@
-"""The accounting command: what experience is worth, and what it costs."""
+"""The account command: value and cost of experience, against a run of agents without any."""
 
 import dataclasses
 import json
@@ -9,12 +9,12 @@ import tyro
 from rich.console import Console
 
 from jaxnav.causal import Form
-from jaxnav.cli.console import command_line, exit_code, result_console
+from jaxnav.cli.console import make_result_console, parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.evaluation.accounting import accounting_table
-from jaxnav.runs.account import account
-from jaxnav.runs.directory import Run
+from jaxnav.evaluation.report import accounting_table
+from jaxnav.runs.evaluate import account
 from jaxnav.runs.policies import EstimatorName
+from jaxnav.runs.run import Run
 from jaxnav.store.files import write_atomic
 
 
@@ -51,26 +51,32 @@ class AccountConfig:
 
 def main(arguments: list[str] | None = None, prog: str = "jaxnav account") -> int:
     """Run the command and return its exit code."""
-    what = "Say what experience is worth to a run where the layout holds, and what it costs where it is shifted."
-    config = command_line(AccountConfig, arguments, prog, what)
-    return exit_code(lambda console: _account(config, console, result_console()))
+    description = "Say what experience is worth to a run where the layout holds, and what it costs where it is shifted."
+    config = parse_arguments(AccountConfig, arguments, prog, description)
+    return run_command(lambda console: _print_account(config, console, make_result_console()))
 
 
-def _account(config: AccountConfig, console: Console, out: Console) -> None:
-    """Evaluate both runs at every shift, print and write."""
-    run, without = Run.open(config.run), Run.open(config.without)
+def _print_account(config: AccountConfig, console: Console, result_console: Console) -> None:
+    """Evaluate both runs at every shift, print the tables and write them as JSON."""
+    run = Run.open(config.run)
+    reference_run = Run.open(config.without)
     target = config.json or config.run / f"account-{config.split}.json"
+
+    # Both runs are evaluated at every shift, and a table printed for each.
     names = ("split", "episodes", "epsilon", "form", "setting", "hold", "seed")
     options = {name: getattr(config, name) for name in names}
-    found = {}
+    entries_by_shift = {}
     for shift in config.shift:
-        entries = account(run, without, shift=shift, console=console, **options)
-        out.print(f"Lead over {without.config.method} at shift {shift:g}, in points")
-        out.print(accounting_table(entries))
-        found[f"{shift:g}"] = [entry.to_json() for entry in entries]
-    about = {"run": str(config.run), "without": str(config.without)} | options
+        entries = account(run, reference_run, shift=shift, console=console, **options)
+        result_console.print(f"Lead over {reference_run.config.method} at shift {shift:g}, in points")
+        result_console.print(accounting_table(entries))
+        entries_by_shift[f"{shift:g}"] = [entry.to_json() for entry in entries]
+
+    # Write the entries with their settings.
+    settings = {"run": str(config.run), "without": str(config.without)} | options
+    document = {"settings": settings, "shifts": entries_by_shift}
     try:
-        write_atomic(target, (json.dumps({"settings": about, "shifts": found}, indent=2) + "\n").encode())
+        write_atomic(target, (json.dumps(document, indent=2) + "\n").encode())
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
     console.print(f"written to {target}")

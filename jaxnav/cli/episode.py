@@ -1,4 +1,4 @@
-"""The episode command: one evaluation episode as a picture."""
+"""The episode command: draw one evaluation episode, or the map that a searching agent made in it."""
 
 import dataclasses
 from pathlib import Path
@@ -7,11 +7,10 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import command_line, exit_code
+from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.runs.packaged import is_policy
-from jaxnav.runs.policies import EstimatorName
-from jaxnav.viz import require_pictures
+from jaxnav.runs.policies import EstimatorName, is_policy
+from jaxnav.viz import require_plotting_packages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,27 +48,27 @@ class EpisodeConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after bad input."""
-    config = command_line(EpisodeConfig, arguments, "jaxnav episode", "Draw one episode.")
-    return exit_code(lambda console: draw(config, console))
+    """Run the command and return its exit code."""
+    config = parse_arguments(EpisodeConfig, arguments, "jaxnav episode", "Draw one episode.")
+    return run_command(lambda console: _draw(config, console))
 
 
-def draw(config: EpisodeConfig, console: Console) -> None:
+def _draw(config: EpisodeConfig, console: Console) -> None:
     """Play the episode and write its picture."""
-    require_pictures()
-    from jaxnav.viz.episode import draw_episode
-    from jaxnav.viz.play import play_episode
-    from jaxnav.viz.search import search_at
-    from jaxnav.viz.search_map import draw_search
+    require_plotting_packages()
+    from jaxnav.viz.episode import draw_episode, play_episode
+    from jaxnav.viz.search import draw_search, take_snapshot
 
-    name, endings = ("map.png", (".png",)) if config.map else ("episode.gif", (".gif", ".png"))
-    path = config.out or (Path() if is_policy(config.source) else Path(config.source)) / name
-    if path.suffix not in endings:
-        raise InputError(f"--out {path}: give a name that ends in {' or '.join(endings)}")
+    # Check the options before anything is played.
+    path = config.out or _default_path(config)
+    suffixes = (".png",) if config.map else (".gif", ".png")
+    if path.suffix not in suffixes:
+        raise InputError(f"--out {path}: give a name that ends in {' or '.join(suffixes)}")
     if config.step is not None and not config.map:
         raise InputError(f"--step {config.step}: is for the map; give --map too")
     if config.map and len(config.shift) > 1:
         raise InputError("--map: is drawn at one layout shift; give one --shift")
+
     episodes = play_episode(
         config.source,
         config.split,
@@ -81,10 +80,17 @@ def draw(config: EpisodeConfig, console: Console) -> None:
         config.shift or (None,),
         console,
     )
-    steps = max(len(each.trace.pose) for each in episodes)
+    num_steps = max(len(episode.trace.pose) for episode in episodes)
     if config.map:
-        step = (steps if config.step is None else config.step) - 1
-        draw_search(episodes[0], search_at(episodes[0], step), step, path)
+        # Steps are counted from 1 in the option, from 0 in the trace.
+        step = (num_steps if config.step is None else config.step) - 1
+        draw_search(episodes[0], take_snapshot(episodes[0], step), step, path)
     else:
         draw_episode(episodes, path)
-    console.print(f"{steps} steps; written to {path}")
+    console.print(f"{num_steps} steps; written to {path}")
+
+
+def _default_path(config: EpisodeConfig) -> Path:
+    """Return the picture's path in the run directory or, for a policy, in the working directory."""
+    folder = Path() if is_policy(config.source) else Path(config.source)
+    return folder / ("map.png" if config.map else "episode.gif")

@@ -1,4 +1,4 @@
-"""The evaluation command: a table, JSON, a row per episode."""
+"""The eval command: evaluate a run; prints a table and writes it as JSON, with a row per episode."""
 
 import dataclasses
 from pathlib import Path
@@ -8,12 +8,12 @@ import tyro
 from rich.console import Console
 
 from jaxnav.causal import Form
-from jaxnav.cli.console import command_line, exit_code, result_console
+from jaxnav.cli.console import make_result_console, parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report_tables import console_table, difference_table
-from jaxnav.runs.directory import Run
+from jaxnav.evaluation.report import difference_table, results_table
 from jaxnav.runs.evaluate import evaluate
 from jaxnav.runs.policies import EstimatorName
+from jaxnav.runs.run import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +57,14 @@ class EvalConfig:
 
 def main(arguments: list[str] | None = None, prog: str = "jaxnav eval") -> int:
     """Run the command and return its exit code."""
-    config = command_line(EvalConfig, arguments, prog, "Evaluate a training run.")
-    return exit_code(lambda console: _evaluate(config, console, result_console()))
+    config = parse_arguments(EvalConfig, arguments, prog, "Evaluate a training run.")
+    return run_command(lambda console: _print_evaluation(config, console, make_result_console()))
 
 
-def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
+def _print_evaluation(config: EvalConfig, console: Console, result_console: Console) -> None:
     """Evaluate a run, print the table and write the files."""
-    target = _target(config)
+    # Find the file first: an evaluation takes minutes.
+    target = _find_target(config)
     results = evaluate(
         Run.open(config.run),
         split=config.split,
@@ -79,11 +80,14 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
         seed=config.seed,
         console=console,
     )
-    out.print(console_table(results.report))
+
+    # Print the table, the paired differences and the notes.
+    result_console.print(results_table(results.report))
     if results.report["differences"]:
-        out.print(difference_table(results.report))
+        result_console.print(difference_table(results.report))
     for note in results.report["notes"]:
-        out.print(note)
+        result_console.print(note)
+
     try:
         results.write(target)
     except OSError as error:
@@ -92,14 +96,23 @@ def _evaluate(config: EvalConfig, console: Console, out: Console) -> None:
     console.print(f"{len(results.episodes.goal)} episodes, {compilations} compilation; written to {target}")
 
 
-def _target(config: EvalConfig) -> Path:
-    """Return where the table goes, or refuse early."""
-    file = config.scenes and f"scenes-{config.scenes.name.split('.')[0]}"  # no world is called that
-    name = "-".join(part for part in ("eval", config.world or file, config.split) if part)
-    name += "" if config.shift is None else f"-shift{config.shift:g}"
-    name += "" if config.setting is None else f"-{config.setting}"
-    name += "" if config.inner_steps is None else f"-inner{config.inner_steps}"
-    target = config.json or config.run / f"{name}.json"
+def _find_target(config: EvalConfig) -> Path:
+    """Return the JSON file to write, or raise an `InputError` before anything is evaluated."""
+    # The default name lists every option that changes the results.
+    parts = ["eval"]
+    if config.world:
+        parts.append(config.world)
+    elif config.scenes:
+        parts.append(f"scenes-{config.scenes.name.split('.')[0]}")  # never the name of a world
+    parts.append(config.split)
+    if config.shift is not None:
+        parts.append(f"shift{config.shift:g}")
+    if config.setting is not None:
+        parts.append(config.setting)
+    if config.inner_steps is not None:
+        parts.append(f"inner{config.inner_steps}")
+
+    target = config.json or config.run / f"{'-'.join(parts)}.json"
     if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
         raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")
     return target

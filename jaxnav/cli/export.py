@@ -1,4 +1,4 @@
-"""The export command: one policy of a run, with its model card."""
+"""The export command: one policy of a run with its model card, as parameters or as a program without jaxnav."""
 
 import dataclasses
 import hashlib
@@ -10,21 +10,22 @@ import jax
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import command_line, exit_code
+from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.policies.methods import find_method
-from jaxnav.runs.directory import Run
-from jaxnav.runs.exported import program
-from jaxnav.runs.model_card import SIGNATURE, model_card
-from jaxnav.runs.policies import POLICIES
-from jaxnav.runs.policy import LoadedPolicy, load_policy
+from jaxnav.runs.policies import POLICIES_DIR
+from jaxnav.runs.policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, load_policy, write_model_card
+from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.task import ACTIONS
 from jaxnav.store.files import write_atomic
 
-CARD = "README.md"
-FILES = PROGRAM, NAMES, PARAMS, POLICY = "step.stablehlo", "step.json", "params.safetensors", "policy.json"
+# Files of an export.
+CARD_FILE = "README.md"
+PROGRAM_FILE = "step.stablehlo"
+NAMES_FILE = "step.json"
+PARAMS_FILE = "params.safetensors"
+POLICY_FILE = "policy.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,89 +48,104 @@ class ExportConfig:
 
 def main(arguments: list[str] | None = None, prog: str = "jaxnav export") -> int:
     """Run the command and return its exit code."""
-    what = "Export a policy of a run with its model card: as parameters, or as a program that runs without jaxnav."
-    config = command_line(ExportConfig, arguments, prog, what)
-    return exit_code(lambda console: _export(config, console))
+    description = (
+        "Export a policy of a run with its model card: as parameters, or as a program that runs without jaxnav."
+    )
+    config = parse_arguments(ExportConfig, arguments, prog, description)
+    return run_command(lambda console: _export(config, console))
 
 
 class Export(NamedTuple):
-    """Hold what an export consists of besides its card.
+    """Contents of an export besides its card.
 
     Attributes:
-      files: their contents, by name.
-      about: what each file is.
-      use: lines of Markdown.
+      files: contents by file name.
+      descriptions: one line for each file.
+      usage: lines of Markdown that show how to use the files.
     """
 
     files: dict[str, bytes]
-    about: dict[str, str]
-    use: tuple[str, ...]
+    descriptions: dict[str, str]
+    usage: tuple[str, ...]
 
 
 def _export(config: ExportConfig, console: Console) -> None:
     """Write the files of an export, the card last."""
+    # Find the policy among those of the run.
     run = Run.open(config.run)
-    names = [f"{arm}-{seed}" for arm in run.config.arms for seed in range(run.config.seeds)]
+    policy_names = [f"{arm}-{seed}" for arm in run.config.arms for seed in range(run.config.seeds)]
     name = config.policy or f"{run.config.arms[-1]}-0"
-    if name not in names:
-        raise InputError(f"--policy {name}: {config.run} has {', '.join(names)}")
-    source = config.run / POLICIES / name
+    if name not in policy_names:
+        raise InputError(f"--policy {name}: {config.run} has {', '.join(policy_names)}")
+    source = config.run / POLICIES_DIR / name
     policy = load_policy(source)
     out = config.out or config.run / "exports" / f"{name}-{config.format}"
     if not _is_replaceable(out):
         raise InputError(f"{out}: is there and holds no export; give another --out")
-    export = _parameters(source) if config.format == "safetensors" else _program(policy, run)
-    card = model_card(run, name, policy, export.about, export.use)
+
+    is_program = config.format == "stablehlo"
+    export = _make_program_export(policy, run) if is_program else _make_parameter_export(source)
+    card = write_model_card(run, name, policy, export.descriptions, export.usage)
+
+    # The card marks a complete export: it is removed first and written last.
     try:
-        for file in (CARD, *FILES):  # without its card nothing of an earlier export is taken for one
+        for file in (CARD_FILE, PROGRAM_FILE, NAMES_FILE, PARAMS_FILE, POLICY_FILE):
             (out / file).unlink(missing_ok=True)
-        for file, data in (export.files | {CARD: card.encode()}).items():
+        for file, data in export.files.items():
             write_atomic(out / file, data)
+        write_atomic(out / CARD_FILE, card.encode())
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
     console.print(f"written to {out}")
 
 
 def _is_replaceable(out: Path) -> bool:
-    """Return whether a folder is missing, empty or an earlier export."""
+    """True if a folder is missing, empty or an earlier export."""
     if not out.is_dir() or not any(out.iterdir()):
         return not out.is_file()
-    card = out / CARD
-    return card.is_file() and SIGNATURE in card.read_text(encoding="utf-8", errors="replace")
+    card = out / CARD_FILE
+    return card.is_file() and MODEL_CARD_SIGNATURE in card.read_text(encoding="utf-8", errors="replace")
 
 
-def _parameters(source: Path) -> Export:
-    """Return the parameters as the run keeps them."""
-    about = {PARAMS: "parameters and what was learned before", POLICY: "what they are built into"}
-    return Export({name: (source / name).read_bytes() for name in about}, about, _code(_LOADING))
+def _make_parameter_export(source: Path) -> Export:
+    """Return the parameters as the run stores them."""
+    descriptions = {PARAMS_FILE: "parameters and what was learned before", POLICY_FILE: "what they are built into"}
+    files = {name: (source / name).read_bytes() for name in descriptions}
+    return Export(files, descriptions, _code_block(_LOADING_CODE))
 
 
-def _program(policy: LoadedPolicy, run: Run) -> Export:
-    """Return the step as a program, and the names of what it takes."""
-    written, task = program(policy), run.config.task
-    names = {"categories": task.categories, "actions": ACTIONS, "rooms": [*ROOM_TYPES, "any other"]}
-    described = names | {"jax": jax.__version__, "sha256": hashlib.sha256(written).hexdigest()}
-    files = {PROGRAM: written, NAMES: (json.dumps(described, indent=2) + "\n").encode()}
-    about = {
-        PROGRAM: f"the step, for CPU, CUDA and TPU; written by JAX {jax.__version__}, runs with JAX and flatbuffers",
-        NAMES: "names by index, and the digest",
+def _make_program_export(policy: LoadedPolicy, run: Run) -> Export:
+    """Return the step as a program, and the names of its inputs' categories, actions and rooms."""
+    program = export_program(policy)
+    contents = {
+        "categories": run.config.task.categories,
+        "actions": ACTIONS,
+        "rooms": [*ROOM_TYPES, "any other"],
+        "jax": jax.__version__,
+        "sha256": hashlib.sha256(program).hexdigest(),
     }
-    inputs = _INPUTS.format(choices=find_method(policy.spec.method).control.num_choices)
-    return Export(files, about, (*_code(_CALLING), *inputs.rstrip().split("\n")))
+    files = {PROGRAM_FILE: program, NAMES_FILE: (json.dumps(contents, indent=2) + "\n").encode()}
+    descriptions = {
+        PROGRAM_FILE: f"the step, for CPU, CUDA and TPU; written by JAX {jax.__version__}, "
+        "runs with JAX and flatbuffers",
+        NAMES_FILE: "names by index, and the digest",
+    }
+    inputs = _INPUTS_TEXT.format(choices=policy.spec.method.control.num_choices)
+    return Export(files, descriptions, (*_code_block(_CALLING_CODE), *inputs.rstrip().split("\n")))
 
 
-def _code(text: str) -> tuple[str, ...]:
+def _code_block(text: str) -> tuple[str, ...]:
     return ("```python", *text.strip().split("\n"), "```")
 
 
-_LOADING = """
+_LOADING_CODE = """
 import jaxnav
 
 policy = jaxnav.load_policy(".")  # this folder
 memory = policy.init()
 """
 
-_CALLING = """
+_CALLING_CODE = """
 import hashlib
 import json
 from pathlib import Path
@@ -147,7 +163,7 @@ outputs = step.call(inputs, np.float32(0.5))  # epsilon
 inputs |= {"memory": outputs["memory"], "action": outputs["action"], "first": np.zeros(8, bool)}
 """
 
-_INPUTS = f"""
+_INPUTS_TEXT = f"""
 Inputs, a row for each episode:
 
 * `detections` uint8 [K, 4]: for each category, by the nearest object of it, confidence x 255 (0: not detected), metres

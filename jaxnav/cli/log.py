@@ -1,4 +1,4 @@
-"""The log command: a run's log to TensorBoard or Weights & Biases."""
+"""The log command: forward a run's training log to TensorBoard or Weights & Biases."""
 
 import dataclasses
 from pathlib import Path
@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import command_line, exit_code
-from jaxnav.runs.directory import Run
+from jaxnav.cli.console import parse_arguments, run_command
+from jaxnav.runs.run import Run
 from jaxnav.runs.tracking import send_log
 
 
@@ -30,15 +30,16 @@ class LogConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after bad input."""
-    config = command_line(LogConfig, arguments, "jaxnav log", "Show a training log elsewhere.")
-    return exit_code(lambda console: _send(config, console))
+    """Run the command and return its exit code."""
+    config = parse_arguments(LogConfig, arguments, "jaxnav log", "Show a training log elsewhere.")
+    return run_command(lambda console: _send(config, console))
 
 
 def _send(config: LogConfig, console: Console) -> None:
+    """Send the rows logged so far; with `--follow`, until the run is finished or Ctrl-C."""
     try:
-        count = send_log(Run.open(config.run), config.to, config.follow, config.project)
+        num_rows = send_log(Run.open(config.run), config.to, config.follow, config.project)
     except KeyboardInterrupt:
         console.print("stopped; what was logged so far has been sent")
         return
-    console.print(f"{count} rows of {config.run} sent to {' and '.join(config.to)}")
+    console.print(f"{num_rows} rows of {config.run} sent to {' and '.join(config.to)}")

@@ -8,13 +8,13 @@ from typing import Literal
 from rich.console import Console
 from rich.live import Live
 
-from jaxnav.cli.console import command_line, exit_code
+from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.game.keys import pressed
-from jaxnav.game.prepare import prepare
-from jaxnav.game.screen import end_screen, look_screen
-from jaxnav.game.session import play
-from jaxnav.runs.replay import scene_named
+from jaxnav.game.keys import read_keys
+from jaxnav.game.prepare import prepare_game
+from jaxnav.game.screen import game_screen, result_screen
+from jaxnav.game.session import play_game
+from jaxnav.runs.evaluate import find_scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,19 +44,20 @@ class PlayConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after bad input."""
-    config = command_line(PlayConfig, arguments, "jaxnav play", "Play an episode by hand.")
-    return exit_code(lambda console: _play(config, console))
+    """Run the command and return its exit code."""
+    config = parse_arguments(PlayConfig, arguments, "jaxnav play", "Play an episode by hand.")
+    return run_command(lambda console: _play(config, console))
 
 
 def _play(config: PlayConfig, console: Console) -> None:
     """Play the episode on the screen, then show its map."""
-    out = Console(highlight=False)
-    with pressed(sys.stdin) as keys:
-        if not out.is_terminal:
+    screen = Console(highlight=False)
+    with read_keys(sys.stdin) as keys:
+        if not screen.is_terminal:
             raise InputError("play: the output is no terminal; start it in one")
-        game = prepare(**dataclasses.asdict(config), console=console)
-        with Live(console=out, screen=True, auto_refresh=False) as live:
-            ending = play(game, keys, lambda look: live.update(look_screen(game, look), refresh=True))
-    scene = scene_named(game.world, game.bank.names[int(game.episode.scene[0])])
-    out.print(end_screen(game, ending, scene, out.width))
+        game = prepare_game(**dataclasses.asdict(config), console=console)
+        with Live(console=screen, screen=True, auto_refresh=False) as live:
+            result = play_game(game, keys, lambda view: live.update(game_screen(game, view), refresh=True))
+
+    scene = find_scene(game.world, game.bank.names[int(game.episode.scene[0])])
+    screen.print(result_screen(game, result, scene, screen.width))

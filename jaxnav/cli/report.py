@@ -1,4 +1,4 @@
-"""The report command: a run on one page, with replays."""
+"""The report command: tables, curves and replays of a run on one HTML page."""
 
 import dataclasses
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import command_line, exit_code
+from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import Run
+from jaxnav.runs.run import Run
 from jaxnav.store.files import write_atomic
-from jaxnav.viz import require_pictures
+from jaxnav.viz import require_plotting_packages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,23 +46,29 @@ class ReportConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = command_line(ReportConfig, arguments, "jaxnav report", "Show a training run on one page.")
-    return exit_code(lambda console: _report(config, console))
+    config = parse_arguments(ReportConfig, arguments, "jaxnav report", "Show a training run on one page.")
+    return run_command(lambda console: _write_report(config, console))
 
 
-def _report(config: ReportConfig, console: Console) -> None:
+def _write_report(config: ReportConfig, console: Console) -> None:
     """Measure the run and write the page."""
-    require_pictures()
-    from jaxnav.report.gather import Options
+    require_plotting_packages()
     from jaxnav.report.make import make_report
+    from jaxnav.report.measure import ReportOptions
 
+    # Check the options before anything is measured.
     target = config.out or config.run / "report.html"
     if target.is_dir():
         raise InputError(f"--out {target}: is a folder; give the name of a file to write")
+
     run = Run.open(config.run)
-    beside = None if config.beside is None else Run.open(config.beside)
-    options = Options(**{field.name: getattr(config, field.name) for field in dataclasses.fields(Options)})
-    page = make_report(run, beside, options, console).encode()
+    reference_run = None if config.beside is None else Run.open(config.beside)
+
+    # `ReportOptions` has some of the fields of `ReportConfig`.
+    option_names = [field.name for field in dataclasses.fields(ReportOptions)]
+    options = ReportOptions(**{name: getattr(config, name) for name in option_names})
+    page = make_report(run, reference_run, options, console).encode()
+
     try:
         write_atomic(target, page)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The scenes commands: import, show and stats."""
+"""The scenes commands: import scenes to a file, show one as a picture, print statistics of a file."""
 
 import dataclasses
 import re
@@ -11,16 +11,22 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from jaxnav.cli.console import exit_code, harmless, result_console
+from jaxnav.cli.console import escape_parser_output, make_result_console, run_command
 from jaxnav.errors import InputError
-from jaxnav.evaluation.scene_statistics import scene_statistics
-from jaxnav.runs.directory import load_run
+from jaxnav.evaluation.scene_statistics import compute_scene_statistics
 from jaxnav.runs.policies import load_policies
-from jaxnav.scenes.categories import most_common
-from jaxnav.scenes.files.importing import Format, ImportSummary, Split, import_scenes, read_format, select
-from jaxnav.scenes.sources import SceneSource
-from jaxnav.scenes.worlds import WORLDS
-from jaxnav.viz import require_pictures
+from jaxnav.runs.run import load_run_config
+from jaxnav.scenes.categories import format_most_common
+from jaxnav.scenes.files.importing import (
+    ImportSummary,
+    SceneFormat,
+    SceneSplit,
+    filter_scenes,
+    import_scenes,
+    read_source,
+)
+from jaxnav.scenes.worlds import WORLDS, SceneSource
+from jaxnav.viz import require_plotting_packages
 from jaxnav.viz.scene_tables import scene_remarks, scene_tables
 
 
@@ -50,10 +56,10 @@ class ImportConfig:
       base: scene file with the rooms that re-placements are of.
     """
 
-    format: Format
+    format: SceneFormat
     source: str
     out: Path
-    split: Split = "train"
+    split: SceneSplit = "train"
     val: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
     room_types: tuple[str, ...] = ()
@@ -96,8 +102,8 @@ class StatsConfig(SceneSource):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after bad input."""
-    with harmless():
+    """Run the command and return its exit code."""
+    with escape_parser_output():
         config = tyro.extras.subcommand_cli_from_dict(
             {"import": ImportConfig, "show": ShowConfig, "stats": StatsConfig},
             args=arguments,
@@ -105,19 +111,20 @@ def main(arguments: list[str] | None = None) -> int:
             config=(tyro.conf.PositionalRequiredArgs,),
         )
     if isinstance(config, ImportConfig):
-        return exit_code(lambda console: convert(config, console))
+        return run_command(lambda console: _import(config, console))
     if isinstance(config, ShowConfig):
-        return exit_code(lambda console: show(config, console))
-    return exit_code(lambda console: print_statistics(config, console))
+        return run_command(lambda console: _show(config, console))
+    return run_command(lambda console: _print_statistics(config, console))
 
 
-def convert(config: ImportConfig, console: Console) -> None:
-    """Import scenes and print what was refused or unknown."""
+def _import(config: ImportConfig, console: Console) -> None:
+    """Import scenes, and print which were refused and which objects are of unknown types."""
 
-    def report(error: InputError) -> None:
+    def report_refusal(error: InputError) -> None:
         console.print(f"refused: {error}", style="yellow")
 
-    scenes = read_format(
+    # Read and select the scenes, and write them by split.
+    scenes = read_source(
         config.format,
         config.source,
         config.split,
@@ -127,39 +134,47 @@ def convert(config: ImportConfig, console: Console) -> None:
         base=config.base,
         agent_part=config.agent_part,
     )
-    categories = config.categories or (WORLDS[config.world].task.categories if config.world else None)
-    scenes = select(scenes, config.room_types, config.largest)
+    categories = config.categories
+    if not categories and config.world:
+        categories = WORLDS[config.world].task.categories
+    scenes = filter_scenes(scenes, config.room_types, config.largest)
     summary = import_scenes(
-        scenes, config.source, config.out, config.split, config.val, config.test, categories, report
+        scenes, config.source, config.out, config.split, config.val, config.test, categories or None, report_refusal
     )
-    for told in _told(summary):
-        console.print(told, style="yellow")
-    if summary.unknown:
-        objects, types = summary.unknown.total(), most_common(summary.unknown)
-        told = f"objects of unknown types, which only block the sight: {objects:,}, of them {types}"
-        console.print(told)
-    counts = f"{len(summary.scenes)} scenes imported, {summary.refused} refused"
+
+    # Print guesses and omissions line by line; the last line counts the scenes.
+    for warning in _import_warnings(summary):
+        console.print(warning, style="yellow")
+    if summary.unknown_type_counts:
+        num_objects = summary.unknown_type_counts.total()
+        types = format_most_common(summary.unknown_type_counts)
+        console.print(f"objects of unknown types, which only block the sight: {num_objects:,}, of them {types}")
+    counts = f"{len(summary.scenes)} scenes imported, {summary.num_refused} refused"
     console.print(f"{counts}; written to {config.out}")
 
 
-def _told(summary: ImportSummary) -> Iterator[str]:
-    """Yield what an import guessed, moved or left out."""
-    yield from (f"{count:,} {text}" for text, count in summary.notes.items())
-    if summary.unconnected:
-        cells = {name: int(scene.reach.sum()) for name, scene in summary.scenes.items()}
-        ((name, most),) = summary.unconnected.most_common(1)
+def _import_warnings(summary: ImportSummary) -> Iterator[str]:
+    """Yield a line for each kind of values guessed, objects moved or cells skipped by an import."""
+    for text, count in summary.notes.items():
+        yield f"{count:,} {text}"
+
+    unconnected = summary.unconnected_cell_counts
+    if unconnected:
+        num_cells = {name: int(scene.reach.sum()) for name, scene in summary.scenes.items()}
+        ((worst_scene, worst_count),) = unconnected.most_common(1)
         yield (
-            f"{summary.unconnected.total():,} of {sum(cells.values()):,} cells in {len(summary.unconnected)} scenes "
-            f"are not connected with the largest part and not used; most in {name}, {most} of {cells[name]}"
+            f"{unconnected.total():,} of {sum(num_cells.values()):,} cells in {len(unconnected)} scenes are not "
+            "connected with the largest part and not used; "
+            f"most in {worst_scene}, {worst_count} of {num_cells[worst_scene]}"
         )
 
 
-def show(config: ShowConfig, console: Console) -> None:
+def _show(config: ShowConfig, console: Console) -> None:
     """Draw a scene and write the picture."""
-    require_pictures()
+    require_plotting_packages()
     from jaxnav.viz.scene import draw_scene
 
-    scene = config.select(config.scene, config.index)
+    scene = config.select_scene(config.scene, config.index)
     path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + ".png")
     if path.suffix != ".png":
         raise InputError(f"--out {path}: give a name that ends in .png")
@@ -171,22 +186,33 @@ def show(config: ShowConfig, console: Console) -> None:
     console.print(f"written to {path}")
 
 
-def print_statistics(config: StatsConfig, console: Console) -> None:
-    """Print the statistics of scenes."""
+def _print_statistics(config: StatsConfig, console: Console) -> None:
+    """Compile the scenes of a file and print their statistics."""
+    # The run or the world gives categories and rules; only a run has layout priors.
     if config.run and config.world:
         raise InputError("--world, --run: both are given, but the run has a world; leave --world out")
-    run = load_run(config.run) if config.run else None
-    task = run.task if run else config.task
-    priors = np.asarray(load_policies(run).knowledge.layout, np.float64) if run else None
+    run_config = load_run_config(config.run) if config.run else None
+    if run_config:
+        task = run_config.task
+        world = run_config.world
+        priors = np.asarray(load_policies(run_config).knowledge.layout, np.float64)
+    else:
+        task = config.task
+        world = config.world_name
+        priors = None
+
+    # Compile scene by scene, with a progress bar.
     scenes = config.open(task)
-    each = (scenes[i] for i in range(len(scenes)))
-    bar = track(each, "compiling", len(scenes), console=console, transient=True, disable=not console.is_terminal)
-    statistics = [scene_statistics(scene, task) for scene in bar]
-    out = result_console()
-    world = run.world if run else config.world_name
-    out.print(f"{config.file}: {len(statistics)} scenes, by the categories and rules of {world}")
+    scene_iterator = (scenes[index] for index in range(len(scenes)))
+    scenes_with_progress = track(
+        scene_iterator, "compiling", len(scenes), console=console, transient=True, disable=not console.is_terminal
+    )
+    statistics = [compute_scene_statistics(scene, task) for scene in scenes_with_progress]
+
+    result_console = make_result_console()
+    result_console.print(f"{config.file}: {len(statistics)} scenes, by the categories and rules of {world}")
     for title, table in scene_tables(statistics, task, priors).items():
-        out.print(title, style="bold")
-        out.print(table, "")
+        result_console.print(title, style="bold")
+        result_console.print(table, "")
     for remark in scene_remarks(statistics, task):
-        out.print(remark)
+        result_console.print(remark)

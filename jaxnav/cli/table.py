@@ -1,4 +1,4 @@
-"""The table command: an evaluation's JSON as a Markdown table."""
+"""The table command: print the JSON file of an evaluation as a Markdown table."""
 
 import dataclasses
 import json
@@ -7,10 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.cli.console import command_line, exit_code, printable
+from jaxnav.cli.console import escape_control_chars, parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import FORMAT
-from jaxnav.evaluation.report_tables import markdown_table
+from jaxnav.evaluation.report import REPORT_FORMAT, markdown_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,17 +25,23 @@ class TableConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = command_line(TableConfig, arguments, "jaxnav table", "Print an evaluation as Markdown.")
-    return exit_code(lambda _: print(printable(markdown_table(_read(config.file)), kept="\n"), end=""))
+    config = parse_arguments(TableConfig, arguments, "jaxnav table", "Print an evaluation as Markdown.")
+    return run_command(lambda _: _print_table(config.file))
 
 
-def _read(path: Path) -> dict:
+def _print_table(path: Path) -> None:
+    text = markdown_table(_read_report(path))
+    print(escape_control_chars(text, keep="\n"), end="")
+
+
+def _read_report(path: Path) -> dict:
+    """Return the report in a JSON file, or raise an `InputError` if the file is no evaluation."""
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: no evaluation can be read from it ({error}); give a file that an evaluation wrote"
         ) from error
-    if not isinstance(report, dict) or report.get("format") != FORMAT:
-        raise InputError(f"{path}: is no evaluation of format {FORMAT}; give a file that an evaluation wrote")
+    if not isinstance(report, dict) or report.get("format") != REPORT_FORMAT:
+        raise InputError(f"{path}: is no evaluation of format {REPORT_FORMAT}; give a file that an evaluation wrote")
     return report

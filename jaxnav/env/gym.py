@@ -1,7 +1,10 @@
-"""The environment for Gymnasium, single and vectorised.
+"""Gymnasium environments, single and vectorised, with named observations.
 
-`gymnasium.make("jaxnav.env.gym:jaxnav/rooms-v0")` and `gymnasium.make_vec(..., num_envs=1024)`, also with `apartments`
-and `houses`; options are those of `jaxnav.make`. Importing this module registers the ids.
+    gymnasium.make("jaxnav.env.gym:jaxnav/rooms-v0")
+    gymnasium.make_vec("jaxnav.env.gym:jaxnav/rooms-v0", num_envs=1024)
+
+The worlds `apartments` and `houses` are registered likewise; keyword arguments are the options of `jaxnav.make`.
+Importing this module registers the ids.
 """
 
 from collections.abc import Sequence
@@ -17,116 +20,24 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from jaxnav.env.make import make
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, State
+from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import WORLDS
 
-Named = dict[str, Any]
-_SCALE = np.array([255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE], np.float32)
-_ORIGIN = np.array([0.0, 0.0, 128.0, 0.0], np.float32)
+#: Observations or infos by name.
+NamedValues = dict[str, Any]
+
+#: A detection is (byte - origin) / scale: confidence, metres ahead, metres to the right, apparent size.
+_DETECTION_SCALE = np.array([255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE], np.float32)
+_DETECTION_ORIGIN = np.array([0.0, 0.0, 128.0, 0.0], np.float32)
 
 
-class Episode(NamedTuple):
-    """Hold an episode and how its state was come to.
-
-    Attributes:
-      state: of the environment.
-      moved: bool [], whether the last action changed the cell.
-    """
-
-    state: State
-    moved: jax.Array
-
-
-def observation_space(env: ObjectNav) -> spaces.Dict:
-    """Return the space of named observations.
-
-    `view` uint8 [V, V]: 0 unknown, 1 free, 2 blocked; row 0 is nearest, column 0 leftmost. `detections` float32 [K, 4]:
-    for each category confidence, metres ahead, metres to the right and apparent size; zeros where it is not detected.
-    `goal`: index of a category. `heading`: compass. `horizon`: the camera's. `moved`: whether the last action changed
-    the cell.
-    """
-    rows, rules = env.row_format, env.task.rules
-    low, high = ((np.array([byte, byte, byte, byte], np.float32) - _ORIGIN) / _SCALE for byte in (0.0, 255.0))
-    shape = (rows.num_categories, 4)
-    return spaces.Dict(
-        {
-            "view": spaces.Box(0, 2, (rows.view, rows.view), np.uint8),
-            "detections": spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), dtype=np.float32),
-            "goal": spaces.Discrete(rows.num_categories),
-            "heading": spaces.Discrete(rules.headings),
-            "horizon": spaces.Discrete(len(rules.horizons)),
-            "moved": spaces.Discrete(2),
-        }
-    )
-
-
-class Told(NamedTuple):
-    """Hold what an action brought.
+class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
+    """One episode at a time.
 
     Attributes:
-      reward: float32 [].
-      terminated, truncated: bool [], whether the episode ended by Done or for lack of steps.
-      success: bool [], whether it was a Done that succeeds.
-    """
-
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    success: jax.Array
-
-
-class _Functions:
-    """Compile reset and step of a batch of episodes, with named observations."""
-
-    def __init__(self, env: ObjectNav, params: EnvParams) -> None:
-        self._env, self._params = env, params
-        self.reset, self.advance, self.step = (
-            jax.jit(jax.vmap(each)) for each in (self._reset, self._advance, self._step)
-        )
-
-    def _reset(self, key: jax.Array) -> tuple[Episode, Named]:
-        episode = Episode(self._env.reset(key, self._params)[1], jnp.bool_(False))
-        return episode, self._named(episode)
-
-    def _advance(self, episode: Episode, action: jax.Array) -> tuple[Episode, Named, Told]:
-        """Take an action; what ends stays where it ended."""
-        state, reward, terminated, truncated = self._env.advance(episode.state, action, self._params)
-        after = Episode(state, self._env.cell(state.pose) != self._env.cell(episode.state.pose))
-        success = terminated & self._env.succeeds(state, self._params)
-        return after, self._named(after), Told(reward, terminated, truncated, success)
-
-    def _step(self, key: jax.Array, episode: Episode, action: jax.Array) -> tuple[Episode, Named, Named, Told]:
-        """Take an action; what ends is followed by a new episode at once."""
-        after, last, told = self._advance(episode, action)
-        fresh, first = self._reset(key)
-        ended = told.terminated | told.truncated
-        episode, named = jax.tree.map(lambda new, old: jnp.where(ended, new, old), (fresh, first), (after, last))
-        return episode, named, last, told
-
-    def _named(self, episode: Episode) -> Named:
-        env, state = self._env, episode.state
-        row, view = env.observe(state, self._params).row, env.row_format.view
-        _, heading, horizon = env.task.rules.split(state.pose)
-        detections = env.row_format.detections(row)
-        values = (detections.astype(jnp.float32) - _ORIGIN[None]) / _SCALE[None]
-        return {
-            "view": env.row_format.view_cells(row).reshape(view, view),
-            "detections": jnp.where(detections[:, :1] > 0, values, 0.0),
-            "goal": state.goal,
-            "heading": heading,
-            "horizon": horizon,
-            "moved": episode.moved.astype(jnp.int32),
-        }
-
-
-class ObjectNavEnv(gymnasium.Env[Named, np.int64]):
-    """Hold one episode at a time.
-
-    Attributes:
-      categories: names of what can be detected, by index.
+      categories: names of the detected categories, by index.
     """
 
     def __init__(self, world: str = "rooms", **options: Any) -> None:
@@ -136,32 +47,37 @@ class ObjectNavEnv(gymnasium.Env[Named, np.int64]):
           InputError: see `jaxnav.make`.
         """
         env, params = make(world, **options)
-        self._functions, self._episodes = _Functions(env, params), None
-        self.observation_space, self.action_space = observation_space(env), spaces.Discrete(env.num_actions)
+        self._batched_env = _BatchedEnv(env, params)
+        self._episodes: EpisodeState | None = None  # leaves [1]
+        self.observation_space = observation_space(env)
+        self.action_space = spaces.Discrete(env.num_actions)
         self.categories = env.categories
 
-    def reset(self, *, seed: int | None = None, options: Named | None = None) -> tuple[Named, Named]:
-        """Begin an episode."""
+    def reset(self, *, seed: int | None = None, options: NamedValues | None = None) -> tuple[NamedValues, NamedValues]:
+        """Start an episode."""
         super().reset(seed=seed)
-        self._episodes, named = self._functions.reset(_keys(self.np_random, 1))
-        return _at(_plain(named), 0), {}
+        self._episodes, observations = self._batched_env.reset(_draw_keys(self.np_random, 1))
+        return _select_env(_to_numpy(observations), 0), {}
 
-    def step(self, action: Any) -> tuple[Named, float, bool, bool, Named]:
-        """Take an action; `info` says whether it was a Done that succeeds."""
-        actions = _checked(self.action_space, self._episodes, action)
-        self._episodes, named, told = self._functions.advance(self._episodes, actions[None])
-        reward, terminated, truncated, success = (leaf.item() for leaf in told)
-        return _at(_plain(named), 0), reward, terminated, truncated, {"success": success}
+    def step(self, action: Any) -> tuple[NamedValues, float, bool, bool, NamedValues]:
+        """Take an action; `info["success"]` is True for a successful Done."""
+        actions = _validate_actions(self.action_space, self._episodes, action)
+        self._episodes, observations, signals = self._batched_env.advance(self._episodes, actions[None])
+
+        # Gymnasium expects Python scalars; the single environment is a batch of one.
+        observation = _select_env(_to_numpy(observations), 0)
+        step_info = {"success": signals.success.item()}
+        return observation, signals.reward.item(), signals.terminated.item(), signals.truncated.item(), step_info
 
 
-class ObjectNavVectorEnv(VectorEnv[Named, np.ndarray, np.ndarray]):
-    """Hold many episodes side by side; those that end begin anew at once.
+class ObjectNavVectorEnv(VectorEnv[NamedValues, np.ndarray, np.ndarray]):
+    """Many parallel episodes in one compiled step, with same-step auto-reset.
 
     Attributes:
-      categories: names of what can be detected, by index.
+      categories: names of the detected categories, by index.
     """
 
-    metadata: Named = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (as Gymnasium declares it)
+    metadata: NamedValues = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (as Gymnasium declares it)
 
     def __init__(self, num_envs: int = 1, world: str = "rooms", **options: Any) -> None:
         """Make the scenes; the options are those of `jaxnav.make`.
@@ -170,86 +86,239 @@ class ObjectNavVectorEnv(VectorEnv[Named, np.ndarray, np.ndarray]):
           InputError: see `jaxnav.make`.
         """
         env, params = make(world, **options)
-        self.num_envs, self._functions, self._episodes = num_envs, _Functions(env, params), None
-        self.single_observation_space, self.single_action_space = (
-            observation_space(env),
-            spaces.Discrete(env.num_actions),
-        )
+        self.num_envs = num_envs
+        self._batched_env = _BatchedEnv(env, params)
+        self._episodes: EpisodeState | None = None  # leaves [num_envs]
+        self.single_observation_space = observation_space(env)
+        self.single_action_space = spaces.Discrete(env.num_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.categories = env.categories
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: Named | None = None
-    ) -> tuple[Named, Named]:
-        """Begin all episodes.
+        self, *, seed: int | Sequence[int | None] | None = None, options: NamedValues | None = None
+    ) -> tuple[NamedValues, NamedValues]:
+        """Start all episodes.
 
         Args:
-          seed: of all of them; or one for each, of which each begins like the single environment.
+          seed: one seed for all environments, or a sequence with one seed for each; in the latter case every first
+            episode equals that of the single environment.
           options: unused.
 
         Raises:
-          ValueError: not as many seeds as episodes.
+          ValueError: the number of seeds differs from the number of environments.
         """
         if not isinstance(seed, Sequence):
+            # One generator serves all environments.
             super().reset(seed=seed)
-            keys = _keys(self.np_random, self.num_envs)
+            reset_keys = _draw_keys(self.np_random, self.num_envs)
         elif len(seed) != self.num_envs:
             raise ValueError(f"seed holds {len(seed)} seeds; give one for each of the {self.num_envs} environments")
         else:
-            generators = [np_random(each)[0] for each in seed]
-            keys = jnp.concatenate([_keys(each, 1) for each in generators])
-            self.np_random = generators[0]
-        self._episodes, named = self._functions.reset(keys)
-        return _plain(named), {}
+            # One generator for each environment; the first one also serves all later episodes.
+            env_generators = []
+            env_keys = []
+            for env_seed in seed:
+                env_generator, _ = np_random(env_seed)
+                env_generators.append(env_generator)
+                env_keys.append(_draw_keys(env_generator, 1))
+            reset_keys = jnp.concatenate(env_keys)
+            self.np_random = env_generators[0]
+        self._episodes, observations = self._batched_env.reset(reset_keys)
+        return _to_numpy(observations), {}
 
-    def step(self, actions: np.ndarray) -> tuple[Named, np.ndarray, np.ndarray, np.ndarray, Named]:
+    def step(self, actions: np.ndarray) -> tuple[NamedValues, np.ndarray, np.ndarray, np.ndarray, NamedValues]:
         """Take an action in every episode.
 
-        Where one ends, `final_obs` and `final_info`, which holds `success`, are of the episode that ended.
+        Where an episode ends, `final_obs` and `final_info` (with `success`) describe the episode that ended, and the
+        observation is the first of the next episode.
         """
-        actions, keys = _checked(self.action_space, self._episodes, actions), _keys(self.np_random, self.num_envs)
-        self._episodes, named, last, told = self._functions.step(keys, self._episodes, actions)
-        told = jax.tree.map(np.array, told)
-        ended, infos = told.terminated | told.truncated, {}
-        if ended.any():
-            final, last = np.full(self.num_envs, None, object), _plain(last)
-            for number in np.flatnonzero(ended).tolist():
-                final[number] = _at(last, number)
-            infos = {"final_obs": final, "final_info": {"success": told.success, "_success": ended}}
-            infos |= {"_final_obs": ended, "_final_info": ended}
-        return _plain(named), told.reward, told.terminated, told.truncated, infos
+        # The keys are those of the next episodes, for environments whose episode ends with this step.
+        actions = _validate_actions(self.action_space, self._episodes, actions)
+        reset_keys = _draw_keys(self.np_random, self.num_envs)
+        step_result = self._batched_env.step(reset_keys, self._episodes, actions)
+        self._episodes, observations, final_observations, signals = step_result
+        signals = jax.tree.map(np.array, signals)
+        has_ended = signals.terminated | signals.truncated
+
+        # Gymnasium's infos: one entry per environment, with a mask of the valid ones under the name with "_".
+        env_infos = {}
+        if has_ended.any():
+            final_observations = _to_numpy(final_observations)
+            final_obs = np.full(self.num_envs, None, object)
+            for env_index in np.flatnonzero(has_ended).tolist():
+                final_obs[env_index] = _select_env(final_observations, env_index)
+            env_infos = {
+                "final_obs": final_obs,
+                "final_info": {"success": signals.success, "_success": has_ended},
+                "_final_obs": has_ended,
+                "_final_info": has_ended,
+            }
+        return _to_numpy(observations), signals.reward, signals.terminated, signals.truncated, env_infos
 
 
-def _checked(space: spaces.Space, episodes: Episode | None, action: Any) -> np.ndarray:
-    """Return the actions int32 of a step.
+def observation_space(env: ObjectNav) -> spaces.Dict:
+    """Return the space of named observations.
+
+    `view` uint8 [V, V]: 0 unknown, 1 free, 2 blocked; row 0 is nearest to the agent, column 0 leftmost. `detections`
+    float32 [K, 4]: confidence, metres ahead, metres to the right and apparent size of each category; zeros where the
+    category is not detected. `goal`: index of the category to search for. `heading`: compass. `horizon`: camera pitch.
+    `moved`: 1 if the last action changed the cell.
+    """
+    row_format = env.row_format
+    task_rules = env.task.rules
+
+    # A detection has four bytes, each from 0 to 255; the bounds are these bytes in units of the observation.
+    detection_low = (np.zeros(4, np.float32) - _DETECTION_ORIGIN) / _DETECTION_SCALE
+    detection_high = (np.full(4, 255.0, np.float32) - _DETECTION_ORIGIN) / _DETECTION_SCALE
+    detections_shape = (row_format.num_categories, 4)
+    return spaces.Dict(
+        {
+            "view": spaces.Box(0, 2, (row_format.view, row_format.view), np.uint8),
+            "detections": spaces.Box(
+                np.broadcast_to(detection_low, detections_shape),
+                np.broadcast_to(detection_high, detections_shape),
+                dtype=np.float32,
+            ),
+            "goal": spaces.Discrete(row_format.num_categories),
+            "heading": spaces.Discrete(task_rules.headings),
+            "horizon": spaces.Discrete(len(task_rules.horizons)),
+            "moved": spaces.Discrete(2),
+        }
+    )
+
+
+class EpisodeState(NamedTuple):
+    """State of an episode, with the effect of the last action.
+
+    Attributes:
+      state: state of the environment.
+      moved: bool [], True where the last action changed the cell.
+    """
+
+    state: State
+    moved: jax.Array
+
+
+class StepSignals(NamedTuple):
+    """Reward and ending of one step.
+
+    Attributes:
+      reward: float32 [].
+      terminated: bool [], True where the episode ended by Done.
+      truncated: bool [], True where the episode reached its step limit.
+      success: bool [], True for a successful Done.
+    """
+
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    success: jax.Array
+
+
+class _BatchedEnv:
+    """Compiled reset and steps of a batch of episodes, with named observations.
+
+    Attributes:
+      reset: (keys [B]) -> episodes, observations.
+      advance: (episodes, actions [B]) -> episodes, observations, signals; without auto-reset.
+      step: (keys [B], episodes, actions [B]) -> episodes, observations, final observations, signals; with auto-reset.
+    """
+
+    def __init__(self, env: ObjectNav, params: EnvParams) -> None:
+        self._env = env
+        self._params = params
+        self.reset = jax.jit(jax.vmap(self._reset))
+        self.advance = jax.jit(jax.vmap(self._advance))
+        self.step = jax.jit(jax.vmap(self._step))
+
+    def _reset(self, key: jax.Array) -> tuple[EpisodeState, NamedValues]:
+        _, start_state = self._env.reset(key, self._params)
+        episode = EpisodeState(start_state, jnp.bool_(False))
+        return episode, self._observe(episode)
+
+    def _advance(self, episode: EpisodeState, action: jax.Array) -> tuple[EpisodeState, NamedValues, StepSignals]:
+        next_state, reward, terminated, truncated = self._env.advance(episode.state, action, self._params)
+
+        # A rotation or a blocked MoveAhead keeps the cell.
+        moved = self._env.cell_of_pose(next_state.pose) != self._env.cell_of_pose(episode.state.pose)
+        success = terminated & self._env.done_succeeds(next_state, self._params)
+        next_episode = EpisodeState(next_state, moved)
+        return next_episode, self._observe(next_episode), StepSignals(reward, terminated, truncated, success)
+
+    def _step(
+        self, key: jax.Array, episode: EpisodeState, action: jax.Array
+    ) -> tuple[EpisodeState, NamedValues, NamedValues, StepSignals]:
+        final_episode, final_observation, signals = self._advance(episode, action)
+
+        # Replace an episode that has ended by a new one, which is drawn in any case.
+        has_ended = signals.terminated | signals.truncated
+        episode, observation = jax.tree.map(
+            lambda new_leaf, old_leaf: jnp.where(has_ended, new_leaf, old_leaf),
+            self._reset(key),
+            (final_episode, final_observation),
+        )
+        return episode, observation, final_observation, signals
+
+    def _observe(self, episode: EpisodeState) -> NamedValues:
+        env = self._env
+        observation_row = env.observe(episode.state, self._params).row
+        _, heading, horizon = env.task.rules.split_pose(episode.state.pose)
+
+        # Detections in metres and apparent size, from bytes; zeros without a detection.
+        detections = env.row_format.detections(observation_row)  # [K, 4]
+        detection_values = (detections.astype(jnp.float32) - _DETECTION_ORIGIN[None]) / _DETECTION_SCALE[None]
+
+        # The view is square, [V V] -> [V, V].
+        view_side = env.row_format.view
+        return {
+            "view": env.row_format.view_cells(observation_row).reshape(view_side, view_side),
+            "detections": jnp.where(detections[:, :1] > 0, detection_values, 0.0),
+            "goal": episode.state.goal,
+            "heading": heading,
+            "horizon": horizon,
+            "moved": episode.moved.astype(jnp.int32),
+        }
+
+
+def _validate_actions(space: spaces.Space, episodes: EpisodeState | None, action: Any) -> np.ndarray:
+    """Return valid actions as int32.
 
     Raises:
-      ResetNeeded: nothing was reset yet.
+      ResetNeeded: `reset` was not called before.
       InvalidAction: the action is not in the space.
     """
     if episodes is None:
         raise gymnasium.error.ResetNeeded("call reset() before step()")
-    array = np.asarray(action)
-    if array.shape != space.shape or array.dtype.kind not in "iu" or not ((array >= 0) & (array < NUM_ACTIONS)).all():
+    # Compiled code cannot raise, so actions are checked before.
+    action_array = np.asarray(action)
+    if (
+        action_array.shape != space.shape
+        or action_array.dtype.kind not in "iu"
+        or not ((action_array >= 0) & (action_array < NUM_ACTIONS)).all()
+    ):
         raise gymnasium.error.InvalidAction(f"{action!r}: give whole numbers from 0 to {NUM_ACTIONS - 1} as in {space}")
-    return array.astype(np.int32)
+    return action_array.astype(np.int32)
 
 
-def _keys(generator: np.random.Generator, number: int) -> jax.Array:
-    """Draw keys of episodes."""
-    return jax.random.split(jax.random.key(int(generator.integers(2**32))), number)
+def _draw_keys(generator: np.random.Generator, count: int) -> jax.Array:
+    """Draw PRNG keys [count] from a NumPy generator."""
+    seed = int(generator.integers(2**32))
+    return jax.random.split(jax.random.key(seed), count)
 
 
-def _plain(named: Named) -> Named:
-    """Return observations in the dtypes of their space, in memory of their own."""
-    wide = {np.dtype(np.int32): np.int64}
-    return {name: np.array(each, wide.get(each.dtype, each.dtype)) for name, each in named.items()}
+def _to_numpy(observations: NamedValues) -> NamedValues:
+    """Copy observations to NumPy arrays in the dtypes of their space."""
+    arrays = {}
+    for name, batch_values in observations.items():
+        space_dtype = np.int64 if batch_values.dtype == np.int32 else batch_values.dtype  # Discrete spaces are int64
+        arrays[name] = np.array(batch_values, space_dtype)
+    return arrays
 
 
-def _at(named: Named, number: int) -> Named:
-    """Return one observation of a batch."""
-    return {name: values[number] for name, values in named.items()}
+def _select_env(observations: NamedValues, index: int) -> NamedValues:
+    """Return the observation of one environment of a batch."""
+    return {name: batch_values[index] for name, batch_values in observations.items()}
 
 
 for _world in WORLDS:

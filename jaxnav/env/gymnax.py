@@ -1,7 +1,9 @@
 # pyright: reportMissingImports=false
-"""The environment for gymnax 1.0 and what trains on it: observations are one array, spaces are gymnax's.
+"""The environment for gymnax 1.0 and trainers built on it: flat observations and gymnax's own spaces.
 
-`env, params = jaxnav.env.gymnax.make("rooms")`. Reset, step and same-step auto-reset are those of `ObjectNav`.
+    env, params = jaxnav.env.gymnax.make("rooms")
+
+Reset, step and same-step auto-reset are those of `ObjectNav`.
 """
 
 import dataclasses
@@ -12,51 +14,64 @@ import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import spaces
 
-from jaxnav.env import make as named
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, State
+from jaxnav.env import make as env_make
+from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, VIEW_BLOCKED, VIEW_FREE
 
-#: Farther than any detection, in metres, and more than any confidence and apparent size.
-BOUND = 6.0
+#: Bound of all entries of an observation: above every distance (metres), confidence and apparent size.
+OBSERVATION_BOUND = 6.0
 
 
 class FlatObjectNav(ObjectNav):
-    """Observe one array, float32 [5 K + 2 V V].
+    """ObjectNav whose observations are one array, float32 [5 K + 2 V V].
 
-    First confidence, metres ahead, metres to the right and apparent size of each category, zeros where it is not
-    detected; then the goal, 1 at its category; then the cells of the view that are free, and those that are blocked.
+    The array holds confidence, metres ahead, metres to the right and apparent size of each category (zeros where the
+    category is not detected), the goal as a one-hot vector, a mask of the free cells of the view and one of the blocked
+    cells.
     """
 
     def observation_space(self, params: EnvParams) -> Any:
-        """Return the box of observations, as gymnax has it."""
-        size = 5 * len(self.categories) + 2 * self.row_format.view**2
-        return spaces.Box(-BOUND, BOUND, (size,), jnp.float32)
+        """Return the space of observations, a gymnax `Box`."""
+        num_entries = 5 * len(self.categories) + 2 * self.row_format.view**2
+        return spaces.Box(-OBSERVATION_BOUND, OBSERVATION_BOUND, (num_entries,), jnp.float32)
 
     def action_space(self, params: EnvParams | None = None) -> Any:
-        """Return the actions, as gymnax has them."""
+        """Return the space of actions, a gymnax `Discrete`."""
         return spaces.Discrete(self.num_actions)
 
     def observe(self, state: State, params: EnvParams) -> Any:
-        """Return what the agent perceives, float32 [5 K + 2 V V]."""
-        seen = super().observe(state, params)
-        detections = self.row_format.detections(seen.row)
-        origin, scale = np.array([[0, 0, 128, 0]]), np.array([[255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE]])
-        values = (detections.astype(jnp.float32) - origin.astype(np.float32)) / scale.astype(np.float32)
-        values = jnp.where(detections[:, :1] > 0, values, 0.0)
-        goal = jax.nn.one_hot(seen.goal, len(self.categories))
-        cells = self.row_format.view_cells(seen.row)
-        floor = [(cells == kind).astype(jnp.float32) for kind in (VIEW_FREE, VIEW_BLOCKED)]
-        return jnp.concatenate([values.ravel(), goal, *floor])
+        """Return the observation of a state, float32 [5 K + 2 V V]."""
+        observation = super().observe(state, params)
+
+        # Detections in metres and apparent size, from bytes.
+        detections = self.row_format.detections(observation.row)  # [K, 4]
+        detection_origin = np.array([[0, 0, 128, 0]]).astype(np.float32)
+        detection_scale = np.array([[255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE]]).astype(np.float32)
+        detection_values = (detections.astype(jnp.float32) - detection_origin) / detection_scale
+        detection_values = jnp.where(detections[:, :1] > 0, detection_values, 0.0)
+
+        # Goal and floor cells as indicators.
+        one_hot_goal = jax.nn.one_hot(observation.goal, len(self.categories))
+        view_cells = self.row_format.view_cells(observation.row)  # [V V]
+        free_mask = (view_cells == VIEW_FREE).astype(jnp.float32)
+        blocked_mask = (view_cells == VIEW_BLOCKED).astype(jnp.float32)
+        return jnp.concatenate([detection_values.ravel(), one_hot_goal, free_mask, blocked_mask])
 
 
 def make(world: str = "rooms", **options: Any) -> tuple[FlatObjectNav, EnvParams]:
-    """Make an environment for gymnax, and its parameters.
+    """Make an environment with flat observations, and its parameters.
 
-    The options are those of `jaxnav.make`.
+    Args:
+      world: `rooms`, `apartments` or `houses`.
+      **options: those of `jaxnav.make`.
 
     Raises:
       InputError: see `jaxnav.make`.
     """
-    env, params = named.make(world, **options)
-    return FlatObjectNav(**{field.name: getattr(env, field.name) for field in dataclasses.fields(env)}), params
+    env, params = env_make.make(world, **options)
+
+    # The subclass differs only in its observations, so it takes over every attribute.
+    env_fields = {}
+    for dataclass_field in dataclasses.fields(env):
+        env_fields[dataclass_field.name] = getattr(env, dataclass_field.name)
+    return FlatObjectNav(**env_fields), params

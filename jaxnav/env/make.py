@@ -1,15 +1,23 @@
-"""From the name of a world to an environment."""
+"""Environments by name: scenes are generated or read, compiled to tables and moved to the device.
+
+`make` is the entry point for users. `build_environment` starts from a compiled bank of scenes.
+"""
 
 import dataclasses
 from pathlib import Path
 
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.env.objectnav import EnvParams, ObjectNav, SceneTables, prior_index
 from jaxnav.errors import InputError
-from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
+from jaxnav.scenes.worlds import WORLDS, Scenes, load_scenes, make_generated_scenes, shift_scenes
+
+_SUCCESS_REWARD = 5.0
+_STEP_REWARD = -0.01
 
 
 def make(
@@ -23,27 +31,98 @@ def make(
     """Make an environment and its parameters.
 
     Args:
-      world: `rooms`, `apartments` or `houses`: what is asked of the agent and how long episodes may last, and the
-        scenes themselves where `scenes` is None.
+      world: `rooms`, `apartments` or `houses`; sets the task, the step limits and, without `scenes`, the scenes.
       split: `train`, `val` or `test`; training episodes are shorter.
-      scenes: path of a scene file to read instead.
-      task: what is asked instead of the world's own.
-      seed: of the generated scenes, and of the shift.
-      shift: layout shift, from 0 to 1: the share of the categories that exchange their places.
+      scenes: path of a scene file; None generates the scenes.
+      task: task that replaces the world's own.
+      seed: seed of the generated scenes, and of the layout shift.
+      shift: layout shift in [0, 1], the share of the categories that exchange their places.
 
     Raises:
-      InputError: bad world, split or scene file, or no scene with a reachable goal.
+      InputError: unknown world or split, bad scene file, or no scene with a reachable goal.
     """
     if world not in WORLDS:
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}; a scene file goes to `scenes`")
-    usual = WORLDS[world]
-    task = task or usual.task
-    unshifted: Scenes = generated(world, split, None, seed) if scenes is None else from_file(scenes, split)
-    chosen = shifted(unshifted, task, shift, seed)
-    bank = compile_bank((chosen[i] for i in range(len(chosen))), task)
+    world_config = WORLDS[world]
+    task = task or world_config.task
+
+    # Scenes, shifted and compiled.
+    unshifted_scenes: Scenes = (
+        make_generated_scenes(world, split, None, seed) if scenes is None else load_scenes(scenes, split)
+    )
+    shifted_scenes = shift_scenes(unshifted_scenes, task, shift, seed)
+    bank = compile_bank((shifted_scenes[scene_index] for scene_index in range(len(shifted_scenes))), task)
+
+    # Training has its own step limit, and may shape rewards and starts.
     if split == "train":
-        env, params = build(bank, {}, usual.train_step_limit, shaping=usual.shaping)
-        env = dataclasses.replace(env, near_starts=usual.near_starts)
+        env, params = build_environment(bank, {}, world_config.train_step_limit, shaping=world_config.shaping)
+        env = dataclasses.replace(env, near_starts=world_config.near_starts)
     else:
-        env, params = build(bank, {"living_room": usual.large_step_limit}, usual.step_limit)
-    return dataclasses.replace(env, made_with=params), params
+        env, params = build_environment(bank, {"living_room": world_config.large_step_limit}, world_config.step_limit)
+    return dataclasses.replace(env, bundled_params=params), params
+
+
+def build_environment(
+    bank: Bank,
+    step_limits: dict[str, int],
+    default_limit: int,
+    num_cells: int = 0,
+    num_scenes: int = 0,
+    shaping: float = 0.0,
+    with_expert: bool = False,
+) -> tuple[ObjectNav, EnvParams]:
+    """Build an environment and its parameters from a compiled bank.
+
+    Args:
+      bank: the scenes.
+      step_limits: step limit by room type.
+      default_limit: step limit of all other room types.
+      num_cells: least number of cells; a smaller bank is padded with unreachable cells, so that banks of equal sizes
+        share one compilation.
+      num_scenes: least number of scenes; a smaller bank repeats its scenes from the first.
+      shaping: see `ObjectNav`.
+      with_expert: includes the actions of shortest paths, for imitation.
+    """
+    # Sizes of the padding, and the scenes with their repetitions, [S].
+    poses_per_cell = bank.task.rules.poses_per_cell
+    num_extra_cells = max(num_cells - len(bank.ahead), 0)
+    scene_indices = np.arange(max(num_scenes, len(bank.names))) % len(bank.names)
+
+    # Padding cells are zeros, and no scene's range of cells includes them.
+    def pad_cells(table: np.ndarray, rows_per_cell: int = 1) -> jax.Array:
+        if not num_extra_cells:
+            return jnp.asarray(table)
+        padded_table = np.zeros((len(table) + rows_per_cell * num_extra_cells, *table.shape[1:]), table.dtype)
+        padded_table[: len(table)] = table
+        return jnp.asarray(padded_table)
+
+    # Tables by cell and pose are padded with cells, tables by scene repeat their scenes.
+    success_bits = np.packbits(bank.best_length == 1, axis=1, bitorder="little")
+    tables = SceneTables(
+        ahead=pad_cells(bank.ahead),
+        rows=pad_cells(bank.rows, poses_per_cell),
+        success=pad_cells(success_bits, poses_per_cell),
+        goal_distance=pad_cells(bank.goal_distance),
+        first_cell=jnp.asarray(bank.first_cell[scene_indices]),
+        num_cells=jnp.asarray(bank.num_cells[scene_indices]),
+        goals=jnp.asarray(bank.goals[scene_indices]),
+        num_goals=jnp.asarray(bank.num_goals[scene_indices]),
+        expert=pad_cells(bank.expert, poses_per_cell) if with_expert else None,
+    )
+
+    # Layout prior and step limit follow from the room type, [S] each.
+    room_priors = []
+    room_limits = []
+    for room_type in bank.room_types:
+        room_priors.append(prior_index(room_type))
+        room_limits.append(step_limits.get(room_type, default_limit))
+
+    # Everything that may change without recompilation goes to the device.
+    params = EnvParams(
+        tables=tables,
+        room=jnp.asarray(np.array(room_priors, np.int32)[scene_indices]),
+        step_limit=jnp.asarray(np.array(room_limits, np.int32)[scene_indices]),
+        success_reward=jnp.float32(_SUCCESS_REWARD),
+        step_reward=jnp.float32(_STEP_REWARD),
+    )
+    return ObjectNav(bank.task, shaping), params

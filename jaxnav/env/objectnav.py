@@ -1,222 +1,333 @@
-"""One ObjectNav episode as pure functions.
+"""The ObjectNav environment as pure functions: parameters, state, reset and step.
 
-Reset, step and observe are integer arithmetic and gathers. Written for a single episode; batch with `jax.vmap`. The
-rules are those of docs/environment.md.
+An agent starts at a random pose of a random scene and must find an object of the goal category, then declare Done.
+`ObjectNav` holds the static description of the task; the scenes are arrays in `EnvParams`, so that scenes of equal
+shapes share one compilation. The interface is that of gymnax 1.0:
+
+    env, params = jaxnav.make("rooms")
+    observation, state = env.reset(key, params)
+    observation, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+
+All functions handle a single episode and consist of integer arithmetic and table look-ups; batch them with `jax.vmap`.
+docs/environment.md states the rules.
+
+Symbols in shapes: S scenes, C cells, H headings, P poses, K categories, R bytes of an observation row.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jaxnav.env.spaces import Box, Dict, Discrete
-from jaxnav.env.types import EnvParams, Observation, State, StepResult
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
-#: Index of the layout prior that all room types outside `ROOM_TYPES` share, and the number of priors.
+#: Index of the layout prior that all room types outside `ROOM_TYPES` share.
 OTHER_ROOM = len(ROOM_TYPES)
+#: Number of layout priors.
 NUM_PRIORS = OTHER_ROOM + 1
-#: Cells of which an episode that starts near its goal takes the nearest.
-CANDIDATES = 8
+#: Number of random cells of which an episode that starts near its goal takes the nearest.
+NUM_START_CANDIDATES = 8
 
 
-def prior_index(room_type: str) -> int:
-    """Return the index of a room type's layout prior."""
-    return ROOM_TYPES.index(room_type) if room_type in ROOM_TYPES else OTHER_ROOM
+class SceneTables(struct.PyTreeNode):
+    """Tables of all scenes on the device; see `jaxnav.scenes.tables.compile.Bank`.
+
+    Attributes:
+      ahead: int32 [C, H], cell after MoveAhead.
+      rows: uint8 [P, R], observation row of each pose.
+      success: uint8 [P, ceil(K / 8)], one bit per pose and goal, set where Done succeeds. Stored apart from the rows,
+        so that no observation contains the answer.
+      goal_distance: float32 [C, K], metres to the nearest object of a category.
+      first_cell: int32 [S], first cell of each scene.
+      num_cells: int32 [S].
+      goals: int32 [S, K], possible goals of each scene, of which the first `num_goals` entries are valid.
+      num_goals: int32 [S].
+      expert: uint8 [P, K], first action of a shortest path to each goal; None unless an agent imitates it.
+    """
+
+    ahead: jax.Array
+    rows: jax.Array
+    success: jax.Array
+    goal_distance: jax.Array
+    first_cell: jax.Array
+    num_cells: jax.Array
+    goals: jax.Array
+    num_goals: jax.Array
+    expert: jax.Array | None = None
+
+
+class EnvParams(struct.PyTreeNode):
+    """Environment parameters that may change without recompilation.
+
+    Attributes:
+      tables: the scenes.
+      room: int32 [S], index of the layout prior of each scene's room type, see `prior_index`.
+      step_limit: int32 [S], number of actions after which an episode in a scene is truncated.
+      success_reward: float32 [], reward of a successful Done.
+      step_reward: float32 [], reward of every other action.
+    """
+
+    tables: SceneTables
+    room: jax.Array
+    step_limit: jax.Array
+    success_reward: jax.Array
+    step_reward: jax.Array
+
+
+class State(struct.PyTreeNode):
+    """State of one episode.
+
+    Attributes:
+      pose: int32 [], pose of the agent, numbered over all scenes.
+      scene: int32 [], index of the scene.
+      goal: int32 [], category to search for.
+      time: int32 [], number of actions taken.
+      nearest: float32 [], least distance to the goal so far, metres; None without reward shaping.
+    """
+
+    pose: jax.Array
+    scene: jax.Array
+    goal: jax.Array
+    time: jax.Array
+    nearest: jax.Array | None = None
+
+
+class Observation(struct.PyTreeNode):
+    """Observation of the agent.
+
+    Attributes:
+      row: uint8 [R], detections and ego-centric view of the pose, packed by `RowFormat`.
+      goal: int32 [], category to search for.
+    """
+
+    row: jax.Array
+    goal: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectNav:
-    """Hold an environment; hashable.
-
-    The interface is that of gymnax 1.0.
+    """The environment; immutable and hashable.
 
     Attributes:
-      task: what is asked of the agent.
-      shaping: reward for every metre that the agent comes nearer to its goal than before in the episode (by
-        `goal_distance`), in training.
-      near_starts: probability that an episode starts in the nearest to its goal of several random cells, in training.
-      made_with: parameters that `jaxnav.make` made with it.
+      task: categories, goals and rules.
+      shaping: training reward per metre by which the agent gets nearer to its goal than ever before in the episode.
+      near_starts: probability that a training episode starts near its goal, in the nearest of `NUM_START_CANDIDATES`
+        random cells.
+      bundled_params: parameters made together with the environment by `jaxnav.make`.
     """
 
     task: Task
     shaping: float = 0.0
     near_starts: float = 0.0
-    made_with: EnvParams | None = dataclasses.field(default=None, compare=False, repr=False)
+    bundled_params: EnvParams | None = dataclasses.field(default=None, compare=False, repr=False)
+
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
+        """Start an episode.
+
+        The scene, the goal among those possible in the scene, the cell and the heading are drawn uniformly; the camera
+        looks straight ahead.
+
+        Args:
+          key: PRNG key, consumed.
+          params: scenes, limits and rewards.
+        """
+        tables = params.tables
+        rules = self.task.rules
+
+        # Scene and goal. One call derives the random words of all draws.
+        random_words = _random_words(key, 4 + NUM_START_CANDIDATES * bool(self.near_starts))
+        scene = _uniform_below(random_words[0], jnp.asarray(tables.num_goals.shape[0], jnp.int32))
+        goal = tables.goals[scene, _uniform_below(random_words[1], tables.num_goals[scene])]
+
+        # Start cell and heading. A share `near_starts` of the episodes starts in the nearest of several random cells.
+        cell = tables.first_cell[scene] + _uniform_below(random_words[2], tables.num_cells[scene])
+        heading = _uniform_below(random_words[3], jnp.asarray(rules.headings, jnp.int32))
+        if self.near_starts:
+            other_cells = tables.first_cell[scene] + _uniform_below(random_words[4:-1], tables.num_cells[scene])
+            candidate_cells = jnp.concatenate([cell[None], other_cells])
+            nearest_cell = candidate_cells[tables.goal_distance[candidate_cells, goal].argmin()]
+            # The upper 24 bits of a word are exact in float32.
+            starts_near = (random_words[-1] >> jnp.uint32(8)).astype(jnp.float32) < self.near_starts * 2.0**24
+            cell = jnp.where(starts_near, nearest_cell, cell)
+
+        # Horizon 0, the first of the rules, looks straight ahead.
+        pose = (cell * rules.headings + heading) * len(rules.horizons)
+        nearest_distance = tables.goal_distance[cell, goal] if self.shaping else None
+        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose), nearest=nearest_distance)
+        return self.observe(state, params), state
+
+    def step(
+        self, key: jax.Array, state: State, action: jax.Array | int, params: EnvParams
+    ) -> tuple[Observation, State, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
+        """Take an action, with same-step auto-reset: a new episode starts as soon as one ends.
+
+        Args:
+          key: PRNG key of the reset, consumed; without effect unless the episode ends.
+          state: current state.
+          action: int [], 0 to 5.
+          params: scenes, limits and rewards.
+
+        Returns:
+          observation, state, reward, terminated, truncated, info. When the episode ends, observation and state belong
+          to the new episode, everything else to the old one. `info` has `final_state` and `final_observation` (after
+          the action, before a reset), `success` bool [] and `length` int32 [] (number of actions so far).
+        """
+        final_state, reward, terminated, truncated = self.advance(state, action, params)
+
+        # Select the reset state where the episode has ended.
+        _, reset_state = self.reset(key, params)
+        has_ended = terminated | truncated
+        state = jax.tree.map(
+            lambda new_leaf, old_leaf: jnp.where(has_ended, new_leaf, old_leaf), reset_state, final_state
+        )
+
+        # The old episode, which a trainer needs for bootstrapping and metrics.
+        step_info = {
+            "final_state": final_state,
+            "final_observation": self.observe(final_state, params),
+            "success": terminated & self.done_succeeds(final_state, params),
+            "length": final_state.time,
+        }
+        return self.observe(state, params), state, reward, terminated, truncated, step_info
+
+    def advance(
+        self, state: State, action: jax.Array | int, params: EnvParams
+    ) -> tuple[State, jax.Array, jax.Array, jax.Array]:
+        """Take an action, without auto-reset.
+
+        Args:
+          state: current state.
+          action: int [], 0 to 5.
+          params: scenes, limits and rewards.
+
+        Returns:
+          Next state, reward float32 [], terminated bool [] (the action is Done) and truncated bool [] (the step limit
+          is reached without Done).
+        """
+        # Move the agent; Done and blocked moves keep the pose.
+        action = jnp.asarray(action)  # accept Python ints
+        pose = self.next_pose(state.pose, action, params)
+        next_time = state.time + 1
+
+        # Done ends the episode, successfully or not. The step limit truncates all others.
+        terminated = action == DONE
+        truncated = ~terminated & (next_time >= params.step_limit[state.scene])
+        success = terminated & self.done_succeeds(state, params)
+        reward = jnp.where(success, params.success_reward, params.step_reward)
+
+        # Reward shaping: pay for each metre by which the distance to the goal falls below its least value so far.
+        nearest_distance = state.nearest
+        if state.nearest is not None:
+            goal_distance = params.tables.goal_distance[self.cell_of_pose(pose), state.goal]
+            nearest_distance = jnp.minimum(state.nearest, goal_distance)
+            reward += self.shaping * (state.nearest - nearest_distance)
+
+        return state.replace(pose=pose, time=next_time, nearest=nearest_distance), reward, terminated, truncated
+
+    def observe(self, state: State, params: EnvParams) -> Observation:
+        """Return the observation of a state."""
+        return Observation(row=params.tables.rows[state.pose], goal=state.goal)
+
+    def next_pose(self, pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
+        """Return the pose after an action, both int32 []."""
+        # The pose as three indices, int32 [] each.
+        num_headings = self.task.rules.headings
+        num_horizons = len(self.task.rules.horizons)
+        cell, heading, horizon = self.task.rules.split_pose(pose)
+
+        def indicator(action_kind: int) -> jax.Array:
+            return (action == action_kind).astype(jnp.int32)
+
+        # A blocked MoveAhead stays in its cell; the horizon is clipped to its range.
+        cell = jnp.where(action == MOVE_AHEAD, params.tables.ahead[cell, heading], cell)
+        heading = (heading + indicator(ROTATE_RIGHT) + (num_headings - 1) * indicator(ROTATE_LEFT)) % num_headings
+        horizon = jnp.clip(horizon + indicator(LOOK_DOWN) - indicator(LOOK_UP), 0, num_horizons - 1)
+        return (cell * num_headings + heading) * num_horizons + horizon
+
+    def cell_of_pose(self, pose: jax.Array) -> jax.Array:
+        """Return the cell of a pose, int32 [], numbered over all scenes."""
+        return self.task.rules.split_pose(pose)[0]
+
+    def done_succeeds(self, state: State, params: EnvParams) -> jax.Array:
+        """Return True where Done would succeed, bool [].
+
+        Rewards and metrics use the answer; agents never observe it.
+        """
+        # The table packs eight goals in a byte, the lowest bit first.
+        goal_byte = state.goal // 8
+        goal_bit = (state.goal % 8).astype(jnp.uint8)
+        return (params.tables.success[state.pose, goal_byte] >> goal_bit) & jnp.uint8(1) > 0
 
     @property
     def name(self) -> str:
-        """Return the name of the environment."""
+        """Name of the environment."""
         return "ObjectNav"
 
     @property
-    def default_params(self) -> EnvParams:
-        """Return the parameters that `jaxnav.make` made with it.
+    def categories(self) -> tuple[str, ...]:
+        """Names of the categories that the detector knows, [K]."""
+        return self.task.categories
 
-        Raises:
-          ValueError: it was not made by `jaxnav.make`.
-        """
-        if self.made_with is None:
-            raise ValueError("default_params: this environment was built by hand; jaxnav.make returns both")
-        return self.made_with
+    @property
+    def row_format(self) -> RowFormat:
+        """Format of the observation rows."""
+        return RowFormat(len(self.categories))
+
+    @property
+    def num_actions(self) -> int:
+        """Number of actions."""
+        return NUM_ACTIONS
 
     def observation_space(self, params: EnvParams) -> Dict:
         """Return the space of observations."""
-        row = Box(0, 255, (self.row_format.num_bytes,), jnp.uint8)
-        return Dict({"row": row, "goal": Discrete(len(self.categories))})
+        row_space = Box(0, 255, (self.row_format.num_bytes,), jnp.uint8)
+        return Dict({"row": row_space, "goal": Discrete(len(self.categories))})
 
     def action_space(self, params: EnvParams | None = None) -> Discrete:
         """Return the space of actions."""
         return Discrete(self.num_actions)
 
     @property
-    def categories(self) -> tuple[str, ...]:
-        """Return the names of what can be detected, [K]."""
-        return self.task.categories
+    def default_params(self) -> EnvParams:
+        """Parameters made together with the environment.
 
-    @property
-    def row_format(self) -> RowFormat:
-        """Return how an observation row is packed."""
-        return RowFormat(len(self.categories))
-
-    @property
-    def num_actions(self) -> int:
-        """Return the size of the action space."""
-        return NUM_ACTIONS
-
-    def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
-        """Start an episode.
-
-        Scene, goal among its possible ones, cell and heading are each uniform; the horizon is 0. With
-        `near_starts` some cells are the nearest to the goal of `CANDIDATES` uniform ones.
-
-        Args:
-          key: consumed.
-          params: the bank and its limits.
+        Raises:
+          ValueError: the environment was not made by `jaxnav.make`.
         """
-        tables = params.tables
-        bits = _words(key, 4 + CANDIDATES * bool(self.near_starts))
-
-        def below(i: int, count: jax.Array) -> jax.Array:
-            # Modulo of 32 random bits: the bias is under count / 2**32.
-            return (bits[i] % count.astype(jnp.uint32)).astype(jnp.int32)
-
-        scene = below(0, jnp.asarray(tables.num_goals.shape[0], jnp.int32))
-        goal = tables.goals[scene, below(1, tables.num_goals[scene])]
-        rules = self.task.rules
-        heading = below(3, jnp.asarray(rules.headings, jnp.int32))
-        cell = tables.first_cell[scene] + below(2, tables.num_cells[scene])
-        if self.near_starts:
-            others = [below(4 + i, tables.num_cells[scene]) for i in range(CANDIDATES - 1)]
-            candidates = jnp.stack([cell, *(tables.first_cell[scene] + other for other in others)])
-            nearest = candidates[tables.goal_distance[candidates, goal].argmin()]
-            near = (bits[-1] >> jnp.uint32(8)).astype(jnp.float32) < self.near_starts * 2.0**24
-            cell = jnp.where(near, nearest, cell)
-        pose = (cell * rules.headings + heading) * len(rules.horizons)
-        nearest = tables.goal_distance[cell, goal] if self.shaping else None
-        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose), nearest=nearest)
-        return self.observe(state, params), state
-
-    def observe(self, state: State, params: EnvParams) -> Observation:
-        """Return what the agent perceives in a state."""
-        return Observation(row=params.tables.rows[state.pose], goal=state.goal)
-
-    def after(self, pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
-        """Return the pose that an action leads to.
-
-        Both are int32 [].
-        """
-        headings, horizons = self.task.rules.headings, len(self.task.rules.horizons)
-        cell, heading, horizon = self.task.rules.split(pose)
-
-        def when(chosen: int) -> jax.Array:
-            return (action == chosen).astype(jnp.int32)
-
-        cell = jnp.where(action == MOVE_AHEAD, params.tables.ahead[cell, heading], cell)
-        heading = (heading + when(ROTATE_RIGHT) + (headings - 1) * when(ROTATE_LEFT)) % headings
-        horizon = jnp.clip(horizon + when(LOOK_DOWN) - when(LOOK_UP), 0, horizons - 1)
-        return (cell * headings + heading) * horizons + horizon
-
-    def cell(self, pose: jax.Array) -> jax.Array:
-        """Return the global cell int32 [] of a pose."""
-        return self.task.rules.split(pose)[0]
-
-    def succeeds(self, state: State, params: EnvParams) -> jax.Array:
-        """Return whether Done would succeed here, bool [].
-
-        Rewards and metrics read it; agents cannot.
-        """
-        byte, bit = state.goal // 8, (state.goal % 8).astype(jnp.uint8)
-        return (params.tables.success[state.pose, byte] >> bit) & jnp.uint8(1) > 0
-
-    def advance(
-        self, state: State, action: jax.Array | int, params: EnvParams
-    ) -> tuple[State, jax.Array, jax.Array, jax.Array]:
-        """Take an action, without reset.
-
-        Args:
-          state: the state.
-          action: int [], 0 to 5.
-          params: the bank and its limits.
-
-        Returns:
-          The next state, reward float32 [], terminated bool [] (Done was chosen) and truncated bool [] (the step limit
-          is reached without Done).
-        """
-        action = jnp.asarray(action)  # a number of Python's too
-        done = action == DONE
-        time = state.time + 1
-        reward = jnp.where(done & self.succeeds(state, params), params.success_reward, params.step_reward)
-        truncated = ~done & (time >= params.step_limit[state.scene])
-        pose = self.after(state.pose, action, params)
-        nearest = state.nearest
-        if nearest is not None:
-            before, nearest = nearest, jnp.minimum(nearest, params.tables.goal_distance[self.cell(pose), state.goal])
-            reward += self.shaping * (before - nearest)
-        return state.replace(pose=pose, time=time, nearest=nearest), reward, done, truncated
-
-    def step(self, key: jax.Array, state: State, action: jax.Array | int, params: EnvParams) -> StepResult:
-        """Take an action, with same-step auto-reset.
-
-        An episode that ends is followed by a new one at once.
-
-        Args:
-          key: consumed; used only if the episode ends.
-          state: the state.
-          action: int [], 0 to 5.
-          params: the bank and its limits.
-
-        Returns:
-          observation, state, reward, terminated, truncated, info. After an ending, observation and state are those of
-          the new episode; `info` is about the episode that the action belongs to: `final_state` and
-          `final_observation` after the action, `success` bool [] and `length` int32 [] (actions so far).
-        """
-        last, reward, terminated, truncated = self.advance(state, action, params)
-        _, fresh = self.reset(key, params)
-        ended = terminated | truncated
-        state = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, last)
-        info = {
-            "final_state": last,
-            "final_observation": self.observe(last, params),
-            "success": terminated & self.succeeds(last, params),
-            "length": last.time,
-        }
-        return self.observe(state, params), state, reward, terminated, truncated, info
+        if self.bundled_params is None:
+            raise ValueError("default_params: this environment was built by hand; jaxnav.make returns both")
+        return self.bundled_params
 
 
-def _words(key: jax.Array, count: int) -> jax.Array:
-    """Return random words uint32 [count] of a key.
+def prior_index(room_type: str) -> int:
+    """Return the index of a room type's layout prior, below `NUM_PRIORS`."""
+    return ROOM_TYPES.index(room_type) if room_type in ROOM_TYPES else OTHER_ROOM
 
-    They are its words through Murmur3's finaliser (Appleby, 2011). A key that is split off is random already; a
-    stronger generator would take most of the time of a step, and most steps have no use for it.
+
+def _uniform_below(random_word: jax.Array, count: jax.Array) -> jax.Array:
+    """Map random uint32 words to int32 below a count; the bias of the modulo is under count / 2**32."""
+    return (random_word % count.astype(jnp.uint32)).astype(jnp.int32)
+
+
+def _random_words(key: jax.Array, count: int) -> jax.Array:
+    """Derive random words from a key by Murmur3's finaliser (Appleby, 2011), uint32 [count].
+
+    A split key is random already. A stronger generator would dominate the time of a step, although most steps have no
+    use for the reset.
     """
-    words = jax.random.key_data(key)
-    mixed = jnp.uint32(0x9E3779B9) * jnp.arange(1, count + 1, dtype=jnp.uint32)
-    for i in range(words.shape[-1]):
-        mixed = mixed ^ words[i]
-        for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
-            mixed = (mixed ^ (mixed >> jnp.uint32(shift))) * jnp.uint32(factor)
-        mixed = mixed ^ (mixed >> jnp.uint32(16))
-    return mixed
+    # Counters, spread over all bits by the golden ratio, so that the words of one key differ.
+    key_words = jax.random.key_data(key)
+    mixed_words = jnp.uint32(0x9E3779B9) * jnp.arange(1, count + 1, dtype=jnp.uint32)
+
+    # Mix in the words of the key one after the other, with one round of the finaliser each.
+    for word_index in range(key_words.shape[-1]):
+        mixed_words = mixed_words ^ key_words[word_index]
+        for shift_bits, mix_factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+            mixed_words = (mixed_words ^ (mixed_words >> jnp.uint32(shift_bits))) * jnp.uint32(mix_factor)
+        mixed_words = mixed_words ^ (mixed_words >> jnp.uint32(16))
+    return mixed_words

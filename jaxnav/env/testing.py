@@ -1,6 +1,7 @@
-"""A public check of the environment contract, for environments and banks of one's own.
+"""Check of the environment contract, for environments and scenes of your own.
 
-In the style of `jumanji.testing`: run it in a test; it raises `AssertionError` with the promise that is broken.
+`check_environment` runs random episodes, in the style of `jumanji.testing`. Call it in a test; an `AssertionError`
+names the promise that is broken.
 """
 
 import chex
@@ -8,54 +9,72 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, Observation
+from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation
 
 
 def check_environment(
     env: ObjectNav, params: EnvParams, num_envs: int = 16, num_steps: int = 64, seed: int = 0
 ) -> None:
-    """Check that an environment keeps its promises.
+    """Check that an environment keeps its contract.
 
-    It checks: one compilation for reset and step; equal keys give equal episodes; shapes, dtypes and ranges of outputs;
-    terminated and truncated never together; a batch of N behaves as N single episodes; time starts anew after an ending
-    and the final state is the one before the reset; observations equal `observe(state)`.
+    The checks: reset and step compile once; equal keys give equal episodes; outputs have their shapes, dtypes and
+    ranges; no episode is terminated and truncated at once; a batch of N equals N single episodes; time restarts after
+    an episode ends, and the final state is the one before the reset; observations equal `observe(state)`.
 
     Raises:
       AssertionError: a promise is broken.
     """
+    # A second compilation of reset or step raises an AssertionError.
     chex.clear_trace_counter()
-    reset = jax.jit(jax.vmap(chex.assert_max_traces(env.reset, n=1), (0, None)))
-    step = jax.jit(jax.vmap(chex.assert_max_traces(env.step, n=1), (0, 0, 0, None)))
+    batched_reset = jax.jit(jax.vmap(chex.assert_max_traces(env.reset, n=1), (0, None)))
+    batched_step = jax.jit(jax.vmap(chex.assert_max_traces(env.step, n=1), (0, 0, 0, None)))
     key = jax.random.key(seed)
-    keys = jax.random.split(key, num_envs)
-    observation, state = reset(keys, params)
-    chex.assert_trees_all_equal((observation, state), reset(keys, params))
+
+    # Resets are reproducible.
+    reset_keys = jax.random.split(key, num_envs)
+    observation, state = batched_reset(reset_keys, params)
+    chex.assert_trees_all_equal((observation, state), batched_reset(reset_keys, params))
     _check_observation(env, observation, num_envs)
 
-    for time in range(num_steps):
-        now = jax.random.fold_in(key, time)
-        keys = jax.random.split(now, num_envs)
-        action = jax.random.randint(jax.random.fold_in(now, 1), (num_envs,), 0, env.num_actions)
-        before = state
-        result = step(keys, state, action, params)
-        observation, state, reward, terminated, truncated, info = result
-        one_key, one_state, one_action = jax.tree.map(lambda leaf: leaf[0], (keys, before, action))
-        single = env.step(one_key, one_state, one_action, params)
-        chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], result), single)
+    for step_index in range(num_steps):
+        # Take random actions.
+        step_key = jax.random.fold_in(key, step_index)
+        step_keys = jax.random.split(step_key, num_envs)
+        action = jax.random.randint(jax.random.fold_in(step_key, 1), (num_envs,), 0, env.num_actions)
+        last_state = state
+        step_result = batched_step(step_keys, state, action, params)
+        observation, state, reward, terminated, truncated, step_info = step_result
+
+        # The first episode of the batch equals the same step of a single episode.
+        first_key, first_state, first_action = jax.tree.map(
+            lambda batch_leaf: batch_leaf[0], (step_keys, last_state, action)
+        )
+        first_result = jax.tree.map(lambda batch_leaf: batch_leaf[0], step_result)
+        chex.assert_trees_all_equal(first_result, env.step(first_key, first_state, first_action, params))
+
+        # Shapes, dtypes and finite values.
         _check_observation(env, observation, num_envs)
-        _check_observation(env, info["final_observation"], num_envs)
+        _check_observation(env, step_info["final_observation"], num_envs)
         chex.assert_trees_all_equal(observation, jax.vmap(env.observe, (0, None))(state, params))
-        chex.assert_tree_all_finite((reward, state, info))
-        chex.assert_shape([reward, terminated, truncated, info["success"], info["length"]], (num_envs,))
-        chex.assert_type([reward, terminated, truncated, info["success"]], [jnp.float32, bool, bool, bool])
+        chex.assert_tree_all_finite((reward, state, step_info))
+        chex.assert_shape([reward, terminated, truncated, step_info["success"], step_info["length"]], (num_envs,))
+        chex.assert_type([reward, terminated, truncated, step_info["success"]], [jnp.float32, bool, bool, bool])
+
+        # Endings, and the new episodes that follow them.
+        has_ended = np.asarray(terminated | truncated)
         _promise(not bool(np.any(terminated & truncated)), "an episode is terminated and truncated at once")
-        _promise(not bool(np.any(info["success"] & ~terminated)), "a success that is not an ending")
-        ended = np.asarray(terminated | truncated)
-        _promise(bool(np.all(info["final_state"].time == before.time + 1)), "a step that takes no time")
-        _promise(bool(np.all(np.asarray(state.time)[ended] == 0)), "an ending that is not followed by a new episode")
-        for leaf, last in zip(jax.tree.leaves(state), jax.tree.leaves(info["final_state"]), strict=True):
-            _promise(bool(np.all((leaf == last) | ended)), "a state that changes after a step without an ending")
+        _promise(not bool(np.any(step_info["success"] & ~terminated)), "a success that is not an ending")
+        _promise(bool(np.all(step_info["final_state"].time == last_state.time + 1)), "a step that takes no time")
+        _promise(
+            bool(np.all(np.asarray(state.time)[has_ended] == 0)), "an ending that is not followed by a new episode"
+        )
+        for state_leaf, final_leaf in zip(
+            jax.tree.leaves(state), jax.tree.leaves(step_info["final_state"]), strict=True
+        ):
+            _promise(
+                bool(np.all((state_leaf == final_leaf) | has_ended)),
+                "a state that changes after a step without an ending",
+            )
 
 
 def _check_observation(env: ObjectNav, observation: Observation, num_envs: int) -> None:
@@ -65,6 +84,6 @@ def _check_observation(env: ObjectNav, observation: Observation, num_envs: int) 
     _promise(bool(np.all((goal >= 0) & (goal < len(env.categories)))), "a goal that is no category")
 
 
-def _promise(kept: bool, broken: str) -> None:
-    if not kept:
-        raise AssertionError(f"the environment breaks its contract: {broken}")
+def _promise(is_kept: bool, violation: str) -> None:
+    if not is_kept:
+        raise AssertionError(f"the environment breaks its contract: {violation}")

@@ -1,25 +1,29 @@
-"""Fixed lists of evaluation episodes."""
+"""Fixed lists of evaluation episodes.
 
-from collections.abc import Iterable, Sequence
+`draw_episodes` draws the episodes of a bank before any agent is run, so that all agents meet the same ones.
+`join_episode_lists` joins the lists of several banks for statistics and reports.
+"""
+
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Clusters, scene_clusters
-from jaxnav.scenes.scene import floor_plan
+from jaxnav.scenes.scene import floor_plan_name
 from jaxnav.scenes.tables.compile import Bank
 
-#: Episodes of a bank at most: so many take a minute to draw, and memory in every row of a table.
+#: Upper bound on the episodes of a bank: a million take about a minute to draw, and memory in every row of a table.
 MAX_EPISODES = 10**6
 
 
 class EpisodeList(NamedTuple):
-    """Hold E episodes, fixed before anything is run.
+    """List of E episodes.
 
     Attributes:
       scene, goal, pose: int32 [E], indices into the bank.
-      best_length: int32 [E], L* >= 1.
+      best_length: int32 [E], L* >= 1, length of a shortest successful episode.
       room: int [E], index into `rooms`.
       rooms: names of the room types.
       scenes: names of the scenes.
@@ -34,85 +38,121 @@ class EpisodeList(NamedTuple):
     scenes: tuple[str, ...]
 
     @property
-    def plan(self) -> np.ndarray:
-        """Return the floor plan of each episode, [E]; see `floor_plan`."""
-        return np.array([floor_plan(name) for name in self.scenes])[self.scene]
+    def floor_plans(self) -> np.ndarray:
+        """Floor plan of each episode, [E]; see `floor_plan_name`."""
+        plan_by_scene = np.array(list(map(floor_plan_name, self.scenes)))
+        return plan_by_scene[self.scene]
 
-    def take(self, chosen: np.ndarray) -> "EpisodeList":
-        """Return the chosen episodes; bool [E], or indices."""
-        fields = ("scene", "goal", "pose", "best_length", "room")
-        return self._replace(**{name: getattr(self, name)[chosen] for name in fields})
+    def take(self, selection: np.ndarray) -> "EpisodeList":
+        """Select episodes by a mask, bool [E], or by indices."""
+        return self._replace(
+            scene=self.scene[selection],
+            goal=self.goal[selection],
+            pose=self.pose[selection],
+            best_length=self.best_length[selection],
+            room=self.room[selection],
+        )
 
     def clusters(self) -> Clusters:
-        """Return the floor plans as clusters, within room types."""
-        return scene_clusters(self.plan, self.room)
+        """Cluster the episodes by floor plan, within room types."""
+        return scene_clusters(self.floor_plans, self.room)
 
 
-def clusters_of(lists: Sequence[EpisodeList]) -> list[Clusters]:
-    """Return the floor plans of several lists as clusters.
-
-    A floor plan that is in several lists is left out of all at once.
-    """
-    whole = together(lists)
-    clusters = whole.clusters()
-    ends = np.cumsum([len(episodes.scene) for episodes in lists])[:-1]
-    return [clusters._replace(weights=weights) for weights in np.split(clusters.weights, ends)]
-
-
-def episode_list(bank: Bank, episodes: int = 1000, seed: int = 0, part: int = 0) -> EpisodeList:
+def draw_episodes(bank: Bank, num_episodes: int = 1000, seed: int = 0, bank_index: int = 0) -> EpisodeList:
     """Draw the episodes of a bank by the paper's rule.
 
-    Equally many per room type, balanced over its scenes. In each scene the goal is uniform over its possible
-    categories, the start uniform over all poses that can reach it.
+    Each room type has equally many episodes, balanced over its scenes. In each scene, the goal is uniform over its
+    possible categories, and the start is uniform over all poses that can reach the goal.
 
     Args:
       bank: the scenes.
-      episodes: E, rounded up to a multiple of the number of room types.
-      seed: of the draw.
-      part: number of the bank among those that are evaluated together; each has draws of its own.
+      num_episodes: E, rounded up to a multiple of the number of room types.
+      seed: seed of the draw.
+      bank_index: index of the bank among those evaluated together; each bank has draws of its own.
 
     Raises:
       InputError: fewer than one episode, or too many.
     """
-    if not 1 <= episodes <= MAX_EPISODES:
-        raise InputError(f"--episodes {episodes}: give at least 1, and at most {MAX_EPISODES}")
+    if not 1 <= num_episodes <= MAX_EPISODES:
+        raise InputError(f"--episodes {num_episodes}: give at least 1, and at most {MAX_EPISODES}")
+
+    # Round up, so that every room type has equally many episodes.
     rooms = tuple(sorted(set(bank.room_types)))
-    per_room = -(-episodes // len(rooms))
-    generator = np.random.default_rng([seed, len(bank.names), part])
+    episodes_per_room = -(-num_episodes // len(rooms))
     poses_per_cell = bank.task.rules.poses_per_cell
-    rows = []
-    for room, name in enumerate(rooms):
-        scenes = [i for i, room_type in enumerate(bank.room_types) if room_type == name]
-        for number in range(per_room):
-            scene = scenes[number % len(scenes)]
-            goal = generator.choice(bank.goals[scene, : bank.num_goals[scene]])
-            first = bank.first_cell[scene] * poses_per_cell
-            lengths = bank.best_length[first : first + bank.num_cells[scene] * poses_per_cell, goal]
-            start = generator.choice(np.flatnonzero(lengths))
-            rows.append((scene, goal, first + start, lengths[start], room))
-    scene, goal, pose, best_length, room = np.array(rows, np.int32).T
+
+    # The bank's index is part of the seed, so that banks evaluated together have independent draws.
+    random_generator = np.random.default_rng([seed, len(bank.names), bank_index])
+
+    # Draw goal, then start, episode by episode: the order of the draws defines the list.
+    episode_rows = []
+    for room_index, room_type in enumerate(rooms):
+        room_scenes = np.flatnonzero(np.array(bank.room_types) == room_type)
+        for episode in range(episodes_per_room):
+            # Scenes take turns; every category that a scene offers as a goal is equally likely.
+            scene = room_scenes[episode % len(room_scenes)]
+            goal = random_generator.choice(bank.goals[scene, : bank.num_goals[scene]])
+
+            # A length of 0 marks poses of the scene that cannot reach the goal.
+            first_pose = bank.first_cell[scene] * poses_per_cell
+            end_pose = first_pose + bank.num_cells[scene] * poses_per_cell
+            best_lengths = bank.best_length[first_pose:end_pose, goal]
+            start_offset = random_generator.choice(np.flatnonzero(best_lengths))
+            episode_rows.append((scene, goal, first_pose + start_offset, best_lengths[start_offset], room_index))
+
+    # From one row per episode to one array [E] per field.
+    scene, goal, pose, best_length, room = np.array(episode_rows, np.int32).T
     return EpisodeList(
         scene=scene, goal=goal, pose=pose, best_length=best_length, room=room, rooms=rooms, scenes=bank.names
     )
 
 
-def together(lists: Sequence[EpisodeList]) -> EpisodeList:
+def join_episode_lists(lists: Sequence[EpisodeList]) -> EpisodeList:
     """Join the lists of several banks, for statistics and reports.
 
-    The `scene` of the whole list is an index into its `scenes`.
+    `scene` and `room` of the result are indices into its own `scenes` and `rooms`; `pose` still counts from the start
+    of each bank.
     """
-    rooms = tuple(sorted({room for episodes in lists for room in episodes.rooms}))
-    first = np.cumsum([0] + [len(episodes.scenes) for episodes in lists])
+    # A room type keeps one index in the joined list, whichever banks contain it.
+    room_names: set[str] = set()
+    for episodes in lists:
+        room_names.update(episodes.rooms)
+    rooms = tuple(sorted(room_names))
 
-    def joined(arrays: Iterable[np.ndarray]) -> np.ndarray:
-        return np.concatenate(list(arrays)).astype(np.int32)
+    # Scenes are numbered on from list to list, rooms are renumbered by name.
+    scene_names: list[str] = []
+    scene_parts = []
+    goal_parts = []
+    pose_parts = []
+    length_parts = []
+    room_parts = []
+    for episodes in lists:
+        scene_parts.append(episodes.scene + len(scene_names))
+        scene_names.extend(episodes.scenes)
+        goal_parts.append(episodes.goal)
+        pose_parts.append(episodes.pose)
+        length_parts.append(episodes.best_length)
+        joined_room = np.array(list(map(rooms.index, episodes.rooms)))
+        room_parts.append(joined_room[episodes.room])
 
     return EpisodeList(
-        scene=joined(episodes.scene + start for episodes, start in zip(lists, first, strict=False)),
-        goal=joined(episodes.goal for episodes in lists),
-        pose=joined(episodes.pose for episodes in lists),
-        best_length=joined(episodes.best_length for episodes in lists),
-        room=joined(np.array([rooms.index(room) for room in episodes.rooms])[episodes.room] for episodes in lists),
+        scene=np.concatenate(scene_parts).astype(np.int32),
+        goal=np.concatenate(goal_parts).astype(np.int32),
+        pose=np.concatenate(pose_parts).astype(np.int32),
+        best_length=np.concatenate(length_parts).astype(np.int32),
+        room=np.concatenate(room_parts).astype(np.int32),
         rooms=rooms,
-        scenes=tuple(name for episodes in lists for name in episodes.scenes),
+        scenes=tuple(scene_names),
     )
+
+
+def joint_clusters(lists: Sequence[EpisodeList]) -> list[Clusters]:
+    """Cluster the episodes of several lists, one result per list.
+
+    A floor plan that occurs in several lists is left out of all of them at once.
+    """
+    clusters = join_episode_lists(lists).clusters()
+
+    # Every list gets its own rows of the weights; columns and scale are shared.
+    list_ends = np.cumsum([len(episodes.scene) for episodes in lists])[:-1]
+    return [clusters._replace(weights=weights) for weights in np.split(clusters.weights, list_ends)]

@@ -1,4 +1,8 @@
-"""What a reader of an evaluation must be told beside its table."""
+"""Notes printed below an evaluation table: limits of the results that the numbers do not show.
+
+`evaluation_notes` covers intervals, privileged rows and rows no better than chance; `budget_note` and
+`convergence_note` describe the training of the evaluated run.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,91 +10,128 @@ from typing import Any
 import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.statistics import LEAST_SCENES, paired_difference
-from jaxnav.evaluation.variants import Row
+from jaxnav.evaluation.statistics import MIN_SCENE_DEGREES, paired_difference
+from jaxnav.evaluation.variants import EvaluationRow
 
 
-def notes(
-    rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, *, room_prior: bool, random: str = "Random"
+def evaluation_notes(
+    rows: Sequence[EvaluationRow],
+    success: np.ndarray,
+    episodes: EpisodeList,
+    *,
+    has_room_prior: bool,
+    random_name: str = "Random",
 ) -> list[str]:
-    """Return what limits the table, a sentence each.
+    """Describe what limits a table, one sentence per note.
 
     Args:
       rows: R rows.
       success: float64 [R, S, E].
       episodes: the E episodes.
-      room_prior: whether the layout's prior is that of the room's own type, not one for all.
-      random: what to call the agent that chooses at random.
+      has_room_prior: True if the layout prior is that of the room's own type, not one for all types.
+      random_name: name of the agent that acts at random.
     """
-    found = _missing_intervals(success.shape[1], episodes)
-    if room_prior and any(row.arm == "layout" for row in rows):
-        found.append("Rows with w are told the type of the room by their prior, others are not.")
-    return found + _no_better(rows, success, episodes, random)
+    # Intervals first, then what a row knows in advance, then comparisons with chance.
+    notes = _missing_interval_notes(success.shape[1], episodes)
+    if has_room_prior and any(row.arm == "layout" for row in rows):
+        notes.append("Rows with w are told the type of the room by their prior, others are not.")
+    return notes + _chance_notes(rows, success, episodes, random_name)
 
 
-def spent(budget: Mapping[str, int]) -> str:
-    """Say what environment steps stand behind a policy.
+def budget_note(budget: Mapping[str, int]) -> str:
+    """Describe the environment steps behind a policy.
 
     Args:
       budget: steps of `exploration`, `imitation` and `learning`.
     """
-    exploration, imitation, learning = (f"{budget[name]:,}" for name in ("exploration", "imitation", "learning"))
     return (
-        f"Environment steps behind each policy: {exploration} of exploration for the layout priors, {imitation} of "
-        f"imitation, {learning} of learning."
+        f"Environment steps behind each policy: {budget['exploration']:,} of exploration for the layout priors, "
+        f"{budget['imitation']:,} of imitation, {budget['learning']:,} of learning."
     )
 
 
-def trained_out(log: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say how far val success still rose at the end of training.
+def convergence_note(log: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Describe how much success on `val` still rose at the end of training.
 
     Args:
-      log: the rows of a run; see `last_quarter`.
+      log: rows of a run; see `last_quarter_success`.
+
+    Returns:
+      One note, or none with too few measurements.
     """
-    if (course := last_quarter(log)) is None:
+    quarter_success = last_quarter_success(log)
+    if quarter_success is None:
         return []
-    return ["In the last quarter of training val success (best actions) went from {:.1f} to {:.1f} %.".format(*course)]
+    start, end = quarter_success
+    return [f"In the last quarter of training val success (best actions) went from {start:.1f} to {end:.1f} %."]
 
 
-def last_quarter(log: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
-    """Return val success before the last quarter and at the end.
-
-    Both are in percent, with best actions, the mean over arms and seeds; None with too few measurements.
+def last_quarter_success(log: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
+    """Compute success on `val` before the last quarter of training and at its end.
 
     Args:
-      log: the rows of a run; those with a measurement on val count.
+      log: rows of a run; rows without a measurement on `val` are ignored.
+
+    Returns:
+      Both in percent, with best actions, averaged over arms and seeds; None with too few measurements.
     """
-    course: dict[int, list[float]] = {}
-    for row in log:
-        if "val_success" in row:
-            course.setdefault(row["env_steps"], []).append(100.0 * row["val_success"])
-    before = [steps for steps in course if steps <= 0.75 * max(course)]
-    if not before:
+    # A measurement for each arm and seed, in percent, by the environment steps before it.
+    success_by_steps: dict[int, list[float]] = {}
+    for log_row in log:
+        if "val_success" in log_row:
+            success_by_steps.setdefault(log_row["env_steps"], []).append(100.0 * log_row["val_success"])
+
+    # The start is the last measurement that lies before the final quarter of the steps.
+    last_steps = max(success_by_steps, default=0)
+    early_steps = []
+    for env_steps in success_by_steps:
+        if env_steps <= 0.75 * last_steps:
+            early_steps.append(env_steps)
+    if not early_steps:
         return None
-    then, now = (float(np.mean(course[max(steps)])) for steps in (before, course))
-    return then, now
+
+    start_success = float(np.mean(success_by_steps[max(early_steps)]))
+    end_success = float(np.mean(success_by_steps[last_steps]))
+    return start_success, end_success
 
 
-def _missing_intervals(seeds: int, episodes: EpisodeList) -> list[str]:
-    found = []
-    if episodes.clusters().degrees < LEAST_SCENES:
-        plans = len(set(episodes.plan))
-        found.append(f"No intervals: {plans} floor plan{'s' * (plans > 1)}; an interval needs at least 3.")
-    if seeds == 1:
-        found.append("No interval for a single training seed: it says nothing of another training; train more seeds.")
-    return found
+def _missing_interval_notes(num_seeds: int, episodes: EpisodeList) -> list[str]:
+    """Explain why a table has no intervals, if so."""
+    interval_notes = []
+
+    # Floor plans are the units of the interval over scenes.
+    if episodes.clusters().degrees_of_freedom < MIN_SCENE_DEGREES:
+        num_plans = len(set(episodes.floor_plans))
+        plural_ending = "s" if num_plans > 1 else ""
+        interval_notes.append(f"No intervals: {num_plans} floor plan{plural_ending}; an interval needs at least 3.")
+
+    # A single seed gives no spread between training runs.
+    if num_seeds == 1:
+        interval_notes.append(
+            "No interval for a single training seed: it says nothing of another training; train more seeds."
+        )
+    return interval_notes
 
 
-def _no_better(rows: Sequence[Row], success: np.ndarray, episodes: EpisodeList, name: str) -> list[str]:
-    """Name the policies that no interval over scenes tells from Random."""
-    random = next((success[i] for i, row in enumerate(rows) if row.variant == "random"), None)
-    if random is None:
+def _chance_notes(
+    rows: Sequence[EvaluationRow], success: np.ndarray, episodes: EpisodeList, random_name: str
+) -> list[str]:
+    """Name the policies whose interval over scenes does not exclude chance."""
+    row_variants = [row.variant for row in rows]
+    if "random" not in row_variants:
         return []
-    clusters, found = episodes.clusters(), []
-    for row, values in zip(rows, success, strict=True):
-        if row.variant not in ("baseline", "layout"):
-            continue
-        gain = paired_difference(random, values, clusters, trained=False)
-        if not (gain.low if gain.bounded else gain.mean) > 0:
-            found.append(f"{row.variant} ({row.decoding}) is no better than {name}.")
-    return found
+
+    # The row of the random agent is the reference of all comparisons.
+    random_success = success[row_variants.index("random")]
+
+    # These policies are compared in other scenes, so the spread between training runs does not count. Without an
+    # interval, the mean decides.
+    clusters = episodes.clusters()
+    chance_notes = []
+    for row, row_success in zip(rows, success, strict=True):
+        if row.variant in ("baseline", "layout"):
+            gain_over_chance = paired_difference(random_success, row_success, clusters, trained=False)
+            lower_bound = gain_over_chance.low if gain_over_chance.has_bounds else gain_over_chance.mean
+            if not lower_bound > 0:
+                chance_notes.append(f"{row.variant} ({row.decoding}) is no better than {random_name}.")
+    return chance_notes

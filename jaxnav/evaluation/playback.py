@@ -1,4 +1,7 @@
-"""Evaluation episodes, step by step: what was seen, believed, inferred and done."""
+"""Replays: evaluation episodes played step by step, with everything that the policy saw and decided.
+
+`play_episodes` returns one `EpisodeTrace` per episode. Use `jaxnav.evaluation.grid` for metrics of many episodes.
+"""
 
 import functools
 from typing import NamedTuple
@@ -7,99 +10,126 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.types import EnvParams, State
-from jaxnav.evaluation.grid import act
-from jaxnav.evaluation.inference import Inference, Inferred
-from jaxnav.policies.acting import Acting, Agent, carried, select
-from jaxnav.policies.methods import Knowledge
-from jaxnav.policies.policy import Params
+from jaxnav.env.objectnav import EnvParams, State
+from jaxnav.evaluation.grid import infer_and_act
+from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace
+from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory, select
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.network import Params
 
 
-class Trace(NamedTuple):
-    """Hold the T decisions of one episode.
+class EpisodeTrace(NamedTuple):
+    """The T decisions of one episode.
 
     Attributes:
       pose: int32 [T], pose at which each action was chosen.
       action: int32 [T]; only the last can be Done.
       inferred: how each action was inferred, leaves [T, ...].
-      success: whether the episode ended with Done where it succeeds.
+      success: True if the episode ended with a successful Done.
     """
 
     pose: np.ndarray
     action: np.ndarray
-    inferred: Inferred
+    inferred: InferenceTrace
     success: bool
 
     @property
     def gap(self) -> np.ndarray:
-        """Return the layout gap D, float32 [T]."""
+        """Layout gap D, float32 [T]."""
         return np.asarray(self.inferred.gap)
 
 
 class _Step(NamedTuple):
-    """Hold one step of E episodes, leaves [E, ...]."""
+    """One step of E episodes, leaves [E, ...]; meaningless for episodes that were not running before the step."""
 
     pose: jax.Array
     action: jax.Array
-    inferred: Inferred
+    inferred: InferenceTrace
     success: jax.Array
     running: jax.Array
 
 
-def play(
-    cell: Inference,
+def play_episodes(
+    cell: InferenceConfig,
     weights: Params,
     start: State,
-    acting: Acting,
-    params: EnvParams,
+    agent_loop: AgentLoop,
+    env_params: EnvParams,
     knowledge: Knowledge,
-) -> list[Trace]:
+) -> list[EpisodeTrace]:
     """Play episodes to their ends, step by step.
 
     Args:
-      cell: how to infer, leaves []; `cell.params` is not used.
+      cell: how to infer, leaves []; `cell.policy_index` is not used.
       weights: parameters of the policy.
-      start: of the episodes, leaves [E].
-      acting: how to act.
-      params: the environment's.
-      knowledge: what was learned before training.
+      start: initial states of the episodes, leaves [E].
+      agent_loop: environment, policy and layout estimator.
+      env_params: parameters of the environment.
+      knowledge: learned before training.
     """
-    count = len(start.pose)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(count))
-    agent, running = _begin(weights, start, acting, params, knowledge), jnp.ones(count, bool)
-    steps = []
+    # A fixed key per episode, so that a replay is the same every time.
+    num_episodes = len(start.pose)
+    episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(num_episodes))
+    agent = _begin(weights, start, agent_loop, env_params, knowledge)
+    running = jnp.ones(num_episodes, bool)
+
+    # All episodes are stepped together until the longest has ended. Steps [E, ...] move to the host one by one.
+    host_steps = []
     while running.any():
-        before = running
-        agent, running, step = _step(cell, weights, agent, running, keys, acting, params, knowledge)
-        steps.append(jax.tree.map(np.asarray, step._replace(running=before)))
-    course = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *steps)  # [E, T, ...]
-    return [_trace(jax.tree.map(lambda leaf, e=e: leaf[e], course)) for e in range(count)]
+        agent, running, step = _step(cell, weights, agent, running, episode_keys, agent_loop, env_params, knowledge)
+        host_steps.append(jax.tree.map(np.asarray, step))
+
+    # Stack the steps along a time axis, and cut out the steps of each episode.
+    all_steps = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *host_steps)  # [E, T, ...]
+    return [_episode_trace(all_steps, episode) for episode in range(num_episodes)]
 
 
-def _trace(course: _Step) -> Trace:
-    """Return the part of a course in which the episode runs."""
-    pose, action, inferred, success, _ = jax.tree.map(lambda leaf: leaf[course.running], course)
-    return Trace(pose, action, inferred, bool(success[-1]))
+def _episode_trace(all_steps: _Step, episode: int) -> EpisodeTrace:
+    """Cut the steps at which one episode was running out of steps [E, T, ...]."""
+    # Success is that of the last running step; the steps after it are meaningless.
+    is_running = all_steps.running[episode]
+    episode_steps = jax.tree.map(lambda leaf: leaf[episode][is_running], all_steps)
+    return EpisodeTrace(
+        episode_steps.pose, episode_steps.action, episode_steps.inferred, bool(episode_steps.success[-1])
+    )
 
 
-@functools.partial(jax.jit, static_argnames="acting")
-def _begin(weights: Params, start: State, acting: Acting, params: EnvParams, knowledge: Knowledge) -> Agent:
-    return acting.begin(start, acting.bind(weights).initial_memory(start.pose.shape), knowledge, params)
+@functools.partial(jax.jit, static_argnames="agent_loop")
+def _begin(weights: Params, start: State, agent_loop: AgentLoop, env_params: EnvParams, knowledge: Knowledge) -> Agent:
+    initial_memory = agent_loop.bind(weights).initial_memory(start.pose.shape)
+    return agent_loop.begin(start, initial_memory, knowledge, env_params)
 
 
-@functools.partial(jax.jit, static_argnames="acting")
+@functools.partial(jax.jit, static_argnames="agent_loop")
 def _step(
-    cell: Inference,
+    cell: InferenceConfig,
     weights: Params,
     agent: Agent,
     running: jax.Array,
-    keys: jax.Array,
-    acting: Acting,
-    params: EnvParams,
+    episode_keys: jax.Array,
+    agent_loop: AgentLoop,
+    env_params: EnvParams,
     knowledge: Knowledge,
 ) -> tuple[Agent, jax.Array, _Step]:
-    """Act once where episodes run; return what runs on, and the step."""
-    policy = acting.bind(weights)
-    after, taken, inferred = act(cell, policy, agent, running, keys, acting, params, knowledge)
-    step = _Step(agent.state.pose, carried(taken.agent).action, inferred, taken.success, running)
-    return select(running, after, agent), running & ~taken.ended, step
+    """Act once in the running episodes.
+
+    Returns:
+      The agents after the step, which episodes still run, and the step.
+    """
+    # Act in all episodes, including those that have ended: shapes stay fixed.
+    policy = agent_loop.bind(weights)
+    next_agent, step_result, inferred = infer_and_act(
+        cell, policy, agent, running, episode_keys, agent_loop, env_params, knowledge
+    )
+
+    # Record the pose before the action, so that a trace pairs each action with the view it was chosen from.
+    recorded_step = _Step(
+        pose=agent.state.pose,
+        action=policy_memory(step_result.agent).action,
+        inferred=inferred,
+        success=step_result.success,
+        running=running,
+    )
+
+    # Agents of ended episodes stay as they were.
+    return select(running, next_agent, agent), running & ~step_result.ended, recorded_step

@@ -1,35 +1,53 @@
-"""The evaluation report: JSON, a console table, a Markdown table.
+"""The evaluation report, its tables, and the accounting of experience.
 
-A report is a plain dictionary that JSON holds exactly; SR, SPL and SAE are in percent (0-100), DTS in metres.
+A report is a plain dictionary that JSON represents exactly; SR, SPL and SAE are in percent (0-100), DTS in metres.
+`build_report` assembles a report from `build_row` and `build_difference`; `results_table`, `difference_table` and
+`markdown_table` print it.
+
+The accounting compares an agent with one that cannot know any layout, on the same episodes. The lead of the agent is
+the difference of their results. If the layout matches training, the lead is the value of experience; under a layout
+shift, a negative lead is its cost. `remaining_share` is the part of the lead that remains after a removal.
 """
 
 import importlib.metadata
 import json
 import platform
 import typing
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from rich.table import Table
+from rich.text import Text
 
 from jaxnav.causal import Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.statistics import paired_difference, scene_clusters, summary
+from jaxnav.evaluation.statistics import (
+    Clusters,
+    Interval,
+    jackknife_interval,
+    mean_interval,
+    paired_difference,
+    run_clusters,
+    scene_clusters,
+)
 from jaxnav.store.files import write_atomic
 
 #: Version of the JSON layout.
-FORMAT = 1
+REPORT_FORMAT = 1
 
 Metric = Literal["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
 
-#: What every row has; in percent but for `dts`, which is in metres. `sr@N`, success within N actions, comes besides.
+#: Metrics of every row, in percent except `dts` in metres. A row may add `sr@N`, success within N actions.
 _METRICS: tuple[Metric, ...] = typing.get_args(Metric)
 #: Variants without training, whose seeds are repetitions.
-UNTRAINED: tuple[Variant, ...] = ("oracle", "random")
-_BUCKETS = {"L>=1": 1, "L>=5": 5}
+UNTRAINED_VARIANTS: tuple[Variant, ...] = ("oracle", "random")
+#: Smallest L* of the episodes in each bucket.
+_LENGTH_BUCKETS = {"L>=1": 1, "L>=5": 5}
 
 
 def build_row(
@@ -44,51 +62,70 @@ def build_row(
     metrics: dict[str, np.ndarray],
     episodes: EpisodeList,
 ) -> dict[str, Any]:
-    """Build one row: a variant's metrics.
-
-    They are over all episodes and over the buckets L* >= 1 and L* >= 5.
+    """Build one row: the metrics of a variant, over all episodes and by bucket (L* >= 1, L* >= 5).
 
     Every episode has L* >= 1, so the overall metrics are those of the first bucket. A bucket without episodes holds
     `"episodes": 0` and no metrics.
 
     Args:
-      variant: what is evaluated; with `method`, `world` and `split` it names the row.
+      variant: the evaluated variant; with `method`, `world` and `split` it identifies the row.
       method: name of the method as printed, for example `ORG`.
       world: world of the episodes.
       split: `train`, `val` or `test`.
-      epsilon: threshold of the sTDE, None where there is none.
-      decoding: how actions are taken from logits.
-      form: how the counterfactual logits are combined, None where there are none.
-      metrics: those of `episode_metrics`, each [S, E].
+      epsilon: threshold of sTDE; None for other variants.
+      decoding: rule that turns logits into actions.
+      form: how counterfactual logits are combined; None for variants without counterfactual.
+      metrics: as returned by `episode_metrics`, each [S, E].
       episodes: the E episodes.
 
     Raises:
       InputError: metrics missing, of unequal or wrong shape, not finite or out of range, or an L* below 1.
     """
-    within = [name for name in metrics if name.startswith("sr@")]
-    if set(metrics) - set(within) != set(_METRICS):
+    # Check the metrics: names, range, then shape.
+    budget_metrics = _budget_metric_names(metrics)
+    if set(metrics) - set(budget_metrics) != set(_METRICS):
         raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_METRICS)}, and any sr@N")
-    scaled = {name: _to_report_units(name, metrics[name]) for name in (*_METRICS, *within)}
-    shape = scaled["sr"].shape
-    if len(shape) != 2 or {values.shape for values in scaled.values()} != {shape}:
+    scaled_metrics = {}
+    for metric_name in (*_METRICS, *budget_metrics):
+        scaled_metrics[metric_name] = _to_report_units(metric_name, metrics[metric_name])
+    result_shape = scaled_metrics["sr"].shape
+    metric_shapes = {metric_values.shape for metric_values in scaled_metrics.values()}
+    if len(result_shape) != 2 or metric_shapes != {result_shape}:
         raise InputError("metrics differ in shape; give each as [seeds, episodes]")
-    if episodes.best_length.shape != shape[1:]:
-        raise InputError(f"metrics have {shape[1]} episodes, and the list {len(episodes.best_length)}; give as many")
+
+    # The lengths L* decide the bucket of each episode.
+    if episodes.best_length.shape != result_shape[1:]:
+        raise InputError(
+            f"metrics have {result_shape[1]} episodes, and the list {len(episodes.best_length)}; give as many"
+        )
     if (episodes.best_length < 1).any():
         raise InputError("best_length holds values below 1; drop episodes whose goal no pose can see")
 
+    # Each metric with its interval, bucket by bucket.
     buckets: dict[str, dict[str, Any]] = {}
-    for name, shortest in _BUCKETS.items():
-        kept = episodes.best_length >= shortest
-        buckets[name] = {"episodes": int(kept.sum())}
-        if kept.any():
-            scenes = scene_clusters(episodes.plan[kept], episodes.room[kept])
-            for metric, values in scaled.items():
-                interval = summary(values[:, kept], scenes, trained=variant not in UNTRAINED)
-                buckets[name][metric] = interval.to_json()
-    identity = {"variant": variant, "method": method, "world": world, "split": split}
-    setting = {"epsilon": epsilon, "decoding": decoding, "form": form}
-    return {**identity, **setting, "seeds": shape[0], **buckets["L>=1"], "buckets": buckets}
+    for bucket_name, min_length in _LENGTH_BUCKETS.items():
+        in_bucket = episodes.best_length >= min_length
+        buckets[bucket_name] = {"episodes": int(in_bucket.sum())}
+        if in_bucket.any():
+            clusters = scene_clusters(episodes.floor_plans[in_bucket], episodes.room[in_bucket])
+            for metric_name, metric_values in scaled_metrics.items():
+                is_trained = variant not in UNTRAINED_VARIANTS
+                interval = mean_interval(metric_values[:, in_bucket], clusters, trained=is_trained)
+                buckets[bucket_name][metric_name] = interval.to_json()
+
+    # The overall metrics stand in the row itself, next to all buckets.
+    return {
+        "variant": variant,
+        "method": method,
+        "world": world,
+        "split": split,
+        "epsilon": epsilon,
+        "decoding": decoding,
+        "form": form,
+        "seeds": result_shape[0],
+        **buckets["L>=1"],
+        "buckets": buckets,
+    }
 
 
 def build_difference(
@@ -102,28 +139,40 @@ def build_difference(
     episodes: EpisodeList,
     same_runs: bool = False,
 ) -> dict[str, Any]:
-    """Build one paired difference of a metric.
-
-    It is `compared - reference` over all episodes, in the report's units.
+    """Build one paired difference, `compared - reference` over all episodes, in the report's units.
 
     Args:
       metric: a key of the metrics.
       reference: (name of the variant, its results [S, E] as given to `build_row`).
-      compared: the same for the variant compared with it.
-      epsilon: threshold of the sTDE, None where there is none.
-      form: how the compared variant combines counterfactual logits, None where there are none.
-      decoding: how actions are taken from logits, in both.
+      compared: the variant compared with it, in the same form.
+      epsilon: threshold of sTDE; None for other variants.
+      form: how the compared variant combines counterfactual logits; None for variants without counterfactual.
+      decoding: rule that turns logits into actions, equal for both variants.
       episodes: the E episodes.
-      same_runs: whether equal seed indexes mean the same network (see `paired_difference`).
+      same_runs: True if equal seed indices are the same network (see `paired_difference`).
 
     Raises:
       InputError: results of unequal or wrong shape, not finite or out of range.
     """
-    (source, a), (target, b) = reference, compared
-    a, b = _to_report_units(metric, a), _to_report_units(metric, b)
-    difference = paired_difference(a, b, episodes.clusters(), same_runs=same_runs)
-    identity = {"metric": metric, "from": source, "to": target, "epsilon": epsilon, "form": form}
-    return {**identity, "decoding": decoding, **difference.to_json()}
+    reference_name, reference_results = reference
+    compared_name, compared_results = compared
+
+    # The difference is taken episode by episode, over all lengths L*.
+    paired = paired_difference(
+        _to_report_units(metric, reference_results),
+        _to_report_units(metric, compared_results),
+        episodes.clusters(),
+        same_runs=same_runs,
+    )
+    return {
+        "metric": metric,
+        "from": reference_name,
+        "to": compared_name,
+        "epsilon": epsilon,
+        "form": form,
+        "decoding": decoding,
+        **paired.to_json(),
+    }
 
 
 def build_report(
@@ -135,8 +184,12 @@ def build_report(
 ) -> dict[str, Any]:
     """Build the report.
 
-    It holds rows, differences, notes, the number of compilations that the evaluation took, settings, versions and
-    format.
+    Args:
+      rows: see `build_row`.
+      differences: see `build_difference`.
+      notes: see `jaxnav.evaluation.notes`.
+      compilations: number of compilations of the evaluation.
+      run: settings of the run.
     """
     return {
         "run": run,
@@ -144,28 +197,32 @@ def build_report(
         "differences": differences,
         "notes": notes,
         "compilations": compilations,
-        "versions": versions(),
-        "format": FORMAT,
+        "versions": package_versions(),
+        "format": REPORT_FORMAT,
     }
 
 
-def versions() -> dict[str, str]:
-    """Return the versions that decide the results.
+def package_versions() -> dict[str, str]:
+    """Look up the versions of Python and packages that influence results.
 
-    They are of Python and of packages; `jaxnav` may run uninstalled, from its source.
+    `jaxnav` is `source` when it runs uninstalled.
     """
+    # A checkout has no metadata of its own, while its dependencies are always installed.
     try:
-        jaxnav = importlib.metadata.version("jaxnav")
+        jaxnav_version = importlib.metadata.version("jaxnav")
     except importlib.metadata.PackageNotFoundError:
-        jaxnav = "source"
-    others = {name: importlib.metadata.version(name) for name in ("jax", "flax", "numpy")}
-    return {"jaxnav": jaxnav, **others, "python": platform.python_version()}
+        jaxnav_version = "source"
+    return {
+        "jaxnav": jaxnav_version,
+        "jax": importlib.metadata.version("jax"),
+        "flax": importlib.metadata.version("flax"),
+        "numpy": importlib.metadata.version("numpy"),
+        "python": platform.python_version(),
+    }
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Write the report as JSON.
-
-    The file is replaced at once, so a reader never sees half of one.
+    """Write the report as JSON, replacing the file atomically.
 
     Raises:
       ValueError: the report holds NaN or an infinity; nothing is written.
@@ -173,11 +230,235 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     write_atomic(path, (json.dumps(report, indent=2, allow_nan=False) + "\n").encode())
 
 
-def _to_report_units(metric: str, values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values, np.float64)
-    scale = 1.0 if metric == "dts" else 100.0
-    highest = np.inf if metric == "dts" else 1.0
-    if not ((values >= 0) & (values <= highest) & np.isfinite(values)).all():
-        unit = "metres, at least 0" if metric == "dts" else "fractions from 0 to 1"
-        raise InputError(f"{metric} holds NaN or values out of range; give {unit}")
-    return values * scale
+def _to_report_units(metric: str, metric_values: np.ndarray) -> np.ndarray:
+    """Check results and convert fractions to percent; `dts` stays in metres."""
+    # Only the distance to success is not a fraction of episodes.
+    metric_values = np.asarray(metric_values, np.float64)
+    is_distance = metric == "dts"
+    upper_bound = np.inf if is_distance else 1.0
+
+    # Comparisons with NaN are false; `isfinite` also refuses an infinite distance.
+    if not ((metric_values >= 0) & (metric_values <= upper_bound) & np.isfinite(metric_values)).all():
+        valid_range = "metres, at least 0" if is_distance else "fractions from 0 to 1"
+        raise InputError(f"{metric} holds NaN or values out of range; give {valid_range}")
+    return metric_values * (1.0 if is_distance else 100.0)
+
+
+#: Titles and decimal places of the metrics.
+METRIC_COLUMNS = {"sr": ("SR (%)", 1), "spl": ("SPL (%)", 1), "dts": ("DTS (m)", 2)}
+#: Titles of the failures, which are printed as means without intervals.
+_FAILURE_COLUMNS = {"timeout": "Time-out (%)", "wrong_done": "Wrong Done (%)"}
+
+
+def results_table(report: dict[str, Any]) -> Table:
+    """Make the table of a report for a terminal.
+
+    One line per row, `mean [95 % interval]`, under a heading per world, split and decoding.
+    """
+    table = Table("Variant", *_column_titles(report))
+    for heading, table_lines in _lines_by_heading(report).items():
+        table.add_section()
+        table.add_row(heading, style="bold")
+        for cells in table_lines:
+            table.add_row(*cells)
+    return table
+
+
+def difference_table(report: dict[str, Any]) -> Table:
+    """Make the table of the paired differences for a terminal.
+
+    One line per comparison and decoding, `mean [95 % interval]`.
+    """
+    # A report lists one difference per metric; its metrics stand side by side in the table.
+    cells_by_comparison: dict[tuple[str, str], list[str]] = {}
+    for difference in report["differences"]:
+        _, digits = METRIC_COLUMNS[difference["metric"]]
+        cell = f"{Interval.from_json(difference):+.{digits}f}"
+        comparison = (difference_label(difference), difference["decoding"])
+        cells_by_comparison.setdefault(comparison, []).append(cell)
+
+    # The report lists the differences of a comparison in the order of these columns.
+    table = Table("Difference, paired on episodes", "decoding", *_metric_titles())
+    for comparison, cells in cells_by_comparison.items():
+        table.add_row(*comparison, *cells)
+    return table
+
+
+def markdown_table(report: dict[str, Any]) -> str:
+    """Make the table of a report in Markdown, with its notes, ending with a newline."""
+    # Title and alignment: text to the left, numbers to the right.
+    column_titles = _column_titles(report)
+    blank_cells = [""] * len(column_titles)
+    table_lines: list[tuple[str, ...]] = [("Variant", *column_titles), ("---", *["---:"] * len(column_titles))]
+
+    # Markdown has no sections, so a heading fills a line of its own.
+    for heading, group_lines in _lines_by_heading(report).items():
+        table_lines.append((f"**{heading}**", *blank_cells))
+        table_lines.extend(group_lines)
+
+    text_parts = []
+    for cells in table_lines:
+        text_parts.append(f"| {' | '.join(cells)} |\n")
+    # Reports of version 0.1 have no notes.
+    for note in report.get("notes", ()):
+        text_parts.append(f"\n{note}\n")
+    return "".join(text_parts)
+
+
+def _metric_titles() -> list[str]:
+    """Titles of the metrics with intervals."""
+    return [title for title, _ in METRIC_COLUMNS.values()]
+
+
+def _column_titles(report: dict[str, Any]) -> list[str]:
+    """Titles of all columns after the first."""
+    titles = _metric_titles()
+    budgets = _action_budgets(report)
+    if budgets:
+        titles.append(f"SR within {', '.join(map(str, budgets))} (%)")
+    return [*titles, *_FAILURE_COLUMNS.values()]
+
+
+def _action_budgets(report: dict[str, Any]) -> list[int]:
+    """Action budgets N of the metrics `sr@N`; none before version 0.2."""
+    # All rows of a report have the same budgets.
+    budgets = []
+    for name in _budget_metric_names(report["rows"][0]):
+        budgets.append(int(name.removeprefix("sr@")))
+    return sorted(budgets)
+
+
+def _budget_metric_names(names: Iterable[str]) -> list[str]:
+    """Select the names of the metrics `sr@N`."""
+    return [name for name in names if name.startswith("sr@")]
+
+
+def _lines_by_heading(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:
+    """Cells of the table's lines, grouped by heading and in order."""
+    budgets = _action_budgets(report)
+    table_lines: dict[str, list[tuple[str, ...]]] = {}
+    for row in report["rows"]:
+        # Metrics with intervals, then success within the budgets, together in one column, then failures.
+        cells = [row_label(row)]
+        for metric, (_, digits) in METRIC_COLUMNS.items():
+            cells.append(f"{Interval.from_json(row[metric]):.{digits}f}")
+        if budgets:
+            budget_cells = [f"{row[f'sr@{budget}']['mean']:.1f}" for budget in budgets]
+            cells.append(", ".join(budget_cells))
+        for metric in _FAILURE_COLUMNS:  # absent before version 0.3
+            cells.append(f"{row[metric]['mean']:.1f}" if metric in row else "")
+
+        # Rows are compared within one world, split and decoding only.
+        heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
+        table_lines.setdefault(heading, []).append(tuple(cells))
+    return table_lines
+
+
+def row_label(row: dict[str, Any]) -> str:
+    """Name of a report's row, as printed in tables."""
+    match row["variant"]:
+        case "oracle":
+            return "Shortest path (oracle)"
+        case "random":
+            return "Random"
+        case "baseline":
+            return f"{row['method']} (baseline)"
+        case "layout":
+            return "+ w (layout)"
+        case "tde":
+            return "+ w + TDE"
+        case _:
+            form_suffix = {"paper": ", paper form", "switch": ", switch"}.get(row["form"], "")
+            return f"+ w + sTDE (eps={row['epsilon']:g}){form_suffix}"
+
+
+def difference_label(difference: dict[str, Any]) -> str:
+    """Name of a report's paired difference, as printed in tables."""
+    compared = row_label({**difference, "variant": difference["to"], "method": ""})
+    reference = "+ w" if difference["from"] == "layout" else difference["from"]
+    return f"{compared} - {reference}"
+
+
+class ExperienceLead(NamedTuple):
+    """Lead of a row over the agent without experience, in one metric.
+
+    Attributes:
+      variant: label of the row, as printed in tables.
+      decoding: rule that turns logits into actions.
+      metric: `sr`, `spl` or `sr@N`.
+      lead: difference to the agent without experience, in percentage points.
+      left: share of the lead without removal that remains with it, in percent; None for rows that remove nothing. For
+        a value of experience it is the share kept; for a cost, 100 minus it is the share recovered.
+    """
+
+    variant: str
+    decoding: Decoding
+    metric: str
+    lead: Interval
+    left: Interval | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Convert to JSON."""
+        share = None if self.left is None else self.left.to_json()
+        return self._asdict() | {"lead": self.lead.to_json(), "left": share}
+
+
+def remaining_share(unaware: np.ndarray, agent: np.ndarray, removed: np.ndarray, scenes: Clusters) -> Interval:
+    """Compute the share of an agent's lead that remains after removal.
+
+    The share is (removed - unaware) / (agent - unaware), of means over the same episodes.
+
+    Args:
+      unaware: bool, int or float [S, E], results of the agent without experience.
+      agent: [S, E], results of the agent with experience, trained separately.
+      removed: [S, E], results of the policies of `agent`, with removal.
+      scenes: clusters of the E episodes.
+
+    Returns:
+      The share in percent, with its interval; NaN if the interval of the lead contains 0 or has no bounds.
+    """
+    # A share of a lead that may be 0 is meaningless.
+    lead = paired_difference(unaware, agent, scenes)
+    if not lead.has_bounds or lead.low <= 0.0 <= lead.high:
+        return Interval(float("nan"))
+
+    # Replicates leave out one run of either agent, and one scene; numerator and denominator leave out the same.
+    runs = run_clusters(2, len(agent))
+
+    def lead_replicates(results: np.ndarray) -> np.ndarray:
+        signed_results = np.concatenate([-np.asarray(unaware, np.float64), np.asarray(results, np.float64)])
+        return runs.weights.T @ signed_results @ scenes.weights
+
+    return jackknife_interval(100.0 * lead_replicates(removed) / lead_replicates(agent), scenes, runs)
+
+
+def accounting_table(entries: Sequence[ExperienceLead]) -> Table:
+    """Make the table of leads for a terminal.
+
+    One line per row of the evaluation, `mean [95 % interval]`.
+    """
+    # Entries are one per metric; those of one row form a line.
+    leads_by_row: dict[tuple[str, str], dict[str, ExperienceLead]] = {}
+    for lead_entry in entries:
+        leads_by_row.setdefault((lead_entry.variant, lead_entry.decoding), {})[lead_entry.metric] = lead_entry
+
+    # Columns in the order in which the metrics first occur. Names are printed as text, without markup.
+    metric_names = dict.fromkeys(lead_entry.metric for lead_entry in entries)
+    table = Table("Variant", "decoding", *map(_lead_title, metric_names), "left of SR (%)")
+    for row_name, lead_by_metric in leads_by_row.items():
+        table.add_row(*map(Text, (*row_name, *_lead_cells(lead_by_metric))))
+    return table
+
+
+def _lead_cells(lead_by_metric: Mapping[str, ExperienceLead]) -> list[str]:
+    """Cells of one line: the lead in each metric, then the remaining share of SR."""
+    cells = []
+    for lead_entry in lead_by_metric.values():
+        cells.append(f"{lead_entry.lead:+.1f}")
+    remaining = lead_by_metric["sr"].left
+    return [*cells, "" if remaining is None else f"{remaining:.0f}"]
+
+
+def _lead_title(metric: str) -> str:
+    metric_name, _, budget = metric.partition("@")
+    return f"{metric_name.upper()} within {budget}" if budget else metric_name.upper()

@@ -1,4 +1,8 @@
-"""Statistics of scenes: sizes, objects, co-occurrence and path lengths."""
+"""Statistics of scenes: sizes, objects, co-occurrence and path lengths.
+
+`compute_scene_statistics` compiles one scene and counts its content. The `summarize_...` functions and `fit_priors`
+combine the statistics of many scenes into the rows of tables.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -6,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.env.objectnav import prior_index
-from jaxnav.evaluation.similarity import layout_gap, layout_similarity, seen_together
+from jaxnav.evaluation.similarity import count_co_detections, scene_layout_gap, scene_layout_similarity
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.scene import SPLITS, Scene, scene_size
 from jaxnav.scenes.tables.compile import compile_scene
@@ -15,98 +19,97 @@ from jaxnav.scenes.task import Task
 
 
 class SceneStatistics(NamedTuple):
-    """Hold the statistics of one scene; K categories.
+    """Statistics of one scene with K categories.
 
     Attributes:
       scene: the scene.
-      cells: number of standable cells.
+      num_cells: number of standable cells.
       size: float64 [2], metres, see `scene_size`.
-      objects: int [K], number of objects by category.
-      detected: int [K], poses at which a category is detected, of `poses`.
-      poses: number of poses.
-      together: float64 [K, K], see `seen_together`.
-      lengths: int [K, ...], starts (level poses) by category and L*; column 0 counts starts without a path.
+      num_objects: int [K], number of objects of each category.
+      num_detected: int [K], number of poses at which each category is detected.
+      num_poses: number of poses.
+      co_detections: float64 [K, K], see `count_co_detections`.
+      path_lengths: int [K, ...], number of starts (level poses) by category and L*; column 0 counts starts without a
+        path.
     """
 
     scene: Scene
-    cells: int
+    num_cells: int
     size: np.ndarray
-    objects: np.ndarray
-    detected: np.ndarray
-    poses: int
-    together: np.ndarray
-    lengths: np.ndarray
+    num_objects: np.ndarray
+    num_detected: np.ndarray
+    num_poses: int
+    co_detections: np.ndarray
+    path_lengths: np.ndarray
 
     @property
     def has_goal(self) -> bool:
-        """Return whether a goal can be reached from any start."""
-        return bool(self.lengths[:, 1:].any())
+        """True if some start has a path to a goal."""
+        return bool(self.path_lengths[:, 1:].any())
 
 
 class RoomSummary(NamedTuple):
-    """Summarize the scenes of one room type.
+    """Summary of the scenes of one room type.
 
     Attributes:
-      room_type: its name, or `all`.
+      room_type: name of the room type, or `all`.
       splits: number of scenes of each split, in the order of `SPLITS`.
       cells: float64 [5], minimum, quartiles and maximum of the number of standable cells.
       size: float64 [2], medians of width and depth, metres.
-      objects: median number of objects.
-      known: median number of objects of categories.
+      num_objects: median number of objects.
+      num_categorized: median number of objects that belong to a category.
     """
 
     room_type: str
     splits: tuple[int, ...]
     cells: np.ndarray
     size: np.ndarray
-    objects: float
-    known: float
+    num_objects: float
+    num_categorized: float
 
 
 class CategorySummary(NamedTuple):
-    """Summarize the objects of one category.
+    """Summary of the objects of one category.
 
     Attributes:
-      name: of the category.
-      share: of the scenes that have such an object, in (0, 1].
+      name: name of the category.
+      share: share of the scenes that contain the category, in (0, 1].
       number: mean number of objects in those scenes.
       height: median height of the centre, metres.
-      lengths: median and 95th percentile of L* over all starts of all scenes; None if no start has a path.
+      path_lengths: median and 95th percentile of L* over all starts of all scenes; None if no start has a path.
     """
 
     name: str
     share: float
     number: float
     height: float
-    lengths: tuple[int, int] | None
+    path_lengths: tuple[int, int] | None
 
 
 class PairSummary(NamedTuple):
-    """Summarize how often two categories are detected together.
-
-    Probabilities are over all poses of all scenes.
+    """Co-detection of two categories over all poses of all scenes.
 
     Attributes:
       rarer, other: names of the categories.
-      given: P(other | rarer).
-      base: P(other).
-      phi: their correlation.
+      conditional: P(other | rarer).
+      marginal: P(other).
+      phi: correlation of the two detections.
     """
 
     rarer: str
     other: str
-    given: float
-    base: float
+    conditional: float
+    marginal: float
     phi: float
 
 
 class PriorFit(NamedTuple):
-    """Hold the fit of one room type to its prior.
+    """Fit of the scenes of one room type to the prior.
 
     Attributes:
-      room_type: its name, or `all`.
-      gaps: float64 [S], see `layout_gap`, of the scenes that show two categories together.
-      similarities: float64 [S], see `layout_similarity`.
+      room_type: name of the room type, or `all`.
+      gaps: float64 [S], see `scene_layout_gap`, of the scenes with co-occurrence.
+      similarities: float64 [S], see `scene_layout_similarity`.
     """
 
     room_type: str
@@ -114,112 +117,191 @@ class PriorFit(NamedTuple):
     similarities: np.ndarray
 
 
-def scene_statistics(scene: Scene, task: Task) -> SceneStatistics:
-    """Compile a scene and count what it holds."""
-    table, num_categories = compile_scene(scene, task), len(task.categories)
-    ids = [category for category in category_ids(scene.types, task.categories) if category >= 0]
-    starts = table.best_length[:: len(task.rules.horizons)]
+def compute_scene_statistics(scene: Scene, task: Task) -> SceneStatistics:
+    """Compile a scene and count its content."""
+    # Objects whose type belongs to no category have the id -1 and are not counted.
+    scene_table = compile_scene(scene, task)
+    num_categories = len(task.categories)
+    known_ids = []
+    for category in category_ids(scene.types, task.categories):
+        if category >= 0:
+            known_ids.append(category)
+
+    # Histogram of L* for each category, over level poses only.
+    start_lengths = scene_table.best_length[:: len(task.rules.horizons)]  # [starts, K]
+    num_lengths = start_lengths.max() + 1
+    path_lengths = np.stack([np.bincount(lengths, minlength=num_lengths) for lengths in start_lengths.T])
+
     return SceneStatistics(
         scene=scene,
-        cells=len(table.ahead),
+        num_cells=len(scene_table.ahead),
         size=scene_size(scene),
-        objects=np.bincount(ids, minlength=num_categories),
-        detected=RowFormat(num_categories).presence(table.rows).sum(axis=0),
-        poses=len(table.rows),
-        together=seen_together(table.rows, num_categories),
-        lengths=np.stack([np.bincount(lengths, minlength=starts.max() + 1) for lengths in starts.T]),
+        num_objects=np.bincount(known_ids, minlength=num_categories),
+        num_detected=RowFormat(num_categories).presence(scene_table.rows).sum(axis=0),
+        num_poses=len(scene_table.rows),
+        co_detections=count_co_detections(scene_table.rows, num_categories),
+        path_lengths=path_lengths,
     )
 
 
-def room_summaries(statistics: Sequence[SceneStatistics]) -> list[RoomSummary]:
-    """Summarize the scenes by room type."""
+def summarize_rooms(statistics: Sequence[SceneStatistics]) -> list[RoomSummary]:
+    """Summarize the scenes of each room type."""
     summaries = []
-    for room_type, scenes in _by_room_type(statistics):
-        splits = [s.scene.split for s in scenes]
-        objects, known = np.median([(len(s.scene.types), s.objects.sum()) for s in scenes], axis=0)
-        cells = np.quantile([s.cells for s in scenes], np.linspace(0, 1, 5))
-        size = np.median([s.size for s in scenes], axis=0)
-        counts = tuple(splits.count(split) for split in SPLITS)
-        summaries.append(RoomSummary(room_type, counts, cells, size, float(objects), float(known)))
+    for room_type, room_scenes in _group_by_room_type(statistics):
+        # Collect the counts of every scene of this room type.
+        split_names = []
+        cell_counts = []
+        scene_sizes = []
+        object_counts = []
+        categorized_counts = []
+        for scene_statistics in room_scenes:
+            split_names.append(scene_statistics.scene.split)
+            cell_counts.append(scene_statistics.num_cells)
+            scene_sizes.append(scene_statistics.size)
+            object_counts.append(len(scene_statistics.scene.types))
+            categorized_counts.append(scene_statistics.num_objects.sum())
+
+        # Medians and quartiles, because sizes of scenes are skewed.
+        room_summary = RoomSummary(
+            room_type=room_type,
+            splits=tuple(map(split_names.count, SPLITS)),
+            cells=np.quantile(cell_counts, np.linspace(0, 1, 5)),
+            size=np.median(scene_sizes, axis=0),
+            num_objects=float(np.median(object_counts)),
+            num_categorized=float(np.median(categorized_counts)),
+        )
+        summaries.append(room_summary)
     return summaries
 
 
-def category_summaries(statistics: Sequence[SceneStatistics], task: Task) -> list[CategorySummary]:
-    """Summarize the objects of each category that a scene has."""
-    counts = np.stack([s.objects for s in statistics])
-    ids = [np.array(category_ids(s.scene.types, task.categories), int) for s in statistics]
-    lengths = np.zeros((len(task.categories), max(2, *(s.lengths.shape[1] for s in statistics))), int)
-    for s in statistics:
-        lengths[:, : s.lengths.shape[1]] += s.lengths
+def summarize_categories(statistics: Sequence[SceneStatistics], task: Task) -> list[CategorySummary]:
+    """Summarize the objects of each category that occurs in some scene."""
+    object_counts = np.stack([scene.num_objects for scene in statistics])  # [N, K]
+
+    # Category and height of all objects of all scenes, and the length of the longest histogram of L*.
+    id_parts = []
+    height_parts = []
+    max_lengths = 2
+    for scene_statistics in statistics:
+        id_parts.append(category_ids(scene_statistics.scene.types, task.categories))
+        height_parts.append(scene_statistics.scene.boxes[:, 1])
+        max_lengths = max(max_lengths, scene_statistics.path_lengths.shape[1])
+    object_ids = np.concatenate(id_parts)
+    object_heights = np.concatenate(height_parts)
+
+    # Sum the histograms of L*, which differ in length between scenes, into [K, max_lengths].
+    path_lengths = np.zeros((len(task.categories), max_lengths), int)
+    for scene_statistics in statistics:
+        path_lengths[:, : scene_statistics.path_lengths.shape[1]] += scene_statistics.path_lengths
+
+    # Share, number and height refer to the scenes that contain the category.
     summaries = []
-    for k in np.flatnonzero(counts.any(axis=0)):
-        present = counts[:, k][counts[:, k] > 0]
-        heights = np.concatenate([s.scene.boxes[i == k, 1] for s, i in zip(statistics, ids, strict=True)])
-        share, number = len(present) / len(statistics), float(present.mean())
-        paths = _percentiles(lengths[k])
-        summaries.append(CategorySummary(task.categories[k], share, number, float(np.median(heights)), paths))
+    for category in np.flatnonzero(object_counts.any(axis=0)):
+        present_counts = object_counts[:, category][object_counts[:, category] > 0]
+        category_summary = CategorySummary(
+            name=task.categories[category],
+            share=len(present_counts) / len(statistics),
+            number=float(present_counts.mean()),
+            height=float(np.median(object_heights[object_ids == category])),
+            path_lengths=_median_and_95th_percentile(path_lengths[category]),
+        )
+        summaries.append(category_summary)
     return summaries
 
 
-def pair_summaries(statistics: Sequence[SceneStatistics], task: Task, count: int) -> list[PairSummary]:
-    """Return the pairs of categories whose detections correlate most.
+def summarize_pairs(statistics: Sequence[SceneStatistics], task: Task, count: int) -> list[PairSummary]:
+    """Find the pairs of categories whose detections correlate most.
 
     With P over all poses of all scenes, phi = (P(i, j) - P(i) P(j)) / sqrt(P(i) (1 - P(i)) P(j) (1 - P(j))).
 
     Returns:
       At most `count` pairs with phi > 0, the greatest first.
     """
-    poses = sum(s.poses for s in statistics)
-    single = np.sum([s.detected for s in statistics], axis=0) / poses
-    both = np.sum([s.together for s in statistics], axis=0) / poses
-    spread = np.sqrt(np.outer(single * (1 - single), single * (1 - single)))
-    phi = np.divide(both - np.outer(single, single), spread, out=np.zeros_like(both), where=spread > 0)
-    rows, columns = np.triu_indices(len(single), 1)
-    order = np.argsort(-phi[rows, columns], kind="stable")[:count]
+    # Pool the poses of all scenes.
+    num_poses = 0
+    detected_counts = []
+    joint_counts = []
+    for scene_statistics in statistics:
+        num_poses += scene_statistics.num_poses
+        detected_counts.append(scene_statistics.num_detected)
+        joint_counts.append(scene_statistics.co_detections)
+
+    # P(i) [K] and P(i, j) [K, K].
+    marginal_share = np.sum(detected_counts, axis=0) / num_poses
+    joint_share = np.sum(joint_counts, axis=0) / num_poses
+
+    # Correlation [K, K]; 0 for a category that is never, or always, detected.
+    spread = np.sqrt(np.outer(marginal_share * (1 - marginal_share), marginal_share * (1 - marginal_share)))
+    covariance = joint_share - np.outer(marginal_share, marginal_share)
+    phi = np.divide(covariance, spread, out=np.zeros_like(joint_share), where=spread > 0)
+
+    # Rank the pairs i < j by phi.
+    row_ids, column_ids = np.triu_indices(len(marginal_share), 1)
+    pair_phi = phi[row_ids, column_ids]
+    best_pairs = np.argsort(-pair_phi, kind="stable")[:count]
+
+    # P(other | rarer) is the telling direction, so the rarer category of a pair comes first.
     summaries = []
-    for pair in order[phi[rows, columns][order] > 0]:
-        i, j = sorted((rows[pair], columns[pair]), key=lambda k: single[k])
-        names = task.categories[i], task.categories[j]
-        given, base, correlation = float(both[i, j] / single[i]), float(single[j]), float(phi[i, j])
-        summaries.append(PairSummary(*names, given, base, correlation))
+    for pair in best_pairs[pair_phi[best_pairs] > 0]:
+        rarer, other = sorted((row_ids[pair], column_ids[pair]), key=lambda category: marginal_share[category])
+        pair_summary = PairSummary(
+            rarer=task.categories[rarer],
+            other=task.categories[other],
+            conditional=float(joint_share[rarer, other] / marginal_share[rarer]),
+            marginal=float(marginal_share[other]),
+            phi=float(phi[rarer, other]),
+        )
+        summaries.append(pair_summary)
     return summaries
 
 
-def prior_fits(statistics: Sequence[SceneStatistics], priors: np.ndarray) -> list[PriorFit]:
-    """Compare scenes with the priors of their room types.
+def fit_priors(statistics: Sequence[SceneStatistics], priors: np.ndarray) -> list[PriorFit]:
+    """Compare the scenes of each room type with the priors of their room types.
 
     Args:
-      statistics: of the scenes.
-      priors: real [rooms, K, K], concentrations, in the order of `ROOM_TYPES`, then that of other rooms.
+      statistics: statistics of the scenes.
+      priors: real [rooms, K, K], concentrations, in the order of `ROOM_TYPES`, followed by the prior of other rooms.
     """
     fits = []
-    for room_type, scenes in _by_room_type(statistics):
-        shown = [s for s in scenes if s.together.any()]
-        gaps = similarities = np.zeros(0)
-        if shown:
-            rooms = [s.scene.room_type for s in shown]
-            prior = priors[[prior_index(room) for room in rooms]]
-            together = np.stack([s.together for s in shown])
-            gaps, similarities = layout_gap(together, prior), layout_similarity(together, prior)
-        fits.append(PriorFit(room_type, gaps, similarities))
+    for room_type, room_scenes in _group_by_room_type(statistics):
+        # A scene where no two categories are seen together has no layout to compare.
+        scene_counts = []
+        prior_indices = []
+        for scene_statistics in room_scenes:
+            if scene_statistics.co_detections.any():
+                scene_counts.append(scene_statistics.co_detections)
+                prior_indices.append(prior_index(scene_statistics.scene.room_type))
+
+        # Each scene is compared with the prior of its own room type, both [S, K, K].
+        if scene_counts:
+            prior = priors[prior_indices]
+            counts = np.stack(scene_counts)
+            fit = PriorFit(room_type, scene_layout_gap(counts, prior), scene_layout_similarity(counts, prior))
+        else:
+            fit = PriorFit(room_type, np.zeros(0), np.zeros(0))
+        fits.append(fit)
     return fits
 
 
-def _by_room_type(statistics: Sequence[SceneStatistics]) -> Iterator[tuple[str, list[SceneStatistics]]]:
-    """Yield scenes by room type, then all of several types."""
-    types = sorted({s.scene.room_type for s in statistics})
-    yield from ((name, [s for s in statistics if s.scene.room_type == name]) for name in types)
-    if len(types) > 1:
+def _group_by_room_type(statistics: Sequence[SceneStatistics]) -> Iterator[tuple[str, list[SceneStatistics]]]:
+    """Yield the scenes of each room type; with several types, all scenes last."""
+    scenes_by_type: dict[str, list[SceneStatistics]] = {}
+    for scene_statistics in statistics:
+        scenes_by_type.setdefault(scene_statistics.scene.room_type, []).append(scene_statistics)
+
+    for room_type in sorted(scenes_by_type):
+        yield room_type, scenes_by_type[room_type]
+    if len(scenes_by_type) > 1:
         yield "all", list(statistics)
 
 
-def _percentiles(lengths: np.ndarray) -> tuple[int, int] | None:
-    """Return median and 95th percentile of L*.
-
-    `lengths` is int [...], the number of starts by L*; None if no start has a path.
-    """
-    up_to = np.cumsum(lengths[1:])
-    if not up_to[-1]:
+def _median_and_95th_percentile(path_lengths: np.ndarray) -> tuple[int, int] | None:
+    """Compute two percentiles of L* from a histogram of starts, int [...]; None if no start has a path."""
+    cumulative_starts = np.cumsum(path_lengths[1:])  # column 0 counts starts without a path
+    num_starts = cumulative_starts[-1]
+    if not num_starts:
         return None
-    median, high = 1 + np.searchsorted(up_to, np.array([0.5, 0.95]) * up_to[-1])
-    return int(median), int(high)
+
+    # The shortest lengths that at least 50 % and 95 % of the starts do not exceed.
+    median_length, high_length = 1 + np.searchsorted(cumulative_starts, np.array([0.5, 0.95]) * num_starts)
+    return int(median_length), int(high_length)

@@ -1,16 +1,38 @@
-"""Fit of a scene's layout to a layout prior."""
+"""Co-occurrence of categories in a scene, and its fit to a layout prior.
+
+`cooccurrence_counts` counts how often two categories are detected together. `scene_layout_gap` (a divergence) and
+`scene_layout_similarity` (a cosine) compare these counts with a prior.
+"""
 
 import numpy as np
 
+from jaxnav.evaluation.statistics import divide_or_nan
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import RowFormat
 
-#: Share of the uniform distribution in both sides of the layout gap, so that it stays finite.
-UNIFORM = 0.05
+#: Share of the uniform distribution in both sides of the layout gap, which keeps it finite.
+UNIFORM_SHARE = 0.05
 
 
-def seen_together(rows: np.ndarray, num_categories: int) -> np.ndarray:
-    """Count poses at which two categories are detected together.
+def cooccurrence_counts(bank: Bank) -> np.ndarray:
+    """Count the co-occurrence of categories in each scene.
+
+    Every pose counts once, unlike in `explore`, which visits only part of the poses.
+
+    Returns:
+      float64 [S, K, K], see `count_co_detections`.
+    """
+    # The rows of a bank follow each other scene by scene.
+    first_pose = bank.first_cell[1:] * bank.task.rules.poses_per_cell
+    num_categories = len(bank.task.categories)
+    scene_counts = []
+    for scene_rows in np.split(bank.rows, first_pose):
+        scene_counts.append(count_co_detections(scene_rows, num_categories))
+    return np.stack(scene_counts)
+
+
+def count_co_detections(rows: np.ndarray, num_categories: int) -> np.ndarray:
+    """Count the poses at which two categories are detected together.
 
     Args:
       rows: uint8 [P, R], see `RowFormat`.
@@ -19,26 +41,15 @@ def seen_together(rows: np.ndarray, num_categories: int) -> np.ndarray:
     Returns:
       float64 [K, K], n_ij, symmetric, whole numbers, 0 on the diagonal.
     """
+    # A product of the presence matrix [P, K] with itself counts the poses that show both categories.
     presence = RowFormat(num_categories).presence(rows).astype(np.float64)
-    together = presence.T @ presence
-    np.fill_diagonal(together, 0.0)
-    return together
+    co_detections = presence.T @ presence
+    np.fill_diagonal(co_detections, 0.0)
+    return co_detections
 
 
-def scene_counts(bank: Bank) -> np.ndarray:
-    """Count the co-occurrence of each scene.
-
-    Every pose counts once, as in `explore`, which visits a part of the poses.
-
-    Returns:
-      float64 [S, K, K], see `seen_together`.
-    """
-    parts = np.split(bank.rows, bank.first_cell[1:] * bank.task.rules.poses_per_cell)
-    return np.stack([seen_together(rows, len(bank.task.categories)) for rows in parts])
-
-
-def expected(counts: np.ndarray) -> np.ndarray:
-    """Return the expected co-occurrence of counts.
+def expected_cooccurrence(counts: np.ndarray) -> np.ndarray:
+    """Compute the expected co-occurrence from counts.
 
     w_ij = n_ij / sum_k n_ik over j, k != i (equation 6 with counts for alpha).
 
@@ -46,56 +57,71 @@ def expected(counts: np.ndarray) -> np.ndarray:
       counts: real [..., K, K], counts or concentrations, >= 0; the diagonal is ignored.
 
     Returns:
-      float64 [..., K, K], 0 on the diagonal; rows add up to 1, but rows without counts are 0.
+      float64 [..., K, K], 0 on the diagonal; rows add up to 1, rows without counts to 0.
     """
-    others = counts * (1.0 - np.eye(counts.shape[-1]))
-    total = others.sum(axis=-1, keepdims=True)
-    return others / np.where(total > 0, total, 1.0)
+    # Rows of categories without any other stay 0 instead of NaN.
+    off_diagonal = counts * (1.0 - np.eye(counts.shape[-1]))
+    row_sums = off_diagonal.sum(axis=-1, keepdims=True)
+    return off_diagonal / np.where(row_sums > 0, row_sums, 1.0)
 
 
-def layout_gap(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Return the divergence of scenes from a prior.
+def scene_layout_gap(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Compute the divergence of scenes from a prior.
 
-    It is the mean over i of KL(p_i || q_i) = sum_{j != i} p_ij ln(p_ij / q_ij), where p_ij = 0.95 w_ij + 0.05 / (K - 1)
-    with w = `expected(counts)`, and q follows from the prior in the same way. The mean is over the categories i that
-    are seen together with others in the scene.
+    The gap is the mean over i of KL(p_i || q_i) = sum_{j != i} p_ij ln(p_ij / q_ij), with p_ij = 0.95 w_ij +
+    0.05 / (K - 1) and w = `expected_cooccurrence(counts)`; q follows from the prior in the same way. The mean is over
+    the categories i that are seen together with another one in the scene.
 
     Args:
-      counts: real [S, K, K], see `scene_counts`.
+      counts: real [S, K, K], see `cooccurrence_counts`.
       prior: real [K, K], or [S, K, K] for a prior of each scene: counts or concentrations.
 
     Returns:
-      float64 [S], nats, >= 0; NaN for a scene in which nothing is seen together.
+      float64 [S], nats, >= 0; NaN for a scene without co-occurrence.
     """
-    others = 1.0 - np.eye(counts.shape[-1])
-    p, q = ((1.0 - UNIFORM) * expected(n) + UNIFORM * others / (len(others) - 1) for n in (counts, prior))
-    divergence = (p * np.log(np.where(others, p, 1.0) / np.where(others, q, 1.0))).sum(axis=-1)
-    present = _present(counts)
-    return _ratio((divergence * present).sum(axis=-1), present.sum(axis=-1))
+    # A share of the uniform distribution keeps both sides above 0 off the diagonal.
+    off_diagonal = 1.0 - np.eye(counts.shape[-1])
+    p = _mix_with_uniform(expected_cooccurrence(counts), off_diagonal)
+    q = _mix_with_uniform(expected_cooccurrence(prior), off_diagonal)
+
+    # KL divergence of every row, [S, K]; the diagonal contributes 0.
+    log_ratio = np.log(np.where(off_diagonal, p, 1.0) / np.where(off_diagonal, q, 1.0))
+    row_divergence = (p * log_ratio).sum(axis=-1)
+
+    # The mean is over the rows that the scene determines.
+    has_others = _has_cooccurrence(counts)
+    return divide_or_nan((row_divergence * has_others).sum(axis=-1), has_others.sum(axis=-1))
 
 
-def layout_similarity(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Return the cosine similarity of scenes and a prior.
+def scene_layout_similarity(counts: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Compute the cosine similarity of scenes and a prior.
 
-    It is sum_ij w_ij v_ij / sqrt(sum_ij w_ij^2 sum_ij v_ij^2) with w = `expected(counts)` and v = `expected(prior)`.
-    The sums are over j != i and over the categories i that are seen together with others in the scene.
+    The similarity is sum_ij w_ij v_ij / sqrt(sum_ij w_ij^2 sum_ij v_ij^2) with w = `expected_cooccurrence(counts)` and
+    v = `expected_cooccurrence(prior)`. The sums are over j != i and over the categories i that are seen together with
+    another one in the scene.
 
     Args:
-      counts: real [S, K, K], see `scene_counts`.
+      counts: real [S, K, K], see `cooccurrence_counts`.
       prior: real [K, K], or [S, K, K] for a prior of each scene: counts or concentrations.
 
     Returns:
-      float64 [S], in [0, 1]; NaN for a scene in which nothing is seen together.
+      float64 [S], in [0, 1]; NaN for a scene without co-occurrence.
     """
-    w, v = expected(counts), expected(prior) * _present(counts)[..., None]
-    return _ratio((w * v).sum(axis=(-2, -1)), np.sqrt((w**2).sum(axis=(-2, -1)) * (v**2).sum(axis=(-2, -1))))
+    # Rows that the scene does not determine are 0 on both sides.
+    w = expected_cooccurrence(counts)
+    v = expected_cooccurrence(prior) * _has_cooccurrence(counts)[..., None]
+
+    # Cosine of both matrices, taken as vectors of K * K entries.
+    dot_product = (w * v).sum(axis=(-2, -1))
+    norms = np.sqrt((w**2).sum(axis=(-2, -1)) * (v**2).sum(axis=(-2, -1)))
+    return divide_or_nan(dot_product, norms)
 
 
-def _present(counts: np.ndarray) -> np.ndarray:
-    """Return the categories seen with others, bool [..., K]."""
-    return expected(counts).sum(axis=-1) > 0
+def _mix_with_uniform(cooccurrence: np.ndarray, off_diagonal: np.ndarray) -> np.ndarray:
+    """Mix rows [..., K, K] with the uniform distribution over the other categories."""
+    return (1.0 - UNIFORM_SHARE) * cooccurrence + UNIFORM_SHARE * off_diagonal / (len(off_diagonal) - 1)
 
 
-def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    """Divide, with NaN where the denominator is 0."""
-    return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator > 0)
+def _has_cooccurrence(counts: np.ndarray) -> np.ndarray:
+    """Mask of the categories that are seen together with another one, bool [..., K]."""
+    return expected_cooccurrence(counts).sum(axis=-1) > 0

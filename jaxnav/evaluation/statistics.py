@@ -1,37 +1,42 @@
-"""Statistics with 95 % intervals over scenes and training runs.
+"""Means and paired differences with 95 % intervals over scenes and training runs.
 
-Results are crossed: every training run meets the same episodes, and the episodes of a scene are alike. An interval asks
-whether other training runs, in other scenes of these room types, would agree, so its units are scenes and runs, not
-episodes. A statistic is computed again without each scene, without each run and without both: a jackknife. Its
-variance is that of a crossed design, its degrees of freedom those of Satterthwaite (1946). For means of equally many
-episodes a scene it is the analysis of variance of the crossed random-effects model. See docs/statistics.md.
+Results are crossed: every training run meets the same episodes, and episodes of one scene resemble each other. An
+interval asks whether other training runs in other scenes of these room types would agree, so its units are scenes and
+runs, not episodes. A jackknife recomputes the statistic without each scene, without each run and without both. The
+variance is that of a crossed design, with the degrees of freedom of Satterthwaite (1946). For means of equally many
+episodes per scene, this is the analysis of variance of the crossed random-effects model. See docs/statistics.md.
+
+`mean_interval` and `paired_difference` cover results by run and episode. For other statistics, compute one replicate
+for each column of the weights of `scene_clusters` and `run_clusters`, and pass them to `jackknife_interval`.
+`SharedDesign` does so for several conditions that share scenes and runs.
 """
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.scene import floor_plan_name
 
-#: Degrees of freedom below which scenes give no interval: three scenes, or more where there are room types.
-LEAST_SCENES = 2
+#: Scenes give an interval from this many degrees of freedom on: three scenes, or more with several room types.
+MIN_SCENE_DEGREES = 2
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Hold a statistic and its 95 % interval.
+    """A statistic and its 95 % interval.
 
     `f"{interval:+.1f}"` gives "+1.0 [+0.5, +1.5]", "+1.0 [-]" without bounds and "-" without a mean.
 
     Attributes:
-      mean: the statistic; NaN where it is undefined.
-      low, high: bounds; NaN where scenes or training runs are too few for them.
+      mean: the statistic; NaN if undefined.
+      low, high: bounds; NaN with too few scenes or training runs.
       std: standard deviation (ddof = 1) over training runs; NaN for fewer than two.
-      seeds: the statistic of each training run, where it is kept.
+      seeds: the statistic of each training run; empty if not recorded.
     """
 
     mean: float
@@ -41,14 +46,15 @@ class Interval:
     seeds: tuple[float, ...] = ()
 
     @property
-    def bounded(self) -> bool:
-        """Return whether there are bounds."""
+    def has_bounds(self) -> bool:
+        """True if the interval has bounds."""
         return not math.isnan(self.low)
 
     def __format__(self, spec: str) -> str:
         if math.isnan(self.mean):
             return "-"
-        return f"{self.mean:{spec}} [{f'{self.low:{spec}}, {self.high:{spec}}' if self.bounded else '-'}]"
+        bounds = f"{self.low:{spec}}, {self.high:{spec}}" if self.has_bounds else "-"
+        return f"{self.mean:{spec}} [{bounds}]"
 
     def __neg__(self) -> "Interval":
         return Interval(-self.mean, -self.high, -self.low)
@@ -60,164 +66,223 @@ class Interval:
         return Interval(level - self.mean, level - self.high, level - self.low)  # 0 without a sign
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON; what is undefined is null."""
-        mean, low, high, std = (None if math.isnan(x) else x for x in (self.mean, self.low, self.high, self.std))
-        kept = {"seeds": list(self.seeds)} if self.seeds else {}
-        return {"mean": mean, "std": std, "ci95": [low, high] if self.bounded else None, **kept}
+        """Convert to JSON; undefined values are null."""
+        interval_data: dict[str, Any] = {
+            "mean": _nan_to_null(self.mean),
+            "std": _nan_to_null(self.std),
+            "ci95": [self.low, _nan_to_null(self.high)] if self.has_bounds else None,
+        }
+        if self.seeds:
+            interval_data["seeds"] = list(self.seeds)
+        return interval_data
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "Interval":
-        """Return it from JSON; `std` and `seeds` may be missing."""
-        mean, std, *bounds = (
-            math.nan if x is None else x for x in (data["mean"], data.get("std"), *(data["ci95"] or (None, None)))
+        """Read an interval from JSON; `std` and `seeds` may be missing."""
+        low, high = data["ci95"] or (None, None)
+        return cls(
+            mean=_null_to_nan(data["mean"]),
+            low=_null_to_nan(low),
+            high=_null_to_nan(high),
+            std=_null_to_nan(data.get("std")),
+            seeds=tuple(data.get("seeds", ())),
         )
-        return cls(mean, *bounds, std=std, seeds=tuple(data.get("seeds", ())))
+
+
+def _nan_to_null(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _null_to_nan(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 class Clusters(NamedTuple):
-    """Hold which of N items are left out together.
+    """Leave-one-out weights of N items in C clusters.
 
     Attributes:
-      weights: float64 [N, 1 + C], how much each item counts: 1 in column 0; without cluster c in column 1 + c, where
-        the others of its stratum count the more, so that a stratum keeps its weight.
-      scale: float64 [C], (n - 1) / n for a cluster of a stratum of n.
-      degrees: of freedom, clusters less strata.
+      weights: float64 [N, 1 + C], weight of each item. Column 0 holds ones. In column 1 + c, the items of cluster c
+        weigh 0, and the remaining items of its stratum weigh more, so that the stratum keeps its weight.
+      scale: float64 [C], (n - 1) / n for a cluster of a stratum of n clusters.
+      degrees_of_freedom: number of clusters minus number of strata.
     """
 
     weights: np.ndarray
     scale: np.ndarray
-    degrees: int
+    degrees_of_freedom: int
 
 
-def leave_one_out(labels: np.ndarray, strata: np.ndarray | None = None, counts: np.ndarray | None = None) -> Clusters:
-    """Leave out one cluster after the other.
-
-    Args:
-      labels: [N], cluster of each item.
-      strata: [N], stratum of each item, the same in all of a cluster; None for a single one.
-      counts: [N], how much each item weighs; None for equal ones.
-    """
-    labels = np.asarray(labels)
-    strata = np.zeros(len(labels), int) if strata is None else np.unique(strata, return_inverse=True)[1]
-    clusters, first, of = np.unique(labels, return_index=True, return_inverse=True)
-    stratum = strata[first]
-    inside, together = strata[:, None] == stratum, of[:, None] == np.arange(len(clusters))  # [N, C]
-    counts = np.ones(len(labels)) if counts is None else counts
-    items, others = counts @ inside, counts @ (inside & ~together)
-    gained = np.divide(items, others, out=np.zeros(len(clusters)), where=others > 0)
-    left = np.where(together, 0.0, np.where(inside, gained, 1.0))
-    size = np.bincount(stratum)[stratum]
-    return Clusters(
-        weights=np.concatenate([np.ones((len(labels), 1)), left], axis=1),
-        scale=(size - 1) / size,
-        degrees=len(clusters) - len(np.unique(stratum)),
-    )
-
-
-def scene_clusters(plans: np.ndarray, rooms: np.ndarray, counts: np.ndarray | None = None) -> Clusters:
-    """Leave out scenes, by floor plan and within room types.
-
-    A single floor plan of a room type shows no variance; where there is one, all room types are one stratum.
-
-    Args:
-      plans: [N], floor plan of each item.
-      rooms: [N], room type of each item.
-      counts: [N], how much each item weighs; None for equal ones.
-    """
-    alone = min(len(set(plans[rooms == room])) for room in set(rooms.tolist())) < 2
-    return leave_one_out(plans, None if alone else rooms, counts)
-
-
-def training_runs(arms: int, seeds: int) -> Clusters:
-    """Leave out training runs; items are [arms * seeds]."""
-    return leave_one_out(np.arange(arms * seeds), np.repeat(np.arange(arms), seeds))
-
-
-def jackknife(replicates: np.ndarray, scenes: Clusters, runs: Clusters | None = None, **known: Any) -> Interval:
-    """Return the interval of a statistic.
-
-    Args:
-      replicates: float64 [1 + R, 1 + C], the statistic under each column of the weights of runs and scenes; [1 + C]
-        where no training varies.
-      scenes: the C scenes.
-      runs: the R training runs; None where no training varies.
-      known: `std` and `seeds` of the interval.
-    """
-    grid = np.atleast_2d(replicates)
-    whole = float(grid[0, 0])
-    if scenes.degrees < LEAST_SCENES or (runs is not None and runs.degrees < 1):
-        return Interval(whole, **known)
-    by_scene = float(scenes.scale @ (grid[0, 1:] - whole) ** 2)
-    variance, degrees = by_scene, float(scenes.degrees)
-    if runs is not None:
-        by_run = float(runs.scale @ (grid[1:, 0] - whole) ** 2)
-        crossed = grid[1:, 1:] - grid[1:, :1] - grid[:1, 1:] + whole
-        # What scenes and runs do together is in both variances, so one of the two is taken off.
-        both = float(runs.scale @ crossed**2 @ scenes.scale)
-        variance = max(by_scene + by_run - both, by_scene, by_run)
-        degrees = _satterthwaite(
-            variance,
-            (by_scene, by_run, both),
-            (scenes.degrees, runs.degrees, scenes.degrees * runs.degrees),
-        )
-    half = float(stdtrit(degrees, 0.975)) * math.sqrt(variance)
-    return Interval(whole, whole - half, whole + half, **known)
-
-
-def summary(values: np.ndarray, scenes: Clusters, *, trained: bool = True) -> Interval:
-    """Return the mean of results with its interval.
+def mean_interval(values: np.ndarray, scenes: Clusters, *, trained: bool = True) -> Interval:
+    """Compute the mean of results with its interval.
 
     Args:
       values: bool, int or float [S, E], finite, by training run and episode.
-      scenes: of the E episodes.
-      trained: whether rows are training runs; else they are repetitions, of which the mean is taken.
+      scenes: clusters of the E episodes.
+      trained: True if rows are training runs; False if they are repetitions, which are averaged.
 
     Raises:
       InputError: wrong or empty shapes, or NaN or infinite values.
     """
-    values = _checked("values", values, scenes)
+    values = _as_finite_results("values", values, scenes)
+
+    # Repetitions are no units of the interval, so they are averaged away and only scenes are left out.
     if not trained:
-        return jackknife(values.mean(axis=0) @ scenes.weights / values.shape[1], scenes)
-    return _mean(values, scenes, training_runs(1, len(values)), values.mean(axis=1))
+        return jackknife_interval(values.mean(axis=0) @ scenes.weights / values.shape[1], scenes)
+    return _mean_over_runs(values, scenes)
 
 
 def paired_difference(
-    a: np.ndarray, b: np.ndarray, scenes: Clusters, *, same_runs: bool = False, trained: bool = True
+    reference: np.ndarray, compared: np.ndarray, scenes: Clusters, *, same_runs: bool = False, trained: bool = True
 ) -> Interval:
-    """Return the mean of `b - a` on the same episodes.
+    """Compute the mean of `compared - reference` on the same episodes.
 
-    Both share the scenes, so that their difficulty cancels.
+    Both sides share the scenes, so that the difficulty of a scene cancels.
 
     Args:
-      a: bool, int or float [S, E], finite; the reference.
-      b: the same shape; what is compared with it.
-      scenes: of the E episodes.
-      same_runs: whether row s of both is the same network (sTDE against no removal). If not, the runs of a and b were
-        trained apart: `std` is sqrt(std_a^2 + std_b^2), and there are no `seeds`.
-      trained: whether other training runs count; else the interval is that of these policies in other scenes.
+      reference: bool, int or float [S, E], finite.
+      compared: the same shape.
+      scenes: clusters of the E episodes.
+      same_runs: True if row s of both sides is the same network (sTDE against no removal). Otherwise, the two sides
+        were trained separately: `std` is sqrt(std_reference^2 + std_compared^2), and there are no `seeds`.
+      trained: True to generalize to other training runs; False for the interval of these policies in other scenes.
 
     Raises:
-      InputError: as `summary`, or shapes of `a` and `b` that differ.
+      InputError: as in `mean_interval`, or the shapes of `reference` and `compared` differ.
     """
-    a, b = _checked("a", a, scenes), _checked("b", b, scenes)
-    if a.shape != b.shape:
-        raise InputError(f"a {a.shape} and b {b.shape} differ in shape; evaluate both on the same runs and episodes")
+    reference = _as_finite_results("a", reference, scenes)
+    compared = _as_finite_results("b", compared, scenes)
+    if reference.shape != compared.shape:
+        raise InputError(
+            f"a {reference.shape} and b {compared.shape} differ in shape; evaluate both on the same runs and episodes"
+        )
+
+    # With the same networks, or with fixed policies, the differences themselves are results [S, E].
+    difference = compared - reference
     if not trained:
-        return summary(b - a, scenes, trained=False)
+        return mean_interval(difference, scenes, trained=False)
     if same_runs:
-        return _mean(b - a, scenes, training_runs(1, len(a)), (b - a).mean(axis=1))
-    runs = training_runs(2, len(a))
-    std = math.hypot(_std(a.mean(axis=1)), _std(b.mean(axis=1)))
-    return dataclasses.replace(_mean(2.0 * np.concatenate([-a, b]), scenes, runs, None), std=std)
+        return _mean_over_runs(difference, scenes)
+
+    # Separate runs: the mean over both arms, with the reference negated, is half of the difference.
+    runs = run_clusters(2, len(reference))
+    signed_results = 2.0 * np.concatenate([-reference, compared])
+    replicates = runs.weights.T @ signed_results @ scenes.weights / signed_results.size
+    combined_std = math.hypot(_std(reference.mean(axis=1)), _std(compared.mean(axis=1)))
+    return jackknife_interval(replicates, scenes, runs, std=combined_std)
 
 
-def _mean(values: np.ndarray, scenes: Clusters, runs: Clusters, seeds: np.ndarray | None) -> Interval:
+def jackknife_interval(
+    replicates: np.ndarray,
+    scenes: Clusters,
+    runs: Clusters | None = None,
+    *,
+    std: float = math.nan,
+    seeds: tuple[float, ...] = (),
+) -> Interval:
+    """Compute the interval of a statistic from its leave-one-out replicates.
+
+    Args:
+      replicates: float64 [1 + R, 1 + C], the statistic under each column of the weights of runs and scenes; [1 + C]
+        for a statistic that does not depend on training runs.
+      scenes: the C scenes.
+      runs: the R training runs; None for a statistic that does not depend on them.
+      std, seeds: see `Interval`; returned unchanged.
+    """
+    # Without enough scenes, or with a single run, there is an estimate but no interval.
+    replicates = np.atleast_2d(replicates)
+    estimate = float(replicates[0, 0])
+    too_few_runs = runs is not None and runs.degrees_of_freedom < 1
+    if scenes.degrees_of_freedom < MIN_SCENE_DEGREES or too_few_runs:
+        return Interval(estimate, std=std, seeds=seeds)
+
+    # The first row leaves out scenes only, the first column runs only.
+    scene_variance = float(scenes.scale @ (replicates[0, 1:] - estimate) ** 2)
+    total_variance = scene_variance
+    total_degrees = float(scenes.degrees_of_freedom)
+    if runs is not None:
+        run_variance = float(runs.scale @ (replicates[1:, 0] - estimate) ** 2)
+
+        # Both variances contain the interaction of scenes and runs, so one copy is subtracted.
+        interaction_effects = replicates[1:, 1:] - replicates[1:, :1] - replicates[:1, 1:] + estimate
+        interaction_variance = float(runs.scale @ interaction_effects**2 @ scenes.scale)
+
+        # The difference can fall below either variance by chance; the greater of both is then used.
+        total_variance = max(scene_variance + run_variance - interaction_variance, scene_variance, run_variance)
+        total_degrees = _satterthwaite_degrees(
+            total_variance,
+            (scene_variance, run_variance, interaction_variance),
+            (scenes.degrees_of_freedom, runs.degrees_of_freedom, scenes.degrees_of_freedom * runs.degrees_of_freedom),
+        )
+
+    # Quantile of Student's t for a two-sided interval of 95 %.
+    half_width = float(stdtrit(total_degrees, 0.975)) * math.sqrt(total_variance)
+    return Interval(estimate, estimate - half_width, estimate + half_width, std=std, seeds=seeds)
+
+
+def scene_clusters(plans: np.ndarray, rooms: np.ndarray, counts: np.ndarray | None = None) -> Clusters:
+    """Cluster items by floor plan, within room types.
+
+    A room type with a single floor plan shows no variance; if there is one, all room types form one stratum.
+
+    Args:
+      plans: [N], floor plan of each item.
+      rooms: [N], room type of each item.
+      counts: [N], weight of each item; None for equal weights.
+    """
+    fewest_plans = min(len(set(plans[rooms == room])) for room in set(rooms.tolist()))
+    return leave_one_out(plans, None if fewest_plans < 2 else rooms, counts)
+
+
+def run_clusters(arms: int, seeds: int) -> Clusters:
+    """Cluster items [arms * seeds] by training run, within arms."""
+    return leave_one_out(np.arange(arms * seeds), np.repeat(np.arange(arms), seeds))
+
+
+def leave_one_out(labels: np.ndarray, strata: np.ndarray | None = None, counts: np.ndarray | None = None) -> Clusters:
+    """Compute the weights that leave out one cluster at a time.
+
+    Args:
+      labels: [N], cluster of each item.
+      strata: [N], stratum of each item, equal within a cluster; None for a single stratum.
+      counts: [N], weight of each item; None for equal weights.
+    """
+    # Number clusters and strata; the first item of a cluster tells the stratum of the cluster.
+    labels = np.asarray(labels)
+    counts = np.ones(len(labels)) if counts is None else counts
+    strata = np.zeros(len(labels), int) if strata is None else np.unique(strata, return_inverse=True)[1]
+    clusters, first_item, cluster_of_item = np.unique(labels, return_index=True, return_inverse=True)
+    stratum_of_cluster = strata[first_item]
+
+    # Which items share the stratum of each cluster, and which belong to the cluster itself, [N, C].
+    in_stratum = strata[:, None] == stratum_of_cluster
+    in_cluster = cluster_of_item[:, None] == np.arange(len(clusters))
+
+    # Without a cluster, the remaining items of its stratum are scaled up to the weight of the whole stratum.
+    stratum_weight = counts @ in_stratum
+    remaining_weight = counts @ (in_stratum & ~in_cluster)
+    scale_up = np.divide(stratum_weight, remaining_weight, out=np.zeros(len(clusters)), where=remaining_weight > 0)
+    weights_without = np.where(in_cluster, 0.0, np.where(in_stratum, scale_up, 1.0))
+
+    # Each stratum loses one degree of freedom to its mean.
+    stratum_size = np.bincount(stratum_of_cluster)[stratum_of_cluster]
+    return Clusters(
+        weights=np.concatenate([np.ones((len(labels), 1)), weights_without], axis=1),
+        scale=(stratum_size - 1) / stratum_size,
+        degrees_of_freedom=len(clusters) - len(np.unique(stratum_of_cluster)),
+    )
+
+
+def _mean_over_runs(values: np.ndarray, scenes: Clusters) -> Interval:
+    """Compute the mean of results [S, E] whose rows are training runs of one arm."""
+    runs = run_clusters(1, len(values))
     replicates = runs.weights.T @ values @ scenes.weights / values.size
-    known = {} if seeds is None else {"std": _std(seeds), "seeds": tuple(seeds.tolist())}
-    return jackknife(replicates, scenes, runs, **known)
+    run_means = values.mean(axis=1)
+    return jackknife_interval(replicates, scenes, runs, std=_std(run_means), seeds=tuple(run_means.tolist()))
 
 
-def _checked(name: str, values: np.ndarray, scenes: Clusters) -> np.ndarray:
+def _as_finite_results(name: str, values: np.ndarray, scenes: Clusters) -> np.ndarray:
+    """Convert results to float64 [S, E] and check shape and values."""
+    # Shape first, then values: NaN must not pass unseen into a mean.
     values = np.asarray(values, np.float64)
     if values.ndim != 2 or values.size == 0:
         raise InputError(f"{name} has shape {values.shape}; give [runs, episodes] with at least one of each")
@@ -234,8 +299,109 @@ def _std(means: np.ndarray) -> float:
     return float(means.std(ddof=1)) if len(means) > 1 else math.nan
 
 
-def _satterthwaite(variance: float, parts: tuple[float, ...], degrees: tuple[int, ...]) -> float:
-    """Return the degrees of freedom of a sum of variances."""
-    spread = sum(part**2 / of for part, of in zip(parts, degrees, strict=True))
-    least = float(min(degrees))
-    return max(variance**2 / spread, least) if spread > 0 else least
+def _satterthwaite_degrees(variance: float, parts: tuple[float, ...], degrees: tuple[int, ...]) -> float:
+    """Approximate the degrees of freedom of a sum of variances."""
+    # (sum of variances)^2 / sum of (variance^2 / its degrees of freedom), never below the fewest.
+    spread_sum = sum(
+        part_variance**2 / part_degrees for part_variance, part_degrees in zip(parts, degrees, strict=True)
+    )
+    fewest_degrees = float(min(degrees))
+    return max(variance**2 / spread_sum, fewest_degrees) if spread_sum > 0 else fewest_degrees
+
+
+class SharedDesign(NamedTuple):
+    """Scenes and training runs that several conditions share.
+
+    A replicate leaves out a floor plan, or a training run, of all conditions at once.
+
+    Attributes:
+      names: [N], names of all scenes, sorted.
+      plans, rooms: [N], floor plan and room type of each scene.
+      scenes: clusters of the scenes.
+      runs: clusters of the training runs.
+    """
+
+    names: tuple[str, ...]
+    plans: np.ndarray
+    rooms: np.ndarray
+    scenes: Clusters
+    runs: Clusters
+
+    @classmethod
+    def from_conditions(cls, conditions: Sequence[tuple[Sequence[str], Sequence[str]]], seeds: int) -> "SharedDesign":
+        """Collect the scenes of all conditions.
+
+        Args:
+          conditions: for each condition, the names of its scenes and their room types.
+          seeds: number of training runs.
+        """
+        # A scene that occurs in several conditions is one scene.
+        room_by_name: dict[str, str] = {}
+        for scene_names, room_types in conditions:
+            room_by_name.update(zip(scene_names, room_types, strict=True))
+
+        # Sorted, so that `jackknife_means` can find a scene by bisection.
+        all_names = tuple(sorted(room_by_name))
+        scene_plans = np.array(list(map(floor_plan_name, all_names)))
+        scene_rooms = np.array([room_by_name[name] for name in all_names])
+        return cls(
+            all_names, scene_plans, scene_rooms, scene_clusters(scene_plans, scene_rooms), run_clusters(1, seeds)
+        )
+
+    def jackknife_means(
+        self, sums: np.ndarray, weights: np.ndarray, names: Sequence[str], *, trained: bool = True
+    ) -> np.ndarray:
+        """Compute the leave-one-out means of a measure in one condition.
+
+        Args:
+          sums: float64 [S, N], the measure summed over the episodes of each scene, by training run; [1, N] for a
+            measure without training.
+          weights: [N], number of episodes of each scene.
+          names: [N], names of the scenes.
+          trained: True if the measure depends on the training run.
+
+        Returns:
+          float64 [1 + R, 1 + C], or [1 + C] for a measure without training; NaN if no episode is left.
+        """
+        # Scenes of other conditions weigh 0 here, but are left out in a column of their own.
+        scene_index = np.searchsorted(self.names, names)
+        counts = np.bincount(scene_index, weights, len(self.names))
+        scene_weights = scene_clusters(self.plans, self.rooms, counts).weights[scene_index]  # [N, 1 + C]
+
+        # A replicate that leaves out all episodes of the condition is NaN.
+        total_weight = np.broadcast_to(weights @ scene_weights, (len(sums), scene_weights.shape[1]))
+        means = divide_or_nan(sums @ scene_weights, total_weight)
+        return self.runs.weights.T @ means / len(means) if trained else means[0]
+
+    def interval(self, means: np.ndarray) -> Interval:
+        """Compute the interval of a statistic from replicates as returned by `jackknife_means`."""
+        return jackknife_interval(means, self.scenes, None if means.ndim == 1 else self.runs)
+
+
+def weight_below(values: np.ndarray, others: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sum the weights of all `others` that lie below each value, counting ties half.
+
+    With `others = values` these are ranks: midranks minus one half if all weights are 1.
+
+    Args:
+      values: real [P].
+      others: real [Q].
+      weights: float [Q, R], weights of `others`.
+
+    Returns:
+      [P, R], with the dtype of the weights.
+    """
+    # Cumulative weights in the order of `others`; entry q is the weight of the q smallest.
+    sorting_order = np.argsort(others)
+    sorted_others = others[sorting_order]
+    weight_up_to = np.concatenate([np.zeros_like(weights[:1]), np.cumsum(weights[sorting_order], axis=0)])  # [Q + 1, R]
+
+    # The mean of both bounds counts ties half.
+    num_less = np.searchsorted(sorted_others, values, "left")
+    num_less_or_equal = np.searchsorted(sorted_others, values, "right")
+    return (weight_up_to[num_less] + weight_up_to[num_less_or_equal]) / 2
+
+
+def divide_or_nan(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    """Divide, giving NaN where the denominator is not positive; both arrays have the same shape."""
+    return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator > 0)

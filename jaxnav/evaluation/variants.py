@@ -1,4 +1,8 @@
-"""The rows of the paper's tables as cells of an evaluation grid."""
+"""The rows of the paper's tables as cells of an evaluation grid.
+
+`table_rows` lists the rows of an evaluation; `inference_grid` turns rows and training seeds into the cells that
+`jaxnav.evaluation.grid` evaluates in one compiled call.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -9,17 +13,17 @@ import jax.numpy as jnp
 
 from jaxnav.causal import FORMS, Form
 from jaxnav.errors import InputError
-from jaxnav.evaluation.inference import Branch, Inference, Source
+from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
 from jaxnav.evaluation.report import Decoding, Variant
 
 
-class Row(NamedTuple):
-    """Name one row of the table.
+class EvaluationRow(NamedTuple):
+    """One row of an evaluation table.
 
     Attributes:
-      variant: what is evaluated.
-      epsilon: threshold of sTDE, else None.
-      form: how counterfactual logits are combined, None where there are none.
+      variant: the evaluated variant.
+      epsilon: threshold of sTDE; None for other variants.
+      form: how counterfactual logits are combined; None for variants without counterfactual.
       decoding: `argmax` or `sample`.
     """
 
@@ -30,72 +34,84 @@ class Row(NamedTuple):
 
     @property
     def arm(self) -> Literal["baseline", "layout"] | None:
-        """Return the arm whose policies it takes; None for any."""
+        """Training arm whose policies the row uses; None if it uses no policy."""
         if self.variant in ("random", "oracle"):
             return None
         return "baseline" if self.variant == "baseline" else "layout"
 
 
-def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: Decoding) -> Row:
-    """Make one row of what its variant uses.
+def table_rows(epsilons: Sequence[float], forms: Sequence[Form], arms: Sequence[str]) -> list[EvaluationRow]:
+    """List the rows of an evaluation.
 
-    Raises:
-      InputError: an epsilon outside [0, inf), or NaN.
-    """
-    if variant == "tde":
-        return Row(variant, None, "paper", decoding)  # equation 1
-    if variant != "stde":
-        return Row(variant, None, None, decoding)
-    if epsilon is None or not 0.0 <= epsilon < float("inf"):
-        raise InputError(f"--epsilon {epsilon}: give numbers from 0 to below infinity")
-    return Row(variant, epsilon, form, decoding)
-
-
-def table_rows(epsilons: Sequence[float], forms: Sequence[Form], arms: Sequence[str]) -> list[Row]:
-    """Make the rows of an evaluation.
-
-    Baseline, layout, hard TDE, and sTDE at every epsilon and in every form, argmax then sampled, and Random; without
-    those of arms that were not trained.
+    The rows are baseline, layout, hard TDE, and sTDE for every epsilon and form, first with argmax and then with
+    sampled actions; Random comes last. Rows of arms that were not trained are left out.
 
     Raises:
       InputError: no epsilon, or one outside [0, inf), or NaN.
     """
     if not epsilons:
         raise InputError("--epsilon: give at least one number")
-    rows: list[Row] = []
+
+    # Best actions first, then sampled ones: the order of the printed table.
+    all_rows: list[EvaluationRow] = []
     for decoding in ("argmax", "sample"):
-        rows += [table_row(variant, None, None, decoding) for variant in ("baseline", "layout", "tde")]
-        rows += [table_row("stde", *setting, decoding) for setting in itertools.product(epsilons, forms)]
-    rows = [row for row in rows if row.arm in arms]
-    return [*rows, table_row("random", None, None, "sample")]
+        for variant in ("baseline", "layout", "tde"):
+            all_rows.append(table_row(variant, None, None, decoding))
+        for epsilon, form in itertools.product(epsilons, forms):
+            all_rows.append(table_row("stde", epsilon, form, decoding))
+
+    # Random needs no policy and is always included.
+    trained_rows = [row for row in all_rows if row.arm in arms]
+    return [*trained_rows, table_row("random", None, None, "sample")]
 
 
-def inference_grid(rows: Sequence[Row], arms: Sequence[str], num_seeds: int) -> Inference:
+def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: Decoding) -> EvaluationRow:
+    """Make one row, dropping the settings that its variant does not use.
+
+    Raises:
+      InputError: an epsilon outside [0, inf), or NaN.
+    """
+    if variant == "tde":
+        return EvaluationRow(variant, None, "paper", decoding)  # equation 1
+    if variant != "stde":
+        return EvaluationRow(variant, None, None, decoding)
+    if epsilon is None or not 0.0 <= epsilon < float("inf"):
+        raise InputError(f"--epsilon {epsilon}: give numbers from 0 to below infinity")
+    return EvaluationRow(variant, epsilon, form, decoding)
+
+
+def inference_grid(rows: Sequence[EvaluationRow], arms: Sequence[str], num_seeds: int) -> InferenceConfig:
     """Make the grid of rows and seeds, leaves [R S].
 
     Args:
-      rows: the rows; their arms must be there.
+      rows: R rows; their arms must be in `arms`.
       arms: names of the arms, in the order in which their parameters are stacked, S each.
       num_seeds: S.
     """
-    cells = [_cell(row, arms, seed, num_seeds) for row in rows for seed in range(num_seeds)]
+    # Row by row, with all seeds of a row next to each other.
+    cells = []
+    for row in rows:
+        for seed in range(num_seeds):
+            cells.append(_inference_cell(row, arms, seed, num_seeds))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cells)
 
 
-def _cell(row: Row, arms: Sequence[str], seed: int, num_seeds: int) -> Inference:
-    place = 0 if row.arm is None else arms.index(row.arm)
-    return Inference(
-        params=jnp.int32(seed + num_seeds * place),
+def _inference_cell(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: int) -> InferenceConfig:
+    """Make the cell of one row and seed, leaves []; the controls of sTDE are off."""
+    # Random gets the policies of the first arm, which it ignores. An infinite epsilon never removes anything.
+    arm_index = 0 if row.arm is None else arms.index(row.arm)
+    return InferenceConfig(
+        policy_index=jnp.int32(seed + num_seeds * arm_index),
         epsilon=jnp.float32(float("inf") if row.epsilon is None else row.epsilon),
-        hard=jnp.bool_(row.variant == "tde"),
+        use_tde=jnp.bool_(row.variant == "tde"),
         form=jnp.int32(FORMS.index(row.form or "paper")),
-        layout=jnp.bool_(row.arm == "layout"),
+        use_layout=jnp.bool_(row.arm == "layout"),
         greedy=jnp.bool_(row.decoding == "argmax"),
-        uniform=jnp.bool_(row.variant == "random"),
-        source=jnp.int32(Source.OWN),
-        gap=jnp.float32(0.0),
-        begin=jnp.int32(0),
-        end=jnp.int32(0),
+        act_randomly=jnp.bool_(row.variant == "random"),
+        gap_source=jnp.int32(GapSource.OWN),
+        given_gap=jnp.float32(0.0),
+        gap_begin=jnp.int32(0),
+        gap_end=jnp.int32(0),
         intervention=jnp.float32(0.0),
-        branch=jnp.int32(Branch.COUNTERFACTUAL),
+        removed=jnp.int32(RemovedLogits.COUNTERFACTUAL),
     )

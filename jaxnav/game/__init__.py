@@ -1,1 +1,1 @@
-"""An episode played by hand, in the terminal."""
+"""Playing an episode by hand in the terminal."""

@@ -1,4 +1,4 @@
-"""Keys of a terminal, one by one."""
+"""Reading single key presses from a terminal."""
 
 import contextlib
 import os
@@ -8,19 +8,20 @@ from typing import TextIO
 
 from jaxnav.errors import InputError
 
-_NAMES: dict[bytes, str] = {b"\x1b[A": "up", b"\x1b[C": "right", b"\x1b[D": "left", b"\r": "enter", b"\n": "enter"}
-_KEY = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-D]|.", re.DOTALL)
+_KEY_NAMES: dict[bytes, str] = {b"\x1b[A": "up", b"\x1b[C": "right", b"\x1b[D": "left", b"\r": "enter", b"\n": "enter"}
+_KEY_PATTERN = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-D]|.", re.DOTALL)
 
 
 @contextlib.contextmanager
-def pressed(stream: TextIO) -> Iterator[Iterator[str]]:
-    """Yield the keys as they are pressed, not echoed.
+def read_keys(stream: TextIO) -> Iterator[Iterator[str]]:
+    """Yield an iterator over the keys as they are pressed, without echo.
 
-    Keys are their characters, or `up`, `left`, `right` and `enter`. The terminal is as it was afterwards.
+    A key is its character, or `up`, `left`, `right` or `enter`. The terminal's settings are restored afterwards.
 
     Raises:
-      InputError: the stream is no terminal, or the system has none of this kind.
+      InputError: the stream is no terminal, or the system has no Unix terminals.
     """
+    # These modules are missing on other systems, where the package can be imported all the same.
     try:
         import termios
         import tty
@@ -28,17 +29,24 @@ def pressed(stream: TextIO) -> Iterator[Iterator[str]]:
         raise InputError("play: needs a terminal of a Unix system; there is none here") from error
     if not stream.isatty():
         raise InputError("play: the input is no terminal; start it in one, without a pipe or a file as input")
+
+    # Without line buffering and echo, each key arrives as it is pressed.
     descriptor = stream.fileno()
-    before = termios.tcgetattr(descriptor)
+    saved_settings = termios.tcgetattr(descriptor)
     try:
         tty.setcbreak(descriptor)
-        yield _keys(descriptor)
+        yield _key_names(descriptor)
     finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, saved_settings)
 
 
-def _keys(descriptor: int) -> Iterator[str]:
-    while data := os.read(descriptor, 64):
-        for key in _KEY.findall(data):
-            name = _NAMES.get(key.replace(b"\x1bO", b"\x1b["))
-            yield name or key.decode(errors="replace")
+def _key_names(descriptor: int) -> Iterator[str]:
+    """Yield the names of keys until the end of the input."""
+    while True:
+        input_bytes = os.read(descriptor, 64)
+        if not input_bytes:
+            return
+        for key_bytes in _KEY_PATTERN.findall(input_bytes):
+            # Terminals send arrows as ESC [ A or, in application mode, as ESC O A.
+            key_name = _KEY_NAMES.get(key_bytes.replace(b"\x1bO", b"\x1b["))
+            yield key_name or key_bytes.decode(errors="replace")

@@ -1,4 +1,7 @@
-"""The recurrent core: one step, and a whole rollout."""
+"""Gated recurrent unit: one step, and a whole rollout with resets.
+
+`unroll_gru` has a hand-written gradient, so that the kernel's gradient is one matrix product over all steps.
+"""
 
 from typing import Any, NamedTuple
 
@@ -8,83 +11,98 @@ import jax.numpy as jnp
 from jaxnav.numerics.product import kernel_gradient
 
 
-def gru(drive: jax.Array, projected: jax.Array, hidden: jax.Array) -> jax.Array:
-    """Take one step of a gated recurrent unit.
-
-    As `flax.nnx.GRUCell` has it (Cho et al., 2014).
+def gru_step(input_gates: jax.Array, hidden_gates: jax.Array, hidden: jax.Array) -> jax.Array:
+    """Compute one step of a gated recurrent unit, as `flax.nnx.GRUCell` does (Cho et al., 2014).
 
     Args:
-      drive: float32 [..., 3 H], what the input contributes to reset gate, update gate and candidate.
-      projected: float32 [..., 3 H], what the hidden state does: `hidden @ kernel`.
-      hidden: float32 [..., H], before the step.
+      input_gates: float32 [..., 3 H], what the input contributes to reset gate, update gate and candidate.
+      hidden_gates: float32 [..., 3 H], what the hidden state contributes: `hidden @ kernel`.
+      hidden: float32 [..., H], hidden state before the step.
 
     Returns:
-      float32 [..., H], after it.
+      float32 [..., H], hidden state after the step.
     """
-    (r, z, n), (by_r, by_z, by_n) = (jnp.split(part, 3, axis=-1) for part in (drive, projected))
-    reset, update = jax.nn.sigmoid(r + by_r), jax.nn.sigmoid(z + by_z)
-    candidate = jnp.tanh(n + reset * by_n)
+    # The contributions to reset gate, update gate and candidate, [..., H] each.
+    input_reset, input_update, input_candidate = jnp.split(input_gates, 3, axis=-1)
+    hidden_reset, hidden_update, hidden_candidate = jnp.split(hidden_gates, 3, axis=-1)
+
+    # The reset gate weights the old state in the candidate, the update gate mixes both.
+    reset = jax.nn.sigmoid(input_reset + hidden_reset)
+    update = jax.nn.sigmoid(input_update + hidden_update)
+    candidate = jnp.tanh(input_candidate + reset * hidden_candidate)
     return (1.0 - update) * candidate + update * hidden
 
 
-class Unrolled(NamedTuple):
-    """Hold the core along a rollout, leaves [T, B, ...].
+class UnrolledGRU(NamedTuple):
+    """Recurrent core along a rollout of T steps of B episodes.
 
     Attributes:
-      after: float32 [T, B, H], hidden state after each step, before a reset.
-      before: float32 [T, B, H], before it; a constant as to gradients.
-      projected: float32 [T, B, 3 H], `before @ kernel`; as to gradients a function of the kernel alone. Together with
-        `before` it serves a second decision on the same memory (of fixed value) at the cost of its gates.
+      hidden_after: float32 [T, B, H], hidden state after each step, before a reset.
+      hidden_before: float32 [T, B, H], hidden state before each step; a constant for gradients.
+      hidden_gates: float32 [T, B, 3 H], `hidden_before @ kernel`; for gradients a function of the kernel alone. With
+        `hidden_before`, a second decision on the same memory (of fixed value) costs only its gates.
     """
 
-    after: jax.Array
-    before: jax.Array
-    projected: jax.Array
+    hidden_after: jax.Array
+    hidden_before: jax.Array
+    hidden_gates: jax.Array
 
 
 @jax.custom_vjp
-def unroll(kernel: jax.Array, drive: jax.Array, ended: jax.Array, hidden: jax.Array) -> Unrolled:
-    """Unroll the core over T steps of B episodes.
+def unroll_gru(kernel: jax.Array, input_gates: jax.Array, ended: jax.Array, hidden: jax.Array) -> UnrolledGRU:
+    """Unroll the core over T steps of B episodes; each ended episode restarts from a zero hidden state.
 
-    The hidden state starts at zero again after each ending.
-
-    Differentiating the loop itself would add up the kernel's gradient step by step, a [H, 3 H] matrix read and written
-    T times; here the loop returns what the steps received, and the gradient is one product over T B rows.
+    Differentiating the loop itself would add up the kernel's gradient step by step, reading and writing a [H, 3 H]
+    matrix T times. Instead the backward loop returns the gradient of every step's gates, and the kernel's gradient is
+    one product over T B rows. Differentiable in reverse mode only, with the gradients described in `UnrolledGRU`.
 
     Args:
       kernel: float32 [H, 3 H].
-      drive: float32 [T, B, 3 H].
-      ended: bool [T, B], the episode ended with this step.
-      hidden: float32 [B, H], at the start.
+      input_gates: float32 [T, B, 3 H].
+      ended: bool [T, B], True where an episode ended with this step.
+      hidden: float32 [B, H], hidden state at the start.
 
     Returns:
-      The states along the rollout. In reverse mode only, and as to gradients as `Unrolled` has it.
+      The states along the rollout.
     """
-    return _unroll(kernel, drive, ended, hidden)[0]
+    return _unroll_forward(kernel, input_gates, ended, hidden)[0]
 
 
-def _unroll(kernel: jax.Array, drive: jax.Array, ended: jax.Array, hidden: jax.Array) -> tuple[Unrolled, Any]:
-    def step(before: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
-        drive, ended = inputs
-        projected = before @ kernel
-        after, pull = jax.vjp(gru, drive, projected, before)
-        return jnp.where(ended[:, None], 0.0, after), (Unrolled(after, before, projected), pull)
+def _unroll_forward(
+    kernel: jax.Array, input_gates: jax.Array, ended: jax.Array, hidden: jax.Array
+) -> tuple[UnrolledGRU, Any]:
+    def step(hidden_before: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
+        # Take the gradient function of every step now, so that the backward pass repeats no gate.
+        input_gates, ended = inputs
+        hidden_gates = hidden_before @ kernel
+        hidden_after, step_vjp = jax.vjp(gru_step, input_gates, hidden_gates, hidden_before)
 
-    _, (run, pulls) = jax.lax.scan(step, hidden, (drive, ended))
-    return run, (kernel, run.before, ended, pulls)
+        # An ended episode starts again from zeros.
+        next_hidden = jnp.where(ended[:, None], 0.0, hidden_after)
+        return next_hidden, (UnrolledGRU(hidden_after, hidden_before, hidden_gates), step_vjp)
 
-
-def _unroll_gradient(saved: Any, cotangent: Unrolled) -> tuple[jax.Array, jax.Array, None, jax.Array]:
-    kernel, before, ended, pulls = saved
-
-    def step(later: jax.Array, inputs: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        pull, ended, received = inputs
-        drive, projected, hidden = pull(received + jnp.where(ended[:, None], 0.0, later))
-        return hidden + projected @ kernel.T, (drive, projected)
-
-    nothing = jnp.zeros_like(before[0])
-    hidden, (drive, projected) = jax.lax.scan(step, nothing, (pulls, ended, cotangent.after), reverse=True)
-    return kernel_gradient(before, projected + cotangent.projected), drive, None, hidden
+    # Scan over time; the leaves of `step_vjps` are those of the single steps, stacked to [T, ...].
+    _, (unrolled, step_vjps) = jax.lax.scan(step, hidden, (input_gates, ended))
+    return unrolled, (kernel, unrolled.hidden_before, ended, step_vjps)
 
 
-unroll.defvjp(_unroll, _unroll_gradient)
+def _unroll_backward(residuals: Any, output_grad: UnrolledGRU) -> tuple[jax.Array, jax.Array, None, jax.Array]:
+    kernel, hidden_before, ended, step_vjps = residuals
+
+    def step(next_grad: jax.Array, inputs: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        # A reset stops the gradient from the following episode.
+        step_vjp, ended, after_grad = inputs
+        gate_grads = step_vjp(after_grad + jnp.where(ended[:, None], 0.0, next_grad))
+        input_gates_grad, hidden_gates_grad, hidden_grad = gate_grads
+        return hidden_grad + hidden_gates_grad @ kernel.T, (input_gates_grad, hidden_gates_grad)
+
+    # Go backwards in time; the kernel's gradient is then one product over all steps.
+    zero_grad = jnp.zeros_like(hidden_before[0])
+    backward_inputs = (step_vjps, ended, output_grad.hidden_after)
+    hidden_grad, gate_grads = jax.lax.scan(step, zero_grad, backward_inputs, reverse=True)
+    input_gates_grad, hidden_gates_grad = gate_grads
+    kernel_grad = kernel_gradient(hidden_before, hidden_gates_grad + output_grad.hidden_gates)
+    return kernel_grad, input_gates_grad, None, hidden_grad
+
+
+unroll_gru.defvjp(_unroll_forward, _unroll_backward)

@@ -1,21 +1,22 @@
-"""Rounding that lets sums be undone."""
+"""Rounding after which float32 sums are exact, so that a + b - b equals a."""
 
 import jax
 import jax.numpy as jnp
 
-_STEP = 2.0**-10
+# A power of two, so that dividing and multiplying by it are exact.
+_GRID_STEP = 2.0**-10
 
 
 @jax.custom_jvp
-def rounded(values: jax.Array) -> jax.Array:
-    """Round to multiples of 2**-10, with the identity's gradient.
+def round_to_grid(values: jax.Array) -> jax.Array:
+    """Round to multiples of 2**-10, with the gradient of the identity.
 
-    Float32 sums of such numbers below 2**13 are exact, so that (a + b) - b is a.
+    Float32 sums of such numbers below 2**13 are exact, so (a + b) - b equals a.
 
     Args:
       values: float32 [...].
     """
-    return jnp.round(values / _STEP) * _STEP
+    return jnp.round(values / _GRID_STEP) * _GRID_STEP
 
 
-rounded.defjvps(lambda tangent, result, values: tangent)
+round_to_grid.defjvps(lambda tangent, output, values: tangent)

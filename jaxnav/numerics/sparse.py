@@ -1,4 +1,8 @@
-"""Work that few members of a batch need at a time."""
+"""Batched updates that cost only as much as the members that need them.
+
+`update_where` applies a function to the masked members of a batch, in the forward and in the backward pass, part by
+part, and skips parts without any such member.
+"""
 
 import functools
 import math
@@ -8,111 +12,131 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-_PARTS = 8  # of a batch, that are worked on one after the other, or left out
+#: Number of parts of a batch, which are computed one after the other or skipped.
+_NUM_PARTS = 8
 
-#: From what all members share, what is known of one and its state to its next state.
+#: Maps (shared, inputs of one member, state of one member) to the member's next state.
 Function = Callable[[Any, Any, Any], Any]
 
 
-def where_due(due: jax.Array, function: Function, shared: Any, known: Any, state: Any) -> Any:
-    """Change the state of those members of a batch that are due.
+def update_where(mask: jax.Array, function: Function, shared: Any, inputs: Any, state: Any) -> Any:
+    """Update the state of the batch members where `mask` is True.
 
-    They are put first, and parts of the batch without any are left out. Other members are neither read nor written, in
-    reverse mode neither, so what it costs goes by the number that is due.
+    Members to update are sorted first, and parts of the batch without any are skipped. Other members are neither read
+    nor written, also in reverse mode, so the cost grows with the number of updates.
 
     Args:
-      due: bool [...].
-      function: from `shared` and leaves of `known` and `state` without a batch to the next state. In reverse mode
-        gradients reach these three, and nothing else that it holds.
+      mask: bool [...].
+      function: from `shared` and leaves of `inputs` and `state` without a batch to the next state. In reverse mode
+        gradients reach these three and no other array that the function closes over.
       shared: a pytree of float arrays.
-      known: leaves [..., ...].
+      inputs: leaves [..., ...].
       state: float leaves [..., ...].
 
     Returns:
-      The state, leaves [..., ...].
+      The next state, leaves [..., ...].
     """
 
-    def flat(tree: Any) -> Any:
-        return jax.tree.map(lambda leaf: leaf.reshape(math.prod(due.shape), *leaf.shape[due.ndim :]), tree)
+    def flatten_batch(tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf.reshape(math.prod(mask.shape), *leaf.shape[mask.ndim :]), tree)
 
-    after = _apply(function, shared, flat(due), flat(known), flat(state))
-    return jax.tree.map(lambda leaf: leaf.reshape(*due.shape, *leaf.shape[1:]), after)
+    # The batch as one axis, [...] -> [B], and back.
+    flat_state = _update(function, shared, flatten_batch(mask), flatten_batch(inputs), flatten_batch(state))
+    return jax.tree.map(lambda leaf: leaf.reshape(*mask.shape, *leaf.shape[1:]), flat_state)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _apply(function: Function, shared: Any, due: jax.Array, known: Any, state: Any) -> Any:
-    """Change the state, leaves [B, ...]."""
+def _update(function: Function, shared: Any, mask: jax.Array, inputs: Any, state: Any) -> Any:
+    """Update the state, leaves [B, ...]."""
 
-    def work(index: jax.Array, state: Any) -> Any:
-        given = _take((due, known, state), index)
-        return _put(state, index, _changed(function, shared, *given))
+    def update_part(index: jax.Array, state: Any) -> Any:
+        # A part may end with members that are not masked, which keep their state.
+        members = _take_rows((mask, inputs, state), index)
+        return _set_rows(state, index, _update_members(function, shared, *members))
 
-    return _for_each_part(due, work, state)
-
-
-def _changed(function: Function, shared: Any, due: jax.Array, known: Any, state: Any) -> Any:
-    """Change a part of a batch; those that are not due keep their state."""
-    after = jax.vmap(function, (None, 0, 0))(shared, known, state)
-    return jax.tree.map(lambda a, b: jnp.where(jnp.expand_dims(due, [*range(1, a.ndim)]), a, b), after, state)
+    return _for_each_part(mask, update_part, state)
 
 
-def _apply_forward(function: Function, *given: Any) -> tuple[Any, Any]:
-    return _apply(function, *given), given
+def _update_members(function: Function, shared: Any, mask: jax.Array, inputs: Any, state: Any) -> Any:
+    """Update the members of one part; unmasked members keep their state."""
+    next_state = jax.vmap(function, (None, 0, 0))(shared, inputs, state)
+
+    def select(new_leaf: jax.Array, old_leaf: jax.Array) -> jax.Array:
+        return jnp.where(jnp.expand_dims(mask, [*range(1, new_leaf.ndim)]), new_leaf, old_leaf)
+
+    return jax.tree.map(select, next_state, state)
 
 
-def _apply_gradient(function: Function, given: Any, received: Any) -> tuple[Any, None, Any, Any]:
-    """Change the parts again, and go back through that."""
-    shared, due, known, state = given
-    numbers, others = _divide(known)
-
-    def work(index: jax.Array, sums: Any) -> Any:
-        by_shared, by_numbers, by_state = sums
-        due_now, numbers_now, others_now, state_now = _take((due, numbers, others, state), index)
-
-        def again(shared: Any, numbers: Any, state: Any) -> Any:
-            return _changed(function, shared, due_now, _join(known, numbers, others_now), state)
-
-        shares, *places = jax.vjp(again, shared, numbers_now, state_now)[1](_take(by_state, index))
-        return jax.tree.map(jnp.add, by_shared, shares), *_put((by_numbers, by_state), index, tuple(places))
-
-    zeros = jax.tree.map(jnp.zeros_like, (shared, numbers))
-    by_shared, by_numbers, by_state = _for_each_part(due, work, (*zeros, received))
-    return by_shared, None, _join(known, by_numbers, [None] * len(others)), by_state
+def _update_forward(function: Function, *arguments: Any) -> tuple[Any, Any]:
+    return _update(function, *arguments), arguments
 
 
-_apply.defvjp(_apply_forward, _apply_gradient)
+def _update_backward(function: Function, residuals: Any, output_grad: Any) -> tuple[Any, None, Any, Any]:
+    """Recompute each part with masked members and differentiate it."""
+    shared, mask, inputs, state = residuals
+    float_inputs, other_inputs = _split_floats(inputs)
+
+    def differentiate_part(index: jax.Array, grads: Any) -> Any:
+        shared_grad, inputs_grad, state_grad = grads
+        members = _take_rows((mask, float_inputs, other_inputs, state), index)
+        part_mask, part_floats, part_others, part_state = members
+
+        def recompute(shared: Any, part_floats: Any, part_state: Any) -> Any:
+            part_inputs = _join_floats(inputs, part_floats, part_others)
+            return _update_members(function, shared, part_mask, part_inputs, part_state)
+
+        # Shared gradients add up over the parts; members have rows of their own.
+        _, part_vjp = jax.vjp(recompute, shared, part_floats, part_state)
+        part_shared_grad, *member_grads = part_vjp(_take_rows(state_grad, index))
+        shared_grad = jax.tree.map(jnp.add, shared_grad, part_shared_grad)
+        return shared_grad, *_set_rows((inputs_grad, state_grad), index, tuple(member_grads))
+
+    # The gradient of an unmasked member's state is that of its output, unchanged.
+    zero_grads = jax.tree.map(jnp.zeros_like, (shared, float_inputs))
+    grads = _for_each_part(mask, differentiate_part, (*zero_grads, output_grad))
+    shared_grad, inputs_grad, state_grad = grads
+    return shared_grad, None, _join_floats(inputs, inputs_grad, [None] * len(other_inputs)), state_grad
 
 
-def _for_each_part(due: jax.Array, work: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
-    """Work on the parts with members that are due, of which `work` gets the indices."""
-    size = len(due) // math.gcd(len(due), _PARTS)
-    order = jnp.argsort(~due)
-
-    def part(number: jax.Array, carry: Any) -> Any:
-        return work(jax.lax.dynamic_slice_in_dim(order, number * size, size), carry)
-
-    return jax.lax.fori_loop(0, -(-due.sum() // size), part, carry)
+_update.defvjp(_update_forward, _update_backward)
 
 
-def _divide(tree: Any) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Return the leaves that gradients can reach, and the others."""
+def _for_each_part(mask: jax.Array, function: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
+    """Call `function` with the member indices of every part that has masked members, and with the carry."""
+    # Equal parts need a number of parts that divides the batch. Masked members come first.
+    part_size = len(mask) // math.gcd(len(mask), _NUM_PARTS)
+    masked_first = jnp.argsort(~mask)
+
+    def run_part(part: jax.Array, carry: Any) -> Any:
+        return function(jax.lax.dynamic_slice_in_dim(masked_first, part * part_size, part_size), carry)
+
+    # The number of parts is traced, so parts beyond the last masked member cost nothing.
+    return jax.lax.fori_loop(0, -(-mask.sum() // part_size), run_part, carry)
+
+
+def _split_floats(tree: Any) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Return the float leaves, which gradients can reach, and the other leaves."""
     leaves = jax.tree.leaves(tree)
-    return [leaf for leaf in leaves if _is_real(leaf)], [leaf for leaf in leaves if not _is_real(leaf)]
+    float_leaves = [leaf for leaf in leaves if _is_float(leaf)]
+    other_leaves = [leaf for leaf in leaves if not _is_float(leaf)]
+    return float_leaves, other_leaves
 
 
-def _join(tree: Any, numbers: Any, others: Any) -> Any:
-    """Return a tree of the leaves that `_divide` divided."""
-    numbers, others = iter(numbers), iter(others)
-    return jax.tree.map(lambda leaf: next(numbers if _is_real(leaf) else others), tree)
+def _join_floats(tree: Any, floats: Any, others: Any) -> Any:
+    """Return a tree like `tree` with the leaves that `_split_floats` separated."""
+    # Both iterators advance in the order of the leaves in `tree`.
+    float_iterator = iter(floats)
+    other_iterator = iter(others)
+    return jax.tree.map(lambda leaf: next(float_iterator if _is_float(leaf) else other_iterator), tree)
 
 
-def _is_real(leaf: jax.Array) -> bool:
+def _is_float(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def _take(tree: Any, index: jax.Array) -> Any:
+def _take_rows(tree: Any, index: jax.Array) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def _put(tree: Any, index: jax.Array, members: Any) -> Any:
-    return jax.tree.map(lambda leaf, new: leaf.at[index].set(new, unique_indices=True), tree, members)
+def _set_rows(tree: Any, index: jax.Array, rows: Any) -> Any:
+    return jax.tree.map(lambda leaf, row: leaf.at[index].set(row, unique_indices=True), tree, rows)

@@ -1,8 +1,11 @@
-"""The causal graph of the paper as types.
+"""The paper's causal graph as types.
 
-S (what is seen) ---------> A
-G (what is sought) -------> A
-S, G --> Z (experience) --> A
+    S (what is seen) ---------> A
+    G (what is sought) -------> A
+    S, G --> Z (experience) --> A
+
+`Pathways` holds the three embeddings that lead to the action A, `Decision` what the policy makes of them, and
+`PolicyState` what it carries from step to step.
 """
 
 from typing import Any, NamedTuple
@@ -12,16 +15,21 @@ import jax
 from jaxnav.causal import do
 from jaxnav.scenes.task import NUM_ACTIONS
 
+#: The previous action at the start of an episode.
+NO_ACTION = NUM_ACTIONS
+
 
 class Pathways(NamedTuple):
-    """Hold the embeddings on the three pathways into the action.
+    """Embeddings on the three pathways into the action.
 
-    With streams, scene and experience end with a 1: 0 removes the stream.
+    With streams, scene and experience end with a 1, the factor of a stream: scene = 0 silences the whole direct stream,
+    that of the goal included, experience = 0 the stream of experience.
 
     Attributes:
-      scene: float32 [..., S], the direct pathway S -> A: what lies around.
-      goal: float32 [..., G], the direct pathway G -> A: detections and what is sought, without experience.
-      experience: float32 [..., Z], the mediator Z: what the method makes of scene and goal by experience.
+      scene: float32 [..., S], the direct pathway S -> A: the surroundings without objects.
+      goal: float32 [..., G], the direct pathway G -> A: detections and the goal, without experience.
+      experience: float32 [..., Z], the mediator Z: what the method makes of scene and goal by experience; with streams
+        followed by a second embedding of the view.
       gate: float32 [..., 1], factor on the logit of Done; no pathway, so interventions leave it as it is.
       reading: what the method's tracker read, for its adaptation, leaves [...]; no pathway either.
     """
@@ -33,55 +41,53 @@ class Pathways(NamedTuple):
     reading: Any = None
 
 
-class Memory(NamedTuple):
-    """Hold what a policy carries through an episode.
+class PolicyState(NamedTuple):
+    """Memory of a policy within an episode.
 
     Attributes:
-      hidden: float32 [..., H], recurrent state; zeros at the start. With streams [..., 2 H], the direct one's first.
+      hidden: float32 [..., H], recurrent state; zeros at the start. With streams [..., 2 H], that of the direct stream
+        first.
       action: int32 [...], the previous action; `NO_ACTION` at the start.
       fast: fast weights of the method's adaptation, leaves [...]; None without one.
-      experienced: float32 [...], 0 in episodes that go without experience in training, otherwise 1; None where the
-        decision has no stream of experience.
+      use_experience: float32 [...], 0 in training episodes without experience, otherwise 1; None where the network
+        has no stream of experience.
     """
 
     hidden: jax.Array
     action: jax.Array
     fast: Any = None
-    experienced: jax.Array | None = None
-
-
-def zero_experience(pathways: Pathways, experienced: jax.Array | None) -> Pathways:
-    """Zero the experience where `experienced` is 0.
-
-    Args:
-      pathways: leaves [..., ...].
-      experienced: float32 [...], 0 or 1; None keeps all.
-    """
-    if experienced is None:
-        return pathways
-    return do(pathways, experience=experienced[..., None] * pathways.experience)
+    use_experience: jax.Array | None = None
 
 
 class Decision(NamedTuple):
-    """Hold the outcome of one decision.
+    """Outcome of one decision.
 
     Attributes:
       logits: float32 [..., A].
       value: float32 [...], estimated return.
       hidden: float32 [..., H], recurrent state after the decision; with streams [..., 2 H].
       fast: fast weights after the decision; None without adaptation.
-      experienced: that of the memory.
+      use_experience: that of the memory.
     """
 
     logits: jax.Array
     value: jax.Array
     hidden: jax.Array
     fast: Any = None
-    experienced: jax.Array | None = None
+    use_experience: jax.Array | None = None
 
-    def memory(self, action: jax.Array) -> Memory:
-        """Return the memory after an action int32 [...] that followed."""
-        return Memory(self.hidden, action, self.fast, self.experienced)
+    def next_state(self, action: jax.Array) -> PolicyState:
+        """Return the memory for the next step, given the action int32 [...] that was taken."""
+        return PolicyState(self.hidden, action, self.fast, self.use_experience)
 
 
-NO_ACTION = NUM_ACTIONS
+def mask_experience(pathways: Pathways, use_experience: jax.Array | None) -> Pathways:
+    """Set the experience to zero where `use_experience` is 0.
+
+    Args:
+      pathways: leaves [..., ...].
+      use_experience: float32 [...], 0 or 1; None keeps all.
+    """
+    if use_experience is None:
+        return pathways
+    return do(pathways, experience=use_experience[..., None] * pathways.experience)

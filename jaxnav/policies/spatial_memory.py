@@ -1,4 +1,8 @@
-"""Where an agent has been and what it has seen there, by compass and odometry."""
+"""Spatial memory: a map of where the agent has been and which cells it saw free or blocked.
+
+The map is drawn from the agent's views by compass and odometry and holds nothing about objects. `SpatialMemory` draws
+and reads it; the policy reads the cells around the agent on the direct pathway of the scene.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,36 +14,36 @@ import numpy as np
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat
 from jaxnav.scenes.task import Rules
 
-#: What is known of a cell; where views disagree the larger number stays.
+#: State of a map cell. Where views disagree, the larger number wins.
 UNKNOWN, BLOCKED, FREE, VISITED = range(4)
 
 
-class Explored(NamedTuple):
-    """Hold the map of one episode.
+class ExplorationMap(NamedTuple):
+    """Map of one episode.
 
     Attributes:
-      cells: uint8 [N, N], what is known of each cell; it goes on at the opposite edge.
-      place: int32 [2], the agent's cell.
+      cells: uint8 [N, N], state of each cell; the map is toroidal, so it wraps around at its edges.
+      position: int32 [2], (z, x) of the agent's cell.
       heading: int32 [], 0 to H - 1, its compass heading.
     """
 
     cells: jax.Array
-    place: jax.Array
+    position: jax.Array
     heading: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
 class SpatialMemory:
-    """Remember the surroundings of one episode, without parameters; hashable.
+    """Mapper without parameters; hashable.
 
-    It holds nothing that depends on how objects are laid out: cells that were free, blocked or visited, from the views
-    and the agent's moves. All functions take one episode; callers `vmap`.
+    The map does not depend on how objects are laid out: its cells are free, blocked or visited, according to the views
+    and the moves of the agent. All functions take one episode; callers `vmap`.
 
     Attributes:
       headings: H of the task.
       size: N, cells along each side of the map.
-      reach: the agent reads so many cells to each side,
-      stride: of which only every so many-th.
+      reach: number of cells that are read on each side of the agent.
+      stride: distance in cells between neighbouring cells that are read.
     """
 
     headings: int
@@ -47,62 +51,74 @@ class SpatialMemory:
     reach: int = 5
     stride: int = 2
 
-    @property
-    def num_inputs(self) -> int:
-        """Return the number of inputs to a network, 3 M."""
-        return 3 * (2 * self.reach + 1) ** 2
-
-    @staticmethod
-    def inputs(surroundings: jax.Array) -> jax.Array:
-        """Return what a network reads of cells [..., M].
-
-        Returns:
-          float32 [..., 3 M]: which are blocked, which free, which visited.
-        """
-        known = [surroundings == code for code in (BLOCKED, FREE, VISITED)]
-        return jnp.concatenate(known, axis=-1).astype(jnp.float32)
-
-    def init(self) -> Explored:
-        """Return the map before anything is seen."""
+    def init(self) -> ExplorationMap:
+        """Return an empty map with the agent at its centre."""
         centre = jnp.full(2, self.size // 2, jnp.int32)
-        return Explored(jnp.zeros((self.size, self.size), jnp.uint8), centre, jnp.int32(0))
+        return ExplorationMap(jnp.zeros((self.size, self.size), jnp.uint8), centre, jnp.int32(0))
 
     def update(
-        self, explored: Explored, row: jax.Array, heading: jax.Array, moved: jax.Array, row_format: RowFormat
-    ) -> Explored:
-        """Take in one step.
+        self, explored: ExplorationMap, row: jax.Array, heading: jax.Array, moved: jax.Array, row_format: RowFormat
+    ) -> ExplorationMap:
+        """Move the agent and draw its view.
 
         Args:
-          explored: before it.
-          row: uint8 [R], the observation row after it.
+          explored: the map before the step.
+          row: uint8 [R], the observation row after the step.
           heading: int32 [], compass heading.
-          moved: bool [], whether the step changed the cell.
-          row_format: of the row.
+          moved: bool [], True where the step changed the cell.
+          row_format: format of the row.
         """
-        step = jnp.asarray(self._rules.steps(), jnp.int32)[heading]
-        place = (explored.place + jnp.where(moved, step, 0)) % self.size
+        # Odometry: a successful step leads one cell ahead.
+        step = jnp.asarray(self._rules.move_steps(), jnp.int32)[heading]
+        position = (explored.position + jnp.where(moved, step, 0)) % self.size
+
+        # Draw the V x V cells of the view, then the agent's own cell.
         view = row_format.view_cells(row)
-        seen = jnp.where(view == VIEW_FREE, FREE, jnp.where(view == VIEW_BLOCKED, BLOCKED, UNKNOWN)).astype(jnp.uint8)
+        blocked_or_unknown = jnp.where(view == VIEW_BLOCKED, BLOCKED, UNKNOWN)
+        view_states = jnp.where(view == VIEW_FREE, FREE, blocked_or_unknown).astype(jnp.uint8)
         offsets = self._rules.view_offsets(row_format.view).reshape(self.headings, -1, 2)
-        rows, columns = self._at(offsets, place, heading)
-        cells = explored.cells.at[rows, columns].max(seen)
-        return Explored(cells.at[place[0], place[1]].set(jnp.uint8(VISITED)), place, heading)
+        rows, columns = self._cells_at(offsets, position, heading)
+        # A state only ever grows (unknown, blocked, free, visited), so the maximum joins map and view.
+        cells = explored.cells.at[rows, columns].max(view_states)
+        cells = cells.at[position[0], position[1]].set(jnp.uint8(VISITED))
+        return ExplorationMap(cells, position, heading)
 
-    def read(self, explored: Explored) -> jax.Array:
-        """Return what is known around the agent, uint8 [M].
+    def read(self, explored: ExplorationMap) -> jax.Array:
+        """Return the states of the cells around the agent, uint8 [M].
 
-        Ego-centric: from the farthest cells behind to those ahead, each line from left to right.
+        The order is ego-centric: from the farthest line behind the agent to the farthest ahead, each from left to
+        right.
         """
-        along = self.stride * np.arange(-self.reach, self.reach + 1)
-        offsets = self._rules.turned_offsets(along, along).reshape(self.headings, -1, 2)
-        rows, columns = self._at(offsets, explored.place, explored.heading)
+        # Offsets [H, M, 2] of the cells that are read, for every heading.
+        distances = self.stride * np.arange(-self.reach, self.reach + 1)
+        offsets = self._rules.offsets_by_heading(distances, distances).reshape(self.headings, -1, 2)
+        rows, columns = self._cells_at(offsets, explored.position, explored.heading)
         return explored.cells[rows, columns]
+
+    @staticmethod
+    def encode_surroundings(surroundings: jax.Array) -> jax.Array:
+        """Encode what `read` returned for a network.
+
+        Args:
+          surroundings: uint8 [..., M].
+
+        Returns:
+          float32 [..., 3 M], flags of the blocked, the free and the visited cells.
+        """
+        # Unknown cells have no flag: all three are 0.
+        flags = [surroundings == cell_state for cell_state in (BLOCKED, FREE, VISITED)]
+        return jnp.concatenate(flags, axis=-1).astype(jnp.float32)
+
+    @property
+    def num_inputs(self) -> int:
+        """Number of inputs to a network, 3 M."""
+        return 3 * (2 * self.reach + 1) ** 2
 
     @property
     def _rules(self) -> Rules:
         return Rules(headings=self.headings)
 
-    def _at(self, offsets: np.ndarray, place: jax.Array, heading: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return rows and columns of the cells at offsets [H, M, 2]."""
-        at = (jnp.asarray(offsets, jnp.int32)[heading] + place[None]) % self.size
-        return at[:, 0], at[:, 1]
+    def _cells_at(self, offsets: np.ndarray, position: jax.Array, heading: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return rows and columns of the cells at offsets [H, M, 2] from the agent, by its heading."""
+        cells = (jnp.asarray(offsets, jnp.int32)[heading] + position[None]) % self.size
+        return cells[:, 0], cells[:, 1]

@@ -1,19 +1,22 @@
-"""What a policy is built from, beside its parameters."""
+"""The specification of a policy: everything but its parameters."""
 
 import dataclasses
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from jaxnav.policies.spatial_memory import SpatialMemory
 
-#: Which detections the direct pathway G -> A sees: of all categories, of the goal's alone, or none.
+if TYPE_CHECKING:
+    from jaxnav.policies.method import Method
+
+#: Detections that the direct pathway G -> A sees: of all categories, of the goal alone, or none.
 Direct = Literal["all", "goal", "none"]
-#: How pathways become logits: fused before one recurrent core (the paper), or in two streams that are added up.
-Deciding = Literal["fused", "streams"]
+#: Network from pathways to logits: fused before one recurrent core (the paper), or two streams that are added.
+DecisionKind = Literal["fused", "streams"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Hold the widths that all methods share.
+    """Widths that all methods share.
 
     Attributes:
       hidden: H, width of the recurrent state and of the fused input.
@@ -32,31 +35,66 @@ class Sizes:
 
 @dataclasses.dataclass(frozen=True)
 class PolicySpec:
-    """Hold what a policy is built from; hashable.
+    """Specification of a policy; hashable.
 
     Attributes:
-      method: name of the method, see `jaxnav.policies.methods.find_method`.
+      method: as `jaxnav.policies.methods.find_method` returns it.
       num_categories: K.
       sizes: widths that all methods share.
-      method_sizes: (name, value) of the method's own sizes that are not the usual ones.
-      direct: which detections the direct pathway sees; the number of parameters does not depend on it.
-      spatial_memory: what the scene's direct pathway remembers beside the view; None in the paper.
+      method_sizes: (name, value) of the method's own sizes, where they differ from the defaults.
+      direct: detections that the direct pathway sees; the number of parameters does not depend on it.
+      spatial_memory: map that the scene's direct pathway reads beside the view; None in the paper.
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
-      decision: how pathways become logits.
+      decision: network from pathways to logits.
       goal_row: whether the direct pathway holds the goal's detection once more, in a row of its own; not in the paper.
     """
 
-    method: str = "org"
+    method: "Method"
     num_categories: int = 22
     sizes: Sizes = Sizes()
     method_sizes: tuple[tuple[str, int], ...] = ()
     direct: Direct = "all"
     done_gate: bool = False
     spatial_memory: SpatialMemory | None = None
-    decision: Deciding = "fused"
+    decision: DecisionKind = "fused"
     goal_row: bool = True
 
     def __post_init__(self) -> None:
-        if self.decision not in get_args(Deciding):
-            raise ValueError(f"decision is {self.decision!r}; choose one of {', '.join(get_args(Deciding))}")
+        if self.decision not in get_args(DecisionKind):
+            raise ValueError(f"decision is {self.decision!r}; choose one of {', '.join(get_args(DecisionKind))}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON values: the method by its name, without the number of categories."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        del fields["num_categories"]
+        memory = self.spatial_memory
+        return fields | {
+            "method": self.method.name,
+            "sizes": dataclasses.asdict(self.sizes),
+            "method_sizes": dict(self.method_sizes),
+            "spatial_memory": None if memory is None else dataclasses.asdict(memory),
+        }
+
+    @classmethod
+    def from_json(cls, fields: dict[str, Any], method: "Method", num_categories: int) -> "PolicySpec":
+        """Return the spec of which `to_json` returned `fields`; other keys are ignored.
+
+        Args:
+          fields: as read from JSON.
+          method: found by the name `fields["method"]`.
+          num_categories: K.
+
+        Raises:
+          KeyError, TypeError, ValueError: a field is missing or has no such value.
+        """
+        values = {field.name: fields[field.name] for field in dataclasses.fields(cls) if field.name != "num_categories"}
+        memory = values["spatial_memory"]
+        values |= {
+            "method": method,
+            "num_categories": num_categories,
+            "sizes": Sizes(**values["sizes"]),
+            "method_sizes": tuple(sorted(values["method_sizes"].items())),
+            "spatial_memory": None if memory is None else SpatialMemory(**memory),
+        }
+        return cls(**values)

@@ -1,6 +1,7 @@
-"""A public check of the contract of methods, for methods of your own.
+"""Test of the contract of methods, for methods of your own.
 
-In the style of `jaxnav.env.testing`: run it in a test; it raises `AssertionError` with the promise that is broken.
+`check_method` acts with a method in a few scenes and raises an error that says which promise is broken. Call it in a
+test, as `jaxnav.env.testing` is called for environments.
 """
 
 from collections.abc import Mapping
@@ -12,21 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.causal import do
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
-from jaxnav.env.types import EnvParams
-from jaxnav.layout import SETTINGS, prior_from_counts
-from jaxnav.policies.acting import Acting, Agent, carried
-from jaxnav.policies.methods import Knowledge, Method, Percept, find_method
-from jaxnav.policies.pathways import Memory, Pathways
-from jaxnav.policies.perception import View
-from jaxnav.policies.policy import Params, Policy, init_params
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
+from jaxnav.layout import ESTIMATORS, prior_from_counts
+from jaxnav.policies.agent_loop import Agent, AgentLoop, View, decide, policy_memory
+from jaxnav.policies.method import Knowledge, Method, Percept
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import Params, Policy, init_params
+from jaxnav.policies.pathways import Decision, Pathways, PolicyState
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import Bank, compile_bank
-from jaxnav.scenes.worlds import WORLDS, generated
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 _SIZES = Sizes(hidden=16, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
-_BATCH = 6
+_BATCH_SIZE = 6
 
 
 def check_method(
@@ -36,17 +36,22 @@ def check_method(
     seed: int = 0,
     bank: Bank | None = None,
 ) -> None:
-    """Check that a method keeps the promises of the seam.
+    """Check that a method keeps its contract.
 
-    It acts in a few scenes and checks: shapes and dtypes of pathways and decisions, all of them finite; a batch
-    equals its single members; `do` leaves the experience as it is; logits are deaf to the view and to the goal's
-    detection when both direct pathways are zero and the experience is given; the tracker takes in every step once, its
-    first view included, and its notes and readings keep their shapes; a choice becomes a legal action.
+    The method acts in a few scenes, and these promises are checked:
+
+    * Pathways and decisions have the right shapes and dtypes and are finite.
+    * A batch gives the same results as its single members.
+    * `do` leaves the experience unchanged.
+    * With both direct pathways zero and the experience given, logits do not depend on the view or the detection of the
+      goal.
+    * The tracker takes in every step once, the first view included, and its states keep their shapes.
+    * A choice becomes a legal action.
 
     Args:
       name: of the method, see `jaxnav.policies.methods.find_method`.
-      method_sizes: the method's own sizes, where they are not the usual ones.
-      steps: environment steps to act for.
+      method_sizes: sizes of the method that differ from their defaults.
+      steps: number of environment steps.
       seed: of parameters, episodes and actions.
       bank: of the scenes; None for two generated rooms.
 
@@ -54,119 +59,181 @@ def check_method(
       InputError: there is no such method.
       AssertionError: a promise is broken.
     """
-    method, rooms = find_method(name), WORLDS["rooms"]
+    method = find_method(name)
+    # Two generated rooms serve where the caller has no scenes.
+    rooms = WORLDS["rooms"]
     if bank is None:
-        scenes = generated("rooms", "train", 2, seed)
+        scenes = make_generated_scenes("rooms", "train", 2, seed)
         bank = compile_bank([scenes[0], scenes[1]], rooms.task)
-    env, params = build(bank, {}, rooms.step_limit)
-    spec = PolicySpec(name, len(env.categories), _SIZES, tuple(sorted((method_sizes or {}).items())))
-    acting = Acting(env, spec, SETTINGS["calibrated"] if method.hosts_layout else None)
-    knowledge, key = _knowledge(method, env, bank), jax.random.key(seed)
-    weights = _lively(jax.jit(init_params, static_argnums=0)(spec, key), key)
+    env, env_params = build_environment(bank, {}, rooms.step_limit)
 
+    # A small policy that is not indifferent between its choices.
+    spec = PolicySpec(method, len(env.categories), _SIZES, tuple(sorted((method_sizes or {}).items())))
+    agent_loop = AgentLoop(env, spec, ESTIMATORS["calibrated"] if method.hosts_layout else None)
+    knowledge = _uniform_knowledge(method, env, bank)
+    key = jax.random.key(seed)
+    params = _with_random_actor(jax.jit(init_params, static_argnums=0)(spec, key), key)
+
+    # Rollouts and histories rely on a bound on how long a choice lasts.
     interval = getattr(method.control, "interval", 0)
-    _promise(isinstance(interval, int) and interval >= 1, "a control that does not say how long a choice lasts")
+    _require(isinstance(interval, int) and interval >= 1, "a control that does not say how long a choice lasts")
+
+    # Act, and keep all agents and choices.
+    @jax.jit
+    def start_episodes() -> Agent:
+        memory = agent_loop.bind(params).initial_memory((_BATCH_SIZE,))
+        return agent_loop.start(key, _BATCH_SIZE, memory, knowledge, env_params)
 
     @jax.jit
-    def start() -> Agent:
-        memory = acting.bind(weights).initial_memory((_BATCH,))
-        return acting.start(key, _BATCH, memory, knowledge, params)
+    def act_once(agent: Agent, step_key: jax.Array) -> tuple[Agent, jax.Array]:
+        return _act_once(agent_loop, agent_loop.bind(params), agent, step_key, knowledge, env_params)
 
-    act = jax.jit(lambda agent, key: _act(acting, acting.bind(weights), agent, key, knowledge, params))
-    agents, choices = [start()], []
+    # `choices[t]` leads from `agents[t]` to `agents[t + 1]`.
+    agents = [start_episodes()]
+    choices: list[jax.Array] = []
     for time in range(steps):
-        agent, choice = act(agents[-1], jax.random.fold_in(key, time))
+        agent, choice = act_once(agents[-1], jax.random.fold_in(key, time))
         agents.append(agent)
         choices.append(choice)
-        action = carried(agents[-1]).action
-        _promise(bool(((action >= 0) & (action < env.num_actions)).all()), "a choice that becomes no action")
-    _check_notes(method, agents, choices, env, knowledge, params)
-    _check_decision(acting, weights, agents[-1], method.control.num_choices, knowledge, params)
+        action = policy_memory(agent).action
+        is_legal = (action >= 0) & (action < env.num_actions)
+        _require(bool(is_legal.all()), "a choice that becomes no action")
+
+    # The tracker is checked against the whole history, decisions in the last step.
+    _check_tracker_states(method, agents, choices, env, knowledge, env_params)
+    _check_decision(agent_loop, params, agents[-1], method.control.num_choices, knowledge, env_params)
 
 
-def _knowledge(method: Method, env: ObjectNav, bank: Bank) -> Knowledge:
-    counts = np.ones((NUM_PRIORS, len(env.categories), len(env.categories)), np.float32)
+def _uniform_knowledge(method: Method, env: ObjectNav, bank: Bank) -> Knowledge:
+    """Return knowledge from counts that are all 1."""
+    num_categories = len(env.categories)
+    # Equal counts [rooms, K, K] prefer no pair of categories.
+    counts = np.ones((NUM_PRIORS, num_categories, num_categories), np.float32)
     prior = jax.vmap(prior_from_counts)(jnp.asarray(counts))
-    return Knowledge(prior, {} if method.learn is None else jax.tree.map(jnp.asarray, method.learn([bank], counts)))
+    learned = {} if method.learn is None else jax.tree.map(jnp.asarray, method.learn([bank], counts))
+    return Knowledge(prior, learned)
 
 
-def _lively(params: dict[str, Any], key: jax.Array) -> dict[str, Any]:
-    """Return parameters of a policy that is not indifferent."""
+def _with_random_actor(params: dict[str, Any], key: jax.Array) -> dict[str, Any]:
+    """Replace the actor's kernel, which is nearly zero at first, by a random one."""
     kernel = jax.random.normal(key, params["actor"]["kernel"].shape)
     return params | {"actor": params["actor"] | {"kernel": kernel}}
 
 
-def _act(
-    acting: Acting, policy: Policy, agent: Agent, key: jax.Array, knowledge: Knowledge, params: EnvParams
+def _act_once(
+    agent_loop: AgentLoop, policy: Policy, agent: Agent, key: jax.Array, knowledge: Knowledge, env_params: EnvParams
 ) -> tuple[Agent, jax.Array]:
-    """Act once, without reset, and return what was chosen too."""
-    pathways = policy.pathways(*acting.view(agent, knowledge, params), carried(agent))
-    decision = policy.decide(pathways, carried(agent))
+    """Act once without auto-reset, and return the agent and its choices."""
+    memory = policy_memory(agent)
+    _, decision = decide(policy, agent_loop.view(agent, knowledge, env_params), memory)
+    # Sample the choices, and step all episodes without a reset.
     choice = jax.random.categorical(key, decision.logits)
-    return acting.step(agent, choice, knowledge, params, policy=policy, decision=decision)[0], choice
+    next_agent, _ = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
+    return next_agent, choice
 
 
-def _check_notes(
+def _check_tracker_states(
     method: Method,
     agents: list[Agent],
     choices: list[jax.Array],
     env: ObjectNav,
     knowledge: Knowledge,
-    params: EnvParams,
+    env_params: EnvParams,
 ) -> None:
-    """Check that notes take in every view once, and every choice."""
+    """Check that tracker states take in every view and every choice exactly once."""
+    # A method without a tracker has nothing to check here.
     tracker = method.tracker
     if tracker is None:
         return
-    update = jax.jit(lambda note, percept: tracker.update(note, knowledge, percept))
-    control = jax.jit(lambda choice, note: method.control.act(choice, note, knowledge)[1])
-    for i in range(_BATCH):
-        note = tracker.init(knowledge)
-        for before, agent, choice in zip([None, *agents], agents, [None, *choices], strict=False):
+
+    @jax.jit
+    def update(tracker_state: Any, percept: Percept) -> Any:
+        return tracker.update(tracker_state, knowledge, percept)
+
+    @jax.jit
+    def apply_choice(choice: jax.Array, tracker_state: Any) -> Any:
+        return method.control.act(choice, tracker_state, knowledge)[1]
+
+    # Track every episode of the batch once more, and compare at every step.
+    for i in range(_BATCH_SIZE):
+        tracker_state = tracker.init(knowledge)
+        for time, agent in enumerate(agents):
             pose = agent.state.pose[i]
-            note = note if choice is None else control(choice[i], note)
-            cell, heading, horizon = env.task.rules.split(pose)
-            moved = jnp.bool_(before is not None and env.cell(before.state.pose[i]) != cell)
-            position = heading, carried(agent).action[i], moved, horizon
-            percept = Percept(params.tables.rows[pose], *position, agent.state.goal[i])
-            note = update(note, percept)
-            kept = jax.tree.map(lambda leaf, i=i: leaf[i], agent.perceived.note)
-            chex.assert_trees_all_equal_shapes_and_dtypes(kept, note)
-            chex.assert_trees_all_close(kept, note, rtol=1e-5, atol=1e-6)
+            cell, heading, horizon = env.task.rules.split_pose(pose)
+            # The control sees the state before the step, so its choice comes before the update.
+            moved = jnp.bool_(False)
+            if time > 0:
+                tracker_state = apply_choice(choices[time - 1][i], tracker_state)
+                moved = jnp.bool_(env.cell_of_pose(agents[time - 1].state.pose[i]) != cell)
+
+            # Rebuild what the tracker perceived, from the tables of the environment.
+            percept = Percept(
+                row=env_params.tables.rows[pose],
+                heading=heading,
+                action=policy_memory(agent).action[i],
+                moved=moved,
+                horizon=horizon,
+                goal=agent.state.goal[i],
+            )
+            tracker_state = update(tracker_state, percept)
+            # The state that the agent carries must be that of a single update per step.
+            agent_tracker_state = _member(agent.perception.tracker_state, i)
+            chex.assert_trees_all_equal_shapes_and_dtypes(agent_tracker_state, tracker_state)
+            chex.assert_trees_all_close(agent_tracker_state, tracker_state, rtol=1e-5, atol=1e-6)
 
 
 def _check_decision(
-    acting: Acting, weights: Params, agent: Agent, num_choices: int, knowledge: Knowledge, params: EnvParams
+    agent_loop: AgentLoop,
+    params: Params,
+    agent: Agent,
+    num_choices: int,
+    knowledge: Knowledge,
+    env_params: EnvParams,
 ) -> None:
     """Check pathways and decisions in the middle of episodes."""
-    view, memory = acting.view(agent, knowledge, params), carried(agent)
+    view = agent_loop.view(agent, knowledge, env_params)
+    memory = policy_memory(agent)
 
-    def embed_view(view: View, memory: Memory) -> Pathways:
-        return acting.bind(weights).pathways(*view, memory)
+    @jax.jit
+    def embed(view: View, memory: PolicyState) -> Pathways:
+        return agent_loop.bind(params).pathways(*view, memory)
 
-    embed = jax.jit(embed_view)
-    decide = jax.jit(lambda pathways, memory: acting.bind(weights).decide(pathways, memory))
+    @jax.jit
+    def decide(pathways: Pathways, memory: PolicyState) -> Decision:
+        return agent_loop.bind(params).decide(pathways, memory)
+
+    # Shapes, dtypes, finite values.
     pathways = embed(view, memory)
     decision = decide(pathways, memory)
-    chex.assert_shape(pathways.experience, (_BATCH, acting.bind(weights).method.width))
-    chex.assert_shape([decision.logits, decision.value], [(_BATCH, num_choices), (_BATCH,)])
+    chex.assert_shape(pathways.experience, (_BATCH_SIZE, agent_loop.bind(params).method.width))
+    chex.assert_shape([decision.logits, decision.value], [(_BATCH_SIZE, num_choices), (_BATCH_SIZE,)])
     chex.assert_type([pathways.experience, decision.logits, decision.value], jnp.float32)
-    chex.assert_trees_all_equal_shapes_and_dtypes(decision.memory(memory.action), memory)
+    chex.assert_trees_all_equal_shapes_and_dtypes(decision.next_state(memory.action), memory)
     chex.assert_tree_all_finite((pathways, decision))
-    for i in range(_BATCH):
-        one: tuple[View, Memory] = jax.tree.map(lambda leaf, i=i: leaf[i], (view, memory))
-        alone = decide(embed(one[0], one[1]), one[1])
-        expected = jax.tree.map(lambda leaf, i=i: leaf[i], decision)
-        chex.assert_trees_all_close(alone, expected, rtol=1e-4, atol=1e-5)
 
+    # Single members of the batch.
+    for i in range(_BATCH_SIZE):
+        member_view = _member(view, i)
+        member_memory = _member(memory, i)
+        member_decision = decide(embed(member_view, member_memory), member_memory)
+        chex.assert_trees_all_close(member_decision, _member(decision, i), rtol=1e-4, atol=1e-5)
+
+    # An intervention leaves the experience unchanged, and then only the experience matters.
     counterfactual = do(pathways, scene=0.0, goal=0.0)
     chex.assert_trees_all_equal(counterfactual.experience, pathways.experience)
-    elsewhere = jax.tree.map(lambda leaf: jnp.roll(leaf, 1, axis=0), pathways)
-    mixed = elsewhere._replace(experience=pathways.experience, gate=pathways.gate)
-    deaf = decide(do(mixed, scene=0.0, goal=0.0), memory).logits
-    chex.assert_trees_all_equal(deaf, decide(counterfactual, memory).logits)
+    # Exchange the direct pathways between members: once they are zero, logits must not change.
+    other_pathways = jax.tree.map(lambda leaf: jnp.roll(leaf, 1, axis=0), pathways)
+    other_pathways = other_pathways._replace(experience=pathways.experience, gate=pathways.gate)
+    other_logits = decide(do(other_pathways, scene=0.0, goal=0.0), memory).logits
+    chex.assert_trees_all_equal(other_logits, decide(counterfactual, memory).logits)
 
 
-def _promise(kept: bool, broken: str) -> None:
-    if not kept:
-        raise AssertionError(f"the method breaks its contract: {broken}")
+def _member(tree: Any, index: int) -> Any:
+    """Return one member of a batch."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _require(condition: bool, problem: str) -> None:
+    """Raise an error that names a broken promise unless the condition holds."""
+    if not condition:
+        raise AssertionError(f"the method breaks its contract: {problem}")

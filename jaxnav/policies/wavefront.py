@@ -1,7 +1,8 @@
-"""Shortest ways on a map, as a wave of bits.
+"""Shortest paths on a toroidal grid map, found by a wave of bits.
 
-A board uint32 [N, N / 32] holds one bit a cell: cell (z, x) is bit x % 32 of word x // 32 in line z. It goes on at the
-opposite edge. A wave spreads to the eight neighbours of all cells by a few shifts.
+A board uint32 [N, N / 32] holds one bit per cell: cell (z, x) is bit x % 32 of word x // 32 in line z. Lines and
+columns wrap around at the edges. `find_path` spreads a wave from the targets to the eight neighbours of all cells,
+which takes a few shifts per step, and `follow_path` returns the agent's next action.
 """
 
 from typing import NamedTuple
@@ -12,93 +13,109 @@ import numpy as np
 
 from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 
-WORD = 32
-_LAST = np.uint32(WORD - 1)
+WORD_BITS = 32
+_LAST_BIT = np.uint32(WORD_BITS - 1)
+
+#: State of the wave: number of steps, cells reached one step before, and cells reached so far.
+_Wave = tuple[jax.Array, jax.Array, jax.Array]
 
 
-class Way(NamedTuple):
-    """Tell how far targets are, and which cells are one step nearer.
+class PathField(NamedTuple):
+    """Distance from a start to its nearest target, and the cells that are closer to it.
 
     Attributes:
-      length: int32 [], steps to the nearest target; -1 where there is no way.
-      nearer: uint32 [N, N / 32], the cells that are nearer to a target than the start is.
+      length: int32 [], steps to the nearest target; -1 where there is no path.
+      closer_cells: uint32 [N, N / 32], the cells that are closer to a target than the start is.
     """
 
     length: jax.Array
-    nearer: jax.Array
+    closer_cells: jax.Array
 
 
-def pack(cells: jax.Array) -> jax.Array:
-    """Return the board uint32 [..., N / 32] of cells bool [..., N]."""
-    words = cells.reshape(*cells.shape[:-1], -1, WORD).astype(jnp.uint32)
-    shifts = np.arange(WORD, dtype=np.uint32).reshape((1,) * cells.ndim + (WORD,))
-    return (words << shifts).sum(axis=-1, dtype=jnp.uint32)
+def find_path(targets: jax.Array, passable: jax.Array, start: jax.Array) -> PathField:
+    """Find a shortest path to the nearest target.
 
-
-def holds(board: jax.Array, places: jax.Array) -> jax.Array:
-    """Return whether cells int32 [..., 2] are on a board, bool [...].
-
-    Beyond an edge it goes on at the opposite one.
-    """
-    z, x = jnp.moveaxis(places % board.shape[0], -1, 0)
-    return (board[z, x // WORD] >> (x % WORD).astype(jnp.uint32)) & np.uint32(1) > 0
-
-
-def spread(board: jax.Array) -> jax.Array:
-    """Return the cells of a board and their eight neighbours."""
-    east = board << np.uint32(1) | jnp.roll(board, 1, axis=1) >> _LAST
-    west = board >> np.uint32(1) | jnp.roll(board, -1, axis=1) << _LAST
-    lines = board | east | west
-    return lines | jnp.roll(lines, 1, axis=0) | jnp.roll(lines, -1, axis=0)
-
-
-def find_way(targets: jax.Array, passable: jax.Array, start: jax.Array) -> Way:
-    """Find a shortest way to the nearest of the targets.
-
-    A step leads to one of eight neighbours. The start and the targets need not be passable.
+    A step leads to one of the eight neighbours. The start and the targets need not be passable.
 
     Args:
       targets: uint32 [N, N / 32].
       passable: uint32 [N, N / 32].
       start: int32 [2], (z, x).
     """
+    # The wave runs backwards, from the targets to the start, and must be able to enter the start.
+    start_row, start_column = start
+    start_bit = jnp.uint32(1) << (start_column % WORD_BITS).astype(jnp.uint32)
+    start_board = jnp.zeros_like(passable).at[start_row, start_column // WORD_BITS].set(start_bit)
+    enterable = passable | start_board
 
-    def goes_on(state: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        _, nearer, reached = state
-        return ~holds(reached, start) & (reached != nearer).any()
+    # The wave ends at the start, or where it reaches nothing new.
+    def is_spreading(wave: _Wave) -> jax.Array:
+        _, reached_before, reached = wave
+        return ~is_on_board(reached, start) & (reached != reached_before).any()
 
-    def step(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        length, _, reached = state
-        return length + 1, reached, reached | (spread(reached) & open_)
+    def spread(wave: _Wave) -> _Wave:
+        length, _, reached = wave
+        return length + 1, reached, reached | (dilate_board(reached) & enterable)
 
-    cell = (
-        jnp.zeros_like(passable)
-        .at[start[0], start[1] // WORD]
-        .set(jnp.uint32(1) << (start[1] % WORD).astype(jnp.uint32))
-    )
-    open_ = passable | cell
-    length, nearer, reached = jax.lax.while_loop(goes_on, step, (jnp.int32(0), jnp.zeros_like(targets), targets))
-    return Way(jnp.where(holds(reached, start), length, -1), nearer)
+    # What was reached one step before the start is closer to a target than the start is.
+    first_wave = (jnp.int32(0), jnp.zeros_like(targets), targets)
+    length, reached_before, reached = jax.lax.while_loop(is_spreading, spread, first_wave)
+    return PathField(jnp.where(is_on_board(reached, start), length, -1), reached_before)
 
 
-def follow(way: Way, start: jax.Array, heading: jax.Array, strides: jax.Array) -> jax.Array:
-    """Return the action int32 [] that follows a way of one step or more.
+def follow_path(path_field: PathField, start: jax.Array, heading: jax.Array, strides: jax.Array) -> jax.Array:
+    """Return the next action int32 [] along a path of at least one step.
 
-    Of several steps that lead nearer it takes the one that needs the fewest turns.
+    Where several steps lead closer, the one that needs the fewest turns is chosen.
 
     Args:
-      way: see `find_way`.
+      path_field: result of `find_path` for this start.
       start: int32 [2], (z, x).
       heading: int32 [].
-      strides: int32 [H, 2], the displacement of a step ahead by heading.
+      strides: int32 [H, 2], the displacement (dz, dx) of a step ahead by heading.
     """
-    turns = (jnp.arange(len(strides)) - heading) % len(strides)
-    away = jnp.where(holds(way.nearer, start[None] + strides), jnp.minimum(turns, len(strides) - turns), len(strides))
-    return turn_to(away.argmin(), heading, len(strides))
+    num_headings = len(strides)
+    # Number of turns to each heading, [H], by the shorter way.
+    right_turns = (jnp.arange(num_headings) - heading) % num_headings
+    num_turns = jnp.minimum(right_turns, num_headings - right_turns)
+
+    # Headings that do not lead closer cost more than any turn.
+    leads_closer = is_on_board(path_field.closer_cells, start[None] + strides)
+    turn_costs = jnp.where(leads_closer, num_turns, num_headings)
+    return turn_towards(turn_costs.argmin(), heading, num_headings)
 
 
-def turn_to(wanted: jax.Array, heading: jax.Array, headings: int) -> jax.Array:
-    """Return the action int32 [] that turns to a heading, or goes ahead."""
-    turns = (wanted - heading) % headings
-    turn = jnp.where(2 * turns <= headings, ROTATE_RIGHT, ROTATE_LEFT)
-    return jnp.where(turns == 0, MOVE_AHEAD, turn).astype(jnp.int32)
+def turn_towards(target_heading: jax.Array, heading: jax.Array, num_headings: int) -> jax.Array:
+    """Return the action int32 [] that turns towards a heading, or MoveAhead where the agent already has it."""
+    right_turns = (target_heading - heading) % num_headings
+    turn_action = jnp.where(2 * right_turns <= num_headings, ROTATE_RIGHT, ROTATE_LEFT)
+    return jnp.where(right_turns == 0, MOVE_AHEAD, turn_action).astype(jnp.int32)
+
+
+def pack_board(cells: jax.Array) -> jax.Array:
+    """Pack cells bool [..., N] into a board uint32 [..., N / 32]."""
+    # Bit i of a word is cell 32 w + i of the line.
+    cells_by_word = cells.reshape(*cells.shape[:-1], -1, WORD_BITS).astype(jnp.uint32)
+    shifts = np.arange(WORD_BITS, dtype=np.uint32).reshape((1,) * cells.ndim + (WORD_BITS,))
+    return (cells_by_word << shifts).sum(axis=-1, dtype=jnp.uint32)
+
+
+def is_on_board(board: jax.Array, positions: jax.Array) -> jax.Array:
+    """Return True where the bit of a cell int32 [..., 2] is set, bool [...].
+
+    Positions beyond an edge wrap around.
+    """
+    # Look the word of each cell up, then test its bit.
+    rows, columns = jnp.moveaxis(positions % board.shape[0], -1, 0)
+    words = board[rows, columns // WORD_BITS]
+    return (words >> (columns % WORD_BITS).astype(jnp.uint32)) & np.uint32(1) > 0
+
+
+def dilate_board(board: jax.Array) -> jax.Array:
+    """Return the cells of a board and their eight neighbours."""
+    # Shifts carry the bit at a word's end into the neighbouring word.
+    shifted_up = board << np.uint32(1) | jnp.roll(board, 1, axis=1) >> _LAST_BIT
+    shifted_down = board >> np.uint32(1) | jnp.roll(board, -1, axis=1) << _LAST_BIT
+    # Along the lines first, then across them: together these are all eight neighbours.
+    dilated_rows = board | shifted_up | shifted_down
+    return dilated_rows | jnp.roll(dilated_rows, 1, axis=0) | jnp.roll(dilated_rows, -1, axis=0)

@@ -1,1 +1,1 @@
-"""The report of a run: one page with tables, charts and replays."""
+"""The report of a run: one HTML page with tables, charts and replays."""

@@ -1,4 +1,4 @@
-"""The charts of a page, as SVG whose colours follow the page."""
+"""The charts of the report's page: figures as SVG whose colors and font follow the page."""
 
 import io
 import re
@@ -9,18 +9,16 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from jaxnav.causal import Form
-from jaxnav.evaluation.accounting import Entry
-from jaxnav.evaluation.report_tables import difference_label
+from jaxnav.evaluation.report import ExperienceLead, difference_label
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.report.content import Chart
-from jaxnav.runs.directory import Run
-from jaxnav.study.curves import GapCourse
+from jaxnav.report.page import Chart
+from jaxnav.runs.run import Run
 from jaxnav.study.figures import effects_figure, epsilon_figure, gap_figure, similarity_figure
-from jaxnav.study.records import Metric, SuccessBySimilarity
+from jaxnav.study.records import GapCurves, StudyMetric, SuccessBySimilarity
 from jaxnav.viz.learning import learning_figure
 
-#: Colours of the figures, as the page names them.
-_COLOURS = {
+#: Variables of the page's style sheet, by the colors of the figures.
+_PAGE_COLORS = {
     "#333333": "ink",
     "#1a1a1a": "ink",
     "#8a8a8a": "pale",
@@ -32,19 +30,19 @@ _COLOURS = {
 }
 
 
-class _Row(NamedTuple):
-    """Hold a row of an evaluation's report."""
+class _ReportRow(NamedTuple):
+    """Row of an evaluation's report, with the interface that `epsilon_figure` expects."""
 
     fields: Mapping[str, Any]
 
-    def metric(self, name: Metric) -> Interval:
+    def metric(self, name: StudyMetric) -> Interval:
         """Return one of the metrics."""
         return Interval.from_json(self.fields[name])
 
 
 def learning_chart(run: Run) -> Chart:
-    """Draw success while training, in training and val scenes."""
-    figure = learning_figure(run.log(), run.reach(), run.config.method.upper())
+    """Draw success during training, in training and val scenes."""
+    figure = learning_figure(run.log(), run.success_by_budget(), run.config.method.upper())
     return Chart(to_svg(figure), "Learning curves: success while training and within a number of actions.")
 
 
@@ -52,40 +50,54 @@ def thresholds_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
     """Draw the metrics over the threshold of sTDE.
 
     Args:
-      reports: evaluations by shift.
+      reports: reports of evaluations, by shift.
     """
-    sweeps: dict[tuple[float, Form], dict[float, _Row]] = {}
+    # Rows of sTDE with best actions, by shift and form of the gap, then by threshold.
+    rows_by_form: dict[tuple[float, Form], dict[float, _ReportRow]] = {}
     for shift, report in reports.items():
-        for row in report["rows"]:
-            if (row["variant"], row["decoding"]) == ("stde", "argmax"):
-                sweeps.setdefault((shift, row["form"]), {})[row["epsilon"]] = _Row(row)
-    return Chart(to_svg(epsilon_figure(sweeps)), "Success, path length and distance by threshold.")
+        for report_row in report["rows"]:
+            if (report_row["variant"], report_row["decoding"]) == ("stde", "argmax"):
+                rows_by_form.setdefault((shift, report_row["form"]), {})[report_row["epsilon"]] = _ReportRow(report_row)
+    return Chart(to_svg(epsilon_figure(rows_by_form)), "Success, path length and distance by threshold.")
 
 
-def leads_chart(accounts: Mapping[float, Sequence[Entry]]) -> Chart:
-    """Draw the leads in success over agents without experience, by shift."""
-    groups = {
-        f"Shift {shift:g}": {e.variant: e.lead for e in entries if (e.metric, e.decoding) == ("sr", "argmax")}
-        for shift, entries in accounts.items()
-    }
-    return Chart(to_svg(effects_figure(groups)), "Lead in success over agents that cannot know any layout.")
+def leads_chart(accounts: Mapping[float, Sequence[ExperienceLead]]) -> Chart:
+    """Draw the leads in success over agents without experience.
+
+    Args:
+      accounts: leads of a run, by shift.
+    """
+    # One group for each shift: leads in success with best actions, by row of the report.
+    leads_by_shift = {}
+    for shift, leads in accounts.items():
+        lead_by_variant: dict[str, Interval] = {}
+        for lead in leads:
+            if (lead.metric, lead.decoding) == ("sr", "argmax"):
+                lead_by_variant[lead.variant] = lead.lead
+        leads_by_shift[f"Shift {shift:g}"] = lead_by_variant
+    return Chart(to_svg(effects_figure(leads_by_shift)), "Lead in success over agents that cannot know any layout.")
 
 
 def differences_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
-    """Draw the paired differences in success, by shift."""
-    groups = {f"Shift {shift:g}": _differences(report) for shift, report in reports.items()}
-    return Chart(to_svg(effects_figure(groups)), "Paired differences in success, best actions.")
+    """Draw the paired differences in success, with best actions.
+
+    Args:
+      reports: reports of evaluations, by shift.
+    """
+    # One group for each shift; the other metrics and sampled actions stand in the tables only.
+    differences_by_shift = {}
+    for shift, report in reports.items():
+        differences: dict[str, Interval] = {}
+        for entry in report["differences"]:
+            if (entry["metric"], entry["decoding"]) == ("sr", "argmax"):
+                differences[difference_label(entry)] = Interval.from_json(entry)
+        differences_by_shift[f"Shift {shift:g}"] = differences
+    return Chart(to_svg(effects_figure(differences_by_shift)), "Paired differences in success, best actions.")
 
 
-def _differences(report: Mapping[str, Any]) -> dict[str, Interval]:
-    """Return the differences in success, best actions, by name."""
-    entries = [e for e in report["differences"] if (e["metric"], e["decoding"]) == ("sr", "argmax")]
-    return {difference_label(entry): Interval.from_json(entry) for entry in entries}
-
-
-def gap_chart(course: GapCourse) -> Chart:
+def gap_chart(curves: GapCurves) -> Chart:
     """Draw the mean layout gap by step."""
-    return Chart(to_svg(gap_figure(course)), "Mean layout gap by step.")
+    return Chart(to_svg(gap_figure(curves)), "Mean layout gap by step.")
 
 
 def similarity_chart(by_shift: Mapping[float, SuccessBySimilarity]) -> Chart:
@@ -96,17 +108,22 @@ def similarity_chart(by_shift: Mapping[float, SuccessBySimilarity]) -> Chart:
 def to_svg(figure: Figure) -> str:
     """Return a figure as an SVG element.
 
-    Its bytes depend on the figure alone. Text is text in the page's font, and colours are variables of the page.
+    The bytes depend on the figure alone. Text is text in the page's font, and colors are variables of the page.
     """
-    text = io.StringIO()
+    # Without the date, the version and random ids, equal figures give equal bytes.
+    svg_file = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxnav"}):
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    svg = text.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r' id="\w+_\d+"', "", svg)  # the same in every figure
-    svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # would be the whole page's
-    svg = re.sub(r"font-family: [^;]*; ?", "", svg)
-    for colour, name in _COLOURS.items():
-        svg = svg.replace(colour, f"var(--{name})")
-    return svg
+        figure.savefig(svg_file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    svg_text = svg_file.getvalue()
+
+    # Keep the element alone, without ids, which all figures share, and without a style, which would be the page's.
+    svg_text = svg_text[svg_text.index("<svg") :]
+    svg_text = re.sub(r"<metadata>.*?</metadata>", "", svg_text, flags=re.DOTALL)
+    svg_text = re.sub(r' id="\w+_\d+"', "", svg_text)
+    svg_text = re.sub(r"<style.*?</style>", "", svg_text, flags=re.DOTALL)
+
+    # Take font and colors from the page.
+    svg_text = re.sub(r"font-family: [^;]*; ?", "", svg_text)
+    for hex_color, css_variable in _PAGE_COLORS.items():
+        svg_text = svg_text.replace(hex_color, f"var(--{css_variable})")
+    return svg_text

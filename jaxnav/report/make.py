@@ -1,53 +1,236 @@
-"""The report of a run."""
+"""The report of a run: measures the run, turns the measurements into sections, and renders the page.
 
+`make_report` is the entry point. Below it stand the sections of the page, one function each.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 from rich.console import Console
 
 from jaxnav.errors import InputError
-from jaxnav.report.gather import Options, measure
-from jaxnav.report.page import render
-from jaxnav.report.sections import make_sections
-from jaxnav.runs.directory import Run
+from jaxnav.evaluation.report import accounting_table, difference_table, results_table, row_label
+from jaxnav.report.charts import (
+    differences_chart,
+    gap_chart,
+    leads_chart,
+    learning_chart,
+    similarity_chart,
+    thresholds_chart,
+)
+from jaxnav.report.measure import ReportOptions, ShiftMeasurements, measure_shift
+from jaxnav.report.page import Section, render_page, to_text_table
+from jaxnav.runs.run import Run
+from jaxnav.study.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
+from jaxnav.study.records import GapCurves, GapLine, GapPanel
+
+#: Report of an evaluation, as in JSON.
+_Report = dict[str, Any]
+
+_RESULTS_TEXT = (
+    "SR is the share of episodes that end with Done where it succeeds, SPL weighs success by the shortest path, DTS is "
+    "the distance to the goal at the end. Brackets are 95 % intervals over training runs and scenes. At "
+    "shift 1 all categories have exchanged their places."
+)
+_ACCOUNT_TEXT = (
+    "The lead over agents that cannot know any layout, on the same episodes. Where the layout holds it is the value of "
+    "experience; where it is shifted, a negative lead is its cost. “Left” is the share of a lead that a removal "
+    "leaves."
+)
+_LEARNING_TEXT = "Success while training, in training scenes and in val scenes, and of the exported policies."
+_THRESHOLDS_TEXT = (
+    "sTDE removes experience where the layout gap exceeds the threshold ε. From ε = 1 on nothing is removed. Best "
+    "actions; bands are 95 % intervals."
+)
+_GAP_TEXT = (
+    "The gap D after each action, over the episodes that still run, with the belief updated by what is seen, "
+    "and frozen at the prior. Sampled actions; nothing is removed."
+)
+_SIMILARITY_TEXT = (
+    "Success of {row} against the similarity of the goal's surroundings to those in training: the cosine of its "
+    "expected co-occurrence in the scene and in the prior."
+)
 
 
-def make_report(run: Run, beside: Run | None, options: Options, console: Console) -> str:
+def make_report(run: Run, reference_run: Run | None, options: ReportOptions, console: Console) -> str:
     """Measure a run and return its page as HTML.
 
     Args:
       run: a finished run.
-      beside: a finished run of agents that cannot know any layout, in the same world; None for none.
-      options: what to measure.
-      console: tells of progress.
+      reference_run: a finished run of agents that cannot know any layout, in the same world; None for none.
+      options: options of the measurements.
+      console: receives messages about the progress.
 
     Raises:
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
-    _check(run, beside, options)
-    by_shift = {shift: measure(run, beside, shift, options, console) for shift in dict.fromkeys(options.shift)}
+    # Measure at each shift once, in the order given.
+    _check(run, reference_run, options)
+    by_shift: dict[float, ShiftMeasurements] = {}
+    for shift in dict.fromkeys(options.shift):
+        by_shift[shift] = measure_shift(run, reference_run, shift, options, console)
+
+    # The header states facts that are equal at all shifts, so that the first report serves.
     report = next(iter(by_shift.values())).results.report
-    about, first = report["run"], report["rows"][0]
-    facts = {
+    first_row = report["rows"][0]
+    run_facts = {
         "Run": run.config.run_dir.name,
         "Method": run.config.method,
         "Decision": run.config.decision,
-        "World": f"{first['world']}, {options.split}",
+        "World": f"{first_row['world']}, {options.split}",
         "Training runs": f"{run.config.seeds} of each arm",
-        "Steps": f"{about['steps_per_policy']:,} a policy",
-        "Episodes": f"{first['episodes']:,} at each shift",
-        "Made with": ", ".join(f"{name} {report['versions'][name]}" for name in ("jaxnav", "jax")),
+        "Steps": f"{report['run']['steps_per_policy']:,} a policy",
+        "Episodes": f"{first_row['episodes']:,} at each shift",
+        "Made with": f"jaxnav {report['versions']['jaxnav']}, jax {report['versions']['jax']}",
     }
-    title = f"{run.config.method.upper()} in {first['world']}"
+
+    # The sections compare the shifts; the replays, one player for each shift, follow the first section.
+    page_title = f"{run.config.method.upper()} in {first_row['world']}"
     sections = make_sections(run, by_shift, options.threshold)
-    return render(title, facts, sections, [each.replays for each in by_shift.values()])
+    replays_by_shift = [measurements.replays for measurements in by_shift.values()]
+    return render_page(page_title, run_facts, sections, replays_by_shift)
 
 
-def _check(run: Run, beside: Run | None, options: Options) -> None:
-    """Refuse in a second what would fail after minutes."""
+def _check(run: Run, reference_run: Run | None, options: ReportOptions) -> None:
+    """Refuse within a second options and runs that would fail after minutes."""
     if not options.shift:
         raise InputError("--shift: give at least one number")
     if options.replays < len(options.shift):
         raise InputError(f"--replays {options.replays}: give at least {len(options.shift)}, one for each shift")
+
+    # Loading the policies fails for unfinished runs.
     run.policies()
-    if beside is not None:
-        beside.policies()
-        if beside.config.task != run.config.task:
+    if reference_run is not None:
+        reference_run.policies()
+        if reference_run.config.task != run.config.task:
             raise InputError("--beside: has another task or detector than the run; train both with equal settings")
+
+
+def make_sections(run: Run, by_shift: Mapping[float, ShiftMeasurements], threshold: float) -> list[Section]:
+    """Return the sections of the page for which there are measurements.
+
+    Args:
+      run: the run.
+      by_shift: measurements by layout shift.
+      threshold: threshold of sTDE in the tables.
+    """
+    # Sections without measurements are None.
+    reports = {shift: measurements.results.report for shift, measurements in by_shift.items()}
+    optional_sections = [
+        _results_section(reports, threshold),
+        _account_section(by_shift, threshold),
+        _learning_section(run),
+        _thresholds_section(reports),
+        _gap_section(run, by_shift),
+        _similarity_section(by_shift),
+    ]
+    return [section for section in optional_sections if section is not None]
+
+
+def _results_section(reports: Mapping[float, _Report], threshold: float) -> Section:
+    # The tables show one threshold; those with every threshold are folded.
+    short_reports: dict[float, _Report] = {}
+    text_tables = []
+    folded_tables = []
+    all_notes = []
+    for shift, report in reports.items():
+        short_report = _at_threshold(report, threshold)
+        short_reports[shift] = short_report
+        shift_title = f"Shift {shift:g}"
+        text_tables.append(to_text_table(shift_title, results_table(short_report)))
+        if short_report["differences"]:
+            folded_tables.append(to_text_table(f"{shift_title}, paired differences", difference_table(short_report)))
+        if len(short_report["rows"]) < len(report["rows"]):
+            folded_tables.append(to_text_table(f"{shift_title}, every threshold", results_table(report)))
+        all_notes += report["notes"]
+
+    # The chart compares shifts, so that all of them need paired differences.
+    section_charts = ()
+    if all(report["differences"] for report in reports.values()):
+        section_charts = (differences_chart(short_reports),)
+
+    # Evaluations of one run repeat most of their notes.
+    unique_notes = tuple(dict.fromkeys(all_notes))
+    return Section("Results", _RESULTS_TEXT, section_charts, tuple(text_tables), tuple(folded_tables), unique_notes)
+
+
+def _at_threshold(report: _Report, threshold: float) -> _Report:
+    """Return a report with one threshold of sTDE alone."""
+    # Entries without a threshold belong to variants other than sTDE, and stay.
+    selected_entries: _Report = {"rows": [], "differences": []}
+    for name, entries in selected_entries.items():
+        for report_entry in report[name]:
+            if report_entry["epsilon"] in (None, threshold):
+                entries.append(report_entry)
+    return report | selected_entries
+
+
+def _account_section(by_shift: Mapping[float, ShiftMeasurements], threshold: float) -> Section | None:
+    # The section needs a run of agents without experience, which was measured at all shifts or at none.
+    accounts = {}
+    text_tables = []
+    for shift, measurements in by_shift.items():
+        if measurements.account is None:
+            return None
+        # Keep the leads of rows that the tables show.
+        short_report = _at_threshold(measurements.results.report, threshold)
+        row_labels = set(map(row_label, short_report["rows"]))
+        leads = [lead for lead in measurements.account if lead.variant in row_labels]
+        accounts[shift] = leads
+        text_tables.append(to_text_table(f"Shift {shift:g}", accounting_table(leads)))
+    return Section("What experience is worth", _ACCOUNT_TEXT, (leads_chart(accounts),), tuple(text_tables))
+
+
+def _learning_section(run: Run) -> Section | None:
+    return Section("Learning", _LEARNING_TEXT, (learning_chart(run),)) if run.log() else None
+
+
+def _thresholds_section(reports: Mapping[float, _Report]) -> Section | None:
+    # Agents without layout weights have no threshold, at any shift.
+    first_report = next(iter(reports.values()))
+    if not any(table_row["variant"] == "stde" for table_row in first_report["rows"]):
+        return None
+    return Section("Thresholds", _THRESHOLDS_TEXT, (thresholds_chart(reports),))
+
+
+def _gap_section(run: Run, by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:
+    # Streamed scenes and agents without the layout have no gap, at any shift.
+    traces_by_shift = []
+    for measurements in by_shift.values():
+        if measurements.gaps is not None:
+            traces_by_shift.append(measurements.gaps)
+    if not traces_by_shift:
+        return None
+    traces_by_shift = truncate_to_shortest(traces_by_shift)
+
+    # A curve for each shift and each way of updating the belief.
+    gap_lines = []
+    for shift, gap_traces in zip(by_shift, traces_by_shift, strict=True):
+        mean_gaps = mean_by_step(gap_traces)
+        for belief, belief_index in BELIEFS.items():
+            gap_lines.append(GapLine(shift, belief, mean_gaps.select(0, belief_index)))
+    gap_panel = GapPanel(run.config.layout.setting, tuple(gap_lines))
+
+    # Share of the episodes that still run: [shifts, T].
+    running_shares = []
+    for gap_traces in traces_by_shift:
+        running_shares.append(gap_traces.running.mean(axis=(0, 1)))
+    running = np.stack(running_shares)
+    curves = GapCurves(tuple(range(running.shape[1])), running, (gap_panel,), ())
+    return Section("The gap", _GAP_TEXT, (gap_chart(curves),))
+
+
+def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:
+    # Streamed scenes have no similarity.
+    similarity_by_shift = {}
+    for shift, measurements in by_shift.items():
+        if measurements.similarity is not None:
+            similarity_by_shift[shift] = measurements.similarity
+    if not similarity_by_shift:
+        return None
+
+    # The text names the row that the chart shows.
+    first_report = next(iter(by_shift.values())).results.report
+    section_text = _SIMILARITY_TEXT.format(row=row_label(first_report["rows"][0]))
+    return Section("Success and similarity", section_text, (similarity_chart(similarity_by_shift),))

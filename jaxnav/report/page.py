@@ -1,4 +1,8 @@
-"""The page: sections and replays as one HTML file that needs nothing else."""
+"""The report's page: sections of text, tables and charts, and replays, as one self-contained HTML file.
+
+`render_page` renders the page from `Section`s, which hold `TextTable`s and `Chart`s, and from the data of the replays.
+The page's layout, style and scripts are the files next to this module.
+"""
 
 import base64
 import dataclasses
@@ -9,86 +13,169 @@ import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
-from jaxnav.report.content import Chart, Section, Table
+from rich.table import Table as ConsoleTable
+
 from jaxnav.report.replays import Replays
 
 
-def render(title: str, facts: Mapping[str, str], sections: Sequence[Section], replays: Sequence[Replays]) -> str:
+class TextTable(NamedTuple):
+    """Table of texts.
+
+    Attributes:
+      title: title of the table.
+      header: names of the columns.
+      rows: cells of each row; a row of one cell is the heading of the rows after it.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+class Chart(NamedTuple):
+    """Chart as an SVG element, and its description in words."""
+
+    svg: str
+    caption: str
+
+
+class Section(NamedTuple):
+    """Section of the page, with its parts in the order of the page.
+
+    Attributes:
+      title: title of the section.
+      about: introduction.
+      charts: charts.
+      tables: tables below the charts.
+      folded: tables that the reader can open.
+      notes: notes below all tables.
+    """
+
+    title: str
+    about: str
+    charts: tuple[Chart, ...] = ()
+    tables: tuple[TextTable, ...] = ()
+    folded: tuple[TextTable, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def to_text_table(title: str, table: ConsoleTable) -> TextTable:
+    """Return a table of the terminal as texts, with equal cells."""
+    # Rich stores the cells by column.
+    column_headers = []
+    column_cells = []
+    for column in table.columns:
+        column_headers.append(str(column.header))
+        column_cells.append(list(map(str, column.cells)))
+
+    # A row whose other cells are empty heads the rows below it.
+    table_rows = []
+    for row_cells in zip(*column_cells, strict=True):
+        is_heading = not any(row_cells[1:])
+        table_rows.append(row_cells[:1] if is_heading else row_cells)
+    return TextTable(title, tuple(column_headers), tuple(table_rows))
+
+
+def render_page(title: str, facts: Mapping[str, str], sections: Sequence[Section], replays: Sequence[Replays]) -> str:
     """Return the page as HTML.
 
-    Every text is escaped. The script is allowed by its digest alone, and nothing may be loaded.
+    Every text is escaped. The script is allowed by its digest alone, and the page can load nothing.
 
     Args:
-      title: of the page.
-      facts: about the run, by name.
-      sections: in order; the replays follow the first.
-      replays: at each shift.
+      title: title of the page.
+      facts: facts about the run, by name.
+      sections: sections in order; the replays follow the first.
+      replays: replays at each shift.
     """
-    script = _file("draw.js") + _file("player.js")
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    rendered = [_section(section) for section in sections]
-    titles = [sections[0].title, "Replays", *(section.title for section in sections[1:])]
-    return Template(_file("page.html")).substitute(
+    # The browser runs the script only if its digest is that of the page's policy.
+    page_script = _read_resource("draw.js") + _read_resource("player.js")
+    script_digest = base64.b64encode(hashlib.sha256(page_script.encode()).digest()).decode()
+
+    # The header: facts about the run, and links to the sections.
+    fact_items = []
+    for fact_name, fact_text in facts.items():
+        fact_items.append(f"<div>{_tag('dt', html.escape(fact_name))}{_tag('dd', html.escape(fact_text))}</div>")
+    section_titles = [section.title for section in sections]
+    section_titles.insert(1, "Replays")
+    section_links = []
+    for section_title in section_titles:
+        section_links.append(f'<a href="#{_anchor(section_title)}">{html.escape(section_title)}</a>')
+
+    # The template puts the replays between the first section and the rest.
+    rendered_sections = list(map(_render_section, sections))
+    return Template(_read_resource("page.html")).substitute(
         title=html.escape(title),
-        policy=f"sha256-{digest}",
-        style=_file("page.css"),
-        script=script,
-        data=_embedded([dataclasses.asdict(each) for each in replays]),
-        facts="".join(
-            f"<div>{_tag('dt', html.escape(name))}{_tag('dd', html.escape(fact))}</div>" for name, fact in facts.items()
-        ),
-        links="".join(f'<a href="#{_anchor(each)}">{html.escape(each)}</a>' for each in titles),
-        first=rendered[0],
-        others="\n".join(rendered[1:]),
+        policy=f"sha256-{script_digest}",
+        style=_read_resource("page.css"),
+        script=page_script,
+        data=_embed_json(list(map(dataclasses.asdict, replays))),
+        facts="".join(fact_items),
+        links="".join(section_links),
+        first=rendered_sections[0],
+        others="\n".join(rendered_sections[1:]),
     )
 
 
-def _section(section: Section) -> str:
-    parts = [_tag("h2", html.escape(section.title)), _tag("p", html.escape(section.about), "about")]
-    parts += [_chart(chart) for chart in section.charts]
-    parts += [_table(table) for table in section.tables]
-    parts += [
-        f"<details><summary>{html.escape(each.title)}</summary>{_table(each)}</details>" for each in section.folded
-    ]
-    parts += [_tag("p", html.escape(note), "note") for note in section.notes]
-    return f'<section id="{_anchor(section.title)}">{"".join(parts)}</section>'
+def _render_section(section: Section) -> str:
+    # The heading and the introduction, then charts and tables.
+    html_parts = [_tag("h2", html.escape(section.title)), _tag("p", html.escape(section.about), "about")]
+    html_parts += map(_render_chart, section.charts)
+    html_parts += map(_render_table, section.tables)
+
+    # Details are closed until the reader opens them.
+    for table in section.folded:
+        html_parts.append(f"<details><summary>{html.escape(table.title)}</summary>{_render_table(table)}</details>")
+    for note in section.notes:
+        html_parts.append(_tag("p", html.escape(note), "note"))
+    return f'<section id="{_anchor(section.title)}">{"".join(html_parts)}</section>'
 
 
-def _chart(chart: Chart) -> str:
-    label = html.escape(chart.caption)
-    return f'<figure class="chart" role="img" aria-label="{label}">{chart.svg}</figure>'
+def _render_chart(chart: Chart) -> str:
+    chart_label = html.escape(chart.caption)
+    return f'<figure class="chart" role="img" aria-label="{chart_label}">{chart.svg}</figure>'
 
 
-def _table(table: Table) -> str:
-    head = "".join(_tag("th", html.escape(cell)) for cell in table.header)
-    body = "".join(_line(row, len(table.header)) for row in table.rows)
-    caption = _tag("caption", html.escape(table.title))
-    return f'<div class="table"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+def _render_table(table: TextTable) -> str:
+    table_caption = _tag("caption", html.escape(table.title))
+    header_row = _render_cells("th", table.header)
+    body_rows = [_render_row(row, len(table.header)) for row in table.rows]
+
+    # The box around a table scrolls where the page is narrower.
+    return (
+        f'<div class="table"><table>{table_caption}<thead><tr>{header_row}</tr></thead>'
+        f"<tbody>{''.join(body_rows)}</tbody></table></div>"
+    )
 
 
-def _line(row: Sequence[str], width: int) -> str:
-    first, *others = (html.escape(cell) for cell in row)
-    if not others:
-        return f'<tr class="group"><th colspan="{width}">{first}</th></tr>'
-    return f"<tr><th>{first}</th>{''.join(_tag('td', cell) for cell in others)}</tr>"
+def _render_row(row: Sequence[str], num_columns: int) -> str:
+    # A single cell is a heading across all columns; otherwise the first cell names the row.
+    first_cell, *other_cells = row
+    if not other_cells:
+        return f'<tr class="group"><th colspan="{num_columns}">{html.escape(first_cell)}</th></tr>'
+    return f"<tr>{_render_cells('th', [first_cell])}{_render_cells('td', other_cells)}</tr>"
 
 
-def _tag(name: str, content: str, kind: str = "") -> str:
-    attribute = f' class="{kind}"' if kind else ""
-    return f"<{name}{attribute}>{content}</{name}>"
+def _render_cells(name: str, cells: Sequence[str]) -> str:
+    """Return cells as elements of one name, `th` or `td`."""
+    return "".join(_tag(name, html.escape(cell)) for cell in cells)
+
+
+def _tag(name: str, content: str, css_class: str = "") -> str:
+    class_attribute = f' class="{css_class}"' if css_class else ""
+    return f"<{name}{class_attribute}>{content}</{name}>"
 
 
 def _anchor(title: str) -> str:
     return re.sub(r"\W+", "-", title.lower())
 
 
-def _embedded(data: Any) -> str:
+def _embed_json(data: Any) -> str:
     """Return JSON that no HTML parser takes for a tag or a comment."""
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    json_text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return json_text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _file(name: str) -> str:
+def _read_resource(name: str) -> str:
     return resources.files("jaxnav.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,31 +1,137 @@
-"""Replays: the same episodes by several agents, as JSON."""
+"""Replays: episodes of an evaluation, played by several agents, as data for the page's player.
 
+`make_replays` chooses the episodes in which most agents differ, plays them with every `ReplayAgent`, and returns
+`Replays`: a `ScenePlan` for each scene with the views that are replayed, and a `ReplayTrace` for each episode and
+agent. The page embeds these dataclasses as JSON, so that their fields are the names that its script reads.
+
+Lengths are whole centimetres. Rectangles are [x, z, width, depth], from their lowest corner. Arrays of shares are
+packed, see `pack_shares`.
+"""
+
+import base64
 import dataclasses
 from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import softmax
 
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.playback import Trace
-from jaxnav.report.plans import Plan, make_plan, pack
-from jaxnav.report.players import Player, choose, compare
-from jaxnav.runs.replay import replay, scene_named
-from jaxnav.scenes.tables.detector import MAX_RANGE
+from jaxnav.evaluation.playback import EpisodeTrace
+from jaxnav.evaluation.report import Variant
+from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.runs.evaluate import find_scene, replay_episodes
+from jaxnav.runs.policies import Policies
+from jaxnav.runs.worlds import CompiledWorld
+from jaxnav.scenes.categories import category_ids
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, detected_positions
+from jaxnav.scenes.tables.visibility import cell_centres, cover_with_rectangles
 from jaxnav.scenes.task import NUM_ACTIONS
+from jaxnav.viz.scene import FULL_SHADE_HEIGHT, view_cone
+
+#: Pairs of roles to show side by side, by the difference between them.
+ROLE_PAIRS = {
+    "Removal": ("layout", "stde"),
+    "Experience": ("layout", "without"),
+    "Layout weights": ("layout", "baseline"),
+}
+
+Rectangle = tuple[int, int, int, int]
+
+
+class ReplayAgent(NamedTuple):
+    """Agent of the replays, with its results in E episodes of the evaluation.
+
+    Attributes:
+      role: the variant of its row, or `without` for agents without experience.
+      name: name of the row in tables.
+      policies: policies of its run.
+      world: compiled scenes, equal for all agents.
+      row: row of the evaluation, with best actions.
+      success: bool [E], success of the first seed.
+      length: int [E], actions of the first seed.
+    """
+
+    role: Variant | Literal["without"]
+    name: str
+    policies: Policies
+    world: CompiledWorld
+    row: EvaluationRow
+    success: np.ndarray
+    length: np.ndarray
+
+    def differs(self, other: "ReplayAgent") -> np.ndarray:
+        """Return in which episodes the other agent has another result or length, bool [E]."""
+        return (self.success != other.success) | (self.length != other.length)
 
 
 @dataclasses.dataclass(frozen=True)
-class Course:
-    """Hold an episode as one agent plays it, T steps.
+class Floor:
+    """Standable floor of a type of room; without a name, outside of rooms."""
+
+    name: str
+    cells: list[Rectangle]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanView:
+    """View from one pose.
+
+    Attributes:
+      x: world x of the agent.
+      z: world z of the agent.
+      yaw: degrees clockwise from +z.
+      cone: packed, the depths of every other ray of the view cone from left to right, as shares of `MAX_RANGE`.
+      seen: index of the category, x, z and confidence in percent of each detection, the surest first.
+    """
+
+    x: int
+    z: int
+    yaw: float
+    cone: str
+    seen: list[tuple[int, int, int, int]]
+
+
+@dataclasses.dataclass(frozen=True)
+class ScenePlan:
+    """Plan of a scene from above, with views.
+
+    Attributes:
+      name: name of the scene.
+      room: type of room of the scene.
+      box: area of the plan.
+      floors: floor of each type of room.
+      walls: walls, which end the sight.
+      furniture: rectangle and height from 0 to 100 of every object, the highest last.
+      objects: index of the category, x and z of each object of a category.
+      views: views that are replayed.
+    """
+
+    name: str
+    room: str
+    box: Rectangle
+    floors: list[Floor]
+    walls: list[Rectangle]
+    furniture: list[tuple[int, ...]]
+    objects: list[tuple[int, int, int]]
+    views: list[PlanView]
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayTrace:
+    """Episode of T steps as one agent plays it, with K categories and A actions.
 
     Attributes:
       views: [T], indices into the plan's views.
-      actions: [T].
-      success: whether it ended with Done where that succeeds.
-      gap, weight: packed [T], layout gap, and weight of the logits that are removed.
+      actions: [T], actions.
+      success: True if the episode ended with Done where Done succeeds.
+      gap: packed [T], layout gap.
+      weight: packed [T], weight of the logits that are removed.
       layout: packed [T, K], weights towards the goal (eq. 7), at most 1; empty without the layout.
-      chances: packed [T, 3, A], of each action: of the factual, the counterfactual and the corrected logits; empty
+      chances: packed [T, 3, A], probabilities by the factual, the counterfactual and the corrected logits; empty
         where the policy chooses no actions.
     """
 
@@ -39,39 +145,39 @@ class Course:
 
 
 @dataclasses.dataclass(frozen=True)
-class Episode:
-    """Hold an episode of the replays.
+class ReplayEpisode:
+    """Episode of the replays.
 
     Attributes:
-      plan: index of its scene's plan.
+      plan: index of the plan of its scene.
       goal: index of the category to search for.
-      best: L*, actions.
-      courses: of each player.
+      best: length L* of a shortest path, actions.
+      courses: trace of each agent.
     """
 
     plan: int
     goal: int
     best: int
-    courses: list[Course]
+    courses: list[ReplayTrace]
 
 
 @dataclasses.dataclass(frozen=True)
 class Replays:
-    """Hold the replays at one layout shift.
+    """Replays of P agents at one layout shift.
 
     Attributes:
-      shift: of the layout.
-      split: of the scenes.
-      categories: names.
-      players: names; what tables call the rows.
-      comparisons: pairs of players by name, what is with and what is without; the first is shown first.
-      thresholds: of sTDE, by player; None where nothing is removed.
-      differ: [P, P], in how many of the evaluation's episodes two players end otherwise or at another step.
-      evaluated: number of these.
-      field_of_view: degrees, horizontal.
-      reach: centimetres, of the view cone.
-      plans: of the scenes.
-      episodes: those in which players differ first.
+      shift: layout shift.
+      split: split of the scenes.
+      categories: names of the categories.
+      players: names of the agents, as in tables.
+      comparisons: pairs of agents by the difference between them, with it and without; the page shows the first pair.
+      thresholds: threshold of sTDE of each agent; None where nothing is removed.
+      differ: [P, P], number of evaluated episodes in which two agents differ in result or length.
+      evaluated: number of evaluated episodes.
+      field_of_view: horizontal field of view, degrees.
+      reach: length of the view cone, centimetres.
+      plans: plans of the scenes.
+      episodes: episodes, those in which most agents differ first.
     """
 
     shift: float
@@ -84,68 +190,242 @@ class Replays:
     evaluated: int
     field_of_view: float
     reach: int
-    plans: list[Plan]
-    episodes: list[Episode]
+    plans: list[ScenePlan]
+    episodes: list[ReplayEpisode]
 
 
-def make_replays(players: Sequence[Player], episodes: EpisodeList, count: int, shift: float, split: str) -> Replays:
-    """Play chosen episodes by every player.
+def make_replays(agents: Sequence[ReplayAgent], episodes: EpisodeList, count: int, shift: float, split: str) -> Replays:
+    """Choose episodes of an evaluation and play them with every agent.
 
     Args:
-      players: at least one; their results are those of `episodes`.
-      episodes: of an evaluation, of the first bank.
-      count: of episodes to replay.
-      shift, split: of the scenes.
+      agents: at least one, with their results in `episodes`.
+      episodes: evaluated episodes of the first bank.
+      count: number of episodes to replay.
+      shift: layout shift of the scenes.
+      split: split of the scenes.
     """
-    world = players[0].world
-    bank, rules = world.banks[0], world.banks[0].task.rules
-    chosen = episodes.take(choose(players, count))
-    played = [replay(player.policies, player.world, chosen, player.row) for player in players]
-    scenes = np.unique(chosen.scene)
-    poses = [
-        np.unique(np.concatenate([traces[e].pose for traces in played for e in np.flatnonzero(chosen.scene == scene)]))
-        for scene in scenes
-    ]
-    of = np.searchsorted(scenes, chosen.scene)
+    world = agents[0].world
+    bank = world.banks[0]
+
+    # Play the selected episodes anew, since the evaluation stores results, not traces.
+    selected_episodes = episodes.take(select_episodes(agents, count))
+    traces_by_agent = []
+    for agent in agents:
+        traces_by_agent.append(replay_episodes(agent.policies, agent.world, selected_episodes, agent.row))
+
+    # One plan for each scene, with a view from every pose that any agent visits there.
+    scenes = np.unique(selected_episodes.scene)
+    scene_plans = []
+    poses_by_plan = []
+    for scene in scenes:
+        episodes_in_scene = np.flatnonzero(selected_episodes.scene == scene)
+        visited_poses = []
+        for traces in traces_by_agent:
+            for episode_index in episodes_in_scene:
+                visited_poses.append(traces[episode_index].pose)
+        poses = np.unique(np.concatenate(visited_poses))
+        poses_by_plan.append(poses)
+        scene_plans.append(make_plan(find_scene(world, bank.names[scene]), bank, scene, poses))
+
+    # One trace for each episode and agent.
+    plan_of_episode = np.searchsorted(scenes, selected_episodes.scene)
+    replay_episode_list = []
+    for episode_index in range(len(selected_episodes.goal)):
+        plan = int(plan_of_episode[episode_index])
+        courses = []
+        for agent, traces in zip(agents, traces_by_agent, strict=True):
+            courses.append(
+                _make_trace(traces[episode_index], poses_by_plan[plan], has_layout=agent.row.arm == "layout")
+            )
+        best_length = int(selected_episodes.best_length[episode_index])
+        replay_episode_list.append(
+            ReplayEpisode(plan, int(selected_episodes.goal[episode_index]), best_length, courses)
+        )
+
+    # Names, thresholds and differences stand in the order of the agents.
     return Replays(
         shift=shift,
         split=split,
         categories=list(bank.task.categories),
-        players=[player.name for player in players],
-        comparisons=compare(players),
-        thresholds=[player.row.epsilon for player in players],
-        differ=[[int(a.differs(b).sum()) for b in players] for a in players],
+        players=[agent.name for agent in agents],
+        comparisons=pair_agents(agents),
+        thresholds=[agent.row.epsilon for agent in agents],
+        differ=[_count_differing_episodes(agent, agents) for agent in agents],
         evaluated=len(episodes.goal),
-        field_of_view=rules.field_of_view[0],
+        field_of_view=bank.task.rules.field_of_view[0],
         reach=round(100 * MAX_RANGE),
-        plans=[
-            make_plan(scene_named(world, bank.names[scene]), bank, scene, seen)
-            for scene, seen in zip(scenes, poses, strict=True)
-        ],
-        episodes=[
-            Episode(
-                int(of[e]),
-                int(chosen.goal[e]),
-                int(chosen.best_length[e]),
-                [
-                    _course(traces[e], poses[of[e]], player.row.arm == "layout")
-                    for traces, player in zip(played, players, strict=True)
-                ],
-            )
-            for e in range(len(chosen.goal))
-        ],
+        plans=scene_plans,
+        episodes=replay_episode_list,
     )
 
 
-def _course(trace: Trace, poses: np.ndarray, layout: bool) -> Course:
-    how = trace.inferred
-    logits = np.stack([how.factual, how.counterfactual, how.corrected], axis=1)
-    return Course(
-        views=np.searchsorted(poses, trace.pose).tolist(),
+def select_episodes(agents: Sequence[ReplayAgent], count: int) -> np.ndarray:
+    """Select the episodes to replay.
+
+    Episodes in which more pairs of agents differ come first, then those that come first in the list.
+
+    Args:
+      agents: at least one.
+      count: number of episodes, or as many as there are.
+
+    Returns:
+      Indices in this order.
+    """
+    # Number of ordered pairs of agents that differ in each episode, [E].
+    num_pairs = np.zeros_like(agents[0].length)
+    for agent in agents:
+        for other in agents:
+            num_pairs = num_pairs + agent.differs(other).astype(int)
+    return np.argsort(-num_pairs, kind="stable")[:count]
+
+
+def pair_agents(agents: Sequence[ReplayAgent]) -> dict[str, tuple[int, int]]:
+    """Return the indices of pairs of agents by the difference between them, as `ROLE_PAIRS`."""
+    # Agents by role; a role can be missing, as without a reference run.
+    index_by_role = {}
+    for index, agent in enumerate(agents):
+        index_by_role[agent.role] = index
+
+    # The page shows the agents of a pair in the order of `ROLE_PAIRS`.
+    role_pairs = {}
+    for name, (first_role, second_role) in ROLE_PAIRS.items():
+        if first_role in index_by_role and second_role in index_by_role:
+            role_pairs[name] = (index_by_role[first_role], index_by_role[second_role])
+    return role_pairs
+
+
+def _count_differing_episodes(agent: ReplayAgent, others: Sequence[ReplayAgent]) -> list[int]:
+    return [int(agent.differs(other).sum()) for other in others]
+
+
+def _make_trace(trace: EpisodeTrace, plan_poses: np.ndarray, has_layout: bool) -> ReplayTrace:
+    """Return a trace as data of the page.
+
+    Args:
+      trace: trace of an episode.
+      plan_poses: sorted poses of the views of the plan.
+      has_layout: True for agents with layout weights.
+    """
+    # Logits of the three inferences, [T, 3, A].
+    inferred = trace.inferred
+    logits = np.stack([inferred.factual, inferred.counterfactual, inferred.corrected], axis=1)
+
+    # Policies that choose among other things than actions have no probabilities to show.
+    chooses_actions = logits.shape[-1] == NUM_ACTIONS
+    return ReplayTrace(
+        views=np.searchsorted(plan_poses, trace.pose).tolist(),
         actions=trace.action.tolist(),
         success=trace.success,
-        gap=pack(trace.gap),
-        weight=pack(np.asarray(how.weight)),
-        layout=pack(np.asarray(how.layout)) if layout else "",
-        chances=pack(softmax(logits, axis=-1)) if logits.shape[-1] == NUM_ACTIONS else "",
+        gap=pack_shares(trace.gap),
+        weight=pack_shares(np.asarray(inferred.weight)),
+        layout=pack_shares(np.asarray(inferred.layout)) if has_layout else "",
+        chances=pack_shares(softmax(logits, axis=-1)) if chooses_actions else "",
     )
+
+
+def make_plan(scene: Scene, bank: Bank, index: int, poses: np.ndarray) -> ScenePlan:
+    """Return the plan of a scene with views from some poses.
+
+    Args:
+      scene: scene with at least one standable cell.
+      bank: tables of the scene.
+      index: index of the scene in the bank.
+      poses: int [V], poses of the bank in this scene.
+    """
+    # Furniture, the highest last, as rectangles with a shade.
+    x, y, z, size_x, size_y, size_z = scene.boxes.T
+    box_top = y + size_y / 2
+    height = np.rint(100 * np.clip(box_top / FULL_SHADE_HEIGHT, 0, 1)).astype(int)
+    boxes = _to_centimetres(np.stack([x - size_x / 2, z - size_z / 2, size_x, size_z], axis=-1))
+    furniture = []
+    for box_index in np.argsort(box_top):
+        furniture.append((*boxes[box_index].tolist(), int(height[box_index])))
+
+    # Objects of categories.
+    object_places = _to_centimetres(scene.boxes[:, [0, 2]]).tolist()
+    object_list = []
+    for category, place in zip(category_ids(scene.types, bank.task.categories), object_places, strict=True):
+        if category >= 0:
+            object_list.append((category, *place))
+
+    # Views from the poses.
+    # A pose of the bank holds the cell, counted over all scenes.
+    centres = cell_centres(scene, standable_cells(scene.reach))
+    views = []
+    for pose in poses:
+        cell, _, _ = bank.task.rules.split_pose(int(pose))
+        views.append(_make_view(scene, bank, int(pose), centres[cell - bank.first_cell[index]]))
+
+    low, high = scene_extent(scene)
+    return ScenePlan(
+        name=scene.name,
+        room=scene.room_type,
+        box=tuple(_to_centimetres(np.concatenate([low, high - low])).tolist()),
+        floors=_make_floors(scene),
+        walls=_to_rectangles(scene, scene.walls),
+        furniture=furniture,
+        objects=object_list,
+        views=views,
+    )
+
+
+def _make_floors(scene: Scene) -> list[Floor]:
+    """Return the standable floor outside of rooms, then that of each type of room."""
+    # Cells of each type of room, and those in any room: bool [nz, nx].
+    cells_by_type: dict[str, np.ndarray] = {}
+    cells_in_rooms = np.zeros_like(scene.reach)
+    for room in sorted(scene.rooms, key=lambda room: room.type):
+        cells_by_type[room.type] = cells_by_type.get(room.type, False) | room.cells
+        cells_in_rooms |= room.cells
+
+    # The agent cannot stand everywhere in a room.
+    floors = [Floor("", _to_rectangles(scene, scene.reach & ~cells_in_rooms))]
+    for room_type, cells in cells_by_type.items():
+        floors.append(Floor(room_type, _to_rectangles(scene, cells & scene.reach)))
+    return floors
+
+
+def _make_view(scene: Scene, bank: Bank, pose: int, place: np.ndarray) -> PlanView:
+    """Return the view from a pose of the bank at a place [2], world (x, z)."""
+    # The view cone as depths, [41]: every other ray is enough for the page.
+    rules = bank.task.rules
+    _, heading, _ = rules.split_pose(pose)
+    yaw = 360.0 / rules.headings * heading
+    cone_outline = view_cone(scene, rules, place, yaw)
+    cone_depth = np.linalg.norm(cone_outline[1::2] - place, axis=1) / MAX_RANGE
+
+    # Detections, the surest first.
+    detections = RowFormat(len(bank.task.categories)).detections(bank.rows[pose])
+    detected_categories = np.flatnonzero(detections[:, 0])
+    surest_first = sorted(detected_categories, key=lambda category: -int(detections[category, 0]))
+
+    # Bytes of confidence, from 0 to 255, become percent.
+    reported_points = detected_positions(detections[surest_first], place, rules.heading_directions()[heading])
+    confidence_percent = np.rint(detections[surest_first, 0] / 2.55).astype(int)
+    seen_objects = []
+    for category, reported_point, confidence in zip(
+        surest_first, _to_centimetres(reported_points).tolist(), confidence_percent, strict=True
+    ):
+        seen_objects.append((int(category), *reported_point, int(confidence)))
+
+    x, z = _to_centimetres(place).tolist()
+    return PlanView(x, z, yaw, pack_shares(cone_depth), seen_objects)
+
+
+def pack_shares(shares: np.ndarray) -> str:
+    """Return numbers from 0 to 1 as base64, a byte each; other numbers are clipped."""
+    return base64.b64encode(np.rint(255.0 * np.clip(shares, 0.0, 1.0)).astype(np.uint8).tobytes()).decode()
+
+
+def _to_rectangles(scene: Scene, mask: np.ndarray) -> list[Rectangle]:
+    """Return cells bool [nz, nx] as rectangles."""
+    # The origin is the centre of the first cell, hence the half.
+    z_low, x_low, z_high, x_high = cover_with_rectangles(mask).T
+    low_corner = np.asarray(scene.origin) + CELL_SIZE * (np.stack([x_low, z_low], axis=-1) - 0.5)
+    rectangle_size = CELL_SIZE * np.stack([x_high - x_low, z_high - z_low], axis=-1)
+    boxes = _to_centimetres(np.concatenate([low_corner, rectangle_size], axis=-1))
+    return list(map(tuple, boxes.tolist()))
+
+
+def _to_centimetres(metres: np.ndarray) -> np.ndarray:
+    return np.rint(100.0 * metres).astype(int)

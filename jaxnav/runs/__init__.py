@@ -1,1 +1,1 @@
-"""A training run: its configuration, directory, scenes, training and evaluation."""
+"""Training runs: configuration, directory, scenes, training, evaluation and exported policies."""

@@ -1,243 +1,476 @@
-"""The policies of a run: how they are read again."""
+"""Exported policies: writing them, checking them, and loading the policies of a run.
+
+A run exports one folder per arm and seed (`export_policy`). `load_policies` reads all of them as `Policies`, which the
+evaluation runs side by side; `read_exported_policy` reads a single folder. Policies that come with the package are
+found by name (`find_policy_folder`), and `load_policy_as_run` treats a single policy like a run with one seed.
+"""
 
 import dataclasses
+import functools
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.errors import InputError
-from jaxnav.gaps import Signs
-from jaxnav.layout import SETTINGS, Setting
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.adaptation import limited
-from jaxnav.policies.methods import Knowledge, find_method
-from jaxnav.policies.spatial_memory import SpatialMemory
-from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.gaps import CooccurrenceEvidence
+from jaxnav.layout import ESTIMATORS, EstimatorConfig
+from jaxnav.policies.adaptation import limit_inner_steps
+from jaxnav.policies.agent_loop import AgentLoop, Perception
+from jaxnav.policies.method import Knowledge, Percept
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import Params, bind, init_params
+from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.exports import check_arrays, check_knowledge
 from jaxnav.runs.worlds import CompiledWorld
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
-from jaxnav.store.export import load_params
-from jaxnav.store.manifest import differences
-from jaxnav.training.calibration import layout_priors
+from jaxnav.scenes.worlds import WORLDS
+from jaxnav.store.checkpoint import describe_arrays
+from jaxnav.store.export import POLICY_FILE, export_params, load_params
+from jaxnav.store.files import list_differences
+from jaxnav.training.calibration import Exploration, layout_priors
 
 #: Folder of the exported policies in a run directory.
-POLICIES = "policies"
-#: How the gap is measured: as a run's layout setting has it, or in another way.
-Gap = Literal["novelty", "evidence", "learned", "overdue", "clock"]
-#: Layout estimators that a run can be evaluated with, besides that of its training.
+POLICIES_DIR = "policies"
+#: Folder of the policies that come with the package, each in a folder of its own.
+PACKAGED_POLICIES = Path(__file__).parents[1] / "weights"
+#: Measures of the layout gap.
+GapName = Literal["novelty", "evidence", "learned", "overdue", "clock"]
+#: Layout estimators that an evaluation may use in place of the one from training.
 EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
 
 
 class Policies(NamedTuple):
-    """Hold the policies of a run, or some arms.
+    """Policies of a run: A arms with S seeds each.
 
     Attributes:
-      params: leaves [A S, ...], the S seeds of each arm after those of the arm before.
+      params: network parameters, leaves [A S, ...]; the seeds of an arm are adjacent.
       arms: names of the A arms.
-      knowledge: what was learned before training.
-      counts: float32 [rooms, K, K], that the layout priors were made of.
-      spec: what the policies are built from.
-      setting: of the layout estimator, as calibrated; None without the arm `layout`.
-      prior_steps: random steps that the priors were collected in.
-      task: that they were trained for.
-      inner_steps: by which they may adapt in an episode; None for the method's usual number.
-      without: what the policies that they hand over to are built from; None without any.
+      knowledge: priors and method knowledge from before training.
+      prior_counts: float32 [rooms, K, K], co-occurrence counts behind the layout priors.
+      spec: specification of the networks.
+      estimator_config: calibrated layout estimator; None without the arm `layout`.
+      prior_steps: random steps in which the counts were collected.
+      task: task of the training.
+      inner_steps: limit of adaptation steps in an episode; None for the method's default.
+      handover_spec: specification of the policies that take over when experience is removed; None without handover.
     """
 
     params: dict[str, Any]
     arms: tuple[str, ...]
     knowledge: Knowledge
-    counts: jax.Array
+    prior_counts: jax.Array
     spec: PolicySpec
-    setting: Setting | None
+    estimator_config: EstimatorConfig | None
     prior_steps: int
     task: Task
     inner_steps: int | None = None
-    without: PolicySpec | None = None
+    handover_spec: PolicySpec | None = None
 
     @property
-    def seeds(self) -> int:
-        """Return the number of seeds of each arm."""
+    def num_seeds(self) -> int:
+        """Number of seeds S of each arm."""
         return len(jax.tree.leaves(self.params)[0]) // len(self.arms)
 
-    def of(self, arm: str) -> dict[str, Any]:
-        """Return the parameters of an arm, leaves [S, ...]."""
-        first = self.seeds * self.arms.index(arm)
-        return jax.tree.map(lambda leaf: leaf[first : first + self.seeds], self.params)
+    def arm_params(self, arm: str) -> dict[str, Any]:
+        """Parameters of one arm, leaves [S, ...]."""
+        start = self.num_seeds * self.arms.index(arm)
+        return jax.tree.map(lambda leaf: leaf[start : start + self.num_seeds], self.params)
 
-    def estimating(self, name: EstimatorName | None, hold: bool = False) -> "Policies":
-        """Return these policies beside another layout estimator.
+    def with_estimator(self, name: EstimatorName | None, hold: bool = False) -> "Policies":
+        """Policies with another layout estimator.
 
         Args:
-          name: `paper` and `released` make weights too; the others measure the gap in another way and leave the
-            layout's weights; None leaves the estimator.
-          hold: the gap never falls within an episode.
+          name: `paper` and `released` replace the layout weights too; other names change only the measure of the gap;
+            None keeps the estimator.
+          hold: keep the gap from falling within an episode.
 
         Raises:
-          InputError: none of the policies uses the layout, or the run knows no signs for `learned` or `overdue`.
+          InputError: no policy uses the layout, or the run learned no co-occurrence evidence, which `learned` and
+            `overdue` need.
         """
         if name is None and not hold:
             return self
-        if self.setting is None:
-            asked = "--hold" if name is None else f"--setting {name}"
-            raise InputError(f"{asked}: needs policies with the layout; train a run with the arm `layout`")
-        if name in ("learned", "overdue") and self.knowledge.signs is None:
+
+        # Refuse an estimator for which the run has no data.
+        if self.estimator_config is None:
+            option = "--hold" if name is None else f"--setting {name}"
+            raise InputError(f"{option}: needs policies with the layout; train a run with the arm `layout`")
+        if name in ("learned", "overdue") and self.knowledge.cooccurrence is None:
             raise InputError(f"--setting {name}: the run learned no signs of another layout; train it anew")
-        setting, knowledge = self.setting, self.knowledge
+
+        # `paper` and `released` also build the priors in their own way.
+        estimator_config = self.estimator_config
+        knowledge = self.knowledge
         if name in ("paper", "released"):
-            setting = SETTINGS[name]
-            knowledge = knowledge._replace(layout=layout_priors(self.counts, setting))
+            estimator_config = ESTIMATORS[name]
+            knowledge = knowledge._replace(layout=layout_priors(self.prior_counts, estimator_config))
         elif name is not None:
-            setting = gap_settings(setting)[name]
-        return self._replace(setting=dataclasses.replace(setting, hold=hold or setting.hold), knowledge=knowledge)
+            estimator_config = estimators_by_gap(estimator_config)[name]
 
-    def adapting(self, steps: int | None) -> "Policies":
-        """Return these policies with so many inner steps in an episode.
+        estimator_config = dataclasses.replace(estimator_config, hold=hold or estimator_config.hold)
+        return self._replace(estimator_config=estimator_config, knowledge=knowledge)
 
-        0 switches their adaptation off, None leaves it.
-
-        Raises:
-          InputError: the method does not adapt, or not by so many steps.
-        """
-        if steps is None:
-            return self
-        adaptation = find_method(self.spec.method).adaptation
-        if adaptation is None:
-            name = self.spec.method
-            raise InputError(f"inner_steps is {steps}; method {name!r} does not adapt in an episode, leave it out")
-        limited(adaptation, steps)
-        return self._replace(inner_steps=steps)
-
-    def handing_over(self, without: "Policies") -> "Policies":
-        """Return pairs with policies that have no experience.
-
-        Removal of experience then leaves these. Parameters are {"agent": ..., "without": ...}.
+    def with_inner_steps(self, inner_steps: int | None) -> "Policies":
+        """Policies with another limit of adaptation steps in an episode.
 
         Args:
-          without: as many policies, of the same task.
+          inner_steps: the limit; 0 switches adaptation off, None keeps the limit.
 
         Raises:
-          InputError: they note, choose or remember otherwise than agents of `anonymous`.
+          InputError: the method does not adapt, or cannot take so many steps.
         """
-        method, other = find_method(self.spec.method), find_method(without.spec.method)
-        if other.tracker is not None or method.control.num_choices != other.control.num_choices:
+        if inner_steps is None:
+            return self
+        method = self.spec.method
+        if method.adaptation is None:
             raise InputError(
-                f"handing over: {self.spec.method!r} cannot hand over to {without.spec.method!r}; train a run with "
+                f"inner_steps is {inner_steps}; method {method.name!r} does not adapt in an episode, leave it out"
+            )
+        limit_inner_steps(method.adaptation, inner_steps)  # raises for an impossible number
+        return self._replace(inner_steps=inner_steps)
+
+    def with_handover_to(self, successors: "Policies") -> "Policies":
+        """Pairs of policies in which `successors` decide once experience is removed.
+
+        Args:
+          successors: equally many policies without experience, trained for the same task.
+
+        Returns:
+          Policies with parameters {"agent": ..., "without": ...}.
+
+        Raises:
+          InputError: the successors track, choose or remember in ways that the agents of `anonymous` do not.
+        """
+        method = self.spec.method
+        other_method = successors.spec.method
+        if other_method.tracker is not None or method.control.num_choices != other_method.control.num_choices:
+            raise InputError(
+                f"handing over: {method.name!r} cannot hand over to {other_method.name!r}; train a run with "
                 "--method anonymous, and let a method that chooses actions hand over to it"
             )
-        if self.spec.spatial_memory != without.spec.spatial_memory:
+        if self.spec.spatial_memory != successors.spec.spatial_memory:
             raise InputError("handing over: one of the runs has no spatial memory; train both alike")
-        return self._replace(params={"agent": self.params, "without": without.params}, without=without.spec)
+        return self._replace(params={"agent": self.params, "without": successors.params}, handover_spec=successors.spec)
 
-    def acting(self, world: CompiledWorld) -> Acting:
-        """Return how they act in the scenes of a world.
+    def make_agent_loop(self, world: CompiledWorld) -> AgentLoop:
+        """Agent loop of these policies in the scenes of a world.
 
         Raises:
-          InputError: their method cannot act there.
+          InputError: the method cannot act in these scenes.
         """
-        world.check(self.spec.method, self.knowledge)
-        return Acting(world.env, self.spec, self.setting, self.inner_steps, self.without)
+        # Some methods refuse scenes, such as those that are larger than their map.
+        world.check_method(self.spec.method, self.knowledge)
+        return AgentLoop(world.env, self.spec, self.estimator_config, self.inner_steps, self.handover_spec)
 
 
-def gap_settings(setting: Setting) -> dict[Gap, Setting]:
-    """Return the settings that measure the gap in each way.
+def estimators_by_gap(estimator_config: EstimatorConfig) -> dict[GapName, EstimatorConfig]:
+    """Variants of a layout estimator, one for each measure of the gap.
 
-    None changes the layout's weights. `clock` is what the gap of the released code comes to: all at once when something
-    new is seen, then gone in steps.
+    All variants keep the layout weights. `clock` reproduces the gap of the released code: the gap appears at once when
+    a new category is seen, and then vanishes in steps.
     """
-    settings: dict[Gap, Setting] = {gap: dataclasses.replace(setting, gap=gap) for gap in get_args(Gap)}
-    settings["clock"] = dataclasses.replace(settings["clock"], passes=SETTINGS["released"].passes)
-    return settings
+    gap_estimators: dict[GapName, EstimatorConfig] = {}
+    for gap_name in get_args(GapName):
+        gap_estimators[gap_name] = dataclasses.replace(estimator_config, gap=gap_name)
+    gap_estimators["clock"] = dataclasses.replace(gap_estimators["clock"], passes=ESTIMATORS["released"].passes)
+    return gap_estimators
 
 
-def load_policies(run: RunConfig, arms: Sequence[str] | None = None) -> Policies:
+def export_policy(
+    folder: Path,
+    config: RunConfig,
+    params: dict[str, Any],
+    knowledge: Knowledge,
+    estimator_config: EstimatorConfig | None,
+    explored: Exploration,
+) -> None:
+    """Export one policy, with everything that acting with it takes.
+
+    Args:
+      folder: target folder, made if missing.
+      config: configuration of the run.
+      params: network parameters.
+      knowledge: priors and method knowledge from before training.
+      estimator_config: layout estimator; None without the layout.
+      explored: random walks behind the priors.
+    """
+    # Settings, as JSON.
+    policy_spec = config.policy_spec(len(config.task.categories))
+    fields = policy_spec.to_json() | {
+        "categories": list(config.task.categories),
+        "task": dataclasses.asdict(config.task),
+        "layout": None if estimator_config is None else dataclasses.asdict(estimator_config),
+        "prior_steps": int(explored.steps),
+        "prior_poses": int(explored.poses),
+    }
+
+    # Arrays, by group.
+    tensors = {
+        "policy": jax.device_get(params),
+        "layout": {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.counts)},
+    }
+    if knowledge.method:
+        tensors["knowledge"] = jax.device_get(knowledge.method)
+    if knowledge.cooccurrence is not None:
+        log_odds, co_visibility = jax.device_get(knowledge.cooccurrence)
+        tensors["signs"] = {"odds": log_odds, "chance": co_visibility}
+
+    export_params(folder, tensors, fields)
+
+
+def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Policies:
     """Load the exported policies of a run.
 
     Args:
-      run: its settings.
+      config: configuration of the run.
       arms: names of the arms to load; None for all.
 
     Raises:
-      InputError: training has not finished, or left an arm out, or an export is damaged.
+      InputError: training has not finished, an arm was not trained, or an export is damaged.
     """
-    arms = tuple(run.arms if arms is None else arms)
-    if absent := [arm for arm in arms if arm not in run.arms]:
-        raise InputError(f"{run.run_dir}: was trained without the arm {absent[0]!r}; train one with all --arms")
-    folders = {arm: [run.run_dir / POLICIES / f"{arm}-{seed}" for seed in range(run.seeds)] for arm in arms}
-    if missing := [folder for paths in folders.values() for folder in paths if not folder.exists()]:
-        raise InputError(f"{missing[0]}: is missing, so training has not finished; train again with this --run-dir")
-    loaded = {arm: [load_params(folder) for folder in paths] for arm, paths in folders.items()}
-    told = "layout" if "layout" in arms else arms[-1]  # its last seed says what holds for all
-    where, (_, spec) = folders[told][-1], loaded[told][-1]
-    stacked = []
+    arms = tuple(config.arms if arms is None else arms)
     for arm in arms:
-        for folder, (tensors, other) in zip(folders[arm], loaded[arm], strict=True):
-            policies = _policies_of(folder, tensors, other)
-            stacked.append(policies.params)
-            if different := differences(other if arm == told else other | {"layout": spec["layout"]}, spec):
-                raise InputError(f"{folder}: is not of the run of {where}: {'; '.join(different)}; train the run anew")
-    policies = _policies_of(where, *loaded[told][-1])
-    policies = policies._replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked), arms=arms)
-    if different := differences(spec["task"], json.loads(json.dumps(dataclasses.asdict(run.task)))):
+        if arm not in config.arms:
+            raise InputError(f"{config.run_dir}: was trained without the arm {arm!r}; train one with all --arms")
+
+    # Look for all folders before reading any.
+    export_folders = []
+    for arm in arms:
+        for seed in range(config.seeds):
+            export_folders.append((arm, config.run_dir / POLICIES_DIR / f"{arm}-{seed}"))
+    for _, folder in export_folders:
+        if not folder.exists():
+            raise InputError(f"{folder}: is missing, so training has not finished; train again with this --run-dir")
+    loaded_exports = [load_params(folder) for _, folder in export_folders]
+
+    # The last seed of the layout arm (else of the last arm) is the reference: its settings hold for all.
+    reference_arm = "layout" if "layout" in arms else arms[-1]
+    reference_index = config.seeds * (arms.index(reference_arm) + 1) - 1
+    reference_folder = export_folders[reference_index][1]
+    reference_fields = loaded_exports[reference_index][1]
+
+    # Every policy must agree with the reference, except that baselines have no layout estimator.
+    parsed_policies = []
+    for (arm, folder), (tensors, fields) in zip(export_folders, loaded_exports, strict=True):
+        parsed_policies.append(_parse_export(folder, tensors, fields))
+        if arm != reference_arm:
+            fields = fields | {"layout": reference_fields["layout"]}
+        field_differences = list_differences(fields, reference_fields)
+        if field_differences:
+            raise InputError(
+                f"{folder}: is not of the run of {reference_folder}: {'; '.join(field_differences)}; train the run anew"
+            )
+
+    # The task may have changed with the version of jaxnav.
+    field_differences = list_differences(reference_fields["task"], _task_fields(config.task))
+    if field_differences:
         raise InputError(
-            f"{where}: was trained for another task than its run says (there != here): {'; '.join(different)}; "
-            "use the version that trained the run"
+            f"{reference_folder}: was trained for another task than its run says (there != here): "
+            f"{'; '.join(field_differences)}; use the version that trained the run"
         )
-    return policies
+
+    # Leaves [S, ...], the seeds of one arm after those of the other.
+    params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(policies.params for policies in parsed_policies))
+    return parsed_policies[reference_index]._replace(params=params, arms=arms)
 
 
-def read_export(folder: Path) -> Policies:
-    """Read one exported policy; its parameters have no leading axis.
-
-    Raises:
-      InputError: no export there, or a damaged one, or one of another version.
-    """
-    return _policies_of(folder, *load_params(folder))
-
-
-def _policies_of(where: Path, tensors: dict[str, Any], spec: dict[str, Any]) -> Policies:
-    """Return what an export says.
-
-    Its parameters have no leading axis.
+def read_exported_policy(folder: Path) -> Policies:
+    """Read one exported policy; its parameters have no leading axis, and `arms` is empty.
 
     Raises:
-      InputError: the spec is of another version, or the method cannot be found or lacks what it learned.
+      InputError: the export is missing, damaged or of another version.
     """
+    return _parse_export(folder, *load_params(folder))
+
+
+def _parse_export(folder: Path, tensors: dict[str, Any], fields: dict[str, Any]) -> Policies:
+    """Build policies from the contents of one export; see `read_exported_policy`."""
     try:
-        if find_method(spec["method"]).learn is not None and "knowledge" not in tensors:
-            raise InputError(f"what method {spec['method']!r} learns before training is missing; train the run anew")
-        sizes, method_sizes = Sizes(**spec["sizes"]), tuple(sorted(spec["method_sizes"].items()))
-        spatial = None if spec["spatial_memory"] is None else SpatialMemory(**spec["spatial_memory"])
-        options = spec["direct"], spec["done_gate"], spatial, spec["decision"], spec["goal_row"]
-        built = spec["method"], len(spec["categories"]), sizes, method_sizes
-        policy = PolicySpec(*built, *options)
-        check_arrays(where, tensors, policy)
+        # The specification decides which arrays there must be.
+        method = find_method(fields["method"])
+        if method.learn is not None and "knowledge" not in tensors:
+            raise InputError(f"what method {fields['method']!r} learns before training is missing; train the run anew")
+        policy_spec = PolicySpec.from_json(fields, method, len(fields["categories"]))
+        check_arrays(folder, tensors, policy_spec)
+
+        # Arrays, on the device.
         params = jax.tree.map(jnp.asarray, tensors["policy"])
+        cooccurrence = None
+        if "signs" in tensors:
+            evidence_arrays = tensors["signs"]
+            cooccurrence = CooccurrenceEvidence(
+                jnp.asarray(evidence_arrays["odds"]), jnp.asarray(evidence_arrays["chance"])
+            )
         knowledge = Knowledge(
             layout=jnp.asarray(tensors["layout"]["prior"]),
             method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
-            signs=jax.tree.map(jnp.asarray, Signs(**tensors["signs"])) if "signs" in tensors else None,
+            cooccurrence=cooccurrence,
         )
         if knowledge.method:
-            check_knowledge(params, policy, knowledge)
+            check_knowledge(params, policy_spec, knowledge)
+
+        estimator_fields = fields["layout"]
         return Policies(
             params=params,
             arms=(),
             knowledge=knowledge,
-            counts=jnp.asarray(tensors["layout"]["counts"]),
-            spec=policy,
-            setting=None if spec["layout"] is None else Setting(**spec["layout"]),
-            prior_steps=spec["prior_steps"],
-            task=Task.from_json(spec["task"]),
+            prior_counts=jnp.asarray(tensors["layout"]["counts"]),
+            spec=policy_spec,
+            estimator_config=None if estimator_fields is None else EstimatorConfig(**estimator_fields),
+            prior_steps=fields["prior_steps"],
+            task=Task.from_json(fields["task"]),
         )
     except InputError as error:
-        raise InputError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
+        raise InputError(f"{folder}: {str(error).removeprefix(f'{folder}: ')}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{where}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
+            f"{folder}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
         ) from error
+
+
+def check_arrays(folder: Path, tensors: Mapping[str, Any], spec: PolicySpec) -> None:
+    """Refuse arrays of the wrong shape or dtype, or with numbers that are not finite.
+
+    Args:
+      folder: folder of the export, for messages.
+      tensors: arrays of the export, as `load_params` returns them.
+      spec: specification of the policy.
+
+    Raises:
+      InputError: names the arrays.
+    """
+    # Shapes and dtypes. Exports of baselines, and of older versions, have no group `signs`.
+    expected_arrays = dict(_expected_arrays(spec))
+    if "signs" not in tensors:
+        del expected_arrays["signs"]
+    present_arrays = {name: tensors.get(name, {}) for name in expected_arrays}
+    field_differences = list_differences(describe_arrays(present_arrays), describe_arrays(expected_arrays))
+    if field_differences:
+        raise InputError(
+            f"{folder}: its arrays do not fit its spec (there != expected): {'; '.join(field_differences)}; "
+            "train the run anew"
+        )
+
+    # Values.
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tensors):
+        if not np.isfinite(leaf).all():
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise InputError(f"{folder}: {name} holds numbers that are not finite; train the run anew")
+
+
+@functools.lru_cache(maxsize=16)
+def _expected_arrays(spec: PolicySpec) -> dict[str, Any]:
+    """Shapes and dtypes of all arrays but the method's knowledge."""
+    category_pairs = jax.ShapeDtypeStruct((NUM_PRIORS, spec.num_categories, spec.num_categories), jnp.float32)
+    return {
+        "policy": jax.eval_shape(functools.partial(init_params, spec), jax.random.key(0)),
+        "layout": {"prior": category_pairs, "counts": category_pairs},
+        "signs": {"odds": category_pairs, "chance": category_pairs},
+    }
+
+
+def check_knowledge(params: Params, spec: PolicySpec, knowledge: Knowledge) -> None:
+    """Refuse method knowledge with which the policy cannot act.
+
+    One step is traced without computing it.
+
+    Raises:
+      InputError: names the error of the trace.
+    """
+    row_format = RowFormat(spec.num_categories)
+    perception = Perception(row_format, spec)
+    zero_index = jnp.int32(0)
+
+    def act_once(params: Params, knowledge: Knowledge) -> Any:
+        # Perceive an empty view.
+        row = jnp.zeros(row_format.num_bytes, jnp.uint8)
+        percept = Percept(
+            row, heading=zero_index, action=zero_index, moved=jnp.bool_(False), horizon=zero_index, goal=zero_index
+        )
+        perception_state = perception.init(knowledge, zero_index)
+        perception_state = perception.update(perception_state, percept, knowledge, zero_index)
+        view = perception.view(perception_state, Observation(row, goal=zero_index), knowledge)
+
+        # Build the pathways, and turn a choice into an action.
+        policy = bind(spec, params)
+        pathways = policy.pathways(*view, policy.initial_memory())
+        return pathways, spec.method.control.act(zero_index, perception_state.tracker_state, knowledge)
+
+    try:
+        jax.eval_shape(act_once, params, knowledge)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        error_line = str(error).split("\n", maxsplit=1)[0]
+        raise InputError(
+            f"what method {spec.method.name!r} learned before training does not fit it "
+            f"({type(error).__name__}: {error_line}); train the run anew"
+        ) from error
+
+
+def find_policy_folder(path: str | Path) -> Path:
+    """Folder of an exported policy.
+
+    Args:
+      path: the folder, or the name of a policy that comes with the package.
+
+    Raises:
+      InputError: neither exists; names the policies of the package.
+    """
+    folder = _resolve_folder(path)
+    if not folder.exists():
+        packaged_names = ", ".join(sorted(os.listdir(PACKAGED_POLICIES)))
+        raise InputError(
+            f"{path}: not an exported policy (No such file or directory: {path}); export it, "
+            f"or load one of the package: {packaged_names}"
+        )
+    return folder
+
+
+def is_policy(path: str | Path) -> bool:
+    """True where an exported policy exists; see `find_policy_folder`."""
+    return (_resolve_folder(path) / POLICY_FILE).exists()
+
+
+def _resolve_folder(path: str | Path) -> Path:
+    return Path(path) if Path(path).exists() else PACKAGED_POLICIES / path
+
+
+def load_policy_as_run(path: str | Path) -> tuple[RunConfig, Policies]:
+    """Load one exported policy as if a run had trained it with one seed.
+
+    Raises:
+      InputError: as `config_for_policy`.
+    """
+    config = config_for_policy(path)
+    policies = read_exported_policy(find_policy_folder(path))
+    params = jax.tree.map(lambda leaf: leaf[None], policies.params)
+    return config, policies._replace(params=params, arms=config.arms)
+
+
+def config_for_policy(path: str | Path) -> RunConfig:
+    """Run configuration with the generated world whose task an exported policy was trained for.
+
+    Raises:
+      InputError: no such policy, or no generated world has its task.
+    """
+    # Generated worlds differ in their tasks, so the task identifies the world.
+    folder = find_policy_folder(path)
+    _, fields = load_params(folder)
+    arm = "baseline" if fields["layout"] is None else "layout"
+    for world in WORLDS:
+        config = dataclasses.replace(RunConfig(), world=world, method=fields["method"], arms=(arm,), seeds=1)
+        if not list_differences(fields["task"], _task_fields(config.task)):
+            return config
+    raise InputError(f"{folder}: was trained for a task that no generated world has; give the run that it comes from")
+
+
+def _task_fields(task: Task) -> dict[str, Any]:
+    """Fields of a task as JSON reads them back, with lists in place of tuples."""
+    return json.loads(json.dumps(dataclasses.asdict(task)))

@@ -1,56 +1,69 @@
-"""A trained policy that acts on observations, one episode at a time."""
+"""A trained policy as an agent: acting on observations, exporting its step as a program, and its model card.
+
+`load_policy` reads an exported policy as a `LoadedPolicy`. Call `LoadedPolicy.init` at the start of an episode and
+`LoadedPolicy.act` at every step; `decide` and `apply_choice` are the two halves of `act`. `export_program` compiles the
+step with `jax.export`, for programs that run without this package, and `write_model_card` describes an export.
+"""
 
 import dataclasses
+import functools
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.export
 import jax.numpy as jnp
 from flax import struct
 
+from jaxnav import __version__
 from jaxnav.causal import Form, do, stde
-from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, prior_index
-from jaxnav.env.types import Observation
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, Observation, prior_index
 from jaxnav.errors import InputError
-from jaxnav.layout import Setting
-from jaxnav.policies.methods import Knowledge, Percept, find_method
-from jaxnav.policies.pathways import Decision, Memory
-from jaxnav.policies.perception import Perceived, Perception
-from jaxnav.policies.policy import Params, bind
+from jaxnav.layout import EstimatorConfig
+from jaxnav.policies.agent_loop import Perception, PerceptionState, decide
+from jaxnav.policies.method import Knowledge, Percept
+from jaxnav.policies.network import Params, bind
+from jaxnav.policies.pathways import Decision, PolicyState
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.packaged import policy_folder
-from jaxnav.runs.policies import EstimatorName, read_export
+from jaxnav.runs.policies import EstimatorName, find_policy_folder, read_exported_policy
+from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
-from jaxnav.store.manifest import differences
+from jaxnav.store.files import list_differences
+
+#: Platforms that exported programs are compiled for.
+PLATFORMS = ("cpu", "cuda", "tpu")
+#: Arrays of an episode memory by name.
+NamedArrays = Mapping[str, jax.Array]
 
 
 class EpisodeMemory(NamedTuple):
-    """Hold what a policy carries through one episode.
+    """State of an agent between two steps of an episode.
 
     Attributes:
-      memory: of the network.
-      perceived: belief, map and note.
+      policy_state: recurrent state of the network and the previous action.
+      perception_state: layout belief, spatial map and tracker state.
       room: int32 [], index of the room type's layout prior.
     """
 
-    memory: Memory
-    perceived: Perceived
+    policy_state: PolicyState
+    perception_state: PerceptionState
     room: jax.Array
 
 
-class Deliberation(NamedTuple):
-    """Hold what a policy makes of one observation.
+class PolicyOutput(NamedTuple):
+    """Decision for one observation, with its factual and counterfactual parts.
 
     Attributes:
-      logits: float32 [C], by which it chooses: of eq. 2 where the policy uses the layout, else the factual ones.
-      factual: float32 [C], a.
-      counterfactual: float32 [C], a_bar; None where the policy does not use the layout.
-      gap: float32 [], D; None there too.
-      weights: float32 [K], w x g of eq. 7; None there too.
-      perceived: belief, map and note with this view.
-      decision: the factual one, for the memory after an action.
+      logits: float32 [C], logits of the choice: sTDE (eq. 2) where the policy uses the layout, else the factual logits.
+      factual: float32 [C], factual logits a.
+      counterfactual: float32 [C], counterfactual logits a_bar; None where the policy does not use the layout.
+      gap: float32 [], layout gap D; None where the policy does not use the layout.
+      weights: float32 [K], layout weights w x g of eq. 7; None where the policy does not use the layout.
+      perception_state: layout belief, spatial map and tracker state, with this observation.
+      decision: factual output of the network, which becomes the policy state once the action is known.
     """
 
     logits: jax.Array
@@ -58,34 +71,34 @@ class Deliberation(NamedTuple):
     counterfactual: jax.Array | None
     gap: jax.Array | None
     weights: jax.Array | None
-    perceived: Perceived
+    perception_state: PerceptionState
     decision: Decision
 
 
 class LoadedPolicy(struct.PyTreeNode):
-    """Act on observations.
+    """Agent that acts on observations.
 
-    A pytree, so that it may be jitted and vmapped.
+    The agent is a pytree, so its methods may be jitted and vmapped.
 
     Attributes:
-      params: of the network.
-      knowledge: what was learned before training.
-      spec: what the network is built from.
-      setting: of the layout estimator; None where the policy does not use the layout.
-      task: that the policy was trained for.
+      params: network parameters.
+      knowledge: priors and method knowledge from before training.
+      spec: specification of the network.
+      estimator_config: layout estimator; None where the policy does not use the layout.
+      task: task of the training.
     """
 
     params: Params
     knowledge: Knowledge
     spec: PolicySpec = struct.field(pytree_node=False)
-    setting: Setting | None = struct.field(pytree_node=False)
+    estimator_config: EstimatorConfig | None = struct.field(pytree_node=False)
     task: Task = struct.field(pytree_node=False)
 
     def init(self, room_type: str | None = None) -> EpisodeMemory:
-        """Begin an episode.
+        """Memory at the start of an episode.
 
         Args:
-          room_type: `kitchen`, `living_room`, `bedroom` or `bathroom`, which picks the layout prior; None for homes
+          room_type: `kitchen`, `living_room`, `bedroom` or `bathroom`, which selects the layout prior; None for homes
             and unknown rooms.
 
         Raises:
@@ -96,9 +109,9 @@ class LoadedPolicy(struct.PyTreeNode):
         return self.begin(jnp.int32(OTHER_ROOM if room_type is None else prior_index(room_type)))
 
     def begin(self, room: jax.Array) -> EpisodeMemory:
-        """Begin an episode in a room type int32 [], an index of layout priors."""
-        memory = bind(self.spec, self.params).initial_memory()
-        return EpisodeMemory(memory, self._perception.init(self.knowledge, room), room)
+        """Memory at the start of an episode in a room with layout prior `room`, int32 []."""
+        policy_state = bind(self.spec, self.params).initial_memory()
+        return EpisodeMemory(policy_state, self._perception.init(self.knowledge, room), room)
 
     def act(
         self,
@@ -111,19 +124,18 @@ class LoadedPolicy(struct.PyTreeNode):
         moved: jax.Array | bool | None = None,
         horizon: jax.Array | int | None = None,
     ) -> tuple[jax.Array, EpisodeMemory]:
-        """Take in one observation and choose an action.
+        """Choose an action for one observation.
 
-        Experience is removed by sTDE (eq. 2) where the policy uses the layout.
+        Where the policy uses the layout, experience is removed by sTDE (eq. 2).
 
         Args:
-          observation: leaves [...] of one episode.
-          memory: from `init`, or from the step before.
-          epsilon: threshold of sTDE; may be traced. At 1 or more nothing is removed.
-          key: consumed, to sample the action; None for the best action.
-          heading: compass heading, and
-          moved: whether the last action changed the cell; policies with a spatial memory and methods with a tracker
-            need both.
-          horizon: index of the camera's horizon, 0 for level; methods with a tracker need it too.
+          observation: observation of one episode.
+          memory: memory from `init`, or from the previous step.
+          epsilon: threshold of sTDE, may be traced. No experience is removed for epsilon >= 1.
+          key: PRNG key to sample the action with; None for the best action.
+          heading: compass heading, needed by policies with a spatial memory and by methods with a tracker.
+          moved: True where the previous action changed the cell; needed like `heading`.
+          horizon: index of the camera's horizon, 0 for level; needed by methods with a tracker.
 
         Returns:
           The action int32 [], and the memory for the next step.
@@ -131,15 +143,10 @@ class LoadedPolicy(struct.PyTreeNode):
         Raises:
           InputError: heading, moved or horizon is needed and missing.
         """
-        made = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
-        chosen = jnp.argmax(made.logits) if key is None else jax.random.categorical(key, made.logits)
-        return self.follow(made, chosen.astype(jnp.int32), memory.room)
-
-    def follow(self, made: Deliberation, chosen: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
-        """Return the action int32 [] of what was chosen, and the memory."""
-        control, perceived = find_method(self.spec.method).control, made.perceived
-        action, note = control.act(chosen, perceived.note, self.knowledge)
-        return action, EpisodeMemory(made.decision.memory(action), perceived._replace(note=note), room)
+        # Best action, or one sampled from the logits.
+        decision = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
+        choice = jnp.argmax(decision.logits) if key is None else jax.random.categorical(key, decision.logits)
+        return self.apply_choice(decision, choice.astype(jnp.int32), memory.room)
 
     def decide(
         self,
@@ -150,35 +157,64 @@ class LoadedPolicy(struct.PyTreeNode):
         heading: jax.Array | int | None = None,
         moved: jax.Array | bool | None = None,
         horizon: jax.Array | int | None = None,
-    ) -> Deliberation:
-        """Take in one observation; see `act`.
+    ) -> PolicyOutput:
+        """Perceive one observation and compute the logits of all choices; see `act`.
 
         Raises:
           InputError: heading, moved or horizon is needed and missing.
         """
+        # Refuse observations without the odometry that this policy reads.
         perception = self._perception
         if perception.uses_odometry and (heading is None or moved is None):
             raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
         if perception.tracker is not None and horizon is None:
             raise InputError("act: this policy's method follows the camera too; give `horizon`")
-        odometry = jnp.int32(0 if heading is None else heading), jnp.bool_(moved is not None and moved)
-        position = odometry[0], memory.memory.action, odometry[1], jnp.int32(0 if horizon is None else horizon)
-        percept = Percept(observation.row, *position, observation.goal)
-        perceived = perception.update(memory.perceived, percept, self.knowledge, memory.room)
-        view = perception.view(perceived, observation, self.knowledge)
+
+        # Update belief, map and tracker with the observation.
+        percept = Percept(
+            observation.row,
+            heading=jnp.int32(0 if heading is None else heading),
+            action=memory.policy_state.action,
+            moved=jnp.bool_(moved is not None and moved),
+            horizon=jnp.int32(0 if horizon is None else horizon),
+            goal=observation.goal,
+        )
+        perception_state = perception.update(memory.perception_state, percept, self.knowledge, memory.room)
+        view = perception.view(perception_state, observation, self.knowledge)
+
+        # Factual decision.
         policy = bind(self.spec, self.params)
-        pathways = policy.pathways(*view, memory.memory)
-        decision = policy.decide(pathways, memory.memory)
-        layout, setting = perceived.layout, self.setting
-        if layout is None or setting is None:
-            return Deliberation(decision.logits, decision.logits, None, None, None, perceived, decision)
-        removed = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.memory).logits
-        logits = stde(decision.logits, removed, layout.gap, epsilon, setting.form)
-        return Deliberation(logits, decision.logits, removed, layout.gap, view.weights, perceived, decision)
+        pathways, decision = decide(policy, view, memory.policy_state)
+        factual = decision.logits
+        layout = perception_state.layout
+        if layout is None or self.estimator_config is None:
+            return PolicyOutput(factual, factual, None, None, None, perception_state, decision)
+
+        # Counterfactual decision by experience alone, and its removal.
+        counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.policy_state).logits
+        logits = stde(factual, counterfactual, layout.gap, epsilon, self.estimator_config.form)
+        return PolicyOutput(logits, factual, counterfactual, layout.gap, view.weights, perception_state, decision)
+
+    def apply_choice(self, output: PolicyOutput, choice: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
+        """Turn a choice into an action, and advance the memory.
+
+        Args:
+          output: result of `decide`.
+          choice: int32 [], index into the logits.
+          room: int32 [], index of the layout prior; `EpisodeMemory.room` of the same episode.
+
+        Returns:
+          The action int32 [], and the memory for the next step.
+        """
+        # Methods with a control of their own turn choices into actions; their tracker follows.
+        perception_state = output.perception_state
+        action, tracker_state = self.spec.method.control.act(choice, perception_state.tracker_state, self.knowledge)
+        perception_state = perception_state._replace(tracker_state=tracker_state)
+        return action, EpisodeMemory(output.decision.next_state(action), perception_state, room)
 
     @property
     def _perception(self) -> Perception:
-        return Perception(RowFormat(self.spec.num_categories), self.spec, self.setting)
+        return Perception(RowFormat(self.spec.num_categories), self.spec, self.estimator_config)
 
 
 def load_policy(
@@ -193,33 +229,255 @@ def load_policy(
     Args:
       path: folder of one policy, such as `runs/rooms/policies/layout-0`; or the name of one that comes with the
         package: `rooms-org`.
-      setting, hold: layout estimator to use instead of the policy's; see `Policies.estimating`.
-      form: how sTDE combines the logits; None for that of the layout setting.
-      env: the environment that it is to act in; None leaves it unchecked.
+      setting, hold: layout estimator to use in place of the policy's; see `Policies.with_estimator`.
+      form: form in which sTDE combines the logits; None for the form of the estimator.
+      env: environment in which the policy will act, to check that they fit; None skips the check.
 
     Raises:
-      InputError: no export there, a damaged one, one whose method cannot be found, an impossible setting, or one
-        trained with other categories or rules than those of `env`.
+      InputError: the export is missing or damaged, its method cannot be found, the setting is impossible, or the policy
+        was trained with other categories or rules than those of `env`.
     """
-    policies = read_export(policy_folder(path)).estimating(setting, hold)
-    layout = policies.setting
-    if layout is not None and form is not None:
-        layout = dataclasses.replace(layout, form=form)
+    # The layout estimator may differ from that of the export.
+    policies = read_exported_policy(find_policy_folder(path)).with_estimator(setting, hold)
+    estimator_config = policies.estimator_config
+    if estimator_config is not None and form is not None:
+        estimator_config = dataclasses.replace(estimator_config, form=form)
+    # Categories and rules must be those of training.
     if env is not None:
         _check_task(path, policies.task, env.task)
-    return LoadedPolicy(policies.params, policies.knowledge, policies.spec, layout, policies.task)
+    return LoadedPolicy(policies.params, policies.knowledge, policies.spec, estimator_config, policies.task)
 
 
-def _check_task(path: str | Path, trained: Task, asked: Task) -> None:
-    """Check that what a policy learned to see and do is asked of it.
+def _check_task(path: str | Path, trained_task: Task, env_task: Task) -> None:
+    """Check that an environment has the categories and rules of training; goals and detector errors may differ."""
 
-    Goals and the detector's errors may differ.
-    """
-    there, here = (
-        {"categories": task.categories, "rules": dataclasses.asdict(task.rules)} for task in (trained, asked)
-    )
-    if different := differences(there, here):
+    def compared_fields(task: Task) -> dict[str, Any]:
+        return {"categories": task.categories, "rules": dataclasses.asdict(task.rules)}
+
+    task_differences = list_differences(compared_fields(trained_task), compared_fields(env_task))
+    if task_differences:
         raise InputError(
-            f"{path}: was trained for another task than that of env (there != here): {'; '.join(different)}; "
+            f"{path}: was trained for another task than that of env (there != here): {'; '.join(task_differences)}; "
             "make one for this task: jaxnav.make(..., task=jaxnav.load_policy(...).task)"
         )
+
+
+def export_program(policy: LoadedPolicy) -> bytes:
+    """Export `policy_step` as a program for any number of parallel episodes.
+
+    `jax.export.deserialize(program).call(inputs, epsilon)` runs it where JAX and flatbuffers are installed.
+
+    Raises:
+      InputError: flatbuffers, which writes the program, is missing.
+    """
+
+    def step_episodes(inputs: Mapping[str, Any], epsilon: jax.Array) -> dict[str, Any]:
+        return jax.vmap(functools.partial(policy_step, policy), (0, None))(inputs, epsilon)
+
+    # A symbolic batch size allows any number of episodes.
+    (num_episodes,) = jax.export.symbolic_shape("episodes")
+    epsilon_shape = jax.ShapeDtypeStruct((), jnp.float32)
+    export = jax.export.export(jax.jit(step_episodes), platforms=PLATFORMS)
+    exported_program = export(input_shapes(policy, num_episodes), epsilon_shape)
+    try:
+        return bytes(exported_program.serialize())
+    except ImportError as error:
+        raise InputError("stablehlo: needs flatbuffers; install it by: pip install 'jaxnav[export]'") from error
+
+
+def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Array) -> dict[str, Any]:
+    """Take one step of one episode, with named arrays.
+
+    Args:
+      policy: the agent.
+      inputs: arrays as described in `input_shapes`, without the leading axis.
+      epsilon: float32 [], threshold of sTDE.
+
+    Returns:
+      `action` int32 [], the best action; `logits` and `factual` float32 [C]; where the policy uses the layout
+      `counterfactual` float32 [C], `gap` float32 [] and `weights` float32 [K], w x g of eq. 7; `memory`.
+    """
+    # Programs take detections and view as arrays; the policy reads them packed into a row.
+    row_format = RowFormat(policy.spec.num_categories)
+    observation = Observation(row_format.pack(inputs["detections"], inputs["view"]), inputs["goal"])
+
+    # The memory: new in the first step of an episode, else that of the previous step with the action that was taken.
+    initial_memory = policy.begin(inputs["room"])
+    previous_memory = _memory_from_names(inputs["memory"], initial_memory)
+    policy_state = previous_memory.policy_state._replace(action=inputs["action"])
+    previous_memory = previous_memory._replace(policy_state=policy_state, room=inputs["room"])
+    memory = jax.tree.map(functools.partial(jnp.where, inputs["first"]), initial_memory, previous_memory)
+
+    # Decide on the best action.
+    decision = policy.decide(
+        observation,
+        memory,
+        epsilon,
+        heading=inputs["heading"],
+        moved=inputs["moved"] & ~inputs["first"],
+        horizon=inputs["horizon"],
+    )
+    choice = jnp.argmax(decision.logits).astype(jnp.int32)
+    action, memory = policy.apply_choice(decision, choice, memory.room)
+
+    # Counterfactual outputs exist only with the layout.
+    step_outputs = {
+        "action": action,
+        "logits": decision.logits,
+        "factual": decision.factual,
+        "memory": _memory_by_name(memory),
+    }
+    if decision.counterfactual is not None:
+        step_outputs |= {
+            "counterfactual": decision.counterfactual,
+            "gap": decision.gap,
+            "weights": decision.weights,
+        }
+    return step_outputs
+
+
+def input_shapes(policy: LoadedPolicy, batch: Any) -> dict[str, Any]:
+    """Shapes and dtypes of the inputs of a step.
+
+    Args:
+      policy: the agent.
+      batch: number of episodes B, may be symbolic.
+
+    Returns:
+      detections: uint8 [B, K, 4], confidence, ahead, right and apparent size; see `RowFormat`.
+      view: uint8 [B, V, V], 0 unknown, 1 free, 2 blocked; row 0 is nearest to the agent, column 0 leftmost.
+      goal: int32 [B], index of a category.
+      action: int32 [B], previous action.
+      heading: int32 [B], clockwise.
+      moved: bool [B], True where the previous action changed the cell.
+      horizon: int32 [B], index of the camera's horizon.
+      room: int32 [B], index of the room type's prior.
+      first: bool [B], True where an episode begins; `action`, `moved` and `memory` are not read there.
+      memory: output `memory` of the previous step, by name.
+    """
+    row_format = RowFormat(policy.spec.num_categories)
+    index_shape = jax.ShapeDtypeStruct((), jnp.int32)
+    flag_shape = jax.ShapeDtypeStruct((), jnp.bool_)
+    # Shapes of one episode; the batch axis comes last.
+    episode_shapes = {
+        "detections": jax.ShapeDtypeStruct((row_format.num_categories, 4), jnp.uint8),
+        "view": jax.ShapeDtypeStruct((row_format.view, row_format.view), jnp.uint8),
+        "goal": index_shape,
+        "action": index_shape,
+        "heading": index_shape,
+        "horizon": index_shape,
+        "room": index_shape,
+        "moved": flag_shape,
+        "first": flag_shape,
+        "memory": _memory_by_name(jax.eval_shape(policy.begin, index_shape)),
+    }
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((batch, *leaf.shape), leaf.dtype), episode_shapes)
+
+
+def _memory_by_name(memory: EpisodeMemory) -> dict[str, Any]:
+    """Arrays of a memory by their paths, such as `policy_state/hidden`."""
+    leaves_with_path, _ = jax.tree.flatten_with_path(memory)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves_with_path}
+
+
+def _memory_from_names(arrays: NamedArrays, template: EpisodeMemory) -> EpisodeMemory:
+    """Memory with the structure of `template` and the arrays of `_memory_by_name`."""
+    # Both directions use the same order of leaves.
+    memory_leaves = [arrays[name] for name in _memory_by_name(template)]
+    return jax.tree.unflatten(jax.tree.structure(template), memory_leaves)
+
+
+#: Sentence by which a model card of this package is recognized.
+MODEL_CARD_SIGNATURE = "A policy for object navigation on a grid, exported by jaxnav."
+
+_ARM_DESCRIPTIONS = {
+    "baseline": "no layout weights",
+    "layout": "layout weights (eq. 7); experience is removed by sTDE (eq. 2)",
+}
+
+_MODEL_CARD = """\
+# {title}
+
+{signature}
+
+{facts}
+
+## Files
+
+{files}
+
+## Use
+
+{usage}
+
+## Limits
+
+It was trained on a grid with a simulated detector, never on images, and knows those categories alone.
+Success was measured in the scenes by which the run chose its policies; it is no result for a table.
+"""
+
+
+def write_model_card(run: Run, name: str, policy: LoadedPolicy, files: Mapping[str, str], use: Iterable[str]) -> str:
+    """Write the model card of a policy of a run.
+
+    Args:
+      run: the run that trained the policy.
+      name: name of the policy in the run, such as `layout-0`.
+      policy: the policy.
+      files: description of each file of the export, by name.
+      use: lines of Markdown on the use of the export.
+
+    Returns:
+      The card, as Markdown.
+    """
+    config = run.config
+    arm, _, seed = name.rpartition("-")
+
+    # Parts of the facts.
+    num_categories = len(config.task.categories)
+    scene_text = f"scenes of `{config.scenes.name}`" if config.scenes else "generated scenes"
+    step_texts = []
+    for purpose, num_steps in config.steps_by_purpose.items():
+        if num_steps:
+            step_texts.append(f"{num_steps:,} of {purpose}")
+    num_parameters = sum(leaf.size for leaf in jax.tree.leaves(policy.params))
+
+    # What the policy is, how it was trained, and what it looks for.
+    card_facts = {
+        "Method": f"`{config.method}`, decision `{config.decision}`, {_ARM_DESCRIPTIONS[arm]}",
+        "Trained in": f"{scene_text}, rules of `{config.world}`, {num_categories} categories, training seed {seed}",
+        "Environment steps": ", ".join(step_texts),
+        "Success in val scenes": _describe_success(run.success_by_budget(), arm),
+        "Parameters": f"{num_parameters:,}",
+        "Looks for": ", ".join(config.task.goals or config.task.categories),
+        "Version": f"jaxnav {__version__}",
+    }
+    # Lists in Markdown.
+    fact_lines = []
+    for fact_name, fact_text in card_facts.items():
+        fact_lines.append(f"* **{fact_name}**: {fact_text}")
+    file_lines = []
+    for file_name, file_description in files.items():
+        file_lines.append(f"* `{file_name}`: {file_description}")
+
+    return _MODEL_CARD.format(
+        title=f"{name} of {config.run_dir.name}",
+        signature=MODEL_CARD_SIGNATURE,
+        facts="\n".join(fact_lines),
+        files="\n".join(file_lines),
+        usage="\n".join(use),
+    )
+
+
+def _describe_success(success_by_budget: dict[str, Any] | None, arm: str) -> str:
+    """Success of an arm's policies within the longest budget."""
+    if success_by_budget is None:
+        return "not measured"
+    # The last budget is the longest step limit, so its success is that of whole episodes.
+    success_curves = success_by_budget["val"][arm]
+    best_success = 100.0 * success_curves["argmax"][-1]
+    sampled_success = 100.0 * success_curves["sample"][-1]
+    return (
+        f"{best_success:.1f} % with best actions, {sampled_success:.1f} % with sampled ones, "
+        f"the mean of all seeds of `{arm}`"
+    )

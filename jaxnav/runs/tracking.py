@@ -1,17 +1,17 @@
-"""A run's log, sent to where it can be watched."""
+"""Forwarding of a run's training log to TensorBoard and Weights & Biases."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import Run, settings
+from jaxnav.runs.run import Run, run_settings
 from jaxnav.store.sinks import SINKS, Sink
 
-#: Seconds between two looks at the log of a run that goes on.
+#: Seconds between two reads of the log of a run that is still training.
 POLL_S = 5.0
-#: What says where a row belongs, and is no number to show.
-_PLACE = ("step", "arm", "seed", "env_steps")
+#: Columns that place a row in the log, and are not logged as values.
+_PLACE_COLUMNS = ("step", "arm", "seed", "env_steps")
 
 
 def send_log(
@@ -21,53 +21,70 @@ def send_log(
     project: str = "jaxnav",
     wait: Callable[[float], object] = time.sleep,
 ) -> int:
-    """Send the training log of a run to sinks, a series per arm and seed.
+    """Send the training log of a run to sinks, as one series per arm and seed.
 
-    Steps are environment steps. Every row goes once: where a run that was interrupted writes rows anew, they hold the
-    same numbers. The training is another process, which no sink can hold up.
+    Steps of a series are environment steps. Every row is sent once: rows that an interrupted run writes again hold the
+    same numbers. Training runs in another process, so a slow sink does not delay it.
 
     Args:
-      run: finished or not.
+      run: a run, finished or not.
       to: names of sinks: `tensorboard`, `wandb`.
-      follow: go on until the run is finished.
-      project: of Weights & Biases.
-      wait: called with the seconds between two looks at the log.
+      follow: continue until the run is finished.
+      project: project in Weights & Biases.
+      wait: function that waits for the seconds between two reads of the log.
 
     Returns:
       The number of rows.
 
     Raises:
-      InputError: no sink, one whose library is not installed, or a damaged log.
+      InputError: no sink is named, the library of a sink is not installed, or the log is damaged.
     """
     if not to:
         raise InputError(f"--to: names no sink; give {' or '.join(SINKS)}")
-    sinks: dict[str, list[Sink]] = {}
-    about, count = settings(run.config), 0
+
+    settings = run_settings(run.config)
+    sinks_by_series: dict[str, list[Sink]] = {}
+    num_rows = 0
     try:
-        for row in _rows(run, follow, wait):
-            series = f"{row['arm']}-{row['seed']}"
-            if series not in sinks:
-                sinks[series] = [SINKS[name](run.config.run_dir, series, project, about) for name in sorted(set(to))]
-            values = {name: value for name, value in row.items() if name not in _PLACE and value is not None}
-            for sink in sinks[series]:
-                sink.write(row["env_steps"], values)
-            count += 1
+        for row in _new_rows(run, follow, wait):
+            # Sinks of a series open with its first row.
+            series_name = f"{row['arm']}-{row['seed']}"
+            if series_name not in sinks_by_series:
+                run_dir = run.config.run_dir
+                sinks_by_series[series_name] = [
+                    SINKS[name](run_dir, series_name, project, settings) for name in sorted(set(to))
+                ]
+
+            # Missing values, such as scores between two validations, are not sent.
+            metric_values = {}
+            for name, metric_value in row.items():
+                if name not in _PLACE_COLUMNS and metric_value is not None:
+                    metric_values[name] = metric_value
+            for sink in sinks_by_series[series_name]:
+                sink.write(row["env_steps"], metric_values)
+            num_rows += 1
     finally:
-        for sink in (sink for each in sinks.values() for sink in each):
-            sink.close()
-    return count
+        for series_sinks in sinks_by_series.values():
+            for sink in series_sinks:
+                sink.close()
+    return num_rows
 
 
-def _rows(run: Run, follow: bool, wait: Callable[[float], object]) -> Iterator[dict[str, Any]]:
-    """Yield each row of the log once."""
-    seen: dict[tuple[str, int], int] = {}
+def _new_rows(run: Run, follow: bool, wait: Callable[[float], object]) -> Iterator[dict[str, Any]]:
+    """Yield each row of the log once, and wait for new ones with `follow`."""
+    num_series = len(run.config.arms) * run.config.seeds
+    last_step: dict[tuple[str, int], int] = {}
     while True:
+        # The whole log is read anew; rows up to the last step of their series are known.
         for row in run.log():
-            series = row["arm"], row["seed"]
-            if row["step"] > seen.get(series, 0):
-                seen[series] = row["step"]
+            series_key = (row["arm"], row["seed"])
+            if row["step"] > last_step.get(series_key, 0):
+                last_step[series_key] = row["step"]
                 yield row
-        finished = len(seen) == len(run.config.arms) * run.config.seeds
-        if not follow or (finished and min(seen.values()) >= run.config.total_updates):
+
+        # A run is finished when every series has its last row.
+        has_all_series = len(last_step) == num_series
+        is_finished = has_all_series and min(last_step.values()) >= run.config.total_updates
+        if is_finished or not follow:
             return
         wait(POLL_S)

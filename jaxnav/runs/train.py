@@ -1,161 +1,179 @@
-"""Training of a run, from the prior to the exported policies."""
+"""Training of a run, from the layout prior to the exported policies.
 
+`train` is the entry point. Before training, `explore_world`, `calibrate_estimator` and `learn_knowledge` collect the
+layout prior and everything else that is known from the training scenes. `make_trainer` builds the trainer of all arms
+and seeds, and `run_updates` trains chunk by chunk: between chunks the run validates, logs and saves its policies.
+A run resumes from its last checkpoint, and a signal ends it after the current chunk (`Interrupts`).
+"""
+
+import dataclasses
 import json
+import signal
+import threading
+import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import jax
+import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxnav.env.types import EnvParams
-from jaxnav.errors import InputError, MissingSplitError
-from jaxnav.layout import Setting
-from jaxnav.policies.methods import METHODS, Knowledge
-from jaxnav.policies.policy import Params
+from jaxnav.env.objectnav import EnvParams, ObjectNav
+from jaxnav.errors import InputError, Interrupted, MissingSplitError
+from jaxnav.layout import ESTIMATORS, EstimatorConfig
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.network import Params
 from jaxnav.policies.testing import check_method
-from jaxnav.runs.check import check
-from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import REACH_FILE, Run, claimed, settings
-from jaxnav.runs.exports import export_policy
-from jaxnav.runs.logs import TIMES_FILE, Logs
-from jaxnav.runs.policies import POLICIES
-from jaxnav.runs.prepare import calibrate_setting, explore_world, learn_knowledge, make_trainer, say_what_is_cut
-from jaxnav.runs.stopwatch import Stopwatch
-from jaxnav.runs.updates import do_updates
-from jaxnav.runs.validation import Validator
-from jaxnav.runs.worlds import CompiledWorld, bank_order, sample_bank, training_world
-from jaxnav.store.checkpoint import restore, set_aside_after
-from jaxnav.store.lock import Lock
-from jaxnav.store.manifest import make_manifest
-from jaxnav.store.signed import write_signed
-from jaxnav.training.devices import Devices, by_first_process, check_agreement, first_process
-from jaxnav.training.exploration import Exploration
-from jaxnav.training.learner import LearnerState
-from jaxnav.training.peers import watched
-from jaxnav.training.trainer import States, Trainer
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.policies import POLICIES_DIR, export_policy
+from jaxnav.runs.run import REACH_FILE, TIMES_FILE, Run, RunLogs, lock_run_dir, run_settings
+from jaxnav.runs.validation import SCORE_METRIC, Validator
+from jaxnav.runs.worlds import (
+    CompiledWorld,
+    compile_sample_bank,
+    compile_training_world,
+    draw_bank_order,
+    prefetch_env_params,
+)
+from jaxnav.store.checkpoint import restore_checkpoint, save_checkpoint, set_aside_checkpoints_after
+from jaxnav.store.files import FolderLock, LogRow, make_manifest, read_log_rows, write_json_with_digest
+from jaxnav.training.calibration import (
+    REDUCTIONS,
+    STRENGTHS,
+    Exploration,
+    calibrate,
+    explore,
+    fit_shift_classifier,
+    layout_priors,
+)
+from jaxnav.training.devices import (
+    Devices,
+    check_agreement,
+    exit_if_process_lost,
+    is_first_process,
+    run_on_first_process,
+)
+from jaxnav.training.ppo import Learner, LearnerState
+from jaxnav.training.trainer import SeedMetrics, ShardedTrainer, Trainer, TrainerStates
+
+# Purposes of keys that are folded into the seed of the run. The arms use 0, 1, ...
+_EXPLORE = 2**31 - 1
+_CALIBRATE = 2**31 - 2
+_COOCCURRENCE = 2**31 - 3
+
+#: Signals that end a run after the current chunk: Ctrl-C, and SIGTERM as schedulers send it.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Chunks between two lines of progress on a console without a progress bar.
+_CHUNKS_PER_LINE = 4
 
 
-@watched()
+@exit_if_process_lost()
 def train(config: RunConfig, console: Console | None = None) -> Run:
     """Train a run and export its policies.
 
-    Training goes on from the run's last checkpoint if it has one.
+    Training resumes from the last checkpoint of the run directory if there is one.
 
     Args:
-      config: the settings.
-      console: to tell of progress on; None for silence.
+      config: configuration of the run.
+      console: console for progress; None for silence.
 
     Returns:
       The finished run.
 
     Raises:
-      InputError: an impossible setting, a run directory that holds something else or is in use, or damaged files.
-      Interrupted: Ctrl-C or SIGTERM came while it trained; it is saved, and the same call goes on from there.
+      InputError: a setting is impossible, the run directory holds something else or is in use, or files are damaged.
+      Interrupted: Ctrl-C or SIGTERM came during training. The run is saved, and the same call resumes it.
     """
-    clock = Stopwatch.start()
-    config = _checked(config)
-    mesh = connected(config)
-    if console is None or not first_process():
+    stopwatch = Stopwatch.start()
+    config = _check_config_and_method(config)
+    mesh = connect_devices(config)
+    if console is None or not is_first_process():
         console = Console(quiet=True)
-    check_agreement(json.dumps(make_manifest(settings(config))))  # before the scenes, which may take long
-    world = training_world(config, console)
-    manifest = make_manifest(settings(config) | {"scenes_fingerprint": world.fingerprint, "budget": config.budget})
+
+    # All processes must train the same run. Settings are compared before the scenes, whose compilation may take long.
+    check_agreement(json.dumps(make_manifest(run_settings(config))))
+    world = compile_training_world(config, console)
+    manifest_fields = {"scenes_fingerprint": world.fingerprint, "budget": config.steps_by_purpose}
+    manifest = make_manifest(run_settings(config) | manifest_fields)
     check_agreement(json.dumps(manifest))
-    with claimed(config) as lock:
-        _train(config, world, manifest, mesh, lock, clock, console)
+
+    with lock_run_dir(config) as lock:
+        _train_in_run_dir(config, world, manifest, mesh, lock, stopwatch, console)
     return Run(config)
 
 
-def _train(
+def _train_in_run_dir(
     config: RunConfig,
     world: CompiledWorld,
     manifest: dict[str, Any],
     mesh: Mesh | None,
-    lock: Lock,
-    clock: Stopwatch,
+    lock: FolderLock,
+    stopwatch: "Stopwatch",
     console: Console,
 ) -> None:
-    """Train in a run directory that is held."""
-    say_what_is_cut(config, console)
+    """Train in a run directory whose lock is held; see `train`."""
+    # Learn what is known before training: layout prior, estimator, and the method's own knowledge.
+    warn_if_rollout_too_short(config, console)
     explored = explore_world(config, world)
     console.print(f"layout prior from {int(explored.steps):,} random steps, {int(explored.poses):,} distinct poses")
-    setting = calibrate_setting(config, world, explored, console)
-    knowledge = learn_knowledge(config, world, explored, setting)
-    trainer = make_trainer(config, world.env, setting, knowledge, mesh)
-    order = bank_order(world, config.seed, config.total_updates // config.chunk)
+    estimator_config = calibrate_estimator(config, world, explored, console)
+    knowledge = learn_knowledge(config, world, explored, estimator_config)
+
+    # Decide in which bank of scenes each chunk trains.
+    trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
+    bank_order = draw_bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
-        console.print(
-            f"one shard after the other: {len(order)} turns in {len(set(order))} of {len(world.banks)} shards"
-        )
-    states, done = _resumed(config, trainer, world.params(order[0]), manifest, console)
-    clock = clock.resume(config.run_dir / TIMES_FILE)
-    finished = done == config.total_updates and (config.run_dir / REACH_FILE).exists()
-    validator = None if finished else _validator(config, trainer, knowledge, world, console)
-    states = do_updates(config, trainer, validator, world, order, states, done, manifest, lock, clock, console)
-    kept = {name: [_exported(state) for state in seeds] for name, seeds in trainer.unpack(states).items()}
-    by_first_process(lambda: _export(config, kept, setting, knowledge, explored))
+        num_used = len(set(bank_order))
+        console.print(f"one shard after the other: {len(bank_order)} turns in {num_used} of {len(world.banks)} shards")
+
+    # Resume from the last checkpoint. A finished run needs no validator.
+    first_params = world.make_env_params(bank_order[0])
+    states, update = _restore_or_init(config, trainer, first_params, manifest, console)
+    stopwatch = stopwatch.resume(config.run_dir / TIMES_FILE)
+    is_finished = update == config.total_updates and (config.run_dir / REACH_FILE).exists()
+    validator = None if is_finished else _make_validator(config, trainer, knowledge, world, console)
+
+    session = TrainingSession(config, trainer, validator, world, bank_order, manifest, lock, stopwatch, console)
+    states = run_updates(session, states, update)
+
+    # Export the best policies, and measure them.
+    policies = {}
+    for arm, seed_states in trainer.unpack(states).items():
+        policies[arm] = [_best_params(state) for state in seed_states]
+    run_on_first_process(lambda: _export_policies(config, policies, estimator_config, knowledge, explored))
     if validator is not None:
-        reach = validator.reach(kept)
-        by_first_process(lambda: write_signed(config.run_dir / REACH_FILE, reach))
-    console.print(f"{config.run_dir}: done in {clock.read()['wall_s']:.0f} s")
+        success_by_budget = validator.success_by_budget(policies)
+        run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
+    console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
 
-def _resumed(
-    config: RunConfig, trainer: Trainer, first: EnvParams, manifest: dict[str, Any], console: Console
-) -> tuple[States, int]:
-    """Return the state to go on from, and its updates.
-
-    What is later in the run directory is dropped: damaged checkpoints, and rows that will be logged again.
-    """
-    restored = restore(config.run_dir, trainer.abstract(first), manifest)
-    for problem in restored.damaged if restored else ():
-        console.print(f"{problem}; moved to {config.run_dir / 'damaged'}")
-    done = restored.step if restored else 0
-    by_first_process(lambda: set_aside_after(config.run_dir, done))
-    by_first_process(lambda: Logs(config).rewind(done))
-    if restored is None:
-        return trainer.init(first), 0
-    console.print(f"resumed after update {done} of {config.total_updates}")
-    return trainer.pack(restored.state), done
-
-
-def _validator(
-    config: RunConfig, trainer: Trainer, knowledge: Knowledge, world: CompiledWorld, console: Console
-) -> Validator | None:
-    """Make what measures the policies, if there are scenes for it."""
-    if not config.validations:
-        return None
-    acting = trainer.learners[config.arms[-1]].acting
-    try:
-        return Validator(config, acting, knowledge, world, console)
-    except MissingSplitError as error:
-        console.print(f"no val scenes, so the last policies are exported ({error})")
-        return None
-
-
-def _checked(config: RunConfig) -> RunConfig:
-    """Return the config, complete and possible, its method checked.
+def _check_config_and_method(config: RunConfig) -> RunConfig:
+    """Complete and check a configuration, and check a method of another package.
 
     Raises:
-      InputError: an impossible setting, or a method of another package that breaks the contract of methods.
+      InputError: a setting is impossible, or the method breaks the contract of methods.
     """
-    config = check(config)
+    config = check_config(config)
     if config.method not in METHODS:
-        bank = sample_bank(config)
+        bank = compile_sample_bank(config)
         try:
             check_method(config.method, method_sizes=config.method_sizes, bank=bank)
-        except Exception as error:  # whatever another's module raises
+        except Exception as error:  # code of another package may raise anything
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise InputError(f"method {config.method!r}: fails check_method ({reason}); mend it") from error
     return config
 
 
-def connected(config: RunConfig) -> Mesh | None:
-    """Join other processes and return the mesh of devices.
-
-    None where one device is enough.
-    """
+def connect_devices(config: RunConfig) -> Mesh | None:
+    """Join the other processes of the run, and return the mesh of devices; None where one device is enough."""
+    # An unset or single device needs no mesh.
     devices = None if config.devices is None else Devices.parse(str(config.devices))
     if devices is None:
         return None
@@ -163,20 +181,421 @@ def connected(config: RunConfig) -> Mesh | None:
     return devices.mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
 
 
-def _exported(state: LearnerState) -> Params:
-    """Return the policy that was kept, else the last one."""
-    return jax.device_get(state.kept.params if state.kept.score >= 0 else state.params)
+def warn_if_rollout_too_short(config: RunConfig, console: Console) -> None:
+    """Warn where rollouts are shorter than the interval between two choices of the method."""
+    # Methods such as `semexp` choose once in several actions.
+    choice_interval = find_method(config.method).control.interval
+    rollout = config.ppo.rollout
+    if rollout < choice_interval:
+        console.print(
+            f"{config.method} chooses every {choice_interval} actions: in rollouts of {rollout} it learns little of "
+            f"what a choice leads to; give --ppo.rollout {2 * choice_interval} or more, and fewer --ppo.num-envs"
+        )
 
 
-def _export(
+def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
+    """Collect co-occurrence counts on random walks in the training scenes.
+
+    The walks are divided equally among the banks of scenes.
+    """
+    key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
+    num_banks = len(world.banks)
+    walks_per_bank = -(-config.layout.walks // num_banks)  # rounded up
+
+    # Explore bank by bank, and add up the counts.
+    explore_bank = jax.jit(explore, static_argnums=(0, 3, 4))
+    explorations = []
+    for bank_index, params in enumerate(prefetch_env_params(world, range(num_banks))):
+        bank_key = jax.random.fold_in(key, bank_index)
+        explorations.append(explore_bank(world.env, params, bank_key, walks_per_bank, config.layout.steps))
+    explored = jax.tree.map(lambda *parts: sum(parts), *explorations)
+
+    # A pooled prior gives every room type the counts of all rooms.
+    if config.layout.prior == "room":
+        return explored
+    pooled_counts = explored.counts.sum(axis=0)
+    return explored._replace(counts=jax.numpy.broadcast_to(pooled_counts, explored.counts.shape))
+
+
+def calibrate_estimator(
+    config: RunConfig, world: CompiledWorld, explored: Exploration, console: Console
+) -> EstimatorConfig:
+    """Configuration of the layout estimator, with strength and reduction.
+
+    Values that the run's configuration leaves open are calibrated in the training scenes of the first bank.
+    """
+    estimator_config = ESTIMATORS[config.layout.setting]
+    if estimator_config.strength is None:
+        return estimator_config  # rows of the prior keep the sums of the counts
+
+    # Only values that are not set are searched.
+    candidate_strengths = STRENGTHS if config.layout.strength is None else (config.layout.strength,)
+    candidate_reductions = REDUCTIONS if config.layout.reduction is None else (config.layout.reduction,)
+    key = jax.random.fold_in(jax.random.key(config.seed), _CALIBRATE)
+    calibration = calibrate(
+        world.env,
+        world.make_env_params(0),
+        explored.counts,
+        estimator_config,
+        key,
+        candidate_strengths,
+        candidate_reductions,
+    )
+
+    estimator_config = calibration.estimator_config
+    console.print(
+        f"layout estimator: prior rows of {estimator_config.strength:g}, reduction {estimator_config.reduction}; "
+        f"gap {calibration.early:.2f} in the first views, {calibration.late:.2f} after twenty steps"
+    )
+    return estimator_config
+
+
+def learn_knowledge(
+    config: RunConfig, world: CompiledWorld, explored: Exploration, estimator_config: EstimatorConfig
+) -> Knowledge:
+    """Knowledge from before training: layout priors, the method's own, and evidence from co-occurrence.
+
+    The evidence is learned in the training scenes of the first bank, and only where policies use the layout.
+    """
+    layout = layout_priors(explored.counts, estimator_config)
+
+    # The method's own knowledge, from the tables of all banks.
+    learn = find_method(config.method).learn
+    method_knowledge = {}
+    if learn is not None:
+        method_knowledge = jax.tree.map(jax.numpy.asarray, learn(world.banks, np.asarray(explored.counts)))
+    if "layout" not in config.arms:
+        return Knowledge(layout, method_knowledge)
+
+    # Evidence that pairs of categories give for another layout.
+    key = jax.random.fold_in(jax.random.key(config.seed), _COOCCURRENCE)
+    num_walks = 4 * config.layout.walks
+    is_pooled = config.layout.prior == "pooled"
+    learn_evidence = jax.jit(fit_shift_classifier, static_argnums=(0, 4, 5))
+    cooccurrence = learn_evidence(world.env, world.make_env_params(0), explored.counts, key, num_walks, is_pooled)
+    return Knowledge(layout, method_knowledge, cooccurrence)
+
+
+def make_trainer(
+    config: RunConfig, env: ObjectNav, estimator_config: EstimatorConfig, knowledge: Knowledge, mesh: Mesh | None = None
+) -> Trainer:
+    """Make the trainer of all arms and seeds of a run.
+
+    Args:
+      config: configuration of the run.
+      env: environment of the training scenes.
+      estimator_config: layout estimator. Training does not use the gap, so it is switched off.
+      knowledge: knowledge from before training.
+      mesh: mesh of devices; None for one device.
+    """
+    # Training episodes may start near their goals.
+    policy_spec = config.policy_spec(len(env.categories))
+    env = dataclasses.replace(env, near_starts=config.near_starts)
+
+    # Arms differ only in the estimator.
+    arm_estimators = {"baseline": None, "layout": dataclasses.replace(estimator_config, gap="none")}
+    learners = {}
+    for arm in config.arms:
+        agent_loop = AgentLoop(env, policy_spec, arm_estimators[arm])
+        learners[arm] = Learner(agent_loop, config.ppo, config.counterfactual)
+
+    stages = list(zip(config.stages, config.stage_scalars, strict=True))
+    key = jax.random.key(config.seed)
+    # With a mesh, seeds and environments are sharded over its devices.
+    arguments = (learners, stages, knowledge, key, config.seeds, config.chunk)
+    if mesh is None:
+        return Trainer(*arguments)
+    return ShardedTrainer(*arguments, mesh=mesh)
+
+
+def _restore_or_init(
+    config: RunConfig, trainer: Trainer, params: EnvParams, manifest: dict[str, Any], console: Console
+) -> tuple[TrainerStates, int]:
+    """Training states of the last checkpoint, or of the start, and the number of updates in them.
+
+    Damaged later checkpoints and later log rows leave the run directory, because training writes them again.
+    """
+    checkpoint = restore_checkpoint(config.run_dir, trainer.abstract_states(params), manifest)
+    update = 0
+    if checkpoint is not None:
+        update = checkpoint.step
+        for damage_note in checkpoint.damaged:
+            console.print(f"{damage_note}; moved to {config.run_dir / 'damaged'}")
+    run_on_first_process(lambda: set_aside_checkpoints_after(config.run_dir, update))
+    run_on_first_process(lambda: RunLogs(config).rewind(update))
+
+    if checkpoint is None:
+        return trainer.init(params), 0
+    console.print(f"resumed after update {update} of {config.total_updates}")
+    return trainer.pack(checkpoint.state), update
+
+
+def _make_validator(
+    config: RunConfig, trainer: Trainer, knowledge: Knowledge, world: CompiledWorld, console: Console
+) -> Validator | None:
+    """Validator of the policies; None without validations or val scenes."""
+    if not config.validations:
+        return None
+    agent_loop = trainer.learners[config.arms[-1]].agent_loop
+    try:
+        return Validator(config, agent_loop, knowledge, world, console)
+    except MissingSplitError as error:
+        console.print(f"no val scenes, so the last policies are exported ({error})")
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingSession:
+    """Everything that the chunks of a training run share.
+
+    Attributes:
+      config: configuration of the run.
+      trainer: trainer of all arms and seeds.
+      validator: measures policies in val scenes; None without such scenes.
+      world: compiled training scenes.
+      bank_order: index of the bank of scenes of every chunk.
+      manifest: identity of the run in its checkpoints.
+      lock: lock of the run directory.
+      stopwatch: seconds of the run.
+      console: console for progress.
+    """
+
+    config: RunConfig
+    trainer: Trainer
+    validator: Validator | None
+    world: CompiledWorld
+    bank_order: Sequence[int]
+    manifest: dict[str, Any]
+    lock: FolderLock
+    stopwatch: "Stopwatch"
+    console: Console
+
+
+def run_updates(session: TrainingSession, states: TrainerStates, update: int) -> TrainerStates:
+    """Train chunk by chunk, from an update to the end of the run.
+
+    Raises:
+      Interrupted: a signal asked for an end. The current chunk is saved.
+    """
+    # Chunks that are still to do, and the environment's parameters for each.
+    config = session.config
+    trainer = session.trainer
+    bank_order = session.bank_order
+    stage_by_chunk = config.stage_by_chunk
+    remaining_chunks = range(update // config.chunk, len(bank_order))
+    env_params = prefetch_env_params(session.world, [bank_order[chunk] for chunk in remaining_chunks])
+
+    with ProgressDisplay(config, update, session.console) as progress, Interrupts() as interrupts:
+        for chunk, params in zip(remaining_chunks, env_params, strict=True):
+            # Episodes start anew where the scenes change.
+            stage_index = stage_by_chunk[chunk]
+            if chunk and bank_order[chunk] != bank_order[chunk - 1]:
+                states = trainer.restart(states, params, stage_index)
+
+            states, metrics = trainer.train(states, params, stage_index)
+            update += config.chunk
+            progress.stop_timing()
+            if session.validator is not None and update in config.validation_updates:
+                states, metrics = _validate(session, session.validator, states, metrics, stage_index)
+
+            # All processes agree on a signal, before the first of them writes.
+            signal_number = interrupts.pending_signal()
+            run_on_first_process(session.lock.check)
+            if is_first_process():
+                time_row = {"step": update} | session.stopwatch.read()
+                RunLogs(config).append(_log_rows(config, metrics, update), time_row)
+            is_save_due = update % (config.chunk * config.save_every) == 0 or update == config.total_updates
+            if signal_number or is_save_due:
+                save_checkpoint(config.run_dir, update, trainer.unpack(states), session.manifest)
+
+            progress.show_chunk(metrics, update)
+            if signal_number:
+                raise _interrupted(config, signal_number, update)
+
+        # A signal may also come during the last save.
+        signal_number = interrupts.pending_signal()
+        if signal_number:
+            raise _interrupted(config, signal_number, update)
+    return states
+
+
+def _validate(
+    session: TrainingSession, validator: Validator, states: TrainerStates, metrics: SeedMetrics, stage_index: int
+) -> tuple[TrainerStates, SeedMetrics]:
+    """Measure all policies in val scenes, and keep the best of each seed.
+
+    Returns:
+      The states with the best policies, and the metrics with the scores.
+    """
+    config = session.config
+    trainer = session.trainer
+    # Score the current parameters, with adaptation as in this stage.
+    policies = {}
+    for arm, seed_states in trainer.unpack(states).items():
+        policies[arm] = [state.params for state in seed_states]
+    scores_by_arm = validator.measure(policies, config.stages[stage_index].adapts_online)
+
+    # Before the last stage, part of the policy has not learned, so no policy is kept.
+    if stage_index == config.stage_by_chunk[-1]:
+        val_success = {}
+        for arm, arm_scores in scores_by_arm.items():
+            val_success[arm] = [seed_scores[SCORE_METRIC] for seed_scores in arm_scores]
+        states = trainer.keep_best(states, val_success)
+
+    # Scores become further columns of the log.
+    scored_metrics: SeedMetrics = {}
+    for arm, seeds in metrics.items():
+        scored_metrics[arm] = [row | seed_score for row, seed_score in zip(seeds, scores_by_arm[arm], strict=True)]
+    return states, scored_metrics
+
+
+def _log_rows(config: RunConfig, metrics: SeedMetrics, update: int) -> list[LogRow]:
+    """Rows of one chunk in the training log, one for each arm and seed."""
+    log_rows: list[LogRow] = []
+    for arm, seeds in metrics.items():
+        for seed, seed_metrics in enumerate(seeds):
+            row_place = {"step": update, "arm": arm, "seed": seed, "env_steps": update * config.steps_per_update}
+            log_rows.append(row_place | seed_metrics)
+    return log_rows
+
+
+def _interrupted(config: RunConfig, signal_number: int, update: int) -> Interrupted:
+    stop_message = f"{config.run_dir}: stopped after update {update} of {config.total_updates} and saved"
+    return Interrupted(signal_number, stop_message)
+
+
+def _best_params(state: LearnerState) -> Params:
+    """Parameters of a seed's best policy in validation, or of its last one without validation."""
+    params = state.best.params if state.best.score >= 0 else state.params
+    return jax.device_get(params)
+
+
+def _export_policies(
     config: RunConfig,
     policies: Mapping[str, Sequence[Params]],
-    setting: Setting,
+    estimator_config: EstimatorConfig,
     knowledge: Knowledge,
     explored: Exploration,
 ) -> None:
-    """Export every seed's policy."""
-    for name, seeds in policies.items():
+    """Export the policy of every arm and seed."""
+    for arm, seeds in policies.items():
+        # Baselines are exported without the layout estimator.
+        arm_estimator = estimator_config if arm == "layout" else None
         for seed, params in enumerate(seeds):
-            folder = config.run_dir / POLICIES / f"{name}-{seed}"
-            export_policy(folder, config, params, knowledge, setting if name == "layout" else None, explored)
+            export_folder = config.run_dir / POLICIES_DIR / f"{arm}-{seed}"
+            export_policy(export_folder, config, params, knowledge, arm_estimator, explored)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stopwatch:
+    """Seconds of a run, added up over interruptions.
+
+    Attributes:
+      wall_start, cpu_start: readings of the clocks at which a run without interruptions would have started.
+    """
+
+    wall_start: float
+    cpu_start: float
+
+    @classmethod
+    def start(cls) -> "Stopwatch":
+        """Start counting."""
+        return cls(time.monotonic(), time.process_time())
+
+    def resume(self, path: Path) -> "Stopwatch":
+        """Continue from the last row of a file of times, which may be missing."""
+        log_rows = read_log_rows(path)
+        if not log_rows:
+            return self
+        return Stopwatch(self.wall_start - log_rows[-1]["wall_s"], self.cpu_start - log_rows[-1]["cpu_s"])
+
+    def read(self) -> dict[str, float]:
+        """Seconds of the run, `wall_s` and `cpu_s`."""
+        wall_seconds = time.monotonic() - self.wall_start
+        cpu_seconds = time.process_time() - self.cpu_start
+        return {"wall_s": round(wall_seconds, 2), "cpu_s": round(cpu_seconds, 2)}
+
+
+class Interrupts:
+    """Context in which the first signal is noted and a second one ends the process.
+
+    Outside the main thread, where Python cannot handle signals, no signal is noted.
+    """
+
+    def __enter__(self) -> "Interrupts":
+        self._signal_number = 0
+        self._previous_handlers = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                # Signals that the parent ignores, or that are not handled by Python, stay as they are.
+                if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                    self._previous_handlers[number] = signal.signal(number, self._note_signal)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, signal_handler in self._previous_handlers.items():
+            signal.signal(number, signal_handler)
+
+    def pending_signal(self) -> int:
+        """Number of a signal that any process of the run received, else 0."""
+        if jax.process_count() == 1:
+            return self._signal_number
+        return int(multihost_utils.process_allgather(np.int32(self._signal_number)).max())
+
+    def _note_signal(self, number: int, _: FrameType | None) -> None:
+        # A second signal finds the default handlers, and ends the process.
+        self._signal_number = number
+        for handled_number in self._previous_handlers:
+            signal.signal(handled_number, signal.SIG_DFL)
+
+
+class ProgressDisplay:
+    """Progress of training on a console: a bar on a terminal, else lines."""
+
+    def __init__(self, config: RunConfig, update: int, console: Console) -> None:
+        """Prepare to show a run that starts or resumes after `update`."""
+        progress_columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self._config = config
+        self._console = console
+        self._bar = Progress(*progress_columns, console=console, disable=not console.is_terminal)
+        self._task = self._bar.add_task("compiling", total=config.total_updates, completed=update)
+
+    def __enter__(self) -> "ProgressDisplay":
+        self._bar.start()
+        self._chunk_start = time.monotonic()
+        self._chunk_seconds = 0.0
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def stop_timing(self) -> None:
+        """Mark the end of a chunk's training, so that its speed excludes validation and saving."""
+        self._chunk_seconds = time.monotonic() - self._chunk_start
+
+    def show_chunk(self, metrics: SeedMetrics, update: int) -> None:
+        """Show the metrics of a chunk, and start timing the next one."""
+        config = self._config
+        # Speed over all arms and seeds together.
+        chunk_steps = config.chunk * config.steps_per_update * config.seeds * len(metrics)
+        steps_per_second = chunk_steps / self._chunk_seconds
+
+        # Mean success of each arm, and gradient steps that were skipped in any seed.
+        success_rates = []
+        num_skipped = 0
+        for arm, seeds in metrics.items():
+            arm_success = np.mean([seed_metrics["success"] for seed_metrics in seeds])
+            success_rates.append(f"{arm} SR {100 * arm_success:.0f} %")
+            num_skipped += sum(seed_metrics["skipped_steps"] for seed_metrics in seeds)
+        skip_note = f", {num_skipped:.0f} gradient steps skipped as not finite" if num_skipped else ""
+
+        progress_line = (
+            f"update {update}/{config.total_updates}, {steps_per_second / 1000:.0f} k steps/s, "
+            f"{', '.join(success_rates)}{skip_note}"
+        )
+        self._bar.update(self._task, completed=update, description=progress_line)
+        # A log file gets a line only every few chunks.
+        is_line_due = (update // config.chunk) % _CHUNKS_PER_LINE == 0
+        if not self._console.is_terminal and is_line_due:
+            self._console.print(progress_line)
+        self._chunk_start = time.monotonic()

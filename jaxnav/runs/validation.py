@@ -1,4 +1,8 @@
-"""Validation: how policies do on fixed episodes while they are trained."""
+"""Validation: success of the policies in fixed episodes while they are trained.
+
+`Validator.measure` scores the policies between chunks of training, and the best policy of each seed is exported.
+`Validator.success_by_budget` measures the exported policies once, in val scenes and in training scenes.
+"""
 
 import dataclasses
 import os
@@ -10,139 +14,177 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from jaxnav.env.types import EnvParams
-from jaxnav.evaluation.episodes import EpisodeList, episode_list
-from jaxnav.evaluation.grid import Evaluator, Outcome
-from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.env.objectnav import EnvParams
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
 from jaxnav.evaluation.report import Decoding
-from jaxnav.evaluation.variants import Row, inference_grid
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.methods import Knowledge
-from jaxnav.policies.policy import Params
+from jaxnav.evaluation.variants import EvaluationRow, inference_grid
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import Params
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.worlds import CompiledWorld, evaluation_world
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
 
-#: Of the episodes; no seed that `evaluate` takes, so these are others.
-_SEED = 2**32
-#: The measure by which policies are chosen.
-SCORE = "val_success"
-#: Numbers of actions at which success is counted.
-_BUDGETS = (5, 10, 15, 20, 30, 40, 50, 75, 100, 150, 200, 300, 400, 500)
+#: Seed of the episodes. `evaluate` takes only smaller seeds, so its episodes differ.
+_EPISODE_SEED = 2**32
+#: Metric by which the best policy of a seed is selected.
+SCORE_METRIC = "val_success"
+#: Columns of the training log, and the episode metrics behind them.
+_LOGGED_METRICS = {"val_success": "sr", "val_spl": "spl", "val_timeout": "timeout", "val_wrong_done": "wrong_done"}
+#: Numbers of actions within which success is counted.
+_ACTION_BUDGETS = (5, 10, 15, 20, 30, 40, 50, 75, 100, 150, 200, 300, 400, 500)
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
-Split = Literal["val", "train"]
-SPLITS: tuple[Split, ...] = ("val", "train")
+ValidationSplit = Literal["val", "train"]
+VALIDATION_SPLITS: tuple[ValidationSplit, ...] = ("val", "train")
 #: Parameters of every seed, by arm.
-Policies = Mapping[str, Sequence[Params]]
-#: What is logged of every seed, by arm.
-Scores = dict[str, list[dict[str, float]]]
+ParamsByArm = Mapping[str, Sequence[Params]]
+#: Scores of every seed, by arm.
+ScoresByArm = dict[str, list[dict[str, float]]]
 
 
-class _Part(NamedTuple):
+class _EpisodeSet(NamedTuple):
     episodes: EpisodeList
     params: EnvParams
 
 
 class Validator:
-    """Measure policies on fixed episodes.
+    """Measures policies in fixed episodes.
 
-    The episodes are as long as those of `evaluate`, but others. They take place in val scenes, and once, at the end, in
-    training scenes too: what is lost from these to those is overfitting, what is lost in both is not learned.
+    The episodes are as long as those of `evaluate`, but they are not the same episodes. Success that is lost from
+    training scenes to val scenes is overfitting; success that is missing in both was never learned.
     """
 
     def __init__(
-        self, config: RunConfig, acting: Acting, knowledge: Knowledge, training: CompiledWorld, console: Console
+        self, config: RunConfig, agent_loop: AgentLoop, knowledge: Knowledge, training: CompiledWorld, console: Console
     ) -> None:
-        """Prepare; nothing is compiled yet.
+        """Prepare the episodes; compilation happens at the first measurement.
 
         Args:
-          config: of the run; its val scenes are used (their first bank).
-          acting: how the episodes are acted.
-          knowledge: what was learned before training.
-          training: the training scenes (their first bank is used).
-          console: to tell of progress on.
+          config: configuration of the run, whose val scenes are used (their first bank).
+          agent_loop: agent loop of the policies.
+          knowledge: knowledge from before training.
+          training: compiled training scenes (their first bank is used).
+          console: console for progress.
 
         Raises:
-          MissingSplitError: the file of scenes has none of val.
-          InputError: the method cannot act in them.
+          MissingSplitError: the scene file has no val scenes.
+          InputError: the method cannot act in the val scenes.
         """
-        new = evaluation_world(config, "val", None, None, console)
-        new.check(config.method, knowledge)
-        # Of equal sizes, so that one compilation serves both.
-        sizes = {name: max(getattr(new, name), getattr(training, name)) for name in ("num_cells", "num_scenes")}
-        limits = {"step_limits": new.step_limits, "step_limit": new.step_limit}
-        worlds: dict[Split, CompiledWorld] = {"val": new, "train": training}
-        self._parts: dict[Split, _Part] = {
-            split: _Part(
-                episode_list(world.banks[0], config.val_episodes, _SEED),
-                dataclasses.replace(world, **sizes, **limits, expert=False).params(0),
-            )
-            for split, world in worlds.items()
-        }
-        self._evaluators = {
-            adapts: Evaluator(dataclasses.replace(acting, env=new.env, inner_steps=inner_steps), removes=False)
-            for adapts, inner_steps in ((True, None), (False, 0))
-        }
-        self._knowledge = jax.device_get(knowledge)
-        self._grids = {
-            arm: inference_grid([Row(arm, None, None, decoding) for decoding in DECODINGS], (arm,), 1)
-            for arm in config.arms
-        }
+        val_world = compile_evaluation_world(config, "val", None, None, console)
+        val_world.check_method(find_method(config.method), knowledge)
 
-    def measure(self, policies: Policies, adapts: bool = True) -> Scores:
-        """Measure policies in val scenes.
+        # Tables of equal sizes, so that one compilation serves both splits.
+        shared_fields = {
+            "num_cells": max(val_world.num_cells, training.num_cells),
+            "num_scenes": max(val_world.num_scenes, training.num_scenes),
+            "step_limits": val_world.step_limits,
+            "step_limit": val_world.step_limit,
+            "has_expert": False,
+        }
+        worlds: dict[ValidationSplit, CompiledWorld] = {"val": val_world, "train": training}
+        self._episode_sets: dict[ValidationSplit, _EpisodeSet] = {}
+        for split, world in worlds.items():
+            episodes = draw_episodes(world.banks[0], config.val_episodes, _EPISODE_SEED)
+            env_params = dataclasses.replace(world, **shared_fields).make_env_params(0)
+            self._episode_sets[split] = _EpisodeSet(episodes, env_params)
+
+        # Evaluators with the method's adaptation, and without it. They need no counterfactual decisions.
+        self._evaluators = {}
+        for adapts_online, inner_steps in ((True, None), (False, 0)):
+            val_loop = dataclasses.replace(agent_loop, env=val_world.env, inner_steps=inner_steps)
+            self._evaluators[adapts_online] = Evaluator(val_loop, can_remove=False)
+
+        # Each arm is evaluated with best and with sampled actions.
+        self._grids = {}
+        for arm in config.arms:
+            grid_rows = [EvaluationRow(arm, None, None, decoding) for decoding in DECODINGS]
+            self._grids[arm] = inference_grid(grid_rows, (arm,), 1)
+        self._knowledge = jax.device_get(knowledge)
+
+    def measure(self, policies: ParamsByArm, adapts_online: bool = True) -> ScoresByArm:
+        """Score policies in val scenes.
 
         Args:
-          policies: of every arm and seed.
-          adapts: whether the method's adaptation changes them.
+          policies: parameters of every arm and seed.
+          adapts_online: False switches the method's adaptation off.
 
         Returns:
-          `val_success`, `val_spl`, `val_timeout` and `val_wrong_done` with the best actions, the same with
-          `_sampled` ones; fractions.
+          `val_success`, `val_spl`, `val_timeout` and `val_wrong_done` with best actions, and with sampled actions under
+          names that end in `_sampled`; all are fractions.
         """
-        best_length = self._parts["val"].episodes.best_length
-        scores: Scores = {arm: [] for arm in policies}
-        for (arm, _), outcome in self._run(policies, "val", adapts).items():
-            metrics = episode_metrics(outcome, best_length)
-            named = {"val_success": "sr", "val_spl": "spl", "val_timeout": "timeout", "val_wrong_done": "wrong_done"}
-            best, sampled = ({name: float(metrics[of][i].mean()) for name, of in named.items()} for i in range(2))
-            scores[arm].append(best | {f"{name}_sampled": value for name, value in sampled.items()})
+        # Row 0 of each outcome holds best actions, row 1 sampled ones; see `DECODINGS`.
+        best_length = self._episode_sets["val"].episodes.best_length
+        scores: ScoresByArm = {arm: [] for arm in policies}
+        for (arm, _), outcome in self._run(policies, "val", adapts_online).items():
+            outcome_metrics = episode_metrics(outcome, best_length)
+            seed_scores = {}
+            for decoding_index, suffix in enumerate(("", "_sampled")):
+                for name, metric in _LOGGED_METRICS.items():
+                    seed_scores[f"{name}{suffix}"] = float(outcome_metrics[metric][decoding_index].mean())
+            scores[arm].append(seed_scores)
         return scores
 
-    def reach(self, policies: Policies) -> dict[str, Any]:
-        """Return success within budgets of actions, as JSON.
+    def success_by_budget(self, policies: ParamsByArm) -> dict[str, Any]:
+        """Success within budgets of actions, as JSON.
 
-        By split, arm and decoding: a fraction for each budget, the mean over seeds.
+        Args:
+          policies: parameters of every arm and seed.
+
+        Returns:
+          `budgets`, and by split, arm and decoding the share of successful episodes within each budget, averaged over
+          seeds. The last budget is the longest step limit.
         """
-        longest = max(int(part.params.step_limit.max()) for part in self._parts.values())
-        budgets = [budget for budget in _BUDGETS if budget < longest] + [longest]
-        found: dict[str, Any] = {"budgets": budgets}
-        for split in SPLITS:
-            runs = self._run(policies, split, adapts=True)
+        # Budgets beyond the longest step limit would repeat it.
+        longest_limit = max(int(episode_set.params.step_limit.max()) for episode_set in self._episode_sets.values())
+        budgets = []
+        for budget in _ACTION_BUDGETS:
+            if budget < longest_limit:
+                budgets.append(budget)
+        budgets.append(longest_limit)
+
+        success: dict[str, Any] = {"budgets": budgets}
+        for split in VALIDATION_SPLITS:
+            outcomes = self._run(policies, split, adapts_online=True)
+            success[split] = {}
             for arm in policies:
-                outcomes = [outcome for (name, _), outcome in runs.items() if name == arm]
-                for i, decoding in enumerate(DECODINGS):
-                    curve = np.mean([_within(outcome, i, budgets) for outcome in outcomes], axis=0)
-                    found.setdefault(split, {}).setdefault(arm, {})[decoding] = [round(x, 4) for x in curve.tolist()]
-        return found
+                # Average the curves of the seeds.
+                arm_outcomes = [outcomes[arm, seed] for seed in range(len(policies[arm]))]
+                success[split][arm] = {}
+                for row, decoding in enumerate(DECODINGS):
+                    seed_curves = [_success_within(outcome, row, budgets) for outcome in arm_outcomes]
+                    mean_curve = np.mean(seed_curves, axis=0)
+                    success[split][arm][decoding] = [round(success_share, 4) for success_share in mean_curve.tolist()]
+        return success
 
-    def _run(self, policies: Policies, split: Split, adapts: bool) -> dict[tuple[str, int], Outcome]:
-        """Run every policy, side by side, with best and sampled actions; leaves [2, E]."""
-        part, evaluator = self._parts[split], self._evaluators[adapts]
+    def _run(
+        self, policies: ParamsByArm, split: ValidationSplit, adapts_online: bool
+    ) -> dict[tuple[str, int], EpisodeOutcome]:
+        """Outcomes of every arm and seed, leaves [2, E] for best and sampled actions."""
+        episode_set = self._episode_sets[split]
+        evaluator = self._evaluators[adapts_online]
 
-        def run(task: tuple[str, int]) -> Outcome:
+        def run_policy(task: tuple[str, int]) -> EpisodeOutcome:
             arm, seed = task
-            weights = jax.tree.map(lambda leaf: np.asarray(leaf)[None], policies[arm][seed])
-            return evaluator(self._grids[arm], weights, [part], self._knowledge, jax.random.key(0))
+            # A single seed, [1, ...].
+            params = jax.tree.map(lambda leaf: np.asarray(leaf)[None], policies[arm][seed])
+            return evaluator(self._grids[arm], params, [episode_set], self._knowledge, jax.random.key(0))
 
-        tasks = [(arm, seed) for arm, seeds in policies.items() for seed in range(len(seeds))]
+        # The first policy compiles for all; then policies run side by side on the cores.
+        arm_seeds = []
+        for arm, seed_params in policies.items():
+            for seed in range(len(seed_params)):
+                arm_seeds.append((arm, seed))
         if not evaluator.compilations:
-            run(tasks[0])  # compiles, once for all
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            return dict(zip(tasks, pool.map(run, tasks), strict=True))
+            run_policy(arm_seeds[0])
+        with ThreadPoolExecutor(os.cpu_count()) as thread_pool:
+            return dict(zip(arm_seeds, thread_pool.map(run_policy, arm_seeds), strict=True))
 
 
-def _within(outcome: Outcome, decoding: int, budgets: Sequence[int]) -> list[float]:
-    """Return the share of episodes that succeed within each budget."""
-    success, length = np.asarray(outcome.success)[decoding], np.asarray(outcome.length)[decoding]
+def _success_within(outcome: EpisodeOutcome, row: int, budgets: Sequence[int]) -> list[float]:
+    """Share of episodes of one row that succeed within each budget of actions."""
+    # Success and number of actions of each episode, [E].
+    success = np.asarray(outcome.success)[row]
+    length = np.asarray(outcome.length)[row]
     return [float((success & (length <= budget)).mean()) for budget in budgets]

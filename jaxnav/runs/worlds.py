@@ -1,4 +1,9 @@
-"""The scenes of a run, compiled in memory or as shards on disk."""
+"""Compiled scenes of a run, in memory or as shards on disk.
+
+`compile_training_world` and `compile_evaluation_world` read or generate the scenes of one split and compile their
+tables. A world with many scenes is streamed from disk: `draw_bank_order` draws which shard comes next, and
+`prefetch_env_params` reads it while the previous one is in use.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -9,32 +14,31 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError
-from jaxnav.policies.methods import Knowledge, find_method
+from jaxnav.policies.method import Knowledge, Method
 from jaxnav.runs.config import RunConfig
-from jaxnav.scenes.categories import most_common, unknown_types
+from jaxnav.scenes.categories import count_unknown_types, format_most_common
 from jaxnav.scenes.scene import SPLITS
-from jaxnav.scenes.tables.compile import Bank, checksum, compile_bank, concatenate
+from jaxnav.scenes.tables.compile import Bank, bank_checksum, compile_bank, concatenate_banks
 from jaxnav.scenes.tables.shards import Shards, compile_shards
-from jaxnav.scenes.worlds import WORLDS, Scenes, from_file, generated, shifted
+from jaxnav.scenes.worlds import WORLDS, Scenes, load_scenes, make_generated_scenes, shift_scenes
 
 
 @dataclasses.dataclass(frozen=True)
 class CompiledWorld:
-    """Hold the compiled scenes of one split.
+    """Compiled scenes of one split.
 
     Attributes:
-      scenes: as read or generated.
+      scenes: the scenes, as read or generated.
       env: the environment.
-      banks: their tables; one in memory, or several that stay on disk until they are used.
-      step_limits: actions of an episode by room type.
-      step_limit: the same in other rooms.
-      num_cells, num_scenes: of the largest bank.
+      banks: tables of the scenes; one bank in memory, or several shards that stay on disk until they are used.
+      step_limits: maximum number of actions in an episode, by room type.
+      step_limit: maximum number of actions in other rooms.
+      num_cells, num_scenes: sizes of the largest bank.
       fingerprint: text that differs wherever the banks differ.
-      expert: whether a method imitates shortest paths in them.
+      has_expert: True where the tables hold the actions of shortest paths, for methods that imitate them.
     """
 
     scenes: Scenes
@@ -45,46 +49,51 @@ class CompiledWorld:
     num_cells: int
     num_scenes: int
     fingerprint: str
-    expert: bool = False
+    has_expert: bool = False
 
-    def params(self, index: int) -> EnvParams:
-        """Return the environment's parameters with one of the banks.
+    def make_env_params(self, index: int) -> EnvParams:
+        """Parameters of the environment with one bank; those of all banks have the same shapes."""
+        _, params = build_environment(
+            self.banks[index],
+            self.step_limits,
+            self.step_limit,
+            self.num_cells,
+            self.num_scenes,
+            with_expert=self.has_expert,
+        )
+        return params
 
-        Those of all banks are of equal shape.
-        """
-        sizes = self.num_cells, self.num_scenes
-        return build(self.banks[index], self.step_limits, self.step_limit, *sizes, expert=self.expert)[1]
-
-    def check(self, method: str, knowledge: Knowledge) -> None:
-        """Let a method refuse scenes that it cannot act in.
+    def check_method(self, method: Method, knowledge: Knowledge) -> None:
+        """Check that a method can act in these scenes.
 
         Raises:
-          InputError: it does.
+          InputError: the method refuses a bank.
         """
-        refuse = find_method(method).check
-        if refuse is not None:
+        if method.check is not None:
             for bank in self.banks:
-                refuse(knowledge, bank)
+                method.check(knowledge, bank)
 
-    def limits(self, bank: Bank) -> np.ndarray:
-        """Return the actions of an episode in each scene, int [S]."""
+    def scene_step_limits(self, bank: Bank) -> np.ndarray:
+        """Maximum number of actions in an episode of each scene of a bank, int [S]."""
         return np.array([self.step_limits.get(room, self.step_limit) for room in bank.room_types])
 
 
-def training_world(config: RunConfig, console: Console) -> CompiledWorld:
+def compile_training_world(config: RunConfig, console: Console) -> CompiledWorld:
     """Compile the training scenes of a run."""
-    scenes = _scenes(config, config.world, "train", config.scenes, config.worlds.shift, console)
-    world = _compiled(config, scenes, {}, config.train_step_limit, console)
-    return dataclasses.replace(world, expert=any(stage.imitates for stage in config.stages))
+    scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, console)
+    world = _compile_world(config, scenes, {}, config.train_step_limit, console)
+    return dataclasses.replace(world, has_expert=any(stage.uses_expert for stage in config.stages))
 
 
-def sample_bank(config: RunConfig, count: int = 4) -> Bank:
+def compile_sample_bank(config: RunConfig, count: int = 4) -> Bank:
     """Compile the first few training scenes of a run."""
-    scenes = _scenes(config, config.world, "train", config.scenes, config.worlds.shift, Console(quiet=True))
-    return compile_bank((scenes[i] for i in range(min(count, len(scenes)))), config.task)
+    scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, Console(quiet=True))
+    # A scene file may hold fewer scenes.
+    num_scenes = min(count, len(scenes))
+    return compile_bank((scenes[index] for index in range(num_scenes)), config.task)
 
 
-def evaluation_world(
+def compile_evaluation_world(
     config: RunConfig,
     split: str,
     scenes: Path | None,
@@ -92,120 +101,189 @@ def evaluation_world(
     console: Console,
     world: str | None = None,
 ) -> CompiledWorld:
-    """Compile the scenes to evaluate a run in.
+    """Compile the scenes in which a run is evaluated.
 
-    One split of its own world or file, of another file or of a generated world, or at another shift. Categories and
-    rules are the run's.
+    Categories and rules are always those of the run.
+
+    Args:
+      config: configuration of the run.
+      split: split of the scenes.
+      scenes: scene file to read in place of the run's scenes.
+      shift: layout shift; see `evaluation_shift`.
+      console: console for progress.
+      world: generated world to use in place of the run's scenes.
 
     Raises:
       InputError: unknown split or world, bad scene file, no scene of the split, a bad shift, or both a file and a
         world.
     """
-    for option, value, known in (("split", split, SPLITS), ("world", world or config.world, WORLDS)):
-        if value not in known:
-            raise InputError(f"--{option} {value}: choose one of {', '.join(known)}")
+    world_name = world or config.world
+    if split not in SPLITS:
+        raise InputError(f"--split {split}: choose one of {', '.join(SPLITS)}")
+    if world_name not in WORLDS:
+        raise InputError(f"--world {world_name}: choose one of {', '.join(WORLDS)}")
     if scenes and world:
         raise InputError(f"--scenes, --world: both are given ({scenes}, {world}); leave one out")
-    name, path = world or config.world, scenes or (None if world else config.scenes)
-    limits = {"living_room": config.worlds.large_step_limit or WORLDS[name].large_step_limit}
-    limit = config.worlds.step_limit or WORLDS[name].step_limit
-    chosen = _scenes(config, name, split, path, evaluation_shift(config, scenes or world, shift), console)
-    return _compiled(config, chosen, limits, limit, console)
+
+    # Another file or world replaces the scenes of the run.
+    path = scenes
+    if not (scenes or world):
+        path = config.scenes
+    evaluation_scenes = _load_scenes(
+        config, world_name, split, path, evaluation_shift(config, scenes or world, shift), console
+    )
+
+    # Episodes in living rooms may be longer.
+    step_limits = {"living_room": config.worlds.large_step_limit or WORLDS[world_name].large_step_limit}
+    step_limit = config.worlds.step_limit or WORLDS[world_name].step_limit
+    return _compile_world(config, evaluation_scenes, step_limits, step_limit, console)
 
 
-def one_world(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
-    """Put the scenes of compiled worlds with equal rules end to end.
-
-    Raises:
-      InputError: the scenes of one of them fill more than one shard.
-    """
-    if any(len(world.banks) > 1 for world in worlds):
-        raise InputError("scenes fill more than one shard; give more --shard-scenes, or fewer scenes")
-    bank = concatenate([world.banks[0] for world in worlds])
-    about = len(bank.ahead), len(bank.names), "-".join(world.fingerprint for world in worlds)
-    return CompiledWorld(worlds[0].scenes, worlds[0].env, (bank,), worlds[0].step_limits, worlds[0].step_limit, *about)
-
-
-def evaluation_shift(config: RunConfig, other: Path | str | None, shift: float | None) -> float:
-    """Return the shift that is asked for, else the run's.
-
-    Another file or world is taken as it is.
-    """
+def evaluation_shift(config: RunConfig, other_source: Path | str | None, shift: float | None) -> float:
+    """Layout shift of an evaluation: `shift` where given, else the run's, and 0 with another file or world."""
     if shift is not None:
         return shift
-    return 0.0 if other else config.worlds.shift
+    return 0.0 if other_source else config.worlds.shift
 
 
-def _scenes(config: RunConfig, world: str, split: str, path: Path | None, shift: float, console: Console) -> Scenes:
-    task, seed = config.task, config.worlds.seed
+def _load_scenes(
+    config: RunConfig, world: str, split: str, path: Path | None, shift: float, console: Console
+) -> Scenes:
+    """Read or generate the scenes of a split, and shift their layout."""
+    # The seed of the generator also decides which categories exchange their places.
+    seed = config.worlds.seed
     if path is None:
-        return shifted(generated(world, split, getattr(config.worlds, f"num_{split}"), seed), task, shift, seed)
-    scenes = from_file(path, split)
-    if counts := unknown_types(scenes.scenes, task.categories):
-        types = most_common(counts)
-        console.print(f"{path}: types that are no category and only block the sight: {types}")
-    return shifted(scenes, task, shift, seed)
+        num_scenes = getattr(config.worlds, f"num_{split}")
+        scenes = make_generated_scenes(world, split, num_scenes, seed)
+        return shift_scenes(scenes, config.task, shift, seed)
+
+    # Objects of a file need not be categories of the task.
+    scenes = load_scenes(path, split)
+    unknown_types = count_unknown_types(scenes.scenes, config.task.categories)
+    if unknown_types:
+        type_names = format_most_common(unknown_types)
+        console.print(f"{path}: types that are no category and only block the sight: {type_names}")
+    return shift_scenes(scenes, config.task, shift, seed)
 
 
-def _compiled(
+def _compile_world(
     config: RunConfig, scenes: Scenes, step_limits: dict[str, int], step_limit: int, console: Console
 ) -> CompiledWorld:
-    task, shard_scenes = config.task, config.worlds.shard_scenes
-    env = ObjectNav(task, WORLDS[config.world].shaping if config.worlds.shaping is None else config.worlds.shaping)
-    if len(scenes) <= shard_scenes:
-        bank = compile_bank((scenes[i] for i in range(len(scenes))), task)
-        console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{_left_out(bank.skipped)}")
-        about = len(bank.ahead), len(bank.names), f"{checksum(bank):08x}"
-        return CompiledWorld(scenes, env, (bank,), step_limits, step_limit, *about)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
-        bar = progress.add_task(f"compiling {len(scenes):,} scenes")
+    """Compile scenes in memory, or to shards where there are more than `worlds.shard_scenes`."""
+    shaping = WORLDS[config.world].shaping if config.worlds.shaping is None else config.worlds.shaping
+    env = ObjectNav(config.task, shaping)
 
-        def report(done: int, total: int) -> None:
-            progress.update(bar, completed=done, total=total)
+    # Few scenes stay in memory as one bank.
+    if len(scenes) <= config.worlds.shard_scenes:
+        bank = compile_bank((scenes[index] for index in range(len(scenes))), config.task)
+        console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{_skipped_note(bank.skipped)}")
+        return CompiledWorld(
+            scenes,
+            env,
+            (bank,),
+            step_limits,
+            step_limit,
+            num_cells=len(bank.ahead),
+            num_scenes=len(bank.names),
+            fingerprint=f"{bank_checksum(bank):08x}",
+        )
+
+    # Many scenes are streamed from disk.
+    shards = _compile_to_cache(config, scenes, console)
+    return CompiledWorld(
+        scenes,
+        env,
+        shards,
+        step_limits,
+        step_limit,
+        num_cells=shards.num_cells,
+        num_scenes=shards.num_scenes,
+        fingerprint=f"{shards.checksum:08x}",
+    )
+
+
+def _compile_to_cache(config: RunConfig, scenes: Scenes, console: Console) -> Shards:
+    """Compile scenes to shards in the cache folder, unless they are there."""
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        progress_bar = progress.add_task(f"compiling {len(scenes):,} scenes")
+
+        def report_progress(completed: int, total: int) -> None:
+            progress.update(progress_bar, completed=completed, total=total)
 
         try:
-            shards = compile_shards(scenes, task, shard_scenes, config.cache.expanduser(), report)
+            cache = config.cache.expanduser()
+            shards = compile_shards(scenes, config.task, config.worlds.shard_scenes, cache, report_progress)
         except OSError as error:
             raise InputError(f"--cache {config.cache}: {error.strerror}; give another folder, or make room") from error
+
+    # Episodes start anew with every shard, so a chunk in one shard must last for a whole episode.
     if config.chunk * config.ppo.rollout < config.train_step_limit:
+        min_chunk = -(-config.train_step_limit // config.ppo.rollout)  # rounded up
         raise InputError(
             f"config: chunk is {config.chunk}; where scenes are streamed it must last for a whole episode: give at "
-            f"least {-(-config.train_step_limit // config.ppo.rollout)}"
+            f"least {min_chunk}"
         )
-    size = sum(file.stat().st_size for file in shards.folder.rglob("*.npy")) / 1e9
+
+    # Say how much of the disk the shards fill.
+    size_gb = sum(array_file.stat().st_size for array_file in shards.folder.rglob("*.npy")) / 1e9
     console.print(
-        f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size:.2f} GB in {shards.folder}"
-        f"{_left_out(shards.skipped)}",
+        f"{sum(shards.counts):,} scenes in {len(shards)} shards, {size_gb:.2f} GB in {shards.folder}"
+        f"{_skipped_note(shards.skipped)}",
     )
-    about = shards.num_cells, shards.num_scenes, f"{shards.checksum:08x}"
-    return CompiledWorld(scenes, env, shards, step_limits, step_limit, *about)
+    return shards
 
 
-def _left_out(skipped: Sequence[str]) -> str:
+def _skipped_note(skipped: Sequence[str]) -> str:
     return f" ({len(skipped)} scenes without a goal left out)" if skipped else ""
 
 
-def bank_order(world: CompiledWorld, seed: int, turns: int) -> list[int]:
-    """Draw which bank is trained in at each turn.
+def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
+    """Join compiled worlds with equal rules into one.
 
-    Pass after pass over all of them, each in an order of its own.
+    Raises:
+      InputError: the scenes of a world fill more than one shard.
     """
-    count = len(world.banks)
-    passes = [np.random.default_rng([seed, i]).permutation(count).tolist() for i in range(-(-turns // count))]
-    return [bank for order in passes for bank in order][:turns]
+    if any(len(world.banks) > 1 for world in worlds):
+        raise InputError("scenes fill more than one shard; give more --shard-scenes, or fewer scenes")
+    # Banks in memory are joined; settings are those of the first world.
+    bank = concatenate_banks([world.banks[0] for world in worlds])
+    first_world = worlds[0]
+    return CompiledWorld(
+        first_world.scenes,
+        first_world.env,
+        (bank,),
+        first_world.step_limits,
+        first_world.step_limit,
+        num_cells=len(bank.ahead),
+        num_scenes=len(bank.names),
+        fingerprint="-".join(world.fingerprint for world in worlds),
+    )
 
 
-def read_ahead(world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
-    """Yield the environment's parameters with one bank after another.
+def draw_bank_order(world: CompiledWorld, seed: int, num_turns: int) -> list[int]:
+    """Draw the index of the bank for every turn of training.
 
-    The next one is read while one is used.
+    Passes over all banks follow one another, each in an order of its own.
     """
+    num_banks = len(world.banks)
+    num_passes = -(-num_turns // num_banks)  # rounded up
+    order: list[int] = []
+    for pass_index in range(num_passes):
+        order += np.random.default_rng([seed, pass_index]).permutation(num_banks).tolist()
+    return order[:num_turns]
+
+
+def prefetch_env_params(world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
+    """Yield the environment's parameters with one bank after another, and read the next bank meanwhile."""
     if not order:
         return
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(world.params, order[0])
-        for i, bank in enumerate(order):
-            params = coming.result()
-            if i + 1 < len(order) and order[i + 1] != bank:
-                coming = pool.submit(world.params, order[i + 1])
+    with ThreadPoolExecutor(1) as thread_pool:
+        # One thread reads the next bank while the caller uses this one.
+        pending_params = thread_pool.submit(world.make_env_params, order[0])
+        for turn_index, bank_index in enumerate(order):
+            params = pending_params.result()
+
+            # A bank that comes again in the next turn stays.
+            if turn_index + 1 < len(order) and order[turn_index + 1] != bank_index:
+                pending_params = thread_pool.submit(world.make_env_params, order[turn_index + 1])
             yield params

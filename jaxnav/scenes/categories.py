@@ -1,4 +1,7 @@
-"""Ordered vocabularies of the object categories."""
+"""Ordered vocabularies of the object categories.
+
+`category_ids` maps object types, which differ between simulators, to a vocabulary; `ALIASES` lists their other names.
+"""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -33,7 +36,7 @@ GIBSON_GOALS: tuple[str, ...] = GIBSON_CATEGORIES[:6]
 #: Room types of the single-room worlds, in the order of the per-type priors.
 ROOM_TYPES: tuple[str, ...] = ("kitchen", "living_room", "bedroom", "bathroom")
 
-#: Type names of other simulator versions and datasets, and the name that is used here.
+#: Type names of other simulator versions and datasets, with the name used here.
 ALIASES = MappingProxyType({
     "Stool": "Chair", "chair": "Chair", "stool": "Chair", "couch": "Sofa", "sofa": "Sofa", "bed": "Bed",
     "potted plant": "HousePlant", "plant": "HousePlant", "toilet": "Toilet", "tv": "Television",
@@ -45,25 +48,38 @@ ALIASES = MappingProxyType({
 
 
 def category_ids(types: tuple[str, ...], categories: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the index of each object type in `categories`.
+    """Return the index of each object type in `categories`, or -1.
 
-    A type is found by its name or else by its alias; -1 where it is no category.
+    A type is matched by its name or else by its alias.
     """
-    index = {name: i for i, name in enumerate(categories)}
-    return tuple(index.get(name, index.get(ALIASES.get(name, name), -1)) for name in types)
+    index_by_name = {name: index for index, name in enumerate(categories)}
+
+    def find_index(name: str) -> int:
+        alias = ALIASES.get(name, name)
+        return index_by_name.get(name, index_by_name.get(alias, -1))
+
+    return tuple(find_index(name) for name in types)
 
 
-def most_common(counts: Counter[str], number: int = 5) -> str:
-    """Name the most frequent entries and the number of others."""
-    shown = ", ".join(f"{name} x {count}" for name, count in counts.most_common(number))
-    return shown + (f" and {len(counts) - number} more" if len(counts) > number else "")
+def format_most_common(counts: Counter[str], number: int = 5) -> str:
+    """Return a text with the most frequent entries and the number of further entries."""
+    entry_texts: list[str] = []
+    for name, count in counts.most_common(number):
+        entry_texts.append(f"{name} x {count}")
+    joined_entries = ", ".join(entry_texts)
+    if len(counts) > number:
+        joined_entries += f" and {len(counts) - number} more"
+    return joined_entries
 
 
-def unknown_types(scenes: Iterable[Scene], categories: tuple[str, ...]) -> Counter[str]:
-    """Count the objects of types that are no category.
+def count_unknown_types(scenes: Iterable[Scene], categories: tuple[str, ...]) -> Counter[str]:
+    """Count the objects of types outside of `categories`, which only occlude other objects."""
+    type_counts: Counter[str] = Counter()
+    for scene in scenes:
+        type_counts.update(scene.types)
 
-    Such objects only block the sight.
-    """
-    types = Counter(name for scene in scenes for name in scene.types)
-    known = category_ids(tuple(types), categories)
-    return Counter({name: types[name] for name, category in zip(types, known, strict=True) if category < 0})
+    unknown_counts: Counter[str] = Counter()
+    for name, category in zip(type_counts, category_ids(tuple(type_counts), categories), strict=True):
+        if category < 0:
+            unknown_counts[name] = type_counts[name]
+    return unknown_counts

@@ -1,9 +1,14 @@
-"""Moves on the lattice, and shortest paths."""
+"""Moves on the lattice and shortest paths.
+
+`standable_cells` finds the cells that an agent can occupy, `cells_ahead` and `pose_successors` tabulate the actions on
+them, and `best_lengths` computes the shortest action sequence from every pose to every goal at once. Arrays use
+C standable cells, H headings, K categories and P = C * H * horizons poses.
+"""
 
 import numpy as np
 from scipy import ndimage
 
-from jaxnav.scenes.scene import CELL
+from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
 
 
@@ -11,7 +16,7 @@ def standable_cells(reach: np.ndarray) -> np.ndarray:
     """Return the cells of the largest 8-connected part.
 
     Args:
-      reach: bool [nz, nx], where one can stand. Of equally large parts the first in row order counts.
+      reach: bool [nz, nx], True where an agent can stand. Of equally large parts the first in row order counts.
 
     Returns:
       int [C, 2], (iz, ix) in row order.
@@ -25,17 +30,23 @@ def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
     Returns:
       int [P, 2] each, the cells of a part; parts and cells are in row order.
     """
-    labels = np.zeros(mask.shape, np.int32)
-    ndimage.label(mask, np.ones((3, 3)), output=labels)
-    cells, label = np.argwhere(mask), labels[mask]
-    parts = np.split(cells[np.argsort(label, kind="stable")], np.cumsum(np.bincount(label)[1:]))[:-1]
+    # Label the parts 1, 2, ...; cells outside of the mask have the label 0.
+    label_grid = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, np.ones((3, 3)), output=label_grid)
+    cells = np.argwhere(mask)
+    cell_labels = label_grid[mask]
+
+    # A stable sort by label keeps the cells of each part in row order.
+    cells_by_label = cells[np.argsort(cell_labels, kind="stable")]
+    part_ends = np.cumsum(np.bincount(cell_labels)[1:])
+    parts = np.split(cells_by_label, part_ends)[:-1]
     return sorted(parts, key=lambda part: part[0].tolist())
 
 
-def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:
+def cells_ahead(cells: np.ndarray, rules: Rules) -> np.ndarray:
     """Return the cell after MoveAhead from every cell and heading.
 
-    Where the way is blocked the agent stays.
+    The agent stays in its cell where the move is blocked.
 
     Args:
       cells: int [C, 2], the standable cells (iz, ix).
@@ -44,107 +55,130 @@ def ahead_of(cells: np.ndarray, rules: Rules) -> np.ndarray:
     Returns:
       int32 [C, H].
     """
-    low = cells.min(axis=0, initial=0) - 1
-    index = np.full(cells.max(axis=0, initial=0) - low + 2, -1)
-    index[tuple((cells - low).T)] = np.arange(len(cells))
-    ahead = index[tuple(np.moveaxis(cells[:, None] - low + rules.steps(), -1, 0))]
-    return np.where(ahead >= 0, ahead, np.arange(len(cells))[:, None]).astype(np.int32)
+    # A grid of cell indices with a margin of one blocked cell (-1) around the standable cells.
+    low_corner = cells.min(axis=0, initial=0) - 1
+    index_grid = np.full(cells.max(axis=0, initial=0) - low_corner + 2, -1)
+    index_grid[tuple((cells - low_corner).T)] = np.arange(len(cells))
+
+    # [C, H, 2] -> [C, H]
+    target_cells = cells[:, None] - low_corner + rules.move_steps()
+    next_cells = index_grid[tuple(np.moveaxis(target_cells, -1, 0))]
+    return np.where(next_cells >= 0, next_cells, np.arange(len(cells))[:, None]).astype(np.int32)
 
 
-def successors(ahead: np.ndarray, rules: Rules) -> np.ndarray:
+def pose_successors(ahead: np.ndarray, rules: Rules) -> np.ndarray:
     """Return the pose after every action from every pose.
 
     Args:
-      ahead: int32 [C, H], see `ahead_of`.
+      ahead: int32 [C, H], see `cells_ahead`.
       rules: headings and horizons.
 
     Returns:
       int32 [P, 6], P = C * H * horizons.
     """
-    last = len(rules.horizons) - 1
-    cell, heading, horizon = np.indices((len(ahead), rules.headings, last + 1), np.int32)
+    # Indices of every pose and of the cell ahead of it, [C, H, horizons] each.
+    last_horizon = len(rules.horizons) - 1
+    cell, heading, horizon = np.indices((len(ahead), rules.headings, last_horizon + 1), np.int32)
+    next_cell = np.broadcast_to(ahead[..., None], cell.shape)
 
-    def pose(cell: np.ndarray, heading: np.ndarray, horizon: np.ndarray) -> np.ndarray:
+    def pose_index(cell: np.ndarray, heading: np.ndarray, horizon: np.ndarray) -> np.ndarray:
         return (cell * rules.headings + heading % rules.headings) * len(rules.horizons) + horizon
 
-    table = [
-        pose(np.broadcast_to(ahead[..., None], cell.shape), heading, horizon),
-        pose(cell, heading - 1, horizon),
-        pose(cell, heading + 1, horizon),
-        pose(cell, heading, np.maximum(horizon - 1, 0)),
-        pose(cell, heading, np.minimum(horizon + 1, last)),
-        pose(cell, heading, horizon),
+    # One entry per action, in the order of `ACTIONS`.
+    next_poses = [
+        pose_index(next_cell, heading, horizon),
+        pose_index(cell, heading - 1, horizon),
+        pose_index(cell, heading + 1, horizon),
+        pose_index(cell, heading, np.maximum(horizon - 1, 0)),
+        pose_index(cell, heading, np.minimum(horizon + 1, last_horizon)),
+        pose_index(cell, heading, horizon),
     ]
-    return np.stack(table, axis=-1).reshape(-1, NUM_ACTIONS).astype(np.int32)
+    return np.stack(next_poses, axis=-1).reshape(-1, NUM_ACTIONS).astype(np.int32)
 
 
 def best_lengths(successor: np.ndarray, success: np.ndarray) -> np.ndarray:
-    """Return L*, the least number of actions to success.
+    """Return L*, the smallest number of actions to success, Done included.
 
-    Done counts as an action.
+    A breadth-first search runs backwards from all successful poses of all goals at once.
 
     Args:
-      successor: int [P, 6].
-      success: bool [P, K], whether Done would succeed at a pose.
+      successor: int [P, 6], see `pose_successors`.
+      success: bool [P, K], True where Done succeeds at a pose.
 
     Returns:
       uint16 [P, K]; 1 where Done succeeds at the pose itself, 0 where the goal cannot be reached.
     """
+    num_goals = success.shape[1]
     lengths = success.astype(np.uint16)
-    # The goals reached so far are the bits of a word, so that one pass over the moves serves them all.
-    bits = np.packbits(success, axis=1, bitorder="little")
-    reached = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)  # [P, words]
-    moves = np.ascontiguousarray(successor[:, :DONE].T)
+
+    # The goals within reach of a pose are bits of 64-bit words, so one pass over the moves serves all goals.
+    success_bits = np.packbits(success, axis=1, bitorder="little")
+    reached_bits = np.pad(success_bits, ((0, 0), (0, -success_bits.shape[1] % 8))).view(np.uint64)  # [P, words]
+    move_successors = np.ascontiguousarray(successor[:, :DONE].T)  # [5, P]
+
     length = 1
     while True:
-        spread = reached.copy()
-        for move in moves:
-            spread |= reached[move]
-        new = np.flatnonzero((spread != reached).any(axis=1))
-        if not len(new):
+        # A pose reaches every goal that one of its successors reaches.
+        next_reached = reached_bits.copy()
+        for successor_pose in move_successors:
+            next_reached |= reached_bits[successor_pose]
+        changed_poses = np.flatnonzero((next_reached != reached_bits).any(axis=1))
+        if not len(changed_poses):
             return lengths
+
+        # Unpack the new bits of the changed poses to (pose, goal) pairs.
         length += 1
-        fresh = np.unpackbits((spread ^ reached)[new].view(np.uint8), axis=1, bitorder="little", count=success.shape[1])
-        pose, goal = np.nonzero(fresh)
-        lengths[new[pose], goal] = length
-        reached = spread
+        new_bytes = (next_reached ^ reached_bits)[changed_poses].view(np.uint8)
+        new_goals = np.unpackbits(new_bytes, axis=1, bitorder="little", count=num_goals)
+        changed_row, goal = np.nonzero(new_goals)
+        lengths[changed_poses[changed_row], goal] = length
+        reached_bits = next_reached
 
 
 def best_actions(successor: np.ndarray, best_length: np.ndarray, pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """Return the first action of a shortest path.
 
     Args:
-      successor: int [P, 6].
+      successor: int [P, 6], see `pose_successors`.
       best_length: uint16 [P, K], see `best_lengths`.
-      pose, goal: int [...], of which to which.
+      pose: int [...], where each path starts.
+      goal: int [...], category that each path leads to.
 
     Returns:
-      int [...], Done where it succeeds; of equally good actions the first. `NUM_ACTIONS`, which is none, where there is
-      no way.
+      int [...], Done where it succeeds, and the first of equally good actions; `NUM_ACTIONS`, which is no action, where
+      the goal cannot be reached.
     """
-    left = best_length[pose, goal]
-    nearer = best_length[successor[pose, :DONE], goal[..., None]] == left[..., None] - 1
-    return np.where(left > 1, nearer.argmax(axis=-1), np.where(left == 1, DONE, NUM_ACTIONS))
+    # A first action is good if it leads to a pose from which one action less is needed.
+    num_actions_left = best_length[pose, goal]
+    next_lengths = best_length[successor[pose, :DONE], goal[..., None]]
+    is_nearer = next_lengths == num_actions_left[..., None] - 1
+
+    # There is no move to choose where Done succeeds, and none that helps where the goal cannot be reached.
+    at_goal_or_stuck = np.where(num_actions_left == 1, DONE, NUM_ACTIONS)
+    return np.where(num_actions_left > 1, is_nearer.argmax(axis=-1), at_goal_or_stuck)
 
 
 def walking_distances(ahead: np.ndarray, rules: Rules, direct: np.ndarray) -> np.ndarray:
     """Return the shortest walks from each cell to goals.
 
     Args:
-      ahead: int32 [C, H], see `ahead_of`.
+      ahead: int32 [C, H], see `cells_ahead`.
       rules: the headings.
-      direct: float64 [C, G], metres straight from each cell to a goal, inf where there is no straight way.
+      direct: float64 [C, G], straight distance in metres from each cell to a goal, inf where the line is blocked.
 
     Returns:
-      float64 [C, G], metres: the least, over all cells, of the walk there and the straight way from there.
+      float64 [C, G], metres: the minimum, over all cells, of the walk to that cell plus its straight distance.
     """
-    ways, first = np.unique(rules.steps(), axis=0, return_index=True)
-    costs = CELL * np.hypot(*ways.T)
+    # Several headings can share a step; one heading for each distinct step is enough.
+    distinct_steps, step_headings = np.unique(rules.move_steps(), axis=0, return_index=True)
+    step_costs = CELL_SIZE * np.hypot(*distinct_steps.T)
+
+    # Relax all steps until no distance changes (Bellman-Ford).
     distance = direct
     while True:
-        nearer = distance
-        for heading, cost in zip(first, costs, strict=True):
-            nearer = np.minimum(nearer, distance[ahead[:, heading]] + cost)
-        if np.array_equal(nearer, distance):
+        next_distance = distance
+        for heading, step_cost in zip(step_headings, step_costs, strict=True):
+            next_distance = np.minimum(next_distance, distance[ahead[:, heading]] + step_cost)
+        if np.array_equal(next_distance, distance):
             return distance
-        distance = nearer
+        distance = next_distance

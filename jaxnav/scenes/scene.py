@@ -1,8 +1,7 @@
-"""Scenes on a 0.25 m lattice.
+"""Scenes on a 0.25 m lattice: standable cells, walls and boxes of objects.
 
-A scene has standable cells, walls and boxes of objects.
-Coordinates are metres, y up, x right and z forward; yaw is in degrees clockwise seen from above and yaw 0
-looks along +z. The floor is at y = 0.
+`Scene` is the common form of generated rooms and homes and of scenes read from files. Coordinates are metres, y up,
+x right and z forward; yaw is in degrees clockwise seen from above and yaw 0 looks along +z. The floor is at y = 0.
 """
 
 import dataclasses
@@ -12,22 +11,22 @@ from typing import NamedTuple
 import numpy as np
 
 #: Lattice spacing in metres; MoveAhead goes to a neighbouring lattice point.
-CELL = 0.25
+CELL_SIZE = 0.25
 
-#: Cells of a scene's side at most, 500 m; a larger extent is a mistake.
-MAX_SIDE = 2000
+#: Largest side of a scene in cells, 500 m; a larger extent is a mistake in the file.
+MAX_SIDE_CELLS = 2000
 
-#: What scenes are divided into.
+#: Names of the data splits.
 SPLITS = ("train", "val", "test")
 
 #: Names of scenes that share their walls with others: apartments, and rooms with their objects moved.
-_FURNISHED = re.compile(
+_FURNISHING_NAME = re.compile(
     r"(FloorPlan_[A-Za-z]+[0-9]+)_[0-9]+|((?:train|val|test)-apartment-[0-9]+)-[0-9]+|(.+)-replaced-[0-9]+"
 )
 
 
 class Room(NamedTuple):
-    """Hold a room of a home.
+    """One room of a home.
 
     Attributes:
       type: `kitchen`, `living_room`, `bedroom`, `bathroom`, ...
@@ -40,7 +39,7 @@ class Room(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Hold one room, apartment or house.
+    """One room, apartment or house.
 
     Attributes:
       name: unique name of the scene.
@@ -71,40 +70,53 @@ class Scene:
     rooms: tuple[Room, ...] = ()
 
 
-def floor_plan(name: str) -> str:
-    """Return the floor plan that a scene's name tells.
+def floor_plan_name(name: str) -> str:
+    """Return the name of the floor plan, derived from a scene's name.
 
     Scenes of one floor plan are alike, and count as one in statistics: `FloorPlan_Train3_1` and `FloorPlan_Train3_5`,
     `val-apartment-02-0` and `val-apartment-02-4`, `FloorPlan7` and `FloorPlan7-replaced-2`. Any other scene has a floor
-    plan of its own, which has its name.
+    plan of its own with the scene's name.
     """
-    while match := _FURNISHED.fullmatch(name):
-        name = next(filter(None, match.groups()))
+    # Suffixes can be nested, for example an apartment with its objects moved.
+    name_match = _FURNISHING_NAME.fullmatch(name)
+    while name_match:
+        name = next(filter(None, name_match.groups()))
+        name_match = _FURNISHING_NAME.fullmatch(name)
     return name
 
 
-def extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest (x, z) of a scene.
+def scene_extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest (x, z) of a scene's cells and objects.
 
     Args:
-      scene: whose objects count.
-      cells: bool [nz, nx], the cells that count; None for all.
+      scene: the scene; all its objects are included.
+      cells: bool [nz, nx], the cells to include; None for all.
 
     Returns:
       float64 [2] each, metres.
     """
-    iz, ix = np.nonzero(np.ones_like(scene.reach) if cells is None else cells)
-    points = np.asarray(scene.origin) + CELL * np.stack([ix, iz], axis=-1)
-    centre, half = scene.boxes[:, [0, 2]], scene.boxes[:, [3, 5]] / 2
-    low = np.minimum(points.min(axis=0) - CELL / 2, (centre - half).min(axis=0, initial=np.inf))
-    high = np.maximum(points.max(axis=0) + CELL / 2, (centre + half).max(axis=0, initial=-np.inf))
+    if cells is None:
+        cells = np.ones_like(scene.reach)
+
+    # Centres of the cells in world coordinates, [C, 2].
+    row, column = np.nonzero(cells)
+    cell_centres = np.asarray(scene.origin) + CELL_SIZE * np.stack([column, row], axis=-1)
+
+    # Footprints of the objects, [N, 2] each.
+    box_centres = scene.boxes[:, [0, 2]]
+    half_sizes = scene.boxes[:, [3, 5]] / 2
+
+    # The cells are squares around their centres. A scene without objects has the extent of its cells.
+    low = np.minimum(cell_centres.min(axis=0) - CELL_SIZE / 2, (box_centres - half_sizes).min(axis=0, initial=np.inf))
+    high = np.maximum(cell_centres.max(axis=0) + CELL_SIZE / 2, (box_centres + half_sizes).max(axis=0, initial=-np.inf))
     return low, high
 
 
 def scene_size(scene: Scene) -> np.ndarray:
     """Return width and depth of a scene, float64 [2], metres.
 
-    They are those of the rectangle around the objects and the cells that are no wall.
+    The rectangle encloses the objects and all cells that are not walls.
     """
-    low, high = extent(scene, scene.reach | ~scene.walls)
+    # Cells that are neither standable nor a wall hold furniture, so they count.
+    low, high = scene_extent(scene, scene.reach | ~scene.walls)
     return high - low

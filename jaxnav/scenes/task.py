@@ -1,4 +1,8 @@
-"""Tasks: categories, goals and the rules of an episode."""
+"""Tasks: categories, goals and the rules of an episode.
+
+`ROOMS`, `APARTMENTS` and `HOUSES` are the tasks of the three worlds; `Rules` also defines the geometry of poses, moves
+and the ego-centric view.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,9 +17,9 @@ from jaxnav.scenes.categories import (
     ROBOTHOR_CATEGORIES,
     ROBOTHOR_GOALS,
 )
-from jaxnav.scenes.tables.detector import Detector
+from jaxnav.scenes.tables.observation_row import Detector
 
-#: Names of the actions, in their order.
+#: Names of the actions; an action is an index into them.
 ACTIONS = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
 NUM_ACTIONS = len(ACTIONS)
 MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTIONS)
@@ -26,14 +30,14 @@ NEIGHBOURS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -
 
 @dataclasses.dataclass(frozen=True)
 class Rules:
-    """Describe motion, view and success.
+    """Rules of motion, view and success.
 
     Attributes:
       headings: H; heading h looks 360 h / H degrees clockwise from +z.
-      horizons: degrees downwards; every episode starts with the first.
+      horizons: camera pitches, degrees downwards; every episode starts with the first.
       field_of_view: horizontal and vertical, degrees.
       camera: height above the floor, metres.
-      success: when Done succeeds: `seen`, a visible goal object whose centre is within the success distance
+      success: condition for Done to succeed: `seen`, a visible goal object whose centre is within the success distance
         horizontally; or `near`, a goal object whose footprint is within the success distance on foot.
       success_distance: metres.
     """
@@ -47,34 +51,32 @@ class Rules:
 
     @property
     def poses_per_cell(self) -> int:
-        """Return the number of poses of one cell.
+        """Number of poses of one cell.
 
-        pose = (cell * headings + heading) * horizons + horizon, each an index.
+        Poses are numbered by pose = (cell * headings + heading) * horizons + horizon, each an index.
         """
         return self.headings * len(self.horizons)
 
-    def split(self, pose: Any) -> tuple[Any, Any, Any]:
+    def split_pose(self, pose: Any) -> tuple[Any, Any, Any]:
         """Return cell, heading and horizon of poses.
 
-        Each is an index, of the type and the shape of `pose`: an int or an array of ints.
+        Each is an index of the type and the shape of `pose`: an int or an array of ints.
         """
-        horizons = len(self.horizons)
-        return pose // self.poses_per_cell, pose // horizons % self.headings, pose % horizons
+        num_horizons = len(self.horizons)
+        return pose // self.poses_per_cell, pose // num_horizons % self.headings, pose % num_horizons
 
     @property
-    def half_view(self) -> tuple[float, float]:
-        """Return the tangents of half the field of view.
+    def half_view_tangents(self) -> tuple[float, float]:
+        """Tangents of half the field of view, horizontal and vertical."""
+        horizontal, vertical = np.tan(np.deg2rad(self.field_of_view) / 2)
+        return float(horizontal), float(vertical)
 
-        Horizontal, then vertical.
+    def heading_directions(self) -> np.ndarray:
+        """Return the unit vectors of the headings, float64 [H, 2], (x, z).
+
+        Components are rounded so that equal lengths are equal numbers.
         """
-        across, up = np.tan(np.deg2rad(self.field_of_view) / 2)
-        return float(across), float(up)
-
-    def directions(self) -> np.ndarray:
-        """Return the unit vectors of the headings.
-
-        They are float64 [H, 2], (x, z), rounded so that equal lengths are equal numbers.
-        """
+        # Clockwise from +z, so x is the sine and z the cosine.
         angles = np.deg2rad(360.0 / self.headings * np.arange(self.headings))
         return np.round(np.stack([np.sin(angles), np.cos(angles)], axis=-1), 12)
 
@@ -87,9 +89,9 @@ class Rules:
         Returns:
           int [H, V, V, 2], (dz, dx) from the agent's cell, by heading; row 0 nearest to the agent, column 0 leftmost.
         """
-        return self.turned_offsets(np.arange(view), np.arange(view) - view // 2)
+        return self.offsets_by_heading(np.arange(view), np.arange(view) - view // 2)
 
-    def turned_offsets(self, ahead: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def offsets_by_heading(self, ahead: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return cells ahead and to the right of the agent.
 
         Args:
@@ -99,27 +101,30 @@ class Rules:
         Returns:
           int [H, A, B, 2], (dz, dx) from the agent's cell, by heading.
         """
-        forward = self.directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
+        # Forward and rightward unit vectors of each heading, as (z, x) like the cells.
+        forward = self.heading_directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
         rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
         return np.rint(forward * ahead[:, None, None] + rightward * right[:, None]).astype(int)
 
-    def steps(self) -> np.ndarray:
-        """Return the displacement of MoveAhead for each heading.
+    def move_steps(self) -> np.ndarray:
+        """Return the displacement of MoveAhead for each heading, int [H, 2], (dz, dx).
 
-        It is int [H, 2], (dz, dx), and leads to the neighbouring cell in the nearest direction.
+        MoveAhead leads to the neighbouring cell in the nearest direction.
         """
-        return NEIGHBOURS[np.rint(8 / self.headings * np.arange(self.headings)).astype(int) % 8]
+        # There are eight neighbours, so several headings can share one.
+        nearest_neighbour = np.rint(8 / self.headings * np.arange(self.headings)).astype(int) % 8
+        return NEIGHBOURS[nearest_neighbour]
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Describe what an agent is asked to do; hashable.
+    """Search task of an agent; hashable.
 
     Attributes:
-      categories: [K] names of what can be detected.
-      goals: names of what can be searched for, some of `categories`; () for all.
-      rules: of motion, view and success.
-      detector: its error rates.
+      categories: [K] names of the object categories that can be detected.
+      goals: the categories that can be goals; () for all of `categories`.
+      rules: rules of motion, view and success.
+      detector: detector with its error rates.
     """
 
     categories: tuple[str, ...] = ITHOR_CATEGORIES
@@ -129,18 +134,23 @@ class Task:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Task":
-        """Make the task of which JSON holds the fields."""
-        rules, detector = _tupled(values["rules"]), _tupled(values["detector"])
-        return cls(**_tupled(values) | {"rules": Rules(**rules), "detector": Detector(**detector)})
+        """Make a task from its fields as read from JSON."""
+        # JSON has lists where the dataclasses have tuples.
+        task_rules = Rules(**_lists_to_tuples(values["rules"]))
+        task_detector = Detector(**_lists_to_tuples(values["detector"]))
+        return cls(**_lists_to_tuples(values) | {"rules": task_rules, "detector": task_detector})
 
     def is_goal(self) -> np.ndarray:
-        """Return which categories can be goals, bool [K]."""
+        """Return where categories can be goals, bool [K]."""
         return np.array([not self.goals or name in self.goals for name in self.categories])
 
 
-def _tupled(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values with tuples for lists."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+def _lists_to_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values with tuples in place of lists."""
+    return {
+        name: tuple(field_value) if isinstance(field_value, list) else field_value
+        for name, field_value in values.items()
+    }
 
 
 #: The tasks of AI2-THOR rooms, RoboTHOR apartments and Gibson houses.

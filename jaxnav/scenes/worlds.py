@@ -1,37 +1,44 @@
-"""The worlds of the paper, and scenes as sequences."""
+"""The worlds of the paper, and their scenes as sequences.
+
+`WORLDS` defines scenes, task and usual limits of the three worlds. `make_generated_scenes` and `load_scenes` return the
+scenes of one split, generated or from a file, and `shift_scenes` shifts their layout. `SceneSource` combines the three
+for commands.
+"""
 
 import dataclasses
+import difflib
+import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 from jaxnav.errors import InputError, MissingSplitError
-from jaxnav.scenes.exchange import check_shift, exchange_places
-from jaxnav.scenes.files.record import read_bytes
-from jaxnav.scenes.files.scene_file import read_scenes
+from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
-from jaxnav.scenes.generate.rooms import generate_room_at
+from jaxnav.scenes.generate.rooms import generate_room
+from jaxnav.scenes.layout_shift import check_shift, exchange_places
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
 
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """Describe what the scenes of a world have in common.
+    """Scenes, task and usual limits of a world.
 
     Attributes:
-      generate: a scene from (split, index, seed).
+      generate: function from (split, index, seed) to a scene.
       counts: usual number of scenes of each split.
       task: categories, goals and rules.
       total_steps: environment steps that a policy is usually trained for.
       train_step_limit: actions of a training episode.
       step_limit: actions of an evaluation episode.
-      large_step_limit: the same in living rooms.
-      shaping: reward in training for every metre nearer to the goal than before in the episode, needed where goals are
-        rarely reached by chance.
+      large_step_limit: actions of an evaluation episode in living rooms.
+      shaping: reward in training for every metre nearer to the goal than before in the episode, for worlds whose goals
+        are rarely reached by chance.
       near_starts: probability that a training episode starts near its goal, for the same reason.
-      budgets: actions within which success is counted too: where experience is worth most, and later.
+      budgets: numbers of actions within which success is counted in addition: where experience is most valuable, and
+        later.
     """
 
     generate: Callable[[str, int, int], Scene]
@@ -49,7 +56,7 @@ class World:
 #: AI2-THOR, RoboTHOR and Gibson in the paper.
 WORLDS = {
     "rooms": World(
-        generate=generate_room_at,
+        generate=generate_room,
         counts={"train": 80, "val": 20, "test": 20},
         task=ROOMS,
         total_steps=1_200_000,
@@ -86,7 +93,8 @@ WORLDS = {
     ),
 }
 
-_STAND_FOR = {
+# Apartments of RoboTHOR, and multi-room homes of any dataset; all other origins are single rooms.
+_WORLD_BY_ORIGIN = {
     "robothor": "apartments",
     "apartments": "apartments",
     "procthor": "houses",
@@ -96,24 +104,21 @@ _STAND_FOR = {
 }
 
 
-def world_named(origin: str) -> str:
-    """Return the name of the world that scenes of an origin stand for.
+def world_name_of_origin(origin: str) -> str:
+    """Return the name of the world whose task and rules apply to scenes of an origin.
 
     Args:
-      origin: the `world` of a scene, such as `robothor`; one that is not known stands for `rooms`.
+      origin: the `world` of a scene, such as `robothor`; an unknown one corresponds to `rooms`.
     """
-    return _STAND_FOR.get(origin, "rooms")
+    return _WORLD_BY_ORIGIN.get(origin, "rooms")
 
 
 class Scenes(Protocol):
-    """Provide the scenes of one split, in order.
-
-    A scene is made on access.
-    """
+    """Sequence of the scenes of one split; a scene can be made on access."""
 
     @property
     def identity(self) -> str:
-        """Return a text that differs wherever the scenes differ."""
+        """Text that is different for different scenes."""
         ...
 
     def __len__(self) -> int: ...
@@ -123,10 +128,10 @@ class Scenes(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class GeneratedScenes:
-    """Generate the scenes of a world on access.
+    """Scenes of a world that are generated on access.
 
     Attributes:
-      world: its name, a key of `WORLDS`.
+      world: name of the world, a key of `WORLDS`.
       split: `train`, `val` or `test`.
       count: number of scenes.
       seed: of the generator, at least 0.
@@ -139,7 +144,7 @@ class GeneratedScenes:
 
     @property
     def identity(self) -> str:
-        """Return the arguments of the generator."""
+        """Arguments of the generator."""
         return repr(self)
 
     def __len__(self) -> int:
@@ -153,10 +158,10 @@ class GeneratedScenes:
 
 @dataclasses.dataclass(frozen=True)
 class FileScenes:
-    """Hold the scenes of a file.
+    """Scenes of a file.
 
     Attributes:
-      scenes: as read.
+      scenes: the scenes in the order of the file.
       identity: split and checksum of the file.
     """
 
@@ -172,11 +177,11 @@ class FileScenes:
 
 @dataclasses.dataclass(frozen=True)
 class ShiftedScenes:
-    """Shift the layout of scenes on access.
+    """Scenes whose layout is shifted on access.
 
     Attributes:
-      scenes: without a shift.
-      task: its categories exchange their places.
+      scenes: the scenes without a shift.
+      task: task whose categories exchange their places.
       shift: share of the categories, from 0 to 1; see `exchange_places`.
       seed: of the exchange.
     """
@@ -188,9 +193,9 @@ class ShiftedScenes:
 
     @property
     def identity(self) -> str:
-        """Return that of the scenes, and the shift."""
-        categories, goals = self.task.categories, self.task.goals
-        return f"{self.scenes.identity}, places exchanged: {self.shift}, {self.seed}, {categories}, {goals}"
+        """Identity of the unshifted scenes, with the shift."""
+        exchange_options = f"{self.shift}, {self.seed}, {self.task.categories}, {self.task.goals}"
+        return f"{self.scenes.identity}, places exchanged: {exchange_options}"
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -199,12 +204,12 @@ class ShiftedScenes:
         return exchange_places(self.scenes[index], self.task, self.shift, self.seed)
 
 
-def shifted(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Scenes:
+def shift_scenes(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Scenes:
     """Return scenes with a shifted layout.
 
     Args:
-      scenes: of a file or of a generated world.
-      task: its categories exchange their places; see `exchange_places`.
+      scenes: scenes of a file or of a generated world.
+      task: task whose categories exchange their places; see `exchange_places`.
       shift: layout shift, from 0 (the scenes themselves) to 1.
       seed: of the exchange, at least 0.
 
@@ -215,18 +220,19 @@ def shifted(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Scenes:
     return ShiftedScenes(scenes, task, shift, seed) if shift else scenes
 
 
-def generated(world: str, split: str, count: int | None = None, seed: int = 0) -> GeneratedScenes:
-    """Describe the scenes of one split of a generated world.
+def make_generated_scenes(world: str, split: str, count: int | None = None, seed: int = 0) -> GeneratedScenes:
+    """Return the scenes of one split of a generated world, which are generated on access.
 
     Args:
       world: a key of `WORLDS`.
       split: `train`, `val` or `test`.
-      count: number of scenes; None for the world's usual one.
+      count: number of scenes; None for the world's usual number.
       seed: of the generator, at least 0.
 
     Raises:
       InputError: an unknown name, or an impossible number.
     """
+    # Check the names before the numbers, whose default depends on them.
     if world not in WORLDS:
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}")
     _check_split(split)
@@ -238,7 +244,7 @@ def generated(world: str, split: str, count: int | None = None, seed: int = 0) -
     return GeneratedScenes(world, split, count, seed)
 
 
-def from_file(path: str | Path, split: str | None) -> FileScenes:
+def load_scenes(path: str | Path, split: str | None) -> FileScenes:
     """Read the scenes of one split of a scene file.
 
     Args:
@@ -246,19 +252,120 @@ def from_file(path: str | Path, split: str | None) -> FileScenes:
       split: `train`, `val` or `test`; None for all scenes.
 
     Raises:
-      MissingSplitError: the file holds no scene of the split.
+      MissingSplitError: the file has no scene of the split.
       InputError: unknown split, or no readable scene file.
     """
+    # An unknown name of a split is reported before the file is read.
     if split is not None:
         _check_split(split)
     scenes = read_scenes(path)
-    chosen = tuple(scene for scene in scenes if split in (None, scene.split))
-    if not chosen:
-        held = sorted({scene.split for scene in scenes})
-        raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(held)}")
-    return FileScenes(chosen, f"{split or 'all'} of {hashlib.sha256(read_bytes(Path(path))).hexdigest()}")
+    scenes_of_split = tuple(scene for scene in scenes if split in (None, scene.split))
+    if not scenes_of_split:
+        splits_in_file = sorted({scene.split for scene in scenes})
+        raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(splits_in_file)}")
+
+    # The identity follows the content of the file, not its name.
+    file_checksum = hashlib.sha256(read_bytes(Path(path))).hexdigest()
+    return FileScenes(scenes_of_split, f"{split or 'all'} of {file_checksum}")
 
 
 def _check_split(split: str) -> None:
     if split not in SPLITS:
         raise InputError(f"split {split!r}: choose one of {', '.join(SPLITS)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneSource:
+    """Options of a command that select scenes of a file or of a generated world.
+
+    Attributes:
+      file: scene file, or the name of a generated world: `rooms`, `apartments` or `houses`.
+      split: of the scenes; default: all of a file, `val` of a generated world.
+      seed: of a generated world, and of the shift.
+      shift: layout shift, from 0 to 1: the share of the categories that exchange their places.
+      world: world whose categories and rules count; default: the generated one, or what the scenes of a file stand for.
+    """
+
+    file: str
+    split: Literal["train", "val", "test"] | None = None
+    seed: int = 0
+    shift: float = 0.0
+    world: Literal["rooms", "apartments", "houses"] | None = None
+
+    @functools.cached_property
+    def world_name(self) -> str:
+        """Name of the world whose rules apply; without `--world` the first scene of a file decides.
+
+        Raises:
+          InputError: no readable scene file.
+        """
+        if self.world:
+            return self.world
+        if self.file in WORLDS:
+            return self.file
+
+        # The first scene that can be used decides; later lines are not parsed.
+        for scene in iterate_scenes(Path(self.file)):
+            if isinstance(scene, Scene):
+                return world_name_of_origin(scene.world)
+        return world_name_of_origin("")
+
+    @property
+    def task(self) -> Task:
+        """Categories and rules of the world."""
+        return WORLDS[self.world_name].task
+
+    def open(self, task: Task | None = None, count: int | None = None) -> Scenes:
+        """Open the scenes.
+
+        Args:
+          task: task whose categories a shift exchanges; None for the task of the world.
+          count: number of scenes of a generated world; None for its usual number.
+
+        Raises:
+          InputError: no readable scene file, no scene of the split, or an impossible number.
+        """
+        # Names of worlds come before files of the same name.
+        scenes: Scenes
+        if self.file in WORLDS:
+            scenes = make_generated_scenes(self.file, self.split or "val", count, self.seed)
+        else:
+            scenes = load_scenes(self.file, self.split)
+        return shift_scenes(scenes, task or self.task, self.shift, self.seed)
+
+    def select_scene(self, name: str | None = None, index: int | None = None) -> Scene:
+        """Return the scene of a name or an index, or else the first scene.
+
+        Raises:
+          InputError: there is no such scene, or both are given.
+        """
+        if name is not None and index is not None:
+            raise InputError("--scene, --index: both are given; give the scene's name or its number")
+        return self._scene_at(index or 0) if name is None else self._scene_named(name)
+
+    def _scene_at(self, index: int) -> Scene:
+        if index < 0:
+            raise InputError(f"--index {index}: give 0 or more")
+        # A generated world has any number of scenes, so it is opened as far as the index.
+        scenes = self.open(count=index + 1)
+        if index >= len(scenes):
+            raise InputError(f"--index {index}: {self.file} holds {len(scenes)} scenes; give 0 to {len(scenes) - 1}")
+        return scenes[index]
+
+    def _scene_named(self, name: str) -> Scene:
+        # Index all scenes by name; of equal names the last counts.
+        scenes = self.open()
+        scene_by_name = {}
+        for index in range(len(scenes)):
+            scene = scenes[index]
+            scene_by_name[scene.name] = scene
+        if name in scene_by_name:
+            return scene_by_name[name]
+
+        # Suggest similar names, or else the first ones.
+        similar_names = difflib.get_close_matches(name, scene_by_name, n=3)
+        if similar_names:
+            name_hint = f"did you mean {' or '.join(similar_names)}?"
+        else:
+            name_hint = f"it holds {', '.join(list(scene_by_name)[:3])}, ..."
+        raise InputError(f"--scene {name!r}: is none of the {len(scene_by_name)} scenes of {self.file}; {name_hint}")

@@ -1,1 +1,1 @@
-"""Checkpoints, exported parameters and the run log."""
+"""Storage: checkpoints, exported parameters, the run log and the services that display it."""

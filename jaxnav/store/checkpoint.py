@@ -1,8 +1,9 @@
-"""Resumable state: one atomic Orbax commit per step, the latest two kept.
+"""Checkpoints: the resumable state of a run, one atomic Orbax commit per step, of which the latest two are kept.
 
-A commit holds the arrays, a digest of each and the manifest together, so that none exists without the others. A process
-killed at any moment leaves the earlier commits whole; what it was writing is ignored and cleared by the next save. A
-list of its files with their digests is added to a commit: damage is found before Orbax reads any of them.
+`save_checkpoint` commits the arrays, a digest of each array and the manifest together, so that none of them exists
+without the others. A process killed at any moment leaves the earlier commits intact; the next save ignores and clears
+an unfinished one. `restore_checkpoint` returns the latest undamaged state. A list of the files of a commit, with their
+digests, is added after the commit, so that damage is found before Orbax reads any of these files.
 """
 
 import contextlib
@@ -16,27 +17,37 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
 from jaxnav.errors import InputError
-from jaxnav.store.leaves import describe, digests
-from jaxnav.store.manifest import check_manifest, differences
-from jaxnav.store.signed import read_signed, sign, verified, write_signed
+from jaxnav.store.files import (
+    add_digest,
+    check_manifest,
+    list_differences,
+    read_json_with_digest,
+    verify_digest,
+    write_json_with_digest,
+)
 
-_KEPT = 2
-#: File in a commit that lists the others.
-FILES_FILE = "files.json"
+#: File in a commit that lists its other files with their digests.
+FILE_LIST = "files.json"
+
+_NUM_KEPT_CHECKPOINTS = 2
+_REMEDY = "the one before it is used"
 
 State = TypeVar("State")
 
 
-class Restored(NamedTuple, Generic[State]):
-    """Hold a restored state.
+class RestoredState(NamedTuple, Generic[State]):
+    """State from a checkpoint.
 
     Attributes:
       state: as it was saved.
-      step: of the checkpoint.
-      damaged: what is wrong with the later checkpoints, which cannot be used.
+      step: step of the checkpoint.
+      damaged: messages about later checkpoints that cannot be used.
     """
 
     state: State
@@ -45,13 +56,13 @@ class Restored(NamedTuple, Generic[State]):
 
 
 class _DamageError(InputError):
-    """Refuse a checkpoint that is not what was saved."""
+    """Error about a checkpoint whose content differs from what was saved."""
 
 
-def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> None:
+def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> None:
     """Save the state of a run at a step.
 
-    State and manifest are committed when it returns; all but the latest two steps are dropped.
+    State and manifest are committed when the function returns; all but the latest two steps are deleted.
 
     Args:
       run_dir: folder of the run; checkpoints go to `run_dir/checkpoints/<step>`.
@@ -63,164 +74,235 @@ def save(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> N
       InputError: the run has this step or a later one already.
       TypeError: a leaf is no array, or an empty one.
     """
+    # Orbax commits the metadata together with the arrays.
     _check_leaves(state)
-    metadata = sign({"manifest": dict(manifest), "leaves": describe(state), "digests": digests(state)})
-    with _quiet_libraries(), _open(run_dir, cleanup_tmp_directories=True) as checkpointer:
-        latest = checkpointer.latest
-        if latest is not None and latest.step >= step:
+    metadata = add_digest(
+        {"manifest": dict(manifest), "leaves": describe_arrays(state), "digests": array_digests(state)}
+    )
+
+    # Steps only increase: an earlier one belongs to another run in this folder.
+    with _quiet_libraries(), _open_checkpointer(run_dir, cleanup_tmp_directories=True) as checkpointer:
+        latest_checkpoint = checkpointer.latest
+        if latest_checkpoint is not None and latest_checkpoint.step >= step:
             raise InputError(
-                f"{run_dir}: holds step {latest.step} already, so step {step} cannot be saved; "
+                f"{run_dir}: holds step {latest_checkpoint.step} already, so step {step} cannot be saved; "
                 "resume that run or choose another run directory"
             )
         checkpointer.save(step, state, force=True, custom_metadata=metadata)
+
+    # One process lists the files, after the commit.
     if jax.process_index() == 0:
-        where = _folder(run_dir) / str(step)
-        write_signed(where / FILES_FILE, {"files": _file_digests(where)})
+        folder = _checkpoints_folder(run_dir) / str(step)
+        write_json_with_digest(folder / FILE_LIST, {"files": _file_digests(folder)})
 
 
-def restore(run_dir: Path, abstract_state: State, expected_manifest: Mapping[str, Any]) -> Restored[State] | None:
-    """Restore the latest undamaged state.
-
-    Returns None if the run has none yet.
+def restore_checkpoint(
+    run_dir: Path, abstract_state: State, expected_manifest: Mapping[str, Any]
+) -> RestoredState[State] | None:
+    """Restore the latest undamaged state, or return None if the run has no checkpoint yet.
 
     Args:
       run_dir: folder of the run.
       abstract_state: `jax.eval_shape` of the state's initialisation (or a state): structure, shapes, dtypes and, where
-        given, shardings; other leaves come to the default device.
-      expected_manifest: from `make_manifest`, with the config that the run is to go on with.
+        given, shardings; leaves without a sharding are placed on the default device.
+      expected_manifest: from `make_manifest`, with the config of the run that resumes.
 
     Raises:
       InputError: the checkpoint has another format version, config or state structure, or all are damaged.
     """
-    if not _folder(run_dir).is_dir():
+    folder = _checkpoints_folder(run_dir)
+    if not folder.is_dir():
         return None
-    damaged: list[str] = []
-    with _quiet_libraries(), _open(run_dir) as checkpointer:
+    damage_messages: list[str] = []
+    with _quiet_libraries(), _open_checkpointer(run_dir) as checkpointer:
+        # From the latest to the earliest, until one is undamaged.
         for step in sorted((saved.step for saved in checkpointer.checkpoints), reverse=True):
             try:
-                state = _load(checkpointer, _folder(run_dir) / str(step), step, abstract_state, expected_manifest)
+                state = _load_step(checkpointer, folder / str(step), step, abstract_state, expected_manifest)
             except _DamageError as error:
-                damaged.append(str(error))
+                damage_messages.append(str(error))
             else:
-                return Restored(state, step, tuple(damaged))
+                return RestoredState(state, step, tuple(damage_messages))
             gc.collect()  # asyncio logs the error of a task when it is collected
-    if damaged:
-        raise InputError(f"{'; '.join(damaged)}: no checkpoint is left; restore one or choose another run directory")
+    if damage_messages:
+        raise InputError(
+            f"{'; '.join(damage_messages)}: no checkpoint is left; restore one or choose another run directory"
+        )
     return None
 
 
-def set_aside_after(run_dir: Path, step: int) -> None:
+def set_aside_checkpoints_after(run_dir: Path, step: int) -> None:
     """Move the checkpoints later than a step to `run_dir/damaged`."""
-    for folder in list(_folder(run_dir).glob("*")):
+    for folder in list(_checkpoints_folder(run_dir).glob("*")):
+        # Other entries are unfinished commits of Orbax.
         if folder.name.isdecimal() and int(folder.name) > step:
-            target = run_dir / "damaged" / folder.name
-            shutil.rmtree(target, ignore_errors=True)
-            target.parent.mkdir(exist_ok=True)
-            folder.rename(target)
+            target_folder = run_dir / "damaged" / folder.name
+            shutil.rmtree(target_folder, ignore_errors=True)
+            target_folder.parent.mkdir(exist_ok=True)
+            folder.rename(target_folder)
 
 
-def _load(
-    checkpointer: ocp.training.Checkpointer, where: Path, step: int, abstract_state: State, expected: Mapping[str, Any]
+def _load_step(
+    checkpointer: ocp.training.Checkpointer,
+    folder: Path,
+    step: int,
+    abstract_state: State,
+    expected_manifest: Mapping[str, Any],
 ) -> State:
-    """Load the state of one step.
+    """Load and verify the state of one step.
 
     Raises:
-      _DamageError: a file is broken, or anything in it is not what was saved.
+      _DamageError: a file is broken, or its content differs from what was saved.
       InputError: another format version, config or state structure.
     """
-    with _damage_named(where):
-        if (where / FILES_FILE).exists():  # a process may end before it is added
-            listed, found = read_signed(where / FILES_FILE, "the one before it is used")["files"], _file_digests(where)
-            if different := [name for name, digest in listed.items() if found.get(name) != digest]:
-                raise ValueError(f"missing or other than saved: {', '.join(different)}")
+    # Verify the files and the metadata before Orbax reads the arrays.
+    with _damage_reported(folder):
+        _check_files(folder)
         metadata = checkpointer.metadata(step).custom_metadata
-        saved = verified(where, metadata if isinstance(metadata, dict) else {}, "the one before it is used")
+        saved = verify_digest(folder, metadata if isinstance(metadata, dict) else {}, _REMEDY)
         if not {"manifest", "leaves"} <= saved.keys():
             raise ValueError("it holds no manifest")
-    check_manifest(where, saved["manifest"], expected)
+
     # Orbax would cast another dtype silently, and names no leaf when a shape or the structure differs.
-    if different := differences(saved["leaves"], describe(abstract_state)):
+    check_manifest(folder, saved["manifest"], expected_manifest)
+    mismatches = list_differences(saved["leaves"], describe_arrays(abstract_state))
+    if mismatches:
         raise InputError(
-            f"{where}: its state has other arrays than this code's (saved != asked for): {'; '.join(different)}; "
+            f"{folder}: its state has other arrays than this code's (saved != asked for): {'; '.join(mismatches)}; "
             f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
         )
-    with _damage_named(where):
-        state = checkpointer.load(step, abstract_state=_placed(abstract_state))
-        # Checkpoints of jaxnav 0.2.0 have no digests.
-        if different := "digests" in saved and differences(saved["digests"], digests(state)):
-            raise ValueError(f"digests differ of {', '.join(line.split(':')[0] for line in different)}")
+
+    # Intact files are no proof: compare the arrays that Orbax made of them, too.
+    with _damage_reported(folder):
+        state = checkpointer.load(step, abstract_state=_with_shardings(abstract_state))
+        if "digests" in saved:  # checkpoints of jaxnav 0.2.0 have none
+            mismatches = list_differences(saved["digests"], array_digests(state))
+            if mismatches:
+                leaf_paths = [mismatch.split(":")[0] for mismatch in mismatches]
+                raise ValueError(f"digests differ of {', '.join(leaf_paths)}")
     return state
 
 
-def _file_digests(where: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file of a commit, by its path in it."""
-    found = {}
-    for path in where.rglob("*"):
-        if path.is_file() and path.name != FILES_FILE:
-            with path.open("rb") as file:
-                found[path.relative_to(where).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
-    return found
+def _check_files(folder: Path) -> None:
+    """Compare the files of a commit with its file list.
 
-
-@contextlib.contextmanager
-def _quiet_libraries() -> Iterator[None]:
-    """Keep Orbax from logging pages about what is told in one line."""
-    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-
-
-@contextlib.contextmanager
-def _damage_named(where: Path) -> Iterator[None]:
-    """Turn what reading broken files raises into one message.
-
-    Orbax and TensorStore raise much over missing or broken files.
+    Raises:
+      InputError: the file list is damaged.
+      ValueError: a file is missing or has another digest.
     """
-    try:
-        yield
-    except (ValueError, KeyError, OSError) as error:
-        reason: BaseException = error
-        while reason.__cause__ is not None:  # Orbax wraps whatever goes wrong while it loads in a KeyError
-            reason = reason.__cause__
-        if not isinstance(reason, ValueError | KeyError | OSError):
-            raise
-        cause = textwrap.shorten(f"{type(reason).__name__}: {reason}", 300)
-        raise _DamageError(f"{where}: is damaged ({cause})") from error
+    if not (folder / FILE_LIST).exists():  # the process may have ended before it was written
+        return
+    # Files that the list does not name are harmless.
+    saved_digests = read_json_with_digest(folder / FILE_LIST, _REMEDY)["files"]
+    file_digests = _file_digests(folder)
+    damaged_files = [name for name, digest in saved_digests.items() if file_digests.get(name) != digest]
+    if damaged_files:
+        raise ValueError(f"missing or other than saved: {', '.join(damaged_files)}")
 
 
-def _folder(run_dir: Path) -> Path:
-    return (run_dir / "checkpoints").absolute()  # Orbax refuses relative paths
+def _file_digests(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of every file of a commit, by its relative path."""
+    # The list cannot hold its own digest.
+    file_digests = {}
+    for path in folder.rglob("*"):
+        if path.is_file() and path.name != FILE_LIST:
+            with path.open("rb") as file:
+                file_digests[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return file_digests
 
 
-def _open(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.Checkpointer:
-    latest_only = ocp.training.preservation_policies.LatestN(_KEPT)
-    return ocp.training.Checkpointer(
-        str(_folder(run_dir)),
-        preservation_policy=latest_only,  # pyright: ignore[reportArgumentType]  (Orbax's own policy, typed too narrowly)
-        cleanup_tmp_directories=cleanup_tmp_directories,
-    )
+# The arrays of a state
+
+
+def describe_arrays(tree: Any) -> dict[str, str]:
+    """Return dtype and shape of every leaf of a tree by its path, `['kernel']: float32[3,4]`."""
+    descriptions = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        shape_text = ",".join(map(str, leaf.shape))
+        descriptions[jax.tree_util.keystr(path)] = f"{leaf.dtype}[{shape_text}]"
+    return descriptions
+
+
+def array_digests(state: Any) -> dict[str, str]:
+    """Return the first 16 hexadecimal digits of the SHA-256 of every leaf, by its path.
+
+    The digests do not depend on the number of devices. All processes that hold parts of a leaf have to call.
+    """
+    digests = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        digests[jax.tree_util.keystr(path)] = hashlib.sha256(_array_bytes(leaf)).hexdigest()[:16]
+    return digests
+
+
+def _array_bytes(leaf: jax.Array) -> bytes:
+    array_data = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+    if array_data.is_fully_replicated:  # also over processes: no exchange
+        return np.asarray(array_data).tobytes()
+    if not array_data.is_fully_addressable:
+        array_data = multihost_utils.process_allgather(array_data, tiled=True)
+    return np.asarray(array_data).tobytes()
 
 
 def _check_leaves(state: Any) -> None:
     """Refuse a state that could be saved, but not restored from an abstract one."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) or leaf.size == 0:
-            name = jax.tree_util.keystr(path)
-            raise TypeError(f"state{name} is {leaf!r}; every leaf must be a non-empty jax.Array")
+            leaf_path = jax.tree_util.keystr(path)
+            raise TypeError(f"state{leaf_path} is {leaf!r}; every leaf must be a non-empty jax.Array")
 
 
-def _placed(abstract_state: State) -> State:
-    """Place every leaf of an abstract state.
+def _with_shardings(abstract_state: State) -> State:
+    """Return an abstract state with a sharding on every leaf, so that Orbax ignores the shardings on disk."""
+    default_sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
-    With a sharding on every leaf the one on disk is not used.
-    """
-    default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding or default), abstract_state
+    def with_sharding(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding or default_sharding)
+
+    return jax.tree.map(with_sharding, abstract_state)
+
+
+# Orbax
+
+
+def _checkpoints_folder(run_dir: Path) -> Path:
+    return (run_dir / "checkpoints").absolute()  # Orbax refuses relative paths
+
+
+def _open_checkpointer(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.Checkpointer:
+    latest_only = ocp.training.preservation_policies.LatestN(_NUM_KEPT_CHECKPOINTS)
+    return ocp.training.Checkpointer(
+        str(_checkpoints_folder(run_dir)),
+        preservation_policy=latest_only,  # pyright: ignore[reportArgumentType]  (Orbax's own policy, typed too narrowly)
+        cleanup_tmp_directories=cleanup_tmp_directories,
     )
+
+
+@contextlib.contextmanager
+def _quiet_libraries() -> Iterator[None]:
+    """Keep Orbax from logging pages about errors that are reported in one line."""
+    # A level above the highest silences a logger.
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    saved_levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, saved_level in zip(loggers, saved_levels, strict=True):
+            logger.setLevel(saved_level)
+
+
+@contextlib.contextmanager
+def _damage_reported(folder: Path) -> Iterator[None]:
+    """Turn the errors of Orbax and TensorStore over missing or broken files into a `_DamageError`."""
+    try:
+        yield
+    except (ValueError, KeyError, OSError) as error:
+        # Orbax wraps every error while it loads in a KeyError: only errors of files are damage.
+        root_error: BaseException = error
+        while root_error.__cause__ is not None:
+            root_error = root_error.__cause__
+        if not isinstance(root_error, ValueError | KeyError | OSError):
+            raise
+        error_summary = textwrap.shorten(f"{type(root_error).__name__}: {root_error}", 300)
+        raise _DamageError(f"{folder}: is damaged ({error_summary})") from error

@@ -1,4 +1,7 @@
-"""Exported parameters: a folder with `params.safetensors` and `policy.json`, readable with NumPy and safetensors."""
+"""Exported policies: a folder with `params.safetensors` and `policy.json`, readable with NumPy and safetensors.
+
+`export_params` writes the folder, `load_params` verifies and reads it.
+"""
 
 import hashlib
 import json
@@ -10,119 +13,130 @@ import numpy as np
 import safetensors.numpy
 
 from jaxnav.errors import InputError
-from jaxnav.store.files import write_atomic
-from jaxnav.store.signed import verified, write_signed
+from jaxnav.store.files import verify_digest, write_atomic, write_json_with_digest
 
-#: Version of the layout of the two files.
-FORMAT_VERSION = 3
+#: Version of the format of the two files.
+POLICY_FORMAT_VERSION = 3
 
-#: File that says what a policy is built from; it is written last.
+#: File that describes the policy; it is written last.
 POLICY_FILE = "policy.json"
 
-_PARAMS = "params.safetensors"
+_PARAMS_FILE = "params.safetensors"
 
 
 class _OtherVersionError(InputError):
-    """Refuse an export of another format version."""
+    """Error about an export of another format version."""
 
 
 def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
-    """Write parameters and what the policy is built from.
-
-    An equal export stays, a damaged one is replaced, and another one is refused.
+    """Write parameters and the specification of their policy.
 
     `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, `spec`, the SHA-256 of the
-    parameters and a digest of its own; it is written last, so an export cut short is refused by `load_params` instead
-    of being mixed.
+    parameters and a digest of its own. Because `policy.json` is written last, `load_params` refuses an export that was
+    cut short. An identical export stays, a damaged one is replaced, and a different one is refused.
 
     Args:
-      folder: made if missing.
+      folder: created if missing.
       params: nested dict of arrays; names are strings without `/`.
       spec: JSON values.
 
     Raises:
       InputError: the folder holds another export, or one of another format version.
-      TypeError: a name in `params` is no string or holds `/`.
+      TypeError: a name in `params` is no string or contains `/`.
     """
-    tensors = safetensors.numpy.save(_flatten(params))
-    policy = {"format_version": FORMAT_VERSION, "params_sha256": hashlib.sha256(tensors).hexdigest(), "spec": spec}
+    tensor_bytes = safetensors.numpy.save(_flatten(params))
+    policy = {
+        "format_version": POLICY_FORMAT_VERSION,
+        "params_sha256": hashlib.sha256(tensor_bytes).hexdigest(),
+        "spec": spec,
+    }
+
+    # An intact export is never overwritten.
     try:
-        held = _read_policy(folder)
+        existing_policy = _read_policy(folder)
     except _OtherVersionError:
         raise
-    except InputError:  # there is none, or a damaged one
-        write_atomic(folder / _PARAMS, tensors)
-        write_signed(folder / POLICY_FILE, policy)
+    except InputError:  # no export there, or a damaged one
+        write_atomic(folder / _PARAMS_FILE, tensor_bytes)
+        write_json_with_digest(folder / POLICY_FILE, policy)
         return
-    if held != json.loads(json.dumps(policy)):
+
+    # Compare as JSON, in which tuples are lists.
+    if existing_policy != json.loads(json.dumps(policy)):
         raise InputError(f"{folder}: holds another policy than would be exported; keep it elsewhere or remove it")
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Load the parameters and the spec of an export.
-
-    The parameters are a nested dict of NumPy arrays.
+    """Load the parameters, a nested dict of NumPy arrays, and the specification of an export.
 
     Raises:
       InputError: no export there, another format version, or files that are damaged or do not belong together.
     """
     policy = _read_policy(folder)
     try:
-        params = _unflatten(safetensors.numpy.load_file(folder / _PARAMS))
+        params = _unflatten(safetensors.numpy.load_file(folder / _PARAMS_FILE))
     except Exception as error:  # safetensors and NumPy raise errors of many types
-        raise InputError(f"{folder / _PARAMS}: holds no arrays ({error}); export the policy again") from error
+        raise InputError(f"{folder / _PARAMS_FILE}: holds no arrays ({error}); export the policy again") from error
     return params, policy["spec"]
 
 
 def _read_policy(folder: Path) -> dict[str, Any]:
-    """Read what an export says of itself, whose parameters are those that were written.
+    """Read `policy.json` and verify that the parameters belong to it.
 
     Raises:
       InputError: as `load_params`.
     """
+    # Read the description and the digest of the parameters.
+    policy_path = folder / POLICY_FILE
+    params_path = folder / _PARAMS_FILE
     try:
-        policy = json.loads((folder / POLICY_FILE).read_bytes())
-        with (folder / _PARAMS).open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        policy = json.loads(policy_path.read_bytes())
+        with params_path.open("rb") as params_file:
+            params_sha256 = hashlib.file_digest(params_file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{folder}: not an exported policy ({error.strerror}: {error.filename}); export it") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{folder / POLICY_FILE}: not JSON ({error}); export the policy again") from error
+        raise InputError(f"{policy_path}: not JSON ({error}); export the policy again") from error
+
+    # Check the version before the digest: another version may compute it differently.
     if not isinstance(policy, dict) or not {"format_version", "params_sha256", "spec"} <= policy.keys():
-        raise InputError(
-            f"{folder / POLICY_FILE}: lacks format_version, params_sha256 or spec; export the policy again"
-        )
-    if policy["format_version"] != FORMAT_VERSION:
+        raise InputError(f"{policy_path}: lacks format_version, params_sha256 or spec; export the policy again")
+    if policy["format_version"] != POLICY_FORMAT_VERSION:
         raise _OtherVersionError(
-            f"{folder / POLICY_FILE}: has format version {policy['format_version']!r}, this code reads version "
-            f"{FORMAT_VERSION}; export the policy again"
+            f"{policy_path}: has format version {policy['format_version']!r}, this code reads version "
+            f"{POLICY_FORMAT_VERSION}; export the policy again"
         )
-    policy = verified(folder / POLICY_FILE, policy, "export the policy again")
+
+    # Both files must be intact and belong together.
+    policy = verify_digest(policy_path, policy, "export the policy again")
     if not isinstance(policy["spec"], dict):
-        raise InputError(f"{folder / POLICY_FILE}: spec is no JSON object; export the policy again")
-    if sha256 != policy["params_sha256"]:
-        raise InputError(f"{folder / _PARAMS}: does not belong to {POLICY_FILE} or is damaged; export the policy again")
+        raise InputError(f"{policy_path}: spec is no JSON object; export the policy again")
+    if params_sha256 != policy["params_sha256"]:
+        raise InputError(f"{params_path}: does not belong to {POLICY_FILE} or is damaged; export the policy again")
     return policy
 
 
 def _flatten(params: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
-    flat = {}
+    """Return nested parameters by flat names, `a/b/kernel`."""
+    flat_params = {}
     for name, value in params.items():
         if not isinstance(name, str) or "/" in name:
             raise TypeError(f"parameter name {name!r} under {prefix!r} must be a string without '/'")
         if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{name}/")
+            flat_params |= _flatten(value, f"{prefix}{name}/")
         else:
-            flat[f"{prefix}{name}"] = np.asarray(value, order="C")
-    return flat
+            flat_params[f"{prefix}{name}"] = np.asarray(value, order="C")
+    return flat_params
 
 
-def _unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _unflatten(flat_params: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return flat parameters as nested dicts."""
     params: dict[str, Any] = {}
-    for name, value in flat.items():
-        *folders, leaf = name.split("/")
-        node = params
-        for part in folders:
-            node = node.setdefault(part, {})
-        node[leaf] = value
+    for flat_name, value in flat_params.items():
+        # Create the missing dicts on the way to the leaf.
+        *parent_names, leaf_name = flat_name.split("/")
+        parent_node = params
+        for parent_name in parent_names:
+            parent_node = parent_node.setdefault(parent_name, {})
+        parent_node[leaf_name] = value
     return params

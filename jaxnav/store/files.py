@@ -1,27 +1,360 @@
-"""Writing a file so that it is there whole or not at all."""
+"""Files of a run that survive crashes: atomic writes, JSON with digests, the run log, the folder lock, the manifest.
 
+`write_atomic` replaces a file in one step. `write_json_with_digest` and `read_json_with_digest` store a JSON object
+together with a digest of its content, so that corruption is reported when the file is read. `append_log_rows` and
+`read_log_rows` do the same for every line of a run's `metrics.jsonl`. `FolderLock` allows only one writer per folder,
+and `make_manifest` and `check_manifest` refuse a checkpoint that was saved under another configuration.
+
+Log rows reach the disk before the checkpoint that covers them is saved. A checkpoint therefore never knows more than
+the log; on resume the rows after the restored step are dropped and written again.
+"""
+
+import hashlib
+import json
+import math
 import os
+import socket
+from collections.abc import Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
+from typing import Any
+
+from jaxnav.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system: nothing is locked there
+    fcntl = None
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Replace a file at once.
+    """Replace a file in one step.
 
-    A reader, or a crash at any moment, finds the old content or the new, never a part.
-
-    Missing parent folders are made.
+    A reader, or a crash at any moment, sees either the old content or the new content, never a part of it. Missing
+    parent folders are created.
 
     Raises:
-      OSError: the file cannot be written; `path` is as it was.
+      OSError: the file cannot be written; `path` is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     # In the same folder, since a rename is atomic only within one file system.
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary_path = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with part.open("wb") as file:
+        with temporary_path.open("wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
+            os.fsync(file.fileno())  # the content is on the disk before the name points to it
+        os.replace(temporary_path, path)
     finally:
-        part.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
+
+
+# JSON records with a digest
+
+#: Key of the digest in a record. It guards against damage, not against forgery.
+DIGEST_KEY = "digest"
+
+
+def add_digest(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record, converted to plain JSON values, with the digest of its content."""
+    plain_record = json.loads(json.dumps(record, allow_nan=False))
+    return plain_record | {DIGEST_KEY: _record_digest(plain_record)}
+
+
+def verify_digest(source: object, record: Mapping[str, Any], remedy: str) -> dict[str, Any]:
+    """Check a record against its digest and return the record without it.
+
+    A record without a digest was written by jaxnav 0.2.0 or earlier and is accepted unchecked.
+
+    Args:
+      source: name of the record, for the message.
+      record: as read from a file.
+      remedy: advice for the message, in case the record is damaged.
+
+    Raises:
+      InputError: the digest does not match the content.
+    """
+    plain_record = {name: value for name, value in record.items() if name != DIGEST_KEY}
+    if DIGEST_KEY in record and record[DIGEST_KEY] != _record_digest(plain_record):
+        raise InputError(f"{source}: is damaged or was changed by hand (its digest is another); {remedy}")
+    return plain_record
+
+
+def write_json_with_digest(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record and its digest atomically.
+
+    Raises:
+      OSError: the file cannot be written; `path` is unchanged.
+    """
+    write_atomic(path, (json.dumps(add_digest(record), indent=2) + "\n").encode())
+
+
+def read_json_with_digest(path: Path, remedy: str) -> dict[str, Any]:
+    """Read a record and verify its digest.
+
+    Args:
+      path: file to read.
+      remedy: advice for the message, in case the file cannot be used.
+
+    Returns:
+      The record without its digest.
+
+    Raises:
+      InputError: the file is missing, not a JSON object, or damaged.
+    """
+    try:
+        record = json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error}); {remedy}") from error
+    if not isinstance(record, dict):
+        raise InputError(f"{path}: holds no JSON object; {remedy}")
+    return verify_digest(path, record, remedy)
+
+
+def _record_digest(plain_record: Mapping[str, Any]) -> str:
+    """Return the first 16 hexadecimal digits of the SHA-256 of a record."""
+    canonical_text = json.dumps(plain_record, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical_text.encode()).hexdigest()[:16]
+
+
+# The folder lock
+
+#: File that the writer of a folder holds locked.
+LOCK_FILE = ".lock"
+
+
+class FolderLock:
+    """Exclusive lock on a folder, so that no other process writes to it.
+
+    The operating system releases the lock when the process ends, however it ends: a lock file left behind locks
+    nothing. On file systems without locks, nothing is locked.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Prepare the lock of a folder without acquiring it."""
+        self._path = folder / LOCK_FILE
+        self._descriptor: int | None = None
+
+    def acquire(self) -> None:
+        """Lock the folder, which must exist.
+
+        Raises:
+          InputError: another process, or another lock of this process, holds the folder.
+          OSError: the folder is missing or cannot be written.
+        """
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if fcntl is not None:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.read(descriptor, 200).decode(errors="replace") or "another process"
+            os.close(descriptor)
+            raise InputError(
+                f"{self._path.parent}: {holder} writes to it; wait for that, end it, or choose another run directory"
+            ) from error
+        except OSError:  # a file system without locks
+            pass
+
+        # The holder signs the file, for the message of those who come too late.
+        self._descriptor = descriptor
+        os.truncate(descriptor, 0)
+        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+
+    def check(self) -> None:
+        """Check that the locked folder is still the one on disk.
+
+        Raises:
+          InputError: the folder or its lock file was removed or replaced.
+        """
+        if self._descriptor is None:
+            return
+        try:
+            is_same_file = os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
+        except FileNotFoundError:
+            is_same_file = False
+        if not is_same_file:
+            raise InputError(
+                f"{self._path.parent}: was removed or replaced, or its {LOCK_FILE} was, while this run wrote to it; "
+                "restore it, or train anew"
+            )
+
+    def release(self) -> None:
+        """Unlock the folder."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+# The run log: one JSON object with its digest per line
+
+LogRow = Mapping[str, int | float | str | None]
+
+
+def append_log_rows(path: Path, rows: Sequence[LogRow]) -> None:
+    """Append rows to a log and wait until they are on the disk.
+
+    A row has an int `step`. NaN and infinities are written as null, since JSON cannot express them.
+    """
+    with path.open("ab") as file:
+        file.write(_encode_rows(rows))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_log_rows(path: Path) -> list[dict[str, Any]]:
+    """Read the rows of a log in order.
+
+    A last line that a crash cut short is skipped; a missing file has no rows.
+
+    Raises:
+      InputError: a line other than the last is no JSON object with an int `step`, or a row is damaged.
+    """
+    if not path.exists():
+        return []
+
+    # A crash can cut short the last line only, so that it may be broken.
+    log_lines = path.read_bytes().splitlines()
+    rows: list[dict[str, Any]] = []
+    has_digest: list[bool] = []
+    for line_number, line in enumerate(log_lines, start=1):
+        source = f"{path}, line {line_number}"
+        row = _parse_row(line)
+        if row is not None:
+            rows.append(verify_digest(source, row, "restore the file, or remove the line"))
+            has_digest.append(DIGEST_KEY in row)
+        elif line_number < len(log_lines):
+            raise InputError(f"{source}: not a JSON object with a whole number `step`; remove the line")
+
+    # All rows have a digest, or none has: a single row without one was damaged or added by hand.
+    if any(has_digest) and not all(has_digest):
+        line_number = has_digest.index(False) + 1
+        raise InputError(
+            f"{path}, line {line_number}: has no digest, unlike others; restore the file, or remove the line"
+        )
+    return rows
+
+
+def truncate_log_after(path: Path, step: int) -> None:
+    """Drop the rows later than a step.
+
+    An incomplete last line is dropped too; a missing log stays missing.
+
+    Raises:
+      InputError: as `read_log_rows`; the log is then unchanged.
+    """
+    if path.exists():
+        remaining_rows = [row for row in read_log_rows(path) if row["step"] <= step]
+        write_atomic(path, _encode_rows(remaining_rows))
+
+
+def _encode_rows(rows: Sequence[LogRow]) -> bytes:
+    """Return rows as JSON lines, each with its digest."""
+    encoded_lines = []
+    for row in rows:
+        # The digest covers the row as it is written, with null for NaN and infinities.
+        finite_row = {name: _finite_or_none(value) for name, value in row.items()}
+        encoded_lines.append(json.dumps(add_digest(finite_row)).encode() + b"\n")
+    return b"".join(encoded_lines)
+
+
+def _finite_or_none(value: float | str | None) -> float | str | None:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _parse_row(line: bytes) -> dict[str, Any] | None:
+    """Return the row of a line, or None if the line is no row."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) and type(row.get("step")) is int else None
+
+
+# The manifest of a checkpoint
+
+#: Raised whenever the stored state changes in a way that older code cannot read.
+CHECKPOINT_FORMAT_VERSION = 2
+
+_PACKAGES = ("jaxnav", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+def make_manifest(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Make the manifest of a run: `format_version`, `config` and package `versions`, as plain JSON values.
+
+    Args:
+      config: nested mapping of JSON values; tuples become lists.
+    """
+    manifest = {"format_version": CHECKPOINT_FORMAT_VERSION, "config": config, "versions": _package_versions()}
+    return json.loads(json.dumps(manifest))
+
+
+def check_manifest(source: object, saved: Any, expected: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint of another format version or another config.
+
+    Package versions may differ.
+
+    Args:
+      source: name of the checkpoint, for the message.
+      saved: manifest in the checkpoint.
+      expected: manifest of the run that resumes from the checkpoint.
+
+    Raises:
+      InputError: another format version, no manifest at all, or another config; names the keys and both values.
+    """
+    # Another format may store the config in another way: check the version first.
+    if not isinstance(saved, dict) or "format_version" not in saved:
+        raise InputError(f"{source}: holds no manifest, so it is no jaxnav checkpoint; choose another run directory")
+    if saved["format_version"] != expected["format_version"]:
+        raise InputError(
+            f"{source}: has format version {saved['format_version']!r}, this code reads version "
+            f"{expected['format_version']!r}; use the jaxnav that wrote it ({saved.get('versions', {}).get('jaxnav')})"
+        )
+
+    # The message names every value that differs, with the saved one first.
+    mismatches = list_differences(saved["config"], expected["config"])
+    if mismatches:
+        raise InputError(
+            f"{source}: was saved under another config (saved != asked for): {'; '.join(mismatches)}; "
+            "restore these values or choose another run directory"
+        )
+
+
+def list_differences(first: Mapping[str, Any], second: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """List the differences between two nested mappings.
+
+    Returns:
+      A line `"train.lr: 0.1 != 0.2"` for each dotted key, with `(absent)` for a missing value.
+    """
+    # Keys of both, of which either may lack some.
+    difference_lines = []
+    for key in sorted(first.keys() | second.keys()):
+        first_value = first.get(key, _ABSENT)
+        second_value = second.get(key, _ABSENT)
+        if isinstance(first_value, Mapping) and isinstance(second_value, Mapping):
+            difference_lines += list_differences(first_value, second_value, f"{prefix}{key}.")
+        elif first_value != second_value:
+            difference_lines.append(f"{prefix}{key}: {first_value!r} != {second_value!r}")
+    return difference_lines
+
+
+class _Absent:
+    """Value of a key that a mapping does not have."""
+
+    def __repr__(self) -> str:
+        return "(absent)"
+
+
+_ABSENT = _Absent()
+
+
+def _package_versions() -> dict[str, str]:
+    """Return the installed versions of jaxnav and of the packages that shape its state."""
+    package_versions = {}
+    for package_name in _PACKAGES:
+        try:
+            package_versions[package_name] = metadata.version(package_name)
+        except metadata.PackageNotFoundError:
+            package_versions[package_name] = "not installed"  # run from a source tree
+    return package_versions

@@ -1,6 +1,7 @@
-"""Where a run's log can be shown: TensorBoard, Weights & Biases.
+"""Services that display a run's log: TensorBoard and Weights & Biases.
 
-A sink takes the rows of one series, an agent of the run, in order. The log itself stays in the run directory.
+A sink receives the rows of one series, that is of one agent of the run, in order. The log itself stays in the run
+directory. `SINKS` has the sinks by name.
 """
 
 import hashlib
@@ -15,26 +16,27 @@ from jaxnav.errors import InputError
 
 
 class Sink(Protocol):
-    """Take numbers by name, step by step."""
+    """Receiver of named numbers, step by step."""
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Take the numbers of a step; steps rise."""
+        """Write the numbers of a step; steps increase."""
         ...
 
     def close(self) -> None:
-        """Finish what was taken."""
+        """Finish writing."""
         ...
 
 
-class TensorBoard:
-    """Write event files into `RUN/tensorboard/SERIES`; earlier ones there are replaced."""
+class TensorBoardSink:
+    """Event files in `RUN/tensorboard/SERIES`, which replace earlier ones there."""
 
     def __init__(self, run_dir: Path, series: str, project: str, settings: Mapping[str, Any]) -> None:
-        folder = run_dir / "tensorboard" / series
-        writer = _installed("tensorboardX", "tensorboard").SummaryWriter
-        for old in folder.glob("events.out.tfevents.*"):
-            old.unlink()
-        self._writer = writer(logdir=str(folder))
+        events_folder = run_dir / "tensorboard" / series
+        writer_class = _import_library("tensorboardX", "tensorboard").SummaryWriter
+        # TensorBoard would draw a second curve over that of an earlier call.
+        for old_events in events_folder.glob("events.out.tfevents.*"):
+            old_events.unlink()
+        self._writer = writer_class(logdir=str(events_folder))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Write the numbers of a step."""
@@ -46,20 +48,20 @@ class TensorBoard:
         self._writer.close()
 
 
-class WandB:
-    """Send to a run of Weights & Biases, one per series, in a group per training run.
+class WandBSink:
+    """Runs of Weights & Biases, one per series, in a group per training run.
 
-    Its id depends on settings and series, so that a log that is sent again goes to the same run. WANDB_MODE=offline
-    keeps it on disk.
+    The id of a run depends on settings and series, so that sending a log again updates the same run. With
+    WANDB_MODE=offline the run stays on disk.
     """
 
     def __init__(self, run_dir: Path, series: str, project: str, settings: Mapping[str, Any]) -> None:
-        identity = json.dumps([settings, series], sort_keys=True).encode()
-        self._run = _installed("wandb", "wandb").init(
+        identity_bytes = json.dumps([settings, series], sort_keys=True).encode()
+        self._run = _import_library("wandb", "wandb").init(
             project=project,
             group=run_dir.resolve().name,
             name=series,
-            id=hashlib.sha256(identity).hexdigest()[:16],
+            id=hashlib.sha256(identity_bytes).hexdigest()[:16],
             config=dict(settings),
             dir=str(run_dir),
             resume="allow",
@@ -71,18 +73,18 @@ class WandB:
         self._run.log(dict(values), step=step)
 
     def close(self) -> None:
-        """Wait until all is sent."""
+        """Wait until everything is sent."""
         self._run.finish()
 
 
-SINKS = {"tensorboard": TensorBoard, "wandb": WandB}
+SINKS = {"tensorboard": TensorBoardSink, "wandb": WandBSink}
 
 
-def _installed(module: str, extra: str) -> ModuleType:
+def _import_library(module: str, extra: str) -> ModuleType:
     """Import a sink's library.
 
     Raises:
-      InputError: it is not installed; says how to install it.
+      InputError: the library is not installed; the message says how to install it.
     """
     try:
         return importlib.import_module(module)

@@ -1,88 +1,116 @@
-"""Comparison of methods: training, evaluation and document."""
+"""Comparison of methods: training, evaluation and documents.
+
+`run_compare` trains and evaluates every run of a comparison that has no results yet, and writes the documents. The
+results of a run are summed by scene (`scores_by_scene`), which suffices for all means and intervals of the tables.
+"""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from rich.console import Console
 
-from jaxnav.baselines.frontier import frontier_outcome
-from jaxnav.evaluation.episodes import EpisodeList, together
-from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.notes import last_quarter, notes
+from jaxnav.baselines.frontier import run_frontier_search
+from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
+from jaxnav.evaluation.grid import episode_metrics
+from jaxnav.evaluation.notes import evaluation_notes, last_quarter_success
 from jaxnav.evaluation.report import Decoding
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Run
-from jaxnav.runs.evaluate import Results, episode_lists, evaluate
-from jaxnav.runs.worlds import evaluation_world
-from jaxnav.study.codec import from_json
-from jaxnav.study.compare_config import CompareConfig, Entry, entries, entry_identity, frontier_identity, world_runs
-from jaxnav.study.compare_pairs import chooses_actions
-from jaxnav.study.compare_report import SCALE, Line, Scores, Training
+from jaxnav.runs.evaluate import Results, draw_episode_lists, evaluate
+from jaxnav.runs.run import Run
+from jaxnav.runs.worlds import compile_evaluation_world
+from jaxnav.study.compare_config import (
+    CompareConfig,
+    ComparedRun,
+    chooses_actions,
+    compared_runs,
+    frontier_identity,
+    run_identity,
+    world_run_configs,
+)
 from jaxnav.study.compare_tables import frontier_name, write_comparison
+from jaxnav.study.config import ensure_trained
 from jaxnav.study.document import check_document
 from jaxnav.study.paper_tables import write_paper_tables
-from jaxnav.study.results import is_written, kept_note, write_record
-from jaxnav.study.runs import ensure_trained
+from jaxnav.study.records import METRIC_SCALE, AgentScores, RunScores, TrainingSummary, from_json
+from jaxnav.study.results import has_record, reuse_note, write_record
 
-#: What random choices are called where they are no actions, and where they are.
+#: Names of random choices: of methods whose choices are not actions, and of methods whose choices are.
 RANDOM_AGENTS = ("random choices", "Random")
-#: Name, settings that decide the numbers, and how they are measured.
-Job = tuple[str, Mapping[str, Any], Callable[[], Scores]]
+
+
+class MeasurementJob(NamedTuple):
+    """One result file of a comparison.
+
+    Attributes:
+      name: of the file.
+      identity: settings that determine the results.
+      measure: trains what is missing and evaluates it.
+    """
+
+    name: str
+    identity: Mapping[str, Any]
+    measure: Callable[[], RunScores]
 
 
 def run_compare(config: CompareConfig, console: Console) -> None:
-    """Train and evaluate what is missing, and write the document.
+    """Train and evaluate the runs that have no results yet, and write the documents.
 
-    Finished runs and results are kept, so an interrupted comparison goes on where it stopped. The document is written
-    anew after every run.
+    Finished runs and results are reused, so an interrupted comparison resumes where it stopped. The documents are
+    rewritten after every run.
 
     Raises:
-      InputError: the document is another one, or a run is impossible.
+      InputError: a file is another document, or a run is impossible.
     """
     for document in (config.document, config.paper):
         if document is not None:
             check_document(document)
-    folder, kept, found = config.results / config.split, 0, {}
-    for name, identity, measure in _jobs(config, console):
-        path = folder / f"{name}.json"
-        if is_written(path, identity):
-            kept += 1
+
+    folder = config.results / config.split
+    num_reused = 0
+    scores_by_name = {}
+    for job in _measurement_jobs(config, console):
+        path = folder / f"{job.name}.json"
+        if has_record(path, job.identity):
+            num_reused += 1
         else:
             console.print(f"{path}")
-            write_record(path, identity, measure())
-        found[name] = from_json(Scores, json.loads(path.read_text()))
-        write_comparison(config, found)
+            write_record(path, job.identity, job.measure())
+
+        # Results are read back, so that documents depend on the files alone.
+        scores_by_name[job.name] = from_json(RunScores, json.loads(path.read_text()))
+        write_comparison(config, scores_by_name)
         if config.paper is not None:
             write_paper_tables(config.paper, folder)
-    if kept:
-        console.print(kept_note(kept, folder))
+
+    if num_reused:
+        console.print(reuse_note(num_reused, folder))
     console.print(f"written to {config.document}")
 
 
-def _jobs(config: CompareConfig, console: Console) -> list[Job]:
-    """Return all jobs of a comparison, the untrained ones first."""
-    searched: list[Job] = [
-        (frontier_name(world), frontier_identity(config, run), partial(measure_frontier, config, run, console))
-        for world, run in world_runs(config).items()
-    ]
-    trained: list[Job] = [
-        (entry.name, entry_identity(config, entry), partial(measure_entry, config, entry, console))
-        for entry in entries(config)
-    ]
-    return searched + trained
+def _measurement_jobs(config: CompareConfig, console: Console) -> list[MeasurementJob]:
+    """List all jobs of a comparison, those without training first."""
+    jobs = []
+    for world, run in world_run_configs(config).items():
+        measure = partial(measure_frontier, config, run, console)
+        jobs.append(MeasurementJob(frontier_name(world), frontier_identity(config, run), measure))
+    for compared_run in compared_runs(config):
+        measure = partial(measure_run, config, compared_run, console)
+        jobs.append(MeasurementJob(compared_run.name, run_identity(config, compared_run), measure))
+    return jobs
 
 
-def measure_entry(config: CompareConfig, entry: Entry, console: Console) -> Scores:
+def measure_run(config: CompareConfig, compared_run: ComparedRun, console: Console) -> RunScores:
     """Train a run unless it is finished, and evaluate it.
 
-    The numbers are those of `jaxnav eval` with the same split, number of episodes, epsilon, form and seed.
+    The numbers equal those of `jaxnav eval` with the same split, number of episodes, epsilon, form and seed.
     """
-    ensure_trained(entry.run, console)
-    run = Run(entry.run)
+    # Train and evaluate.
+    ensure_trained(compared_run.run, console)
+    run = Run(compared_run.run)
     results = evaluate(
         run,
         split=config.split,
@@ -92,44 +120,67 @@ def measure_entry(config: CompareConfig, entry: Entry, console: Console) -> Scor
         seed=config.seed,
         console=console,
     )
-    success = results.metrics()["sr"]
-    random, room_prior = RANDOM_AGENTS[chooses_actions(entry.method)], entry.run.layout.prior == "room"
-    told = notes(results.rows, success, results.episodes, room_prior=room_prior, random=random)
-    budget, wall = results.report["run"]["budget"], run.times()[-1]["wall_s"]
-    return by_scene(results, Training(budget, wall, last_quarter(run.log()), tuple(told)))
+
+    # The document prints caveats and the cost of training beside the results.
+    notes = evaluation_notes(
+        results.rows,
+        results.metrics()["sr"],
+        results.episodes,
+        has_room_prior=compared_run.run.layout.prior == "room",
+        random_name=RANDOM_AGENTS[chooses_actions(compared_run.method)],
+    )
+    training = TrainingSummary(
+        budget=results.report["run"]["budget"],
+        wall_s=run.times()[-1]["wall_s"],
+        course=last_quarter_success(run.log()),
+        notes=tuple(notes),
+    )
+    return scores_by_scene(results, training)
 
 
-def by_scene(results: Results, training: Training) -> Scores:
-    """Return the results of an evaluation, scene by scene."""
-    metrics = results.metrics()
-    lines = [
-        _line(row.variant, row.decoding, {name: metrics[name][i] for name in SCALE}, results.episodes)
-        for i, row in enumerate(results.rows)
-    ]
-    return _scores(results.episodes, lines, training)
+def measure_frontier(config: CompareConfig, run: RunConfig, console: Console) -> RunScores:
+    """Evaluate frontier search on the episodes of a world."""
+    world = compile_evaluation_world(run, config.split, None, None, console)
+    episode_lists = draw_episode_lists(world, config.episodes, config.seed)
+    outcomes = []
+    for bank, bank_episodes in zip(world.banks, episode_lists, strict=True):
+        outcomes.append(run_frontier_search(bank, bank_episodes, world.scene_step_limits(bank)))
 
-
-def measure_frontier(config: CompareConfig, run: RunConfig, console: Console) -> Scores:
-    """Search the frontiers in the episodes of a world."""
-    world = evaluation_world(run, config.split, None, None, console)
-    lists = episode_lists(world, config.episodes, config.seed)
-    outcomes = [
-        frontier_outcome(bank, episodes, world.limits(bank)) for bank, episodes in zip(world.banks, lists, strict=True)
-    ]
-    outcome, episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[None], *outcomes), together(lists)
+    # The search is deterministic, so it counts as a single run: leaves [1, E].
+    outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves)[None], *outcomes)
+    episodes = join_episode_lists(episode_lists)
     metrics = episode_metrics(outcome, episodes.best_length)
-    return _scores(episodes, [_line("frontier", "argmax", metrics, episodes)])
+    return _run_scores(episodes, [_sum_by_scene("frontier", "argmax", metrics, episodes)])
 
 
-def _line(variant: str, decoding: Decoding, metrics: Mapping[str, np.ndarray], episodes: EpisodeList) -> Line:
-    """Add up metrics [S, E] over the episodes of each scene."""
-    drawn = np.unique(episodes.scene)
-    inside = (episodes.scene[:, None] == drawn).astype(np.float64)  # [E, N]
-    return Line(variant, decoding, **{name: metrics[name] @ inside for name in SCALE})
+def scores_by_scene(results: Results, training: TrainingSummary) -> RunScores:
+    """Sum the results of an evaluation by scene."""
+    metrics = results.metrics()
+    agents = []
+    for row_index, row in enumerate(results.rows):
+        row_metrics = {name: metrics[name][row_index] for name in METRIC_SCALE}
+        agents.append(_sum_by_scene(row.variant, row.decoding, row_metrics, results.episodes))
+    return _run_scores(results.episodes, agents, training)
 
 
-def _scores(episodes: EpisodeList, lines: Iterable[Line], training: Training | None = None) -> Scores:
-    """Return results with what is known of the scenes."""
-    drawn, first, counts = np.unique(episodes.scene, return_index=True, return_counts=True)
-    rooms = tuple(episodes.rooms[room] for room in episodes.room[first])
-    return Scores(tuple(episodes.scenes[scene] for scene in drawn), rooms, counts, tuple(lines), training)
+def _sum_by_scene(
+    variant: str, decoding: Decoding, metrics: Mapping[str, np.ndarray], episodes: EpisodeList
+) -> AgentScores:
+    """Sum metrics [S, E] over the episodes of each scene, [S, N]."""
+    scenes = np.unique(episodes.scene)
+    membership = (episodes.scene[:, None] == scenes).astype(np.float64)  # [E, N]
+    return AgentScores(variant, decoding, **{name: metrics[name] @ membership for name in METRIC_SCALE})
+
+
+def _run_scores(
+    episodes: EpisodeList, agents: Sequence[AgentScores], training: TrainingSummary | None = None
+) -> RunScores:
+    """Add the names, room types and numbers of episodes of the scenes."""
+    scenes, first_episodes, episode_counts = np.unique(episodes.scene, return_index=True, return_counts=True)
+    return RunScores(
+        scenes=tuple(episodes.scenes[scene] for scene in scenes),
+        rooms=tuple(episodes.rooms[room] for room in episodes.room[first_episodes]),
+        episodes=episode_counts,
+        lines=tuple(agents),
+        training=training,
+    )

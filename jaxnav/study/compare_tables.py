@@ -1,55 +1,85 @@
-"""The document of a comparison, in Markdown."""
+"""The document of a comparison of methods, in Markdown.
+
+`write_comparison` writes the page from the results that exist so far: for each world the success of every agent, the
+paired improvements between agents, and the cost of training.
+"""
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
-from jaxnav.evaluation.report import Decoding
-from jaxnav.evaluation.report_tables import COLUMNS
-from jaxnav.policies.spec import Deciding
-from jaxnav.study.compare_config import CompareConfig, Entry, entries, left_out
-from jaxnav.study.compare_pairs import LABELS, VARIANTS, TableRow, chooses_actions, comparisons, run_label
-from jaxnav.study.compare_report import SCALE, Line, Scores
-from jaxnav.study.document import reading_section, write_lines
-from jaxnav.study.tables import markdown
+from jaxnav.evaluation.report import METRIC_COLUMNS, Decoding
+from jaxnav.policies.spec import DecisionKind
+from jaxnav.study.compare_config import (
+    ROW_LABELS,
+    VARIANT_LABELS,
+    CompareConfig,
+    ComparedAgent,
+    ComparedRun,
+    agent_comparisons,
+    chooses_actions,
+    compared_runs,
+    left_out_runs,
+    run_label,
+)
+from jaxnav.study.document import reading_section, table_lines, write_markdown
+from jaxnav.study.records import METRIC_SCALE, AgentResult, RunScores, find_result
 
-DECODINGS: Mapping[Decoding, str] = {"argmax": "best actions", "sample": "sampled actions"}
-REFERENCE_TITLES = {"random": "Random", "frontier": "Frontier search", "oracle": "Shortest path"}
-#: Results of a world's runs, by method and decision.
-Parts = Mapping[tuple[str, Deciding], Scores]
+DECODING_LABELS: Mapping[Decoding, str] = {"argmax": "best actions", "sample": "sampled actions"}
+UNTRAINED_TITLES = {"random": "Random", "frontier": "Frontier search", "oracle": "Shortest path"}
+BUDGET_PURPOSES = ("exploration", "imitation", "learning")
+#: Results of the runs in one world, by method and decision.
+WorldScores = Mapping[tuple[str, DecisionKind], RunScores]
 
 
 def frontier_name(world: str) -> str:
-    """Return the name of the results of frontier search."""
+    """Name of the results of frontier search in a world."""
     return f"{world}-frontier"
 
 
-def write_comparison(config: CompareConfig, found: Mapping[str, Scores]) -> None:
-    """Write the document from the results that are there.
+def write_comparison(config: CompareConfig, scores_by_name: Mapping[str, RunScores]) -> None:
+    """Write the document from the results that exist.
 
-    What stands between the two lines `<!-- reading -->` of the document is kept: it is written by hand.
+    The text between the two lines `<!-- reading -->` of the document is written by hand and preserved.
+
+    Args:
+      config: of the comparison.
+      scores_by_name: results of runs by `ComparedRun.name`, and of frontier search by `frontier_name`.
 
     Raises:
-      InputError: the document is another one.
+      InputError: the file is another document.
     """
-    runs = entries(config)
-    lines = [*_head(config, runs, found), *reading_section(config.document)]
+    # All sections are rewritten, for those runs of each world that have results.
+    runs = compared_runs(config)
+    lines = [*_head_section(config, runs, scores_by_name), *reading_section(config.document)]
     for world in config.worlds:
-        there = [entry for entry in runs if entry.world == world and entry.name in found]
-        parts: Parts = {(entry.method, entry.decision): found[entry.name] for entry in there}
-        lines += _world(config, world, parts, found.get(frontier_name(world)))
-    write_lines(config.document, lines)
+        world_scores: WorldScores = {
+            (run.method, run.decision): scores_by_name[run.name]
+            for run in runs
+            if run.world == world and run.name in scores_by_name
+        }
+        frontier = scores_by_name.get(frontier_name(world))
+        if world_scores:
+            lines += _world_sections(config, world, world_scores, frontier)
+    write_markdown(config.document, lines)
 
 
-def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scores]) -> list[str]:
-    """Return the title and what holds for all tables."""
-    learning = [entry for entry in runs if entry.method not in config.unlearned]
-    steps = {entry.world: entry.run.total_updates * entry.run.update_steps for entry in learning}
-    text = [
-        f"{config.base.seeds} seeds of each policy. Environment steps of each, imitation included: "
-        + ", ".join(f"{number:,} in {world}" for world, number in steps.items())
-        + f". {config.episodes:,} episodes in each world, of the split `{config.split}` and the same for all rows.",
+def _head_section(
+    config: CompareConfig, runs: Sequence[ComparedRun], scores_by_name: Mapping[str, RunScores]
+) -> list[str]:
+    """Lines of the title and of all that applies to every table."""
+    steps_by_world = {}
+    for run in runs:
+        if run.method not in config.unlearned:
+            steps_by_world[run.world] = run.run.total_updates * run.run.steps_per_update
+    steps = ", ".join(f"{num_steps:,} in {world}" for world, num_steps in steps_by_world.items())
+
+    lines = [
+        f"# {config.title}",
         "",
-        *(f"* {line}" for line in _reading_help(config)),
+        f"{config.base.seeds} seeds of each policy. Environment steps of each, imitation included: {steps}"
+        f". {config.episodes:,} episodes in each world, of the split `{config.split}` and the same for all rows.",
+        "",
+        *(f"* {line}" for line in _row_explanations(config)),
         "",
         "Numbers are means over seeds and episodes with 95 % intervals over training runs and scenes "
         "(docs/statistics.md), not corrected for their number. Differences are paired on the episodes. DTS is better "
@@ -57,16 +87,19 @@ def _head(config: CompareConfig, runs: Sequence[Entry], found: Mapping[str, Scor
         "scenes of `val`.",
         "",
     ]
-    for world, never in itertools.groupby(left_out(config), lambda entry: entry.world):
-        names = "; ".join(run_label(entry.method, entry.decision) for entry in never)
-        text += [f"Left out in {world}, for what they would take: {names}.", ""]
-    if left := [entry.name for entry in runs if entry.name not in found]:
-        text += [f"**Not finished:** {len(left)} of {len(runs)} runs are missing.", ""]
-    return [f"# {config.title}", "", *text]
+
+    # Runs that are excluded, and runs that are not finished yet.
+    for world, left_out in itertools.groupby(left_out_runs(config), lambda run: run.world):
+        names = "; ".join(run_label(run.method, run.decision) for run in left_out)
+        lines += [f"Left out in {world}, for what they would take: {names}.", ""]
+    num_missing = sum(run.name not in scores_by_name for run in runs)
+    if num_missing:
+        lines += [f"**Not finished:** {num_missing} of {len(runs)} runs are missing.", ""]
+    return lines
 
 
-def _reading_help(config: CompareConfig) -> list[str]:
-    """Return what the names of the rows mean."""
+def _row_explanations(config: CompareConfig) -> list[str]:
+    """Explain the names of the rows."""
     lines = [
         "Random, frontier search (it explores without any prior) and the shortest path (it knows everything) are not "
         "trained; their rows are the same in all tables.",
@@ -89,86 +122,110 @@ def _reading_help(config: CompareConfig) -> list[str]:
     return lines
 
 
-def _world(config: CompareConfig, world: str, parts: Parts, frontier: Scores | None) -> list[str]:
-    """Return all sections of one world."""
-    if not parts:
-        return []
-    # Where a policy chooses no actions, random choices are no random actions.
-    one = next((part for run, part in parts.items() if chooses_actions(run[0])), next(iter(parts.values())))
-    untrained = [one, *([frontier] if frontier else [])]
-    lines = [f"## {world}: {len(one.scenes)} scenes, {sum(one.episodes):,} episodes", ""]
-    for decoding, name in DECODINGS.items():
-        lines += [f"### Success, {name}", "", *_metrics_table(config, untrained, parts, decoding), ""]
-    for decoding, name in DECODINGS.items():
-        if improved := _improvements(config, parts, decoding):
+def _world_sections(
+    config: CompareConfig, world: str, world_scores: WorldScores, frontier: RunScores | None
+) -> list[str]:
+    """Lines of all sections of one world."""
+    # Agents without training are in the results of every run. Random choices are random actions only if the policy
+    # chooses actions, so such a run is preferred.
+    untrained_run = next(iter(world_scores.values()))
+    for (method, _), run_scores in world_scores.items():
+        if chooses_actions(method):
+            untrained_run = run_scores
+            break
+    untrained = [untrained_run]
+    if frontier:
+        untrained.append(frontier)
+
+    # Tables of success, of improvements and of the training.
+    lines = [f"## {world}: {len(untrained_run.scenes)} scenes, {sum(untrained_run.episodes):,} episodes", ""]
+    for decoding, label in DECODING_LABELS.items():
+        lines += [f"### Success, {label}", "", *_success_table(config, untrained, world_scores, decoding), ""]
+    for decoding, label in DECODING_LABELS.items():
+        improvements = _improvement_rows(config, world_scores, decoding)
+        if improvements:
             header = ("", "SR (points)", "SPL (points)", "DTS (m)")
-            lines += [f"### Improvements, {name}", "", *markdown(header, improved), ""]
-    return [*lines, "### What the runs took", "", *_training_table(parts), "", *_notes(parts), ""]
+            lines += [f"### Improvements, {label}", "", *table_lines(header, improvements), ""]
+    lines += ["### What the runs took", "", *_training_table(world_scores), ""]
+    return [*lines, *_training_notes(world_scores), ""]
 
 
-def _searches(config: CompareConfig, method: str) -> bool:
-    """Return whether random choices are another agent than Random."""
-    return method in config.methods and not chooses_actions(method)
+def _success_table(
+    config: CompareConfig, untrained: Iterable[RunScores], world_scores: WorldScores, decoding: Decoding
+) -> list[str]:
+    """Table of SR, SPL and DTS of every agent."""
+    results: list[tuple[str, AgentResult]] = []
 
+    # Agents without training.
+    has_random_actions = any(chooses_actions(method) for method, _ in world_scores)
+    for (variant, title), run_scores in itertools.product(UNTRAINED_TITLES.items(), untrained):
+        result = find_result(run_scores, variant, decoding)
+        if result and (variant != "random" or has_random_actions):
+            results.append((title, result))
 
-def _metrics_table(config: CompareConfig, untrained: Iterable[Scores], parts: Parts, decoding: Decoding) -> list[str]:
-    """Return SR, SPL and DTS of every agent."""
-    rows = [
-        (title, part, line)
-        for (variant, title), part in itertools.product(REFERENCE_TITLES.items(), untrained)
-        if (line := part.line(variant, decoding)) and (variant != "random" or any(chooses_actions(m) for m, _ in parts))
-    ]
-    rows += [
-        (str(TableRow(*run, variant)), part, line)
-        for (run, part), variant in itertools.product(parts.items(), LABELS)
-        if (line := part.line(variant, decoding)) and (variant in VARIANTS or _searches(config, run[0]))
-    ]
-    cells = [
-        (title, *(f"{part.summary(line, metric):.{COLUMNS[metric][1]}f}" for metric in SCALE))
-        for title, part, line in rows
-    ]
-    return markdown(("", *(COLUMNS[metric][0] for metric in SCALE)), cells)
+    # Variants of each run, and random choices where these differ from random actions.
+    for (method, decision), run_scores in world_scores.items():
+        has_random_choices = method in config.methods and not chooses_actions(method)
+        for variant in ROW_LABELS:
+            result = find_result(run_scores, variant, decoding)
+            if result and (variant in VARIANT_LABELS or has_random_choices):
+                results.append((str(ComparedAgent(method, decision, variant)), result))
 
-
-def _improvements(config: CompareConfig, parts: Parts, decoding: Decoding) -> list[tuple[str, ...]]:
-    """Return the paired differences between agents, as cells."""
-
-    def line(agent: TableRow) -> tuple[Scores, Line] | None:
-        part = parts.get((agent.method, agent.decision))
-        found = part and part.line(agent.variant, decoding)
-        return (part, found) if part and found else None
-
-    cells = []
-    for agent, reference in comparisons(config):
-        if (one := line(agent)) and (other := line(reference)):
-            differences = (one[0].difference(one[1], *other, metric) for metric in SCALE)
-            values = (f"{each:+z.{COLUMNS[metric][1]}f}" for metric, each in zip(SCALE, differences, strict=True))
-            cells.append((f"{agent} over {reference}", *values))
-    return cells
-
-
-def _training_table(parts: Parts) -> list[str]:
-    """Return the steps, the time and the last course of every run."""
+    # One row per agent, with the decimals of each metric.
     rows = []
-    for run, part in parts.items():
-        if training := part.training:
-            steps = (f"{training.budget[name]:,}" for name in ("exploration", "imitation", "learning"))
-            course = "{:.1f} → {:.1f}".format(*training.course) if training.course else "-"
-            rows.append((run_label(*run), *steps, f"{training.wall_s / 60:,.1f}", course))
-    return markdown(
-        ("run", "exploration (steps)", "imitation (steps)", "learning (steps)", "wall time (min)", "val SR (%)"),
-        rows,
-    )
+    for title, result in results:
+        cells = [f"{result.interval(metric):.{METRIC_COLUMNS[metric][1]}f}" for metric in METRIC_SCALE]
+        rows.append((title, *cells))
+    return table_lines(("", *(METRIC_COLUMNS[metric][0] for metric in METRIC_SCALE)), rows)
 
 
-def _notes(parts: Parts) -> list[str]:
-    """Return what the tables' reader must be told."""
-    told: dict[str, list[str]] = {}
-    for run, part in parts.items():
-        for note in part.training.notes if part.training else ():
-            told.setdefault(note, []).append(run_label(*run))
-    minutes = sum(part.training.wall_s for part in parts.values() if part.training) / 60
-    return [
+def _improvement_rows(config: CompareConfig, world_scores: WorldScores, decoding: Decoding) -> list[tuple[str, ...]]:
+    """Rows of the paired differences between agents."""
+    rows = []
+    for agent, reference in agent_comparisons(config):
+        agent_scores = world_scores.get((agent.method, agent.decision))
+        reference_scores = world_scores.get((reference.method, reference.decision))
+        agent_result = find_result(agent_scores, agent.variant, decoding)
+        reference_result = find_result(reference_scores, reference.variant, decoding)
+        if not (agent_result and reference_result):
+            continue
+
+        cells = []
+        for metric in METRIC_SCALE:
+            _, digits = METRIC_COLUMNS[metric]
+            cells.append(f"{agent_result.difference(reference_result, metric):+z.{digits}f}")
+        rows.append((f"{agent} over {reference}", *cells))
+    return rows
+
+
+def _training_table(world_scores: WorldScores) -> list[str]:
+    """Table of the steps, the time and the convergence of every run."""
+    rows = []
+    for (method, decision), run_scores in world_scores.items():
+        training = run_scores.training
+        if training is None:
+            continue
+        steps = [f"{training.budget[purpose]:,}" for purpose in BUDGET_PURPOSES]
+        course = "{:.1f} → {:.1f}".format(*training.course) if training.course else "-"
+        rows.append((run_label(method, decision), *steps, f"{training.wall_s / 60:,.1f}", course))
+
+    step_titles = [f"{purpose} (steps)" for purpose in BUDGET_PURPOSES]
+    return table_lines(("run", *step_titles, "wall time (min)", "val SR (%)"), rows)
+
+
+def _training_notes(world_scores: WorldScores) -> list[str]:
+    """Lines on how the table of trainings is read, and the notes of the runs."""
+    seconds = []
+    runs_by_note: dict[str, list[str]] = {}
+    for (method, decision), run_scores in world_scores.items():
+        if run_scores.training is None:
+            continue
+        seconds.append(run_scores.training.wall_s)
+        for note in run_scores.training.notes:
+            runs_by_note.setdefault(note, []).append(run_label(method, decision))
+    minutes = sum(seconds) / 60
+
+    lines = [
         "Exploration, imitation and learning are the environment steps behind each policy; exploration serves the "
         "layout's priors and the graph of `sp`. What else methods know before training they read from the training "
         "scenes themselves (docs/methods.md). The wall time is that of "
@@ -176,5 +233,8 @@ def _notes(parts: Parts) -> list[str]:
         "minutes of training. Val SR is that of best actions, the mean of "
         "all policies, before the last quarter of training and at its end: where it rises, longer training pays.",
         "",
-        *(f"* {'; '.join(runs) if len(runs) < len(parts) else 'All runs'}: {note}" for note, runs in told.items()),
     ]
+    for note, runs in runs_by_note.items():
+        subject = "; ".join(runs) if len(runs) < len(world_scores) else "All runs"
+        lines.append(f"* {subject}: {note}")
+    return lines

@@ -1,28 +1,61 @@
-"""Proof of the instrument: what the layout shift changes."""
+"""The layout shift as an instrument: which properties of scenes and agents it changes.
+
+A valid shift leaves the difficulty of the scenes unchanged, costs agents that rely on the training layout, and costs
+nothing to agents that cannot know any layout. `measure_scenes` measures a world at one shift, scene by scene;
+`compare_shifts` turns the measures of several shifts into an `InstrumentReport`; `prove_instrument` does both for a
+finished run and prints the verdicts.
+"""
 
 import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import numpy as np
 from rich.console import Console
 
+from jaxnav.baselines.difficulty import expected_length, random_success
+from jaxnav.baselines.frontier import run_frontier_search
+from jaxnav.env.objectnav import prior_index
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import FORMAT, versions, write_report
+from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
+from jaxnav.evaluation.grid import episode_metrics
+from jaxnav.evaluation.report import REPORT_FORMAT, package_versions, write_report
+from jaxnav.evaluation.similarity import cooccurrence_counts, scene_layout_gap, scene_layout_similarity
+from jaxnav.evaluation.statistics import Interval, SharedDesign, divide_or_nan
+from jaxnav.evaluation.variants import table_row
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import load_run, settings
+from jaxnav.runs.evaluate import evaluate_rows
 from jaxnav.runs.policies import Policies, load_policies
-from jaxnav.runs.worlds import evaluation_world
-from jaxnav.study.codec import to_json
-from jaxnav.study.config import StudyConfig
-from jaxnav.study.dial import compare
-from jaxnav.study.instrument_report import InstrumentReport, console_table, verdicts
-from jaxnav.study.runs import ensure_trained, run_config
-from jaxnav.study.scene_measures import measure_scenes
+from jaxnav.runs.run import load_run_config, run_settings
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.tables.compile import Bank, categories_in_view
+from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.study.config import StudyConfig, ensure_trained, study_run_config
+from jaxnav.study.records import (
+    BASELINE_MEASURES,
+    CATEGORY_MEASURES,
+    DIFFICULTY_MEASURES,
+    MATCH_TOLERANCE,
+    MAX_LOSS_WITHOUT_EXPERIENCE,
+    MIN_BASELINE_LOSS,
+    NO_EXPERIENCE_MEASURES,
+    InstrumentReport,
+    Measure,
+    MeasureChange,
+    ShiftMeasures,
+    instrument_console_table,
+    instrument_verdicts,
+    to_json,
+)
+
+TRAINED_MEASURES = BASELINE_MEASURES + NO_EXPERIENCE_MEASURES
 
 
 @dataclasses.dataclass(frozen=True)
 class InstrumentConfig:
-    """Describe a proof of the instrument with a finished run.
+    """Configuration of a proof of the instrument with a finished run.
 
     Attributes:
       run: the run directory; the table is also written there, as instrument-SPLIT.json.
@@ -30,9 +63,9 @@ class InstrumentConfig:
       without: run directory of agents that cannot know any layout, such as those of the method `anonymous`: they must
         lose nothing.
       split: scenes to evaluate on.
-      episodes: number at each shift; see the evaluation.
-      scenes_per_split: generated scenes of the split; default: the run's.
-      seed: of the episode lists and the sampled actions.
+      episodes: number of episodes at each shift.
+      scenes_per_split: number of generated scenes of the split; default: that of the run.
+      seed: seed of the episode lists and the sampled actions.
     """
 
     run: Path
@@ -44,83 +77,433 @@ class InstrumentConfig:
     seed: int = 0
 
 
-def study_instrument(config: StudyConfig, run: RunConfig, without: Path | None = None) -> InstrumentConfig:
-    """Return the proof that a study asks of a run."""
-    return InstrumentConfig(run.run_dir, config.shifts, without, config.split, config.episodes, seed=config.seed)
+def study_instrument_config(config: StudyConfig, run: RunConfig, without: Path | None = None) -> InstrumentConfig:
+    """Return the configuration of the proof that a study includes for a run."""
+    return InstrumentConfig(
+        run=run.run_dir,
+        shift=config.shifts,
+        without=without,
+        split=config.split,
+        episodes=config.episodes,
+        seed=config.seed,
+    )
 
 
 def prove_main_run(config: StudyConfig, console: Console, out: Console) -> None:
-    """Prove the instrument with a study's main run.
-
-    The run is trained unless it is finished; see `prove_instrument`.
-    """
-    run = run_config(config, "main")
+    """Prove the instrument with the main run of a study, which is trained unless finished; see `prove_instrument`."""
+    run = study_run_config(config, "main")
     ensure_trained(run, console)
-    prove_instrument(study_instrument(config, run), console, out)
+    prove_instrument(study_instrument_config(config, run), console, out)
 
 
 def prove_instrument(config: InstrumentConfig, console: Console, out: Console) -> None:
-    """Measure at every shift, print the table, write JSON.
+    """Measure at every shift, print table and verdicts, and write them as JSON.
 
     Args:
-      config: what is measured.
-      console: shows the progress.
-      out: takes the table and the verdicts.
+      config: run, shifts and episodes.
+      console: prints progress.
+      out: prints the table and the verdicts.
 
     Raises:
-      InputError: an impossible setting, no finished run, or a file that cannot be written.
+      InputError: an invalid setting, no finished run, or a file that cannot be written.
     """
+    # Invalid settings are reported before anything is measured.
     run = _checked_run(config)
-    report = instrument_report(config, run, console)
-    out.print(console_table(report))
-    for line in verdicts(report):
-        out.print(line, markup=False)
-    target = config.run / f"instrument-{config.split}.json"
+    report = measure_instrument(config, run, console)
+    out.print(instrument_console_table(report))
+    for verdict_line in instrument_verdicts(report):
+        out.print(verdict_line, markup=False)
+
+    # The report also stays next to the run that it is about.
+    report_path = config.run / f"instrument-{config.split}.json"
     try:
-        write_report(target, to_json(report) | {"versions": versions(), "format": FORMAT})
+        write_report(report_path, to_json(report) | {"versions": package_versions(), "format": REPORT_FORMAT})
     except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror})") from error
-    console.print(f"written to {target}")
-
-
-def instrument_report(config: InstrumentConfig, run: RunConfig, console: Console) -> InstrumentReport:
-    """Measure a finished run at every shift and compare."""
-    policies, totals = load_policies(run), []
-    without = None if config.without is None else load_without(config.without, run)
-    shifts = sorted(set(config.shift))
-    for shift in shifts:
-        console.print(f"shift {shift:g}:")
-        world = evaluation_world(run, config.split, None, shift, console)
-        totals.append(measure_scenes(world, policies, without, config.episodes, config.seed))
-    about = settings(run) | {"evaluation_split": config.split, "evaluation_seed": config.seed}
-    return dataclasses.replace(compare(shifts, totals), run=about)
-
-
-def load_without(folder: Path, run: RunConfig) -> Policies:
-    """Load agents that cannot know any layout.
-
-    Raises:
-      InputError: no finished run, or one of another task or number of seeds.
-    """
-    other = load_run(folder)
-    if (other.task, other.seeds) != (run.task, run.seeds):
-        raise InputError(f"--without {folder}: is of another task or number of seeds; train it like {run.run_dir}")
-    return load_policies(other, ("baseline",))
+        raise InputError(f"{report_path}: cannot be written ({error.strerror})") from error
+    console.print(f"written to {report_path}")
 
 
 def _checked_run(config: InstrumentConfig) -> RunConfig:
-    """Return the run with the number of scenes asked for."""
-    given = f"--shift {' '.join(map(str, config.shift))}"
+    """Check the settings and load the run, with the number of scenes that the configuration asks for."""
+    shift_option = f"--shift {' '.join(map(str, config.shift))}"
     if not all(0.0 <= shift <= 1.0 for shift in config.shift):
-        raise InputError(f"{given}: give numbers from 0 to 1")
+        raise InputError(f"{shift_option}: give numbers from 0 to 1")
     if len(set(config.shift)) < 2:
-        raise InputError(f"{given}: give at least two different shifts")
+        raise InputError(f"{shift_option}: give at least two different shifts")
     if not 0 <= config.seed < 2**32:
         raise InputError(f"--seed {config.seed}: give a whole number from 0 to 2**32 - 1")
-    run = load_run(config.run)
+
+    # Only generated scenes can be made in another number than in training.
+    run = load_run_config(config.run)
     if config.scenes_per_split is None:
         return run
     if run.scenes:
         raise InputError(f"--scenes-per-split: {config.run} is a run on scenes of a file; leave it out")
     worlds = dataclasses.replace(run.worlds, **{f"num_{config.split}": config.scenes_per_split})
     return dataclasses.replace(run, worlds=worlds)
+
+
+def measure_instrument(config: InstrumentConfig, run: RunConfig, console: Console) -> InstrumentReport:
+    """Measure a finished run at every shift and compare the shifts."""
+    policies = load_policies(run)
+    unaware_policies = None if config.without is None else load_unaware_policies(config.without, run)
+
+    # Rising, because all shifts are compared with the lowest.
+    shifts = sorted(set(config.shift))
+    totals_by_shift = []
+    for shift in shifts:
+        console.print(f"shift {shift:g}:")
+        world = compile_evaluation_world(run, config.split, None, shift, console)
+        totals_by_shift.append(measure_scenes(world, policies, unaware_policies, config.episodes, config.seed))
+
+    # The split and the seed of the evaluation are no settings of the run, and are added to them.
+    report_settings = run_settings(run) | {"evaluation_split": config.split, "evaluation_seed": config.seed}
+    return dataclasses.replace(compare_shifts(shifts, totals_by_shift), run=report_settings)
+
+
+def load_unaware_policies(folder: Path, run: RunConfig) -> Policies:
+    """Load agents that cannot know any layout.
+
+    Raises:
+      InputError: no finished run, or one of another task or number of seeds.
+    """
+    unaware_run = load_run_config(folder)
+    if (unaware_run.task, unaware_run.seeds) != (run.task, run.seeds):
+        raise InputError(f"--without {folder}: is of another task or number of seeds; train it like {run.run_dir}")
+    return load_policies(unaware_run, ("baseline",))
+
+
+# Measures of one shift
+
+
+class SceneTotals(NamedTuple):
+    """Measures of N scenes at one shift.
+
+    Attributes:
+      values: float64 [S, N], sums over the episodes of each scene by seed; S = 1 for measures without training.
+      weights: float64 [N], number of episodes of each scene; a mean is the sum of values / the sum of weights.
+      categories: float64 [N, K], means by goal category; NaN for categories that do not occur.
+      rooms: [N], room types.
+      names: [N], names of the scenes.
+    """
+
+    values: Mapping[Measure, np.ndarray]
+    weights: Mapping[Measure, np.ndarray]
+    categories: Mapping[Measure, np.ndarray]
+    rooms: tuple[str, ...]
+    names: tuple[str, ...]
+
+
+def measure_scenes(
+    world: CompiledWorld, policies: Policies, unaware_policies: Policies | None, num_episodes: int, seed: int
+) -> SceneTotals:
+    """Measure the scenes of a world at one shift.
+
+    L* and Random are exact means over all episodes that could be drawn in a scene, not over the drawn ones.
+
+    Args:
+      world: the scenes.
+      policies: policies with the baseline among their arms.
+      unaware_policies: policies of agents that cannot know any layout, with as many seeds.
+      num_episodes: number of episodes in all scenes together.
+      seed: seed of the episode lists and the sampled actions.
+    """
+    # Results of the baseline, bool [2, S, E]: with best actions, and with sampled ones.
+    rows = [table_row("baseline", None, None, decoding) for decoding in ("argmax", "sample")]
+    episode_lists, outcome, _ = evaluate_rows(rows, policies, world, num_episodes, seed)
+    episodes = join_episode_lists(episode_lists)
+    num_scenes = len(episodes.scenes)
+
+    def sum_by_scene(values: np.ndarray) -> np.ndarray:
+        """Sum values [S, E] over the episodes of each scene, [S, N]."""
+        scene_sums = []
+        for run_values in values:
+            scene_sums.append(np.bincount(episodes.scene, run_values, num_scenes))
+        return np.stack(scene_sums)
+
+    # Measures without training, bank by bank. The scenes are read once, in order.
+    priors = np.asarray(policies.knowledge.layout, np.float64)
+    scenes_in_order = (world.scenes[index] for index in range(len(world.scenes)))
+    bank_measures = []
+    for bank, bank_episodes in zip(world.banks, episode_lists, strict=True):
+        bank_measures.append(_measure_bank(bank, bank_episodes, world, priors, scenes_in_order))
+    scenes = BankMeasures(*map(np.concatenate, zip(*bank_measures, strict=True)))
+
+    # Exact means count as often as a scene has episodes, so that all measures are sums over episodes.
+    episode_counts = np.bincount(episodes.scene, minlength=num_scenes).astype(np.float64)
+    baseline_argmax, baseline_sample = 100.0 * np.asarray(outcome.success, np.float64)
+    values: dict[Measure, np.ndarray] = {
+        "best_length": episode_counts * scenes.best_length[None],
+        "random_sr": episode_counts * 100.0 * scenes.random_success[None],
+        "frontier_sr": sum_by_scene(100.0 * scenes.success[None]),
+        "frontier_steps": sum_by_scene(scenes.actions[None].astype(np.float64)),
+        "start_distance": episode_counts * np.nanmean(scenes.distance, axis=1)[None],
+        "goal_detected": episode_counts * 100.0 * np.nanmean(scenes.detected, axis=1)[None],
+        "done_succeeds": episode_counts * 100.0 * np.nanmean(scenes.succeeds, axis=1)[None],
+        "layout_gap": np.nan_to_num(scenes.gap)[None],
+        "layout_similarity": np.nan_to_num(scenes.similarity)[None],
+        "baseline_argmax_sr": sum_by_scene(baseline_argmax),
+        "baseline_sample_sr": sum_by_scene(baseline_sample),
+    }
+
+    # Agents without experience meet the same episodes.
+    if unaware_policies is not None:
+        _, unaware_outcome, _ = evaluate_rows(rows, unaware_policies, world, num_episodes, seed)
+        unaware_metrics = episode_metrics(unaware_outcome, episodes.best_length)
+        argmax_success, sample_success = 100.0 * unaware_metrics["sr"]
+        argmax_wrong, sample_wrong = 100.0 * unaware_metrics["wrong_done"]
+        values["without_argmax_sr"] = sum_by_scene(argmax_success)
+        values["without_sample_sr"] = sum_by_scene(sample_success)
+        values["without_argmax_wrong"] = sum_by_scene(argmax_wrong)
+        values["without_sample_wrong"] = sum_by_scene(sample_wrong)
+
+    # Layout measures weigh every scene with co-occurrence once, all others weigh scenes by their episodes.
+    has_cooccurrence = (~np.isnan(scenes.gap)).astype(np.float64)
+    weights: dict[Measure, np.ndarray] = {}
+    for measure in values:
+        weights[measure] = has_cooccurrence if measure.startswith("layout") else episode_counts
+
+    # Room types in the order of the scenes, bank by bank.
+    room_types: list[str] = []
+    for bank in world.banks:
+        room_types.extend(bank.room_types)
+
+    return SceneTotals(
+        values=values,
+        weights=weights,
+        categories={"goal_detected": 100.0 * scenes.detected, "done_succeeds": 100.0 * scenes.succeeds},
+        rooms=tuple(room_types),
+        names=episodes.scenes,
+    )
+
+
+class BankMeasures(NamedTuple):
+    """Measures of one bank that need no policies.
+
+    Attributes:
+      best_length, random_success: float64 [N], means over all episodes that could be drawn in a scene.
+      success, actions: bool and int [E], of the frontier search.
+      gap, similarity: float64 [N], between layout and prior; NaN for a scene without co-occurrence.
+      detected, succeeds, distance: float64 [N, K], see `DetectionShares`.
+    """
+
+    best_length: np.ndarray
+    random_success: np.ndarray
+    success: np.ndarray
+    actions: np.ndarray
+    gap: np.ndarray
+    similarity: np.ndarray
+    detected: np.ndarray
+    succeeds: np.ndarray
+    distance: np.ndarray
+
+
+def _measure_bank(
+    bank: Bank, episodes: EpisodeList, world: CompiledWorld, priors: np.ndarray, scenes: Iterator[Scene]
+) -> BankMeasures:
+    # The frontier search plays the drawn episodes within the step limits of their scenes.
+    step_limits = world.scene_step_limits(bank)
+    frontier = run_frontier_search(bank, episodes, step_limits)
+
+    # Every scene is compared with the prior of its own room type, both [N, K, K].
+    counts = cooccurrence_counts(bank)
+    prior = priors[list(map(prior_index, bank.room_types))]
+    detection = measure_detection(bank, scenes)
+    return BankMeasures(
+        best_length=expected_length(bank),
+        random_success=random_success(bank, step_limits),
+        success=np.asarray(frontier.success),
+        actions=np.asarray(frontier.length),
+        gap=scene_layout_gap(counts, prior),
+        similarity=scene_layout_similarity(counts, prior),
+        detected=detection.detected,
+        succeeds=detection.succeeds,
+        distance=detection.distance,
+    )
+
+
+class DetectionShares(NamedTuple):
+    """Detection by scene and goal category.
+
+    All are float64 [N, K], NaN for categories that are no goal of a scene.
+
+    Attributes:
+      detected: share of the poses with the goal in view (see `in_view`) that detect it.
+      succeeds: share of the detecting poses where Done would succeed; NaN for a goal that is never detected.
+      distance: mean distance of the cells to the nearest goal object, metres; see `CompiledScene.goal_distance`.
+    """
+
+    detected: np.ndarray
+    succeeds: np.ndarray
+    distance: np.ndarray
+
+
+def measure_detection(bank: Bank, scenes: Iterator[Scene]) -> DetectionShares:
+    """Measure the detection of goals over all poses.
+
+    Args:
+      bank: N scenes.
+      scenes: the scenes that the bank was compiled from, in order; scenes that the bank left out are skipped.
+    """
+    poses_per_cell = bank.task.rules.poses_per_cell
+    row_format = RowFormat(len(bank.task.categories))
+    share_shape = (len(bank.names), len(bank.task.categories))
+    shares = DetectionShares(np.full(share_shape, np.nan), np.full(share_shape, np.nan), np.full(share_shape, np.nan))
+
+    for index, name in enumerate(bank.names):
+        # Cells and poses of the scene are slices of the bank.
+        scene = _find_scene(scenes, name)
+        first_cell = bank.first_cell[index]
+        cell_slice = slice(first_cell, first_cell + bank.num_cells[index])
+        pose_slice = slice(cell_slice.start * poses_per_cell, cell_slice.stop * poses_per_cell)
+        goals = bank.goals[index, : bank.num_goals[index]]
+
+        # Poses [P, goals]; detections without the goal in view are false alarms and do not count.
+        in_view = categories_in_view(scene, bank.task)[:, goals]
+        detected = in_view & row_format.presence(bank.rows[pose_slice])[:, goals]
+        succeeds = detected & (bank.best_length[pose_slice][:, goals] == 1)
+        shares.detected[index, goals] = divide_or_nan(detected.sum(axis=0), in_view.sum(axis=0))
+        shares.succeeds[index, goals] = divide_or_nan(succeeds.sum(axis=0), detected.sum(axis=0))
+
+        # Cells [C, goals]; cells without a path to the goal have an infinite distance and do not count.
+        goal_distance = bank.goal_distance[cell_slice][:, goals]
+        is_finite = np.isfinite(goal_distance)
+        shares.distance[index, goals] = np.where(is_finite, goal_distance, 0.0).sum(axis=0) / is_finite.sum(axis=0)
+    return shares
+
+
+def _find_scene(scenes: Iterator[Scene], name: str) -> Scene:
+    """Read on to the scene with a name."""
+    return next(scene for scene in scenes if scene.name == name)
+
+
+# Comparison of shifts
+
+
+def compare_shifts(shifts: Sequence[float], totals: Sequence[SceneTotals]) -> InstrumentReport:
+    """Compare all shifts with the first.
+
+    Args:
+      shifts: layout shifts, rising.
+      totals: measures at each shift; all share training runs, and floor plans by name.
+
+    Raises:
+      InputError: a measure of difficulty is 0 at the first shift.
+    """
+    # Scenes are left out of all shifts at once, so that their difficulty cancels in the differences.
+    num_seeds = len(totals[0].values[BASELINE_MEASURES[0]])
+    conditions = [(total.names, total.rooms) for total in totals]
+    design = SharedDesign.from_conditions(conditions, num_seeds)
+
+    # Leave-one-out means of every measure at every shift.
+    means: dict[Measure, list[np.ndarray]] = {}
+    for measure in totals[0].values:
+        is_trained = measure in TRAINED_MEASURES
+        means[measure] = []
+        for total in totals:
+            values = total.values[measure]
+            mean = design.jackknife_means(values, total.weights[measure], total.names, trained=is_trained)
+            means[measure].append(mean)
+
+    # The table: one column per shift, with the interval of every measure.
+    shift_columns = []
+    for index, (shift, total) in enumerate(zip(shifts, totals, strict=True)):
+        measure_intervals = {}
+        for measure, shift_means in means.items():
+            measure_intervals[measure] = design.interval(shift_means[index])
+        shift_column = ShiftMeasures(
+            shift=shift,
+            scenes=len(total.names),
+            episodes=int(total.weights["frontier_sr"].sum()),
+            measures=measure_intervals,
+        )
+        shift_columns.append(shift_column)
+
+    # Changes of difficulty, which a valid shift keeps small.
+    difficulty_changes = []
+    for measure in DIFFICULTY_MEASURES:
+        difficulty_changes += _percent_changes(measure, shifts, means[measure], design)
+    category_changes = []
+    for measure in CATEGORY_MEASURES:
+        category_changes += _category_changes(measure, shifts, totals, design)
+
+    # Losses from the first shift to the last: agents that rely on the layout must lose, agents without must not.
+    baseline_losses = []
+    for measure in BASELINE_MEASURES:
+        loss = _loss(measure, means[measure], design)
+        is_met = loss.mean >= MIN_BASELINE_LOSS and loss.low > 0
+        baseline_losses.append(MeasureChange(measure, shifts[0], shifts[-1], loss, is_met))
+
+    # Agents without experience may not have been measured.
+    unaware_losses = []
+    if NO_EXPERIENCE_MEASURES[0] in means:
+        for measure in NO_EXPERIENCE_MEASURES:
+            loss = _loss(measure, means[measure], design)
+            is_met = loss.mean < MAX_LOSS_WITHOUT_EXPERIENCE
+            unaware_losses.append(MeasureChange(measure, shifts[0], shifts[-1], loss, is_met))
+
+    return InstrumentReport(
+        shifts=tuple(shift_columns),
+        matched=tuple(difficulty_changes),
+        categories=tuple(category_changes),
+        discriminating=tuple(baseline_losses),
+        without=tuple(unaware_losses) if unaware_losses else None,
+    )
+
+
+def _loss(measure: Measure, means: Sequence[np.ndarray], design: SharedDesign) -> Interval:
+    """Compute the loss from the first shift to the last; more wrong Dones are a loss."""
+    sign = -1.0 if measure.endswith("wrong") else 1.0
+    return design.interval(sign * (means[0] - means[-1]))
+
+
+def _percent_changes(
+    measure: Measure, shifts: Sequence[float], means: Sequence[np.ndarray], design: SharedDesign
+) -> list[MeasureChange]:
+    """Compute the changes from the first shift, in percent."""
+    # Replicates [1 + R, 1 + C] or [1 + C]; the first entry is the mean itself.
+    first_mean = means[0]
+    if not first_mean.flat[0]:
+        raise InputError(f"{measure} is 0 at shift {shifts[0]:g}: nothing to compare with; give more --episodes")
+    changes = []
+    for shift, shift_mean in zip(shifts[1:], means[1:], strict=True):
+        percent_change = design.interval(100.0 * (shift_mean - first_mean) / first_mean)
+        changes.append(
+            MeasureChange(measure, shifts[0], shift, percent_change, holds=abs(percent_change.mean) <= MATCH_TOLERANCE)
+        )
+    return changes
+
+
+def _category_changes(
+    measure: Measure, shifts: Sequence[float], totals: Sequence[SceneTotals], design: SharedDesign
+) -> list[MeasureChange]:
+    """Compute the mean absolute change over the categories, from the first shift.
+
+    A category weighs as many scenes as have it at the first shift. Categories of few scenes change by chance, so the
+    mean is above 0 even without a real change.
+    """
+    # Leave-one-out means by category at each shift, and the scenes that weigh a category.
+    means = [_category_means(total, measure, design) for total in totals]
+    num_scenes = (~np.isnan(totals[0].categories[measure])).sum(axis=0)  # [K]
+    changes = []
+    for shift, shift_mean in zip(shifts[1:], means[1:], strict=True):
+        change_sizes = np.abs(shift_mean - means[0])  # [K, 1 + C]
+        category_weights = num_scenes[:, None] * ~np.isnan(change_sizes)
+
+        # A replicate that leaves out every scene of a category is NaN there, and skips the category.
+        mean_size = np.nansum(category_weights * np.nan_to_num(change_sizes), axis=0) / category_weights.sum(axis=0)
+        mean_change = design.interval(mean_size)
+        changes.append(MeasureChange(measure, shifts[0], shift, mean_change, holds=mean_change.mean <= MATCH_TOLERANCE))
+    return changes
+
+
+def _category_means(total: SceneTotals, measure: Measure, design: SharedDesign) -> np.ndarray:
+    """Compute the leave-one-out means of each category over its scenes, [K, 1 + C]."""
+    category_means = []
+    for scene_values in total.categories[measure].T:
+        # Scenes without the category as a goal weigh 0; every other scene weighs 1.
+        scene_weights = 1.0 - np.isnan(scene_values)
+        category_means.append(
+            design.jackknife_means(np.nan_to_num(scene_values)[None], scene_weights, total.names, trained=False)
+        )
+    return np.stack(category_means)

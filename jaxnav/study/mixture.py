@@ -1,12 +1,16 @@
-"""Removal in a mixed population: what it keeps of the value of experience, and what it recovers of the cost.
+"""Removal in a mixed population: how much value of experience it keeps, and how much of the cost it recovers.
 
-Half of the episodes are in scenes laid out like those of training, half in shifted ones, and no agent is told which. A
-removal is worth what it gains over the mixture. A gap is worth what it gains over the gap of another episode of the
-mixture, over the mean gap of all episodes at the time, and over clocks.
+Half of the episodes are in scenes laid out as in training, half in shifted ones, and no agent knows which. A removal is
+worth its gain over the whole mixture. A gap is worth its gain over controls: the gap of another episode of the mixture,
+the mean gap of all episodes at the same time, and clocks.
+
+`measure_mixture` evaluates the removals of a run and their controls. `PopulationMetrics` compares outcomes, at each
+shift and over the mixture.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,199 +19,163 @@ from rich.console import Console
 
 from jaxnav.causal import Form
 from jaxnav.errors import InputError
-from jaxnav.evaluation.accounting import share_left
-from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.grid import Outcome
-from jaxnav.evaluation.metrics import episode_metrics
-from jaxnav.evaluation.report import Decoding
-from jaxnav.evaluation.statistics import Clusters, Interval, paired_difference, summary
+from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
+from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
+from jaxnav.evaluation.report import Decoding, remaining_share
+from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.policies import Gap, gap_settings, load_policies
+from jaxnav.runs.policies import GapName, estimators_by_gap, load_policies
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.study.bench import Bench, Subject, layout_setting
-from jaxnav.study.mixture_report import ByShift, Compared, Mixture, Removal
-from jaxnav.study.outcomes import mean_weight
-from jaxnav.study.population import mixed_population
-from jaxnav.study.trials import Control, Schedule, Trial, Use
+from jaxnav.study.config import StudyConfig
+from jaxnav.study.measure import (
+    EvaluatedRun,
+    TrialRunner,
+    draw_study_episodes,
+    mean_removal_weight,
+    require_estimator_config,
+)
+from jaxnav.study.records import (
+    ControlComparison,
+    GapSchedule,
+    IntervalsByShift,
+    MixtureReport,
+    RemovalReport,
+    StdeOptions,
+    Trial,
+    TrialControl,
+)
 
-#: Constant gaps, and times by the second budget of the world, after or until which experience is taken out whole. All
-#: times are below 1, for nothing that comes later changes success within the budget.
-CONSTANTS = (0.25, 0.5, 0.75)
-TIMES = (0.1, 0.25, 0.5)
-ORACLE = "told the shift"
+#: Gaps of the constant controls.
+CONSTANT_GAPS = (0.25, 0.5, 0.75)
+#: Times of the clocks, as shares of the world's second action budget: all experience is removed after, or until, that
+#: time. They are below 1, because a later removal cannot change success within the budget.
+CLOCK_TIMES = (0.1, 0.25, 0.5)
+#: Name of the removal that knows the shift: all experience is removed at every shift but the first.
+ORACLE_NAME = "told the shift"
 
 
-class Way(NamedTuple):
-    """Name a way of removal: a gap, whether it is held, and its use."""
+class RemovalRule(NamedTuple):
+    """A rule of soft removal.
 
-    gap: Gap
+    Attributes:
+      gap: name of the layout gap.
+      hold: True if the gap never falls within an episode.
+      options: threshold and form of sTDE.
+    """
+
+    gap: GapName
     hold: bool
-    use: Use
+    options: StdeOptions
 
     def __str__(self) -> str:
-        held = " held" if self.hold else ""
-        return f"{self.gap}{held}, {self.use.form}, eps {self.use.epsilon:g}"
+        suffix = " held" if self.hold else ""
+        return f"{self.gap}{suffix}, {self.options.form}, eps {self.options.epsilon:g}"
 
 
-#: Soft removal by every gap, and handing over: a switch that does not go back.
-WAYS = (
-    Way("novelty", False, Use(0.5, "residual")),
-    *(Way(gap, False, Use(0.0, "paper")) for gap in ("novelty", "evidence", "learned", "overdue")),
-    *(Way(gap, True, Use(0.5, "switch")) for gap in ("evidence", "overdue")),
-    Way("learned", True, Use(0.75, "switch")),
+#: Soft removal by every gap, then switches that hand over for the rest of the episode.
+REMOVAL_RULES = (
+    RemovalRule("novelty", False, StdeOptions(0.5, "residual")),
+    RemovalRule("novelty", False, StdeOptions(0.0, "paper")),
+    RemovalRule("evidence", False, StdeOptions(0.0, "paper")),
+    RemovalRule("learned", False, StdeOptions(0.0, "paper")),
+    RemovalRule("overdue", False, StdeOptions(0.0, "paper")),
+    RemovalRule("evidence", True, StdeOptions(0.5, "switch")),
+    RemovalRule("overdue", True, StdeOptions(0.5, "switch")),
+    RemovalRule("learned", True, StdeOptions(0.75, "switch")),
 )
-#: Controls of each form; a mean gap is no switch.
-CONTROLS: Mapping[Form, tuple[Control | Schedule, ...]] = {
+#: Controls of each form. A mean gap is not a switch, so `course` does not apply there.
+CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
     "residual": ("shuffled", "course"),
     "paper": ("shuffled", "course"),
     "switch": ("shuffled",),
 }
-Values = Mapping[str, np.ndarray]
-
-
-class Subset(NamedTuple):
-    """Hold which episodes count, and their scenes."""
-
-    chosen: np.ndarray
-    scenes: Clusters
-
-
-class Ledger:
-    """Hold outcomes on the episodes of a population, and compare them.
-
-    Args:
-      episodes: of the population.
-      shift: int [E], index of each episode's shift.
-      budgets: numbers of actions within which success is counted too.
-    """
-
-    def __init__(self, episodes: EpisodeList, shift: np.ndarray, budgets: Sequence[int]) -> None:
-        self._episodes, self._budgets = episodes, budgets
-        self.metrics = ("sr", "spl", *(f"sr@{budget}" for budget in budgets))
-        chosen = [shift == part for part in range(shift.max() + 1)]
-        self._parts = [Subset(each, episodes.take(each).clusters()) for each in chosen]
-        self._all = Subset(np.ones(len(shift), bool), episodes.clusters())
-
-    def measure(self, outcome: Outcome) -> Values:
-        """Return the metrics of outcomes in percent, [S, E]."""
-        found = episode_metrics(outcome, self._episodes.best_length, self._budgets)
-        return {name: 100.0 * found[name] for name in self.metrics}
-
-    def told(self, plain: Outcome, hard: Outcome) -> Outcome:
-        """Return what hard removal at all shifts but the first gives."""
-        return jax.tree.map(lambda kept, removed: np.where(self._parts[0].chosen, kept, removed), plain, hard)
-
-    def weights(self, outcome: Outcome) -> tuple[float, ...]:
-        """Return the mean weight of what is removed at each shift."""
-        parts = [jax.tree.map(lambda leaf: leaf[:, part.chosen], outcome) for part in self._parts]  # noqa: B023
-        return tuple(map(mean_weight, parts))
-
-    def by_shift(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return values [..., E] of each shift."""
-        return tuple(values[..., part.chosen] for part in self._parts)
-
-    def means(self, measured: Values) -> dict[str, ByShift]:
-        """Return the means at each shift."""
-        return {
-            name: tuple(summary(measured[name][:, part.chosen], part.scenes) for part in self._parts)
-            for name in self.metrics
-        }
-
-    def changes(self, a: Values, b: Values, *, same_runs: bool) -> dict[str, ByShift]:
-        """Return `b - a` at each shift."""
-        return {
-            name: tuple(self._difference(a[name], b[name], part, same_runs=same_runs) for part in self._parts)
-            for name in self.metrics
-        }
-
-    def overall(self, a: Values, b: Values) -> dict[str, Interval]:
-        """Return `b - a` of the same policies over all episodes."""
-        return {name: paired_difference(a[name], b[name], self._all.scenes, same_runs=True) for name in self.metrics}
-
-    def left(self, without: Values, agent: Values, removed: Values) -> dict[str, ByShift]:
-        """Return the share of a lead that removal leaves."""
-
-        def share(name: str, part: Subset) -> Interval:
-            nobody, acting, left = (each[name][:, part.chosen] for each in (without, agent, removed))
-            return share_left(nobody, acting, left, part.scenes)
-
-        return {name: tuple(share(name, part) for part in self._parts) for name in self.metrics}
-
-    @staticmethod
-    def _difference(a: np.ndarray, b: np.ndarray, part: Subset, *, same_runs: bool) -> Interval:
-        return paired_difference(a[:, part.chosen], b[:, part.chosen], part.scenes, same_runs=same_runs)
 
 
 def measure_mixture(
     run: RunConfig,
     without: RunConfig,
     decoding: Decoding,
-    bench: Bench,
+    runner: TrialRunner,
     console: Console,
-    ways: Sequence[Way] = WAYS,
+    rules: Sequence[RemovalRule] = REMOVAL_RULES,
     *,
     hand_over: bool = False,
-) -> Mixture:
+) -> MixtureReport:
     """Evaluate removals and their controls in a mixed population.
 
     Args:
-      run: finished, with the arm of the layout.
-      without: finished, of agents that cannot know any layout, with as many seeds.
-      decoding: of actions.
-      bench: evaluates.
-      console: shows the progress.
-      ways: of removal, besides TDE and clocks.
-      hand_over: whether removal leaves the agents of `without`, and not the run's own direct effect.
+      run: a finished run with the layout arm.
+      without: a finished run of agents that cannot know any layout, with as many seeds.
+      decoding: rule that turns logits into actions.
+      runner: runs the trials.
+      console: prints progress.
+      rules: rules of soft removal, in addition to TDE and clocks.
+      hand_over: True if removal hands over to the agents of `without`; False if it leaves the run's own direct effect.
 
     Raises:
       InputError: a run is not finished, they differ in world, goals or number of seeds, cannot hand over, or see
-        `mixed_population`.
+        `draw_mixed_population`.
     """
-    for name in ("world", "scenes", "worlds", "task", "seeds"):
-        if getattr(run, name) != getattr(without, name):
-            raise InputError(f"{run.run_dir} and {without.run_dir} differ in {name}; train both alike")
-    config, budgets = bench.config, WORLDS[run.world].budgets
+    # Paired comparisons need the same episodes and as many training runs on both sides.
+    for setting_name in ("world", "scenes", "worlds", "task", "seeds"):
+        if getattr(run, setting_name) != getattr(without, setting_name):
+            raise InputError(f"{run.run_dir} and {without.run_dir} differ in {setting_name}; train both alike")
+    config = runner.config
+    budgets = WORLDS[run.world].budgets
     shifts = (config.shifts[0], config.shifts[-1])
-    world, episodes, shift = mixed_population(run, shifts, config, console)
-    ledger = Ledger(episodes, shift, budgets)
-    unaware = Subject(load_policies(without, ("baseline",)), world, episodes)
+
+    # Both runs meet the same episodes.
+    world, episodes, shift_index = draw_mixed_population(run, shifts, config, console)
+    unaware_run = EvaluatedRun(load_policies(without, ("baseline",)), world, episodes)
     policies = load_policies(run, ("layout",))
-    subject = Subject(policies.handing_over(unaware.policies) if hand_over else policies, world, episodes)
-    nobody = ledger.measure(bench.run(unaware, None, [Trial("baseline", decoding)])[0])
-    known = {"plain": Trial("layout", decoding), "TDE": Trial("tde", decoding)} | clock_trials(decoding, budgets[-1])
+    if hand_over:
+        policies = policies.with_handover_to(unaware_run.policies)
+    evaluated_run = EvaluatedRun(policies, world, episodes)
+    estimator = require_estimator_config(policies)
+
+    # References and clocks are evaluated once, for all rules.
+    (unaware_outcome,) = runner.run_trials(unaware_run, None, [Trial("baseline", decoding)])
     console.print("TDE and clocks")
-    outcomes = bench.run(subject, layout_setting(subject.policies), list(known.values()))
-    plain, hard, *clocks = outcomes
-    agent = ledger.measure(plain)
+    clocks = clock_trials(decoding, budgets[-1])
+    plain_trials = [Trial("layout", decoding), Trial("tde", decoding), *clocks.values()]
+    plain_outcome, tde_outcome, *clock_outcomes = runner.run_trials(evaluated_run, estimator, plain_trials)
+    outcome_by_clock = dict(zip(clocks, clock_outcomes, strict=True))
 
-    def removal(name: str, outcome: Outcome, controls: Mapping[str, Outcome] | None = None) -> Removal:
-        removed = ledger.measure(outcome)
-        compared = {
-            key: Compared(ledger.weights(each), ledger.overall(ledger.measure(each), removed))
-            for key, each in (controls or {}).items()
+    # Hard removal, the oracle and the clocks need no estimate of the shift from the views of an episode.
+    metrics = PopulationMetrics(episodes, shift_index, budgets)
+    references = _References(
+        metrics=metrics,
+        unaware=metrics.percent_metrics(unaware_outcome),
+        agent=metrics.percent_metrics(plain_outcome),
+    )
+    clock_reports = list(itertools.starmap(references.report_removal, outcome_by_clock.items()))
+    reports = [
+        references.report_removal("TDE", tde_outcome),
+        references.report_removal(ORACLE_NAME, metrics.oracle_removal(plain_outcome, tde_outcome)),
+        *clock_reports,
+    ]
+
+    # Every rule is compared with its own controls and with the best clock.
+    score_name = f"sr@{budgets[-1]}"
+    best_clock = max(clock_reports, key=lambda report: report.mixture[score_name].mean).name
+    for rule in rules:
+        console.print(str(rule))
+        rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)
+        controls = CONTROLS_BY_FORM[rule.options.form]
+        trial = Trial("stde", decoding, *rule.options)
+        control_trials = []
+        for control in controls:
+            control_trials.append(dataclasses.replace(trial, control=control))
+        rule_outcome, *control_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *control_trials])
+        compared_outcomes = dict(zip(controls, control_outcomes, strict=True)) | {
+            best_clock: outcome_by_clock[best_clock]
         }
-        return Removal(
-            name=name,
-            weight=ledger.weights(outcome),
-            change=ledger.changes(agent, removed, same_runs=True),
-            mixture=ledger.overall(agent, removed),
-            left=ledger.left(nobody, agent, removed),
-            compared=compared or None,
-        )
+        reports.append(references.report_removal(str(rule), rule_outcome, compared_outcomes))
 
-    timed = dict(zip(list(known)[2:], clocks, strict=True))
-    rows = [removal(name, outcome) for name, outcome in timed.items()]
-    score = f"sr@{budgets[-1]}"
-    best = max(rows, key=lambda row: row.mixture[score].mean).name
-    rows = [removal("TDE", hard), removal(ORACLE, ledger.told(plain, hard)), *rows]
-    for way in ways:
-        console.print(str(way))
-        setting = dataclasses.replace(gap_settings(layout_setting(subject.policies))[way.gap], hold=way.hold)
-        trial = Trial("stde", decoding, *way.use)
-        controls = CONTROLS[way.use.form]
-        own, *others = bench.run(subject, setting, [trial, *(dataclasses.replace(trial, control=c) for c in controls)])
-        rows.append(removal(str(way), own, dict(zip(controls, others, strict=True)) | {best: timed[best]}))
-    return Mixture(
+    # Scenes and episodes are counted per shift, and lengths are those without removal.
+    plain_lengths = metrics.by_shift(np.asarray(plain_outcome.length))
+    return MixtureReport(
         run=run.run_dir.name,
         heir=without.run_dir.name if hand_over else None,
         decoding=decoding,
@@ -215,25 +183,241 @@ def measure_mixture(
         shifts=shifts,
         scenes=len(episodes.scenes) // len(shifts),
         episodes=len(episodes.goal) // len(shifts),
-        length=tuple(float(np.median(part)) for part in ledger.by_shift(np.asarray(plain.length))),
-        without=ledger.means(nobody),
-        agent=ledger.means(agent),
-        lead=ledger.changes(nobody, agent, same_runs=False),
-        removals=tuple(rows),
+        length=tuple(float(np.median(lengths)) for lengths in plain_lengths),
+        without=metrics.means(references.unaware),
+        agent=metrics.means(references.agent),
+        lead=metrics.differences(references.unaware, references.agent, same_runs=False),
+        removals=tuple(reports),
     )
 
 
 def clock_trials(decoding: Decoding, budget: int) -> dict[str, Trial]:
-    """Return removals that know nothing of the episode.
+    """List the removals that depend on nothing in the episode, by name.
 
-    Constant gaps, and hard removal after or until a time, as a share of a budget of actions.
+    They are constant gaps, and removal of all experience after or until a time, as a share of an action budget.
     """
-    constants = {
-        f"constant {weight:g}": Trial("stde", decoding, 0.0, "paper", "constant", weight=weight) for weight in CONSTANTS
-    }
-    steps = [round(time * budget) for time in TIMES]
-    return constants | {
-        f"{control} step {step}": Trial("stde", decoding, 0.0, "paper", control, step)
-        for control in ("after", "until")
-        for step in steps
-    }
+    # A constant gap removes the same share of experience at every step.
+    trials_by_name = {}
+    for constant_gap in CONSTANT_GAPS:
+        trials_by_name[f"constant {constant_gap:g}"] = Trial(
+            "stde", decoding, 0.0, "paper", "constant", weight=constant_gap
+        )
+
+    # A clock removes all experience on one side of a step.
+    for control in ("after", "until"):
+        for time_share in CLOCK_TIMES:
+            clock_step = round(time_share * budget)
+            trials_by_name[f"{control} step {clock_step}"] = Trial("stde", decoding, 0.0, "paper", control, clock_step)
+    return trials_by_name
+
+
+class MixedPopulation(NamedTuple):
+    """Episodes of several shifts in one world.
+
+    Attributes:
+      world: the scenes of all shifts, concatenated.
+      episodes: equally many episodes at each shift.
+      shift: int [E], index of each episode's shift.
+    """
+
+    world: CompiledWorld
+    episodes: EpisodeList
+    shift: np.ndarray
+
+
+def draw_mixed_population(
+    run: RunConfig, shifts: Sequence[float], config: StudyConfig, console: Console
+) -> MixedPopulation:
+    """Draw episodes at every shift.
+
+    Args:
+      run: the run whose scenes are used.
+      shifts: layout shifts.
+      config: split of the scenes, number of episodes at each shift, and the seed of their draw.
+      console: prints progress.
+
+    Raises:
+      InputError: see `compile_evaluation_world` and `concatenate_worlds`.
+    """
+    # All worlds are compiled before any episode is drawn; a study has one bank in each.
+    worlds = []
+    for shift in shifts:
+        worlds.append(compile_evaluation_world(run, config.split, None, shift, console))
+
+    # The episodes of each shift follow each other, as the poses of the concatenated bank do.
+    episode_lists = []
+    num_episodes = []
+    num_poses = []
+    for world in worlds:
+        episodes = draw_study_episodes(world, config)
+        episode_lists.append(episodes)
+        num_episodes.append(len(episodes.pose))
+        num_poses.append(len(world.banks[0].rows))
+
+    return MixedPopulation(
+        world=concatenate_worlds(worlds),
+        episodes=join_end_to_end(episode_lists, num_poses),
+        shift=np.repeat(np.arange(len(shifts)), num_episodes),
+    )
+
+
+def join_end_to_end(lists: Sequence[EpisodeList], num_poses: Sequence[int]) -> EpisodeList:
+    """Join the episode lists of banks that were concatenated into one bank.
+
+    Args:
+      lists: one list per bank.
+      num_poses: number of poses of each bank.
+    """
+    # Poses of a bank follow those of the banks before it.
+    first_poses = np.cumsum([0, *num_poses[:-1]])
+    joined_poses = []
+    for episodes, first_pose in zip(lists, first_poses, strict=True):
+        joined_poses.append(episodes.pose + first_pose)
+    return join_episode_lists(lists)._replace(pose=np.concatenate(joined_poses).astype(np.int32))
+
+
+#: Results [S, E] by name of the metric.
+MetricValues = Mapping[str, np.ndarray]
+
+
+class EpisodeSubset(NamedTuple):
+    """The episodes of one shift.
+
+    Attributes:
+      mask: bool [E].
+      scenes: clusters of these episodes.
+    """
+
+    mask: np.ndarray
+    scenes: Clusters
+
+
+class PopulationMetrics:
+    """Metrics of outcomes in a mixed population, and their differences.
+
+    Args:
+      episodes: episodes of the population.
+      shift: int [E], index of each episode's shift.
+      budgets: action budgets N of the additional metrics `sr@N`.
+    """
+
+    def __init__(self, episodes: EpisodeList, shift: np.ndarray, budgets: Sequence[int]) -> None:
+        self.metric_names = ("sr", "spl", *(f"sr@{budget}" for budget in budgets))
+        self._episodes = episodes
+        self._budgets = budgets
+        self._clusters = episodes.clusters()
+
+        # Each shift has clusters of its own, and so intervals of its own.
+        self._subsets = []
+        for index in range(shift.max() + 1):
+            mask = shift == index
+            self._subsets.append(EpisodeSubset(mask, episodes.take(mask).clusters()))
+
+    def percent_metrics(self, outcome: EpisodeOutcome) -> MetricValues:
+        """Compute the metrics of an outcome in percent, [S, E]."""
+        metrics = episode_metrics(outcome, self._episodes.best_length, self._budgets)
+        return {name: 100.0 * metrics[name] for name in self.metric_names}
+
+    def oracle_removal(self, plain: EpisodeOutcome, hard: EpisodeOutcome) -> EpisodeOutcome:
+        """Combine outcomes into hard removal at all shifts but the first."""
+        is_first_shift = self._subsets[0].mask
+        return jax.tree.map(lambda plain_leaf, hard_leaf: np.where(is_first_shift, plain_leaf, hard_leaf), plain, hard)
+
+    def removal_weights(self, outcome: EpisodeOutcome) -> tuple[float, ...]:
+        """Average the weight of the removed logits at each shift."""
+        weights = []
+        for subset in self._subsets:
+            # The mean needs only the choices and their weights, both [S, E].
+            subset_outcome = outcome._replace(
+                choices=outcome.choices[:, subset.mask], mean_weight=outcome.mean_weight[:, subset.mask]
+            )
+            weights.append(mean_removal_weight(subset_outcome))
+        return tuple(weights)
+
+    def by_shift(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Split values [..., E] by shift."""
+        return tuple(values[..., subset.mask] for subset in self._subsets)
+
+    def means(self, values: MetricValues) -> dict[str, IntervalsByShift]:
+        """Average each metric at each shift."""
+        return self._for_each_shift(mean_interval, values)
+
+    def differences(
+        self, reference: MetricValues, compared: MetricValues, *, same_runs: bool
+    ) -> dict[str, IntervalsByShift]:
+        """Compute `compared - reference` for each metric at each shift."""
+
+        def difference(reference: np.ndarray, compared: np.ndarray, scenes: Clusters) -> Interval:
+            return paired_difference(reference, compared, scenes, same_runs=same_runs)
+
+        return self._for_each_shift(difference, reference, compared)
+
+    def remaining_shares(
+        self, unaware: MetricValues, agent: MetricValues, removed: MetricValues
+    ) -> dict[str, IntervalsByShift]:
+        """Compute the share of the lead that remains after removal, for each metric at each shift."""
+        return self._for_each_shift(remaining_share, unaware, agent, removed)
+
+    def overall_differences(self, reference: MetricValues, compared: MetricValues) -> dict[str, Interval]:
+        """Compute `compared - reference` of the same policies over all episodes, for each metric."""
+        differences = {}
+        for name in self.metric_names:
+            differences[name] = paired_difference(reference[name], compared[name], self._clusters, same_runs=True)
+        return differences
+
+    def _for_each_shift(self, statistic: Callable[..., Interval], *sides: MetricValues) -> dict[str, IntervalsByShift]:
+        """Compute a statistic of the results [S, E] of several sides, for each metric at each shift."""
+        # Metric by metric, with the clusters of each shift.
+        intervals_by_metric = {}
+        for name in self.metric_names:
+            intervals = []
+            for subset in self._subsets:
+                side_results = [side[name][:, subset.mask] for side in sides]
+                intervals.append(statistic(*side_results, subset.scenes))
+            intervals_by_metric[name] = tuple(intervals)
+        return intervals_by_metric
+
+
+class _References(NamedTuple):
+    """Results that every removal is compared with.
+
+    Attributes:
+      metrics: computes and compares metrics.
+      unaware: results of the agent without experience.
+      agent: results of the agent with experience, without removal.
+    """
+
+    metrics: PopulationMetrics
+    unaware: MetricValues
+    agent: MetricValues
+
+    def report_removal(
+        self, name: str, outcome: EpisodeOutcome, controls: Mapping[str, EpisodeOutcome] | None = None
+    ) -> RemovalReport:
+        """Report the outcome of one removal.
+
+        Args:
+          name: name of the removal.
+          outcome: its outcome.
+          controls: outcomes of its controls, by name; None for a removal that is a control itself.
+        """
+        # The gain over each control is measured over the whole mixture.
+        metrics = self.metrics
+        removed = metrics.percent_metrics(outcome)
+        compared_controls = {}
+        for control_name, control_outcome in (controls or {}).items():
+            control_metrics = metrics.percent_metrics(control_outcome)
+            compared_controls[control_name] = ControlComparison(
+                weight=metrics.removal_weights(control_outcome),
+                gained=metrics.overall_differences(control_metrics, removed),
+            )
+
+        # The removal uses the networks of the agent, so both are paired by run.
+        return RemovalReport(
+            name=name,
+            weight=metrics.removal_weights(outcome),
+            change=metrics.differences(self.agent, removed, same_runs=True),
+            mixture=metrics.overall_differences(self.agent, removed),
+            left=metrics.remaining_shares(self.unaware, self.agent, removed),
+            compared=compared_controls or None,
+        )

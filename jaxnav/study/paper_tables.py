@@ -1,61 +1,126 @@
-"""The paper's tables beside a comparison's results, in Markdown."""
+"""The paper's tables beside the results of a comparison, in Markdown.
+
+`TABLE_1`, `TABLE_2_AI2THOR`, `TABLE_2_ROBOTHOR` and `TABLE_3` hold the numbers as printed in Zhang et al., CVPR 2023.
+`write_paper_tables` writes a page that lays them beside our results and judges which of their orderings hold.
+"""
 
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report_tables import COLUMNS
+from jaxnav.evaluation.report import METRIC_COLUMNS
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.store.manifest import differences
+from jaxnav.store.files import list_differences
 from jaxnav.study.claims import Claim
-from jaxnav.study.codec import from_json
-from jaxnav.study.compare_pairs import VARIANTS
-from jaxnav.study.compare_report import SCALE, Line, Scores
-from jaxnav.study.document import reading_section, write_lines
-from jaxnav.study.paper_numbers import TABLE_1, TABLE_2_AI2THOR, TABLE_2_ROBOTHOR, TABLE_3, Agent, Printed
-from jaxnav.study.tables import markdown
+from jaxnav.study.compare_config import VARIANT_LABELS
+from jaxnav.study.document import reading_section, table_lines, write_markdown
+from jaxnav.study.records import METRIC_SCALE, AgentResult, AgentScores, RunScores, find_result, from_json
 
-#: Methods that know more of what is seen than a list of detections.
-STRUCTURED = ("sp", "eotp", "org", "tpn", "vtnet", "hoz")
-#: Methods into which the paper puts the layout.
-HOSTS = ("eotp", "org", "vtnet", "hoz")
-#: Uses of policies as printed, and what is gained by one over another.
-USES = {**VARIANTS, "tde": " + w + TDE"}
-STEPS = (("stde", "baseline"), ("layout", "baseline"), ("stde", "layout"), ("layout", "tde"))
-#: Settings of a run that belong to its method.
-OF_A_METHOD = ("method", "method_sizes", "arms", "imitation")
-POINTS = 2.0  # of SR; the least effect that would matter
-#: Results of one world's methods, with one core, by method.
-Parts = Mapping[str, Scores]
-#: Results and lines of a host with and without sTDE.
-Pair = tuple[tuple[Scores, Line], tuple[Scores, Line]]
+# The paper's numbers
 
 
-class Table(NamedTuple):
-    """Hold one table of the paper.
+class PaperRow(NamedTuple):
+    """One row of a table.
 
     Attributes:
-      title: what it shows, and where.
-      printed: its rows.
-      world: ours, that it is laid beside.
+      sr, spl: percent.
+      dts: metres.
+    """
+
+    sr: float
+    spl: float
+    dts: float
+
+
+#: Method and variant. In Tables 2 and 3, methods with the layout use sTDE.
+PaperAgent = tuple[str, str]
+#: Rows of a table, by agent.
+PaperRows = Mapping[PaperAgent, PaperRow]
+
+#: Ablation of ORG, AI2-THOR, val.
+TABLE_1: PaperRows = {
+    ("org", "baseline"): PaperRow(66.48, 38.42, 0.54),
+    ("org", "layout"): PaperRow(71.40, 39.11, 0.49),
+    ("org", "tde"): PaperRow(69.24, 38.38, 0.52),
+    ("org", "stde"): PaperRow(74.95, 41.68, 0.47),
+}
+#: AI2-THOR and RoboTHOR, test.
+_TABLE_2: Mapping[PaperAgent, tuple[PaperRow, PaperRow]] = {
+    ("random", "random"): (PaperRow(4.68, 2.42, 1.36), PaperRow(2.92, 1.34, 2.40)),
+    ("rgb", "baseline"): (PaperRow(59.06, 34.56, 0.68), PaperRow(27.48, 16.45, 2.08)),
+    ("sp", "baseline"): (PaperRow(62.19, 37.60, 0.61), PaperRow(26.22, 16.90, 2.06)),
+    ("savn", "baseline"): (PaperRow(63.27, 38.20, 0.56), PaperRow(28.53, 18.27, 1.96)),
+    ("eotp", "baseline"): (PaperRow(65.61, 38.93, 0.55), PaperRow(28.84, 18.82, 1.95)),
+    ("org", "baseline"): (PaperRow(66.53, 39.00, 0.54), PaperRow(29.64, 19.13, 1.95)),
+    ("tpn", "baseline"): (PaperRow(68.60, 39.40, 0.54), PaperRow(30.05, 19.05, 1.89)),
+    ("vtnet", "baseline"): (PaperRow(70.10, 39.60, 0.52), PaperRow(31.62, 19.63, 1.87)),
+    ("hoz", "baseline"): (PaperRow(70.38, 39.04, 0.48), PaperRow(32.27, 20.48, 1.85)),
+    ("eotp", "stde"): (PaperRow(69.62, 40.02, 0.52), PaperRow(37.37, 22.00, 1.81)),
+    ("org", "stde"): (PaperRow(74.85, 41.56, 0.47), PaperRow(39.27, 22.81, 1.77)),
+    ("vtnet", "stde"): (PaperRow(75.25, 41.69, 0.47), PaperRow(41.53, 23.87, 1.72)),
+    ("hoz", "stde"): (PaperRow(75.05, 41.53, 0.46), PaperRow(42.13, 24.54, 1.67)),
+}
+#: AI2-THOR, test.
+TABLE_2_AI2THOR: PaperRows = {agent: ai2thor for agent, (ai2thor, _) in _TABLE_2.items()}
+#: RoboTHOR, test.
+TABLE_2_ROBOTHOR: PaperRows = {agent: robothor for agent, (_, robothor) in _TABLE_2.items()}
+#: Gibson, val; its RGBD+RL is `rgb`, whose view of the floor is what depth would give. Random's 0.04 looks like a
+#: fraction among percentages.
+TABLE_3: PaperRows = {
+    ("random", "random"): PaperRow(0.04, 0.04, 3.89),
+    ("rgb", "baseline"): PaperRow(8.42, 2.87, 3.23),
+    ("semexp", "baseline"): PaperRow(65.35, 33.52, 1.56),
+    ("semexp", "stde"): PaperRow(66.96, 34.33, 1.53),
+}
+
+# The page
+
+#: Methods whose input has more structure than a list of detections.
+STRUCTURED_METHODS = ("sp", "eotp", "org", "tpn", "vtnet", "hoz")
+#: Methods into which the paper puts the layout.
+LAYOUT_HOSTS = ("eotp", "org", "vtnet", "hoz")
+PAPER_VARIANT_LABELS = {**VARIANT_LABELS, "tde": " + w + TDE"}
+#: Gains of a host: a variant and its reference.
+GAIN_COMPARISONS = (("stde", "baseline"), ("layout", "baseline"), ("stde", "layout"), ("layout", "tde"))
+#: Settings of a run that belong to its method.
+METHOD_SETTINGS = ("method", "method_sizes", "arms", "imitation")
+MIN_SR_EFFECT = 2.0  # points, the least effect that would matter
+#: Results of the runs with one core in one world, by method.
+MethodScores = Mapping[str, RunScores]
+
+
+class PaperTable(NamedTuple):
+    """One table of the paper.
+
+    Attributes:
+      title: subject and data set.
+      rows: its rows.
+      world: our world beside it.
     """
 
     title: str
-    printed: Mapping[Agent, Printed]
+    rows: PaperRows
     world: str
 
 
-TABLES = (
-    Table("Table 1: what ORG gains (AI2-THOR, val)", TABLE_1, "rooms"),
-    Table("Table 2: AI2-THOR, test", TABLE_2_AI2THOR, "rooms"),
-    Table("Table 2: RoboTHOR, test", TABLE_2_ROBOTHOR, "apartments"),
-    Table("Table 3: Gibson, val", TABLE_3, "houses"),
+class HostPair(NamedTuple):
+    """Results of a host with and without sTDE."""
+
+    stde: AgentResult
+    baseline: AgentResult
+
+
+PAPER_TABLES = (
+    PaperTable("Table 1: what ORG gains (AI2-THOR, val)", TABLE_1, "rooms"),
+    PaperTable("Table 2: AI2-THOR, test", TABLE_2_AI2THOR, "rooms"),
+    PaperTable("Table 2: RoboTHOR, test", TABLE_2_ROBOTHOR, "apartments"),
+    PaperTable("Table 3: Gibson, val", TABLE_3, "houses"),
 )
-HEAD = """# The paper's tables beside ours
+PAGE_HEAD = """# The paper's tables beside ours
 
 S. Zhang et al., *Layout-based Causal Inference for Object Navigation*, CVPR 2023, Tables 1 to 3, beside our results.
 All but the summary is written by `jaxnav compare --config table2 --paper docs/paper_tables.md`. Ours are best actions
@@ -80,172 +145,246 @@ wider than needed. A group is the mean of its methods that were run. What the pa
 """
 
 
-def write_paper_tables(document: Path, results: Path) -> None:
+def write_paper_tables(document: Path, results_folder: Path) -> None:
     """Write the page from all results in a folder.
 
     Args:
-      document: the file; what stands between its two lines `<!-- reading -->` is kept.
-      results: folder of a split, with files WORLD-METHOD-DECISION.json of `jaxnav compare`.
+      document: the file; the text between its two lines `<!-- reading -->` is preserved.
+      results_folder: folder of a split, with files WORLD-METHOD-DECISION.json of `jaxnav compare`.
 
     Raises:
-      InputError: the document is another one, or a world's methods were compared with different settings.
+      InputError: the file is another document, or a world's methods were compared with different settings.
     """
-    records = {path.stem: json.loads(path.read_text()) for path in sorted(results.glob("*.json"))}
-    for table in TABLES:
-        _check_alike(table, results, records)
-    found = {name: from_json(Scores, record) for name, record in records.items()}
-    worlds = {table.world: _parts(table.world, found) for table in TABLES}
-    lines = [HEAD.format(split=results.name, points=POINTS), *reading_section(document)]
-    lines += ["## Which orderings hold", "", *_orderings(worlds), ""]
-    for table in TABLES:
-        lines += [f"## {table.title}", "", *_beside(table, worlds[table.world]), ""]
-    write_lines(document, lines)
+    data_by_name = {path.stem: json.loads(path.read_text()) for path in sorted(results_folder.glob("*.json"))}
+    for table in PAPER_TABLES:
+        _check_equal_settings(table, results_folder, data_by_name)
+
+    # Results with one core, world by world.
+    scores_by_world: dict[str, MethodScores] = {}
+    for table in PAPER_TABLES:
+        name_by_method = _fused_run_names(table.world, data_by_name)
+        scores_by_world[table.world] = {
+            method: from_json(RunScores, data_by_name[name]) for method, name in name_by_method.items()
+        }
+
+    lines = [PAGE_HEAD.format(split=results_folder.name, points=MIN_SR_EFFECT), *reading_section(document)]
+    lines += ["## Which orderings hold", "", *_orderings_table(scores_by_world), ""]
+    for table in PAPER_TABLES:
+        lines += [f"## {table.title}", "", *_side_by_side_table(table, scores_by_world[table.world]), ""]
+    write_markdown(document, lines)
 
 
-def _of_one_core(world: str, names: Iterable[str]) -> dict[str, str]:
-    """Return the names of a world's results with one core, by method."""
-    first, last = f"{world}-", "-fused"
-    there = (name for name in names if name.startswith(first) and name.endswith(last))
-    return {name.removeprefix(first).removesuffix(last): name for name in there}
+def _fused_run_names(world: str, names: Iterable[str]) -> dict[str, str]:
+    """Names of a world's results with one core, by method."""
+    prefix = f"{world}-"
+    suffix = "-fused"
+    name_by_method = {}
+    for name in names:
+        if name.startswith(prefix) and name.endswith(suffix):
+            name_by_method[name.removeprefix(prefix).removesuffix(suffix)] = name
+    return name_by_method
 
 
-def _check_alike(table: Table, results: Path, records: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse methods of a table that differ in more than what a method is."""
-    shared, printed = {}, {method for method, _ in table.printed}
-    for method, name in _of_one_core(table.world, records).items():
-        if method not in printed:
-            continue
-        study = records[name].get("study", {})
-        run = {key: value for key, value in study.get("run", {}).items() if key not in OF_A_METHOD}
-        shared[name] = {**study, "run": run}
-    for name, settings in shared.items():
-        first = next(iter(shared))
-        if different := differences(settings, shared[first]):
+def _check_equal_settings(
+    table: PaperTable, results_folder: Path, data_by_name: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Refuse methods of a table that differ in settings that do not belong to the method."""
+    table_methods = {method for method, _ in table.rows}
+    settings_by_name = {}
+    for method, name in _fused_run_names(table.world, data_by_name).items():
+        if method in table_methods:
+            study = data_by_name[name].get("study", {})
+            shared_settings = {
+                setting: value for setting, value in study.get("run", {}).items() if setting not in METHOD_SETTINGS
+            }
+            settings_by_name[name] = {**study, "run": shared_settings}
+
+    for name, settings in settings_by_name.items():
+        first_name = next(iter(settings_by_name))
+        differences = list_differences(settings, settings_by_name[first_name])
+        if differences:
             raise InputError(
-                f"{results / name}.json: was compared with other settings than {first}.json "
-                f"({'; '.join(different)}); compare both with the same ones"
+                f"{results_folder / name}.json: was compared with other settings than {first_name}.json "
+                f"({'; '.join(differences)}); compare both with the same ones"
             )
 
 
-def _parts(world: str, found: Mapping[str, Scores]) -> Parts:
-    """Return the results of a world's methods with one core."""
-    return {method: found[name] for method, name in _of_one_core(world, found).items()}
-
-
-def _beside(table: Table, parts: Parts) -> list[str]:
-    """Return rows of the paper's numbers and ours."""
+def _side_by_side_table(table: PaperTable, scores_by_method: MethodScores) -> list[str]:
+    """Table of the paper's numbers and ours."""
     rows = []
-    for (method, variant), printed in table.printed.items():
-        one = _line(parts, method, variant)
-        ours = (f"{one[0].summary(one[1], metric):.{COLUMNS[metric][1]}f}" for metric in SCALE) if one else 3 * ["-"]
-        name = "Random" if method == "random" else f"`{method}`{USES[variant]}"
-        rows.append((name, *(f"{each:.2f}" for each in printed), *ours))
-    header = ("", *(f"{place}: {COLUMNS[metric][0]}" for place in ("paper", f"our {table.world}") for metric in SCALE))
-    return markdown(header, rows)
+    for (method, variant), paper_row in table.rows.items():
+        name = "Random" if method == "random" else f"`{method}`{PAPER_VARIANT_LABELS[variant]}"
+        paper_cells = [f"{value:.2f}" for value in paper_row]
+        our_cells = ["-"] * len(METRIC_SCALE)
+        result = _agent_result(scores_by_method, method, variant)
+        if result:
+            our_cells = [f"{result.interval(metric):.{METRIC_COLUMNS[metric][1]}f}" for metric in METRIC_SCALE]
+        rows.append((name, *paper_cells, *our_cells))
+
+    titles = [METRIC_COLUMNS[metric][0] for metric in METRIC_SCALE]
+    paper_titles = [f"paper: {title}" for title in titles]
+    our_titles = [f"our {table.world}: {title}" for title in titles]
+    return table_lines(("", *paper_titles, *our_titles), rows)
 
 
-def _line(parts: Parts, method: str, variant: str) -> tuple[Scores, Line] | None:
-    """Return the results and the line of an agent, best actions.
+def _agent_result(scores_by_method: MethodScores, method: str, variant: str) -> AgentResult | None:
+    """Result of an agent with best actions, or None if it was not evaluated.
 
-    Random is that of a method that chooses actions, and is in every table.
+    Random acts in the results of every run; `rgb` is one whose choices are actions.
     """
-    part = parts.get("rgb" if method == "random" else method)
-    line = part and part.line(variant, "argmax")
-    return (part, line) if part and line else None
+    return find_result(scores_by_method.get("rgb" if method == "random" else method), variant, "argmax")
 
 
-def _orderings(worlds: Mapping[str, Parts]) -> list[str]:
-    """Return every ordering of the paper with its effect here."""
-    rows = []
-    for world, printed in (("rooms", TABLE_2_AI2THOR), ("apartments", TABLE_2_ROBOTHOR), ("houses", TABLE_3)):
-        if not worlds[world]:
+# Orderings
+
+
+def _orderings_table(scores_by_world: Mapping[str, MethodScores]) -> list[str]:
+    """Table of every ordering of the paper with our effect and verdict."""
+    rows: list[tuple[str, ...]] = []
+    for world, paper_rows in (("rooms", TABLE_2_AI2THOR), ("apartments", TABLE_2_ROBOTHOR), ("houses", TABLE_3)):
+        scores_by_method = scores_by_world[world]
+        if not scores_by_method:
             rows.append((f"{world}: all", "-", "-", "not run"))
             continue
-        rows += _levels(world, worlds[world], printed)
-        for host in (host for host in (*HOSTS, "semexp") if (host, "stde") in printed):
-            rows += _gains(world, worlds[world], host, {**printed, **TABLE_1} if world == "rooms" else printed)
-    rows += _between(worlds)
-    return markdown(("in SR points", "paper", "ours", "verdict"), rows)
+
+        rows += _group_rows(world, scores_by_method, paper_rows)
+
+        # In rooms, the numbers of ORG are those of Table 1, which has all its variants.
+        gain_rows = {**paper_rows, **TABLE_1} if world == "rooms" else paper_rows
+        for host in (*LAYOUT_HOSTS, "semexp"):
+            if (host, "stde") in paper_rows:
+                rows += _host_gain_rows(world, scores_by_method, host, gain_rows)
+
+    rows += _world_comparison_rows(scores_by_world)
+    return table_lines(("in SR points", "paper", "ours", "verdict"), rows)
 
 
-def _levels(world: str, parts: Parts, printed: Mapping[Agent, Printed]) -> Iterable[tuple[str, ...]]:
-    """Compare the methods as a group with Random and RGB+RL."""
-    learned = [method for method, variant in printed if variant == "baseline"]
-    groups = {("random", "random"): learned, ("rgb", "baseline"): [name for name in learned if name in STRUCTURED]}
-    for (reference, variant), methods in groups.items():
-        there = [(*one, method) for method in methods if (one := _line(parts, method, "baseline"))]
+def _group_rows(world: str, scores_by_method: MethodScores, paper_rows: PaperRows) -> list[tuple[str, ...]]:
+    """Compare the methods as a group with Random and with RGB+RL."""
+    learned_methods = [method for method, variant in paper_rows if variant == "baseline"]
+    structured_methods = [method for method in learned_methods if method in STRUCTURED_METHODS]
+    rows = []
+    for reference, methods in ((("random", "random"), learned_methods), (("rgb", "baseline"), structured_methods)):
         if not methods:
             continue
-        name = "Random" if reference == "random" else f"`{reference}`"
-        text = f"{world}: methods over {name}" + (f" ({len(there)} of {len(methods)})" if there else "")
-        compared = [method for *_, method in there] or methods
-        level = sum(printed[method, "baseline"].sr for method in compared) / len(compared)
-        other, effect = _line(parts, reference, variant), Interval(math.nan)
-        if there and other:
-            effect = there[0][0].difference(_mean([line for _, line, _ in there]), *other, "sr")
-        yield _row(text, level - printed[reference, variant].sr, effect)
+        results = {}
+        for method in methods:
+            result = _agent_result(scores_by_method, method, "baseline")
+            if result:
+                results[method] = result
+
+        # The paper's difference, over the methods that were run if there are any.
+        compared_methods = list(results) or methods
+        paper_mean = sum(paper_rows[method, "baseline"].sr for method in compared_methods) / len(compared_methods)
+        paper_effect = paper_mean - paper_rows[reference].sr
+
+        our_effect = Interval(math.nan)
+        reference_result = _agent_result(scores_by_method, *reference)
+        if results and reference_result:
+            our_effect = _mean_result(list(results.values())).difference(reference_result, "sr")
+
+        reference_label = "Random" if reference[0] == "random" else f"`{reference[0]}`"
+        coverage = f" ({len(results)} of {len(methods)})" if results else ""
+        rows.append(_ordering_row(f"{world}: methods over {reference_label}{coverage}", paper_effect, our_effect))
+    return rows
 
 
-def _gains(world: str, parts: Parts, host: str, printed: Mapping[Agent, Printed]) -> Iterable[tuple[str, ...]]:
+def _host_gain_rows(
+    world: str, scores_by_method: MethodScores, host: str, paper_rows: PaperRows
+) -> list[tuple[str, ...]]:
     """Compare a host with and without the layout, and step by step."""
-    for variant, reference in STEPS:
-        text = f"{world}: `{host}`{USES[variant]} over `{host}`{USES[reference]}"
-        yield _row(text, _told(printed, host, variant, reference), _gain(parts, host, variant, reference))
+    rows = []
+    for variant, reference in GAIN_COMPARISONS:
+        agent_label = f"`{host}`{PAPER_VARIANT_LABELS[variant]}"
+        reference_label = f"`{host}`{PAPER_VARIANT_LABELS[reference]}"
+        paper_gain = _paper_gain(paper_rows, host, variant, reference)
+        our_gain = _our_gain(scores_by_method, host, variant, reference)
+        rows.append(_ordering_row(f"{world}: {agent_label} over {reference_label}", paper_gain, our_gain))
+    return rows
 
 
-def _told(printed: Mapping[Agent, Printed], host: str, variant: str = "stde", reference: str = "baseline") -> float:
-    """Return what the paper says that a host gains, NaN for nothing."""
-    if (host, variant) not in printed or (host, reference) not in printed:
-        return math.nan
-    return printed[host, variant].sr - printed[host, reference].sr
-
-
-def _gain(parts: Parts, host: str, variant: str = "stde", reference: str = "baseline") -> Interval:
-    one, other = _line(parts, host, variant), _line(parts, host, reference)
-    return one[0].difference(one[1], *other, "sr") if one and other else Interval(math.nan)
-
-
-def _between(worlds: Mapping[str, Parts]) -> Iterable[tuple[str, ...]]:
+def _world_comparison_rows(scores_by_world: Mapping[str, MethodScores]) -> list[tuple[str, ...]]:
     """Compare the gains of hosts between worlds."""
-    printed = {"rooms": TABLE_2_AI2THOR, "apartments": TABLE_2_ROBOTHOR}
-    there = {name: _gaining(worlds[name]) for name in printed}
-    told = {name: [_told(table, host) for host in there[name] or HOSTS] for name, table in printed.items()}
-    paper = {name: sum(gains) / len(gains) for name, gains in told.items()}
-    gains = {name: _group_gain(list(pairs.values())) for name, pairs in there.items()}
-    semexp = TABLE_3["semexp", "stde"].sr - TABLE_3["semexp", "baseline"].sr
-    larger = _apart(gains["apartments"], gains["rooms"])
-    yield _row("gains of hosts: apartments over rooms", paper["apartments"] - paper["rooms"], larger)
-    smaller = _apart(gains["rooms"], _gain(worlds["houses"], "semexp"))
-    yield _row("gains: hosts in rooms over `semexp` in houses", paper["rooms"] - semexp, smaller)
+    paper_gains = {}
+    our_gains = {}
+    for world, paper_rows in (("rooms", TABLE_2_AI2THOR), ("apartments", TABLE_2_ROBOTHOR)):
+        pairs = _host_pairs(scores_by_world[world])
+        hosts = list(pairs) or LAYOUT_HOSTS
+        paper_gains[world] = sum(_paper_gain(paper_rows, host) for host in hosts) / len(hosts)
+        our_gains[world] = _mean_host_gain(list(pairs.values()))
+    paper_semexp_gain = _paper_gain(TABLE_3, "semexp")
+    our_semexp_gain = _our_gain(scores_by_world["houses"], "semexp")
+
+    return [
+        _ordering_row(
+            "gains of hosts: apartments over rooms",
+            paper_gains["apartments"] - paper_gains["rooms"],
+            _conservative_difference(our_gains["apartments"], our_gains["rooms"]),
+        ),
+        _ordering_row(
+            "gains: hosts in rooms over `semexp` in houses",
+            paper_gains["rooms"] - paper_semexp_gain,
+            _conservative_difference(our_gains["rooms"], our_semexp_gain),
+        ),
+    ]
 
 
-def _gaining(parts: Parts) -> dict[str, Pair]:
-    """Return results and lines with and without sTDE of the hosts that have both."""
-    pairs = {host: (_line(parts, host, "stde"), _line(parts, host, "baseline")) for host in HOSTS}
-    return {host: (one, other) for host, (one, other) in pairs.items() if one and other}
+def _paper_gain(paper_rows: PaperRows, host: str, variant: str = "stde", reference: str = "baseline") -> float:
+    """Gain in SR that the paper reports for a host; NaN if a row is missing."""
+    if (host, variant) not in paper_rows or (host, reference) not in paper_rows:
+        return math.nan
+    return paper_rows[host, variant].sr - paper_rows[host, reference].sr
 
 
-def _group_gain(there: list[Pair]) -> Interval:
-    """Return the mean gain of hosts."""
-    if not there:
+def _our_gain(
+    scores_by_method: MethodScores, host: str, variant: str = "stde", reference: str = "baseline"
+) -> Interval:
+    """Gain in SR of a host; NaN if a variant was not evaluated."""
+    agent_result = _agent_result(scores_by_method, host, variant)
+    reference_result = _agent_result(scores_by_method, host, reference)
+    if not (agent_result and reference_result):
         return Interval(math.nan)
-    part = there[0][0][0]
-    return part.difference(_mean([one[1] for one, _ in there]), part, _mean([other[1] for _, other in there]), "sr")
+    return agent_result.difference(reference_result, "sr")
 
 
-def _apart(a: Interval, b: Interval) -> Interval:
-    """Return a less b, of worlds apart; bounds are added, so they are wide."""
-    return Interval(a.mean - b.mean, a.low - b.high, a.high - b.low)
+def _host_pairs(scores_by_method: MethodScores) -> dict[str, HostPair]:
+    """Results of the hosts that were evaluated with and without sTDE."""
+    pairs = {}
+    for host in LAYOUT_HOSTS:
+        stde = _agent_result(scores_by_method, host, "stde")
+        baseline = _agent_result(scores_by_method, host, "baseline")
+        if stde and baseline:
+            pairs[host] = HostPair(stde, baseline)
+    return pairs
 
 
-def _mean(lines: list[Line]) -> Line:
-    """Return the line of a group, the mean of its methods, run by run."""
-    values = {metric: sum(getattr(line, metric) for line in lines) / len(lines) for metric in SCALE}
-    return dataclasses.replace(lines[0], **values)
+def _mean_host_gain(pairs: Sequence[HostPair]) -> Interval:
+    """Mean gain of hosts; NaN without any."""
+    if not pairs:
+        return Interval(math.nan)
+    mean_stde = _mean_result([pair.stde for pair in pairs])
+    # Both means stand for the policies of one run, so that their clusters are shared.
+    mean_baseline = _mean_result([pair.baseline for pair in pairs])._replace(run=mean_stde.run)
+    return mean_stde.difference(mean_baseline, "sr")
 
 
-def _row(text: str, paper: float, effect: Interval) -> tuple[str, ...]:
-    told = "-" if math.isnan(paper) else f"{paper:+.1f}"
-    if math.isnan(effect.mean):
-        return text, told, "-", "not run"
-    return text, told, f"{effect:+z.1f}", Claim(text, "points", effect, POINTS).verdict
+def _conservative_difference(first: Interval, second: Interval) -> Interval:
+    """Difference of independent worlds; bounds are added, so the interval is wide."""
+    return Interval(first.mean - second.mean, first.low - second.high, first.high - second.low)
+
+
+def _mean_result(results: Sequence[AgentResult]) -> AgentResult:
+    """Result of a group: the mean of its methods, run by run."""
+    values = {}
+    for metric in METRIC_SCALE:
+        values[metric] = sum(getattr(result.agent, metric) for result in results) / len(results)
+    mean_agent: AgentScores = dataclasses.replace(results[0].agent, **values)
+    return AgentResult(results[0].run, mean_agent)
+
+
+def _ordering_row(text: str, paper_effect: float, our_effect: Interval) -> tuple[str, ...]:
+    paper_cell = "-" if math.isnan(paper_effect) else f"{paper_effect:+.1f}"
+    if math.isnan(our_effect.mean):
+        return text, paper_cell, "-", "not run"
+    verdict = Claim(text, "points", our_effect, MIN_SR_EFFECT).verdict
+    return text, paper_cell, f"{our_effect:+z.1f}", verdict

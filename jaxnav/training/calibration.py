@@ -1,134 +1,468 @@
-"""Calibration of the layout estimator on random walks."""
+"""Knowledge of the layout that is collected before training, on random walks in the training scenes.
+
+1. `explore` counts how often two categories are detected together.
+2. `calibrate` chooses strength and reduction of the layout estimator, and `layout_priors` turns the counts into its
+   priors.
+3. `fit_shift_classifier` learns how strongly pairs of categories seen together indicate another layout than that of
+   training, by a logistic regression against walks under a simulated layout shift.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
+from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
 from jaxnav.errors import InputError
-from jaxnav.layout import Reduction, Setting, prior_from_counts
-from jaxnav.policies.acting import Acting, Agent
-from jaxnav.policies.methods import Knowledge
+from jaxnav.gaps import CooccurrenceEvidence, seen_together
+from jaxnav.layout import EstimatorConfig, Reduction, prior_from_counts
+from jaxnav.policies.agent_loop import Agent, AgentLoop
+from jaxnav.policies.method import Knowledge
 from jaxnav.scenes.task import DONE
 
-#: What a gap should be like in the training layouts, after Fig. 6b: large in the first three views that the belief
-#: takes in, well under the paper's threshold of 0.5 twenty steps later.
-EARLY, LATE, LATE_STEP = 0.75, 0.25, 20
-EARLY_VIEWS = 3
+#: Candidates of the calibration: sums of the prior's rows, and reductions over rows in the gap.
 STRENGTHS = (5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0)
 REDUCTIONS: tuple[Reduction, ...] = ("mean_visible", "sum")
 
+#: Target of the calibration, after Fig. 6b of the paper: in the training layouts the gap is large in the first views
+#: that the belief accepts, and well under the paper's threshold of 0.5 after `LATE_STEP` steps.
+EARLY_GAP_TARGET = 0.75
+LATE_GAP_TARGET = 0.25
+NUM_EARLY_VIEWS = 3
+LATE_STEP = 20
 
-def layout_priors(counts: jax.Array, setting: str | Setting) -> jax.Array:
-    """Make the layout priors of exploration's counts.
+#: Lengths of the walks that the shift classifier learns from; each walk is cut at one of them.
+_WALK_LENGTHS = (1, 2, 5, 10, 20, 40, 60)
+#: Standard deviation of the noise on the frequency ranks by which categories are paired for an exchange, in ranks.
+_RANK_NOISE = 3.0
+#: Weight of the squared log odds in the loss of the regression.
+_L2_WEIGHT = 1e-3
+#: Share of the scenes that is held out of the regression to calibrate its scale.
+_CALIBRATION_SHARE = 0.25
+#: Steps and learning rate of Adam in the fits.
+_NUM_FIT_STEPS = 100
+_FIT_LEARNING_RATE = 0.1
 
-    Every pair starts with one sighting (the all-ones Dirichlet). A room type that training has no scene of gets the
-    prior of all its scenes together.
+
+# 1. Exploration
+
+
+class Exploration(NamedTuple):
+    """Co-occurrence counts from random walks.
+
+    Attributes:
+      counts: float32 [rooms, K, K], number of poses at which two categories were detected together, by room type; on
+        the diagonal, at which a category was detected.
+      steps: int32 [], number of steps.
+      poses: int32 [], number of distinct poses visited.
+    """
+
+    counts: jax.Array
+    steps: jax.Array
+    poses: jax.Array
+
+
+def explore(
+    env: ObjectNav, env_params: EnvParams, key: jax.Array, num_walks: int = 2048, num_steps: int = 100
+) -> Exploration:
+    """Count which categories are detected together on random walks (paper, section 3.3, stage i).
+
+    The walks never choose Done, and each pose counts once, however often it is visited.
+
+    Args:
+      env: the environment.
+      env_params: of the training scenes.
+      key: consumed.
+      num_walks: parallel walks.
+      num_steps: steps of each walk.
+    """
+    agent_loop = AgentLoop(env)
+    agent, actions = _start_walks(agent_loop, env_params, None, key, num_walks, num_steps)
+    tables = env_params.tables
+
+    # Walk, and mark the poses visited in any walk.
+    def step(carry: tuple[Agent, jax.Array], action: jax.Array) -> tuple[tuple[Agent, jax.Array], None]:
+        agent, is_visited = carry
+        agent, _ = agent_loop.step(agent, action, None, env_params)
+        return (agent, is_visited.at[agent.state.pose].set(True)), None
+
+    is_visited = jnp.zeros(tables.rows.shape[0], bool).at[agent.state.pose].set(True)
+    (_, is_visited), _ = jax.lax.scan(step, (agent, is_visited), actions)
+
+    # Detections at visited poses [P, K], and the room type of each pose [P].
+    presence = (env.row_format.presence(tables.rows) & is_visited[:, None]).astype(jnp.float32)
+    pose_scenes = jnp.repeat(
+        jnp.arange(len(env_params.room)),
+        tables.num_cells * env.task.rules.poses_per_cell,
+        total_repeat_length=len(is_visited),
+    )
+    pose_rooms = env_params.room[pose_scenes]
+
+    def count_pairs(room: jax.Array) -> jax.Array:
+        is_in_room = (pose_rooms == room)[:, None].astype(jnp.float32)
+        return (presence * is_in_room).T @ presence
+
+    return Exploration(
+        counts=jax.lax.map(count_pairs, jnp.arange(NUM_PRIORS)),  # one room type at a time, to save memory
+        steps=jnp.int32(num_walks * num_steps),
+        poses=is_visited.sum(dtype=jnp.int32),
+    )
+
+
+def _start_walks(
+    agent_loop: AgentLoop,
+    env_params: EnvParams,
+    knowledge: Knowledge | None,
+    key: jax.Array,
+    num_walks: int,
+    num_steps: int,
+) -> tuple[Agent, jax.Array]:
+    """Start random walks: agents [W] at random poses, and their actions without Done, int32 [T, W]."""
+    start_key = jax.random.fold_in(key, 0)
+    walk_key = jax.random.fold_in(key, 1)
+    agent = agent_loop.start(start_key, num_walks, None, knowledge, env_params)
+    actions = jax.random.randint(walk_key, (num_steps, num_walks), 0, DONE)
+    return agent, actions
+
+
+# 2. Layout priors, and calibration of the estimator
+
+
+def layout_priors(counts: jax.Array, estimator_config: str | EstimatorConfig) -> jax.Array:
+    """Layout priors of all room types.
+
+    Each pair starts with one sighting (the all-ones Dirichlet). A room type without training scenes gets the prior of
+    all scenes together.
 
     Args:
       counts: float32 [rooms, K, K], see `Exploration`.
-      setting: of the estimator.
+      estimator_config: configuration of the layout estimator, or its name.
 
     Returns:
-      float32 [rooms, K, K], the prior of each room type.
+      float32 [rooms, K, K].
     """
-    met = counts.any(axis=(1, 2), keepdims=True)
-    counts = jnp.where(met, counts, counts.sum(axis=0, keepdims=True))
-    return jax.vmap(lambda room: prior_from_counts(room + 1.0, setting))(counts)
+
+    def room_prior(room_counts: jax.Array) -> jax.Array:
+        return prior_from_counts(room_counts + 1.0, estimator_config)
+
+    return jax.vmap(room_prior)(_fill_unseen_rooms(counts))
+
+
+def _fill_unseen_rooms(counts: jax.Array) -> jax.Array:
+    """Give room types without training scenes the counts of all scenes together, float32 [rooms, K, K]."""
+    has_scenes = counts.any(axis=(1, 2), keepdims=True)
+    return jnp.where(has_scenes, counts, counts.sum(axis=0, keepdims=True))
 
 
 class Calibration(NamedTuple):
-    """Hold the chosen setting, and how its gap runs.
+    """A calibrated layout estimator.
 
     Attributes:
-      setting: with the chosen strength and reduction.
-      early: median gap of the first three views taken in.
-      late: median gap at step 20.
+      estimator_config: with the best strength and reduction.
+      early: median over walks of the mean gap in the first three accepted views; NaN without any.
+      late: median over walks of the gap at step 20.
     """
 
-    setting: Setting
+    estimator_config: EstimatorConfig
     early: float
     late: float
 
 
 def calibrate(
     env: ObjectNav,
-    params: EnvParams,
+    env_params: EnvParams,
     counts: jax.Array,
-    setting: Setting,
+    estimator_config: EstimatorConfig,
     key: jax.Array,
     strengths: Sequence[float] = STRENGTHS,
     reductions: Sequence[Reduction] = REDUCTIONS,
     num_walks: int = 256,
 ) -> Calibration:
-    """Choose strength and reduction of the estimator.
+    """Choose strength and reduction of the estimator so that the gap behaves as in the paper's Fig. 6b.
 
-    The gap is to run as in the paper's Fig. 6b where the layout is as trained. Of all pairs the one with the least
-    |early - 0.75| + |late - 0.25| is taken, early and late being medians over the same random walks without Done.
+    Among all pairs, the one with the smallest |early - 0.75| + |late - 0.25| is best. Early and late gaps are medians
+    over random walks without Done in the training scenes, the same walks for all pairs.
 
     Args:
       env: the environment.
-      params: of the training scenes.
+      env_params: of the training scenes.
       counts: float32 [rooms, K, K], from `explore`.
-      setting: the estimator's other choices.
+      estimator_config: all other settings of the estimator.
       key: consumed.
-      strengths, reductions: to choose from.
+      strengths, reductions: candidates.
       num_walks: parallel walks.
 
     Raises:
       InputError: no walk shows two categories together.
     """
-    choices = [dataclasses.replace(setting, strength=strength) for strength in strengths]
-    priors = jnp.stack([layout_priors(counts, chosen) for chosen in choices])
+    # The strength enters by the priors alone, so all strengths are measured in one call, [strengths, rooms, K, K].
+    strength_priors = []
+    for strength in strengths:
+        strength_priors.append(layout_priors(counts, dataclasses.replace(estimator_config, strength=strength)))
+    priors = jnp.stack(strength_priors)
+
+    # Measure the gaps of all pairs.
     calibrations = []
     for reduction in reductions:
-        reduced = dataclasses.replace(setting, reduction=reduction)  # the strength only enters by the priors
-        gaps = partial(_gaps, reduced, env=env, key=key, num_walks=num_walks)
-        early, late = jax.jit(jax.vmap(gaps, (0, None)))(priors, params)
-        calibrations += [
-            Calibration(dataclasses.replace(reduced, strength=chosen.strength), _median(e), float(np.median(f)))
-            for chosen, e, f in zip(choices, np.asarray(early), np.asarray(late), strict=True)
-        ]
-    if all(np.isnan(one.early) for one in calibrations):
+        reduction_config = dataclasses.replace(estimator_config, reduction=reduction)
+        measure_gaps = partial(_measure_gaps, reduction_config, env=env, key=key, num_walks=num_walks)
+        early_gaps, late_gaps = jax.device_get(jax.jit(jax.vmap(measure_gaps, (0, None)))(priors, env_params))
+        for strength, early_gap, late_gap in zip(strengths, early_gaps, late_gaps, strict=True):
+            candidate = dataclasses.replace(reduction_config, strength=strength)
+            calibrations.append(Calibration(candidate, _median_of_finite(early_gap), float(np.median(late_gap))))
+
+    # Take the pair nearest to the targets.
+    if all(np.isnan(calibration.early) for calibration in calibrations):
         raise InputError("layout: no random walk shows two categories together, so nothing can be calibrated")
-    return min(calibrations, key=lambda one: abs(one.early - EARLY) + abs(one.late - LATE))
+    return min(calibrations, key=_distance_to_targets)
 
 
-def _gaps(
-    setting: Setting, priors: jax.Array, params: EnvParams, env: ObjectNav, key: jax.Array, num_walks: int
+def _distance_to_targets(calibration: Calibration) -> float:
+    return abs(calibration.early - EARLY_GAP_TARGET) + abs(calibration.late - LATE_GAP_TARGET)
+
+
+def _median_of_finite(values: np.ndarray) -> float:
+    """Median of the finite values, NaN without any."""
+    finite_values = values[np.isfinite(values)]
+    return float(np.median(finite_values)) if len(finite_values) else float("nan")
+
+
+def _measure_gaps(
+    estimator_config: EstimatorConfig,
+    priors: jax.Array,
+    env_params: EnvParams,
+    env: ObjectNav,
+    key: jax.Array,
+    num_walks: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return mean early gap and late gap, [num_walks].
+    """Early and late gap of each walk, float32 [W]; the early gap is NaN where no view was accepted.
 
-    The early one is NaN where nothing was accepted.
+    Args:
+      estimator_config: with a reduction; its strength has no effect.
+      priors: float32 [rooms, K, K], of one strength.
+      env_params, env, key, num_walks: as in `calibrate`.
     """
-    start_key, walk_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
-    actions = jax.random.randint(walk_key, (LATE_STEP, num_walks), 0, DONE)
-    acting, knowledge = Acting(env, setting=setting), Knowledge(priors)
+    agent_loop = AgentLoop(env, estimator=estimator_config)
+    knowledge = Knowledge(priors)
+    agent, actions = _start_walks(agent_loop, env_params, knowledge, key, num_walks, LATE_STEP)
 
-    def alpha(agent: Agent) -> jax.Array:
-        assert agent.perceived.layout is not None
-        return agent.perceived.layout.alpha
+    def belief(agent: Agent) -> jax.Array:
+        assert agent.perception.layout is not None
+        return agent.perception.layout.alpha
 
+    # A view is accepted where it changes the belief; the first view is compared with the prior.
     def step(agent: Agent, action: jax.Array) -> tuple[Agent, tuple[jax.Array, jax.Array]]:
-        after, _ = acting.step(agent, action, knowledge, params)
-        return after, (acting.gap(after), (alpha(after) != alpha(agent)).any(axis=(1, 2)))
+        next_agent, _ = agent_loop.step(agent, action, knowledge, env_params)
+        is_accepted = (belief(next_agent) != belief(agent)).any(axis=(1, 2))
+        return next_agent, (agent_loop.gap(next_agent), is_accepted)
 
-    agent = acting.start(start_key, num_walks, None, knowledge, params)
-    prior = priors[params.room[agent.state.scene]]
-    first = acting.gap(agent), (alpha(agent) != prior).any(axis=(1, 2))
-    _, later = jax.lax.scan(step, agent, actions)
-    gap, accepted = (jnp.concatenate([a[None], b]) for a, b in zip(first, later, strict=True))
-    early = accepted & (jnp.cumsum(accepted, axis=0) <= EARLY_VIEWS)
-    return jnp.where(early, gap, 0.0).sum(axis=0) / early.astype(jnp.float32).sum(axis=0), gap[-1]
+    prior = priors[env_params.room[agent.state.scene]]
+    first_gap = agent_loop.gap(agent)
+    first_accepted = (belief(agent) != prior).any(axis=(1, 2))
+    _, (later_gaps, later_accepted) = jax.lax.scan(step, agent, actions)
+    gaps = jnp.concatenate([first_gap[None], later_gaps])  # [T + 1, W]
+    is_accepted = jnp.concatenate([first_accepted[None], later_accepted])
+
+    # Mean over the first accepted views, and the gap after the last step.
+    is_early = is_accepted & (jnp.cumsum(is_accepted, axis=0) <= NUM_EARLY_VIEWS)
+    num_early = is_early.astype(jnp.float32).sum(axis=0)
+    early_gap = jnp.where(is_early, gaps, 0.0).sum(axis=0) / num_early
+    return early_gap, gaps[-1]
 
 
-def _median(values: np.ndarray) -> float:
-    """Return the median of defined values, NaN without any."""
-    defined = values[np.isfinite(values)]
-    return float(np.median(defined)) if len(defined) else float("nan")
+# 3. Shift classifier
+
+
+def fit_shift_classifier(
+    env: ObjectNav,
+    env_params: EnvParams,
+    counts: jax.Array,
+    key: jax.Array,
+    num_walks: int = 8192,
+    pooled: bool = False,
+) -> CooccurrenceEvidence:
+    """Learn which pairs of categories seen together indicate another layout than that of training.
+
+    A logistic regression on the pairs that a random walk has seen together distinguishes walks in the training scenes
+    from the same walks with categories exchanged at random (`draw_category_exchange`). The scale of its log odds is
+    calibrated in a quarter of the scenes, on log odds learned in the rest. A room type without scenes gets log odds of
+    0.
+
+    Args:
+      env: the environment.
+      env_params: of the training scenes.
+      counts: float32 [rooms, K, K], from `explore`.
+      key: consumed.
+      num_walks: W, parallel walks.
+      pooled: learn the same log odds for all room types.
+    """
+    walk_key = jax.random.fold_in(key, 0)
+    exchange_key = jax.random.fold_in(key, 1)
+    length_key = jax.random.fold_in(key, 2)
+    scene_key = jax.random.fold_in(key, 3)
+
+    # Pairs that each walk has seen together when it is cut at a random length, bool [W, K, K].
+    presence, scene = _detect_on_walks(env, env_params, walk_key, num_walks)  # [W, T + 1, K], [W]
+    lengths = jax.random.choice(length_key, jnp.array(_WALK_LENGTHS), (num_walks,))
+    is_before_cut = jnp.arange(presence.shape[1])[None] <= lengths[:, None]
+    co_seen = jax.vmap(seen_together)(presence & is_before_cut[..., None])
+
+    # The same pairs in another layout: a new exchange of categories for each walk.
+    room = env_params.room[scene]
+    is_present = _find_present_categories(env, env_params)[scene]  # [W, K]
+    frequency = jnp.diagonal(counts, axis1=1, axis2=2)[room]
+    exchange_keys = jax.random.split(exchange_key, num_walks)
+    exchanges = jax.vmap(draw_category_exchange)(exchange_keys, is_present, frequency)
+    shifted_co_seen = jax.vmap(_permute_categories)(co_seen, exchanges)
+
+    # Examples of both layouts, bool [2 W, pairs], and the scenes that only calibrate.
+    rows, columns = jnp.triu_indices(counts.shape[-1], 1)
+    pairs = jnp.concatenate([co_seen, shifted_co_seen])[:, rows, columns]
+    is_held_out = jax.random.bernoulli(scene_key, _CALIBRATION_SHARE, env_params.room.shape)[scene]
+
+    # Log odds of each room type, or of all as if they were the first one.
+    fit_rooms = jnp.zeros_like(room) if pooled else room
+    pair_log_odds = _fit_log_odds(pairs, jnp.tile(fit_rooms, 2), jnp.tile(is_held_out, 2), len(counts))
+    if pooled:
+        pair_log_odds = jnp.broadcast_to(pair_log_odds[0], pair_log_odds.shape)
+    log_odds = jnp.zeros_like(counts).at[:, rows, columns].set(pair_log_odds)
+    return CooccurrenceEvidence(log_odds=log_odds, co_visibility=co_visibility_from_counts(counts))
+
+
+def co_visibility_from_counts(counts: jax.Array) -> jax.Array:
+    """Probability that a pose showing one category shows another one too.
+
+    Args:
+      counts: float32 [rooms, K, K], see `Exploration`.
+
+    Returns:
+      float32 [rooms, K, K] in [0, 1], the share of the poses showing i that show j too; 0 on the diagonal and where i
+      was never seen. A room type without training scenes gets the shares of all scenes together.
+    """
+    counts = _fill_unseen_rooms(counts)
+    category_counts = jnp.diagonal(counts, axis1=1, axis2=2)[..., None]
+    off_diagonal = 1 - jnp.eye(counts.shape[-1], dtype=counts.dtype)
+    return counts / jnp.maximum(category_counts, 1) * off_diagonal[None]
+
+
+def _detect_on_walks(
+    env: ObjectNav, env_params: EnvParams, key: jax.Array, num_walks: int
+) -> tuple[jax.Array, jax.Array]:
+    """Detections on random walks, bool [W, T + 1, K], and the scene of each walk, int32 [W]."""
+    agent_loop = AgentLoop(env)
+    agent, actions = _start_walks(agent_loop, env_params, None, key, num_walks, _WALK_LENGTHS[-1])
+
+    def step(agent: Agent, action: jax.Array) -> tuple[Agent, jax.Array]:
+        next_agent, _ = agent_loop.step(agent, action, None, env_params)
+        return next_agent, next_agent.state.pose
+
+    _, next_poses = jax.lax.scan(step, agent, actions)
+    poses = jnp.concatenate([agent.state.pose[None], next_poses]).T
+    return env.row_format.presence(env_params.tables.rows[poses]), agent.state.scene
+
+
+def _find_present_categories(env: ObjectNav, env_params: EnvParams) -> jax.Array:
+    """Find the categories in each scene, bool [S, K]: those detected more often than false alarms explain."""
+    tables = env_params.tables
+    poses_per_cell = env.task.rules.poses_per_cell
+
+    # Detections of each scene as differences of cumulative sums over all poses.
+    detections = env.row_format.presence(tables.rows).astype(jnp.int32)
+    cumulative = jnp.concatenate([jnp.zeros_like(detections[:1]), jnp.cumsum(detections, axis=0)])
+    first_pose = tables.first_cell * poses_per_cell
+    num_poses = tables.num_cells * poses_per_cell
+    num_detections = cumulative[first_pose + num_poses] - cumulative[first_pose]
+
+    detection_share = num_detections.astype(jnp.float32) / num_poses[:, None].astype(jnp.float32)
+    return detection_share > 2 * env.task.detector.false_alarm
+
+
+def draw_category_exchange(key: jax.Array, present: jax.Array, frequency: jax.Array) -> jax.Array:
+    """Draw a random exchange of categories that are seen about equally often.
+
+    The categories present are ordered by frequency, with noise on their ranks. Each two neighbours exchange; the last
+    of an odd number stays.
+
+    Args:
+      key: consumed.
+      present: bool [K], categories in the scene.
+      frequency: float32 [K], how often each category is seen.
+
+    Returns:
+      int32 [K], a permutation that is its own inverse: each category is seen where the one it maps to was seen.
+    """
+    # Order by noisy ranks; absent categories come last.
+    ranks = jnp.argsort(jnp.argsort(jnp.where(present, frequency, jnp.inf))).astype(jnp.float32)
+    noisy_ranks = ranks + _RANK_NOISE * jax.random.normal(key, ranks.shape)
+    order = jnp.argsort(jnp.where(present, noisy_ranks, jnp.inf)).astype(jnp.int32)
+
+    # Positions 0 and 1, 2 and 3, ... are partners, as far as both categories are present.
+    position = jnp.arange(len(order))
+    num_present = present.sum()
+    partner = jnp.where((position ^ 1) < num_present, position ^ 1, position)
+    partner = jnp.where(position < num_present, partner, position)
+    return jnp.zeros_like(order).at[order].set(order[partner])
+
+
+def _permute_categories(co_seen: jax.Array, permutation: jax.Array) -> jax.Array:
+    """Permute rows and columns of a matrix [K, K] over categories."""
+    return co_seen[permutation][:, permutation]
+
+
+def _fit_log_odds(pairs: jax.Array, rooms: jax.Array, is_held_out: jax.Array, num_rooms: int) -> jax.Array:
+    """Calibrated log odds that each pair indicates the shifted layout, float32 [rooms, pairs].
+
+    The log odds are fitted to all examples, and multiplied by the scale that calibrates, in the held-out examples, a
+    fit without them.
+
+    Args:
+      pairs: bool [2 W, pairs], pairs seen together; the second W examples are those of the shifted layout.
+      rooms: int32 [2 W], room type whose log odds hold for an example.
+      is_held_out: bool [2 W], examples that only calibrate.
+      num_rooms: number of room types.
+    """
+    examples = pairs.astype(jnp.float32)
+    is_shifted = (jnp.arange(len(pairs)) >= len(pairs) // 2).astype(jnp.float32)
+
+    def predict(log_odds: jax.Array) -> jax.Array:
+        logits_by_room = examples @ log_odds.T  # [2 W, rooms]
+        return jnp.take_along_axis(logits_by_room, rooms[:, None], axis=-1)[:, 0]
+
+    def cross_entropy(logits: jax.Array, mask: jax.Array) -> jax.Array:
+        losses = optax.sigmoid_binary_cross_entropy(logits, is_shifted)
+        return (losses * mask.astype(jnp.float32)).sum() / jnp.maximum(mask.sum(), 1).astype(jnp.float32)
+
+    def fit(mask: jax.Array) -> jax.Array:
+        def regularized_loss(log_odds: jax.Array) -> jax.Array:
+            return cross_entropy(predict(log_odds), mask) + _L2_WEIGHT * (log_odds**2).sum()
+
+        return _minimize(regularized_loss, jnp.zeros((num_rooms, pairs.shape[-1])))
+
+    # Fit without the held-out examples, calibrate on them, then fit to all.
+    held_out_logits = predict(fit(~is_held_out))
+
+    def calibration_loss(log_scale: jax.Array) -> jax.Array:
+        return cross_entropy(jnp.exp(log_scale) * held_out_logits, is_held_out)
+
+    log_scale = _minimize(calibration_loss, jnp.zeros(()))
+    return jnp.exp(log_scale) * fit(jnp.ones_like(is_held_out))
+
+
+def _minimize(loss: Callable[[jax.Array], jax.Array], start: jax.Array) -> jax.Array:
+    """Minimise a loss by gradient descent with Adam, and return the minimiser."""
+    optimizer = optax.adam(_FIT_LEARNING_RATE)
+
+    def descend(carry: tuple[Any, optax.OptState], _: None) -> tuple[tuple[Any, optax.OptState], None]:
+        weights, optimizer_state = carry
+        gradient = jax.grad(loss)(weights)
+        with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
+            updates, optimizer_state = optimizer.update(gradient, optimizer_state)
+        return (optax.apply_updates(weights, updates), optimizer_state), None
+
+    (weights, _), _ = jax.lax.scan(descend, (start, optimizer.init(start)), length=_NUM_FIT_STEPS)
+    return weights

@@ -1,4 +1,8 @@
-"""What can be set about learning."""
+"""Settings of PPO, and the schedule of training stages.
+
+`PPOConfig` holds what a user can set. `PPOScalars` is its traced part, whose values may change without a new
+compilation. `stage_index_at` tells which stage of a method a part of training belongs to.
+"""
 
 import dataclasses
 from typing import Literal
@@ -7,32 +11,37 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.policies.methods import Stage
+from jaxnav.policies.method import Stage
+
+#: Training of the branch that counterfactual decisions use: not at all (the paper's text), by zeroing both direct
+#: pathways with probability 1/2 (the released code), or by matching the factual policy along the rollout.
+Counterfactual = Literal["none", "coin", "distil"]
 
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Configure recurrent PPO.
+    """Settings of recurrent PPO.
 
     Attributes:
       num_envs: parallel episodes of each seed.
-      rollout: steps of every episode between two updates; at most the shortest step limit.
+      rollout: steps of each episode between two updates; at most the shortest step limit.
       epochs: passes over a rollout.
-      minibatches: parts of a pass, split over episodes.
-      learning_rate: of Adam at the start; falls linearly to 0, in each stage of training anew.
+      minibatches: minibatches of a pass, split over episodes.
+      learning_rate: initial learning rate of Adam; decays linearly to 0 within each stage of training.
       gamma: discount.
-      gae_lambda: of generalised advantage estimation.
-      clip: of the probability ratio.
-      entropy: weight of the entropy bonus at the start,
-      final_entropy: at the end; linear in between.
+      gae_lambda: lambda of generalised advantage estimation.
+      clip: clip range of the probability ratio.
+      entropy: weight of the entropy bonus at the start of a stage.
+      final_entropy: weight of the entropy bonus at the end of a stage; linear in between.
       value: weight of the value loss.
       max_grad_norm: global norm to which gradients are clipped.
-      distil: weight of the counterfactual branch's loss where it is distilled.
-      alone: share of the updates of the last stage that does not imitate, the first of them, in which the direct stream
-        acts and learns alone, where there are streams.
-      experience: probability that an episode after that has the stream of experience.
-      experience_drawn: whether that is drawn once in an episode or at every step anew.
-      experience_rate: factor on the learning rate after that, for what is added disturbs a policy that has learned.
+      distil: weight of the distillation loss of the counterfactual branch.
+      alone: with streams, share of the last stage without imitation in which only the direct stream acts and learns;
+        the stage begins with it.
+      experience: probability that an episode uses the stream of experience, in the rest of that stage.
+      experience_drawn: draw this once per `episode`, or anew at each `step`.
+      experience_rate: factor on the learning rate in the rest of that stage, because the added stream disturbs a policy
+        that has already learned.
     """
 
     num_envs: int = 256
@@ -54,27 +63,40 @@ class PPOConfig:
     experience_rate: float = 0.5
 
     def num_updates(self, total_steps: int) -> int:
-        """Return the updates that environment steps of a seed take.
-
-        They are rounded up.
-        """
+        """Number of updates in `total_steps` environment steps of a seed, rounded up."""
         return -(-total_steps // (self.num_envs * self.rollout))
 
-    def scalars(self, num_updates: int, begin: int = 0, rate: float = 1.0) -> "PPOScalars":
-        """Return the traced part, for a stage of so many updates.
+    def scalars(self, num_updates: int, first_update: int = 0, lr_scale: float = 1.0) -> "PPOScalars":
+        """Traced settings of a training stage.
 
-        `rate` is a factor on the learning rate.
+        Args:
+          num_updates: updates in the stage.
+          first_update: updates before the stage.
+          lr_scale: factor on the learning rate.
         """
-        names = PPOScalars.__dataclass_fields__.keys() - {"begin", "num_updates"}
-        settings = {name: jnp.float32(getattr(self, name)) for name in names}
-        settings["learning_rate"] *= rate
-        return PPOScalars(**settings, begin=jnp.float32(begin), num_updates=jnp.float32(num_updates))
+        return PPOScalars(
+            learning_rate=jnp.float32(self.learning_rate) * lr_scale,
+            gamma=jnp.float32(self.gamma),
+            gae_lambda=jnp.float32(self.gae_lambda),
+            clip=jnp.float32(self.clip),
+            entropy=jnp.float32(self.entropy),
+            final_entropy=jnp.float32(self.final_entropy),
+            value=jnp.float32(self.value),
+            distil=jnp.float32(self.distil),
+            experience=jnp.float32(self.experience),
+            begin=jnp.float32(first_update),
+            num_updates=jnp.float32(num_updates),
+        )
 
 
 class PPOScalars(struct.PyTreeNode):
-    """Hold the settings that may change without compiling anew.
+    """Settings that may change without a new compilation, float32 [] each.
 
-    float32 [] each, see `PPOConfig`; `begin` are the updates before the stage, `num_updates` those in it.
+    The settings are those of `PPOConfig`; the schedule of a stage is given by two more.
+
+    Attributes:
+      begin: updates before the stage.
+      num_updates: updates in the stage.
     """
 
     learning_rate: jax.Array
@@ -90,21 +112,16 @@ class PPOScalars(struct.PyTreeNode):
     num_updates: jax.Array
 
 
-#: How the branch that a counterfactual decision uses is trained: not at all (the paper's text), by zeroing both direct
-#: pathways with a fair coin (the released code), or by matching the factual policy beside the rollout.
-Counterfactual = Literal["none", "coin", "distil"]
-
-
-def stage_at(stages: tuple[Stage, ...], share: float) -> int:
-    """Return the stage after a share of all updates.
+def stage_index_at(stages: tuple[Stage, ...], progress: float) -> int:
+    """Index of the stage that training is in.
 
     Args:
-      stages: of a method, in order.
-      share: of the updates that are done, in [0, 1).
+      stages: stages of a method, in order.
+      progress: share of all updates that are done, in [0, 1).
     """
-    end = 0.0
-    for number, stage in enumerate(stages):
-        end += stage.share
-        if share < end - 1e-9:
-            return number
+    stage_end = 0.0
+    for stage_index, stage in enumerate(stages):
+        stage_end += stage.share
+        if progress < stage_end - 1e-9:  # sums of shares are rounded
+            return stage_index
     return len(stages) - 1

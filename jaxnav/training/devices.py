@@ -1,17 +1,26 @@
-"""Devices: one run on many of them.
+"""Training one run on several devices, of one process or of several.
 
-The devices are of one process or of several; seeds are side by side, and the episodes of each are shared out.
+The devices form a mesh (seeds, episodes): seeds are divided among groups of devices, and the episodes of a seed among
+the devices of its group. Parameters, tables and priors are copied to all devices. Results do not depend on the number
+of devices, because random numbers do not depend on where they are drawn; only the order of sums over episodes differs.
 
-The devices form a mesh (seeds, episodes). Parameters, tables and priors are on all devices; the leaves of an agent are
-cut along its episodes. What is computed stays that of one device: random numbers do not depend on where they are drawn,
-so that only the order of sums over episodes differs.
+`Devices` connects the processes and makes the mesh. `replicate_on_devices`, `replicated_sharding` and `state_sharding`
+place arrays on it. `is_first_process`, `run_on_first_process` and `check_agreement` coordinate processes, and
+`exit_if_process_lost` ends a process when another one of its run is lost.
 """
 
+import atexit
+import contextlib
+import ctypes
 import dataclasses
 import hashlib
 import math
+import os
 import re
-from collections.abc import Callable
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -20,22 +29,28 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxnav.errors import InputError
-from jaxnav.training.learner import LearnerState
-from jaxnav.training.peers import PATIENCE, watch
-from jaxnav.training.shares import EPISODES, SEEDS
+from jaxnav.training.ppo import LearnerState
+from jaxnav.training.shares import EPISODE_AXIS, SEED_AXIS
 
 Tree = TypeVar("Tree")
+
+#: Seconds after which a process that does not connect, or does not respond, counts as lost.
+TIMEOUT_SECONDS = 30
+
+#: File that JAX's own messages go to; empty before `redirect_crash_output`.
+_crash_log = ""
 
 
 @dataclasses.dataclass(frozen=True)
 class Devices:
-    """Name devices to train on.
+    """Devices to train on.
 
     Attributes:
-      count: so many of this process; None takes all devices of all processes.
-      address: `HOST:PORT` where the first of several processes waits for the others; None leaves it to the launcher
-        (Slurm, Open MPI, Kubernetes or a TPU pod) to tell which processes there are, unless `count` is given.
-      process, processes: index of this process, and how many there are.
+      count: number of devices of this process; None for all devices of all processes.
+      address: `HOST:PORT` where the first of several processes waits for the rest; None without `count` leaves the
+        discovery of processes to the launcher (Slurm, Open MPI, Kubernetes or a TPU pod).
+      process: index of this process.
+      processes: number of processes.
     """
 
     count: int | None = None
@@ -45,39 +60,38 @@ class Devices:
 
     @classmethod
     def parse(cls, text: str) -> "Devices | None":
-        """Read `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`.
-
-        Returns None if the text is none of these.
-        """
+        """Parse `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`; None if the text is none of these."""
         if text == "cluster":
             return cls()
         if re.fullmatch(r"[1-9]\d*", text):
             return cls(count=int(text))
-        parts = re.fullmatch(r"(.+:\d+),(\d+),(\d+)", text)
-        if parts and int(parts[2]) < int(parts[3]):
-            return cls(address=parts[1], process=int(parts[2]), processes=int(parts[3]))
+        match = re.fullmatch(r"(.+:\d+),(\d+),(\d+)", text)
+        if match and int(match[2]) < int(match[3]):
+            return cls(address=match[1], process=int(match[2]), processes=int(match[3]))
         return None
 
     def connect(self) -> None:
-        """Join the other processes, before anything is computed.
+        """Join the other processes; call before anything is computed.
+
+        From then on, the loss of a process ends this one; see `exit_if_process_lost`.
 
         Raises:
-          InputError: no launcher tells of the processes. If one is lost, now or later, this one ends; see `peers`.
+          InputError: the processes cannot be discovered or joined.
         """
         if self.count or jax.distributed.is_initialized():
             return
-        jax.config.update("jax_enable_preemption_service", False)  # it would ignore a SIGTERM
-        detection = "deactivate" if self.address else None
-        watch()
+
+        jax.config.update("jax_enable_preemption_service", False)  # which would ignore a SIGTERM
+        redirect_crash_output()
         try:
             jax.distributed.initialize(
                 self.address,
                 self.processes,
                 self.process,
-                cluster_detection_method=detection,
-                initialization_timeout=PATIENCE,
-                heartbeat_timeout_seconds=PATIENCE,
-                shutdown_timeout_seconds=PATIENCE,
+                cluster_detection_method="deactivate" if self.address else None,
+                initialization_timeout=TIMEOUT_SECONDS,
+                heartbeat_timeout_seconds=TIMEOUT_SECONDS,
+                shutdown_timeout_seconds=TIMEOUT_SECONDS,
             )
         except (ValueError, RuntimeError) as error:
             raise InputError(
@@ -85,13 +99,14 @@ class Devices:
                 "with an address of process 0"
             ) from error
 
-    def mesh(self, seeds: int, num_envs: int, minibatches: int) -> Mesh:
-        """Make the mesh of devices.
+    def mesh(self, num_seeds: int, num_envs: int, minibatches: int) -> Mesh:
+        """Mesh (seeds, episodes) of the devices.
 
-        It has as many groups of devices as divide the seeds, each with an equal share of every minibatch.
+        The number of groups is the greatest that divides both devices and seeds. Each device of a group gets an equal
+        share of every minibatch.
 
         Raises:
-          InputError: there are fewer devices, or the episodes cannot be shared out.
+          InputError: there are fewer devices, or the episodes cannot be divided equally.
         """
         devices = jax.devices()
         count = self.count or len(devices)
@@ -100,72 +115,136 @@ class Devices:
                 f"config: devices is {count}; there are {len(devices)} (on a CPU as many as "
                 f"XLA_FLAGS=--xla_force_host_platform_device_count={count} makes)"
             )
-        groups = math.gcd(count, seeds)
-        share = count // groups
-        if num_envs % (share * minibatches):
+
+        num_groups = math.gcd(count, num_seeds)
+        group_size = count // num_groups
+        if num_envs % (group_size * minibatches):
             raise InputError(
-                f"config: ppo.num_envs is {num_envs}; with {count} devices for {seeds} seeds the episodes of each are "
-                f"shared by {share}: give a multiple of {share} x ppo.minibatches ({minibatches})"
+                f"config: ppo.num_envs is {num_envs}; with {count} devices for {num_seeds} seeds the episodes of each "
+                f"are shared by {group_size}: give a multiple of {group_size} x ppo.minibatches ({minibatches})"
             )
-        return Mesh(np.array(devices[:count]).reshape(groups, share), (SEEDS, EPISODES))
+        return Mesh(np.array(devices[:count]).reshape(num_groups, group_size), (SEED_AXIS, EPISODE_AXIS))
 
 
-def replicated(mesh: Mesh) -> NamedSharding:
-    """Place whole arrays on every device."""
+# Placing arrays on a mesh
+
+
+def replicated_sharding(mesh: Mesh) -> NamedSharding:
+    """Sharding that copies whole arrays to all devices."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
-    """Place the leaves of a seed's state.
+    """Sharding of a seed's state, a pytree prefix: episodes are divided, all else is copied to all devices.
 
-    Or of `stacked` seeds' states: episodes are divided, stacked seeds as well.
+    Args:
+      mesh: of devices.
+      stacked: for the stacked states of several seeds, whose seeds are divided among the groups of devices too.
     """
-    seeds = (SEEDS,) if stacked else ()
-    whole = NamedSharding(mesh, PartitionSpec(*seeds))
-    episodes = NamedSharding(mesh, PartitionSpec(*seeds, EPISODES))
-    state: Any = LearnerState  # holds places here, not arrays
-    return state(params=whole, kept=whole, optimizer=whole, agent=episodes, key=whole, update=whole)
+    seed_axes = (SEED_AXIS,) if stacked else ()
+    copied = NamedSharding(mesh, PartitionSpec(*seed_axes))
+    divided = NamedSharding(mesh, PartitionSpec(*seed_axes, EPISODE_AXIS))
+
+    # Untyped, because the fields hold shardings here rather than arrays.
+    state_type: Any = LearnerState
+    return state_type(params=copied, best=copied, optimizer=copied, agent=divided, key=copied, update=copied)
 
 
-def everywhere(mesh: Mesh, tree: Tree) -> Tree:
+def replicate_on_devices(mesh: Mesh, tree: Tree) -> Tree:
     """Copy arrays that every process has to all devices."""
-    place = replicated(mesh)
-    return jax.jit(lambda tree: tree, in_shardings=place, out_shardings=place)(tree)
+    sharding = replicated_sharding(mesh)
+    return jax.jit(lambda tree: tree, in_shardings=sharding, out_shardings=sharding)(tree)
 
 
-def first_process() -> bool:
-    """Return whether this is the process that writes."""
+# Coordinating processes
+
+
+def is_first_process() -> bool:
+    """True in the process that writes files and messages."""
     return jax.process_index() == 0
 
 
-def by_first_process(action: Callable[[], Any]) -> None:
-    """Let the first process act while the others wait.
+def run_on_first_process(action: Callable[[], Any]) -> None:
+    """Run an action in the first process while the rest wait.
 
     Raises:
-      InputError: in every process, if the first one was refused.
+      InputError: in every process, if the action raised one in the first.
     """
-    refusal = None
-    if first_process():
+    error = None
+    if is_first_process():
         try:
             action()
-        except InputError as error:
-            refusal = error
-    refused = jax.process_count() > 1 and multihost_utils.broadcast_one_to_all(np.bool_(refusal is not None))
-    if refusal or refused:
-        raise refusal or InputError("process 0 was refused; it says why")
+        except InputError as action_error:
+            error = action_error
+
+    # All processes learn whether the action failed; only the first one has the error itself.
+    has_failed = error is not None
+    if jax.process_count() > 1:
+        has_failed = bool(multihost_utils.broadcast_one_to_all(np.bool_(has_failed)))
+    if has_failed:
+        raise error or InputError("process 0 was refused; it says why")
 
 
 def check_agreement(text: str) -> None:
-    """Make sure that every process says the same.
+    """Check that a text is the same in all processes.
 
     Raises:
-      InputError: some do not.
+      InputError: some processes have a different text.
     """
     if jax.process_count() == 1:
         return
+
     digest = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint32)
-    told = multihost_utils.process_allgather(digest)
-    if others := [index for index, other in enumerate(told) if (other != told[0]).any()]:
+    digests = multihost_utils.process_allgather(digest)
+    others = np.flatnonzero((digests != digests[0]).any(axis=1)).tolist()
+    if others:
         raise InputError(
             f"config: processes {others} have other settings, scenes or versions than process 0; give all the same"
         )
+
+
+# Losing a process
+
+
+def redirect_crash_output() -> None:
+    """Report the loss of a process in one line instead of JAX's own output.
+
+    When a process is lost, JAX aborts from one of its own threads, with a page of addresses. From here on, output that
+    JAX and gloo write to the file descriptor of stderr goes to a file, which the line names and which is removed when
+    the run ends well. Python's `sys.stderr` still writes to the terminal.
+    """
+    global _crash_log
+    log_descriptor, _crash_log = tempfile.mkstemp(prefix="jaxnav-", suffix=".log")
+    atexit.register(os.unlink, _crash_log)
+    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
+    os.dup2(log_descriptor, 2)
+    ctypes.pythonapi.PyOS_setsig(signal.SIGABRT, _on_abort)  # Python's own handlers wait for the main thread
+
+
+@contextlib.contextmanager
+def exit_if_process_lost() -> Iterator[None]:
+    """Exit with a message where communication with another process fails; also usable as a decorator."""
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, TimeoutError, ValueError) as error:
+        # A failed collective may raise a ValueError; only its text distinguishes it from a mistake in the program.
+        is_other_error = isinstance(error, ValueError) and "Gloo" not in str(error)
+        if is_other_error or not _crash_log:
+            raise
+        os.write(2, f"{type(error).__name__}: {error}\n".encode())
+        _exit_with_message()
+
+
+@ctypes.CFUNCTYPE(None, ctypes.c_int)
+def _on_abort(_: int) -> None:
+    _exit_with_message()
+
+
+def _exit_with_message() -> None:
+    """Exit at once with the code of invalid input; JAX's own exit would wait for the lost process."""
+    sys.stderr.write(
+        "error: config: devices: another process of this run ended, cannot be reached or has other versions "
+        f"(details: {_crash_log}); start all again, the run goes on from its last checkpoint\n"
+    )
+    sys.stderr.flush()
+    os._exit(2)

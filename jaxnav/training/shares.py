@@ -1,7 +1,8 @@
-"""Shares: what devices that share the episodes of a seed compute together.
+"""Reductions over devices that share the episodes of a seed.
 
-An exchange between processes takes milliseconds per array, whatever its size; so a gradient and all that is told of it
-are exchanged as one array. One device exchanges nothing.
+`mean_over_devices` averages a function of the episodes, such as a gradient, over their devices. Inside such a function,
+`masked_mean` and `mean_and_std` are statistics over the episodes of all devices. A collective between processes takes
+milliseconds per array, whatever its size, so each reduction sends a single flat array. On one device nothing is sent.
 """
 
 from collections.abc import Callable
@@ -12,51 +13,66 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec
 
-#: The axes of a mesh of devices.
-SEEDS, EPISODES = "seeds", "episodes"
+#: Axes of a mesh of devices: groups of devices for different seeds, and the devices of a group for their episodes.
+SEED_AXIS = "seeds"
+EPISODE_AXIS = "episodes"
 
 
-def averaged(function: Callable[..., Any], *places: Any) -> Callable[..., Any]:
-    """Average a function over the devices that share episodes.
+def mean_over_devices(function: Callable[..., Any], *in_specs: Any) -> Callable[..., Any]:
+    """Average the results of a function over the devices that share episodes.
 
     Args:
-      function: from arrays to a tree of float32 means over its episodes.
-      places: of each argument's leaves (or prefixes of its tree), as `jax.shard_map` takes them.
+      function: from arrays to a pytree of float32 means over its episodes.
+      in_specs: sharding of each argument, a pytree prefix as for `jax.shard_map`.
     """
-    if jax.sharding.get_abstract_mesh().shape.get(EPISODES, 1) == 1:
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.shape.get(EPISODE_AXIS, 1) == 1:
         return function
 
-    def average(*arguments: Any) -> Any:
-        flat, tree = ravel_pytree(function(*arguments))
-        return tree(jax.lax.pmean(flat, EPISODES))
+    def averaged_function(*arguments: Any) -> Any:
+        flat_result, unravel = ravel_pytree(function(*arguments))
+        return unravel(jax.lax.pmean(flat_result, EPISODE_AXIS))
 
-    return jax.shard_map(average, in_specs=places, out_specs=PartitionSpec(), check_vma=False)
+    return jax.shard_map(averaged_function, in_specs=in_specs, out_specs=PartitionSpec(), check_vma=False)
 
 
-def average(values: jax.Array, counted: jax.Array | None = None) -> jax.Array:
-    """Return the mean float32 [] of those values [...] that count.
+def masked_mean(values: jax.Array, mask: jax.Array | None = None) -> jax.Array:
+    """Mean of the values under a mask, float32 [].
+
+    Inside `mean_over_devices` the values are those of one device. The share under the mask is then that of all devices,
+    so that the results average to the mean over all devices.
 
     Args:
-      values: float32 [...]; within `averaged` a device's share.
-      counted: bool [...], which of them; None for all. 0 where none of all devices counts.
+      values: float32 [...].
+      mask: bool [...]; None for all values. The mean is 0 where the mask is False everywhere.
     """
-    if counted is None:
+    if mask is None:
         return values.mean()
-    share = counted.astype(jnp.float32).mean()
-    if EPISODES in jax.sharding.get_abstract_mesh().manual_axes:
-        share = jax.lax.pmean(share, EPISODES)
-    return jnp.where(counted, values, 0.0).mean() / jnp.maximum(share, 1.0 / 2**24)
+
+    share = mask.astype(jnp.float32).mean()
+    if _is_inside_mean_over_devices():
+        share = jax.lax.pmean(share, EPISODE_AXIS)
+    return jnp.where(mask, values, 0.0).mean() / jnp.maximum(share, 1.0 / 2**24)
 
 
-def moments(values: jax.Array, counted: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
-    """Return mean and deviation of the values of all devices.
+def mean_and_std(values: jax.Array, mask: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation of the values of all devices, float32 [] each.
 
-    Float32 [...] to float32 [] each; within `averaged` the values are a device's share. `counted` is as in `average`.
+    Args:
+      values: float32 [...]; those of one device inside `mean_over_devices`.
+      mask: bool [...], see `masked_mean`.
     """
-    if EPISODES not in jax.sharding.get_abstract_mesh().manual_axes:
-        if counted is None:
-            return values.mean(), values.std()
-        mean = average(values, counted)
-        return mean, jnp.sqrt(average(jnp.square(values - mean), counted))
-    mean, square = jax.lax.pmean(jnp.stack([average(values, counted), average(jnp.square(values), counted)]), EPISODES)
-    return mean, jnp.sqrt(jnp.maximum(square - jnp.square(mean), 0.0))
+    # Several devices send both moments as one array.
+    if _is_inside_mean_over_devices():
+        local_moments = jnp.stack([masked_mean(values, mask), masked_mean(jnp.square(values), mask)])
+        mean, mean_square = jax.lax.pmean(local_moments, EPISODE_AXIS)
+        return mean, jnp.sqrt(jnp.maximum(mean_square - jnp.square(mean), 0.0))
+
+    if mask is None:
+        return values.mean(), values.std()
+    mean = masked_mean(values, mask)
+    return mean, jnp.sqrt(masked_mean(jnp.square(values - mean), mask))
+
+
+def _is_inside_mean_over_devices() -> bool:
+    return EPISODE_AXIS in jax.sharding.get_abstract_mesh().manual_axes

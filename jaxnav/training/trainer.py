@@ -1,6 +1,13 @@
-"""The trainer: all arms and seeds of a run, side by side."""
+"""Trainers of all arms and seeds of a run, side by side.
+
+`Trainer` trains on one device, with seeds in parallel threads. `ShardedTrainer` trains on a mesh of devices. Both share
+an interface: `init` starts all seeds, `train` does a chunk of updates, `restart` gives the seeds new episodes,
+`keep_best` keeps the policies with the best validation scores, and `pack` and `unpack` convert the states from and to
+those in a checkpoint.
+"""
 
 import dataclasses
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,30 +18,31 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxnav.env.types import EnvParams
-from jaxnav.policies.methods import Knowledge, Stage
+from jaxnav.env.objectnav import EnvParams
+from jaxnav.policies.method import Knowledge, Stage
 from jaxnav.training.config import PPOScalars
-from jaxnav.training.devices import everywhere, replicated, state_sharding
-from jaxnav.training.learner import Learner, LearnerState
-from jaxnav.training.shares import SEEDS
+from jaxnav.training.devices import replicate_on_devices, replicated_sharding, state_sharding
+from jaxnav.training.ppo import Learner, LearnerState
+from jaxnav.training.shares import SEED_AXIS
 
-#: Of every arm its seeds, as a checkpoint holds them.
-Seeds = dict[str, list[LearnerState]]
-#: The same as a trainer holds them; see `Trainer.unpack`.
-States = dict[str, Any]
-Metrics = dict[str, list[dict[str, float]]]
+#: States by arm and seed, as in a checkpoint.
+SeedStates = dict[str, list[LearnerState]]
+#: States by arm, as a trainer holds them; see `Trainer.unpack`.
+TrainerStates = dict[str, Any]
+#: Metrics of a chunk of updates, by arm and seed.
+SeedMetrics = dict[str, list[dict[str, float]]]
 
 #: Purposes of the keys of the arms: policies without and with the layout estimator.
-ARM_KEYS = {"baseline": 0, "layout": 1}
+ARM_KEY_PURPOSES = {"baseline": 0, "layout": 1}
 
 
 class Trainer:
-    """Train all arms and seeds of a run.
+    """Trainer of all arms and seeds of a run on one device.
 
-    Each arm is compiled once for each stage of its method, and seeds of all arms run side by side on the cores.
+    Each arm is compiled once for each stage of its method. The seeds of all arms run side by side on the cores.
 
     Attributes:
-      learners: the learner of each arm, by name.
+      learners: learner of each arm, by name.
     """
 
     def __init__(
@@ -43,207 +51,270 @@ class Trainer:
         stages: Sequence[tuple[Stage, PPOScalars]],
         knowledge: Knowledge,
         key: jax.Array,
-        seeds: int,
-        chunk: int,
+        num_seeds: int,
+        chunk_size: int,
     ) -> None:
-        """Prepare; nothing is compiled yet.
+        """Prepare the trainer; nothing is compiled yet.
 
         Args:
-          learners: of each arm, a name in `ARM_KEYS`.
-          stages: of training, with the traced settings of PPO in each.
-          knowledge: what was learned before training.
+          learners: learner of each arm, named as in `ARM_KEY_PURPOSES`.
+          stages: stages of training, each with its traced settings of PPO.
+          knowledge: learned before training.
           key: typed PRNG key [] of all arms and seeds.
-          seeds: S, of each arm.
-          chunk: updates of one call of `train`.
+          num_seeds: S, seeds of each arm.
+          chunk_size: updates in one call of `train`.
         """
         self.learners = dict(learners)
-        self._scalars, self._knowledge, self._key = tuple(scalars for _, scalars in stages), knowledge, key
         self._stages = [stage for stage, _ in stages]
-        self._seeds, self._chunk = seeds, chunk
+        self._scalars = [scalars for _, scalars in stages]
+        self._knowledge = knowledge
+        self._key = key
+        self._num_seeds = num_seeds
+        self._chunk_size = chunk_size
+
+        # Functions of each arm; those that depend on the stage, (arm, stage index), are added when they are needed.
+        self._init_functions = {}
+        self._keep_functions = {}
+        for arm in self.learners:
+            self._init_functions[arm] = self._jit_init(self._stage_learner(arm, 0))
+            self._keep_functions[arm] = self._jit_keep(self.learners[arm])
+        self._restart_functions: dict[tuple[str, int], Any] = {}
         self._compiled: dict[tuple[str, int], Any] = {}
-        self._starts = {name: jax.jit(self._learner(name, 0).init) for name in self.learners}
-        self._restarts: dict[tuple[str, int], Any] = {}
-        self._keeps = {name: jax.jit(learner.keep, donate_argnums=0) for name, learner in self.learners.items()}
 
-    def abstract(self, params: EnvParams) -> Seeds:
-        """Return shapes and devices of every seed's state."""
-        return jax.eval_shape(self.init, params)
+    def abstract_states(self, env_params: EnvParams) -> SeedStates:
+        """Shapes, dtypes and shardings of all states in a checkpoint."""
+        return jax.eval_shape(self.init, env_params)
 
-    def pack(self, seeds: Seeds) -> States:
-        """Return the states that a checkpoint held."""
-        return seeds
+    def pack(self, seed_states: SeedStates) -> TrainerStates:
+        """Convert states from those in a checkpoint."""
+        return seed_states
 
-    def unpack(self, states: States) -> Seeds:
-        """Return the states that a checkpoint is to hold."""
+    def unpack(self, states: TrainerStates) -> SeedStates:
+        """Convert states to those in a checkpoint."""
         return states
 
-    def init(self, params: EnvParams) -> States:
-        """Start every seed."""
-        states: States = {}
-        for name, start in self._starts.items():
-            root = jax.random.fold_in(self._key, ARM_KEYS[name])
-            keys = [jax.random.fold_in(root, seed) for seed in range(self._seeds)]
-            states[name] = [start(key, params, self._knowledge) for key in keys]
-        return states
+    def init(self, env_params: EnvParams) -> TrainerStates:
+        """Start all seeds."""
+        return self._init_seeds(env_params)
 
-    def restart(self, states: States, params: EnvParams, stage: int = 0) -> States:
-        """Give every seed new episodes; donates the states."""
-        return {
-            name: [self._restart(name, stage)(state, params, self._knowledge) for state in seeds]
-            for name, seeds in states.items()
-        }
+    def restart(self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> TrainerStates:
+        """Start new episodes in all seeds; donates the states."""
+        new_states: TrainerStates = {}
+        for arm, arm_states in states.items():
+            restart = self._restart_function(arm, stage_index)
+            new_states[arm] = [restart(state, env_params, self._knowledge) for state in arm_states]
+        return new_states
 
-    def keep(self, states: States, scores: Mapping[str, Sequence[float]]) -> States:
-        """Keep every policy that none of its seed outscored; donates the states."""
-        return {
-            name: [
-                self._keeps[name](state, jnp.float32(score)) for state, score in zip(seeds, scores[name], strict=True)
-            ]
-            for name, seeds in states.items()
-        }
-
-    def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
-        """Do a chunk of updates; donates the states.
+    def keep_best(self, states: TrainerStates, scores: Mapping[str, Sequence[float]]) -> TrainerStates:
+        """Keep each seed's present policy as its best one, unless an earlier one scored higher; donates the states.
 
         Args:
-          states: of every seed.
-          params: the environment's.
-          stage: number of the stage, see `training.config.stage_at`.
+          states: of all seeds.
+          scores: of the present policies, by arm and seed.
+        """
+        new_states: TrainerStates = {}
+        for arm, arm_states in states.items():
+            new_states[arm] = []
+            for state, score in zip(arm_states, scores[arm], strict=True):
+                new_states[arm].append(self._keep_functions[arm](state, jnp.float32(score)))
+        return new_states
+
+    def train(
+        self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0
+    ) -> tuple[TrainerStates, SeedMetrics]:
+        """Do a chunk of updates in all seeds; donates the states.
+
+        Args:
+          states: of all seeds.
+          env_params: of the training scenes.
+          stage_index: index of the stage, see `training.config.stage_index_at`.
 
         Returns:
           The states after the chunk, and its metrics.
         """
-        tasks = [(name, seed) for seed in range(self._seeds) for name in self.learners]
-        for name in self.learners:  # one at a time: a compilation takes half a gigabyte, and two are hardly quicker
-            self._compile(name, stage, states[name], params)
-        with ThreadPoolExecutor(min(len(tasks), os.cpu_count() or 1)) as pool:
-            results = list(pool.map(lambda task: self._call(task, stage, states, params), tasks))
-        after: States = {name: [] for name in self.learners}
-        metrics: Metrics = {name: [] for name in self.learners}
-        for (name, _), (state, values) in zip(tasks, results, strict=True):
-            after[name].append(state)
-            metrics[name].append({key: float(value) for key, value in values.items()})
-        return after, metrics
+        # One arm at a time: a compilation takes half a gigabyte, and two in parallel are hardly faster.
+        train_functions = {}
+        for arm in self.learners:
+            train_functions[arm] = self._compiled_train(arm, stage_index, states[arm][0], env_params)
 
-    def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
-        """Compile the chunk of an arm, unless it is."""
-        if (name, stage) not in self._compiled:
-            learner, num_updates = self._learner(name, stage), self._chunk
+        def train_seed(job: tuple[str, int]) -> Any:
+            arm, seed = job
+            result = train_functions[arm](states[arm][seed], self._scalars[stage_index], env_params, self._knowledge)
+            return jax.block_until_ready(result)
 
-            def train(state: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
-                return learner.train(state, scalars, params, knowledge, num_updates)
+        # Seeds of all arms run in threads, as many as there are cores.
+        jobs = [(arm, seed) for seed in range(self._num_seeds) for arm in self.learners]
+        with ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as pool:
+            results = list(pool.map(train_seed, jobs))
 
-            given = states[0], self._scalars[stage], params, self._knowledge
-            lowered = jax.jit(train, donate_argnums=0).lower(*given)
-            self._compiled[name, stage] = lowered.compile()
-        return self._compiled[name, stage]
+        # Results by arm, in the order of the seeds.
+        new_states: TrainerStates = {arm: [] for arm in self.learners}
+        metrics: SeedMetrics = {arm: [] for arm in self.learners}
+        for (arm, _), (state, values) in zip(jobs, results, strict=True):
+            new_states[arm].append(state)
+            metrics[arm].append({name: float(value) for name, value in values.items()})
+        return new_states, metrics
 
-    def _call(self, task: tuple[str, int], stage: int, states: States, params: EnvParams) -> Any:
-        (name, seed), call = task, self._compiled[task[0], stage]
-        given = states[name][seed], self._scalars[stage], params, self._knowledge
-        return jax.block_until_ready(call(*given))
+    def _init_seeds(self, env_params: EnvParams) -> SeedStates:
+        """Start all seeds, each with a key of its own."""
+        seed_states: SeedStates = {}
+        for arm, init in self._init_functions.items():
+            arm_key = jax.random.fold_in(self._key, ARM_KEY_PURPOSES[arm])
+            seed_states[arm] = []
+            for seed in range(self._num_seeds):
+                seed_key = jax.random.fold_in(arm_key, seed)
+                seed_states[arm].append(init(seed_key, env_params, self._knowledge))
+        return seed_states
 
-    def _learner(self, name: str, stage: int) -> Learner:
-        """Return the learner of an arm in a stage."""
-        return dataclasses.replace(self.learners[name], stage=self._stages[stage])
+    def _stage_learner(self, arm: str, stage_index: int) -> Learner:
+        """Learner of an arm in a stage."""
+        return dataclasses.replace(self.learners[arm], stage=self._stages[stage_index])
 
-    def _restart(self, name: str, stage: int) -> Any:
-        """Return what gives an arm new episodes in a stage."""
-        if (name, stage) not in self._restarts:
-            self._restarts[name, stage] = self._restarter(self._learner(name, stage))
-        return self._restarts[name, stage]
+    def _restart_function(self, arm: str, stage_index: int) -> Any:
+        """Jitted `Learner.restart` of an arm in a stage."""
+        if (arm, stage_index) not in self._restart_functions:
+            learner = self._stage_learner(arm, stage_index)
+            self._restart_functions[arm, stage_index] = self._jit_restart(learner)
+        return self._restart_functions[arm, stage_index]
 
-    def _restarter(self, learner: Learner) -> Any:
+    def _compiled_train(self, arm: str, stage_index: int, state: LearnerState, env_params: EnvParams) -> Any:
+        """Compiled chunk of updates of an arm in a stage, for arguments like these."""
+        if (arm, stage_index) not in self._compiled:
+            learner = self._stage_learner(arm, stage_index)
+            arguments = (state, self._scalars[stage_index], env_params, self._knowledge)
+            self._compiled[arm, stage_index] = self._compile_train(learner, arguments)
+        return self._compiled[arm, stage_index]
+
+    # How a learner's functions are compiled; a trainer on several devices does it differently.
+
+    def _jit_init(self, learner: Learner) -> Any:
+        return jax.jit(learner.init)
+
+    def _jit_keep(self, learner: Learner) -> Any:
+        return jax.jit(learner.keep, donate_argnums=0)
+
+    def _jit_restart(self, learner: Learner) -> Any:
         return jax.jit(learner.restart, donate_argnums=0)
+
+    def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
+        def train(state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
+            return learner.train(state, scalars, env_params, knowledge, self._chunk_size)
+
+        return jax.jit(train, donate_argnums=0).lower(*arguments).compile()
 
 
 class ShardedTrainer(Trainer):
-    """Train on a mesh of devices.
+    """Trainer of all arms and seeds of a run on a mesh of devices.
 
-    Arm by arm, all seeds in one call; between calls the seeds of an arm stay stacked and divided among the devices.
+    Arms are trained one after the other, all seeds of an arm in one call. Between calls the states of an arm's seeds
+    stay stacked, leaves [S, ...], and sharded over the devices.
     """
 
-    def __init__(self, *arguments: Any, mesh: Mesh, **named: Any) -> None:
-        """Prepare as `Trainer`, on a mesh."""
-        super().__init__(*arguments, **named)
-        self._mesh, self._place, self._stacked = mesh, state_sharding(mesh), state_sharding(mesh, stacked=True)
-        self._key, self._scalars, self._knowledge = everywhere(mesh, (self._key, self._scalars, self._knowledge))
-        self._given: EnvParams | None = None
-        self._stack = jax.jit(
-            lambda seeds: jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds), out_shardings=self._stacked
-        )
-        self._unstack = jax.jit(
-            lambda state: [jax.tree.map(lambda leaf, i=i: leaf[i], state) for i in range(self._seeds)],
-            out_shardings=[self._place] * self._seeds,
-        )
-        for name, learner in self.learners.items():
-            self._starts[name] = jax.jit(self._learner(name, 0).init, out_shardings=self._place)
-            self._keeps[name] = jax.jit(jax.vmap(learner.keep), out_shardings=self._stacked, donate_argnums=0)
+    def __init__(self, *arguments: Any, mesh: Mesh, **keywords: Any) -> None:
+        """Prepare the trainer on a mesh; all other arguments are those of `Trainer`."""
+        self._mesh = mesh
+        self._seed_sharding = state_sharding(mesh)
+        self._stacked_sharding = state_sharding(mesh, stacked=True)
+        super().__init__(*arguments, **keywords)
+        shared_arrays = (self._key, self._scalars, self._knowledge)
+        self._key, self._scalars, self._knowledge = replicate_on_devices(mesh, shared_arrays)
+        self._local_env_params: EnvParams | None = None
 
-    def abstract(self, params: EnvParams) -> Seeds:
-        """Return shapes and devices of every seed's state."""
-        states = jax.eval_shape(super().init, params)
-        places = jax.tree.map(lambda _: self._place, states, is_leaf=lambda node: isinstance(node, LearnerState))
-        return jax.tree.map(lambda leaf, place: leaf.update(sharding=place), states, jax.tree.broadcast(places, states))
+        def stack(arm_states: list[LearnerState]) -> LearnerState:
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arm_states)
 
-    def pack(self, seeds: Seeds) -> States:
-        """Stack the seeds of every arm."""
-        return {name: self._stack(states) for name, states in seeds.items()}
+        def unstack(stacked_state: LearnerState) -> list[LearnerState]:
+            return [jax.tree.map(operator.itemgetter(seed), stacked_state) for seed in range(self._num_seeds)]
 
-    def unpack(self, states: States) -> Seeds:
-        """Copy every seed's state to all groups of devices."""
-        return {name: self._unstack(state) for name, state in states.items()}
+        self._stack = jax.jit(stack, out_shardings=self._stacked_sharding)
+        self._unstack = jax.jit(unstack, out_shardings=[self._seed_sharding] * self._num_seeds)
 
-    def init(self, params: EnvParams) -> States:
-        """Start every seed."""
-        return self.pack(super().init(self._everywhere(params)))
+    def abstract_states(self, env_params: EnvParams) -> SeedStates:
+        """Shapes, dtypes and shardings of all states in a checkpoint."""
+        abstract_states = jax.eval_shape(self._init_seeds, env_params)
 
-    def restart(self, states: States, params: EnvParams, stage: int = 0) -> States:
-        """Give every seed new episodes; donates the states."""
-        params = self._everywhere(params)
-        return {name: self._restart(name, stage)(state, params, self._knowledge) for name, state in states.items()}
+        def add_shardings(state: LearnerState) -> LearnerState:
+            shardings = jax.tree.broadcast(self._seed_sharding, state)
+            return jax.tree.map(lambda leaf, sharding: leaf.update(sharding=sharding), state, shardings)
 
-    def keep(self, states: States, scores: Mapping[str, Sequence[float]]) -> States:
-        """Keep policies; see `Trainer.keep`."""
-        return {name: self._keeps[name](state, np.array(scores[name], np.float32)) for name, state in states.items()}
+        return jax.tree.map(add_shardings, abstract_states, is_leaf=lambda node: isinstance(node, LearnerState))
 
-    def train(self, states: States, params: EnvParams, stage: int = 0) -> tuple[States, Metrics]:
-        """Do a chunk of updates of every seed; see `Trainer.train`."""
-        params = self._everywhere(params)
-        after: States = {}
-        metrics: Metrics = {}
-        for name in self.learners:
-            train = self._compile(name, stage, states[name], params)
-            after[name], values = train(states[name], self._scalars[stage], params, self._knowledge)
-            rows = jax.device_get(values)
-            metrics[name] = [{key: float(value[seed]) for key, value in rows.items()} for seed in range(self._seeds)]
-        return after, metrics
+    def pack(self, seed_states: SeedStates) -> TrainerStates:
+        """Stack the states of each arm's seeds, and divide them among groups of devices."""
+        return {arm: self._stack(arm_states) for arm, arm_states in seed_states.items()}
 
-    def _restarter(self, learner: Learner) -> Any:
-        restart = jax.vmap(learner.restart, in_axes=(0, None, None))
-        return jax.jit(restart, out_shardings=self._stacked, donate_argnums=0)
+    def unpack(self, states: TrainerStates) -> SeedStates:
+        """Unstack the states of each arm's seeds, and copy each of them to all groups of devices."""
+        return {arm: self._unstack(stacked_state) for arm, stacked_state in states.items()}
 
-    def _everywhere(self, params: EnvParams) -> EnvParams:
-        if params is not self._given:  # copied once for as long as a bank is used
-            self._given, self._placed = params, everywhere(self._mesh, params)
-        return self._placed
+    def init(self, env_params: EnvParams) -> TrainerStates:
+        """Start all seeds."""
+        return self.pack(self._init_seeds(self._replicate_env_params(env_params)))
 
-    def _compile(self, name: str, stage: int, states: Any, params: EnvParams) -> Any:
-        """Compile the chunk of an arm, unless it is."""
-        if (name, stage) in self._compiled:
-            return self._compiled[name, stage]
-        learner, num_updates = self._learner(name, stage), self._chunk
+    def restart(self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> TrainerStates:
+        """Start new episodes in all seeds; donates the states."""
+        env_params = self._replicate_env_params(env_params)
+        new_states: TrainerStates = {}
+        for arm, stacked_state in states.items():
+            restart = self._restart_function(arm, stage_index)
+            new_states[arm] = restart(stacked_state, env_params, self._knowledge)
+        return new_states
 
-        def train(states: LearnerState, scalars: PPOScalars, params: EnvParams, knowledge: Knowledge) -> Any:
-            def one(state: LearnerState) -> Any:
-                return learner.train(state, scalars, params, knowledge, num_updates)
+    def keep_best(self, states: TrainerStates, scores: Mapping[str, Sequence[float]]) -> TrainerStates:
+        """Keep each seed's present policy as its best one; see `Trainer.keep_best`."""
+        new_states: TrainerStates = {}
+        for arm, stacked_state in states.items():
+            seed_scores = np.array(scores[arm], np.float32)
+            new_states[arm] = self._keep_functions[arm](stacked_state, seed_scores)
+        return new_states
 
-            after, metrics = jax.vmap(one, spmd_axis_name=SEEDS)(states)
-            table = jnp.stack(list(metrics.values()), axis=-1)  # exchanged as one array
-            table = jax.lax.with_sharding_constraint(table, replicated(self._mesh))
-            return after, dict(zip(metrics, jnp.unstack(table, axis=-1), strict=True))
+    def train(
+        self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0
+    ) -> tuple[TrainerStates, SeedMetrics]:
+        """Do a chunk of updates in all seeds; see `Trainer.train`."""
+        env_params = self._replicate_env_params(env_params)
+        new_states: TrainerStates = {}
+        metrics: SeedMetrics = {}
+        for arm in self.learners:
+            train = self._compiled_train(arm, stage_index, states[arm], env_params)
+            new_states[arm], values = train(states[arm], self._scalars[stage_index], env_params, self._knowledge)
 
-        call = jax.jit(train, out_shardings=(self._stacked, replicated(self._mesh)), donate_argnums=0)
+            # Metrics come as one array [S] for each name.
+            arm_metrics = {name: value.tolist() for name, value in jax.device_get(values).items()}
+            metrics[arm] = [{name: row[seed] for name, row in arm_metrics.items()} for seed in range(self._num_seeds)]
+        return new_states, metrics
+
+    def _replicate_env_params(self, env_params: EnvParams) -> EnvParams:
+        """Copy parameters to all devices, once for as long as the same scenes are used."""
+        if env_params is not self._local_env_params:
+            self._local_env_params = env_params
+            self._replicated_env_params = replicate_on_devices(self._mesh, env_params)
+        return self._replicated_env_params
+
+    def _jit_init(self, learner: Learner) -> Any:
+        return jax.jit(learner.init, out_shardings=self._seed_sharding)
+
+    def _jit_keep(self, learner: Learner) -> Any:
+        return jax.jit(jax.vmap(learner.keep), out_shardings=self._stacked_sharding, donate_argnums=0)
+
+    def _jit_restart(self, learner: Learner) -> Any:
+        restart_seeds = jax.vmap(learner.restart, in_axes=(0, None, None))
+        return jax.jit(restart_seeds, out_shardings=self._stacked_sharding, donate_argnums=0)
+
+    def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
+        replicated = replicated_sharding(self._mesh)
+
+        def train(stacked_state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
+            def train_seed(state: LearnerState) -> Any:
+                return learner.train(state, scalars, env_params, knowledge, self._chunk_size)
+
+            new_state, metrics = jax.vmap(train_seed, spmd_axis_name=SEED_AXIS)(stacked_state)
+
+            # Metrics are sent between devices as one array [S, names].
+            table = jnp.stack(list(metrics.values()), axis=-1)
+            table = jax.lax.with_sharding_constraint(table, replicated)
+            return new_state, dict(zip(metrics, jnp.unstack(table, axis=-1), strict=True))
+
+        jitted_train = jax.jit(train, out_shardings=(self._stacked_sharding, replicated), donate_argnums=0)
         with jax.set_mesh(self._mesh):
-            self._compiled[name, stage] = call.lower(states, self._scalars[stage], params, self._knowledge).compile()
-        return self._compiled[name, stage]
+            return jitted_train.lower(*arguments).compile()

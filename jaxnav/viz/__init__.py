@@ -5,11 +5,11 @@ import importlib
 from jaxnav.errors import InputError
 
 
-def require_pictures() -> None:
-    """Refuse to draw where what draws is not installed.
+def require_plotting_packages() -> None:
+    """Check that the packages for drawing are installed.
 
     Raises:
-      InputError: matplotlib or pillow is missing; says how to install them.
+      InputError: matplotlib or pillow is missing; the message says how to install them.
     """
     try:
         for module in ("matplotlib.figure", "PIL.Image"):

@@ -1,65 +1,434 @@
-"""The picture of an episode, or of several side by side, moving or still."""
+"""Pictures of evaluation episodes, still or moving, at one or several layout shifts.
+
+`play_episode` plays an episode of a run or of an exported policy and returns one `PlayedEpisode` for each layout shift.
+`draw_episode` writes their picture, a GIF or a PNG with an `EpisodePanel` for each: the scene from above, the
+detections and the layout gap.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+from rich.console import Console
 
-from jaxnav.viz.panel import Episode, Panel
-from jaxnav.viz.plan import GOAL, PALE
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.evaluation.playback import EpisodeTrace
+from jaxnav.evaluation.variants import table_row
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.evaluate import find_scene, replay_episodes
+from jaxnav.runs.policies import EstimatorName, Policies, is_policy, load_policies, load_policy_as_run
+from jaxnav.runs.run import load_run_config
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift
+from jaxnav.scenes.categories import category_ids
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.tables.observation_row import RowFormat, detected_positions
+from jaxnav.scenes.tables.visibility import cell_centres
+from jaxnav.scenes.task import DONE, Task
+from jaxnav.viz.scene import draw_agent, draw_plan
+from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR, style_axes
 
-MAX_FRAMES, STEP_MS, LAST_MS, NUM_COLOURS = 60, 220, 2500, 128
-WIDTH, HEIGHT = 5.2, 6.8  # inches, of a panel
+REMOVAL_COLOR = "#E69F00"
+ACTION_PHRASES = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")
+SHIFT_CAPTIONS = {0.0: "layout as trained", 1.0: "layout shifted"}
+
+# Size of a panel, inches.
+PANEL_WIDTH = 5.2
+PANEL_HEIGHT = 6.8
+
+# Frames of a GIF.
+MAX_FRAMES = 60
+STEP_MILLISECONDS = 220
+LAST_MILLISECONDS = 2500
+NUM_COLORS = 128
+
+_MAX_DETECTIONS = 8  # bars in a panel
+
+PlayedVariant = Literal["stde", "layout", "baseline"]
 
 
-def draw_episode(episodes: Sequence[Episode], path: Path) -> None:
-    """Write the picture of an episode.
+class PlayedEpisode(NamedTuple):
+    """Episode of T steps with the data for its picture; observation rows have R bytes.
 
-    It has a panel for each layout shift, in step; a panel whose episode has ended keeps its end. Hollow stars show
-    where the goal is in the first panel. A path that ends in .gif gets a frame per step, evenly spaced ones of an
-    episode with more than 60 steps; another path gets the last frame.
+    Attributes:
+      trace: poses, actions and inference of the agent.
+      scene: scene of the episode.
+      places: float64 [T, 2], world (x, z) of the agent at each step.
+      rows: uint8 [T, R], observation rows.
+      task: categories and rules.
+      goal: index of the category to search for.
+      best_length: length L* of a shortest path.
+      epsilon: threshold of sTDE; infinite where experience is kept.
+      title: name of the agent and the scene.
+      policies: policies of the run, one of which acted.
+      shift: layout shift of the scene, from 0 to 1.
+    """
+
+    trace: EpisodeTrace
+    scene: Scene
+    places: np.ndarray
+    rows: np.ndarray
+    task: Task
+    goal: int
+    best_length: int
+    epsilon: float
+    title: str
+    policies: Policies
+    shift: float = 0.0
+
+
+# Playing an episode
+
+
+def play_episode(
+    source: str | Path,
+    split: str = "val",
+    index: int = 0,
+    variant: PlayedVariant = "stde",
+    epsilon: float = 0.5,
+    estimator: EstimatorName | None = None,
+    scenes: Path | None = None,
+    shifts: Sequence[float | None] = (None,),
+    console: Console | None = None,
+) -> list[PlayedEpisode]:
+    """Play one episode of an evaluation at every layout shift.
+
+    Room, goal and start are equal at every shift. The first seed acts, with the best action at every step. With several
+    shifts all episodes of the list are played, and the console reports how many goals are found at each shift.
 
     Args:
-      episodes: at least one; the same room, goal and start at several layout shifts.
-      path: of the picture.
+      source: directory of a finished run, folder of an exported policy, or name of a policy of the package.
+      split: scenes to play in.
+      index: index of the episode in the default list of an evaluation (of the first shard, where scenes are streamed).
+      variant: `stde` removes experience where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
+      epsilon: threshold of sTDE, at least 0.
+      estimator: layout estimator to use instead of the run's; see `Policies.with_estimator`.
+      scenes: scene file to read instead of the run's world or file.
+      shifts: layout shifts of the scenes, from 0 to 1; None for the run's.
+      console: receives messages; None for silence.
+
+    Raises:
+      InputError: no finished run and no policy, no such episode, a goal that cannot be reached at some shift, or an
+        impossible epsilon.
     """
-    first = episodes[0]
-    figure = Figure(figsize=(WIDTH * len(episodes), HEIGHT), dpi=100)
+    console = console or Console(quiet=True)
+    # The arm without layout weights acts in the variant `baseline`.
+    config, policies = _load_source(source, "baseline" if variant == "baseline" else "layout")
+    policies = policies.with_estimator(estimator)
+
+    # The episodes are drawn at the first shift; at the others only the shortest paths differ.
+    worlds = []
+    for shift in shifts:
+        worlds.append(compile_evaluation_world(config, split, scenes, shift, console))
+    episodes = draw_episodes(worlds[0].banks[0])
+    if not 0 <= index < len(episodes.goal):
+        raise InputError(f"--index {index}: give a number from 0 to {len(episodes.goal) - 1}")
+    episode_lists = [_with_shortest_paths(episodes, world) for world in worlds]
+    best_lengths = np.stack([episode_list.best_length for episode_list in episode_lists])  # [shifts, E]
+    is_reachable = best_lengths.min(axis=0) > 0
+    if not is_reachable[index]:
+        raise InputError(f"--index {index}: at some --shift the goal cannot be reached; give another")
+
+    # Play the episode alone or, to compare shifts, all episodes.
+    played_indices = np.flatnonzero(is_reachable) if len(shifts) > 1 else np.array([index])
+    gap_form = None if policies.estimator_config is None else policies.estimator_config.form
+    evaluation_row = table_row(variant, epsilon if variant == "stde" else None, gap_form, "argmax")
+    traces_by_shift = []
+    for world, episode_list in zip(worlds, episode_lists, strict=True):
+        traces_by_shift.append(replay_episodes(policies, world, episode_list.take(played_indices), evaluation_row))
+    applied_shifts = [evaluation_shift(config, scenes, shift) for shift in shifts]
+    if len(shifts) > 1:
+        success_by_shift = []
+        for traces in traces_by_shift:
+            success_by_shift.append([trace.success for trace in traces])
+        _report_success(np.array(success_by_shift), applied_shifts, console)
+
+    # Of these, return the episode that was asked for.
+    played_position = int(np.searchsorted(played_indices, index))
+    name_suffixes = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
+    agent_name = f"{policies.spec.method.name.upper()}{name_suffixes[variant]}"
+    threshold = np.inf if evaluation_row.epsilon is None else epsilon
+    played_episodes = []
+    for traces, world, episode_list, shift in zip(traces_by_shift, worlds, episode_lists, applied_shifts, strict=True):
+        trace = traces[played_position]
+        played_episodes.append(
+            _make_played_episode(trace, world, episode_list, index, threshold, agent_name, shift, policies)
+        )
+    return played_episodes
+
+
+def _load_source(source: str | Path, arm: str) -> tuple[RunConfig, Policies]:
+    """Load a run or an exported policy."""
+    if not is_policy(source):
+        config = load_run_config(Path(source))
+        return config, load_policies(config, config.arms if arm in config.arms else (arm,))
+    config, policies = load_policy_as_run(source)
+    if arm not in config.arms:
+        raise InputError(f"{source}: is a policy of the arm {config.arms[0]!r}; choose another --variant")
+    return config, policies
+
+
+def _with_shortest_paths(episodes: EpisodeList, world: CompiledWorld) -> EpisodeList:
+    """Return the episodes with the lengths L* of a world in which objects may lie elsewhere."""
+    return episodes._replace(best_length=world.banks[0].best_length[episodes.pose, episodes.goal])
+
+
+def _report_success(success: np.ndarray, shifts: Sequence[float], console: Console) -> None:
+    """Print how many of the episodes, bool [shifts, E], succeed at each shift, and at this shift alone."""
+    for i, shift in enumerate(shifts):
+        success_elsewhere = np.delete(success, i, axis=0).any(axis=0)
+        only_here = success[i] & ~success_elsewhere
+        console.print(f"shift {shift:g}: {success[i].sum()} of {success.shape[1]} found, {only_here.sum()} only there")
+
+
+def _make_played_episode(
+    trace: EpisodeTrace,
+    world: CompiledWorld,
+    episodes: EpisodeList,
+    index: int,
+    epsilon: float,
+    agent_name: str,
+    shift: float,
+    policies: Policies,
+) -> PlayedEpisode:
+    """Combine a trace with the scene and the tables of its episode."""
+    # The cell of each pose, counted from the first one of the scene, [T].
+    bank = world.banks[0]
+    scene_index = episodes.scene[index]
+    scene = find_scene(world, bank.names[scene_index])
+    visited_cells = trace.pose // bank.task.rules.poses_per_cell - bank.first_cell[scene_index]
+    return PlayedEpisode(
+        trace=trace,
+        scene=scene,
+        places=cell_centres(scene, standable_cells(scene.reach))[visited_cells],
+        rows=bank.rows[trace.pose],
+        task=bank.task,
+        goal=int(episodes.goal[index]),
+        best_length=int(episodes.best_length[index]),
+        epsilon=epsilon,
+        title=f"{agent_name}  ·  {scene.name}",
+        policies=policies,
+        shift=shift,
+    )
+
+
+# The picture
+
+
+def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
+    """Write the picture of an episode, with a panel for each layout shift.
+
+    All panels show one step at a time; a panel whose episode has ended keeps its end. Hollow stars mark where the goal
+    is in the first panel. A path that ends in .gif gets a frame per step, evenly spaced ones of an episode with more
+    than 60 steps; another path gets the last frame.
+
+    Args:
+      episodes: at least one; equal room, goal and start at several layout shifts.
+      path: file to write.
+    """
+    # Texts above and below the panels.
+    first_episode = episodes[0]
+    figure = Figure(figsize=(PANEL_WIDTH * len(episodes), PANEL_HEIGHT), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    goal, margin = first.task.categories[first.goal], 0.02 / len(episodes)
-    figure.text(margin, 0.955, f"Looking for {goal}", color=GOAL, fontsize=14, weight="bold")
-    figure.text(1 - margin, 0.012, first.title, color=PALE, fontsize=8, ha="right")
-    span = max(2, *(len(episode.trace.pose) for episode in episodes))
+    goal_name = first_episode.task.categories[first_episode.goal]
+    text_margin = 0.02 / len(episodes)
+    figure.text(text_margin, 0.955, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
+    figure.text(1 - text_margin, 0.012, first_episode.title, color=MUTED_COLOR, fontsize=8, ha="right")
+
+    # One panel for each episode, side by side.
+    max_steps = max(len(episode.trace.pose) for episode in episodes)
     width = 1 / len(episodes)
-    panels = [Panel(figure, width * i, width, episode, span) for i, episode in enumerate(episodes)]
+    panels = []
+    for number, episode in enumerate(episodes):
+        panels.append(EpisodePanel(figure, width * number, width, episode, gap_steps=max(2, max_steps)))
     for panel in panels[1:]:
-        panel.draw_elsewhere(first)
+        panel.mark_goal_of(first_episode)
 
-    last = max(len(episode.trace.pose) for episode in episodes) - 1
-    steps = range(0, last + 1, -(-(last + 1) // MAX_FRAMES)) if path.suffix == ".gif" else []
-    images = []
-    for step in [*(step for step in steps if step != last), last]:
+    # One frame for each step, or the last one alone.
+    last_step = max_steps - 1
+    is_gif = path.suffix == ".gif"
+    step_stride = -(-max_steps // MAX_FRAMES)
+    frame_steps = [*range(0, last_step, step_stride), last_step] if is_gif else [last_step]
+    frames = []
+    for step in frame_steps:
         for panel in panels:
-            panel.draw(step)
+            panel.draw_step(step)
         canvas.draw()
-        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+
+    # Only a GIF has more than one frame.
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        _write_gif(images, path)
+    if is_gif:
+        _write_gif(frames, path)
     else:
-        images[-1].save(path, optimize=True)
+        frames[-1].save(path, optimize=True)
 
 
-def _write_gif(images: list[Image.Image], path: Path) -> None:
+def _write_gif(frames: list[Image.Image], path: Path) -> None:
     """Write frames with one palette.
 
     Equal pixels stay equal from frame to frame, which keeps the file small.
     """
-    richest = max(images, key=lambda image: len(image.getcolors(2**20) or ()))
-    palette = richest.quantize(NUM_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    durations = [STEP_MS] * (len(images) - 1) + [LAST_MS]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
+    # The palette of the frame with most colors serves all frames.
+    richest_frame = max(frames, key=lambda frame: len(frame.getcolors(2**20) or ()))
+    palette = richest_frame.quantize(NUM_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette_frames = []
+    for frame in frames:
+        palette_frames.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
+
+    # The end stays longer, before the GIF starts anew.
+    frame_durations = [STEP_MILLISECONDS] * (len(frames) - 1) + [LAST_MILLISECONDS]
+    first_frame, *next_frames = palette_frames
+    first_frame.save(path, save_all=True, append_images=next_frames, duration=frame_durations, loop=0, optimize=True)
+
+
+class EpisodePanel:
+    """Panel of a figure that shows one episode, step by step."""
+
+    def __init__(
+        self, figure: Figure, panel_left: float, panel_width: float, episode: PlayedEpisode, gap_steps: int
+    ) -> None:
+        """Draw the parts that do not change: the plan of the scene and the caption.
+
+        Args:
+          figure: figure to draw in.
+          panel_left: left side of the panel, as a share of the figure.
+          panel_width: width of the panel, as a share of the figure.
+          episode: episode to draw.
+          gap_steps: number of steps on the axis of the layout gap.
+        """
+
+        def add_axes(x: float, y: float, width: float, height: float) -> Axes:
+            return figure.add_axes((panel_left + x * panel_width, y, width * panel_width, height))
+
+        # The plan fills the width; below it stand the detections and the gap.
+        self._episode = episode
+        self._gap_steps = gap_steps
+        self._moving_artists: list[Artist] = []
+        self._plan_axes = add_axes(0.02, 0.31, 0.96, 0.565)
+        self._detections_axes = add_axes(0.2, 0.075, 0.28, 0.185)
+        self._gap_axes = add_axes(0.6, 0.1, 0.35, 0.16)
+
+        # Captions: the shift on the left, the state of the episode on the right.
+        caption_text = SHIFT_CAPTIONS.get(episode.shift, f"layout shifted by {episode.shift:g}")
+        caption_left = panel_left + 0.02 * panel_width
+        figure.text(caption_left, 0.9, caption_text, color=TEXT_COLOR, fontsize=12, weight="bold")
+        self._status = figure.text(panel_left + 0.98 * panel_width, 0.9, "", fontsize=10.5, ha="right")
+        draw_plan(self._plan_axes, episode.scene, episode.task.categories, episode.goal)
+
+    def mark_goal_of(self, other: PlayedEpisode) -> None:
+        """Mark where the goal is in the scene of another episode."""
+        # A hollow star for each object of the goal's category there.
+        object_categories = np.array(category_ids(other.scene.types, other.task.categories))
+        places = other.scene.boxes[object_categories == other.goal][:, [0, 2]]
+        self._plan_axes.plot(*places.T, "*", color="none", markeredgecolor=GOAL_COLOR, markersize=13, zorder=5)
+
+    def draw_step(self, step: int) -> None:
+        """Draw a step, or the last step if the episode has ended before."""
+        last_step = len(self._episode.trace.pose) - 1
+        step = min(step, last_step)
+        text, color = describe_step(self._episode, step)
+        self._status.set(text=text, color=color, weight="bold" if step == last_step else "normal")
+
+        # Only the agent and its path move; the plan stays.
+        for artist in self._moving_artists:
+            artist.remove()
+        self._moving_artists = _draw_agent_and_path(self._plan_axes, self._episode, step)
+        _draw_detections(self._detections_axes, self._episode, step)
+        _draw_gap(self._gap_axes, self._episode, step, self._gap_steps)
+
+
+def describe_step(episode: PlayedEpisode, step: int) -> tuple[str, str]:
+    """Return a phrase for the action of a step or for the end of the episode, and its color."""
+    trace = episode.trace
+    if step < len(trace.pose) - 1:
+        return f"step {step + 1}: {ACTION_PHRASES[trace.action[step]]}", TEXT_COLOR
+    if trace.action[step] != DONE:
+        return f"out of time after {step + 1} steps", GOAL_COLOR
+    if not trace.success:
+        return f"wrong Done after {step + 1} steps", GOAL_COLOR
+    return f"found in {step + 1} steps (best: {episode.best_length})", SEEN_COLOR
+
+
+def _draw_agent_and_path(axes: Axes, episode: PlayedEpisode, step: int) -> list[Artist]:
+    """Draw the path so far, the agent, and rings around the detections."""
+    # The agent at the end of its path, over a ring at the start.
+    rules = episode.task.rules
+    place = episode.places[step]
+    _, heading, _ = rules.split_pose(episode.trace.pose[step])
+    agent = draw_agent(axes, episode.scene, rules, place, 360.0 / rules.headings * heading)
+    path = axes.plot(*episode.places[: step + 1].T, color=AGENT_COLOR, lw=2, solid_joinstyle="round", zorder=4)
+    start_style = {"color": "white", "markeredgecolor": AGENT_COLOR, "markersize": 6, "zorder": 4}
+    start_ring = axes.plot(*episode.places[0], "o", **start_style)
+
+    # Rings stand where the detector reports objects, not where they are.
+    detections = _detections_at(episode, step)
+    detected = np.flatnonzero(detections[:, 0])
+    reported_points = detected_positions(detections[detected], place, rules.heading_directions()[heading])
+    colors = [_color_of(int(category), episode) for category in detected]
+    rings = axes.scatter(*reported_points.T, s=110, facecolor="none", edgecolor=colors, lw=1.6, zorder=6)
+    return [*agent, *path, *start_ring, rings]
+
+
+def _draw_detections(axes: Axes, episode: PlayedEpisode, step: int) -> None:
+    """Draw bars of confidence, the greatest on top."""
+    # The categories with the highest confidence, of those that are detected.
+    axes.clear()
+    confidence = _detections_at(episode, step)[:, 0] / 255.0
+    by_confidence = np.argsort(-confidence)[:_MAX_DETECTIONS]
+    most_confident = by_confidence[confidence[by_confidence] > 0]
+    bar_labels = []
+    bar_colors = []
+    for category in most_confident:
+        bar_labels.append(episode.task.categories[category])
+        bar_colors.append(_color_of(int(category), episode))
+
+    # The axis has room for as many bars at every step.
+    axes.barh(range(len(most_confident)), confidence[most_confident], 0.6, color=bar_colors)
+    axes.set_yticks(range(len(most_confident)), bar_labels)
+    axes.set(xlim=(0, 1), ylim=(_MAX_DETECTIONS - 0.4, -0.6), xticks=(0, 0.5, 1))
+    axes.set_title("Detected now, confidence", loc="right", fontsize=10, color=TEXT_COLOR)
+    style_axes(axes, label_size=8.5)
+
+
+def _detections_at(episode: PlayedEpisode, step: int) -> np.ndarray:
+    return RowFormat(len(episode.task.categories)).detections(episode.rows[step])
+
+
+def _color_of(category: int, episode: PlayedEpisode) -> str:
+    return GOAL_COLOR if category == episode.goal else SEEN_COLOR
+
+
+def _draw_gap(axes: Axes, episode: PlayedEpisode, step: int, gap_steps: int) -> None:
+    """Draw the layout gap so far, on an axis of `gap_steps` steps.
+
+    The filled part above the threshold is the weight with which experience is removed.
+    """
+    # The gap, and its excess over the threshold.
+    axes.clear()
+    gap = episode.trace.gap[: step + 1]
+    epsilon = episode.epsilon
+    step_numbers = np.arange(1, step + 2)
+    if epsilon <= 1:
+        axes.axhline(epsilon, color=MUTED_COLOR, lw=1, ls=(0, (4, 3)))
+        axes.text(1.01, epsilon, "ε", color=MUTED_COLOR, va="center", transform=axes.get_yaxis_transform())
+        axes.fill_between(
+            step_numbers, epsilon, np.maximum(gap, epsilon), color=REMOVAL_COLOR, alpha=0.6, lw=0, step="mid"
+        )
+    axes.step(step_numbers, gap, where="mid", color=AGENT_COLOR, lw=1.6)
+    axes.plot(step_numbers[-1], gap[-1], "o", color=AGENT_COLOR, markersize=4.5)
+
+    # Equal axes at every step.
+    axes.set(xlim=(0.5, gap_steps + 0.5), ylim=(0, 1.02), yticks=(0, 0.5, 1))
+    axes.set_title("Layout gap D", loc="right", fontsize=10, color=TEXT_COLOR)
+    axis_label = "step" if epsilon > 1 else "step; filled: experience taken out"
+    axes.set_xlabel(axis_label, fontsize=8.5, color=MUTED_COLOR)
+    axes.locator_params(axis="x", integer=True, nbins=6)
+    style_axes(axes, label_size=8.5)

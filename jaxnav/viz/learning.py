@@ -1,4 +1,4 @@
-"""The learning curves of a run."""
+"""Learning curves of a run: success during training, and success of the exported policies within a budget."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,67 +7,92 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxnav.viz.figure import fix_placement, grid, set_title
-from jaxnav.viz.plan import INK
+from jaxnav.viz.style import TEXT_COLOR, freeze_axes_positions, make_panels, set_panel_title
 
-#: Colour of an arm's lines.
-_ARMS = {"baseline": "#D55E00", "layout": "#0072B2"}
+#: Color of the curves of each arm.
+_ARM_COLORS = {"baseline": "#D55E00", "layout": "#0072B2"}
+
+# Styles of the curves: of val episodes with best and with sampled actions, and of training scenes.
 _LINE: dict[str, Any] = {"lw": 1.4, "ms": 3.5}
-_BEST: dict[str, Any] = _LINE | {"ls": "-", "marker": "o"}
-_SAMPLED: dict[str, Any] = _LINE | {"ls": "--", "marker": "s"}
-_TRAINING: dict[str, Any] = _LINE | {"ls": ":"}
+_BEST_STYLE: dict[str, Any] = _LINE | {"ls": "-", "marker": "o"}
+_SAMPLED_STYLE: dict[str, Any] = _LINE | {"ls": "--", "marker": "s"}
+_TRAINING_STYLE: dict[str, Any] = _LINE | {"ls": ":"}
 
 
 def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] | None, title: str) -> Figure:
-    """Draw success while training, and within numbers of actions.
+    """Draw success during training, and within numbers of actions.
 
-    Left, the mean over seeds against environment steps: of training episodes, and of val episodes with best and with
-    sampled actions. Right, of the exported policies: in val scenes, and with best actions in training scenes.
+    The left panel shows the mean over seeds against environment steps: of training episodes, and of val episodes with
+    best and with sampled actions. The right panel shows the exported policies: in val scenes, and with best actions in
+    training scenes.
 
     Args:
       rows: the training log.
-      reach: success within budgets, see `Validator.reach`; None leaves the right panel out.
-      title: of the figure.
+      reach: success within budgets, see `Validator.reach`; None for no right panel.
+      title: title of the figure.
     """
-    figure, panels = grid(1, 1 if reach is None else 2, height=3.2, sharey=True)
-    arms = [arm for arm in _ARMS if any(row["arm"] == arm for row in rows)]
+    # The right panel has the budgets, if they were measured.
+    figure, panels = make_panels(1, 1 if reach is None else 2, height=3.2, sharey=True)
+    logged_arms = {row["arm"] for row in rows}
+    arms = [arm for arm in _ARM_COLORS if arm in logged_arms]
+
+    # Curves of the training log.
+    log_axes = panels[0, 0]
     for arm in arms:
-        color = {"color": _ARMS[arm]}
-        panels[0, 0].plot(*_curve(rows, arm, "success"), **color, **_TRAINING)
-        panels[0, 0].plot(*_curve(rows, arm, "val_success"), **color, **_BEST)
-        panels[0, 0].plot(*_curve(rows, arm, "val_success_sampled"), **color, **_SAMPLED)
-        if reach is not None:
-            panels[0, 1].plot(reach["budgets"], _percent(reach["val"][arm]["argmax"]), **color, **_BEST)
-            panels[0, 1].plot(reach["budgets"], _percent(reach["val"][arm]["sample"]), **color, **_SAMPLED)
-            panels[0, 1].plot(reach["budgets"], _percent(reach["train"][arm]["argmax"]), **color, **_TRAINING)
-    panels[0, 0].set(xlabel="Environment steps of a policy (million)", ylabel="SR (%)", ylim=(0, 100))
-    set_title(panels[0, 0], title, "while training")
+        color = _ARM_COLORS[arm]
+        log_axes.plot(*_mean_curve(rows, arm, "success"), color=color, **_TRAINING_STYLE)
+        log_axes.plot(*_mean_curve(rows, arm, "val_success"), color=color, **_BEST_STYLE)
+        log_axes.plot(*_mean_curve(rows, arm, "val_success_sampled"), color=color, **_SAMPLED_STYLE)
+    log_axes.set(xlabel="Environment steps of a policy (million)", ylabel="SR (%)", ylim=(0, 100))
+    set_panel_title(log_axes, title, "while training")
+
+    # Curves of the exported policies.
     if reach is not None:
-        panels[0, 1].set(xlabel="Actions")
-        set_title(panels[0, 1], "exported policies", "success within a number of actions")
-    _legend(figure, arms)
-    return fix_placement(figure)
+        reach_axes = panels[0, 1]
+        budgets = reach["budgets"]
+        for arm in arms:
+            color = _ARM_COLORS[arm]
+            reach_axes.plot(budgets, _percent(reach["val"][arm]["argmax"]), color=color, **_BEST_STYLE)
+            reach_axes.plot(budgets, _percent(reach["val"][arm]["sample"]), color=color, **_SAMPLED_STYLE)
+            reach_axes.plot(budgets, _percent(reach["train"][arm]["argmax"]), color=color, **_TRAINING_STYLE)
+        reach_axes.set(xlabel="Actions")
+        set_panel_title(reach_axes, "exported policies", "success within a number of actions")
+
+    _add_legend(figure, arms)
+    return freeze_axes_positions(figure)
 
 
-def _curve(rows: Sequence[Mapping[str, Any]], arm: str, name: str) -> tuple[list[float], list[float]]:
+def _mean_curve(rows: Sequence[Mapping[str, Any]], arm: str, name: str) -> tuple[list[float], list[float]]:
     """Return millions of steps, and the mean over seeds in percent."""
-    values: dict[int, list[float]] = {}
+    # The log has a row for each seed and step; a metric may be missing in some.
+    values_by_step: dict[int, list[float]] = {}
     for row in rows:
         if row["arm"] == arm and row.get(name) is not None:
-            values.setdefault(row["env_steps"], []).append(row[name])
-    return [steps / 1e6 for steps in values], _percent([float(np.mean(each)) for each in values.values()])
+            values_by_step.setdefault(row["env_steps"], []).append(row[name])
+
+    # One point for each step, in the order of the log.
+    million_steps = []
+    mean_values = []
+    for num_steps, seed_values in values_by_step.items():
+        million_steps.append(num_steps / 1e6)
+        mean_values.append(float(np.mean(seed_values)))
+    return million_steps, _percent(mean_values)
 
 
 def _percent(shares: Sequence[float]) -> list[float]:
     return [100.0 * share for share in shares]
 
 
-def _legend(figure: Figure, arms: Sequence[str]) -> None:
-    styles: dict[str, dict[str, Any]] = {
-        "val, best actions": _BEST,
-        "val, sampled": _SAMPLED,
-        "training scenes": _TRAINING,
+def _add_legend(figure: Figure, arms: Sequence[str]) -> None:
+    styles = {
+        "val, best actions": _BEST_STYLE,
+        "val, sampled": _SAMPLED_STYLE,
+        "training scenes": _TRAINING_STYLE,
     }
-    keys = [Line2D([], [], label=arm, color=_ARMS[arm], lw=3) for arm in arms]
-    keys += [Line2D([], [], label=name, color=INK, **style) for name, style in styles.items()]
-    figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), fontsize=8, frameon=False)
+    # Colors stand for arms, line styles for the episodes.
+    handles = []
+    for arm in arms:
+        handles.append(Line2D([], [], label=arm, color=_ARM_COLORS[arm], lw=3))
+    for style_label, line_style in styles.items():
+        handles.append(Line2D([], [], label=style_label, color=TEXT_COLOR, **line_style))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)

@@ -1,141 +1,528 @@
-"""The picture of one scene, with a view."""
+"""Pictures of scenes: the plan from above, the view from a pose, and both with a panel of numbers.
+
+`draw_scene` writes the picture of a scene, which `scene_figure` composes. `draw_plan`, `draw_plan_background` and
+`draw_agent` draw into any axes and serve the pictures of episodes and searches, too. `LabelPlacer` writes names where
+they cover little else.
+"""
 
 import dataclasses
 import io
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.path import Path as Outline
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
+from matplotlib.transforms import Affine2D
 
+from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.scene import Scene, extent, scene_size
-from jaxnav.scenes.tables.detector import PERFECT
-from jaxnav.scenes.tables.visibility import cell_centres
+from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent, scene_size
+from jaxnav.scenes.tables.compile import compile_scene
+from jaxnav.scenes.tables.observation_row import MAX_RANGE, PERFECT_DETECTOR, RowFormat, detected_positions
+from jaxnav.scenes.tables.visibility import cell_centres, cover_with_rectangles, is_opaque
 from jaxnav.scenes.task import Rules, Task
 from jaxnav.store.files import write_atomic
-from jaxnav.viz.plan import GOAL, HEIGHTS, INK, PALE, SEEN, TALL, WALL, draw_agent, draw_room
-from jaxnav.viz.view import View, view_from
+from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR
 
-DPI = 120
-# Inches: the plan is as large as fits between these sides, the panel beside it.
-_LARGEST, _NARROWEST = np.array([9.0, 8.0]), 3.0
-_PANEL, _MARGIN, _HEAD, _FOOT, _DETECTIONS = 2.9, 0.25, 0.6, 0.35, 3.15
-_LINE = 40  # characters in a line of the panel
-_LEGEND = {"frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.4, "handletextpad": 0.6}
+SCENE_DPI = 120
+
+# Colors of a plan.
+BACKGROUND_COLOR = "#f7f5f1"
+FLOOR_COLOR = "#ebe5d8"
+WALL_COLOR = "#55524d"
+ROOM_TINTS = ("#f3d9b8", "#c9e0ee", "#cbe6dc", "#eed3e2", "#f1ecb9", "#d6d4ee")  # pale colors of the palette
+
+#: Boxes are shaded by the height of their tops, from 0 m to this height in metres; higher boxes are no darker.
+FULL_SHADE_HEIGHT = 2.0
+HEIGHT_COLORMAP = LinearSegmentedColormap.from_list("height", ["#ddd5c5", "#7f7566"])
+
+_ARROW = Outline([(0, 1), (-0.75, -0.9), (0, -0.45), (0.75, -0.9), (0, 1)], closed=True)
+_PLAN_MARGIN = 0.05  # metres around the plan
+_SHARED_LABEL_DISTANCE = 1.0  # metres within which objects of one category share a label, such as burners of a stove
+
+# Composition of the picture of a scene, in inches. The plan is as large as fits, the panel stands on its right.
+_LARGEST_PLAN = np.array([9.0, 8.0])
+_NARROWEST_PLAN = 3.0
+_PANEL_WIDTH = 2.9
+_MARGIN = 0.25
+_HEADER_HEIGHT = 0.6
+_FOOTER_HEIGHT = 0.35
+_DETECTIONS_OFFSET = 3.15  # from the header to the list of detections
+_MAX_LINE_LENGTH = 40  # characters in a line of the panel
+_LEGEND_STYLE = {"frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.4, "handletextpad": 0.6}
+
+
+class PoseView(NamedTuple):
+    """Detections at one pose with a level camera.
+
+    Attributes:
+      place: float64 [2], world (x, z).
+      yaw: heading, degrees.
+      detections: distance in metres, category and world (x, z) of each detected object, the nearest first.
+    """
+
+    place: np.ndarray
+    yaw: float
+    detections: list[tuple[float, str, np.ndarray]]
+
+
+# The picture of a scene
 
 
 def draw_scene(scene: Scene, task: Task, path: Path, pose: tuple[float, float, float] | None = None) -> None:
     """Write the picture of a scene as a PNG.
 
     Args:
-      scene: what to draw.
+      scene: scene to draw.
       task: categories and rules; the view is that of a detector without errors.
-      path: the file.
-      pose: x and z in metres and heading in degrees of the level camera; None for what detects most categories.
+      path: file to write.
+      pose: x and z in metres and heading in degrees of the level camera; None for the pose that detects most
+        categories.
 
     Raises:
-      InputError: nobody can stand at the pose, or look that way.
+      InputError: the agent cannot stand at the pose, or cannot face that way.
       OSError: the file cannot be written.
     """
-    task = dataclasses.replace(task, detector=PERFECT)
-    picture = io.BytesIO()
-    scene_figure(scene, task, view_from(scene, task, pose)).savefig(picture, dpi=DPI)
-    write_atomic(path, picture.getvalue())
+    task = dataclasses.replace(task, detector=PERFECT_DETECTOR)
+    png_buffer = io.BytesIO()
+    scene_figure(scene, task, view_from_pose(scene, task, pose)).savefig(png_buffer, dpi=SCENE_DPI)
+    write_atomic(path, png_buffer.getvalue())
 
 
-def scene_figure(scene: Scene, task: Task, view: View) -> Figure:
-    """Draw a plan, a view and a panel with numbers."""
-    low, high = extent(scene)
-    plan = (high - low) * np.min(_LARGEST / (high - low))
-    detections = _detections(view)
-    width = _MARGIN + max(plan[0], _NARROWEST) + _MARGIN + _PANEL
-    height = _HEAD + max(plan[1] + _FOOT, _DETECTIONS + 0.2 * len(detections.splitlines()))
+def scene_figure(scene: Scene, task: Task, view: PoseView) -> Figure:
+    """Compose the plan of a scene, a view and a panel with numbers."""
+    # The figure is as large as the plan, the panel and the list of detections require.
+    low_corner, high_corner = scene_extent(scene)
+    plan_size = (high_corner - low_corner) * np.min(_LARGEST_PLAN / (high_corner - low_corner))
+    plan_width = max(plan_size[0], _NARROWEST_PLAN)
+    detections_text = _describe_detections(view)
+    detections_bottom = _DETECTIONS_OFFSET + 0.2 * len(detections_text.splitlines())
+    width = _MARGIN + plan_width + _MARGIN + _PANEL_WIDTH
+    height = _HEADER_HEIGHT + max(plan_size[1] + _FOOTER_HEIGHT, detections_bottom)
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    box = (_MARGIN / width, 1 - (_HEAD + plan[1]) / height, max(plan[0], _NARROWEST) / width, plan[1] / height)
-    axes = figure.add_axes(box, anchor="NW")
-    draw_room(axes, scene, task.categories)
-    marks = [*_draw_cells(axes, scene), Patch(color=WALL, label="wall"), *_draw_view(axes, scene, task.rules, view)]
+
+    # The plan with the view in it.
+    plan_bottom = 1 - (_HEADER_HEIGHT + plan_size[1]) / height
+    axes = figure.add_axes((_MARGIN / width, plan_bottom, plan_width / width, plan_size[1] / height), anchor="NW")
+    draw_plan(axes, scene, task.categories)
+    legend_handles = [
+        *_draw_cells(axes, scene),
+        Patch(color=WALL_COLOR, label="wall"),
+        *_draw_view(axes, scene, task.rules, view),
+    ]
     _draw_scale(axes)
 
-    def write(x: float, down: float, text: str, size: float, **more) -> None:
-        figure.text(x / width, 1 - down / height, text, fontsize=size, color=INK, va="top", parse_math=False, **more)
+    # The name above the plan, and the texts of the panel; places are in inches from the upper left corner.
+    def write(x: float, down: float, text: str, size: float, **style) -> None:
+        position = (x / width, 1 - down / height)
+        figure.text(*position, text, fontsize=size, color=TEXT_COLOR, va="top", parse_math=False, **style)
 
-    left = width - _PANEL
-    write(_MARGIN, 0.2, scene.name, min(14.0, 100 * (width - 2 * _MARGIN) / len(scene.name)), weight="bold")
-    write(left, _HEAD, _facts(scene, task), 9, linespacing=1.6)
-    write(left, _HEAD + _DETECTIONS, detections, 9, linespacing=1.5)
-    corner = (left / width, 1 - (_HEAD + 1.1) / height)
-    figure.legend(handles=marks, loc="upper left", bbox_to_anchor=corner, fontsize=9, labelcolor=INK, **_LEGEND)
-    _draw_heights(figure, (left / width, 1 - (_HEAD + 2.7) / height, 2.2 / width, 0.12 / height))
+    panel_left = width - _PANEL_WIDTH
+    name_size = min(14.0, 100 * (width - 2 * _MARGIN) / len(scene.name))
+    write(_MARGIN, 0.2, scene.name, name_size, weight="bold")
+    write(panel_left, _HEADER_HEIGHT, _describe_scene(scene, task), 9, linespacing=1.6)
+    write(panel_left, _HEADER_HEIGHT + _DETECTIONS_OFFSET, detections_text, 9, linespacing=1.5)
+
+    # The legend and the scale of heights between these texts.
+    figure.legend(
+        handles=legend_handles,
+        loc="upper left",
+        bbox_to_anchor=(panel_left / width, 1 - (_HEADER_HEIGHT + 1.1) / height),
+        fontsize=9,
+        labelcolor=TEXT_COLOR,
+        **_LEGEND_STYLE,
+    )
+    _draw_height_scale(figure, (panel_left / width, 1 - (_HEADER_HEIGHT + 2.7) / height, 2.2 / width, 0.12 / height))
     return figure
 
 
 def _draw_cells(axes: Axes, scene: Scene) -> list[Artist]:
     """Draw standable cells as dots and unreachable ones as crosses.
 
-    Unreachable are the cells outside the largest connected part.
+    Cells outside the largest connected part are unreachable.
     """
     cells = standable_cells(scene.reach)
-    apart = scene.reach.copy()
-    apart[tuple(cells.T)] = False
-    marks: list[Artist] = [
-        axes.scatter(*cell_centres(scene, cells).T, s=2.5, color=PALE, lw=0, zorder=3, label="standable cell")
+    dots = cell_centres(scene, cells).T
+    cell_marks: list[Artist] = [
+        axes.scatter(*dots, s=2.5, color=MUTED_COLOR, lw=0, zorder=3, label="standable cell"),
     ]
-    if apart.any():
-        crosses = cell_centres(scene, np.argwhere(apart)).T
-        marks.append(axes.scatter(*crosses, s=12, color=GOAL, marker="x", lw=0.9, zorder=3, label="cut off from those"))
-    return marks
+    is_unreachable = scene.reach.copy()
+    is_unreachable[tuple(cells.T)] = False
+    if is_unreachable.any():
+        crosses = cell_centres(scene, np.argwhere(is_unreachable)).T
+        artist_style = {"s": 12, "color": GOAL_COLOR, "marker": "x", "lw": 0.9, "zorder": 3}
+        cell_marks.append(axes.scatter(*crosses, label="cut off from those", **artist_style))
+    return cell_marks
 
 
-def _draw_view(axes: Axes, scene: Scene, rules: Rules, view: View) -> list[Artist]:
+def _draw_view(axes: Axes, scene: Scene, rules: Rules, view: PoseView) -> list[Artist]:
     """Draw the view cone, the agent and detected objects."""
     cone, _ = draw_agent(axes, scene, rules, view.place, view.yaw)
     cone.set_label("in view")
-    points = np.reshape([point for *_, point in view.seen], (-1, 2))
-    rings = axes.scatter(*points.T, s=90, facecolor="none", edgecolor=SEEN, lw=1.6, zorder=6, label="detected")
+    object_places = []
+    for _, _, object_place in view.detections:
+        object_places.append(object_place)
+
+    # A view without detections has places of shape [0, 2].
+    points = np.reshape(object_places, (-1, 2))
+    artist_style = {"s": 90, "facecolor": "none", "edgecolor": SEEN_COLOR, "lw": 1.6, "zorder": 6}
+    rings = axes.scatter(*points.T, label="detected", **artist_style)
     return [cone, rings]
 
 
 def _draw_scale(axes: Axes) -> None:
     """Draw a bar of one metre below the plan."""
-    left, down = axes.get_xlim()[0], -0.15 * axes.figure.dpi / axes.bbox.height
-    at = {"transform": axes.get_xaxis_transform(), "clip_on": False, "color": INK}
-    axes.plot([left, left + 1.0], [down, down], lw=2, solid_capstyle="butt", **at)
-    axes.text(left + 1.0, down, "  1 m", fontsize=8.5, va="center", **at)
+    bar_start = axes.get_xlim()[0]
+    down = -0.15 * axes.figure.dpi / axes.bbox.height
+    artist_style = {"transform": axes.get_xaxis_transform(), "clip_on": False, "color": TEXT_COLOR}
+    axes.plot([bar_start, bar_start + 1.0], [down, down], lw=2, solid_capstyle="butt", **artist_style)
+    axes.text(bar_start + 1.0, down, "  1 m", fontsize=8.5, va="center", **artist_style)
 
 
-def _draw_heights(figure: Figure, box: tuple[float, float, float, float]) -> None:
+def _draw_height_scale(figure: Figure, box: tuple[float, float, float, float]) -> None:
     """Draw the scale of the furniture's shades."""
-    bar = figure.add_axes(box)
-    shades = ScalarMappable(Normalize(0, TALL), HEIGHTS)
-    figure.colorbar(shades, bar, orientation="horizontal", ticks=[0, 0.5, 1, 1.5, 2]).outline.set_visible(False)
-    bar.set_title("furniture, height of its top in m", fontsize=9, color=INK, loc="left")
-    bar.tick_params(labelsize=8, labelcolor=INK, length=0)
+    axes = figure.add_axes(box)
+    shades = ScalarMappable(Normalize(0, FULL_SHADE_HEIGHT), HEIGHT_COLORMAP)
+    figure.colorbar(shades, axes, orientation="horizontal", ticks=[0, 0.5, 1, 1.5, 2]).outline.set_visible(False)
+    axes.set_title("furniture, height of its top in m", fontsize=9, color=TEXT_COLOR, loc="left")
+    axes.tick_params(labelsize=8, labelcolor=TEXT_COLOR, length=0)
 
 
-def _facts(scene: Scene, task: Task) -> str:
+def _describe_scene(scene: Scene, task: Task) -> str:
+    """Return name of the world, size, cells and objects of a scene, a line each."""
     width, depth = scene_size(scene)
-    standable, cells = len(standable_cells(scene.reach)), scene.reach.sum()
-    ids = [category for category in category_ids(scene.types, task.categories) if category >= 0]
-    lines = [
+    num_standable = len(standable_cells(scene.reach))
+    num_free = scene.reach.sum()
+
+    # Of the objects, those that have a category.
+    object_categories = np.array(category_ids(scene.types, task.categories), int)
+    object_categories = object_categories[object_categories >= 0]
+
+    # Homes have rooms, and some scenes have cells that the agent cannot reach.
+    rooms_text = f", {len(scene.rooms)} rooms" if scene.rooms else ""
+    unreachable_text = f", {num_free - num_standable} cut off" if num_free > num_standable else ""
+    text_lines = [
         f"{scene.world}: {scene.room_type.replace('_', ' ')}, {scene.split}",
-        f"{width:.1f} x {depth:.1f} m" + (f", {len(scene.rooms)} rooms" if scene.rooms else ""),
-        f"{standable} standable cells" + (f", {cells - standable} cut off" if cells > standable else ""),
-        f"{len(scene.types)} objects, {len(ids)} of {len(set(ids))} categories",
+        f"{width:.1f} x {depth:.1f} m{rooms_text}",
+        f"{num_standable} standable cells{unreachable_text}",
+        f"{len(scene.types)} objects, {len(object_categories)} of {len(np.unique(object_categories))} categories",
     ]
-    return "\n".join(line if len(line) <= _LINE else line[: _LINE - 1] + "…" for line in lines)
+    return "\n".join(map(_shorten, text_lines))
 
 
-def _detections(view: View) -> str:
-    lines = [f"{name}, {distance:.1f} m" for distance, name, _ in view.seen]
+def _shorten(line: str) -> str:
+    return line if len(line) <= _MAX_LINE_LENGTH else line[: _MAX_LINE_LENGTH - 1] + "…"
+
+
+def _describe_detections(view: PoseView) -> str:
+    """Return the pose of a view and its detections, a line each."""
     x, z = view.place
-    head = f"From x {x:g}, z {z:g}, heading {view.yaw:g}°"
-    return "\n".join([head, "is detected:" if lines else "nothing is detected.", *lines])
+    lines = [f"From x {x:g}, z {z:g}, heading {view.yaw:g}°"]
+    lines.append("is detected:" if view.detections else "nothing is detected.")
+    for distance, name, _ in view.detections:
+        lines.append(f"{name}, {distance:.1f} m")
+    return "\n".join(lines)
+
+
+# The view from a pose
+
+
+def view_from_pose(scene: Scene, task: Task, pose: tuple[float, float, float] | None = None) -> PoseView:
+    """Return the detections at a pose of a scene.
+
+    Args:
+      scene: scene to look at.
+      task: categories, rules and detector; a detector without errors reports every visible category.
+      pose: x and z in metres and heading in degrees; None for the first of the poses that detect most categories.
+
+    Raises:
+      InputError: the agent cannot stand at the pose, or cannot face that way.
+    """
+    rules = task.rules
+    row_format = RowFormat(len(task.categories))
+    centres = cell_centres(scene, standable_cells(scene.reach))
+    rows = compile_scene(scene, task).rows[:: len(rules.horizons)]  # of the level camera
+
+    # Level poses are numbered cell * H + heading.
+    if pose is None:
+        level_pose = int(row_format.presence(rows).sum(axis=1).argmax())
+    else:
+        level_pose = _find_level_pose(centres, rules, *pose)
+    cell, heading = divmod(level_pose, rules.headings)
+    place = centres[cell]
+    detections = row_format.detections(rows[level_pose])
+    reported_places = detected_positions(detections, place, rules.heading_directions()[heading])
+
+    # A detection is rounded to bytes: the object is the one nearest to where it points.
+    object_categories = np.array(category_ids(scene.types, task.categories))
+    object_places = scene.boxes[:, [0, 2]]
+    detection_list: list[tuple[float, str, np.ndarray]] = []
+    for category in np.flatnonzero(detections[:, 0]):
+        candidates = object_places[object_categories == category]
+        nearest_index = np.linalg.norm(candidates - reported_places[category], axis=1).argmin()
+        point = candidates[nearest_index]
+        distance = float(np.linalg.norm(point - place))
+        detection_list.append((distance, task.categories[category], point))
+    yaw = 360.0 / rules.headings * heading
+    return PoseView(place, yaw, sorted(detection_list, key=lambda detection: detection[0]))
+
+
+def _find_level_pose(centres: np.ndarray, rules: Rules, x: float, z: float, yaw: float) -> int:
+    """Return the number of a level pose, cell * H + heading."""
+    distance = np.linalg.norm(centres - (x, z), axis=1)
+    cell = int(np.argmin(distance))
+    if not np.abs(centres[cell] - (x, z)).max() <= CELL_SIZE / 2:
+        raise InputError(
+            f"--pose {x:g} {z:g} {yaw:g}: nobody can stand there; the nearest place is {centres[cell, 0]:g} "
+            f"{centres[cell, 1]:g}"
+        )
+    turn_angle = 360.0 / rules.headings
+    if yaw % turn_angle != 0:
+        raise InputError(f"--pose {x:g} {z:g} {yaw:g}: give a heading that is a multiple of {turn_angle:g} degrees")
+    return cell * rules.headings + int(yaw // turn_angle) % rules.headings
+
+
+# The plan
+
+
+def draw_plan(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int | None = None) -> None:
+    """Draw walls, floor, furniture and the objects of categories.
+
+    Taller boxes are darker. An object of a category is a dot with a name, an object of the category `goal` a star. The
+    rooms of a home are tinted by their types and named.
+    """
+    draw_plan_background(axes, scene, alpha=1.0)
+    labels = _draw_objects(axes, scene, categories, goal)
+    for room in scene.rooms:
+        # The name of a room stands on free floor, if there is any.
+        free_cells = room.cells & scene.reach
+        iz, ix = np.nonzero(free_cells if free_cells.any() else room.cells)
+        places = np.asarray(scene.origin) + CELL_SIZE * np.stack([ix, iz], axis=-1)
+        labels.label_area(room.type.replace("_", " "), places, WALL_COLOR)
+
+
+def draw_plan_background(axes: Axes, scene: Scene, alpha: float = 0.3) -> None:
+    """Draw walls, floor and furniture without names.
+
+    Args:
+      axes: axes to draw in, which get the limits of the plan.
+      scene: scene to draw.
+      alpha: opacity.
+    """
+    low_corner, high_corner = scene_extent(scene)
+    nz, nx = scene.reach.shape
+    corner = np.asarray(scene.origin) - CELL_SIZE / 2
+    sides = (corner[0], corner[0] + CELL_SIZE * nx, corner[1], corner[1] + CELL_SIZE * nz)
+    axes.imshow(_floor_colors(scene), origin="lower", extent=sides, interpolation="nearest", alpha=alpha)
+    _draw_boxes(axes, scene, alpha)
+
+    low_corner = low_corner - _PLAN_MARGIN
+    high_corner = high_corner + _PLAN_MARGIN
+    axes.set(
+        xlim=(low_corner[0], high_corner[0]), ylim=(low_corner[1], high_corner[1]), aspect="equal", xticks=[], yticks=[]
+    )
+    axes.set(facecolor=BACKGROUND_COLOR)
+    axes.spines[:].set_visible(False)
+    axes.apply_aspect()
+
+
+def draw_agent(axes: Axes, scene: Scene, rules: Rules, place: np.ndarray, yaw: float) -> tuple[Polygon, Line2D]:
+    """Draw the view cone, and the agent as an arrow.
+
+    Args:
+      axes: axes of the plan.
+      scene: scene whose walls and tall boxes end the cone.
+      rules: field of view and height of the camera.
+      place: float [2], world (x, z).
+      yaw: heading, degrees.
+    """
+    outline = view_cone(scene, rules, place, yaw)
+    (cone,) = axes.fill(*outline.T, color=AGENT_COLOR, alpha=0.16, lw=0, zorder=3)
+    marker = MarkerStyle(_ARROW, transform=Affine2D().rotate_deg(-yaw))
+    (arrow,) = axes.plot(*place, marker=marker, color=AGENT_COLOR, markersize=15, markeredgecolor="white", zorder=8)
+    return cone, arrow
+
+
+def view_cone(scene: Scene, rules: Rules, place: np.ndarray, yaw: float) -> np.ndarray:
+    """Return the outline of the visible floor of a level view.
+
+    The cone is 5 m deep and ends at walls and at opaque boxes as high as the camera.
+
+    Returns:
+      float64 [N, 2], world (x, z), `place` first.
+    """
+    # Points along each ray: [401 distances, 81 rays, 2].
+    ray_angles = np.deg2rad(yaw + rules.field_of_view[0] * np.linspace(-0.5, 0.5, 81))
+    ray_distances = np.linspace(0.0, MAX_RANGE, 401)
+    ray_directions = np.stack([np.sin(ray_angles), np.cos(ray_angles)], axis=-1)
+    points = place + ray_distances[:, None] * ray_directions[:, None]
+
+    # Mark the points in walls; those outside the grid are free.
+    cells = np.rint((points - scene.origin) / CELL_SIZE).astype(int)[..., ::-1]
+    last_cell = np.array(scene.walls.shape) - 1
+    iz, ix = np.moveaxis(np.clip(cells, 0, last_cell), -1, 0)
+    is_inside_grid = (cells == np.stack([iz, ix], axis=-1)).all(axis=-1)
+    is_blocked = scene.walls[iz, ix] & is_inside_grid
+
+    # Mark the points in boxes that are as high as the camera.
+    box_top = scene.boxes[:, 1] + scene.boxes[:, 4] / 2
+    for box in scene.boxes[is_opaque(scene.boxes) & (box_top >= rules.camera)]:
+        is_blocked |= (np.abs(points - box[[0, 2]]) < box[[3, 5]] / 2).all(axis=-1)
+
+    # Each ray ends at its first blocked point, or at the end of the range.
+    depth = np.where(is_blocked.any(axis=1), is_blocked.argmax(axis=1), len(ray_distances) - 1)
+    return np.concatenate([place[None], points[np.arange(len(ray_angles)), depth]])
+
+
+def _floor_colors(scene: Scene) -> np.ndarray:
+    """Return the colors of the cells, float [nz, nx, 3]; standable floor is darker than the rest."""
+    colors = np.array([to_rgb(FLOOR_COLOR), to_rgb(BACKGROUND_COLOR)])[np.where(scene.reach, 0, 1)]
+    # Types of rooms have tints in alphabetical order; furniture stands on a paler floor.
+    room_types = sorted({room.type for room in scene.rooms})
+    for room in scene.rooms:
+        room_tint = np.array(to_rgb(ROOM_TINTS[room_types.index(room.type) % len(ROOM_TINTS)]))
+        colors[room.cells & scene.reach] = room_tint
+        colors[room.cells & ~scene.reach] = (room_tint + to_rgb(BACKGROUND_COLOR)) / 2
+    colors[scene.walls] = to_rgb(WALL_COLOR)
+    return colors
+
+
+def _draw_boxes(axes: Axes, scene: Scene, alpha: float) -> None:
+    """Draw the boxes of all objects, the highest on top."""
+    x, y, z, size_x, size_y, size_z = scene.boxes.T
+    box_top = y + size_y / 2
+    by_height = np.argsort(box_top)
+    rectangle_patches = []
+    for i in by_height:
+        corner = (x[i] - size_x[i] / 2, z[i] - size_z[i] / 2)
+        rectangle_patches.append(Rectangle(corner, size_x[i], size_z[i]))
+    shades = HEIGHT_COLORMAP(np.clip(box_top[by_height] / FULL_SHADE_HEIGHT, 0.0, 1.0))
+    artist_style = {"edgecolor": "white", "linewidth": 0.7, "alpha": alpha, "zorder": 2}
+    axes.add_collection(PatchCollection(rectangle_patches, facecolor=shades, **artist_style))
+
+
+def _draw_objects(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int | None) -> "LabelPlacer":
+    """Mark and name the objects of categories, those of `goal` first."""
+    object_categories = category_ids(scene.types, categories)
+    places = scene.boxes[:, [0, 2]]
+    objects = np.flatnonzero(np.array(object_categories, int) >= 0).tolist()
+    objects.sort(key=lambda number: object_categories[number] != goal)
+
+    # Labels avoid the dots and the walls.
+    corner = np.asarray(scene.origin) - CELL_SIZE / 2
+    walls = corner + CELL_SIZE * cover_with_rectangles(scene.walls)[:, [[1, 0], [3, 2]]]
+    labels = LabelPlacer(axes, places[objects], walls, halo=BACKGROUND_COLOR)
+
+    labelled_places: dict[int, list[np.ndarray]] = {}
+    for number in objects:
+        is_goal = object_categories[number] == goal
+        marker, size, color = ("*", 15, GOAL_COLOR) if is_goal else ("o", 4, TEXT_COLOR)
+        artist_style = {"markeredgecolor": "white", "markeredgewidth": 0.7, "zorder": 6 if is_goal else 5}
+        axes.plot(places[number, 0], places[number, 1], marker, color=color, markersize=size, **artist_style)
+
+        # Objects of one category that stand together share a label.
+        same_category_places = labelled_places.setdefault(object_categories[number], [])
+        if not _is_any_near(places[number], same_category_places):
+            same_category_places.append(places[number])
+            labels.label_point(categories[object_categories[number]], places[number], color)
+    return labels
+
+
+def _is_any_near(place: np.ndarray, other_places: Sequence[np.ndarray]) -> bool:
+    """Return True if any other place [2] is so near that one label serves both."""
+    return any(np.linalg.norm(place - other) < _SHARED_LABEL_DISTANCE for other in other_places)
+
+
+class LabelPlacer:
+    """Writes names on a plan where they cover the least.
+
+    Names, dots and walls drawn so far count as covered, walls half as much as the others. Of equally good positions
+    the first is used.
+    """
+
+    def __init__(self, axes: Axes, dots: np.ndarray, walls: np.ndarray, halo: str) -> None:
+        """Register dots and walls.
+
+        Args:
+          axes: axes of the plan, with their final limits and position.
+          dots: float [N, 2], world (x, z) of the dots.
+          walls: float [M, 2, 2], low and high corner (x, z) of each wall.
+          halo: color around the letters.
+        """
+        self._axes = axes
+        self._halo = withStroke(linewidth=1.6, foreground=halo)
+        self._point_size = axes.figure.dpi / 72  # pixels
+
+        # Boxes to avoid in pixels, [N, (low, high), (x, y)], and the cost of covering a pixel of each.
+        dot_pixels = axes.transData.transform(dots.reshape(-1, 2))
+        wall_corners = axes.transData.transform(walls.reshape(-1, 2))
+        dot_boxes = dot_pixels[:, None] + 3 * self._point_size * np.array([[-1, -1], [1, 1]])
+        self._occupied_boxes = np.concatenate([dot_boxes, wall_corners.reshape(-1, 2, 2)])
+        self._costs = np.repeat([1.0, 0.5], [len(dot_boxes), len(wall_corners) // 2])
+
+    def label_point(self, name: str, place: np.ndarray, color: str) -> None:
+        """Write a name next to the dot at `place` [2]."""
+        text = self._add_text(name, color, fontsize=7)
+        size = np.array(text.get_window_extent().size)
+        width, height = size
+
+        # Candidates around the dot, the nearest first: left and right of it, below and above, then the corners.
+        label_offsets: list[tuple[float, float]] = []
+        for label_gap in self._point_size * np.array([5, 9, 14]):
+            sides = (label_gap, -label_gap - width)
+            label_offsets += [(side, -height / 2) for side in sides]
+            label_offsets += [(-width / 2, label_gap), (-width / 2, -label_gap - height)]
+            for level in (label_gap / 3, -label_gap / 3 - height):
+                label_offsets += [(side, level) for side in sides]
+        self._move_to_best(text, self._axes.transData.transform(place) + np.array(label_offsets), size)
+
+    def label_area(self, name: str, places: np.ndarray, color: str) -> None:
+        """Write the name of an area, centred on one of its places, preferably near its middle.
+
+        Args:
+          name: name to write.
+          places: float [N, 2], world (x, z) of the area.
+          color: color of the letters.
+        """
+        text = self._add_text(name, color, fontsize=9, style="italic", parse_math=False)
+        distance_to_middle = np.linalg.norm(places - places.mean(axis=0), axis=1)
+        places = places[np.argsort(distance_to_middle, kind="stable")]
+        size = np.array(text.get_window_extent().size)
+        self._move_to_best(text, self._axes.transData.transform(places) - size / 2, size)
+
+    def _add_text(self, name: str, color: str, **font) -> Text:
+        return self._axes.text(0, 0, name, color=color, va="bottom", path_effects=[self._halo], zorder=7, **font)
+
+    def _move_to_best(self, text: Text, corners: np.ndarray, size: np.ndarray) -> None:
+        """Move a text to the best of the lower left corners [N, 2], in pixels."""
+        # The cost of a position: the area that the text would cover of each occupied box.
+        text_boxes = np.stack([corners, corners + size], axis=1)
+        overlap_low = np.maximum(text_boxes[:, None, 0], self._occupied_boxes[:, 0])
+        overlap_high = np.minimum(text_boxes[:, None, 1], self._occupied_boxes[:, 1])
+        position_cost = np.prod(np.maximum(overlap_high - overlap_low, 0.0), axis=-1) @ self._costs
+
+        # The area outside the axes costs twice as much.
+        frame = self._axes.bbox
+        size_inside = np.minimum(text_boxes[:, 1], frame.max) - np.maximum(text_boxes[:, 0], frame.min)
+        position_cost += 2 * (np.prod(size) - np.prod(np.maximum(size_inside, 0.0), axis=-1))
+
+        best_index = int(np.argmin(np.round(position_cost)))
+        x, y = self._axes.transData.inverted().transform(corners[best_index])
+        text.set_position((x, y))
+        self._occupied_boxes = np.concatenate([self._occupied_boxes, text_boxes[best_index : best_index + 1]])
+        self._costs = np.append(self._costs, 1.0)

@@ -1,22 +1,25 @@
-"""Statistics of scenes as console tables."""
+"""Statistics of scenes as console tables, and remarks about scenes with unusual content."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from rich.table import Table
 
 from jaxnav.evaluation.scene_statistics import (
     SceneStatistics,
-    category_summaries,
-    pair_summaries,
-    prior_fits,
-    room_summaries,
+    fit_priors,
+    summarize_categories,
+    summarize_pairs,
+    summarize_rooms,
 )
-from jaxnav.scenes.categories import unknown_types
+from jaxnav.scenes.categories import count_unknown_types
 from jaxnav.scenes.scene import SPLITS
 from jaxnav.scenes.task import Task
 
-_PAIRS = 15
+_MAX_PAIRS = 15
+
+#: Columns of names; the other columns have numbers, aligned to the right.
+_NAME_COLUMNS = ("room type", "category", "i", "j")
 
 
 def scene_tables(
@@ -25,9 +28,9 @@ def scene_tables(
     """Build the tables of scenes by title.
 
     Args:
-      statistics: of the scenes, at least one.
-      task: categories and rules that they were counted by.
-      priors: layout priors to compare the scenes with, see `prior_fits`.
+      statistics: statistics of at least one scene.
+      task: categories and rules of these statistics.
+      priors: layout priors to compare the scenes with, see `fit_priors`.
     """
     tables = {
         "Scenes: standable cells (least, quartiles, most), and medians": _room_table(statistics),
@@ -39,62 +42,99 @@ def scene_tables(
         ),
     }
     if priors is not None:
-        tables["Layouts against the run's priors: KL in nats and cosine similarity"] = _fit_table(statistics, priors)
+        tables["Layouts against the run's priors: KL in nats and cosine similarity"] = _prior_table(statistics, priors)
     return tables
 
 
 def scene_remarks(statistics: Sequence[SceneStatistics], task: Task) -> list[str]:
     """List absent categories, unknown types and scenes without a goal."""
-    present = np.any([s.objects for s in statistics], axis=0)
-    unknown = unknown_types((s.scene for s in statistics), task.categories).most_common()
-    remarks = {
-        "Categories in no scene": [name for name, there in zip(task.categories, present, strict=True) if not there],
-        "Unknown types, which only block the sight": [f"{name} x {count}" for name, count in unknown],
-        "Scenes without a goal": [s.scene.name for s in statistics if not s.has_goal],
+    # Gather the scenes, those without a goal, and which categories occur in any of them, bool [K].
+    scenes = []
+    scenes_without_goal = []
+    is_present = np.zeros(len(task.categories), bool)
+    for scene_statistics in statistics:
+        scenes.append(scene_statistics.scene)
+        is_present |= np.asarray(scene_statistics.num_objects) > 0
+        if not scene_statistics.has_goal:
+            scenes_without_goal.append(scene_statistics.scene.name)
+    absent_categories = [task.categories[category] for category in np.flatnonzero(~is_present)]
+
+    # Objects of unknown types, the most frequent first.
+    unknown_types = []
+    for type_name, count in count_unknown_types(scenes, task.categories).most_common():
+        unknown_types.append(f"{type_name} x {count}")
+
+    # One line each, also where there is nothing to remark.
+    names_by_title = {
+        "Categories in no scene": absent_categories,
+        "Unknown types, which only block the sight": unknown_types,
+        "Scenes without a goal": scenes_without_goal,
     }
-    return [f"{what}: {', '.join(names) or 'none'}" for what, names in remarks.items()]
+    remarks = []
+    for remark_title, remark_names in names_by_title.items():
+        remarks.append(f"{remark_title}: {', '.join(remark_names) or 'none'}")
+    return remarks
 
 
 def _room_table(statistics: Sequence[SceneStatistics]) -> Table:
-    table = _table("room type", *SPLITS, "standable cells", "width x depth", "objects", "of categories")
-    for room in room_summaries(statistics):
-        cells, (width, depth) = " ".join(f"{q:.0f}" for q in room.cells), room.size
-        row = cells, f"{width:.1f} x {depth:.1f} m", f"{room.objects:g}", f"{room.known:g}"
-        _add(table, room.room_type, *map(str, room.splits), *row)
+    table = _make_table("room type", *SPLITS, "standable cells", "width x depth", "objects", "of categories")
+    for room in summarize_rooms(statistics):
+        width, depth = room.size
+        table.add_row(
+            room.room_type,
+            *map(str, room.splits),
+            _join_formatted(room.cells, ".0f"),
+            f"{width:.1f} x {depth:.1f} m",
+            f"{room.num_objects:g}",
+            f"{room.num_categorized:g}",
+        )
     return table
 
 
 def _category_table(statistics: Sequence[SceneStatistics], task: Task) -> Table:
-    table = _table("category", "in scenes", "number there", "height", "L* median", "L* p95")
-    for category in category_summaries(statistics, task):
-        row = f"{category.share:.0%}", f"{category.number:.2f}", f"{category.height:.2f} m"
-        _add(table, category.name, *row, *map(str, category.lengths or ("-", "-")))
+    table = _make_table("category", "in scenes", "number there", "height", "L* median", "L* p95")
+    for category in summarize_categories(statistics, task):
+        table.add_row(
+            category.name,
+            f"{category.share:.0%}",
+            f"{category.number:.2f}",
+            f"{category.height:.2f} m",
+            *map(str, category.path_lengths or ("-", "-")),
+        )
     return table
 
 
 def _pair_table(statistics: Sequence[SceneStatistics], task: Task) -> Table:
-    table = _table("i", "j", "P(j | i)", "P(j)", "phi")
-    for pair in pair_summaries(statistics, task, _PAIRS):
-        _add(table, pair.rarer, pair.other, f"{pair.given:.2f}", f"{pair.base:.2f}", f"{pair.phi:.2f}")
+    table = _make_table("i", "j", "P(j | i)", "P(j)", "phi")
+    for pair in summarize_pairs(statistics, task, _MAX_PAIRS):
+        pair_probabilities = (f"{pair.conditional:.2f}", f"{pair.marginal:.2f}", f"{pair.phi:.2f}")
+        table.add_row(pair.rarer, pair.other, *pair_probabilities)
     return table
 
 
-def _fit_table(statistics: Sequence[SceneStatistics], priors: np.ndarray) -> Table:
-    table = _table("room type", "scenes", "KL mean", "KL quartiles", "cosine mean", "cosine quartiles")
-    for fit in prior_fits(statistics, priors):
-        row = []
-        for values in (fit.gaps, fit.similarities) if len(fit.gaps) else ():
-            row += [f"{values.mean():.2f}", " ".join(f"{q:.2f}" for q in np.quantile(values, [0.25, 0.5, 0.75]))]
-        _add(table, fit.room_type, str(len(fit.gaps)), *row)
+def _prior_table(statistics: Sequence[SceneStatistics], priors: np.ndarray) -> Table:
+    table = _make_table("room type", "scenes", "KL mean", "KL quartiles", "cosine mean", "cosine quartiles")
+    for prior_fit in fit_priors(statistics, priors):
+        # Without scenes that can be compared, the other cells stay empty.
+        row_cells = [prior_fit.room_type, str(len(prior_fit.gaps))]
+        if len(prior_fit.gaps):
+            row_cells += _mean_and_quartiles(prior_fit.gaps)
+            row_cells += _mean_and_quartiles(prior_fit.similarities)
+        table.add_row(*row_cells)
     return table
 
 
-def _table(*columns: str) -> Table:
+def _mean_and_quartiles(fit_values: np.ndarray) -> tuple[str, str]:
+    quartiles = np.quantile(fit_values, [0.25, 0.5, 0.75])
+    return f"{fit_values.mean():.2f}", _join_formatted(quartiles, ".2f")
+
+
+def _join_formatted(numbers: Iterable[float], number_format: str) -> str:
+    return " ".join(format(number, number_format) for number in numbers)
+
+
+def _make_table(*columns: str) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
     for column in columns:
-        table.add_column(column, justify="left" if column in ("room type", "category", "i", "j") else "right")
+        table.add_column(column, justify="left" if column in _NAME_COLUMNS else "right")
     return table
-
-
-def _add(table: Table, *cells: str) -> None:
-    table.add_row(*cells)

@@ -1,99 +1,300 @@
-"""What a search with a map knew at one step of an episode, and what it meant to do."""
+"""Picture of a search with a map: the agent's map at one step, its target block and its planned path.
 
+`take_snapshot` recomputes the map and the plan of a step from a played episode, and `draw_search` draws both over the
+plan of the home. `MapProjection` converts cells of the toroidal map to places in the world.
+"""
+
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 
 from jaxnav.errors import InputError
-from jaxnav.policies.methods import Knowledge, Percept, find_method
+from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.methods.local_policy import LocalPolicy
-from jaxnav.policies.methods.map_tracker import Course, found
+from jaxnav.policies.methods.map_tracker import (
+    BLOCKS_PER_SIDE,
+    EXPLORED_BIT,
+    FREE_BIT,
+    WALL_BIT,
+    SearchState,
+    goal_on_map,
+)
 from jaxnav.policies.pathways import NO_ACTION
+from jaxnav.scenes.scene import CELL_SIZE, scene_extent
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
-from jaxnav.viz.panel import Episode
+from jaxnav.viz.episode import PlayedEpisode, describe_step
+from jaxnav.viz.scene import BACKGROUND_COLOR, LabelPlacer, draw_agent, draw_plan_background
+from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR
 
-AHEAD = 80  # actions to look ahead at most
+MAX_PREDICTED_ACTIONS = 80
+
+NEAR_COLOR = "#bcd9ea"
+FAR_COLOR = "#e6f0f6"
+OBSTACLE_COLOR = "#55524d"
+BLOCK_COLOR = "#CC79A7"
+
+_SHARED_LABEL_DISTANCE = 1.0  # metres within which marks of one category share a label
 
 
-class Search(NamedTuple):
-    """Hold a map and a plan.
+class SearchSnapshot(NamedTuple):
+    """Map and plan of an agent at one step.
 
     Attributes:
-      course: with the map, after the choice of the step; leaves are NumPy arrays.
-      planned: int32 [L, 2], cells (z, x) where the next actions lead if nothing new is seen.
+      search_state: state of the search after the choice of the step, with the map; leaves are NumPy arrays.
+      predicted_cells: int32 [L, 2], cells (z, x) after each of the next actions, if nothing new is seen.
     """
 
-    course: Course
-    planned: np.ndarray
+    search_state: SearchState
+    predicted_cells: np.ndarray
 
     @property
-    def searching(self) -> bool:
-        """Return whether the goal is not on the map."""
-        return not found(jax.tree.map(jnp.asarray, self.course))
+    def is_searching(self) -> bool:
+        """True while the goal is not on the map."""
+        return not goal_on_map(jax.tree.map(jnp.asarray, self.search_state))
 
 
-def search_at(episode: Episode, step: int) -> Search:
-    """Return the map and the plan of a step.
+def take_snapshot(episode: PlayedEpisode, step: int) -> SearchSnapshot:
+    """Return the map and the plan at a step.
 
     Args:
-      episode: as played.
-      step: from 0.
+      episode: played episode of a method that searches with a map.
+      step: step of the episode, from 0.
 
     Raises:
       InputError: the method keeps no map, or the episode has no such step.
     """
-    name, steps = episode.policies.spec.method, len(episode.trace.pose)
-    method, knowledge = find_method(name), episode.policies.knowledge
+    method = episode.policies.spec.method
+    knowledge = episode.policies.knowledge
     control = method.control
-    if not isinstance(control, LocalPolicy) or method.tracker is None:
-        raise InputError(f"--map: method {name!r} keeps no map to plan on; give a run of semexp")
-    if not 0 <= step < steps:
-        raise InputError(f"--step {step + 1}: give a number from 1 to {steps}")
     tracker = method.tracker
+    num_steps = len(episode.trace.pose)
+    if not isinstance(control, LocalPolicy) or tracker is None:
+        raise InputError(f"--map: method {method.name!r} keeps no map to plan on; give a run of semexp")
+    if not 0 <= step < num_steps:
+        raise InputError(f"--step {step + 1}: give a number from 1 to {num_steps}")
 
-    def take_in(note: Course, seen: tuple[Percept, jax.Array]) -> tuple[Course, None]:
-        percept, choice = seen
-        return control.act(choice, tracker.update(note, knowledge, percept), knowledge)[1], None
+    # Repeat the updates of the map up to the step, with the choices of the episode.
+    def update_map(state: SearchState, inputs: tuple[Percept, jax.Array]) -> tuple[SearchState, None]:
+        percept, choice = inputs
+        _, next_state = control.act(choice, tracker.update(state, knowledge, percept), knowledge)
+        return next_state, None
 
-    percepts, choices = _percepts(episode), jnp.asarray(episode.trace.inferred.corrected.argmax(axis=-1))
-    seen = jax.tree.map(lambda leaf: leaf[: step + 1], (percepts, choices))
-    course, _ = jax.jit(lambda seen: jax.lax.scan(take_in, tracker.init(knowledge), seen))(seen)
-    planned = jax.jit(lambda course: plan(control, course, choices[step], knowledge))(course)
-    return Search(jax.tree.map(np.asarray, course), np.asarray(planned))
+    choices = jnp.asarray(episode.trace.inferred.corrected.argmax(axis=-1))
+    inputs = jax.tree.map(lambda leaf: leaf[: step + 1], (_percepts(episode), choices))
+    search_state, _ = jax.jit(lambda inputs: jax.lax.scan(update_map, tracker.init(knowledge), inputs))(inputs)
+
+    # Predict the next actions with the choice of this step.
+    predict = jax.jit(lambda state: predict_path(control, state, choices[step], knowledge))
+    predicted_cells = predict(search_state)
+    return SearchSnapshot(jax.tree.map(np.asarray, search_state), np.asarray(predicted_cells))
 
 
-def plan(control: LocalPolicy, course: Course, choice: jax.Array, knowledge: Knowledge) -> jax.Array:
-    """Return where the next actions lead if nothing new is seen.
+def predict_path(control: LocalPolicy, search_state: SearchState, choice: jax.Array, knowledge: Knowledge) -> jax.Array:
+    """Return the cells that the next actions lead to, if nothing new is seen.
 
     Returns:
-      int32 [AHEAD, 2], cells (z, x).
+      int32 [MAX_PREDICTED_ACTIONS, 2], cells (z, x).
     """
-    strides, size = knowledge.method["steps"], len(course.cells)
+    strides = knowledge.method["steps"]
+    size = len(search_state.cells)
 
-    def go(body: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], jax.Array]:
-        place, heading, horizon = body
-        now = course._replace(place=place, heading=heading, horizon=horizon)
-        action = control.act(choice, now, knowledge)[0]
-        ahead = (place + strides[heading]) % size
-        turn = (action == ROTATE_RIGHT).astype(jnp.int32) - (action == ROTATE_LEFT).astype(jnp.int32)
-        tilt = (action == LOOK_DOWN).astype(jnp.int32) - (action == LOOK_UP).astype(jnp.int32)
-        place = jnp.where(action == MOVE_AHEAD, ahead, place)
-        return (place, (heading + turn) % len(strides), horizon + tilt), place
+    def move(pose: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], jax.Array]:
+        position, heading, horizon = pose
+        state = search_state._replace(position=position, heading=heading, horizon=horizon)
+        action = control.act(choice, state, knowledge)[0]
 
-    return jax.lax.scan(go, (course.place, course.heading, course.horizon), length=AHEAD)[1]
+        # Move on the toroidal map.
+        cell_ahead = (position + strides[heading]) % size
+        heading_change = (action == ROTATE_RIGHT).astype(jnp.int32) - (action == ROTATE_LEFT).astype(jnp.int32)
+        horizon_change = (action == LOOK_DOWN).astype(jnp.int32) - (action == LOOK_UP).astype(jnp.int32)
+        next_position = jnp.where(action == MOVE_AHEAD, cell_ahead, position)
+        return (next_position, (heading + heading_change) % len(strides), horizon + horizon_change), next_position
+
+    first_pose = (search_state.position, search_state.heading, search_state.horizon)
+    _, cells = jax.lax.scan(move, first_pose, length=MAX_PREDICTED_ACTIONS)
+    return cells
 
 
-def _percepts(episode: Episode) -> Percept:
-    """Return what the tracker was told, leaves [T, ...]."""
-    _, heading, horizon = episode.task.rules.split(episode.trace.pose)
-    moved = np.concatenate([[False], (np.diff(episode.places, axis=0) != 0).any(axis=1)])
+def _percepts(episode: PlayedEpisode) -> Percept:
+    """Return the inputs of the tracker in an episode, leaves [T, ...]."""
+    _, heading, horizon = episode.task.rules.split_pose(episode.trace.pose)
+    # A percept holds the action before it; the first one has none.
+    has_moved = (np.diff(episode.places, axis=0) != 0).any(axis=1)
+    earlier_actions = jnp.asarray(episode.trace.action[:-1], jnp.int32)
     return Percept(
         row=jnp.asarray(episode.rows),
         heading=jnp.asarray(heading),
-        action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), jnp.asarray(episode.trace.action[:-1], jnp.int32)]),
-        moved=jnp.asarray(moved),
+        action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), earlier_actions]),
+        moved=jnp.asarray(np.concatenate([[False], has_moved])),
         horizon=jnp.asarray(horizon),
         goal=jnp.full(len(heading), episode.goal, jnp.int32),
     )
+
+
+class MapProjection:
+    """Projection of the toroidal map of an agent onto the home.
+
+    Attributes:
+      size: cells along a side of the map.
+    """
+
+    def __init__(self, episode: PlayedEpisode, snapshot: SearchSnapshot) -> None:
+        """Place the start of the episode in the middle of the map, and the map around the middle of the home."""
+        self.size = len(snapshot.search_state.cells)
+        self._start = episode.places[0]
+        home_centre = np.mean(scene_extent(episode.scene), axis=0)
+        # Cell (z, x) of the map, not wrapped, in the middle of the home.
+        self._centre_cell = np.rint((home_centre - self._start) / CELL_SIZE).astype(int)[::-1] + self.size // 2
+
+    def unroll(self, cells: np.ndarray) -> np.ndarray:
+        """Return the map with the home in its middle."""
+        return np.roll(cells, tuple(self.size // 2 - self._centre_cell), axis=(0, 1))
+
+    def to_world(self, cells: np.ndarray) -> np.ndarray:
+        """Return the world (x, z) of map cells (z, x), float64 [..., 2]."""
+        from_centre = self._wrap(cells - self._centre_cell)
+        from_start = from_centre + self._centre_cell - self.size // 2
+        return self._start + CELL_SIZE * from_start[..., ::-1]
+
+    def path_to_world(self, cells: np.ndarray) -> np.ndarray:
+        """Return the world (x, z) of consecutive cells [L, 2], each the shorter way from the one before.
+
+        A path may lead beyond the edge of the map.
+        """
+        steps = self._wrap(np.diff(cells, axis=0))
+        from_first = np.concatenate([np.zeros((1, 2), int), np.cumsum(steps, axis=0)])
+        return self.to_world(cells[0]) + CELL_SIZE * from_first[:, ::-1]
+
+    @property
+    def borders(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom and top of the unrolled map, metres."""
+        x_low, z_low = self._start + CELL_SIZE * (self._centre_cell[::-1] - self.size) - CELL_SIZE / 2
+        return x_low, x_low + CELL_SIZE * self.size, z_low, z_low + CELL_SIZE * self.size
+
+    def _wrap(self, offsets: np.ndarray) -> np.ndarray:
+        """Return offsets between cells by the shorter way around the map."""
+        return (offsets + self.size // 2) % self.size - self.size // 2
+
+
+def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, path: Path) -> None:
+    """Write the picture of the search at a step as a PNG."""
+    figure = Figure(figsize=(9.6, 5.4), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.015, 0.03, 0.7, 0.85))
+    projection = MapProjection(episode, snapshot)
+
+    # Texts above the plan.
+    goal_name = episode.task.categories[episode.goal]
+    status_text, status_color = describe_step(episode, step)
+    figure.text(0.02, 0.945, episode.title, color=MUTED_COLOR, fontsize=9.5)
+    figure.text(0.02, 0.9, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
+    figure.text(0.98, 0.935, status_text, color=status_color, fontsize=10.5, ha="right")
+
+    # The plan of the home, faint, under the agent's map.
+    draw_plan_background(axes, episode.scene)
+    _draw_map(axes, snapshot, projection)
+    _draw_paths(axes, episode, snapshot, step, projection)
+    _draw_marks(axes, episode, snapshot, projection)
+
+    # The legend stands to the right of the plan.
+    legend_handles = _legend_handles(goal_name, snapshot.is_searching)
+    figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
+    canvas.draw()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _draw_map(axes: Axes, snapshot: SearchSnapshot, projection: MapProjection) -> None:
+    """Draw the floor and walls on the map."""
+    cells = projection.unroll(np.asarray(snapshot.search_state.cells))
+    map_image = np.zeros((*cells.shape, 4))
+    # Explored floor and walls cover floor that was only seen from afar.
+    for bits, color in ((FREE_BIT, FAR_COLOR), (FREE_BIT | EXPLORED_BIT, NEAR_COLOR), (WALL_BIT, OBSTACLE_COLOR)):
+        map_image[cells & bits == bits] = to_rgba(color)
+    axes.imshow(map_image, origin="lower", extent=projection.borders, interpolation="nearest", zorder=2.5)
+
+
+def _draw_paths(
+    axes: Axes, episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, projection: MapProjection
+) -> None:
+    """Draw the path so far, the planned path, the agent and, during the search, the target block."""
+    # The path so far, from a ring at the start.
+    search_state = snapshot.search_state
+    rules = episode.task.rules
+    axes.plot(*episode.places[: step + 1].T, color=AGENT_COLOR, lw=2, solid_joinstyle="round", zorder=4)
+    axes.plot(*episode.places[0], "o", color="white", markeredgecolor=AGENT_COLOR, markersize=6, zorder=4)
+
+    # The planned path begins at the agent.
+    planned_path = projection.path_to_world(np.stack([search_state.position, *snapshot.predicted_cells]))
+    axes.plot(*planned_path.T, ":", color=AGENT_COLOR, lw=2, zorder=4)
+    draw_agent(axes, episode.scene, rules, episode.places[step], 360.0 / rules.headings * float(search_state.heading))
+    if snapshot.is_searching:
+        _draw_block(axes, search_state, projection)
+    axes.apply_aspect()
+
+
+def _draw_block(axes: Axes, search_state: SearchState, projection: MapProjection) -> None:
+    """Draw the target block, which may lie beyond the home."""
+    block_size = projection.size // BLOCKS_PER_SIDE  # cells
+    block_side = CELL_SIZE * block_size  # metres
+    middle_cell = search_state.block_start + block_size // 2
+    _, block_middle = projection.path_to_world(np.stack([search_state.position, middle_cell]))
+    block_corner = block_middle - CELL_SIZE * (block_size // 2) - CELL_SIZE / 2
+    axes.add_patch(Rectangle(block_corner, block_side, block_side, fill=False, edgecolor=BLOCK_COLOR, lw=2.2, zorder=5))
+
+    # Widen the plan, so that it shows the whole block.
+    x_low, x_high = axes.get_xlim()
+    z_low, z_high = axes.get_ylim()
+    axes.set_xlim(min(x_low, block_corner[0] - CELL_SIZE), max(x_high, block_corner[0] + block_side + CELL_SIZE))
+    axes.set_ylim(min(z_low, block_corner[1] - CELL_SIZE), max(z_high, block_corner[1] + block_side + CELL_SIZE))
+
+
+def _draw_marks(axes: Axes, episode: PlayedEpisode, snapshot: SearchSnapshot, projection: MapProjection) -> None:
+    """Draw and name the cells in which categories were seen."""
+    # Places of each category on the map, the goal's first.
+    categories = episode.task.categories
+    places_by_category = []
+    for category in range(len(categories)):
+        marked_cells = np.argwhere(snapshot.search_state.cells & np.uint32(1 << category))
+        places_by_category.append(projection.to_world(marked_cells))
+    goal_first = sorted(range(len(categories)), key=lambda category: category != episode.goal)
+
+    no_walls = np.zeros((0, 2, 2))
+    label_placer = LabelPlacer(axes, np.concatenate(places_by_category), no_walls, halo=BACKGROUND_COLOR)
+    style = {"markeredgecolor": "white", "markeredgewidth": 0.5, "zorder": 6}
+    for category in goal_first:
+        marker, size, color = ("*", 13, GOAL_COLOR) if category == episode.goal else ("s", 4, SEEN_COLOR)
+        earlier_places: list[np.ndarray] = []
+        for place in places_by_category[category]:
+            axes.plot(*place, marker, color=color, markersize=size, **style)
+            # Marks of one category that are near each other share a label.
+            is_labelled = any(np.linalg.norm(place - other) < _SHARED_LABEL_DISTANCE for other in earlier_places)
+            if not is_labelled:
+                label_placer.label_point(categories[category], place, color)
+            earlier_places.append(place)
+
+
+def _legend_handles(goal_name: str, is_searching: bool) -> list[Patch | Line2D]:
+    """Return the entries of the legend."""
+    block_handles = [Patch(fill=False, edgecolor=BLOCK_COLOR, lw=2, label="block chosen to search in")]
+    # The target block is drawn during the search only.
+    return [
+        Patch(color=NEAR_COLOR, label="floor seen from nearby"),
+        Patch(color=FAR_COLOR, label="floor seen from afar"),
+        Patch(color=OBSTACLE_COLOR, label="walls and furniture as known"),
+        Line2D([], [], marker="s", ls="", color=SEEN_COLOR, label="a category was seen here"),
+        Line2D([], [], marker="*", ls="", color=GOAL_COLOR, markersize=12, label=f"{goal_name}, as known"),
+        *(block_handles if is_searching else []),
+        Line2D([], [], color=AGENT_COLOR, lw=2, label="way so far"),
+        Line2D([], [], color=AGENT_COLOR, lw=2, ls=":", label="way planned"),
+        Patch(facecolor=BACKGROUND_COLOR, edgecolor=MUTED_COLOR, label="faint: the home as it is"),
+    ]

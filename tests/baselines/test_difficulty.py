@@ -6,7 +6,7 @@ from support import tiny_world as tiny
 from support.scenes import HOUSES, SMALL, draw
 
 from jaxnav.baselines.difficulty import expected_length, random_success
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
 
@@ -20,7 +20,7 @@ def test_where_the_goal_is_everywhere_random_succeeds_with_its_first_done(limit)
 
 
 def test_both_are_means_over_the_episodes_that_are_drawn():
-    episodes, successor = episode_list(tiny.BANK, 6000, seed=2), tiny.BANK.successor
+    episodes, successor = draw_episodes(tiny.BANK, 6000, seed=2), tiny.BANK.successor
     lengths, random = expected_length(tiny.BANK), random_success(tiny.BANK, np.array(tiny.LIMITS))
     generator = np.random.default_rng(0)
     pose, running, success = episodes.pose, np.ones(len(episodes.pose), bool), np.zeros(len(episodes.pose), bool)
@@ -31,7 +31,7 @@ def test_both_are_means_over_the_episodes_that_are_drawn():
         running &= action != 5
         pose = successor[pose, action]
     for scene in range(2):
-        chosen = episodes.scene == scene
+        in_scene = episodes.scene == scene
         for values, expected in ((episodes.best_length, lengths[scene]), (success, random[scene])):
-            error = values[chosen].std() / np.sqrt(chosen.sum())
-            assert abs(values[chosen].mean() - expected) < 4 * error
+            error = values[in_scene].std() / np.sqrt(in_scene.sum())
+            assert abs(values[in_scene].mean() - expected) < 4 * error

@@ -8,24 +8,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, coarse_scene, draw, maze_scene
 
-from jaxnav.baselines.frontier import frontier_outcome, walk
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.baselines.frontier import frontier_walk, run_frontier_search
+from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.tables.detector import PERFECT, Detector
-from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, Detector, RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, MOVE_AHEAD, ROTATE_RIGHT, Task
 
 BLIND = Detector(miss_near=1.0, miss_far=1.0, false_alarm=0.0)
 BOOK_BEHIND = ("Book", 0.0, 0.8, -1.0, *SMALL)
 
 
-def compiled(*scenes, rules=ROOMS, detector=PERFECT):
+def compiled(*scenes, rules=ROOMS, detector=PERFECT_DETECTOR):
     return compile_bank(scenes, Task(CATEGORIES, rules=rules, detector=detector))
 
 
 def searched(bank, pose, goal=BOOK, limit=100):
     """The actions of the searcher."""
-    return [action for _, action in walk(bank, bank.successor, pose, goal, limit)]
+    return [action for _, action in frontier_walk(bank, bank.successor, pose, goal, limit)]
 
 
 def pose(cell, heading, rules=ROOMS):
@@ -33,8 +32,8 @@ def pose(cell, heading, rules=ROOMS):
 
 
 def outcome(bank, count=60, limit=200):
-    episodes = episode_list(bank, count)
-    return frontier_outcome(bank, episodes, np.full(len(bank.names), limit)), episodes
+    episodes = draw_episodes(bank, count)
+    return run_frontier_search(bank, episodes, np.full(len(bank.names), limit)), episodes
 
 
 def test_it_walks_straight_to_what_it_sees():
@@ -101,9 +100,9 @@ def test_a_single_false_alarm_is_not_believed():
 
 def test_done_at_the_step_limit_counts():
     bank = compiled(draw([".###"] + ["####"] * 3, BOOK_BEHIND))
-    episodes = episode_list(bank, 1)._replace(pose=np.array([pose(0, 0)], np.int32))
+    episodes = draw_episodes(bank, 1)._replace(pose=np.array([pose(0, 0)], np.int32))
     for limit, success in ((6, True), (5, False)):
-        result = frontier_outcome(bank, episodes, np.array([limit]))
+        result = run_frontier_search(bank, episodes, np.array([limit]))
         assert (bool(result.success[0]), int(result.length[0])) == (success, limit)
 
 
@@ -124,7 +123,7 @@ def test_it_knows_only_what_it_perceives(seed, start, goal):
     stripped = alone._replace(
         rows=rows, best_length=0 * alone.best_length, goal_distance=0 * alone.goal_distance, ahead=0 * alone.ahead
     )
-    assert [action for _, action in walk(stripped, alone.successor, start, goal, 100)] == actions
+    assert [action for _, action in frontier_walk(stripped, alone.successor, start, goal, 100)] == actions
 
 
 @settings(max_examples=20)
@@ -132,8 +131,8 @@ def test_it_knows_only_what_it_perceives(seed, start, goal):
 def test_it_never_walks_in_vain(seed, rules):
     scene = maze_scene(seed)
     bank = compiled(dataclasses.replace(scene, types=("Book",) * len(scene.types)), rules=rules, detector=BLIND)
-    steps = list(walk(bank, bank.successor, 0, CHAIR, 150))
-    cells = [at // rules.poses_per_cell for at, _ in steps]
+    steps = list(frontier_walk(bank, bank.successor, 0, CHAIR, 150))
+    cells = [pose // rules.poses_per_cell for pose, _ in steps]
     assert all(
         (after != before) == (action == MOVE_AHEAD)
         for before, after, (_, action) in zip(cells[:-1], cells[1:], steps[:-1], strict=True)

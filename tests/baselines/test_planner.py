@@ -5,15 +5,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, FRIDGE, ROOMS, SMALL, coarse_scene, draw, maze_scene
 
-from jaxnav.baselines.layout_model import detection_counts, detection_rates, flat
-from jaxnav.baselines.planner import Home, search, shortest_ways
+from jaxnav.baselines.layout_model import detection_counts, detection_rates, uniform_layout_model
+from jaxnav.baselines.planner import PlannerScene, search_for_goal, shortest_paths
 from jaxnav.baselines.sites import find_sites
-from jaxnav.scenes.lattice import best_lengths, successors
+from jaxnav.scenes.lattice import best_lengths, pose_successors
 from jaxnav.scenes.tables.compile import compile_scene
-from jaxnav.scenes.tables.detector import PERFECT
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.task import Task
 
-FLAT = flat(len(CATEGORIES))
+FLAT = uniform_layout_model(len(CATEGORIES))
 #: An alley with a chamber at either end; a wall hides most of each from the alley.
 ALLEY = ["...##########...", "................", "...##########..."]
 WALLS = [(z, x) for z in (0, 2) for x in range(3, 13)]
@@ -21,39 +21,39 @@ CLUES = (("Fridge", 0.25, 0.9, 0.5, 0.2, 0.2, 0.2), ("Chair", 3.5, 0.5, 0.5, 0.2
 
 
 def home_of(scene, rules=ROOMS):
-    task = Task(CATEGORIES, rules=rules, detector=PERFECT)
+    task = Task(CATEGORIES, rules=rules, detector=PERFECT_DETECTOR)
     table = compile_scene(scene, task)
-    return Home(find_sites(scene, task, table.rows), successors(table.ahead, rules), table.best_length)
+    return PlannerScene(find_sites(scene, task, table.rows), pose_successors(table.ahead, rules), table.best_length)
 
 
 def searched(home, pose, goal=BOOK, model=FLAT, limit=200):
-    return search(home, detection_rates(detection_counts(home.sites)), model, goal, pose, limit)
+    return search_for_goal(home, detection_rates(detection_counts(home.sites)), model, goal, pose, limit)
 
 
 def test_it_walks_the_shortest_way_to_what_it_sees():
     home = home_of(draw(["."] * 10, ("Book", 0.0, 0.8, 3.0, *SMALL)))
-    found = searched(home, pose=0)
-    assert (found.length, found.success) == (home.best_length[0, BOOK], True)
-    assert found.glimpses == []  # detected before it had to choose
+    search = searched(home, pose=0)
+    assert (search.length, search.success) == (home.best_length[0, BOOK], True)
+    assert search.snapshots == []  # detected before it had to choose
 
 
 def test_it_turns_round():
     # One cell, the book 1 m behind: in view from 135 degrees on, after three turns to either side; then Done.
-    found = searched(home_of(draw([".###"] + ["####"] * 3, ("Book", 0.0, 0.8, -1.0, *SMALL))), pose=0)
-    assert (found.length, found.success) == (4, True)
+    search = searched(home_of(draw([".###"] + ["####"] * 3, ("Book", 0.0, 0.8, -1.0, *SMALL))), pose=0)
+    assert (search.length, search.success) == (4, True)
 
 
 def test_it_ends_at_the_limit():
     # The book is behind a wall for good.
     scene = draw(["....", "####", "####"], ("Book", 0.25, 0.8, 0.5, *SMALL), walls=[(1, x) for x in range(4)])
-    found = searched(home_of(scene), pose=0, limit=30)
-    assert (found.length, found.success) == (30, False)
-    assert len(found.glimpses) == 5  # after 0, 1, 3, 7 and 15 actions
+    search = searched(home_of(scene), pose=0, limit=30)
+    assert (search.length, search.success) == (30, False)
+    assert len(search.snapshots) == 5  # after 0, 1, 3, 7 and 15 actions
 
 
 def test_it_gives_up_where_all_poses_are_taken():
-    found = searched(home_of(draw([".###"] + ["####"] * 3, ("Chair", 0.5, 0.8, 0.5, *SMALL))), pose=0)
-    assert (found.length, found.success) == (200, False)
+    search = searched(home_of(draw([".###"] + ["####"] * 3, ("Chair", 0.5, 0.8, 0.5, *SMALL))), pose=0)
+    assert (search.length, search.success) == (200, False)
 
 
 def test_a_belief_leads_to_the_clue_it_trusts():
@@ -63,10 +63,10 @@ def test_a_belief_leads_to_the_clue_it_trusts():
     middle = 10  # of the second row, after the six cells of the first one
     trusting = {}
     for clue in (FRIDGE, CHAIR):
-        relation = np.zeros_like(FLAT.relation)
+        relation = np.zeros_like(FLAT.relation_weights)
         relation[BOOK, clue] = 4.0
         trusting[clue] = [
-            searched(home, (middle + 3) * 16 + 2 * heading, model=FLAT._replace(relation=relation)).length
+            searched(home, (middle + 3) * 16 + 2 * heading, model=FLAT._replace(relation_weights=relation)).length
             for heading in range(8)
         ]
     assert np.mean(trusting[FRIDGE]) + 4 < np.mean(trusting[CHAIR])
@@ -79,10 +79,10 @@ def test_it_knows_nothing_that_it_has_not_seen(seed, rules):
     home = home_of(maze_scene(seed), rules)
     sites = home.sites
     rates = detection_rates(detection_counts(sites))
-    hidden = np.where(sites.seen >= 0, home.best_length, 7)
-    blind = home._replace(sites=sites._replace(objects=~sites.objects), best_length=hidden)
+    hidden = np.where(sites.detected_site >= 0, home.best_length, 7)
+    blind = home._replace(sites=sites._replace(object_sites=~sites.object_sites), best_length=hidden)
     for goal in range(len(CATEGORIES)):
-        a, b = (search(one, rates, FLAT, goal, 0, 40) for one in (home, blind))
+        a, b = (search_for_goal(one, rates, FLAT, goal, 0, 40) for one in (home, blind))
         assert (a.length, a.success) == (b.length, b.success)
 
 
@@ -90,14 +90,14 @@ def test_it_knows_nothing_that_it_has_not_seen(seed, rules):
 @given(seed=st.integers(0, 999))
 def test_a_glimpse_holds_every_look_once(seed):
     home = home_of(maze_scene(seed))
-    found = searched(home, pose=0, goal=FRIDGE, limit=40)
-    for before, after in zip(found.glimpses, found.glimpses[1:], strict=False):
-        assert (before.looks <= after.looks).all()
+    search = searched(home, pose=0, goal=FRIDGE, limit=40)
+    for before, after in zip(search.snapshots, search.snapshots[1:], strict=False):
+        assert (before.look_counts <= after.look_counts).all()
         assert (before.features <= after.features).all()
-    if found.glimpses:
-        site, look = home.sites.views.at(0)
-        assert found.glimpses[0].looks.sum() == len(site)
-        assert found.glimpses[0].looks[look, site].all()
+    if search.snapshots:
+        site, look = home.sites.views.from_pose(0)
+        assert search.snapshots[0].look_counts.sum() == len(site)
+        assert search.snapshots[0].look_counts[look, site].all()
 
 
 @settings(max_examples=10, deadline=None)
@@ -107,7 +107,7 @@ def test_ways_are_as_long_as_the_table_says(seed, rules):
     successor = home_of(coarse_scene(seed), rules).successor
     targets = np.random.default_rng(seed).integers(len(successor), size=5)
     lengths = best_lengths(successor, np.arange(len(successor))[:, None] == targets)
-    ways, before = shortest_ways(successor, 0)
+    ways, before = shortest_paths(successor, 0)
     np.testing.assert_array_equal(ways[targets] + 1, lengths[0])
     reached = np.flatnonzero(ways > 0)
     assert (successor[before[reached]] == reached[:, None]).any(axis=1).all()

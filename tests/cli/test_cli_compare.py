@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from support.commands import CONFIG, contents, evaluate, refusal
 
-from jaxnav.cli import compare as command
+from jaxnav.cli import study as command
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.study import compare
-from jaxnav.study.compare_report import Line, Scores, Training
-from jaxnav.study.document import READING
+from jaxnav.study.document import READING_MARK
+from jaxnav.study.records import AgentScores, RunScores, TrainingSummary
 
 OWN = ("method: ", "method_sizes: ")  # every run has its own, or one method alone has them
 BASE = "".join(f"  {line}\n" for line in CONFIG.strip().splitlines() if not line.startswith(OWN))
@@ -34,23 +34,23 @@ def run(folder, *options):
     config.write_text(COMPARE)
     places = {"results": "results", "document": "docs/table.md", "runs": "runs"}
     given = [part for name, place in places.items() for part in (f"--{name}", str(folder / place))]
-    return command.main(["--config", str(config), *given, *map(str, options)])
+    return command.compare_main(["--config", str(config), *given, *map(str, options)])
 
 
 def tables(folder):
     """Return the cells of the document's rows, by section and first cell."""
-    found = {}
+    results = {}
     for section in (folder / "docs" / "table.md").read_text().split("### ")[1:]:
         title, *lines = section.splitlines()
         rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
-        found.setdefault(title, {row[0]: row[1:] for row in rows})  # of the first world
-    return found
+        results.setdefault(title, {row[0]: row[1:] for row in rows})  # of the first world
+    return results
 
 
 def agent(variant, decoding, successes):
     """Return a line of two seeds that succeed so often in each of three scenes of four episodes."""
     sums = np.tile(np.array(successes, float), (2, 1))
-    return Line(variant, decoding, sr=sums, spl=sums / 2.0, dts=4.0 - sums)
+    return AgentScores(variant, decoding, sr=sums, spl=sums / 2.0, dts=4.0 - sums)
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def steps(monkeypatch):
     def drawn(name, lines, training=None):
         names.append(name)
         scenes = ("a", "b", "c")
-        return Scores(scenes, ("Kitchen",) * 3, np.array([4, 4, 4]), tuple(lines), training)
+        return RunScores(scenes, ("Kitchen",) * 3, np.array([4, 4, 4]), tuple(lines), training)
 
     def frontier(config, shared, console):
         return drawn(
@@ -75,10 +75,10 @@ def steps(monkeypatch):
             lines += [agent(arm, decoding, (1, 2, 2 + more)) for arm in entry.run.arms]
             lines += [agent("stde", decoding, (1, 3, 3))] * ("layout" in entry.run.arms)
         budget = {"exploration": 1280, "imitation": 0, "learning": 512}
-        return drawn(entry.name, lines, Training(budget, 90.0, (10.0, 12.5), ("Note of all.",)))
+        return drawn(entry.name, lines, TrainingSummary(budget, 90.0, (10.0, 12.5), ("Note of all.",)))
 
     monkeypatch.setattr(compare, "measure_frontier", frontier)
-    monkeypatch.setattr(compare, "measure_entry", entry)
+    monkeypatch.setattr(compare, "measure_run", entry)
     return names
 
 
@@ -87,7 +87,7 @@ def steps(monkeypatch):
 def test_the_numbers_of_the_document_are_those_of_an_evaluation(tmp_path):
     options = ("--worlds", "{near: {}}", "--methods", "org", "--ablations", "{}")
     assert run(tmp_path, *options) == 0
-    found, target = tables(tmp_path), tmp_path / "eval.json"
+    results, target = tables(tmp_path), tmp_path / "eval.json"
     agents = {"fused": "`org`", "streams": "`org`, streams"}
     names = {"baseline": "", "layout": " + w", "stde": " + w + sTDE"}
     for decision, name in agents.items():
@@ -98,17 +98,19 @@ def test_the_numbers_of_the_document_are_those_of_an_evaluation(tmp_path):
         rows = [row for row in report["rows"] if row["variant"] in titles]
         assert len(rows) == (8 if decision == "fused" else 6)
         for row in rows:
-            section = found[f"Success, {'sampled' if row['decoding'] == 'sample' else 'best'} actions"]
+            section = results[f"Success, {'sampled' if row['decoding'] == 'sample' else 'best'} actions"]
             cells = [
                 f"{Interval.from_json(row[metric]):.{digits}f}"
                 for metric, digits in zip(("sr", "spl", "dts"), (1, 1, 2), strict=True)
             ]
             assert section[titles[row["variant"]]] == cells
-        for each in report["differences"]:
-            if each["metric"] == "sr" and each["to"] in names:
-                section = found[f"Improvements, {'sampled' if each['decoding'] == 'sample' else 'best'} actions"]
-                title = f"{name}{names[each['to']]} over {name}{names[each['from']]}"
-                assert section[title][0] == f"{Interval.from_json(each):+z.1f}"
+        for difference in report["differences"]:
+            if difference["metric"] == "sr" and difference["to"] in names:
+                section = results[
+                    f"Improvements, {'sampled' if difference['decoding'] == 'sample' else 'best'} actions"
+                ]
+                title = f"{name}{names[difference['to']]} over {name}{names[difference['from']]}"
+                assert section[title][0] == f"{Interval.from_json(difference):+z.1f}"
     # Again: nothing is done anew.
     before = contents(tmp_path)
     assert run(tmp_path, *options) == 0
@@ -132,7 +134,7 @@ def test_the_papers_tables_stand_beside_all_results_of_the_folder(steps, tmp_pat
 def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
     assert run(tmp_path) == 0
     assert steps == PARTS
-    text, found = (tmp_path / "docs" / "table.md").read_text(), tables(tmp_path)
+    text, results = (tmp_path / "docs" / "table.md").read_text(), tables(tmp_path)
     assert "2 seeds of each policy" in text
     assert "512 in near, 512 in far. 24 episodes in each world, of the split `val`" in text
     assert "Not finished" not in text
@@ -141,9 +143,9 @@ def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
     runs = ["`org`", "`org` + w", "`org` + w + sTDE", "`org`, streams + w", "`org`, streams + w + sTDE"]
     rows = [*runs, *(name.replace("org", "rgb") for name in runs)]
     for name in ("best", "sampled"):
-        section = found[f"Success, {name} actions"]
+        section = results[f"Success, {name} actions"]
         assert list(section)[2:] == ["Random", "Frontier search", "`anonymous`", *rows]
-        improved = found[f"Improvements, {name} actions"]
+        improved = results[f"Improvements, {name} actions"]
         assert list(improved)[2:] == [
             "`org` over `anonymous`",
             "`org` + w over `org`",
@@ -154,10 +156,10 @@ def test_the_document_holds_every_agent_and_every_improvement(steps, tmp_path):
             "`org`, streams + w + sTDE over `org` + w + sTDE",
             *(f"{one} over {one.replace('org', 'rgb')}" for one in runs),
         ]
-    assert found["Success, best actions"]["`org` + w"][0].startswith("41.7 [")
-    assert found["Improvements, best actions"]["`org` + w + sTDE over `org` + w"][0].startswith("+16.7 [")
-    assert found["Improvements, best actions"]["`org`, streams + w over `org` + w"][2].startswith("-0.08 [")
-    assert found["What the runs took"]["`org`, streams"] == ["1,280", "0", "512", "1.5", "10.0 → 12.5"]
+    assert results["Success, best actions"]["`org` + w"][0].startswith("41.7 [")
+    assert results["Improvements, best actions"]["`org` + w + sTDE over `org` + w"][0].startswith("+16.7 [")
+    assert results["Improvements, best actions"]["`org`, streams + w over `org` + w"][2].startswith("-0.08 [")
+    assert results["What the runs took"]["`org`, streams"] == ["1,280", "0", "512", "1.5", "10.0 → 12.5"]
 
 
 def test_runs_are_left_out_by_their_names_and_the_document_says_so(steps, tmp_path):
@@ -173,11 +175,11 @@ def test_random_choices_stand_beside_the_method_that_makes_them(steps, tmp_path)
     """1 of 12 episodes against 5; no method here chooses actions, so there are no random ones."""
     only = ("--methods", "semexp", "--ablations", "{}", "--worlds", "{near: {}}", "--decisions", "fused")
     assert run(tmp_path, *only) == 0
-    found = tables(tmp_path)
+    results = tables(tmp_path)
     rows = ["`semexp`", "`semexp` + w", "`semexp` + w + sTDE", "`semexp`, random choices"]
-    assert list(found["Success, best actions"])[2:] == ["Frontier search", *rows]
-    assert found["Success, best actions"][rows[-1]][0].startswith("8.3 [")
-    improved = found["Improvements, best actions"]
+    assert list(results["Success, best actions"])[2:] == ["Frontier search", *rows]
+    assert results["Success, best actions"][rows[-1]][0].startswith("8.3 [")
+    improved = results["Improvements, best actions"]
     # By scene 1 - 0, 2 - 1 and 2 - 0 of four: all runs are alike, so their number does not widen the interval.
     assert improved["`semexp` over `semexp`, random choices"][0].startswith("+33.3 [")
     assert "`semexp` + w + sTDE over `semexp`, random choices" in improved
@@ -193,7 +195,9 @@ def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path, caps
 
     assert again() == PARTS
     document = tmp_path / "docs" / "table.md"
-    document.write_text(document.read_text().replace(f"{READING}\n\n{READING}", f"{READING}\nBy hand.\n{READING}"))
+    document.write_text(
+        document.read_text().replace(f"{READING_MARK}\n\n{READING_MARK}", f"{READING_MARK}\nBy hand.\n{READING_MARK}")
+    )
     before = contents(tmp_path)
     assert "were there already" not in capsys.readouterr().err
     assert again() == []
@@ -212,20 +216,20 @@ def test_only_what_is_missing_or_of_other_settings_is_done(steps, tmp_path, caps
 
 
 def test_an_interrupted_comparison_says_so_and_goes_on(steps, tmp_path, monkeypatch):
-    measure = compare.measure_entry
+    measure = compare.measure_run
 
     def interrupted(config, entry, console):
         if entry.name == "near-org-streams":
             raise KeyboardInterrupt
         return measure(config, entry, console)
 
-    monkeypatch.setattr(compare, "measure_entry", interrupted)
+    monkeypatch.setattr(compare, "measure_run", interrupted)
     assert run(tmp_path) == 130
     text = (tmp_path / "docs" / "table.md").read_text()
     assert "**Not finished:** 8 of 10 runs are missing." in text
     assert "## near" in text
     assert "## far" not in text
-    monkeypatch.setattr(compare, "measure_entry", measure)
+    monkeypatch.setattr(compare, "measure_run", measure)
     steps.clear()
     assert run(tmp_path) == 0
     assert steps == PARTS[4:]

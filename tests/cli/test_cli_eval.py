@@ -12,10 +12,10 @@ import pytest
 from support.commands import SEEDS, contents, evaluate, finished_run, refusal
 from support.records import resigned
 
-from jaxnav.cli.eval import EvalConfig, _target
+from jaxnav.cli.eval import EvalConfig, _find_target
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.scenes.files.scene_file import write_scenes
-from jaxnav.scenes.worlds import generated
+from jaxnav.scenes.worlds import make_generated_scenes
 
 
 @pytest.fixture(scope="module")
@@ -190,14 +190,16 @@ def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
     shutil.copytree(run_dir, run)
     with resigned(run / "config.json") as config:
         config["worlds"]["shift"] = 0.5  # of the run's own scenes; a file is taken as it is
-    write_scenes(file, (generated("rooms", "val")[i] for i in range(2)))
-    told = {}
+    write_scenes(file, (make_generated_scenes("rooms", "val")[i] for i in range(2)))
+    outputs = {}
     for shift, options in ((0.0, ()), (1.0, ("--shift", 1))):
         target = tmp_path / f"{shift}.json"
         assert evaluate(run, "--episodes", 40, "--scenes", file, "--json", target, *options) == 0
         assert json.loads(target.read_text())["run"]["evaluation_shift"] == shift
-        told[shift] = [(row["scene"], row["goal"], row["start_pose"], row["best_length"]) for row in _episodes(target)]
-    assert told[0.0] != told[1.0]
+        outputs[shift] = [
+            (row["scene"], row["goal"], row["start_pose"], row["best_length"]) for row in _episodes(target)
+        ]
+    assert outputs[0.0] != outputs[1.0]
     capsys.readouterr()
     assert evaluate(run, "--shift", 1.5, "--scenes", file) == 2
     assert "layout shift: seed 0, shift 1.5; give" in refusal(capsys)
@@ -206,7 +208,7 @@ def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
 def test_a_world_and_a_file_of_its_name_have_reports_of_their_own():
     run, file = Path("run"), Path("elsewhere/rooms.jsonl.gz")
     configs = [EvalConfig(run), EvalConfig(run, world="rooms"), EvalConfig(run, scenes=file)]
-    names = [str(_target(config)) for config in configs]
+    names = [str(_find_target(config)) for config in configs]
     assert names == ["run/eval-val.json", "run/eval-rooms-val.json", "run/eval-scenes-rooms-val.json"]
 
 
@@ -218,7 +220,7 @@ def test_a_policy_of_a_file_is_evaluated_in_a_generated_world(run_dir, tmp_path,
     with resigned(run / "config.json") as config:
         config["scenes"] = str(file)
         config["worlds"]["shift"] = 0.5  # of the scenes of the file
-    write_scenes(file, (generated("rooms", "val", seed=1)[i] for i in range(2)))
+    write_scenes(file, (make_generated_scenes("rooms", "val", seed=1)[i] for i in range(2)))
     assert evaluate(run, "--episodes", 8, "--world", "rooms") == 0
     rooms, own = (json.loads((run / name).read_text()) for name in ("eval-rooms-val.json", "eval-val.json"))
     assert rooms["rows"] == own["rows"]

@@ -13,14 +13,14 @@ from support.records import resigned
 
 from jaxnav import __main__ as commands
 from jaxnav.baselines.difficulty import expected_length, random_success
-from jaxnav.baselines.frontier import frontier_outcome
-from jaxnav.cli.instrument import main
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.baselines.frontier import run_frontier_search
+from jaxnav.cli.study import instrument_main
+from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import ROOMS
-from jaxnav.scenes.worlds import generated, shifted
-from jaxnav.study.instrument_report import MEASURES
+from jaxnav.scenes.worlds import make_generated_scenes, shift_scenes
+from jaxnav.study.records import MEASURES
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def run_dir(tmp_path_factory):
 
 
 def instrument(*options):
-    return main([*map(str, options)])
+    return instrument_main([*map(str, options)])
 
 
 @pytest.mark.slow
@@ -51,10 +51,10 @@ def test_the_report_holds_what_is_measured_at_every_shift(run_dir, capsys):
     for column in report["shifts"]:
         assert (column["scenes"], column["episodes"]) == (4, 12)
         # Three episodes in each scene: means over scenes are means over episodes.
-        scenes = shifted(generated("rooms", "val", 4), ROOMS, column["shift"])
+        scenes = shift_scenes(make_generated_scenes("rooms", "val", 4), ROOMS, column["shift"])
         bank = compile_bank((scenes[i] for i in range(4)), ROOMS)
         limits = np.array([14 if room == "living_room" else 12 for room in bank.room_types])
-        searched = frontier_outcome(bank, episode_list(bank, 12), limits)
+        searched = run_frontier_search(bank, draw_episodes(bank, 12), limits)
         assert column["best_length"]["mean"] == pytest.approx(expected_length(bank).mean())
         assert column["random_sr"]["mean"] == pytest.approx(100 * random_success(bank, limits).mean())
         assert column["frontier_sr"]["mean"] == pytest.approx(100 * np.asarray(searched.success).mean())
@@ -103,7 +103,7 @@ def test_bad_requests_are_refused_and_write_nothing(run_dir, capsys, options, pr
 @pytest.mark.slow
 def test_a_run_on_scenes_of_a_file(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "scenes.jsonl.gz"
-    scenes = generated("rooms", "val", 4)
+    scenes = make_generated_scenes("rooms", "val", 4)
     write_scenes(file, [scenes[i] for i in range(4)])
     shutil.copytree(run_dir, run)
     with resigned(run / "config.json") as settings:

@@ -30,8 +30,8 @@ def test_options_are_handed_on_and_the_page_is_written(run_dir, tmp_path, made):
     out = tmp_path / "new" / "page.html"
     assert report(run_dir, "--beside", run_dir, "--split", "test", "--shift", 0.5, "--replays", 6, "--out", out) == 0
     assert out.read_text() == "a page"
-    run, beside, options, _ = made[0]
-    assert run.config.run_dir == beside.config.run_dir == run_dir
+    run, reference_run, options, _ = made[0]
+    assert run.config.run_dir == reference_run.config.run_dir == run_dir
     assert (options.split, options.shift, options.replays, options.threshold) == ("test", (0.5,), 6, 0.5)
     assert options.episodes == 1000
 

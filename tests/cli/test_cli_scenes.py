@@ -25,9 +25,9 @@ def test_every_format_becomes_an_environment(tmp_path, capsys, form, world):
     options = [tmp_path / option if option.endswith(".pbz2") else option for option in form.options]
     code = run(form.name, source, target, "--split", "val", "--categories", "Chair", "Bed", "Fridge", "Sink",
                "DiningTable", *options)  # fmt: skip
-    told = capsys.readouterr().err
-    assert code == 0, told
-    assert "scenes imported, 0 refused" in told
+    output = capsys.readouterr().err
+    assert code == 0, output
+    assert "scenes imported, 0 refused" in output
     scenes = read_scenes(target)
     assert {scene.split for scene in scenes} == {"val"}
     if form.name == "procthor":  # its table is no goal of the houses, but can be looked for
@@ -55,14 +55,14 @@ def test_refused_scenes_are_told_and_counted_and_the_others_kept(tmp_path, capsy
     source, target = tmp_path / "houses.jsonl.gz", tmp_path / "scenes.jsonl.gz"
     source.write_bytes(gzip.compress("\n".join(json.dumps(house) for house in (HOUSE, nowhere)).encode()))
     assert run("procthor", source, target) == 0
-    told = capsys.readouterr().err
-    assert f"refused: {source}" in told
-    assert "doors[0]: wall0" in told
-    assert "objects of unknown types, which only block the sight: 1, of them Bowl x 1\n" in told
+    output = capsys.readouterr().err
+    assert f"refused: {source}" in output
+    assert "doors[0]: wall0" in output
+    assert "objects of unknown types, which only block the sight: 1, of them Bowl x 1\n" in output
     # Without the database, types and sizes of table and bowl come from their names.
-    assert "2 types of objects are guessed from the names of their assets; --assets tells them, procthor/data" in told
-    assert "2 sizes of objects are the typical ones of their types; --assets" in told
-    assert "1 scenes imported, 1 refused" in told
+    assert "2 types of objects are guessed from the names of their assets; --assets tells them, procthor/data" in output
+    assert "2 sizes of objects are the typical ones of their types; --assets" in output
+    assert "1 scenes imported, 1 refused" in output
     assert len(read_scenes(target)) == 1
 
 
@@ -72,15 +72,17 @@ def test_what_is_not_connected_is_counted(tmp_path, capsys):
     source.write_text("\n".join(json.dumps(house) for house in (HOUSE, shut)))
     (tmp_path / "assets.json").write_text(json.dumps(ASSETS))
     assert run("procthor", source, target, "--assets", tmp_path / "assets.json") == 0
-    told = capsys.readouterr().err
+    output = capsys.readouterr().err
     # 230 cells with the door, 227 without it: 121 in the larger room and 106 in the other.
-    assert "106 of 457 cells in 1 scenes are not connected with the largest part and not used; most in houses-1" in told
-    assert "houses-1, 106 of 227" in told
-    assert "guessed" not in told
+    assert (
+        "106 of 457 cells in 1 scenes are not connected with the largest part and not used; most in houses-1" in output
+    )
+    assert "houses-1, 106 of 227" in output
+    assert "guessed" not in output
     assert run("procthor", source, target, "--assets", tmp_path / "assets.json", "--agent-part") == 0
-    told = capsys.readouterr().err
-    assert "121 cells are not connected with the agent and left out" in told  # it stands in the smaller room
-    assert "largest" not in told
+    output = capsys.readouterr().err
+    assert "121 cells are not connected with the agent and left out" in output  # it stands in the smaller room
+    assert "largest" not in output
 
 
 def test_homes_are_kept_by_room_type_and_size(tmp_path, capsys):
@@ -91,10 +93,10 @@ def test_homes_are_kept_by_room_type_and_size(tmp_path, capsys):
     source.write_text("\n".join(json.dumps(house) for house in (HOUSE, HOUSE, room)))
     # A house is 6 m by 3 m: 25 lattice points from wall to wall, and a cell beyond at either end.
     assert run("procthor", source, target, "--room-types", "house", "--largest", "27") == 0
-    told = capsys.readouterr().err
+    output = capsys.readouterr().err
     assert [scene.name for scene in read_scenes(target)] == ["houses-0", "houses-1"]
-    assert "1 scenes are left out, for their room type is not house\n" in told
-    assert "2 scenes imported, 0 refused" in told
+    assert "1 scenes are left out, for their room type is not house\n" in output
+    assert "2 scenes imported, 0 refused" in output
     assert run("procthor", source, target, "--room-types", "kitchen") == 0
     assert [scene.name for scene in read_scenes(target)] == ["houses-2"]
 
@@ -148,9 +150,9 @@ def test_what_cannot_be_imported_leaves_nothing(tmp_path, monkeypatch, capsys, a
     (tmp_path / "cut.json.gz").write_bytes(gzip.compress(json.dumps(METADATA).encode())[:-9])
     before = sorted(path.name for path in tmp_path.iterdir())
     assert run("ai2thor", *arguments) == 2
-    told = capsys.readouterr().err
-    assert problem in told
-    assert told.splitlines()[-1].startswith("error: ")
+    output = capsys.readouterr().err
+    assert problem in output
+    assert output.splitlines()[-1].startswith("error: ")
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
@@ -184,11 +186,11 @@ def test_bad_lines_of_a_scene_file_leave_the_others(tmp_path, capsys):
     line = gzip.decompress(good.read_bytes())
     mixed.write_bytes(line + line.replace(b'"train"', b'"trial"') + b"{]\n" + line)
     assert run("scenes", mixed, tmp_path / "o.jsonl.gz") == 0
-    told = capsys.readouterr().err
-    assert "1 scenes imported, 3 refused" in told
-    assert "line 2" in told
-    assert "line 3: not JSON" in told
-    assert "name is that of line 1 too" in told
+    output = capsys.readouterr().err
+    assert "1 scenes imported, 3 refused" in output
+    assert "line 2" in output
+    assert "line 3: not JSON" in output
+    assert "name is that of line 1 too" in output
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -15,13 +15,13 @@ from support import tiny_world as tiny
 from support.commands import CONFIG, evaluate, train
 
 from jaxnav.env.objectnav import NUM_PRIORS
-from jaxnav.layout import Setting
-from jaxnav.policies.methods import Knowledge
+from jaxnav.layout import EstimatorConfig
+from jaxnav.policies.method import Knowledge
 from jaxnav.runs.config import RunConfig, WorldConfig
-from jaxnav.runs.prepare import make_trainer
-from jaxnav.runs.worlds import bank_order, evaluation_world, read_ahead, training_world
+from jaxnav.runs.train import make_trainer
+from jaxnav.runs.worlds import compile_evaluation_world, compile_training_world, draw_bank_order, prefetch_env_params
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.store.runlog import read_rows
+from jaxnav.store.files import read_log_rows
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.trainer import Trainer
 
@@ -50,39 +50,39 @@ def finished(config_file, cache, tmp_path_factory):
 @pytest.fixture(scope="module")
 def world(cache):
     config = RunConfig(worlds=WorldConfig(num_train=9, shard_scenes=4), cache=cache)
-    return training_world(config, Console(file=io.StringIO()))
+    return compile_training_world(config, Console(file=io.StringIO()))
 
 
 def test_all_banks_have_one_shape_on_the_device(world):
     assert len(world.banks) == 3
-    shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), world.params(i)) for i in range(3)]
+    shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), world.make_env_params(i)) for i in range(3)]
     assert shapes[0] == shapes[1] == shapes[2]
     # And hold what their own banks hold, then nothing.
     for i, bank in enumerate(world.banks):
-        tables = world.params(i).tables
+        tables = world.make_env_params(i).tables
         np.testing.assert_array_equal(tables.rows[: len(bank.rows)], bank.rows)
         assert not tables.rows[len(bank.rows) :].any()
 
 
 def test_every_pass_meets_every_bank_in_an_order_of_its_own(world):
-    order, other = bank_order(world, 1, 30), bank_order(world, 2, 30)
+    order, other = draw_bank_order(world, 1, 30), draw_bank_order(world, 2, 30)
     passes = [tuple(order[start : start + 3]) for start in range(0, 30, 3)]
     assert all(sorted(one) == [0, 1, 2] for one in passes)
     assert len(set(passes)) > 2
     assert order != other
-    assert bank_order(world, 1, 7) == order[:7]
+    assert draw_bank_order(world, 1, 7) == order[:7]
 
 
 def test_banks_are_read_one_ahead(world, monkeypatch):
-    asked, params = [], type(world).params
-    monkeypatch.setattr(type(world), "params", lambda self, bank: asked.append(bank) or params(self, bank))
+    asked, params = [], type(world).make_env_params
+    monkeypatch.setattr(type(world), "make_env_params", lambda self, bank: asked.append(bank) or params(self, bank))
     order = [2, 0, 0, 1]
-    given = read_ahead(world, order)
+    given = prefetch_env_params(world, order)
     for turn, bank in enumerate(order):
         chex.assert_trees_all_equal(next(given), params(world, bank))
         time.sleep(0.2)  # the thread that reads
         assert asked == [[2, 0], [2, 0], [2, 0, 1], [2, 0, 1]][turn]
-    assert list(given) == list(read_ahead(world, [])) == []
+    assert list(given) == list(prefetch_env_params(world, [])) == []
 
 
 @pytest.mark.slow
@@ -90,16 +90,16 @@ def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
     ppo = PPOConfig(num_envs=32, rollout=4, minibatches=2)
     config = RunConfig(ppo=ppo, seeds=1, sizes=tiny.SIZES, worlds=WorldConfig(near_starts=0.5))
-    trainer = make_trainer(config, world.env, Setting(), Knowledge(jnp.ones((NUM_PRIORS, 22, 22))))
-    assert (trainer.learners["layout"].acting.env.near_starts, world.env.near_starts) == (0.5, 0.0)
+    trainer = make_trainer(config, world.env, EstimatorConfig(), Knowledge(jnp.ones((NUM_PRIORS, 22, 22))))
+    assert (trainer.learners["layout"].agent_loop.env.near_starts, world.env.near_starts) == (0.5, 0.0)
     assert [RunConfig(world=name).near_starts for name in ("rooms", "apartments", "houses")] == [0.0, 0.5, 0.5]
-    before = trainer.init(world.params(0))
-    kept = jax.tree.map(np.array, before["layout"][0].replace(key=None))
-    after = trainer.restart(before, world.params(1))["layout"][0]
+    before = trainer.init(world.make_env_params(0))
+    copied = jax.tree.map(np.array, before["layout"][0].replace(key=None))
+    after = trainer.restart(before, world.make_env_params(1))["layout"][0]
     chex.assert_trees_all_equal(
-        (after.params, after.optimizer, after.update), (kept.params, kept.optimizer, kept.update)
+        (after.params, after.optimizer, after.update), (copied.params, copied.optimizer, copied.update)
     )
-    assert not np.array_equal(after.agent.state.pose, kept.agent.state.pose)
+    assert not np.array_equal(after.agent.state.pose, copied.agent.state.pose)
     assert not np.asarray(after.agent.state.time).any()
     assert (np.asarray(after.agent.state.scene) < len(world.banks[1].names)).all()
 
@@ -117,12 +117,12 @@ def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache
 
     monkeypatch.setattr(Trainer, "train", train_twice)
     assert train(config_file, stopped, *OPTIONS, "--cache", cache) == 130
-    assert [row["step"] for row in read_rows(stopped / "metrics.jsonl")] == [2, 2, 4, 4]
+    assert [row["step"] for row in read_log_rows(stopped / "metrics.jsonl")] == [2, 2, 4, 4]
     capsys.readouterr()
     assert train(config_file, stopped, *OPTIONS, "--cache", cache) == 0
     assert "resumed after update 4 of 8" in capsys.readouterr().err
     assert len(calls) == 5  # two, the one that stopped, and two more
-    assert read_rows(finished / "metrics.jsonl")[-1]["step"] == 8
+    assert read_log_rows(finished / "metrics.jsonl")[-1]["step"] == 8
     for name in ("metrics.jsonl", "policies/layout-0/params.safetensors", "policies/baseline-0/params.safetensors"):
         assert (stopped / name).read_bytes() == (finished / name).read_bytes()
 
@@ -139,12 +139,12 @@ def test_streamed_evaluation_is_one_compilation_and_knows_all_scenes(finished, t
 
 def test_shards_hold_what_memory_would(world, cache):
     whole = RunConfig(worlds=WorldConfig(num_train=9), cache=cache)
-    memory = training_world(whole, Console(file=io.StringIO()))
+    memory = compile_training_world(whole, Console(file=io.StringIO()))
     assert len(memory.banks) == 1
     np.testing.assert_array_equal(np.concatenate([bank.rows for bank in world.banks]), memory.banks[0].rows)
     assert memory.fingerprint != world.fingerprint
     shifted = dataclasses.replace(whole, worlds=dataclasses.replace(whole.worlds, num_val=4))
     straight, turned = (
-        evaluation_world(shifted, "val", None, shift, Console(file=io.StringIO())) for shift in (0.0, 1.0)
+        compile_evaluation_world(shifted, "val", None, shift, Console(file=io.StringIO())) for shift in (0.0, 1.0)
     )
     assert straight.fingerprint != turned.fingerprint

@@ -11,18 +11,18 @@ from support.commands import SHIFTS, contents, refusal, study_command
 
 from jaxnav import __main__ as commands
 from jaxnav.cli import study as command
-from jaxnav.runs.directory import load_run
 from jaxnav.runs.policies import load_policies
-from jaxnav.study import draw
+from jaxnav.runs.run import load_run_config
+from jaxnav.study import figures
 from jaxnav.study import run as study_run
-from jaxnav.study.document import READING
-from jaxnav.study.runs import run_config
-from jaxnav.study.trials import USES
+from jaxnav.study.config import study_run_config
+from jaxnav.study.document import READING_MARK
+from jaxnav.study.records import STDE_OPTIONS
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, layout_priors
 
 #: Variant, decoding, epsilon and form of the rows of a run of the layout arm alone.
 LAYOUT_ARM = [(variant, "argmax", None, None) for variant in ("layout", "tde")]
-LAYOUT_ARM += [("stde", "argmax", *use) for use in USES.values()]
+LAYOUT_ARM += [("stde", "argmax", *use) for use in STDE_OPTIONS.values()]
 
 
 def study(folder, *options):
@@ -48,15 +48,15 @@ def test_a_study_from_training_to_document(tmp_path):
     results = tmp_path / "results" / "val"
     assert {path.stem for path in results.iterdir()} == names
     # The runs are what they are called, and their policies carry it.
-    runs = [load_run(tmp_path / "runs" / name) for name in ("main", "coin")]
+    runs = [load_run_config(tmp_path / "runs" / name) for name in ("main", "coin")]
     assert [run.counterfactual for run in runs] == ["distil", "coin"]
     for run in runs:
         policies = load_policies(run, run.arms)
         assert (policies.spec.direct, policies.spec.done_gate) == ("goal", True)
         # The priors are those of the exported counts, and the setting is the calibrated one.
-        setting = policies.setting
+        setting = policies.estimator_config
         assert setting is not None
-        np.testing.assert_allclose(policies.knowledge.layout, layout_priors(policies.counts, setting), rtol=1e-6)
+        np.testing.assert_allclose(policies.knowledge.layout, layout_priors(policies.prior_counts, setting), rtol=1e-6)
         assert setting.strength in STRENGTHS
         assert setting.reduction in REDUCTIONS
 
@@ -105,14 +105,16 @@ def steps(monkeypatch):
     def measure_condition(run, full, shift, bench, console):
         name = run.run_dir.name
         assert full == (name in ("main", "real"))
-        condition = study_results.full_condition(shift, chosen=0.5) if full else study_results.condition(shift, name)
+        condition = (
+            study_results.full_condition(shift, chosen_epsilon=0.5) if full else study_results.condition(shift, name)
+        )
         return measured(f"{name}-shift{shift:g}", condition)
 
     monkeypatch.setattr(study_run, "ensure_trained", lambda run, console: names.append(run.run_dir.name))
-    monkeypatch.setattr(study_run, "instrument_report", lambda *_: measured("instrument", study_results.instrument()))
+    monkeypatch.setattr(study_run, "measure_instrument", lambda *_: measured("instrument", study_results.instrument()))
     monkeypatch.setattr(study_run, "measure_condition", measure_condition)
-    monkeypatch.setattr(study_run, "gap_course", lambda *_: measured("gap", study_results.course()))
-    monkeypatch.setattr(draw, "draw_figures", lambda folder, images: names.append(f"figures of {folder.name}"))
+    monkeypatch.setattr(study_run, "measure_gap_curves", lambda *_: measured("gap", study_results.course()))
+    monkeypatch.setattr(figures, "draw_study_figures", lambda folder, images: names.append(f"figures of {folder.name}"))
     return names
 
 
@@ -129,13 +131,15 @@ def test_only_what_is_missing_or_of_another_study_is_done(steps, tmp_path, capsy
 
     assert again() == ASKED + MAIN + COIN + DRAWN
     document = tmp_path / "docs" / "study.md"
-    text = document.read_text().replace(f"{READING}\n\n{READING}", f"{READING}\nBy hand.\n{READING}")
+    text = document.read_text().replace(
+        f"{READING_MARK}\n\n{READING_MARK}", f"{READING_MARK}\nBy hand.\n{READING_MARK}"
+    )
     document.write_text(text)
     before = contents(tmp_path)
     assert "were there already" not in capsys.readouterr().err
     assert again() == ASKED + DRAWN
-    assert "6 results in" in (told := " ".join(capsys.readouterr().err.split()))
-    assert "were there already; measure them anew with another --results" in told
+    assert "6 results in" in (output := " ".join(capsys.readouterr().err.split()))
+    assert "were there already; measure them anew with another --results" in output
     assert contents(tmp_path) == before
     assert "By hand." in document.read_text()
     # A part that is missing, and one that is damaged.
@@ -202,7 +206,7 @@ def test_another_document_is_refused_before_any_training(untrained, tmp_path, ca
 def test_the_configs_that_come_with_it(name, scenes):
     config = command.parse_study(["--config", name])
     assert config.shifts == (0.0, 0.5, 1.0)
-    assert run_config(config, "main").worlds.num_val == scenes
+    assert study_run_config(config, "main").worlds.num_val == scenes
     assert {0.0, 0.5, 1.0} <= set(config.epsilon)
     assert (config.document == Path("docs/study.md")) == (name == "study")
 

@@ -11,10 +11,10 @@ import pytest
 from support.commands import POLICIES, SEEDS, contents, evaluate, finished_run, refusal, train
 
 from jaxnav.cli import train as train_command
-from jaxnav.layout import SETTINGS, Setting
+from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
 from jaxnav.store.export import load_params
-from jaxnav.store.runlog import read_rows
+from jaxnav.store.files import read_log_rows
 from jaxnav.training.calibration import REDUCTIONS, STRENGTHS, layout_priors
 
 
@@ -34,7 +34,7 @@ def run_dir(tmp_path_factory):
 def test_a_run_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
     assert {folder.name for folder in (run_dir / "policies").iterdir()} == POLICIES
     assert {folder.name for folder in (run_dir / "checkpoints").iterdir()} == {"2", "4"}
-    rows = read_rows(run_dir / "metrics.jsonl")
+    rows = read_log_rows(run_dir / "metrics.jsonl")
     identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
     assert sorted(identities) == sorted((s, a, i) for s in (2, 4) for a in ("baseline", "layout") for i in range(SEEDS))
     for row in rows:
@@ -52,9 +52,9 @@ def test_policies_say_how_they_are_used(run_dir):
         assert spec["categories"] == list(ITHOR_CATEGORIES)
         assert spec["sizes"]["hidden"] == 16
         if name.startswith("layout"):
-            setting = Setting(**spec["layout"])
+            setting = EstimatorConfig(**spec["layout"])
             assert setting == dataclasses.replace(
-                SETTINGS["calibrated"], strength=setting.strength, reduction=setting.reduction
+                ESTIMATORS["calibrated"], strength=setting.strength, reduction=setting.reduction
             )
             assert setting.strength in STRENGTHS
             assert setting.reduction in REDUCTIONS
@@ -107,7 +107,7 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("method: orgy", "method 'orgy': is unknown; did you mean 'org'?"),
         ("method: no_such_package:MINE", "method 'no_such_package:MINE': cannot be imported (ModuleNotFoundError: "),
         ("method: jaxnav.layout:MINE", "method 'jaxnav.layout:MINE': cannot be imported (AttributeError: "),
-        ("method: jaxnav.layout:SETTINGS", "method 'jaxnav.layout:SETTINGS': is dict, no jaxnav Method"),
+        ("method: jaxnav.layout:ESTIMATORS", "method 'jaxnav.layout:ESTIMATORS': is dict, no jaxnav Method"),
         ("{method: anonymous, arms: [layout]}", "method 'anonymous' cannot host the layout; give baseline alone"),
         ("method_sizes: {layers: 2}", "method_sizes.layers is 2; is unknown; 'org' has relation_layers"),
         ("{method: rgb, method_sizes: {layers: 2}}", "'rgb' has no sizes of its own"),

@@ -9,7 +9,7 @@ import pytest
 from support.commands import contents
 
 from jaxnav.cli import console
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import run_command
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
 
@@ -28,7 +28,7 @@ def home(tmp_path, monkeypatch):
 def folder_of_a_command():
     """The folder for compiled programs that JAX has while a command runs."""
     seen = []
-    assert exit_code(lambda _: seen.append(jax.config.values["jax_compilation_cache_dir"])) == 0
+    assert run_command(lambda _: seen.append(jax.config.values["jax_compilation_cache_dir"])) == 0
     return seen[0]
 
 
@@ -73,7 +73,7 @@ def trims(monkeypatch, library, seconds):
     monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(**functions))
     heard = []
     monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", heard.append)
-    console._give_memory_back.__wrapped__()
+    console._trim_memory_after_compiling.__wrapped__()
     for listener in heard:
         listener("/jax/core/compile/backend_compile_duration", seconds, fun_name="f")
         listener("/jax/checkpoint/write/duration_secs", seconds)
@@ -90,9 +90,9 @@ def test_another_c_library_is_left_alone(monkeypatch):
 
 
 def test_jax_tells_of_its_compilations(monkeypatch):
-    told = []
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=told.append))
-    monkeypatch.setattr(console, "_LONG_S", 0.0)
-    console._give_memory_back.__wrapped__()
+    calls = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=calls.append))
+    monkeypatch.setattr(console, "_LONG_COMPILATION_S", 0.0)
+    console._trim_memory_after_compiling.__wrapped__()
     jax.jit(lambda x: x * 3 + 1)(2)
-    assert set(told) == {0}
+    assert set(calls) == {0}

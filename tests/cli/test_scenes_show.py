@@ -9,12 +9,11 @@ from support.scenes import SMALL, draw
 
 from jaxnav.cli import scenes as scenes_command
 from jaxnav.scenes.files.scene_file import write_scenes
-from jaxnav.scenes.tables.detector import PERFECT
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.task import Task
-from jaxnav.viz.scene import DPI, scene_figure
-from jaxnav.viz.view import view_from
+from jaxnav.viz.scene import SCENE_DPI, scene_figure, view_from_pose
 
-TASK = Task(detector=PERFECT)
+TASK = Task(detector=PERFECT_DETECTOR)
 # Cells (0, 0) to (0, 1.5) m and, with no way there, one at (0.75, 0).
 HALL = draw([".##."] + [".###"] * 6, ("Book", 0.0, 0.8, 2.5, *SMALL))
 OTHER = dataclasses.replace(draw(["..", ".."], ("Pan", 0.25, 0.9, 0.75, *SMALL)), name="a/b $x", split="val")
@@ -35,10 +34,10 @@ def test_the_file_is_a_png_of_the_figures_size(file, tmp_path, capsys):
     out = tmp_path / "new" / "hall.png"
     assert show(file, "--scene", "drawn", "--pose", 0, 1.5, -90, "--out", out) == 0
     assert str(out) in capsys.readouterr().err.replace("\n", "")
-    size = scene_figure(HALL, TASK, view_from(HALL, TASK, (0, 1.5, -90))).get_size_inches()
+    size = scene_figure(HALL, TASK, view_from_pose(HALL, TASK, (0, 1.5, -90))).get_size_inches()
     with Image.open(out) as image:
         assert image.format == "PNG"
-        assert image.size == tuple((size * DPI).astype(int))
+        assert image.size == tuple((size * SCENE_DPI).astype(int))
     assert [path.name for path in out.parent.iterdir()] == ["hall.png"]
 
 

@@ -10,14 +10,14 @@ from support.scenes import SMALL, draw
 
 from jaxnav.cli import scenes as scenes_command
 from jaxnav.env.objectnav import OTHER_ROOM
-from jaxnav.evaluation.similarity import layout_gap, layout_similarity, scene_counts
-from jaxnav.runs.directory import load_run
+from jaxnav.evaluation.similarity import cooccurrence_counts, scene_layout_gap, scene_layout_similarity
 from jaxnav.runs.policies import load_policies
+from jaxnav.runs.run import load_run_config
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.tables.compile import compile_bank, compile_scene
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import generated
+from jaxnav.scenes.worlds import make_generated_scenes
 
 # One cell, at the origin. x from -0.3 (book) to 0.875 (lattice), z from -0.125 (lattice) to 1.25 (chair).
 KITCHEN = draw(
@@ -105,17 +105,17 @@ def test_splits_worlds_and_generated_scenes(file, capsys):
 def test_the_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
     _, run_dir = commands.finished_run(tmp_path_factory)
     capsys.readouterr()
-    kitchen, bath = generated("rooms", "val", 8)[0], generated("rooms", "val", 8)[3]
-    apartment = dataclasses.replace(generated("rooms", "val", 8)[4], room_type="apartment")
+    kitchen, bath = make_generated_scenes("rooms", "val", 8)[0], make_generated_scenes("rooms", "val", 8)[3]
+    apartment = dataclasses.replace(make_generated_scenes("rooms", "val", 8)[4], room_type="apartment")
     write_scenes(tmp_path / "a.jsonl.gz", [kitchen, apartment, bath])
     rows = stats(capsys, tmp_path / "a.jsonl.gz", "--run", run_dir)
     start = next(i for i, cells in enumerate(rows) if cells[0].startswith("Layouts against"))
-    run = load_run(run_dir)
+    run = load_run_config(run_dir)
     priors = np.asarray(load_policies(run).knowledge.layout)[
         [0, OTHER_ROOM, 3]
     ]  # kitchens are the first room type, baths the last
-    counts = scene_counts(compile_bank([kitchen, apartment, bath], run.task))
-    gaps, likeness = layout_gap(counts, priors), layout_similarity(counts, priors)
+    counts = cooccurrence_counts(compile_bank([kitchen, apartment, bath], run.task))
+    gaps, likeness = scene_layout_gap(counts, priors), scene_layout_similarity(counts, priors)
     for name, which in {"kitchen": [0], "apartment": [1], "bathroom": [2], "all": [0, 1, 2]}.items():
         measured = [gaps[which], likeness[which]]
         means = [np.mean(values) for values in measured]
@@ -132,7 +132,8 @@ def test_scenes_in_which_nothing_is_seen_together_have_no_gap(tmp_path_factory, 
     alone = dataclasses.replace(alone, yaws=alone.yaws[:1], parents=alone.parents[:1])
     # A false alarm has a chance of 0.5 % at each of the 16 poses and categories: the name decides whether there is one.
     together = {
-        name: scene_counts(compile_bank([dataclasses.replace(alone, name=name)], Task())).any() for name in "abcde"
+        name: cooccurrence_counts(compile_bank([dataclasses.replace(alone, name=name)], Task())).any()
+        for name in "abcde"
     }
     quiet = next(name for name, seen in together.items() if not seen)
     write_scenes(file, [dataclasses.replace(alone, name=quiet)])

@@ -54,11 +54,11 @@ def test_an_observation_holds_what_the_row_says_in_metres(single, scenes):
     state = single._episodes.state
     row = env.observe(jax.tree.map(lambda leaf: leaf[0], state), params).row
     bytes_, seen = np.asarray(env.row_format.detections(row), np.float64), observation["detections"]
-    found = bytes_[:, 0] > 0
-    np.testing.assert_allclose(seen[found, 0], bytes_[found, 0] / 255, rtol=1e-6)
-    np.testing.assert_allclose(seen[found, 1], bytes_[found, 1] / 51, rtol=1e-6)
-    np.testing.assert_allclose(seen[found, 2], (bytes_[found, 2] - 128) / 25.4, rtol=1e-6)
-    assert (seen[~found] == 0).all()
+    is_detected = bytes_[:, 0] > 0
+    np.testing.assert_allclose(seen[is_detected, 0], bytes_[is_detected, 0] / 255, rtol=1e-6)
+    np.testing.assert_allclose(seen[is_detected, 1], bytes_[is_detected, 1] / 51, rtol=1e-6)
+    np.testing.assert_allclose(seen[is_detected, 2], (bytes_[is_detected, 2] - 128) / 25.4, rtol=1e-6)
+    assert (seen[~is_detected] == 0).all()
     np.testing.assert_array_equal(observation["view"].ravel(), env.row_format.view_cells(row))
 
 
@@ -66,7 +66,7 @@ def test_a_seed_gives_the_same_episodes(single):
     def episodes(seed):
         first, _ = single.reset(seed=seed)
         second, _ = single.reset()
-        return [(each["goal"], each["heading"], each["view"].tobytes()) for each in (first, second)]
+        return [(part["goal"], part["heading"], part["view"].tobytes()) for part in (first, second)]
 
     assert episodes(5) == episodes(5)
     assert len({str(episodes(seed)) for seed in range(6)}) > 1
@@ -78,10 +78,10 @@ def test_a_step_is_that_of_the_environment(single, scenes):
     state = jax.tree.map(lambda leaf: leaf[0], single._episodes.state)
     for action in (0, 2, 0, 4, 1, 0, 0, DONE):
         before, (state, reward, terminated, truncated) = state, env.advance(state, jnp.int32(action), params)
-        observation, *told, info = single.step(action)
-        assert told == [reward, terminated, truncated]
-        assert info["success"] == bool(terminated & env.succeeds(state, params))
-        assert observation["moved"] == int(env.cell(state.pose) != env.cell(before.pose))
+        observation, *outcome, info = single.step(action)
+        assert outcome == [reward, terminated, truncated]
+        assert info["success"] == bool(terminated & env.done_succeeds(state, params))
+        assert observation["moved"] == int(env.cell_of_pose(state.pose) != env.cell_of_pose(before.pose))
         assert observation["heading"] == state.pose // 2 % 8
         assert observation["horizon"] == state.pose % 2
     assert terminated
@@ -127,8 +127,8 @@ def test_what_is_returned_may_be_written_to(scenes):
     """Learners of other libraries do."""
     vector = ObjectNavVectorEnv(2, scenes=scenes)
     observation, _ = vector.reset(seed=0)
-    _, *told, _ = vector.step(np.zeros(2, int))
-    for array in (*observation.values(), *told):
+    _, *outcome, _ = vector.step(np.zeros(2, int))
+    for array in (*observation.values(), *outcome):
         array[:] = 0
 
 

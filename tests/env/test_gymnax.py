@@ -45,10 +45,10 @@ def test_an_observation_holds_what_the_row_does(made):
     assert jax.vmap(space.contains)(observations).all()
     table = np.asarray(observations[:, : 4 * count]).reshape(64, count, 4)
     row = np.asarray(plain.row_format.detections(seen.row), np.float64)
-    found = row[..., 0] > 0
-    expected = (row - [0, 0, 128, 0]) / [255, 51, 25.4, 127.5] * found[..., None]
+    is_detected = row[..., 0] > 0
+    expected = (row - [0, 0, 128, 0]) / [255, 51, 25.4, 127.5] * is_detected[..., None]
     np.testing.assert_allclose(table, expected, rtol=1e-5, atol=1e-6)
-    assert found.any()
+    assert is_detected.any()
     np.testing.assert_array_equal(observations[:, 4 * count : 5 * count].argmax(axis=1), seen.goal)
     free, blocked = np.split(np.asarray(observations[:, 5 * count :]), 2, axis=1)
     np.testing.assert_array_equal(free + 2 * blocked, plain.row_format.view_cells(seen.row))
@@ -73,7 +73,7 @@ def test_the_sticky_wrapper_replays_actions(made):
     before = state.env_state.pose
     _, state, *_, info = env.step(KEY, state, jnp.int32(DONE), params)  # the first action is MoveAhead, always
     assert int(info["length"]) == 1
-    assert int(state.env_state.pose) == int(made[0].after(before, jnp.int32(0), params))
+    assert int(state.env_state.pose) == int(made[0].next_pose(before, jnp.int32(0), params))
 
 
 def test_the_flatten_wrapper_has_nothing_to_do(made):

@@ -15,7 +15,7 @@ from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.generate.rooms import generate_rooms
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, generated
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def named_room(room, split, room_type):
 def test_make_generates_a_world():
     env, params = make("houses", "val", seed=3)
     check_environment(env, params, num_envs=4, num_steps=16)
-    scenes = generated("houses", "val", seed=3)
+    scenes = make_generated_scenes("houses", "val", seed=3)
     bank = compile_bank([scenes[i] for i in range(len(scenes))], WORLDS["houses"].task)
     np.testing.assert_array_equal(params.tables.rows, bank.rows)
 

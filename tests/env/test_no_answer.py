@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from support.leakage import find_leaks, step_into
 
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.scenes.tables.compile import Bank, compile_bank
-from jaxnav.scenes.worlds import WORLDS, generated
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 #: Scenes of each world, enough that a perfect predictor differs from the detector beyond chance for most goals.
 NUM_SCENES = {"rooms": 12, "apartments": 8, "houses": 4}
@@ -21,9 +20,9 @@ EACH = ["rooms", "houses", pytest.param("apartments", marks=pytest.mark.slow)]
 
 @functools.cache
 def world(name: str) -> tuple[Bank, ObjectNav, EnvParams]:
-    scenes = generated(name, "train", NUM_SCENES[name])
+    scenes = make_generated_scenes(name, "train", NUM_SCENES[name])
     bank = compile_bank([scenes[i] for i in range(len(scenes))], WORLDS[name].task)
-    return bank, *build(bank, {}, 10)
+    return bank, *build_environment(bank, {}, 10)
 
 
 @pytest.mark.parametrize("name", EACH)

@@ -10,10 +10,8 @@ import pytest
 from scipy.stats import chisquare
 from support.scenes import BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, draw
 
-from jaxnav.env.build import build
-from jaxnav.env.make import make
-from jaxnav.env.objectnav import CANDIDATES
-from jaxnav.env.types import State
+from jaxnav.env.make import build_environment, make
+from jaxnav.env.objectnav import NUM_START_CANDIDATES, State
 from jaxnav.scenes.generate.rooms import generate_rooms
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, Task
@@ -31,7 +29,7 @@ def in_one_cell(goal=BOOK, heading=0, time=0):
     ("heading", "goal", "reward", "success"), [(0, BOOK, 5.0, True), (0, CHAIR, -0.01, False), (4, CHAIR, 5.0, True)]
 )
 def test_done_on_the_last_step_is_terminated_only(heading, goal, reward, success):
-    env, params = build(ONE_CELL, {}, 3)
+    env, params = build_environment(ONE_CELL, {}, 3)
     state = in_one_cell(goal, heading, time=2)
     _, after, gained, terminated, truncated, info = env.step(jax.random.key(0), state, jnp.int32(DONE), params)
     assert (gained, terminated, truncated) == (np.float32(reward), True, False)
@@ -39,7 +37,7 @@ def test_done_on_the_last_step_is_terminated_only(heading, goal, reward, success
 
 
 def test_the_step_limit_truncates():
-    env, params = build(ONE_CELL, {}, 3)
+    env, params = build_environment(ONE_CELL, {}, 3)
     state, endings = in_one_cell(), []
     for action in (LOOK_DOWN, MOVE_AHEAD, LOOK_UP):
         state, reward, terminated, truncated = env.advance(state, jnp.int32(action), params)
@@ -50,7 +48,7 @@ def test_the_step_limit_truncates():
 
 
 def test_an_ending_does_not_leak_the_next_episode():
-    env, params = build(BANK, {}, 1)  # every step ends an episode
+    env, params = build_environment(BANK, {}, 1)  # every step ends an episode
     keys = jax.random.split(jax.random.key(0), 400)
     _, state = jax.vmap(env.reset, (0, None))(keys, params)
     action = jnp.arange(400) % 6
@@ -72,7 +70,7 @@ def test_starts_are_uniform(rules):
     wide = draw(["..", ".."], ("Book", 0, 1.5, 1, *SMALL))
     narrow = draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Fridge", 1, 0.9, 0.5, 0.3, 1.2, 0.3))
     bank = compile_bank([wide, narrow], Task(CATEGORIES, rules=rules))
-    env, params = build(bank, {}, 10)
+    env, params = build_environment(bank, {}, 10)
     _, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 40_000), params)
     pose, scene, goal = np.asarray(state.pose), np.asarray(state.scene), np.asarray(state.goal)
     assert not np.asarray(state.time).any()
@@ -97,8 +95,8 @@ def test_shaping_rewards_metres_nearer_than_before(rules, ahead):
     # the centre, walk: 2.5 - z to the footprint). Each MoveAhead is 0.25 m, whatever is measured.
     corridor = draw(["."] * 8, ("Book", 0, 1.0, 2.75, 0.5, 0.5, 0.5))
     bank = compile_bank([corridor], Task(CATEGORIES, rules=rules))
-    plain, params = build(bank, {}, 100)
-    shaped, _ = build(bank, {}, 100, shaping=2.0)
+    plain, params = build_environment(bank, {}, 100)
+    shaped, _ = build_environment(bank, {}, 100, shaping=2.0)
     per_cell = rules.poses_per_cell
     back = rules.headings // 2 * len(rules.horizons)
     start = State(pose=jnp.int32(3 * per_cell), scene=jnp.int32(0), goal=jnp.int32(BOOK), time=jnp.int32(0))
@@ -113,7 +111,7 @@ def test_shaping_rewards_metres_nearer_than_before(rules, ahead):
             np.testing.assert_allclose(reward, -0.01 + 2.0 * gained, atol=1e-6)
             assert after.nearest == pytest.approx(nearest - gained, abs=1e-6)
     _, begun = shaped.reset(jax.random.key(0), params)
-    assert begun.nearest == pytest.approx(bank.goal_distance[shaped.cell(begun.pose), BOOK])
+    assert begun.nearest == pytest.approx(bank.goal_distance[shaped.cell_of_pose(begun.pose), BOOK])
     done = start.replace(pose=jnp.int32(7 * per_cell), nearest=jnp.float32(ahead))
     np.testing.assert_allclose(bank.goal_distance[7, BOOK], ahead)  # z = 1.75
     assert shaped.advance(done, jnp.int32(DONE), params)[1] == 5.0
@@ -122,8 +120,8 @@ def test_shaping_rewards_metres_nearer_than_before(rules, ahead):
 
 def test_padded_tables_hold_the_same_episodes():
     cells, cell_poses = len(BANK.ahead), BANK.task.rules.poses_per_cell
-    env, params = build(BANK, {"kitchen": 7}, 9)
-    padded_env, padded = build(BANK, {"kitchen": 7}, 9, cells + 10, 6)
+    env, params = build_environment(BANK, {"kitchen": 7}, 9)
+    padded_env, padded = build_environment(BANK, {"kitchen": 7}, 9, cells + 10, 6)
     assert padded_env == env
     # 4 scenes, and the first two again.
     assert (params.step_limit.tolist(), padded.step_limit.tolist()) == ([7, 9, 9, 9], [7, 9, 9, 9, 7, 9])
@@ -134,19 +132,19 @@ def test_padded_tables_hold_the_same_episodes():
     for name, added in (("ahead", 10), ("goal_distance", 10), ("rows", 10 * cell_poses)):
         np.testing.assert_array_equal(longer[name][:-added], tables[name])
         assert not np.asarray(longer[name][-added:]).any()
-    small = build(BANK, {}, 9, cells - 1, 2)[1]
+    small = build_environment(BANK, {}, 9, cells - 1, 2)[1]
     assert (len(small.tables.ahead), len(small.room)) == (cells, 4)
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
 def test_some_starts_are_near_the_goal(share):
     """Of C cells the nearest: its distance is at most x with probability 1 - (1 - F(x))^C, F that of one cell."""
-    env, params = build(BANK, {}, 10)
+    env, params = build_environment(BANK, {}, 10)
     keys = jax.random.split(jax.random.key(0), 40_000)
 
     def distances(env):
         _, state = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
-        distance = BANK.goal_distance[np.asarray(env.cell(state.pose)), np.asarray(state.goal)]
+        distance = BANK.goal_distance[np.asarray(env.cell_of_pose(state.pose)), np.asarray(state.goal)]
         return state, distance, np.asarray(state.scene) * 100 + np.asarray(state.goal)
 
     plain, uniform, kinds = distances(env)
@@ -159,13 +157,15 @@ def test_some_starts_are_near_the_goal(share):
     one, other = uniform[kinds == kind], nearer[kinds == kind]
     for x in np.quantile(one, [0.1, 0.3, 0.6]):
         below = (one <= x).mean()
-        expected = (1 - share) * below + share * (1 - (1 - below) ** CANDIDATES)
+        expected = (1 - share) * below + share * (1 - (1 - below) ** NUM_START_CANDIDATES)
         assert (other <= x).mean() == pytest.approx(expected, abs=0.04)
 
 
 @pytest.mark.parametrize("action", [ROTATE_LEFT, DONE])
 def test_a_plain_number_is_an_action(action):
     """Also where nothing is compiled, as wrappers of others call it."""
-    env, params = build(ONE_CELL, {}, 9)
-    plain, array = (env.step(jax.random.key(0), in_one_cell(), each, params) for each in (action, jnp.int32(action)))
+    env, params = build_environment(ONE_CELL, {}, 9)
+    plain, array = (
+        env.step(jax.random.key(0), in_one_cell(), number, params) for number in (action, jnp.int32(action))
+    )
     chex.assert_trees_all_equal(plain, array)

@@ -9,8 +9,8 @@ import pytest
 from support import tiny_world as tiny
 
 import jaxnav
+from jaxnav.env.objectnav import Observation
 from jaxnav.env.spaces import Box, Dict, Discrete, Space
-from jaxnav.env.types import Observation
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 

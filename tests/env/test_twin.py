@@ -17,26 +17,25 @@ from support.twin import DONE
 from support.twin_guide import Guide, row_differences, same_distance
 from support.twin_scene import largest_component
 
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, State
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.files.scene_file import read_scenes
 from jaxnav.scenes.generate.rooms import generate_rooms
-from jaxnav.scenes.lattice import standable_cells, successors
+from jaxnav.scenes.lattice import pose_successors, standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import Bank, compile_bank, compile_scene
-from jaxnav.scenes.tables.detector import PERFECT
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, generated
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 NUM_ENVS, FEW, MANY = 20, 150, 5000  # 3,000 steps of a source and task, or 100,000
 LIVING_ROOM, OTHERS = 60, 30  # step limits
 SLOW = pytest.mark.slow
 TASKS = {
-    "rooms": Task(rules=ROOMS, detector=PERFECT),
-    "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT),
-    "houses": Task(rules=HOUSES, goals=ITHOR_CATEGORIES[1::2], detector=PERFECT),
+    "rooms": Task(rules=ROOMS, detector=PERFECT_DETECTOR),
+    "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT_DETECTOR),
+    "houses": Task(rules=HOUSES, goals=ITHOR_CATEGORIES[1::2], detector=PERFECT_DETECTOR),
 }
 
 
@@ -82,7 +81,7 @@ def roll_out(env: ObjectNav, params: EnvParams, seed: int, steps: int) -> Rollou
     def act(key, state):
         steer, choose, step = jax.random.split(key, 3)
         last = state.time + 1 == params.step_limit[state.scene]
-        done = jax.random.bernoulli(steer, jnp.where(env.succeeds(state, params) | last, 0.2, 0.01))
+        done = jax.random.bernoulli(steer, jnp.where(env.done_succeeds(state, params) | last, 0.2, 0.01))
         action = jnp.where(done, DONE, jax.random.randint(choose, (), 0, DONE))
         _, after, reward, terminated, truncated, info = env.step(step, state, action, params)
         return after, Rollout(state, action, reward, terminated, truncated, info)
@@ -132,7 +131,7 @@ def test_random_steps(source, world, steps):
     assert bank.names == tuple(scene.name for scene in scenes)
     assert [len(guide.cells) for guide in guides] == bank.num_cells.tolist()
     # Padded: there are unused cells, and the first scenes again.
-    env, params = build(bank, {"living_room": LIVING_ROOM}, OTHERS, len(bank.ahead) + 7, len(scenes) + 2)
+    env, params = build_environment(bank, {"living_room": LIVING_ROOM}, OTHERS, len(bank.ahead) + 7, len(scenes) + 2)
     assert params.room.tolist() == [0, 1, 2, 3, 0, 1]
     rollout = roll_out(env, params, len(source), steps)
 
@@ -165,12 +164,12 @@ def test_standable_cells():
         assert {(iz, ix) for iz, ix in standable_cells(reach).tolist()} == expected
 
 
-def differences_of(scene: Scene, guide: Guide, task: Task, every: int = 1) -> collections.Counter[str]:
+def differences_of(scene: Scene, guide: Guide, task: Task, stride: int = 1) -> collections.Counter[str]:
     """Count what differs from the twin at poses, by name."""
     table, differences = compile_scene(scene, task), collections.Counter()
-    successor = successors(table.ahead, task.rules)
+    successor = pose_successors(table.ahead, task.rules)
     assert len(successor) == len(table.rows) == len(guide.cells) * task.rules.poses_per_cell
-    for pose in range(0, len(successor), every):
+    for pose in range(0, len(successor), stride):
         differences.update(row_differences(table.rows[pose], guide.place(pose), len(task.categories)))
         goals = set(np.flatnonzero(task.is_goal()).tolist())
         differences["success"] += (
@@ -187,32 +186,35 @@ def differences_of(scene: Scene, guide: Guide, task: Task, every: int = 1) -> co
 
 @pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize(
-    ("source", "every"),
+    ("source", "stride"),
     [("coarse", 1), pytest.param("maze", 2, marks=SLOW), ("rooms", 3), pytest.param("ithor", 3, marks=SLOW)],
 )
-def test_every_pose(source, every, world):
+def test_every_pose(source, stride, world):
     task = TASKS[world]
-    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::every]:
+    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::stride]:
         assert differences_of(scene, guide, task) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", ["apartments", "houses"])
 def test_generated_homes(world):
-    task, scene = dataclasses.replace(WORLDS[world].task, detector=PERFECT), generated(world, "val")[0]
-    assert differences_of(scene, Guide(scene, task), task, every=13) == collections.Counter()
+    task, scene = (
+        dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR),
+        make_generated_scenes(world, "val")[0],
+    )
+    assert differences_of(scene, Guide(scene, task), task, stride=13) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", ["apartments", "houses"])
 def test_real_apartments(world):
-    task, scene = dataclasses.replace(WORLDS[world].task, detector=PERFECT), read_scenes(require(ROBOTHOR))[0]
-    assert differences_of(scene, Guide(scene, task), task, every=7) == collections.Counter()
+    task, scene = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR), read_scenes(require(ROBOTHOR))[0]
+    assert differences_of(scene, Guide(scene, task), task, stride=7) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", TASKS)
-@pytest.mark.parametrize(("source", "every"), [("coarse", 3), ("maze", 2), ("rooms", 3), ("ithor", 3)])
-def test_best_lengths(source, every, world):
+@pytest.mark.parametrize(("source", "stride"), [("coarse", 3), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+def test_best_lengths(source, stride, world):
     task, starts, differences, lengths = TASKS[world], np.random.default_rng(0), 0, set()
-    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::every]:
+    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::stride]:
         best_length = compile_scene(scene, task).best_length
         assert not best_length[:, ~task.is_goal()].any()
         for pose in starts.choice(len(best_length), 4, replace=False).tolist():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxnav.evaluation.accounting import share_left
+from jaxnav.evaluation.report import remaining_share
 from jaxnav.evaluation.statistics import scene_clusters
 
 SCENES, EPISODES, SEEDS = 12, 10, 4
@@ -24,7 +24,7 @@ def test_a_removal_that_leaves_a_fixed_share_has_it_exactly(share):
     without = np.broadcast_to(
         results(generator, 0.6)[:1], agent.shape
     )  # equal seeds, so that leaving one out is no change
-    interval = share_left(without, agent, without + share * (agent - without), CLUSTERS)
+    interval = remaining_share(without, agent, without + share * (agent - without), CLUSTERS)
     # (w + s (a - w) - w) / (a - w) = s under all weights, so nothing varies.
     np.testing.assert_allclose((interval.mean, interval.low, interval.high), 100 * share, atol=1e-9)
 
@@ -34,7 +34,7 @@ def test_the_interval_holds_the_true_share():
     for _ in range(200):
         # A cost: -0.3 with experience, -0.1 with removal; a third of it is left.
         without, agent, removed = (results(generator, success) for success in (0.9, 0.6, 0.8))
-        interval = share_left(without, agent, removed, CLUSTERS)
+        interval = remaining_share(without, agent, removed, CLUSTERS)
         held += interval.low <= 100 / 3 <= interval.high
     assert held >= 184  # 92 % of 200; the 95 % interval of 95 % is 184 to 195
 
@@ -42,4 +42,4 @@ def test_the_interval_holds_the_true_share():
 def test_there_is_no_share_of_a_lead_that_is_not_clear():
     generator = np.random.default_rng(2)
     without, agent = results(generator, 0.6), results(generator, 0.6)
-    assert np.isnan(share_left(without, agent, agent, CLUSTERS).mean)
+    assert np.isnan(remaining_share(without, agent, agent, CLUSTERS).mean)

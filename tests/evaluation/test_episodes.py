@@ -8,17 +8,16 @@ import pytest
 from support import tiny_world as tiny
 from support.study_results import episodes_in
 
-from jaxnav.baselines.shortest_path import oracle_actions, oracle_outcome, replay
-from jaxnav.env.build import build
+from jaxnav.baselines.shortest_path import oracle_actions, replay_actions, run_oracle
+from jaxnav.env.make import build_environment
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import clusters_of, episode_list
-from jaxnav.evaluation.grid import Outcome, first_states
-from jaxnav.evaluation.metrics import episode_metrics
+from jaxnav.evaluation.episodes import draw_episodes, joint_clusters
+from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics, start_states
 from jaxnav.scenes.generate.rooms import generate_rooms
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, Rules, Task
 
-EPISODES = episode_list(tiny.BANK, 24, seed=1)
+EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
 
 
 def test_episodes_are_possible_and_know_their_best_length():
@@ -33,7 +32,7 @@ def test_episodes_are_possible_and_know_their_best_length():
 def test_episodes_are_equally_many_per_room_type_and_scene():
     bank = compile_bank(generate_rooms(0, 6, 0, seed=1), Task())  # two kitchens and living rooms, one of the others
     assert len(bank.names) == 6
-    episodes = episode_list(bank, 42)
+    episodes = draw_episodes(bank, 42)
     assert episodes.rooms == ("bathroom", "bedroom", "kitchen", "living_room")
     # 42 / 4 is rounded up to 11 of each; where there are two scenes they take turns: 6 and 5.
     np.testing.assert_array_equal(np.bincount(episodes.room), [11] * 4)
@@ -49,13 +48,13 @@ def test_episodes_are_equally_many_per_room_type_and_scene():
 
 
 def test_episodes_are_fixed_by_bank_and_seed():
-    chex.assert_trees_all_equal(episode_list(tiny.BANK, 24, seed=1)[:5], EPISODES[:5])
-    assert not np.array_equal(episode_list(tiny.BANK, 24, seed=2).pose, EPISODES.pose)
+    chex.assert_trees_all_equal(draw_episodes(tiny.BANK, 24, seed=1)[:5], EPISODES[:5])
+    assert not np.array_equal(draw_episodes(tiny.BANK, 24, seed=2).pose, EPISODES.pose)
 
 
 def test_no_episodes_are_refused():
     with pytest.raises(InputError, match="--episodes 0: give at least 1"):
-        episode_list(tiny.BANK, 0)
+        draw_episodes(tiny.BANK, 0)
 
 
 # Floor plans
@@ -64,11 +63,11 @@ def test_no_episodes_are_refused():
 def test_scenes_of_a_floor_plan_are_left_out_together():
     names = ("FloorPlan_Train1_1", "FloorPlan_Train2_1", "FloorPlan_Train1_5")
     episodes = episodes_in([0, 1, 2, 1, 1], names=names)
-    assert episodes.plan.tolist() == [f"FloorPlan_Train{number}" for number in (1, 2, 1, 2, 2)]
+    assert episodes.floor_plans.tolist() == [f"FloorPlan_Train{number}" for number in (1, 2, 1, 2, 2)]
     clusters = episodes.clusters()
     # Two of five are of the first: without them the other three count 5 / 3 each, and else 5 / 2.
     np.testing.assert_allclose(clusters.weights.T, [[1] * 5, [0, 5 / 3, 0, 5 / 3, 5 / 3], [5 / 2, 0, 5 / 2, 0, 0]])
-    assert (clusters.scale.tolist(), clusters.degrees) == ([1 / 2, 1 / 2], 1)
+    assert (clusters.scale.tolist(), clusters.degrees_of_freedom) == ([1 / 2, 1 / 2], 1)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +80,7 @@ def test_scenes_of_a_floor_plan_are_left_out_together():
 )
 def test_room_types_are_strata_where_each_has_two_floor_plans(room, names, degrees):
     clusters = episodes_in(range(5), room=room, names=names).clusters()
-    assert clusters.degrees == degrees
+    assert clusters.degrees_of_freedom == degrees
     # A stratum keeps its weight.
     room = np.array(room) if degrees == 3 and names is None else np.zeros(5, int)
     for kind in set(room):
@@ -90,9 +89,9 @@ def test_room_types_are_strata_where_each_has_two_floor_plans(room, names, degre
 
 def test_a_floor_plan_is_left_out_of_all_lists_at_once():
     here = episodes_in([0, 1, 1, 2, 3], room=[0, 0, 1, 1], names=("a", "b", "c", "d"))
-    there = episodes_in([0, 0, 1, 2], room=[1, 0, 1], names=("c", "a-replaced-1", "d"))
-    one, other = clusters_of([here, there])
-    assert one.degrees == other.degrees == 4 - 2
+    replaced = episodes_in([0, 0, 1, 2], room=[1, 0, 1], names=("c", "a-replaced-1", "d"))
+    one, other = joint_clusters([here, replaced])
+    assert one.degrees_of_freedom == other.degrees_of_freedom == 4 - 2
     np.testing.assert_array_equal(one.scale, other.scale)
     # Bedrooms a (1 here, 1 there) and b (2 here): without one the other two count double. Kitchens c (1 and 2) and d (1
     # and 1): without c the weight of five is d's two, without d it is c's three. The other room type counts as before.
@@ -100,7 +99,7 @@ def test_a_floor_plan_is_left_out_of_all_lists_at_once():
     np.testing.assert_allclose(one.weights[:, 1:], [a, b, b, c, d])
     np.testing.assert_allclose(other.weights[:, 1:], [c, c, a, d])
     # By themselves they would not be: each list has its own scenes.
-    assert there.clusters().weights.shape == (4, 1 + 3)
+    assert replaced.clusters().weights.shape == (4, 1 + 3)
 
 
 # The shortest way in generated rooms
@@ -110,10 +109,10 @@ def test_a_floor_plan_is_left_out_of_all_lists_at_once():
 def test_an_oracle_has_full_marks(rules):
     """It goes down the table of best lengths: SR 1 and SPL 1, exactly."""
     bank = compile_bank(generate_rooms(0, 4, 0, seed=5), Task(rules=rules))
-    env, params = build(bank, {}, 100)
-    episodes = episode_list(bank, 200)
+    env, params = build_environment(bank, {}, 100)
+    episodes = draw_episodes(bank, 200)
     actions = oracle_actions(bank, episodes)
-    outcome = oracle_outcome([bank], [episodes], [params], env)
+    outcome = run_oracle([bank], [episodes], [params], env)
     np.testing.assert_array_equal(outcome.length, episodes.best_length)
     metrics = episode_metrics(outcome, episodes.best_length)
     np.testing.assert_array_equal(metrics["sr"], np.ones(200))
@@ -124,9 +123,11 @@ def test_an_oracle_has_full_marks(rules):
     assert np.median(outcome.length) > 3
 
     # Nothing is taken for granted: other actions fail, and a step limit stops the oracle too.
-    astray = replay(np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), first_states(episodes), params, env)
+    astray = replay_actions(
+        np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), start_states(episodes), params, env
+    )
     assert not astray.success.any()
-    stopped = replay(actions, first_states(episodes), build(bank, {}, 3)[1], env)
+    stopped = replay_actions(actions, start_states(episodes), build_environment(bank, {}, 3)[1], env)
     np.testing.assert_array_equal(stopped.success, episodes.best_length <= 3)
 
 
@@ -134,14 +135,14 @@ def test_an_oracle_has_full_marks(rules):
 
 
 def test_metrics_by_hand():
-    leaves = Outcome(
+    leaves = EpisodeOutcome(
         done=jnp.array([True, True, False, True]),
         success=jnp.array([True, True, False, True]),
         length=jnp.array([10, 1, 30, 2], jnp.int32),
         moves=jnp.array([6, 0, 20, 1], jnp.int32),
         distance=jnp.array([1.4, 0.3, 3.5, 1.0], jnp.float32),
         choices=jnp.array([10, 1, 30, 2], jnp.int32),
-        weight=jnp.zeros(4),
+        mean_weight=jnp.zeros(4),
     )
     outcome = jax.tree.map(np.asarray, leaves)  # as the evaluator returns it
     metrics = episode_metrics(outcome, np.array([5, 1, 6, 2]), budgets=(2, 9))
@@ -162,7 +163,7 @@ def test_metrics_by_hand():
 def test_an_episode_fails_by_a_time_out_or_a_wrong_done():
     zeros, ones = jnp.zeros(3), jnp.ones(3, jnp.int32)
     done, success = jnp.array([True, True, False]), jnp.array([True, False, False])
-    outcome = Outcome(done, success, ones, jnp.zeros(3, jnp.int32), zeros, ones, zeros)
+    outcome = EpisodeOutcome(done, success, ones, jnp.zeros(3, jnp.int32), zeros, ones, zeros)
     metrics = episode_metrics(jax.tree.map(np.asarray, outcome), np.ones(3, np.int32))
     np.testing.assert_array_equal(metrics["wrong_done"], [0, 1, 0])
     np.testing.assert_array_equal(metrics["timeout"], [0, 0, 1])

@@ -11,22 +11,22 @@ import pytest
 from support import tiny_world as tiny
 
 from jaxnav.causal import stde
-from jaxnav.evaluation.episodes import episode_list, together
-from jaxnav.evaluation.grid import Evaluator, act, first_states
-from jaxnav.evaluation.inference import Branch, Source
-from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.episodes import draw_episodes, join_episode_lists
+from jaxnav.evaluation.grid import Evaluator, infer_and_act, start_states
+from jaxnav.evaluation.playback import play_episodes
+from jaxnav.evaluation.removal import GapSource, RemovedLogits
 from jaxnav.evaluation.report import Decoding
-from jaxnav.evaluation.variants import Row, inference_grid, table_row, table_rows
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.methods import Knowledge
-from jaxnav.policies.pathways import NO_ACTION, Memory
+from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.scenes.task import DONE, MOVE_AHEAD
 
 SEEDS, LIMITS = 2, (12, 16)
 ENV, PARAMS = tiny.world()
 PARAMS = PARAMS.replace(step_limit=jnp.array(LIMITS, jnp.int32))
 KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)  # a belief that gives way at once: large gaps
-EPISODES = episode_list(tiny.BANK, 24, seed=1)
+EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
 ARMS = ("baseline", "layout")
 ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"], ARMS)
 #: Parameters of the two baselines, then of the two layout policies; seeds that say Done here and there.
@@ -41,14 +41,14 @@ def control(epsilon, form, decoding, **changes):
 
 #: Controls whose gaps or logits are of other episodes or drawn by key.
 CONTROLS = [
-    control(0.0, "paper", "argmax", source=Source.OTHER),
-    control(0.2, "residual", "sample", source=Source.MEAN),
-    control(0.2, "residual", "sample", source=Source.GIVEN, gap=1.0, begin=2, end=5),
-    control(0.0, "paper", "argmax", branch=Branch.NOISE),
+    control(0.0, "paper", "argmax", gap_source=GapSource.OTHER),
+    control(0.2, "residual", "sample", gap_source=GapSource.MEAN),
+    control(0.2, "residual", "sample", gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=5),
+    control(0.0, "paper", "argmax", removed=RemovedLogits.NOISE),
     control(0.0, "paper", "sample", intervention=1.0),
 ]
 CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, ARMS, SEEDS), *CONTROLS)
-ACTING, KEY = Acting(ENV, tiny.SPEC, tiny.SETTING), jax.random.key(3)
+ACTING, KEY = AgentLoop(ENV, tiny.SPEC, tiny.SETTING), jax.random.key(3)
 
 
 class Compilations(logging.Handler):
@@ -59,7 +59,7 @@ class Compilations(logging.Handler):
         self.count = 0
 
     def emit(self, record):
-        self.count += record.getMessage().startswith("Compiling jit(_run)")
+        self.count += record.getMessage().startswith("Compiling jit(_run_grid)")
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +87,15 @@ def outcome(evaluated):
 
 def pick(outcome, variant, epsilon=None, form=None, decoding: Decoding = "argmax"):
     """The outcome [S, E] of one row."""
-    return tiny.at(outcome, ROWS.index(Row(variant, epsilon, form, decoding)))
+    return tiny.leaves_at(outcome, ROWS.index(EvaluationRow(variant, epsilon, form, decoding)))
 
 
 # Cells
 
 
 def test_the_whole_grid_is_one_compilation(evaluated):
-    _, counted, told = evaluated
-    assert counted == told == 1
+    _, counted, events = evaluated
+    assert counted == events == 1
     # Of each decoding: baseline, layout, TDE, and two forms of three sTDE. And Random.
     assert len(ROWS) == 2 * (3 + 6) + 1
 
@@ -105,21 +105,21 @@ def test_the_whole_grid_is_one_compilation(evaluated):
 def test_at_epsilon_one_nothing_is_taken_out_bit_for_bit(outcome, form, decoding):
     layout = pick(outcome, "layout", decoding=decoding)
     chex.assert_trees_all_equal(pick(outcome, "stde", 1.0, form, decoding), layout)
-    assert not layout.weight.any()
+    assert not layout.mean_weight.any()
     # At epsilon 0 something is taken out, and it matters.
     stde = pick(outcome, "stde", 0.0, form, decoding)
-    assert 0.1 < stde.weight.max() < 1
+    assert 0.1 < stde.mean_weight.max() < 1
     assert not np.array_equal(stde.length, layout.length)
 
 
 def test_hard_tde_takes_all_experience_out(outcome):
-    np.testing.assert_array_equal(pick(outcome, "tde", form="paper").weight, np.ones((SEEDS, 24)))
+    np.testing.assert_array_equal(pick(outcome, "tde", form="paper").mean_weight, np.ones((SEEDS, 24)))
     assert not np.array_equal(pick(outcome, "tde", form="paper").length, pick(outcome, "layout").length)
 
 
 def test_the_weight_falls_as_epsilon_rises(outcome):
     # The first step is the same for all, so that its gap is; afterwards they part.
-    means = [pick(outcome, "stde", epsilon, "residual").weight.mean() for epsilon in (0.0, 0.2, 1.0)]
+    means = [pick(outcome, "stde", epsilon, "residual").mean_weight.mean() for epsilon in (0.0, 0.2, 1.0)]
     assert means[0] > means[1] > means[2] == 0
 
 
@@ -143,16 +143,16 @@ def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_othe
     grid = inference_grid([ROWS[i] for i in cells], ARMS, SEEDS)
     lists = [part(episodes) for episodes in parts]
     evaluator = Evaluator(ACTING)
-    found = evaluator(grid, WEIGHTS, [(episodes, PARAMS) for episodes in lists], KNOWLEDGE, KEY)
+    result = evaluator(grid, WEIGHTS, [(episodes, PARAMS) for episodes in lists], KNOWLEDGE, KEY)
     assert evaluator.compilations == 1
-    found = jax.tree.map(lambda leaf: leaf.reshape(len(cells), SEEDS, -1), found)
+    result = jax.tree.map(lambda leaf: leaf.reshape(len(cells), SEEDS, -1), result)
     expected = jax.tree.map(lambda leaf: leaf[cells][..., np.concatenate(parts)], outcome)
     best = np.array([ROWS[i].decoding == "argmax" for i in cells])
-    chex.assert_trees_all_equal(tiny.at(found, best), tiny.at(expected, best))
+    chex.assert_trees_all_equal(tiny.leaves_at(result, best), tiny.leaves_at(expected, best))
     # Sampled actions follow the number of the episode in its part, which the first four keep.
-    chex.assert_trees_all_equal(tiny.at(found, ..., slice(4)), tiny.at(expected, ..., slice(4)))
-    assert not np.array_equal(found.length[~best], expected.length[~best])
-    merged = together(lists)
+    chex.assert_trees_all_equal(tiny.leaves_at(result, ..., slice(4)), tiny.leaves_at(expected, ..., slice(4)))
+    assert not np.array_equal(result.length[~best], expected.length[~best])
+    merged = join_episode_lists(lists)
     assert merged.scenes == 2 * EPISODES.scenes
     assert [merged.scenes[i] for i in merged.scene] == [
         EPISODES.scenes[i] for i in EPISODES.scene[np.concatenate(parts)]
@@ -162,10 +162,10 @@ def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_othe
 
 
 def test_a_single_episode():
-    grid = tiny.at(CELLS, slice(1))
-    found = Evaluator(ACTING)(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], KNOWLEDGE, KEY)
-    assert found.length.shape == (1, 1)
-    assert 1 <= found.length[0, 0] <= max(LIMITS)
+    grid = tiny.leaves_at(CELLS, slice(1))
+    result = Evaluator(ACTING)(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], KNOWLEDGE, KEY)
+    assert result.length.shape == (1, 1)
+    assert 1 <= result.length[0, 0] <= max(LIMITS)
 
 
 # Against a plain loop
@@ -174,8 +174,8 @@ def test_a_single_episode():
 def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
     """One episode, best actions, by single calls."""
     scene, goal, pose = (int(getattr(EPISODES, name)[episode]) for name in ("scene", "goal", "pose"))
-    prior, weights, belief = KNOWLEDGE.layout[PARAMS.room[scene]], tiny.at(WEIGHTS, seed), None
-    memory = Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
+    prior, weights, belief = KNOWLEDGE.layout[PARAMS.room[scene]], tiny.leaves_at(WEIGHTS, seed), None
+    memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
     length, action, total, moves = 0, None, 0.0, 0
     while length < LIMITS[scene] and action != DONE:
         row = tiny.BANK.rows[pose]
@@ -186,14 +186,14 @@ def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
         logits = stde(factual.logits, counterfactual.logits, belief.gap, epsilon, form)
         action = int(np.argmax(logits))
         length, moves, total = length + 1, moves + (action == MOVE_AHEAD), total + float(weight)
-        memory = Memory(factual.hidden, jnp.int32(action))  # what is carried on is factual
+        memory = PolicyState(factual.hidden, jnp.int32(action))  # what is carried on is factual
         pose = int(tiny.BANK.successor[pose, action])
     return {
         "success": action == DONE and tiny.BANK.best_length[pose, goal] == 1,
         "length": length,
         "moves": moves,
         "distance": tiny.BANK.goal_distance[pose // tiny.POSES_PER_CELL, goal],
-        "weight": total / length,
+        "mean_weight": total / length,
     }
 
 
@@ -202,60 +202,62 @@ def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
     [("baseline", None, None), ("layout", None, None), ("stde", 0.0, "paper"), ("stde", 0.2, "residual")],
 )
 def test_outcomes_are_those_of_a_plain_loop(outcome, variant, epsilon, form):
-    found = pick(outcome, variant, epsilon, form)
+    result = pick(outcome, variant, epsilon, form)
     layout, threshold = variant != "baseline", jnp.float32(np.inf if epsilon is None else epsilon)
     for seed in range(SEEDS):
         for episode in range(0, 24, 3):
             expected = plain_loop(seed + SEEDS * layout, episode, layout, threshold, form or "residual")
             for name, value in expected.items():
-                assert getattr(found, name)[seed, episode] == pytest.approx(value, rel=1e-4, abs=1e-6), (name, episode)
+                assert getattr(result, name)[seed, episode] == pytest.approx(value, rel=1e-4, abs=1e-6), (name, episode)
 
 
 @jax.jit
 def begin(weights):
     memory = ACTING.bind(weights).initial_memory(EPISODES.goal.shape)
-    return ACTING.begin(first_states(EPISODES), memory, KNOWLEDGE, PARAMS)
+    return ACTING.begin(start_states(EPISODES), memory, KNOWLEDGE, PARAMS)
 
 
 @jax.jit
 def take(cell, weights, agent, running, keys):
-    return act(cell, ACTING.bind(weights), agent, running, keys, ACTING, PARAMS, KNOWLEDGE)
+    return infer_and_act(cell, ACTING.bind(weights), agent, running, keys, ACTING, PARAMS, KNOWLEDGE)
 
 
 @pytest.mark.parametrize("number", range(len(CONTROLS)))
 def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, number):
     """Leaving ended episodes out changes no one's next running episode and no one's noise."""
     for seed in range(SEEDS):
-        cell = tiny.at(CELLS, (len(ROWS) + number) * SEEDS + seed)
-        weights = tiny.at(WEIGHTS, int(cell.params))
+        cell = tiny.leaves_at(CELLS, (len(ROWS) + number) * SEEDS + seed)
+        weights = tiny.leaves_at(WEIGHTS, int(cell.policy_index))
         # Folded with the part, the parameters and the episode.
-        folded = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.params)
+        folded = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.policy_index)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(folded, jnp.arange(len(EPISODES.goal)))
         agent = begin(weights)
         running = np.ones(len(EPISODES.goal), bool)
         success, length, total = ~running, np.zeros(len(running), int), np.zeros(len(running))
         while running.any():
-            agent, taken, inferred = take(cell, weights, agent, running, keys)
-            success |= running & np.asarray(taken.success)
+            agent, step_result, inferred = take(cell, weights, agent, running, keys)
+            success |= running & np.asarray(step_result.success)
             length += running
             total += np.where(running, inferred.weight, 0.0)
-            running &= ~np.asarray(taken.ended)
-        found = tiny.at(outcome, len(ROWS) + number, seed)
-        np.testing.assert_array_equal(found.success, success)
-        np.testing.assert_array_equal(found.length, length)
-        np.testing.assert_allclose(found.weight, total / length, rtol=1e-5, atol=1e-7)
+            running &= ~np.asarray(step_result.ended)
+        result = tiny.leaves_at(outcome, len(ROWS) + number, seed)
+        np.testing.assert_array_equal(result.success, success)
+        np.testing.assert_array_equal(result.length, length)
+        np.testing.assert_allclose(result.mean_weight, total / length, rtol=1e-5, atol=1e-7)
 
 
 def test_playing_an_episode_agrees_with_the_grid(outcome):
-    row = ROWS.index(Row("stde", 0.2, "residual", "argmax"))
-    cell = tiny.at(CELLS, row * SEEDS + 1)
-    traces = play(cell, tiny.at(WEIGHTS, int(cell.params)), first_states(EPISODES), ACTING, PARAMS, KNOWLEDGE)
+    row = ROWS.index(EvaluationRow("stde", 0.2, "residual", "argmax"))
+    cell = tiny.leaves_at(CELLS, row * SEEDS + 1)
+    traces = play_episodes(
+        cell, tiny.leaves_at(WEIGHTS, int(cell.policy_index)), start_states(EPISODES), ACTING, PARAMS, KNOWLEDGE
+    )
     for episode, trace in enumerate(traces):
-        found = tiny.at(outcome, row, 1, episode)
-        assert (len(trace.pose), trace.success) == (found.length, found.success)
+        result = tiny.leaves_at(outcome, row, 1, episode)
+        assert (len(trace.pose), trace.success) == (result.length, result.success)
         assert trace.pose[0] == EPISODES.pose[episode]
         assert not (trace.action[:-1] == DONE).any()
-        assert np.maximum(trace.gap - 0.2, 0).mean() == pytest.approx(found.weight, abs=1e-6)
+        assert np.maximum(trace.gap - 0.2, 0).mean() == pytest.approx(result.mean_weight, abs=1e-6)
         how, weight = trace.inferred, np.maximum(trace.gap - 0.2, 0)[:, None]
         np.testing.assert_allclose(how.weight, weight[:, 0], atol=1e-7)
         # Equation 2 in its residual form, and the best action of what it gives.

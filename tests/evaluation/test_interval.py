@@ -27,7 +27,7 @@ def fields(interval: Interval) -> list[float]:
 )
 def test_it_is_written_with_its_bounds(interval, spec, text):
     assert f"{interval:{spec}}" == text
-    assert interval.bounded == ("," in text)
+    assert interval.has_bounds == ("," in text)
 
 
 def test_levels_and_signs_keep_the_bounds_in_order():
@@ -41,7 +41,7 @@ def test_levels_and_signs_keep_the_bounds_in_order():
 
 @pytest.mark.parametrize("turned", [-UNDEFINED, UNDEFINED - 0.5, 0.5 - UNDEFINED, -Interval(1.0), 0.5 - Interval(1.0)])
 def test_what_has_no_bounds_gets_none(turned):
-    assert not turned.bounded
+    assert not turned.has_bounds
     assert math.isnan(turned.high)
 
 

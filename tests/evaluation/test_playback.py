@@ -10,29 +10,28 @@ from PIL import Image
 from PIL.GifImagePlugin import GifImageFile
 from support import tiny_world as tiny
 
-from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.inference import Inferred
-from jaxnav.evaluation.playback import Trace
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.evaluation.playback import EpisodeTrace
+from jaxnav.evaluation.removal import InferenceTrace
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
-from jaxnav.viz.episode import draw_episode
-from jaxnav.viz.panel import Episode, Panel
-from jaxnav.viz.plan import view_cone
+from jaxnav.viz.episode import EpisodePanel, PlayedEpisode, draw_episode
+from jaxnav.viz.scene import view_cone
 
 
 def episode_of(action, success=False, shift=0.0):
     """An episode of the tiny world with the given actions."""
-    episodes = episode_list(tiny.BANK, 12)
+    episodes = draw_episodes(tiny.BANK, 12)
     pose = [int(episodes.pose[0])]
-    for chosen in action[:-1]:
-        pose.append(int(tiny.BANK.successor[pose[-1], chosen]))
+    for played_action in action[:-1]:
+        pose.append(int(tiny.BANK.successor[pose[-1], played_action]))
     gap, logits = np.linspace(0.9, 0.2, len(pose)), np.zeros((len(pose), NUM_ACTIONS))
-    inferred = Inferred(*map(jnp.asarray, (np.ones((len(pose), 1)), gap, gap - 0.1, logits, logits, logits)))
-    trace = Trace(np.array(pose), np.array(action), inferred, success)
+    inferred = InferenceTrace(*map(jnp.asarray, (np.ones((len(pose), 1)), gap, gap - 0.1, logits, logits, logits)))
+    trace = EpisodeTrace(np.array(pose), np.array(action), inferred, success)
     scene = (tiny.KITCHEN, tiny.BEDROOM)[episodes.scene[0]]
     cells = cell_centres(scene, standable_cells(scene.reach))
-    return Episode(
+    return PlayedEpisode(
         trace=trace,
         scene=scene,
         places=cells[trace.pose // tiny.POSES_PER_CELL - tiny.BANK.first_cell[episodes.scene[0]]],
@@ -85,10 +84,10 @@ def test_panels_are_in_step_and_keep_their_ends(tmp_path):
 )
 def test_a_panel_says_how_the_episode_ends(actions, success, words):
     figure = Figure()
-    panel = Panel(figure, 0.0, 1.0, episode_of(actions, success, shift=0.5), 2)
-    panel.draw(0)
+    panel = EpisodePanel(figure, 0.0, 1.0, episode_of(actions, success, shift=0.5), 2)
+    panel.draw_step(0)
     assert {"layout shifted by 0.5", "step 1: turns left"} <= {text.get_text() for text in figure.texts}
-    panel.draw(7)  # others may last longer
+    panel.draw_step(7)  # others may last longer
     assert any(text.get_text().startswith(words) for text in figure.texts)
 
 

@@ -174,9 +174,9 @@ def test_nan_never_reaches_the_file(tmp_path):
 
 
 def test_versions():
-    found = reports.versions()
-    assert list(found) == ["jaxnav", "jax", "flax", "numpy", "python"]
-    assert (found["jax"], found["numpy"]) == (jax.__version__, np.__version__)
+    versions = reports.package_versions()
+    assert list(versions) == ["jaxnav", "jax", "flax", "numpy", "python"]
+    assert (versions["jax"], versions["numpy"]) == (jax.__version__, np.__version__)
 
 
 @pytest.mark.parametrize(("installed", "expected"), [({"jaxnav": "1.2.3"}, "1.2.3"), ({}, "source")])
@@ -187,4 +187,4 @@ def test_version_of_an_installed_package_and_of_a_source_tree(monkeypatch, insta
         return installed.get(name, "0")
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    assert reports.versions()["jaxnav"] == expected
+    assert reports.package_versions()["jaxnav"] == expected

@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from jaxnav.evaluation import report_tables
+from jaxnav.evaluation import report as report_tables
 
 ROW = {"variant": "baseline", "method": "ORG", "world": "ithor", "split": "test"}
 ROW |= {"epsilon": None, "decoding": "argmax", "form": None}
@@ -77,7 +77,7 @@ def test_a_cell_without_an_interval_says_so():
 def test_console_table():
     report = fixed_report(fixed_row(method="[bold]X[/bold]"), fixed_row(decoding="sample", method="VTNet"))
     console = Console(width=160, record=True, file=io.StringIO(), markup=False)
-    console.print(report_tables.console_table(report))
+    console.print(report_tables.results_table(report))
     lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines()]
     assert [cells for cells in lines if cells] == [
         ["ithor test, argmax decoding", "", "", "", "", "", ""],

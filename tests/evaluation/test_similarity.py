@@ -10,7 +10,12 @@ from scipy.spatial.distance import cosine
 from scipy.special import rel_entr
 from support import tiny_world as tiny
 
-from jaxnav.evaluation.similarity import expected, layout_gap, layout_similarity, scene_counts
+from jaxnav.evaluation.similarity import (
+    cooccurrence_counts,
+    expected_cooccurrence,
+    scene_layout_gap,
+    scene_layout_similarity,
+)
 from jaxnav.scenes.tables.observation_row import RowFormat
 
 K = 4
@@ -19,7 +24,7 @@ MATRICES = st.lists(st.integers(0, 30), min_size=K * K, max_size=K * K).map(lamb
 
 def test_counts_are_those_of_the_poses_of_each_scene_one_by_one():
     bank, row_format = tiny.BANK, RowFormat(len(tiny.CATEGORIES))
-    counts = scene_counts(bank)
+    counts = cooccurrence_counts(bank)
     assert counts.shape == (2, 3, 3)
     first = bank.num_cells[0] * tiny.POSES_PER_CELL  # the kitchen's 16 cells, then the bedroom's 6
     for scene, rows in enumerate((bank.rows[:first], bank.rows[first:])):
@@ -33,7 +38,7 @@ def test_counts_are_those_of_the_poses_of_each_scene_one_by_one():
 def test_expected_co_occurrence():
     # Row 0: 1 and 3 of 4; row 1: nothing; row 2: all with category 0. The diagonal is no part of it.
     counts = np.array([[9, 1, 3], [0, 5, 0], [2, 0, 0]])
-    np.testing.assert_array_equal(expected(counts), [[0, 0.25, 0.75], [0, 0, 0], [1, 0, 0]])
+    np.testing.assert_array_equal(expected_cooccurrence(counts), [[0, 0.25, 0.75], [0, 0, 0], [1, 0, 0]])
 
 
 def test_the_gap_in_numbers():
@@ -44,22 +49,22 @@ def test_the_gap_in_numbers():
     prior = np.array([[0, 7, 7], [1, 0, 1], [1, 1, 0]])
     row_0 = 0.2625 * math.log(0.2625 / 0.5) + 0.7375 * math.log(0.7375 / 0.5)
     row_2 = 0.975 * math.log(0.975 / 0.5) + 0.025 * math.log(0.025 / 0.5)
-    np.testing.assert_allclose(layout_gap(counts, prior), [(row_0 + row_2) / 2], rtol=1e-12)
+    np.testing.assert_allclose(scene_layout_gap(counts, prior), [(row_0 + row_2) / 2], rtol=1e-12)
     # Cosine: the scene's rows 0 and 2 are (1/4, 3/4, 1, 0), the prior's (1/2, 1/2, 1/2, 1/2).
     likeness = (0.125 + 0.375 + 0.5) / math.sqrt((0.0625 + 0.5625 + 1) * 1)
-    np.testing.assert_allclose(layout_similarity(counts, prior), [likeness], rtol=1e-12)
+    np.testing.assert_allclose(scene_layout_similarity(counts, prior), [likeness], rtol=1e-12)
 
 
 def test_a_scene_in_which_nothing_is_seen_together_has_no_number():
     counts = np.stack([np.diag([3.0, 4, 0, 0]), np.ones((K, K))])
-    assert np.isnan(layout_gap(counts, np.ones((K, K)))).tolist() == [True, False]
-    assert np.isnan(layout_similarity(counts, np.ones((K, K)))).tolist() == [True, False]
+    assert np.isnan(scene_layout_gap(counts, np.ones((K, K)))).tolist() == [True, False]
+    assert np.isnan(scene_layout_similarity(counts, np.ones((K, K)))).tolist() == [True, False]
 
 
 @given(st.lists(MATRICES, min_size=3, max_size=3), st.lists(MATRICES, min_size=3, max_size=3))
 def test_as_scipy_has_it(counts, priors):
     counts, priors = np.array(counts), np.array(priors)
-    gaps, likeness = layout_gap(counts, priors), layout_similarity(counts, priors)
+    gaps, likeness = scene_layout_gap(counts, priors), scene_layout_similarity(counts, priors)
     for scene, prior, gap, like in zip(counts, priors, gaps, likeness, strict=True):
         rows = [(np.delete(scene[i], i), np.delete(prior[i], i)) for i in range(K) if np.delete(scene[i], i).sum() > 0]
         if not rows:
@@ -77,14 +82,14 @@ def test_as_scipy_has_it(counts, priors):
 @given(MATRICES, st.floats(0.1, 50))
 def test_amounts_and_the_diagonal_do_not_matter(counts, factor):
     counts, prior = counts[None] + 1, factor * (counts + 1) + np.diag([1.0, 2, 3, 4])
-    np.testing.assert_allclose(layout_gap(counts, prior), 0, atol=1e-12)
-    np.testing.assert_allclose(layout_similarity(counts, prior), 1, rtol=1e-12)
+    np.testing.assert_allclose(scene_layout_gap(counts, prior), 0, atol=1e-12)
+    np.testing.assert_allclose(scene_layout_similarity(counts, prior), 1, rtol=1e-12)
 
 
 def test_a_prior_of_each_scene():
     counts = np.random.default_rng(0).integers(0, 9, (3, K, K))
     priors = np.random.default_rng(1).integers(0, 9, (3, K, K))
-    for measure in (layout_gap, layout_similarity):
+    for measure in (scene_layout_gap, scene_layout_similarity):
         alone = [measure(scene[None], prior)[0] for scene, prior in zip(counts, priors, strict=True)]
         np.testing.assert_allclose(measure(counts, priors), alone, rtol=1e-12)
         assert measure(counts, priors) != pytest.approx(measure(counts, priors[::-1]))

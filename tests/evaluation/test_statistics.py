@@ -12,12 +12,12 @@ from support.simulated_results import SIZES, coverage, episode_bootstrap, jackkn
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import (
     Interval,
-    jackknife,
+    jackknife_interval,
     leave_one_out,
+    mean_interval,
     paired_difference,
+    run_clusters,
     scene_clusters,
-    summary,
-    training_runs,
 )
 
 
@@ -39,7 +39,7 @@ def test_the_others_of_a_stratum_take_over_its_weight():
     expected = {"a": [0, 0, 3, 1, 1], "b": [1.5, 1.5, 0, 1, 1], "c": [1, 1, 1, 0, 2], "d": [1, 1, 1, 2, 0]}
     np.testing.assert_allclose(clusters.weights, np.array([[1] * 5, *expected.values()]).T)
     np.testing.assert_allclose(clusters.scale, 1 / 2)  # two clusters in each stratum
-    assert clusters.degrees == 4 - 2
+    assert clusters.degrees_of_freedom == 4 - 2
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2)), min_size=2, max_size=20))
@@ -54,10 +54,10 @@ def test_strata_keep_their_weight(pairs):
 
 def test_a_room_type_of_one_floor_plan_joins_the_others():
     plans, rooms = np.array(list("aabbcc")), np.array([0, 0, 0, 0, 1, 1])
-    assert scene_clusters(plans, rooms).degrees == 3 - 1
-    assert scene_clusters(plans, np.array([0, 0, 0, 0, 0, 0])).degrees == 3 - 1
+    assert scene_clusters(plans, rooms).degrees_of_freedom == 3 - 1
+    assert scene_clusters(plans, np.array([0, 0, 0, 0, 0, 0])).degrees_of_freedom == 3 - 1
     # Negative control: two floor plans of each type stay apart.
-    assert scene_clusters(np.array(list("aabbcd")), rooms).degrees == 4 - 2
+    assert scene_clusters(np.array(list("aabbcd")), rooms).degrees_of_freedom == 4 - 2
 
 
 # Closed forms
@@ -65,7 +65,7 @@ def test_a_room_type_of_one_floor_plan_joins_the_others():
 
 def test_the_mean_of_scenes_has_students_interval():
     # Five scenes of one episode: mean 3, variance of the mean 2.5 / 5 = 0.5, 4 degrees of freedom.
-    interval = summary(np.array([[1.0, 2, 3, 4, 5]]), scenes_of(5), trained=False)
+    interval = mean_interval(np.array([[1.0, 2, 3, 4, 5]]), scenes_of(5), trained=False)
     assert interval.mean == 3
     assert half_width(interval) == pytest.approx(t.ppf(0.975, 4) * math.sqrt(0.5))
 
@@ -73,24 +73,24 @@ def test_the_mean_of_scenes_has_students_interval():
 def test_episodes_of_a_scene_count_as_one():
     # Twenty episodes in each scene, all alike, say no more than one. Treated as independent they would give a fifth.
     values = np.repeat([[1.0, 2, 3, 4, 5]], 20, axis=1)
-    clustered = summary(values, scenes_of(5, 20), trained=False)
+    clustered = mean_interval(values, scenes_of(5, 20), trained=False)
     assert half_width(clustered) == pytest.approx(t.ppf(0.975, 4) * math.sqrt(0.5))
-    apart = summary(values, scenes_of(100), trained=False)
+    apart = mean_interval(values, scenes_of(100), trained=False)
     assert half_width(apart) < 0.4 * half_width(clustered)
 
 
 def test_room_types_take_out_the_variance_between_them():
     # Types with scenes 0, 1 and 10, 11: the variance of each type's mean is 0.5 / 2, of the whole (0.25 + 0.25) / 4.
     values, rooms = np.array([[0.0, 1, 10, 11]]), np.array([0, 0, 1, 1])
-    within = summary(values, scene_clusters(np.arange(4), rooms), trained=False)
+    within = mean_interval(values, scene_clusters(np.arange(4), rooms), trained=False)
     assert half_width(within) == pytest.approx(t.ppf(0.975, 2) * math.sqrt(0.125))
-    assert half_width(summary(values, scenes_of(4), trained=False)) > 3 * half_width(within)
+    assert half_width(mean_interval(values, scenes_of(4), trained=False)) > 3 * half_width(within)
 
 
 def test_seeds_alone_have_students_interval():
     # All scenes alike: seed means 1, 2 and 6 have mean 3 and variance 7, so 7 / 3 with 2 degrees of freedom.
     values = np.repeat([[1.0], [2.0], [6.0]], 12, axis=1)
-    interval = summary(values, scenes_of(12))
+    interval = mean_interval(values, scenes_of(12))
     assert (interval.mean, interval.seeds) == (pytest.approx(3), pytest.approx((1, 2, 6)))
     assert interval.std == pytest.approx(math.sqrt(7))
     assert half_width(interval) == pytest.approx(t.ppf(0.975, 2) * math.sqrt(7 / 3))
@@ -121,12 +121,12 @@ def test_crossed_means_follow_the_analysis_of_variance(seed):
     draw = np.random.default_rng(seed)
     values = draw.normal(size=(4, 1)) + draw.normal(size=(1, 9)) + 0.5 * draw.normal(size=(4, 9))
     variance, degrees = anova(values)
-    assert half_width(summary(values, scenes_of(9))) == pytest.approx(t.ppf(0.975, degrees) * math.sqrt(variance))
+    assert half_width(mean_interval(values, scenes_of(9))) == pytest.approx(t.ppf(0.975, degrees) * math.sqrt(variance))
 
 
 def test_a_variance_is_never_below_one_of_its_parts():
     # Scenes -1 and +1 in seed 0, +1 and -1 in seed 1: neither scenes nor seeds differ, the rest would be subtracted.
-    interval = summary(np.array([[-1.0, 1, 0], [1, -1, 0]]), scenes_of(3))
+    interval = mean_interval(np.array([[-1.0, 1, 0], [1, -1, 0]]), scenes_of(3))
     assert (interval.low, interval.high) == pytest.approx((0, 0))
 
 
@@ -160,15 +160,15 @@ def test_runs_trained_apart_vary_apart():
 def test_a_difference_turned_round_changes_sign(outcomes, same_runs):
     values = np.reshape(outcomes, (2, 12))
     a, b, scenes = values, values[::-1], leave_one_out(np.arange(12) % 4)
-    there, back = (paired_difference(*pair, scenes, same_runs=same_runs) for pair in ((a, b), (b, a)))
-    assert (back.mean, back.low, back.high) == pytest.approx((-there.mean, -there.high, -there.low))
+    forth, back = (paired_difference(*pair, scenes, same_runs=same_runs) for pair in ((a, b), (b, a)))
+    assert (back.mean, back.low, back.high) == pytest.approx((-forth.mean, -forth.high, -forth.low))
 
 
 @settings(max_examples=30)
 @given(st.lists(st.integers(-50, 50), min_size=24, max_size=24), st.floats(0.1, 100), st.floats(-10, 10))
 def test_an_interval_follows_a_change_of_units(cells, scale, shift):
     values, scenes = np.reshape(cells, (3, 8)) / 10, scenes_of(8)
-    before, after = summary(values, scenes), summary(values * scale + shift, scenes)
+    before, after = mean_interval(values, scenes), mean_interval(values * scale + shift, scenes)
     expected = [scale * x + shift for x in (before.mean, before.low, before.high)]
     assert (after.mean, after.low, after.high) == pytest.approx(expected, abs=1e-9)
     assert after.std == pytest.approx(before.std * scale, abs=1e-9)
@@ -180,16 +180,16 @@ def test_an_interval_follows_a_change_of_units(cells, scale, shift):
 @pytest.mark.parametrize(("runs", "scenes", "bounded"), [(2, 3, True), (2, 2, False), (1, 20, False), (3, 1, False)])
 def test_too_few_scenes_or_runs_have_no_bounds(runs, scenes, bounded):
     values = np.random.default_rng(0).random((runs, 2 * scenes))
-    interval = summary(values, scenes_of(scenes, 2))
+    interval = mean_interval(values, scenes_of(scenes, 2))
     assert interval.mean == pytest.approx(values.mean())
-    assert interval.bounded == bounded
+    assert interval.has_bounds == bounded
     assert math.isnan(interval.std) == (runs == 1)
 
 
 def test_a_statistic_that_a_scene_decides_has_no_bounds():
     replicates = np.array([0.5, math.nan, 0.4, 0.6])
-    assert not jackknife(replicates, scenes_of(3)).bounded
-    assert jackknife(np.array([0.5, 0.5, 0.4, 0.6]), scenes_of(3)).bounded
+    assert not jackknife_interval(replicates, scenes_of(3)).has_bounds
+    assert jackknife_interval(np.array([0.5, 0.5, 0.4, 0.6]), scenes_of(3)).has_bounds
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_a_statistic_that_a_scene_decides_has_no_bounds():
 )
 def test_bad_input_is_refused(values, message):
     with pytest.raises(InputError, match=message):
-        summary(values, scenes_of(2))
+        mean_interval(values, scenes_of(2))
     with pytest.raises(InputError, match=message):
         paired_difference(values, values, scenes_of(2))
 
@@ -228,6 +228,6 @@ def test_episodes_taken_for_independent_cover_far_less():
 
 
 def test_runs_of_both_arms_are_left_out_within_their_arm():
-    runs = training_runs(2, 3)
-    assert runs.degrees == 4
+    runs = run_clusters(2, 3)
+    assert runs.degrees_of_freedom == 4
     np.testing.assert_allclose(runs.weights[:, 1], [0, 1.5, 1.5, 1, 1, 1])

@@ -7,10 +7,10 @@ import pytest
 from support import tiny_world as tiny
 from support.rollouts import ENV, KNOWLEDGE, PARAMS
 
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator
 from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.policies.acting import Acting
+from jaxnav.policies.agent_loop import AgentLoop
 
 EPISODES = 64
 
@@ -22,13 +22,13 @@ def test_episodes_without_experience_are_those_of_the_direct_stream():
     stream = weights["experience_stream"]
     mute = weights | {"experience_stream": stream | {"actor": jax.tree.map(jnp.zeros_like, stream["actor"])}}
     rows = [table_row(variant, None, None, "sample") for variant in ("layout", "tde")]
-    grid, evaluator = inference_grid(rows, ("layout",), 1), Evaluator(Acting(ENV, tiny.STREAMS, tiny.SETTING))
-    parts = [(episode_list(tiny.BANK, EPISODES, seed=1), PARAMS)]
+    grid, evaluator = inference_grid(rows, ("layout",), 1), Evaluator(AgentLoop(ENV, tiny.STREAMS, tiny.SETTING))
+    parts = [(draw_episodes(tiny.BANK, EPISODES, seed=1), PARAMS)]
     whole, alone = (
         evaluator(grid, jax.tree.map(lambda leaf: leaf[None], given), parts, KNOWLEDGE, jax.random.key(0))
         for given in (weights, mute)
     )
     for name in ("done", "success", "length", "moves", "distance"):
-        found, expected = getattr(whole, name), getattr(alone, name)
-        np.testing.assert_array_equal(found[1], expected[0])
+        result, expected = getattr(whole, name), getattr(alone, name)
+        np.testing.assert_array_equal(result[1], expected[0])
     assert (whole.length[0] != whole.length[1]).mean() > 0.2  # experience matters to the policy that has it

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from jaxnav.errors import InputError
-from jaxnav.game.keys import pressed
+from jaxnav.game.keys import read_keys
 
 pty = pytest.importorskip("pty")
 termios = pytest.importorskip("termios")
@@ -16,13 +16,13 @@ def test_keys_have_names_and_the_terminal_is_restored():
     controller, terminal = pty.openpty()
     with os.fdopen(terminal, "r+b", buffering=0) as raw, io.TextIOWrapper(raw) as stream:
         before = termios.tcgetattr(terminal)
-        with pressed(stream) as keys:
+        with read_keys(stream) as keys:
             during = termios.tcgetattr(terminal)[3]
             assert not during & (termios.ECHO | termios.ICANON)
             os.write(controller, b"w\x1b[A\x1b[D\x1bOC\r\x1b[5~q")
             assert [next(keys) for _ in range(7)] == ["w", "up", "left", "right", "enter", "\x1b[5~", "q"]
         assert termios.tcgetattr(terminal) == before
-        with pytest.raises(KeyboardInterrupt), pressed(stream):
+        with pytest.raises(KeyboardInterrupt), read_keys(stream):
             raise KeyboardInterrupt
         assert termios.tcgetattr(terminal) == before
     os.close(controller)
@@ -32,6 +32,6 @@ def test_what_is_no_terminal_is_refused(tmp_path):
     with (
         (tmp_path / "file").open("w+") as file,
         pytest.raises(InputError, match="play: the input is no terminal"),
-        pressed(file),
+        read_keys(file),
     ):
         pass

@@ -8,21 +8,21 @@ import pytest
 from rich.console import Console
 from support import tiny_world as tiny
 
-from jaxnav.evaluation.episodes import episode_list
-from jaxnav.game.episode import Ending, Game, Look
-from jaxnav.game.screen import end_screen, look_screen
-from jaxnav.layout import SETTINGS
-from jaxnav.policies.methods import Knowledge
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.game.episode import Game, GameResult, GameView
+from jaxnav.game.screen import game_screen, result_screen
+from jaxnav.layout import ESTIMATORS
+from jaxnav.policies.method import Knowledge
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.worlds import FileScenes
 
 ENV, _ = tiny.world()
-EPISODES = episode_list(tiny.BANK, 40)
+EPISODES = draw_episodes(tiny.BANK, 40)
 BOOK = EPISODES.take(np.flatnonzero((EPISODES.goal == 0) & (EPISODES.scene == 0))[:1])
 WORLD = CompiledWorld(
     FileScenes((tiny.KITCHEN, tiny.BEDROOM), "tiny"), ENV, (tiny.BANK,), {}, 9, len(tiny.BANK.ahead), 2, "tiny"
 )
-GAME = Game(WORLD, BOOK, Knowledge(jnp.zeros(1)), SETTINGS["paper"])
+GAME = Game(WORLD, BOOK, Knowledge(jnp.zeros(1)), ESTIMATORS["paper"])
 
 
 def text(renderable, width=80):
@@ -36,13 +36,13 @@ def look(**changes):
     cells[0] = 1
     cells[3, 5] = 2
     seen = [("Book", 0.5, 0.0, 0.9), ("CoffeeMachine", 1.0, 1.0, 0.5), ("Chair", 4.0, -4.0, 0.5)]
-    fields = {"time": 3, "limit": 9, "heading": 45.0, "horizon": 30.0, "cells": cells, "seen": seen}
+    fields = {"time": 3, "step_limit": 9, "heading": 45.0, "horizon": 30.0, "view_cells": cells, "detections": seen}
     weights = np.array([1.0, 0.25, 0.5])
-    return Look(**fields | {"weights": weights, "gap": 0.6, "advice": None} | changes)
+    return GameView(**fields | {"goal_weights": weights, "gap": 0.6, "advice": None} | changes)
 
 
 def test_the_screen_says_what_is_perceived():
-    shown = text(look_screen(GAME, look(advice=np.array([0.1, 0.6, 0.25, 0.05, 0.0, 0.0]))))
+    shown = text(game_screen(GAME, look(advice=np.array([0.1, 0.6, 0.25, 0.05, 0.0, 0.0]))))
     assert max(map(len, shown.splitlines())) <= 80
     assert "Looking for Book" in shown
     assert "step 3 of 9, heading 45°, camera 30° down" in shown
@@ -56,7 +56,7 @@ def test_the_screen_says_what_is_perceived():
 
 def test_the_view_has_the_agent_at_the_bottom():
     """Book is two cells ahead, the machine four ahead and four to the right; the chair is beyond the view."""
-    lines = text(look_screen(GAME, look())).splitlines()
+    lines = text(game_screen(GAME, look())).splitlines()
     rows = [line[1:23] for line in lines if line.startswith("│")][:11]
     assert rows[10] == "· " * 5 + "▲ " + "· " * 5
     assert rows[8] == " " * 10 + "a " + " " * 10
@@ -66,7 +66,7 @@ def test_the_view_has_the_agent_at_the_bottom():
 
 
 def test_nothing_detected_is_said():
-    shown = text(look_screen(GAME, look(seen=[], horizon=0.0)))
+    shown = text(game_screen(GAME, look(detections=[], horizon=0.0)))
     assert "nothing" in shown
     assert "camera" not in shown
     assert "the policy" not in shown
@@ -75,16 +75,16 @@ def test_nothing_detected_is_said():
 @pytest.mark.parametrize(
     ("ending", "words"),
     [
-        ({"success": True, "done": True}, "found in 2 actions; a shortest path takes 1. SPL 50 %"),
-        ({"done": True}, "wrong Done after 2 actions; a shortest path takes 1. SPL 0 %"),
-        ({"quit": True}, "left after 2 actions"),
+        ({"success": True, "said_done": True}, "found in 2 actions; a shortest path takes 1. SPL 50 %"),
+        ({"said_done": True}, "wrong Done after 2 actions; a shortest path takes 1. SPL 0 %"),
+        ({"has_quit": True}, "left after 2 actions"),
         ({}, "out of time after 2 actions"),
     ],
 )
 def test_the_end_says_how_it_went(ending, words):
     pose = int(BOOK.pose[0])
-    how = {"success": False, "done": False, "quit": False} | ending
-    assert f"Book: {words}" in text(end_screen(GAME, Ending([pose] * 3, [pose] * 2, **how), tiny.KITCHEN, 80))
+    how = {"success": False, "said_done": False, "has_quit": False} | ending
+    assert f"Book: {words}" in text(result_screen(GAME, GameResult([pose] * 3, [pose] * 2, **how), tiny.KITCHEN, 80))
 
 
 def test_the_map_shows_both_paths():
@@ -94,8 +94,8 @@ def test_the_map_shows_both_paths():
     past the last row, and (1.5, 0), past the last column.
     """
     per_cell = tiny.POSES_PER_CELL
-    ending = Ending([0, per_cell], [0, 4 * per_cell], False, False, True)
-    wide = text(end_screen(GAME, ending, tiny.KITCHEN, 80)).splitlines()[:5]
+    ending = GameResult([0, per_cell], [0, 4 * per_cell], False, False, True)
+    wide = text(result_screen(GAME, ending, tiny.KITCHEN, 80)).splitlines()[:5]
     assert [line.rstrip() for line in wide] == [
         "░ ░ ░ ░ ░ ░",
         "· · · · ░ ░",
@@ -103,5 +103,5 @@ def test_the_map_shows_both_paths():
         "○ · · · ░ ░",
         "S ● · · ░ ░",
     ]
-    narrow = text(end_screen(GAME, ending, tiny.KITCHEN, 11)).splitlines()
+    narrow = text(result_screen(GAME, ending, tiny.KITCHEN, 11)).splitlines()
     assert "S●··░░" in narrow

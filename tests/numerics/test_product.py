@@ -7,14 +7,14 @@ import pytest
 from flax import nnx
 from support.arrays import normal
 
-from jaxnav.numerics.product import Linear, product
+from jaxnav.numerics.product import Linear, matmul_rows
 
 
 @pytest.mark.parametrize("width", [9, 0])
 @pytest.mark.parametrize("shape", [(), (6,), (2, 3, 5)])
 def test_product_has_jaxs_gradients(shape, width):
     rows, kernel, by_result = normal(8, *shape, width), normal(9, width, 4), normal(10, *shape, 4)
-    value, pull = jax.vjp(product, rows, kernel)
+    value, pull = jax.vjp(matmul_rows, rows, kernel)
     expected, expected_pull = jax.vjp(jnp.matmul, rows, kernel)
     np.testing.assert_array_equal(value, expected)
     for one, two in zip(pull(by_result), expected_pull(by_result), strict=True):

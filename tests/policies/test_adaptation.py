@@ -12,23 +12,29 @@ import pytest
 from flax import nnx
 from support import tiny_world as tiny
 
-from jaxnav.env.types import Observation
+from jaxnav.env.objectnav import Observation
 from jaxnav.errors import InputError
-from jaxnav.policies.adaptation import LearnedSteps, limited, replay_window
-from jaxnav.policies.learned_loss import WINDOW, Judging, LearnedLoss
-from jaxnav.policies.methods import METHODS
-from jaxnav.policies.pathways import zero_experience
-from jaxnav.policies.policy import bind
+from jaxnav.policies.adaptation import (
+    WINDOW,
+    HasLearnedLoss,
+    LearnedLoss,
+    LearnedLossAdaptation,
+    limit_inner_steps,
+    replay_window,
+)
+from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.network import bind
+from jaxnav.policies.pathways import mask_experience
 from jaxnav.scenes.task import NUM_ACTIONS
 
 STEPS, RATE, K = 27, 0.05, tiny.SPEC.num_categories
 FAST = ("fuse", "core", "actor")
-SAVN = dataclasses.replace(tiny.SPEC, method="savn", method_sizes=())
+SAVN = dataclasses.replace(tiny.SPEC, method=find_method("savn"), method_sizes=())
 SPECS = {
     "savn": SAVN,
     "gated": dataclasses.replace(SAVN, done_gate=True),
     "streams": dataclasses.replace(SAVN, decision="streams", direct="goal"),
-    "eotp": dataclasses.replace(SAVN, method="jaxnav.policies.methods.eotp:ADAPTED"),
+    "eotp": dataclasses.replace(SAVN, method=find_method("jaxnav.policies.methods.eotp:ADAPTED")),
 }
 
 
@@ -50,9 +56,9 @@ def acted(spec, weights, adaptation, observation, action):
         observation, action = part
         pathways = policy.pathways(observation, jnp.ones((*action.shape, K)), memory=memory)
         decision = policy.decide(pathways, memory)
-        return decision.memory(action), (decision.logits, decision.fast)
+        return decision.next_state(action), (decision.logits, decision.fast)
 
-    memory = policy.initial_memory(action.shape[1:])._replace(experienced=experienced)
+    memory = policy.initial_memory(action.shape[1:])._replace(use_experience=experienced)
     return jax.lax.scan(step, memory, (observation, action))[1]
 
 
@@ -70,9 +76,9 @@ def acted_plainly(spec, weights, observation, action, order=2):
         seen = jax.tree.map(lambda leaf, time=time: leaf[time], observation)
         pathways = policy.pathways(seen, jnp.ones(K), memory=memory)
         window.append((pathways, memory))
-        decision = policy.decide_plainly(pathways, memory)
+        decision = policy.decide_without_adaptation(pathways, memory)
         logits.append(decision.logits)
-        memory = decision.memory(action[time])
+        memory = decision.next_state(action[time])
         if len(window) == WINDOW and time < 4 * WINDOW:
             begin, held = fast, window
             if order < 2:
@@ -91,10 +97,10 @@ def judged(spec, window, method, fast):
     alone = None if spec.decision == "fused" else jnp.float32(0.0)
     hidden, rows = window[0][1].hidden, []
     for pathways, memory in window:
-        decision = policy.decide_plainly(zero_experience(pathways, alone), memory._replace(hidden=hidden))
+        decision = policy.decide_without_adaptation(mask_experience(pathways, alone), memory._replace(hidden=hidden))
         hidden = decision.hidden
         rows.append(jnp.concatenate([hidden[: policy.hidden], jax.nn.softmax(decision.logits)]))
-    return cast(Judging, policy.method).learned_loss(jnp.stack(rows))
+    return cast(HasLearnedLoss, policy.method).learned_loss(jnp.stack(rows))
 
 
 # The rule
@@ -106,13 +112,15 @@ def test_factors_are_steps_of_the_whole_kernels(name):
     """What is added up, of rank 24, is what autodiff takes from kernels of the episode's own."""
     spec, (observation, action) = SPECS[name], given(0)
     weights = tiny.lively(0, spec)
-    logits, fast = jax.jit(functools.partial(acted, spec, weights, LearnedSteps(rate=RATE)))(observation, action)
+    logits, fast = jax.jit(functools.partial(acted, spec, weights, LearnedLossAdaptation(learning_rate=RATE)))(
+        observation, action
+    )
     expected = jax.jit(functools.partial(acted_plainly, spec))(weights, observation, action)
     np.testing.assert_allclose(logits, expected, rtol=2e-4, atol=2e-4)
     plain = acted(spec, weights, None, observation, action)[0]
     np.testing.assert_allclose(logits[:WINDOW], plain[:WINDOW], rtol=1e-5, atol=1e-5)
     assert np.abs(logits - plain)[WINDOW:].max(axis=1).min() > 1e-4
-    for factors in fast.factors.values():
+    for factors in fast.layer_changes.values():
         assert (np.abs(factors.outputs[-1]).max(axis=-1) > 0).sum() == 4 * WINDOW  # the rank is at most 24
 
 
@@ -120,7 +128,7 @@ def test_factors_are_steps_of_the_whole_kernels(name):
 @pytest.mark.parametrize("order", [1, 2])
 def test_training_differentiates_through_the_steps(order):
     spec, (observation, action) = SAVN, given(1)
-    weights, adaptation = tiny.lively(0, spec), LearnedSteps(rate=RATE, second_order=order == 2)
+    weights, adaptation = tiny.lively(0, spec), LearnedLossAdaptation(learning_rate=RATE, second_order=order == 2)
     mixture = jnp.asarray(np.random.default_rng(2).normal(size=(STEPS, NUM_ACTIONS)), jnp.float32)
     gradient = jax.jit(jax.grad(lambda w: (mixture * acted(spec, w, adaptation, observation, action)[0]).sum()))(
         weights
@@ -162,7 +170,7 @@ def test_the_loss_is_two_causal_convolutions_and_a_length():
 def test_an_episode_ignores_the_others():
     """Every episode of a batch adapts as it does alone."""
     observation, action = given(3, 16)
-    weights, adaptation = tiny.lively(0, SAVN), LearnedSteps(rate=RATE)
+    weights, adaptation = tiny.lively(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)
     go = jax.jit(functools.partial(acted, SAVN, weights, adaptation))
     logits, _ = go(observation, action)
     other = jax.tree.map(lambda leaf: leaf.at[:, 5].set(leaf[:, 6]), (observation, action))
@@ -175,8 +183,10 @@ def test_an_episode_ignores_the_others():
 
 
 def test_nothing_is_learned_before_a_window_is_full_nor_after_the_fourth():
-    _, fast = jax.jit(functools.partial(acted, SAVN, tiny.lively(0, SAVN), LearnedSteps(rate=RATE)))(*given(4))
-    changes = fast.factors["core"].outputs
+    _, fast = jax.jit(functools.partial(acted, SAVN, tiny.lively(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)))(
+        *given(4)
+    )
+    changes = fast.layer_changes["core"].outputs
     times = [time + 1 for time in range(STEPS) if np.any(changes[time] != (changes[time - 1] if time else 0.0))]
     assert times == [6, 12, 18, 24]
 
@@ -188,14 +198,14 @@ def test_the_window_is_what_was_decided():
 
     def step(memory, part):
         decision = policy.decide(policy.pathways(part[0], jnp.ones(K)), memory)
-        return decision.memory(part[1]), (memory, decision)
+        return decision.next_state(part[1]), (memory, decision)
 
     # The second window: after the first step, before the second.
     window = jax.tree.map(lambda leaf: leaf[: 2 * WINDOW], (observation, action))
     _, (before, decision) = jax.lax.scan(step, policy.initial_memory(), window)
     last, after = jax.tree.map(lambda leaf: leaf[-1], (before, decision))
-    nothing = {layer: jnp.zeros_like(f.outputs[:WINDOW]) for layer, f in last.fast.factors.items()}
-    rows, inputs = replay_window(policy, after.fast._replace(factors=last.fast.factors), nothing)
+    nothing = {layer: jnp.zeros_like(f.outputs[:WINDOW]) for layer, f in last.fast.layer_changes.items()}
+    rows, inputs = replay_window(policy, after.fast._replace(layer_changes=last.fast.layer_changes), nothing)
     np.testing.assert_allclose(rows[:, : policy.hidden], decision.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(rows[-1, policy.hidden :], jax.nn.softmax(after.logits), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(inputs["core"], before.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
@@ -214,25 +224,27 @@ def test_fast_weights_can_be_stored(name):
 
 def test_fewer_steps_are_possible_and_more_are_refused():
     adaptation = METHODS["savn"].adaptation
-    assert limited(adaptation, 0) is None
-    assert limited(adaptation, 2) == LearnedSteps(inner_steps=2)
+    assert limit_inner_steps(adaptation, 0) is None
+    assert limit_inner_steps(adaptation, 2) == LearnedLossAdaptation(inner_steps=2)
     for steps in (5, -1):
         with pytest.raises(
             InputError, match=rf"^inner_steps is {steps}; an episode remembers 4 windows of 6 actions: "
         ):
-            limited(adaptation, steps)
+            limit_inner_steps(adaptation, steps)
     with pytest.raises(InputError, match=r"^inner_steps is 1; the method adapts in another way: give 0"):
-        limited(METHODS["tpn"].adaptation, 1)
-    with pytest.raises(InputError, match=r"^LearnedSteps: inner_steps is 0; give 1 or more, or no adaptation$"):
-        LearnedSteps(inner_steps=0)
+        limit_inner_steps(METHODS["tpn"].adaptation, 1)
+    with pytest.raises(
+        InputError, match=r"^LearnedLossAdaptation: inner_steps is 0; give 1 or more, or no adaptation$"
+    ):
+        LearnedLossAdaptation(inner_steps=0)
 
 
 @pytest.mark.slow
 def test_fewer_steps_are_the_first_of_more():
     weights, (observation, action) = tiny.lively(0, SAVN), given(6)
-    two, _ = acted(SAVN, weights, LearnedSteps(inner_steps=2, rate=RATE), observation, action)
-    four, _ = acted(SAVN, weights, LearnedSteps(rate=RATE), observation, action)
-    none, fast = acted(SAVN, weights, limited(LearnedSteps(), 0), observation, action)
+    two, _ = acted(SAVN, weights, LearnedLossAdaptation(inner_steps=2, learning_rate=RATE), observation, action)
+    four, _ = acted(SAVN, weights, LearnedLossAdaptation(learning_rate=RATE), observation, action)
+    none, fast = acted(SAVN, weights, limit_inner_steps(LearnedLossAdaptation(), 0), observation, action)
     assert fast is None
     np.testing.assert_allclose(two[: 3 * WINDOW], four[: 3 * WINDOW], rtol=1e-5, atol=1e-5)
     assert np.abs(two - four)[3 * WINDOW :].max() > 1e-3

@@ -11,8 +11,9 @@ import pytest
 from support import tiny_world as tiny
 from support.scenes import BOOK, CHAIR, FRIDGE
 
-from jaxnav.env.types import Observation
-from jaxnav.policies.policy import bind
+from jaxnav.env.objectnav import Observation
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import bind
 from jaxnav.scenes.tables.observation_row import RowFormat
 
 ROW_FORMAT = RowFormat(3)
@@ -22,7 +23,7 @@ BOOK_SEEN, CHAIR_SEEN, NOTHING = (204, 102, 128, 38), (150, 51, 140, 60), (0, 0,
 @functools.cache
 def deciding(method):
     """Return a compiled first decision of a lively policy."""
-    spec = dataclasses.replace(tiny.SPEC, method=method, method_sizes=())
+    spec = dataclasses.replace(tiny.SPEC, method=find_method(method), method_sizes=())
     policy = bind(spec, tiny.lively(0, spec))
 
     @jax.jit
@@ -68,7 +69,7 @@ def test_the_view_and_the_goals_detection_do_matter():
 
 
 def test_its_networks_have_one_category():
-    spec = dataclasses.replace(tiny.SPEC, method="anonymous", method_sizes=())
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
     params = tiny.lively(0, spec)
     chex.assert_shape(params["appearance"]["embedding"], (1, tiny.SIZES.appearance))
     chex.assert_shape(params["sought"]["embedding"], (1, tiny.SIZES.appearance))

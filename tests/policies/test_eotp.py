@@ -10,19 +10,19 @@ import pytest
 from support import tiny_world as tiny
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
 
-from jaxnav.policies.features import features
+from jaxnav.policies.features import unpack_features
 from jaxnav.policies.methods import find_method
-from jaxnav.policies.methods.eotp import Rows, SpatialAttention, UniformAttention
-from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.policies.methods.eotp import AttentionEntries, SpatialAttention, UniformAttention
+from jaxnav.policies.network import bind, init_params
+from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT
 
 K, HIDDEN = len(CATEGORIES), tiny.SIZES.hidden
-SPEC = dataclasses.replace(tiny.SPEC, method="eotp", method_sizes=())
+SPEC = dataclasses.replace(tiny.SPEC, method=find_method("eotp"), method_sizes=())
 WEIGHTS = tiny.lively(0, SPEC)
 ONES = jnp.ones(K)
-MEMORY = Memory(jnp.sin(jnp.arange(HIDDEN, dtype=jnp.float32)), jnp.int32(MOVE_AHEAD))
+MEMORY = PolicyState(jnp.sin(jnp.arange(HIDDEN, dtype=jnp.float32)), jnp.int32(MOVE_AHEAD))
 
 
 def module(weights=WEIGHTS, spec=SPEC):
@@ -39,15 +39,15 @@ def seen(*categories, goal=FRIDGE):
     row[: 4 * K] = 0
     for category in categories:
         row[4 * category : 4 * category + 4] = 200, 10 + 9 * category, 110 + 20 * category, 30
-    return features(jnp.asarray(row), jnp.int32(goal), RowFormat(K))
+    return unpack_features(jnp.asarray(row), jnp.int32(goal), RowFormat(K))
 
 
-def encoded(view, weights=ONES, method=EOTP) -> Rows:
+def encoded(view, weights=ONES, method=EOTP) -> AttentionEntries:
     return method.encode(view, APPEARANCE, weights, None)
 
 
 def attention(view, memory=MEMORY, method=EOTP):
-    return np.asarray(method.attention(encoded(view, method=method), memory))
+    return np.asarray(method.attention_weights(encoded(view, method=method), memory))
 
 
 def with_parts(*parts):
@@ -95,8 +95,8 @@ def test_the_experience_is_that_of_numpy():
     np.testing.assert_allclose(attention(view), share, rtol=1e-4)
     read = (layout * share)[:, None] * np.maximum(rows, 0)
     expected = np.maximum(read @ p["maps"]["outer"]["kernel"] + p["maps"]["outer"]["bias"], 0)
-    found = EOTP.attend(encoded(view, jnp.asarray(layout, jnp.float32)), MEMORY)
-    np.testing.assert_allclose(found, expected.reshape(-1), rtol=1e-4, atol=1e-6)
+    result = EOTP.attend(encoded(view, jnp.asarray(layout, jnp.float32)), MEMORY)
+    np.testing.assert_allclose(result, expected.reshape(-1), rtol=1e-4, atol=1e-6)
     assert np.ptp(share) > 0.05
     assert (expected > 0).sum() > 3
 
@@ -121,7 +121,7 @@ def test_attention_moves_with_goal_action_and_memory(part, name):
         method = module(with_parts(*parts))
         rows = encoded(seen(BOOK, CHAIR, FRIDGE), method=method)
         asked = rows._replace(goal=encoded(seen(goal=goal), method=method).goal)
-        return np.asarray(method.attention(rows, MEMORY)), np.asarray(method.attention(asked, memory))
+        return np.asarray(method.attention_weights(rows, MEMORY)), np.asarray(method.attention_weights(asked, memory))
 
     one, other = both(alone)
     assert np.abs(one - other).max() > 0.02
@@ -136,7 +136,7 @@ def test_the_memory_says_in_which_parts():
     quiet = EOTP.parts(jnp.zeros(HIDDEN))
     assert np.abs(EOTP.parts(MEMORY.hidden) - quiet).max() > 0.1
     # Before anything is remembered or done, only the goal asks.
-    start = Memory(jnp.zeros(HIDDEN), jnp.int32(NO_ACTION))
+    start = PolicyState(jnp.zeros(HIDDEN), jnp.int32(NO_ACTION))
     np.testing.assert_allclose(
         attention(view, start), attention(view, start, module(with_parts(quiet[0], 0, 0))), rtol=1e-5
     )
@@ -159,11 +159,11 @@ def test_cosines_know_directions_alone():
     louder = jax.tree.map(lambda leaf: 3 * leaf, maps["inner"])
     long = module(WEIGHTS | {"method": WEIGHTS["method"] | {"maps": maps | {"inner": louder}}})
     view = seen(BOOK, CHAIR)
-    here, there = encoded(view), encoded(view, method=long)
-    np.testing.assert_allclose(np.linalg.norm(here.keys, axis=-1), np.ones(K), rtol=1e-5)
-    np.testing.assert_allclose(here.keys, there.keys, rtol=1e-4, atol=1e-6)
+    short_window, long_window = encoded(view), encoded(view, method=long)
+    np.testing.assert_allclose(np.linalg.norm(short_window.keys, axis=-1), np.ones(K), rtol=1e-5)
+    np.testing.assert_allclose(short_window.keys, long_window.keys, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(attention(view), attention(view, method=long), rtol=1e-4)
-    np.testing.assert_allclose(3 * here.values, there.values, rtol=1e-4)
+    np.testing.assert_allclose(3 * short_window.values, long_window.values, rtol=1e-4)
 
 
 def test_layout_weights_multiply_after_the_norm():
@@ -171,7 +171,7 @@ def test_layout_weights_multiply_after_the_norm():
     view, layout = seen(BOOK, CHAIR), jnp.array([0.0, 0.5, 2.0])
     plain, weighted = encoded(view), encoded(view, layout)
     np.testing.assert_array_equal(plain.keys, weighted.keys)
-    np.testing.assert_array_equal(EOTP.attention(plain, MEMORY), EOTP.attention(weighted, MEMORY))
+    np.testing.assert_array_equal(EOTP.attention_weights(plain, MEMORY), EOTP.attention_weights(weighted, MEMORY))
     np.testing.assert_allclose(weighted.values, layout[:, None] * plain.values, rtol=1e-6)
     changed = np.asarray(EOTP.attend(weighted, MEMORY) != EOTP.attend(plain, MEMORY)).reshape(K, -1)
     assert changed.any(axis=-1).all()
@@ -186,9 +186,9 @@ def test_layout_weights_multiply_after_the_norm():
 
 
 def test_uniform_attention_is_deaf_to_what_asks():
-    spec = dataclasses.replace(SPEC, method="jaxnav.policies.methods.eotp:UNIFORM")
+    spec = dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.eotp:UNIFORM"))
     uniform = module(spec=spec)
-    assert type(uniform) is UniformAttention is find_method(spec.method).experience
+    assert type(uniform) is UniformAttention is spec.method.experience
     views = seen(BOOK, FRIDGE), *(seen(BOOK, CHAIR, FRIDGE, goal=goal) for goal, _ in OTHER.values())
     for view, memory in zip(views, (MEMORY, *(memory for _, memory in OTHER.values())), strict=True):
         shown = np.asarray(view.visible + view.goal > 0)
@@ -201,7 +201,7 @@ def test_uniform_attention_is_deaf_to_what_asks():
 
 def test_gradients_are_finite_before_anything_is_remembered():
     """Vectors of length 0 have no direction."""
-    start, view = Memory(jnp.zeros(HIDDEN), jnp.int32(NO_ACTION)), seen(BOOK)
+    start, view = PolicyState(jnp.zeros(HIDDEN), jnp.int32(NO_ACTION)), seen(BOOK)
 
     @jax.jit
     @jax.grad
@@ -210,6 +210,6 @@ def test_gradients_are_finite_before_anything_is_remembered():
         return method.attend(method.encode(view, weights["appearance"]["embedding"], ONES, None), start).sum()
 
     for weights in (WEIGHTS, init_params(SPEC, jax.random.key(0))):
-        found = gradient(weights)["method"]
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-        assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(found)) < 100
+        result = gradient(weights)["method"]
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
+        assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(result)) < 100

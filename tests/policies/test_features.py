@@ -6,7 +6,7 @@ import numpy as np
 from support.scenes import CATEGORIES
 from support.tiny_world import BANK
 
-from jaxnav.policies.features import NUM_FEATURES, features
+from jaxnav.policies.features import NUM_FEATURES, unpack_features
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat
 
 K, VIEW = len(CATEGORIES), 11
@@ -21,7 +21,7 @@ def packed_row():
 
 
 def test_features_of_a_row_packed_by_hand():
-    seen = features(packed_row(), jnp.int32(2), RowFormat(K))
+    seen = unpack_features(packed_row(), jnp.int32(2), RowFormat(K))
     half = np.sqrt(0.5)
     # Category 0: confidence 255 / 255 = 1; ahead 255 / 51 = 5 m -> 1; right (1 - 128) / 25.4 = -5 m -> -1; distance
     # sqrt(2); sine -1 / sqrt(2), cosine 1 / sqrt(2); size 51 / 127.5 = 0.4. It is not the goal.
@@ -37,12 +37,12 @@ def test_features_of_a_row_packed_by_hand():
 
 
 def test_a_goal_that_is_not_detected_has_its_flag_alone():
-    table = features(packed_row(), jnp.int32(1), RowFormat(K)).table
+    table = unpack_features(packed_row(), jnp.int32(1), RowFormat(K)).table
     np.testing.assert_array_equal(table[1], [0] * (NUM_FEATURES - 1) + [1])
     np.testing.assert_array_equal(table[:, -1], [0, 1, 0])
 
 
 def test_features_of_every_row_of_a_bank_are_finite_and_of_order_one():
-    seen = features(jnp.asarray(BANK.rows), jnp.zeros(len(BANK.rows), jnp.int32), RowFormat(K))
+    seen = unpack_features(jnp.asarray(BANK.rows), jnp.zeros(len(BANK.rows), jnp.int32), RowFormat(K))
     assert (np.abs(np.concatenate(jax.tree.map(np.ravel, list(seen)))) <= 2).all()
     np.testing.assert_array_equal(seen.visible, RowFormat(K).presence(BANK.rows))

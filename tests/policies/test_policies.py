@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 from flax import nnx
 from support.scenes import CATEGORIES
-from support.tiny_world import BANK, SIZES, SPEC, at, decide, lively
+from support.tiny_world import BANK, SIZES, SPEC, decide, leaves_at, lively
 
 from jaxnav.causal import do
-from jaxnav.env.types import Observation
-from jaxnav.policies.methods import METHODS
-from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.env.objectnav import Observation
+from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.network import INITIAL_DONE_LOGIT, bind, init_params
+from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.policies.stream import SELDOM
 from jaxnav.scenes.lattice import NUM_ACTIONS
 from jaxnav.store.export import export_params
 
@@ -39,14 +38,16 @@ def batch(seed=0):
     observation = Observation(row=jnp.asarray(BANK.rows[pose]), goal=jnp.asarray(generator.integers(0, K, BATCH)))
     hidden = jnp.asarray(generator.normal(size=(BATCH, SIZES.hidden)), jnp.float32)
     action = jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32)
-    return observation, Memory(hidden=hidden, action=action)
+    return observation, PolicyState(hidden=hidden, action=action)
 
 
 class Compiled:
     """A policy with compiled methods."""
 
     def __init__(self, method):
-        spec = dataclasses.replace(SPEC, method=method, method_sizes=SPEC.method_sizes if method == "org" else ())
+        spec = dataclasses.replace(
+            SPEC, method=find_method(method), method_sizes=SPEC.method_sizes if method == "org" else ()
+        )
         policy = bind(spec, lively(0, spec))
         self.experience_width = policy.method.width
         self.pathways = jax.jit(lambda observation, weights: policy.pathways(observation, weights))
@@ -71,7 +72,7 @@ def org():
 def test_shapes(policy, shape):
     observation, memory = jax.tree.map(lambda x: x.reshape(BATCH, -1)[: np.prod(shape, dtype=int)], batch())
     observation = Observation(row=observation.row.reshape(*shape, -1), goal=observation.goal.reshape(shape))
-    memory = Memory(hidden=memory.hidden.reshape(*shape, -1), action=memory.action.reshape(shape))
+    memory = PolicyState(hidden=memory.hidden.reshape(*shape, -1), action=memory.action.reshape(shape))
     pathways = policy.pathways(observation, jnp.ones((*shape, K)))
     decision = policy.decide(pathways, memory)
     chex.assert_shape(pathways.scene, (*shape, SIZES.view_outputs))
@@ -89,9 +90,11 @@ def test_a_batch_is_its_single_members(policy):
     decision = policy.decide(pathways, memory)
     assert float(decision.logits.std()) > 0.1  # lively, so that the comparison says something
     for i in range(BATCH):
-        own = policy.pathways(at(observation, i), WEIGHTS[i])
-        chex.assert_trees_all_close(own, at(pathways, i), rtol=1e-5, atol=1e-6)
-        chex.assert_trees_all_close(policy.decide(own, at(memory, i)), at(decision, i), rtol=1e-5, atol=1e-6)
+        own = policy.pathways(leaves_at(observation, i), WEIGHTS[i])
+        chex.assert_trees_all_close(own, leaves_at(pathways, i), rtol=1e-5, atol=1e-6)
+        chex.assert_trees_all_close(
+            policy.decide(own, leaves_at(memory, i)), leaves_at(decision, i), rtol=1e-5, atol=1e-6
+        )
 
 
 def test_an_episode_begins_with_nothing_remembered_and_no_action(org):
@@ -104,11 +107,11 @@ def test_an_episode_begins_with_nothing_remembered_and_no_action(org):
 def test_the_first_policy_is_close_to_uniform_but_seldom_done():
     weights = init_params(SPEC, jax.random.key(0))
     for i, row in enumerate(BANK.rows[::16]):
-        logits = decide(weights, row, i % K, WEIGHTS[0], Memory(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION)))[
+        logits = decide(weights, row, i % K, WEIGHTS[0], PolicyState(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION)))[
             0
         ].logits
-        assert 0 < np.abs(np.asarray(logits) - [0, 0, 0, 0, 0, SELDOM]).max() < 0.1
-    assert 1 / 70 < np.exp(SELDOM) / (5 + np.exp(SELDOM)) < 1 / 50
+        assert 0 < np.abs(np.asarray(logits) - [0, 0, 0, 0, 0, INITIAL_DONE_LOGIT]).max() < 0.1
+    assert 1 / 70 < np.exp(INITIAL_DONE_LOGIT) / (5 + np.exp(INITIAL_DONE_LOGIT)) < 1 / 50
 
 
 # Interventions
@@ -184,7 +187,7 @@ def test_rgb_has_no_experience():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_parameters_are_plain_data_and_come_back(method):
-    spec = PolicySpec(method=method, num_categories=K, sizes=SIZES)
+    spec = PolicySpec(method=find_method(method), num_categories=K, sizes=SIZES)
     params = init_params(spec, jax.random.key(3))
 
     def check(node):
@@ -212,13 +215,13 @@ from pathlib import Path
 import jaxnav
 import jax.numpy as jnp
 import numpy as np
-from jaxnav.policies import policy, spec
+from jaxnav.policies.network import bind
+from jaxnav.policies.methods.org import ORG
+from jaxnav.policies.spec import PolicySpec
 from jaxnav.store.export import load_params
-from jaxnav.env.types import Observation
-params, told = load_params(Path(sys.argv[1]))
-sizes = spec.Sizes(**told["sizes"]), tuple(map(tuple, told["method_sizes"]))
-told = spec.PolicySpec(told["method"], told["num_categories"], *sizes, goal_row=told["goal_row"])
-bound = policy.bind(told, params)
+from jaxnav.env.objectnav import Observation
+params, fields = load_params(Path(sys.argv[1]))
+bound = bind(PolicySpec.from_json(fields, ORG, fields["num_categories"]), params)
 given = np.load(sys.argv[2])
 observation = Observation(row=jnp.asarray(given["row"]), goal=jnp.asarray(given["goal"]))
 pathways = bound.pathways(observation, jnp.asarray(given["weights"]))
@@ -229,12 +232,12 @@ print(json.dumps({"modules": sorted(sys.modules), "logits": decision.logits.toli
 
 @pytest.mark.slow
 def test_an_exported_policy_runs_without_the_trainer(tmp_path, org):
-    export_params(tmp_path / "policy", lively(0), dataclasses.asdict(SPEC))
+    export_params(tmp_path / "policy", lively(0), SPEC.to_json() | {"num_categories": K})
     observation, _ = batch()
     np.savez(tmp_path / "given.npz", row=observation.row, goal=observation.goal, weights=WEIGHTS)
     command = [sys.executable, "-c", USE_EXPORT, str(tmp_path / "policy"), str(tmp_path / "given.npz")]
-    told = json.loads(subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout)
+    output = json.loads(subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout)
     expected = org.decide(org.pathways(observation, WEIGHTS), org.initial_memory((BATCH,))).logits
-    np.testing.assert_allclose(told["logits"], expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(output["logits"], expected, rtol=1e-5, atol=1e-6)
     heavy = {"matplotlib", "orbax", "tyro", "PIL", "jaxnav.training", "jaxnav.evaluation", "jaxnav.cli"}
-    assert not heavy & set(told["modules"])
+    assert not heavy & set(output["modules"])

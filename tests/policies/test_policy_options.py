@@ -13,10 +13,9 @@ from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
 from support.tiny_world import BANK, SIZES, SPEC, lively
 
 from jaxnav.causal import do
-from jaxnav.env.types import Observation
-from jaxnav.policies.fused import DONE_GATE
-from jaxnav.policies.pathways import Memory, Pathways
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.env.objectnav import Observation
+from jaxnav.policies.network import DONE_GATE, bind, init_params
+from jaxnav.policies.pathways import Pathways, PolicyState
 from jaxnav.policies.spec import Direct
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
@@ -35,16 +34,16 @@ def with_detections(detections):
 
 def detections(goal, others):
     """The goal's detection in every episode, and that of the two other categories."""
-    found = np.empty((BATCH, K, 4), np.uint8)
-    found[:] = others
-    found[np.arange(BATCH), GOAL] = goal
-    return found
+    result = np.empty((BATCH, K, 4), np.uint8)
+    result[:] = others
+    result[np.arange(BATCH), GOAL] = goal
+    return result
 
 
 def memory(seed=0):
     generator = np.random.default_rng(seed)
     hidden = jnp.asarray(generator.normal(size=(BATCH, SIZES.hidden)), jnp.float32)
-    return Memory(hidden=hidden, action=jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32))
+    return PolicyState(hidden=hidden, action=jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32))
 
 
 class Compiled:
@@ -139,9 +138,9 @@ FACTOR = np.array([0.58, 0.116, 0.0, 0.0, 0.58 * 128 / 255, 0.58 / 255], np.floa
 
 def uncertain(others=SEEN):
     """The goal detected with those confidences."""
-    found = detections(SEEN, others)
-    found[np.arange(BATCH), GOAL, 0] = CONFIDENCE
-    return with_detections(found)
+    result = detections(SEEN, others)
+    result[np.arange(BATCH), GOAL, 0] = CONFIDENCE
+    return with_detections(result)
 
 
 def test_the_gate_is_the_confidence_of_the_goal(gated, plain):
@@ -156,14 +155,14 @@ def test_the_gate_multiplies_the_logit_of_done_alone(gated, plain, intervention)
     """By the same factor in the factual decision and in any counterfactual one."""
     observation = uncertain()
     pathways = do(gated.pathways(observation), **intervention)
-    found = gated.decide(pathways, memory())
+    result = gated.decide(pathways, memory())
     free = plain.decide(do(plain.pathways(observation), **intervention), memory())
-    np.testing.assert_allclose(found.logits[:, :DONE], free.logits[:, :DONE], rtol=1e-6)
-    np.testing.assert_allclose(found.logits[:, DONE], FACTOR * free.logits[:, DONE], rtol=1e-5, atol=1e-9)
-    assert (found.logits[CONFIDENCE == 0, DONE] == 0).all()
+    np.testing.assert_allclose(result.logits[:, :DONE], free.logits[:, :DONE], rtol=1e-6)
+    np.testing.assert_allclose(result.logits[:, DONE], FACTOR * free.logits[:, DONE], rtol=1e-5, atol=1e-9)
+    assert (result.logits[CONFIDENCE == 0, DONE] == 0).all()
     assert (free.logits[:, DONE] != 0).all()
-    np.testing.assert_allclose(found.value, free.value, rtol=1e-5)
-    np.testing.assert_allclose(found.hidden, free.hidden, rtol=1e-5)
+    np.testing.assert_allclose(result.value, free.value, rtol=1e-5)
+    np.testing.assert_allclose(result.hidden, free.hidden, rtol=1e-5)
 
 
 def test_the_gate_sees_the_goal_where_the_direct_pathway_sees_nothing():

@@ -11,27 +11,27 @@ from support import tiny_world as tiny
 from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
 
 from jaxnav.evaluation import grid
-from jaxnav.evaluation.episodes import episode_list
+from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator
 from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.policies.acting import Acting, carried
-from jaxnav.policies.adaptation import replay_window
-from jaxnav.policies.learned_loss import WINDOW
+from jaxnav.policies.adaptation import WINDOW, replay_window
+from jaxnav.policies.agent_loop import AgentLoop, policy_memory
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.testing import check_method
-from jaxnav.training.collect import collect
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
-from jaxnav.training.loss import replay
+from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 
 LIMIT = 30
-SPEC = dataclasses.replace(tiny.SPEC, method="savn", method_sizes=())
-ACTING = Acting(ENV, SPEC)
+SPEC = dataclasses.replace(tiny.SPEC, method=find_method("savn"), method_sizes=())
+ACTING = AgentLoop(ENV, SPEC)
 LONG = PARAMS.replace(step_limit=jnp.full(2, LIMIT, jnp.int32))
 
 
 def changed(fast):
     """Which episodes have changed kernels, bool [B]."""
-    return np.stack([np.abs(factors.outputs).max(axis=(-1, -2)) > 0 for factors in fast.factors.values()]).all(axis=0)
+    return np.stack([np.abs(factors.outputs).max(axis=(-1, -2)) > 0 for factors in fast.layer_changes.values()]).all(
+        axis=0
+    )
 
 
 @pytest.mark.slow
@@ -42,34 +42,34 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     def go():
         policy = ACTING.bind(weights)
         agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
-        agent, _ = collect(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWLEDGE)
-        agent, rollout = collect(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWLEDGE)
-        return agent, rollout, replay(policy, rollout.transitions, rollout.memory, PARAMS).decisions
+        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWLEDGE)
+        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWLEDGE)
+        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.memory, PARAMS).factual
 
     agent, rollout, again = go()
     transitions = rollout.transitions
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(again.logits), transitions.choice[..., None], axis=-1)[..., 0]
     np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-4)
-    fast, running = carried(agent).fast, ~np.asarray(transitions.ended[-1])
+    fast, running = policy_memory(agent).fast, ~np.asarray(transitions.ended[-1])
     replayed = jax.tree.map(lambda leaf: leaf[-1], again.fast)
-    for layer, factors in fast.factors.items():
-        expected = replayed.factors[layer].outputs
+    for layer, factors in fast.layer_changes.items():
+        expected = replayed.layer_changes[layer].outputs
         np.testing.assert_allclose(factors.outputs[running], expected[running], rtol=1e-3, atol=1e-5)
     # New with the episode: nothing is changed before its own sixth decision.
-    np.testing.assert_array_equal(fast.decisions, agent.state.time)
+    np.testing.assert_array_equal(fast.num_decisions, agent.state.time)
     np.testing.assert_array_equal(changed(fast), np.asarray(agent.state.time) >= WINDOW)
     assert 0 < changed(fast).sum() < ENVS
 
 
 @functools.cache
 def outcome(inner_steps=None):
-    episodes = episode_list(tiny.BANK, 32, seed=1)
+    episodes = draw_episodes(tiny.BANK, 32, seed=1)
     rows = inference_grid([table_row("baseline", None, None, "sample")], ("baseline",), 1)
     weights = tiny.lively(0, SPEC)
     weights["actor"]["kernel"] = 0.3 * weights["actor"]["kernel"]  # long episodes
     weights = jax.tree.map(lambda leaf: leaf[None], weights)
     acting = dataclasses.replace(ACTING, inner_steps=inner_steps)
-    return Evaluator(acting, removes=False)(rows, weights, [(episodes, LONG)], KNOWLEDGE, jax.random.key(0))
+    return Evaluator(acting, can_remove=False)(rows, weights, [(episodes, LONG)], KNOWLEDGE, jax.random.key(0))
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_evaluation_carries_the_changes_of_episodes_that_go_on(monkeypatch):
     with_parts = outcome()
     assert len(set(with_parts.length[0])) > 5
     assert (with_parts.length > WINDOW).any()
-    monkeypatch.setattr(grid, "_SHARES", ())
+    monkeypatch.setattr(grid, "_BATCH_DIVISORS", ())
     jax.tree.map(np.testing.assert_array_equal, with_parts, outcome.__wrapped__())
 
 
@@ -95,16 +95,16 @@ def fall(weights, steps):
     policy = ACTING.bind(weights)
 
     def loss(fast):
-        nothing = {layer: jnp.zeros_like(factors.outputs[:WINDOW]) for layer, factors in fast.factors.items()}
+        nothing = {layer: jnp.zeros_like(factors.outputs[:WINDOW]) for layer, factors in fast.layer_changes.items()}
         return policy.method.learned_loss(replay_window(policy, fast, nothing)[0])  # type: ignore[attr-defined]
 
     def step(agent, key):
-        memory = carried(agent)
+        memory = policy_memory(agent)
         decision = policy.decide(policy.pathways(*ACTING.view(agent, KNOWLEDGE, LONG), memory), memory)
-        after, before = decision.fast, decision.fast._replace(factors=memory.fast.factors)
+        after, before = decision.fast, decision.fast._replace(layer_changes=memory.fast.layer_changes)
         choice, keys = jax.random.categorical(key, decision.logits), jax.random.split(key, ENVS)
         agent, _ = ACTING.step(agent, choice, KNOWLEDGE, LONG, policy=policy, decision=decision, keys=keys)
-        full = (after.decisions % WINDOW == 0) & (after.decisions <= 4 * WINDOW)
+        full = (after.num_decisions % WINDOW == 0) & (after.num_decisions <= 4 * WINDOW)
         return agent, (full, jax.vmap(loss)(before), jax.vmap(loss)(after))
 
     agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, LONG)

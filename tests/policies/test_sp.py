@@ -13,15 +13,20 @@ from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
 
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
-from jaxnav.policies.features import NUM_FEATURES, features
+from jaxnav.policies.features import NUM_FEATURES, unpack_features
 from jaxnav.policies.methods import METHODS, find_method
-from jaxnav.policies.methods.graphs import graph_from_file, learn_graph, learn_permuted, normalised
-from jaxnav.policies.methods.sp import GraphConvolution
-from jaxnav.policies.policy import bind
+from jaxnav.policies.methods.sp import (
+    GraphConvolution,
+    graph_from_file,
+    learn_graph,
+    learn_permuted_graph,
+    normalize_adjacency,
+)
+from jaxnav.policies.network import bind
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import RowFormat
-from jaxnav.scenes.worlds import WORLDS, generated
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 K = len(CATEGORIES)
 #: Book and chair stand together, and chair and fridge: with loops the row sums are 2, 3 and 2.
@@ -44,10 +49,10 @@ def counted(kitchen, bedroom=None):
 
 
 def test_the_graph_is_normalised_symmetrically_with_loops():
-    np.testing.assert_allclose(normalised(PATH), MIXING, rtol=1e-15)
-    np.testing.assert_array_equal(normalised(np.zeros((2, K, K))), np.stack([np.eye(K)] * 2))
+    np.testing.assert_allclose(normalize_adjacency(PATH), MIXING, rtol=1e-15)
+    np.testing.assert_array_equal(normalize_adjacency(np.zeros((2, K, K))), np.stack([np.eye(K)] * 2))
     # Weights: the row sums are 1.5, 2.5 and 2.
-    mixing = normalised(np.array([[0, 0.5, 0], [0.5, 0, 1], [0, 1, 0]]))
+    mixing = normalize_adjacency(np.array([[0, 0.5, 0], [0.5, 0, 1], [0, 1, 0]]))
     np.testing.assert_allclose(np.diagonal(mixing), [1 / 1.5, 1 / 2.5, 1 / 2])
     np.testing.assert_allclose(mixing[BOOK, CHAIR], 0.5 / (1.5 * 2.5) ** 0.5)
 
@@ -59,7 +64,7 @@ def test_edges_are_shares_of_poses_over_all_rooms():
     learned = learn_graph([], counted(kitchen, bedroom))
     assert learned["mixing"].dtype == np.float32
     edges = np.array([[0, 0.5, 0], [0.5, 0, 0], [0, 0, 0]])
-    np.testing.assert_allclose(learned["mixing"], normalised(edges), rtol=1e-6)
+    np.testing.assert_allclose(learned["mixing"], normalize_adjacency(edges), rtol=1e-6)
     # A room twice as often explored counts twice, and one prior for all rooms changes nothing.
     everywhere = np.repeat(counted(kitchen, bedroom).sum(axis=0)[None], NUM_PRIORS, axis=0)
     np.testing.assert_allclose(learn_graph([], everywhere)["mixing"], learned["mixing"], rtol=1e-6)
@@ -69,12 +74,12 @@ def test_edges_are_shares_of_poses_over_all_rooms():
 
 def test_permuted_edges_are_those_of_another_category():
     counts = counted([(BOOK, CHAIR)] * 3 + [(CHAIR, FRIDGE)])
-    mixing, permuted = (learn([], counts)["mixing"] for learn in (learn_graph, learn_permuted))
+    mixing, permuted = (learn([], counts)["mixing"] for learn in (learn_graph, learn_permuted_graph))
     for one in range(K):
         for other in range(K):
             assert permuted[(one + 1) % K, (other + 1) % K] == mixing[one, other]
     assert np.abs(mixing - permuted).max() > 0.1
-    assert find_method("jaxnav.policies.methods.sp:PERMUTED").learn is learn_permuted
+    assert find_method("jaxnav.policies.methods.sp:PERMUTED").learn is learn_permuted_graph
 
 
 # A file of edges
@@ -85,7 +90,7 @@ def test_edges_are_read_from_a_file(tmp_path):
     path.write_text("# what I know\n\nBook,Chair\n Fridge , Chair, 0.5  # in kitchens\n")
     learned = graph_from_file(path, [tiny.BANK], np.zeros((NUM_PRIORS, K, K)))
     np.testing.assert_allclose(
-        learned["mixing"], normalised(np.array([[0, 1, 0], [1, 0, 0.5], [0, 0.5, 0]])), rtol=1e-6
+        learned["mixing"], normalize_adjacency(np.array([[0, 1, 0], [1, 0, 0.5], [0, 0.5, 0]])), rtol=1e-6
     )
 
 
@@ -130,7 +135,7 @@ def module(spec, weights):
     return cast(GraphConvolution, bind(spec, weights).method)
 
 
-SPEC = dataclasses.replace(tiny.SPEC, method="sp", method_sizes=())
+SPEC = dataclasses.replace(tiny.SPEC, method=METHODS["sp"], method_sizes=())
 SP, APPEARANCE = module(SPEC, tiny.lively(0, SPEC)), bind(SPEC, tiny.lively(0, SPEC)).appearance.embedding[...]
 
 
@@ -140,7 +145,7 @@ def seen(*categories, goal=FRIDGE):
     row[: 4 * K] = 0
     for category in categories:
         row[4 * category : 4 * category + 4] = 200, 10, 120 + category, 30
-    return features(jnp.asarray(row), jnp.int32(goal), RowFormat(K))
+    return unpack_features(jnp.asarray(row), jnp.int32(goal), RowFormat(K))
 
 
 def experience(view, mixing, weights=None):
@@ -156,7 +161,7 @@ def test_a_graph_convolution_by_hand(second, expected):
     3, times -1: -[5/12 + 5/18, 5/6r + 5/9r + 1/3r, 5/18 + 1/6]. It is negative: the last layer has no ReLU. The second
     has: times -2 nothing is left.
     """
-    spec = PolicySpec("sp", K, Sizes(hidden=4, view_outputs=2, appearance=1, row_hidden=1, row_outputs=1))
+    spec = PolicySpec(METHODS["sp"], K, Sizes(hidden=4, view_outputs=2, appearance=1, row_hidden=1, row_outputs=1))
     weights = tiny.lively(0, spec)
     kernels = {
         "named": jnp.zeros((1, 1)),
@@ -166,14 +171,14 @@ def test_a_graph_convolution_by_hand(second, expected):
     }
     weights["method"] = {name: {"kernel": kernel} for name, kernel in kernels.items()}
     mixing = jnp.asarray(MIXING, jnp.float32)
-    found = module(spec, weights).encode(seen(BOOK), jnp.ones((K, 1)), jnp.ones(K), mixing)
-    np.testing.assert_allclose(found, -np.array(expected), rtol=1e-6)
+    result = module(spec, weights).encode(seen(BOOK), jnp.ones((K, 1)), jnp.ones(K), mixing)
+    np.testing.assert_allclose(result, -np.array(expected), rtol=1e-6)
 
 
 def test_the_graph_convolution_is_that_of_numpy():
     """With all of its inputs, for a batch."""
     view, draws = seen(BOOK, CHAIR), np.random.default_rng(0)
-    mixing = normalised(np.abs(draws.normal(size=(K, K))) * (1 - np.eye(K)))
+    mixing = normalize_adjacency(np.abs(draws.normal(size=(K, K))) * (1 - np.eye(K)))
     kernel = {name: np.asarray(getattr(SP, name).kernel[...], float) for name in ("named", "seen", "second", "third")}
     nodes = np.asarray(view.table, float) @ kernel["seen"] + np.asarray(APPEARANCE, float) @ kernel["named"]
     nodes = np.maximum(mixing @ nodes, 0)
@@ -186,15 +191,15 @@ def test_the_graph_convolution_is_that_of_numpy():
 
 def test_permuting_the_edges_changes_the_experience():
     view = seen(BOOK)
-    here, there = experience(view, MIXING), experience(view, np.roll(MIXING, 1, axis=(0, 1)))
-    assert (np.abs(here - there) > 1e-2 * np.abs(here).max()).all()
+    first, second = experience(view, MIXING), experience(view, np.roll(MIXING, 1, axis=(0, 1)))
+    assert (np.abs(first - second) > 1e-2 * np.abs(first).max()).all()
 
 
 def test_categories_hear_of_those_they_are_joined_to():
     """A detection reaches the ends of a path of two edges; without edges it stays where it is."""
     alone = experience(seen(CHAIR), np.eye(K)) != experience(seen(BOOK, CHAIR), np.eye(K))
     assert alone.tolist() == [True, False, False]
-    apart = normalised(np.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, 0]]))
+    apart = normalize_adjacency(np.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, 0]]))
     joined = experience(seen(CHAIR), apart) != experience(seen(BOOK, CHAIR), apart)
     assert joined.tolist() == [True, True, False]
     assert (experience(seen(CHAIR), MIXING) != experience(seen(BOOK, CHAIR), MIXING)).all()
@@ -214,12 +219,12 @@ def test_no_fresh_policy_is_silent():
     """With a ReLU at the end some would be for all categories of this view, and could not learn otherwise."""
     spec = dataclasses.replace(SPEC, sizes=Sizes())
     weights = [tiny.lively(seed, spec) for seed in range(12)]
-    told = [
+    lines = [
         module(spec, w).encode(seen(BOOK), w["appearance"]["embedding"], jnp.ones(K), jnp.asarray(MIXING, jnp.float32))
         for w in weights
     ]
-    assert all(np.abs(z).max() > 1e-2 for z in told)
-    assert 1 < sum((np.asarray(z) < 0).all() for z in told) < 11
+    assert all(np.abs(z).max() > 1e-2 for z in lines)
+    assert 1 < sum((np.asarray(z) < 0).all() for z in lines) < 11
 
 
 # The shipped worlds
@@ -232,12 +237,12 @@ def test_edges_of_training_scenes_hold_in_others_and_permuted_ones_do_not(world,
     task = WORLDS[world].task
 
     def pairs(learn, split, count):
-        every = generated(world, split, count)
-        rows = compile_bank((every[i] for i in range(count)), task).rows
+        world_scenes = make_generated_scenes(world, split, count)
+        rows = compile_bank((world_scenes[i] for i in range(count)), task).rows
         shown = RowFormat(len(task.categories)).presence(rows).astype(float)
         mixing = learn([], (shown.T @ shown)[None])["mixing"]
         return mixing[np.triu_indices(len(mixing), 1)]
 
     others = pairs(learn_graph, "val", scenes // 2)
     assert np.corrcoef(pairs(learn_graph, "train", scenes), others)[0, 1] > 0.7
-    assert abs(np.corrcoef(pairs(learn_permuted, "train", scenes), others)[0, 1]) < 0.2
+    assert abs(np.corrcoef(pairs(learn_permuted_graph, "train", scenes), others)[0, 1]) < 0.2

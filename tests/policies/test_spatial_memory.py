@@ -12,14 +12,14 @@ from support.rollouts import ENV, KNOWLEDGE, PARAMS
 
 import jaxnav
 from jaxnav.causal import do
-from jaxnav.env.build import build
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.policy import bind
+from jaxnav.env.make import build_environment
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.network import bind
 from jaxnav.policies.spatial_memory import BLOCKED, FREE, UNKNOWN, VISITED, SpatialMemory
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import DONE, MOVE_AHEAD, NUM_ACTIONS
-from jaxnav.scenes.worlds import WORLDS, generated
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 STEPS, WALKS = 60, 8
 
@@ -28,10 +28,10 @@ STEPS, WALKS = 60, 8
 def walked(request):
     """Maps after random walks in a generated scene, and the cells that were visited; 8 and 12 headings."""
     task = WORLDS[request.param].task
-    scene = generated(request.param, "train", 1)[0]
-    env, params = build(compile_bank([scene], task), {}, 10**6)
+    scene = make_generated_scenes(request.param, "train", 1)[0]
+    env, params = build_environment(compile_bank([scene], task), {}, 10**6)
     memory = SpatialMemory(task.rules.headings)
-    acting = Acting(env, dataclasses.replace(tiny.SPEC, num_categories=len(task.categories), spatial_memory=memory))
+    acting = AgentLoop(env, dataclasses.replace(tiny.SPEC, num_categories=len(task.categories), spatial_memory=memory))
 
     @jax.jit
     def walk(key):
@@ -40,16 +40,16 @@ def walked(request):
         def step(agent, key):
             draw = jax.random.randint(key, (WALKS,), 0, NUM_ACTIONS - 1)
             agent, _ = acting.step(agent, jnp.where(draw % 2 == 0, MOVE_AHEAD, draw), None, params)
-            return agent, env.cell(agent.state.pose)
+            return agent, env.cell_of_pose(agent.state.pose)
 
         agent, cells = jax.lax.scan(step, start, jax.random.split(key, STEPS))
-        return agent.perceived.explored, jnp.concatenate([env.cell(start.state.pose)[None], cells])
+        return agent.perception.spatial_map, jnp.concatenate([env.cell_of_pose(start.state.pose)[None], cells])
 
     explored, cells = jax.tree.map(np.asarray, walk(jax.random.key(0)))
     return scene, memory, env, explored, cells
 
 
-def known(explored, walk, start):
+def expected_map(explored, walk, start):
     """What is known of each cell, by its offset (dz, dx) from the first one."""
     size = explored.cells.shape[-1]
     return {
@@ -63,13 +63,13 @@ def test_the_map_agrees_with_the_room(walked):
     standable = standable_cells(scene.reach)
     inside = set(map(tuple, standable))
     for walk in range(WALKS):
-        found = known(explored, walk, standable[cells[0, walk]])
-        assert {cell for cell, code in found.items() if code == VISITED} == {
+        result = expected_map(explored, walk, standable[cells[0, walk]])
+        assert {cell for cell, code in result.items() if code == VISITED} == {
             tuple(standable[c]) for c in cells[:, walk]
         }
-        assert {cell for cell, code in found.items() if code == FREE} <= inside
-        assert not {cell for cell, code in found.items() if code == BLOCKED} & inside
-        assert len(found) > len(set(cells[:, walk]))  # seen from afar
+        assert {cell for cell, code in result.items() if code == FREE} <= inside
+        assert not {cell for cell, code in result.items() if code == BLOCKED} & inside
+        assert len(result) > len(set(cells[:, walk]))  # seen from afar
 
 
 def test_what_is_read_is_the_map_turned_with_the_agent(walked):
@@ -85,7 +85,7 @@ def test_what_is_read_is_the_map_turned_with_the_agent(walked):
             continue  # not along an axis of the lattice
         # North is +z. Facing it, ahead is +z and right is +x; a quarter turn right faces +x.
         turned = np.rot90(explored.cells[walk], -quarter)
-        z, x = explored.place[walk]
+        z, x = explored.position[walk]
         for _ in range(quarter):
             z, x = x, len(turned) - 1 - z
         along = memory.stride * np.arange(-memory.reach, memory.reach + 1)
@@ -95,12 +95,12 @@ def test_what_is_read_is_the_map_turned_with_the_agent(walked):
 def test_one_hot_inputs():
     codes = jnp.array([UNKNOWN, BLOCKED, FREE, VISITED], jnp.uint8)
     expected = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    np.testing.assert_array_equal(SpatialMemory.inputs(codes), np.concatenate(expected))
+    np.testing.assert_array_equal(SpatialMemory.encode_surroundings(codes), np.concatenate(expected))
 
 
 def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episode():
     spec = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
-    acting, weights = Acting(ENV, spec, tiny.SETTING), tiny.lively(0, spec)
+    acting, weights = AgentLoop(ENV, spec, tiny.SETTING), tiny.lively(0, spec)
 
     @jax.jit
     def go(key):
@@ -111,8 +111,8 @@ def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episod
         elsewhere = view._replace(surroundings=jnp.full_like(view.surroundings, VISITED))
         memory = policy.initial_memory((4,))
         embedded = policy.pathways(*view, memory), policy.pathways(*elsewhere, memory)
-        direct = [policy.decide(each, memory).logits for each in embedded]
-        alone = [policy.decide(do(each, scene=0.0, goal=0.0), memory).logits for each in embedded]
+        direct = [policy.decide(pathways, memory).logits for pathways in embedded]
+        alone = [policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits for pathways in embedded]
         decision = policy.decide(embedded[0], memory)
         done = jnp.array([DONE, DONE, MOVE_AHEAD, MOVE_AHEAD])
         keys = jax.random.split(key, 4)
@@ -125,13 +125,13 @@ def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episod
     assert not np.allclose(*direct)
     chex.assert_trees_all_equal(*alone)
     # A new episode has visited one cell.
-    visited = (np.asarray(after.perceived.explored.cells) == VISITED).sum(axis=(1, 2))
+    visited = (np.asarray(after.perception.spatial_map.cells) == VISITED).sum(axis=(1, 2))
     assert (visited[:2] == 1).all()
-    np.testing.assert_array_equal(np.asarray(after.perceived.explored.place)[:2], 32)
+    np.testing.assert_array_equal(np.asarray(after.perception.spatial_map.position)[:2], 32)
 
 
 def test_a_policy_without_it_has_no_part_of_it():
     policy = bind(tiny.SPEC, tiny.lively(0))
     assert policy.view.kernel.shape[0] == 2 * policy.row_format.view**2
-    assert Acting(ENV, tiny.SPEC).start(jax.random.key(0), 1, None, None, PARAMS).perceived.explored is None
+    assert AgentLoop(ENV, tiny.SPEC).start(jax.random.key(0), 1, None, None, PARAMS).perception.spatial_map is None
     assert jaxnav.RunConfig(spatial_memory=False).policy_spec(22).spatial_memory is None

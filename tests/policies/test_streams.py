@@ -13,13 +13,12 @@ from support import tiny_world as tiny
 from support.scenes import CATEGORIES
 
 from jaxnav.causal import do, stde, tde
-from jaxnav.env.types import Observation
-from jaxnav.policies.methods import METHODS
-from jaxnav.policies.pathways import Decision, Memory
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.env.objectnav import Observation
+from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.network import StreamsPolicy, bind, init_params
+from jaxnav.policies.pathways import Decision, PolicyState
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.policies.streams import Streams
 from jaxnav.scenes.task import NUM_ACTIONS
 
 K, BATCH, HIDDEN = len(CATEGORIES), 48, tiny.SIZES.hidden
@@ -29,7 +28,7 @@ HOSTS = [*METHODS, "support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
 
 def streams(method, **options):
     sizes = tiny.SPEC.method_sizes if method == "org" else ()
-    return dataclasses.replace(tiny.STREAMS, method=method, method_sizes=sizes, **options)
+    return dataclasses.replace(tiny.STREAMS, method=find_method(method), method_sizes=sizes, **options)
 
 
 class Decisions(NamedTuple):
@@ -52,7 +51,7 @@ def compiled(spec):
         pathways = policy.pathways(observation, layout, reading, surroundings, memory)
         counterfactual = do(pathways, scene=0.0, goal=0.0)
         given = pathways, counterfactual, do(pathways, experience=0.0), do(counterfactual, experience=0.0)
-        return Decisions(*(policy.decide(each, memory) for each in given))
+        return Decisions(*(policy.decide(pathways_i, memory) for pathways_i in given))
 
     return decide
 
@@ -70,12 +69,15 @@ def memories(generator, experienced=1.0, spec=tiny.STREAMS):
     hidden = jnp.asarray(generator.uniform(-1, 1, (BATCH, 2 * HIDDEN)), jnp.float32)
     action = jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32)
     fast = bind(spec, tiny.lively(0, spec)).initial_memory((BATCH,)).fast
-    if spec.method == "tpn":
-        fast = fast._replace(decisions=fast.decisions + 7, change=jnp.asarray(generator.normal(size=fast.change.shape)))
-    if spec.method == "savn":
-        factors = jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=leaf.shape), jnp.float32), fast.factors)
-        fast = fast._replace(factors=factors)
-    return Memory(hidden, action, fast, jnp.full(BATCH, experienced))
+    if spec.method.name == "tpn":
+        random_change = generator.normal(size=fast.actor_change.shape)
+        fast = fast._replace(num_decisions=fast.num_decisions + 7, actor_change=jnp.asarray(random_change))
+    if spec.method.name == "savn":
+        layer_changes = jax.tree.map(
+            lambda leaf: jnp.asarray(generator.normal(size=leaf.shape), jnp.float32), fast.layer_changes
+        )
+        fast = fast._replace(layer_changes=layer_changes)
+    return PolicyState(hidden, action, fast, jnp.full(BATCH, experienced))
 
 
 def decisions(spec, seed, experienced=1.0):
@@ -104,14 +106,14 @@ EACH = [pytest.param(method, marks=() if method in QUICK else pytest.mark.slow) 
 @pytest.mark.parametrize("method", EACH)
 def test_removing_experience_leaves_the_direct_stream_to_the_bit(method):
     for seed in range(4):
-        found = decisions(streams(method), seed)
-        alone = found.direct.logits
+        result = decisions(streams(method), seed)
+        alone = result.direct.logits
         if method.endswith("ADAPTIVE"):  # whose habit is part of either decision
-            alone = alone - found.nothing.logits
-        left = tde(found.factual.logits, found.counterfactual.logits)
-        np.testing.assert_array_equal(bits(left + 0.0), bits(alone + 0.0))  # zeros have one sign
+            alone = alone - result.nothing.logits
+        effect = tde(result.factual.logits, result.counterfactual.logits)
+        np.testing.assert_array_equal(bits(effect + 0.0), bits(alone + 0.0))  # zeros have one sign
         assert np.std(alone) > 0.1
-        assert np.std(found.counterfactual.logits) > 0.1
+        assert np.std(result.counterfactual.logits) > 0.1
 
 
 @pytest.mark.parametrize(
@@ -119,26 +121,26 @@ def test_removing_experience_leaves_the_direct_stream_to_the_bit(method):
     [name if name in ("rgb", "org", "hoz") else pytest.param(name, marks=pytest.mark.slow) for name in HOSTS],
 )
 def test_soft_removal_keeps_a_share_of_experience(method):
-    found = decisions(streams(method), seed=5)
-    direct, experience = found.direct.logits - found.nothing.logits, found.counterfactual.logits
-    kept = jnp.linspace(0, 1, BATCH)
-    softened = stde(found.factual.logits, experience, 1.0 - kept, 0.0, "paper")
-    np.testing.assert_allclose(softened, direct + kept[:, None] * experience, rtol=1e-6, atol=1e-6)
+    result = decisions(streams(method), seed=5)
+    direct, experience = result.direct.logits - result.nothing.logits, result.counterfactual.logits
+    share = jnp.linspace(0, 1, BATCH)
+    softened = stde(result.factual.logits, experience, 1.0 - share, 0.0, "paper")
+    np.testing.assert_allclose(softened, direct + share[:, None] * experience, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{"done_gate": True}, {"spatial_memory": SpatialMemory(4)}])
 def test_options_leave_the_equations_as_they_are(options):
-    found = decisions(streams("org", **options), seed=3)
-    left = tde(found.factual.logits, found.counterfactual.logits)
-    np.testing.assert_array_equal(bits(left + 0.0), bits(found.direct.logits + 0.0))
-    assert np.std(left) > 0.1
+    result = decisions(streams("org", **options), seed=3)
+    effect = tde(result.factual.logits, result.counterfactual.logits)
+    np.testing.assert_array_equal(bits(effect + 0.0), bits(result.direct.logits + 0.0))
+    assert np.std(effect) > 0.1
 
 
 def test_without_either_stream_nothing_is_left():
-    found = decisions(streams("org"), seed=1)
-    assert not found.nothing.logits.any()
-    assert not found.nothing.value.any()
-    np.testing.assert_allclose(found.direct.value + found.counterfactual.value, found.factual.value, rtol=1e-5)
+    result = decisions(streams("org"), seed=1)
+    assert not result.nothing.logits.any()
+    assert not result.nothing.value.any()
+    np.testing.assert_allclose(result.direct.value + result.counterfactual.value, result.factual.value, rtol=1e-5)
 
 
 # What the streams get
@@ -156,13 +158,13 @@ def test_detections_other_than_the_goals_matter_with_experience_alone(method, ex
     table[:] = np.where(others, 255 - table, table)
     spec, memory = streams(method), memories(generator, experienced)
     decide, layout = compiled(spec), jnp.ones((BATCH, K))
-    here, there = (
+    original, altered = (
         decide(tiny.lively(0, spec), one.replace(row=row), layout, None, memory) for row in (one.row, changed)
     )
-    differ = (here.factual.logits != there.factual.logits).any(axis=1)
+    differ = (original.factual.logits != altered.factual.logits).any(axis=1)
     assert differ.tolist() == [changes and method != "rgb"] * BATCH  # the experience of rgb is its view
-    np.testing.assert_array_equal(here.direct.logits, there.direct.logits)
-    chex.assert_trees_all_equal(here.factual.value == there.factual.value, ~differ)
+    np.testing.assert_array_equal(original.direct.logits, altered.direct.logits)
+    chex.assert_trees_all_equal(original.factual.value == altered.factual.value, ~differ)
 
 
 def test_episodes_without_experience_are_decided_by_the_direct_stream():
@@ -171,14 +173,14 @@ def test_episodes_without_experience_are_decided_by_the_direct_stream():
         np.testing.assert_array_equal(off.factual.logits, on.direct.logits)
         np.testing.assert_allclose(off.factual.value, on.direct.value, rtol=2e-6, atol=2e-7)  # a sum, rounded once
         np.testing.assert_array_equal(off.factual.hidden[:, :HIDDEN], on.factual.hidden[:, :HIDDEN])
-        np.testing.assert_array_equal(off.factual.experienced, np.zeros(BATCH))
+        np.testing.assert_array_equal(off.factual.use_experience, np.zeros(BATCH))
 
 
 def test_each_stream_has_a_core_of_its_own():
     """The hidden states are those of two cells of Flax."""
     generator = np.random.default_rng(0)
     observation, memory, spec = observations(generator), memories(generator), streams("org")
-    policy = cast(Streams, bind(spec, tiny.lively(0, spec)))
+    policy = cast(StreamsPolicy, bind(spec, tiny.lively(0, spec)))
     pathways = policy.pathways(observation, jnp.ones((BATCH, K)))
     after = policy.decide(pathways, memory).hidden
     previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
@@ -197,7 +199,7 @@ def test_an_episode_begins_with_experience():
     spec = streams("support.methods:ADAPTIVE")
     memory = bind(spec, tiny.lively(0, spec)).initial_memory((2, 3))
     np.testing.assert_array_equal(memory.hidden, np.zeros((2, 3, 2 * HIDDEN)))
-    np.testing.assert_array_equal(memory.experienced, np.ones((2, 3)))
+    np.testing.assert_array_equal(memory.use_experience, np.ones((2, 3)))
     assert memory.fast.shape == (2, 3, NUM_ACTIONS)
 
 
@@ -216,4 +218,4 @@ def test_streams_add_a_view_and_a_stream():
 
 def test_unknown_decisions_are_refused():
     with pytest.raises(ValueError, match=r"^decision is 'both'; choose one of fused, streams$"):
-        PolicySpec(decision="both")  # type: ignore[arg-type]
+        PolicySpec(METHODS["org"], decision="both")  # type: ignore[arg-type]

@@ -14,23 +14,26 @@ from support import tiny_world as tiny
 from support.rollouts import ENV, ENVS, LENGTH, PARAMS
 
 from jaxnav.causal import do
-from jaxnav.env.types import Observation
-from jaxnav.policies.acting import Acting, carried
-from jaxnav.policies.methods import METHODS
-from jaxnav.policies.methods.tpn import ATTENDED, REMEMBERED, Indiscriminate, TentativePolicy, actor_changes
-from jaxnav.policies.methods.trail import learn_motion
-from jaxnav.policies.pathways import Memory
-from jaxnav.policies.policy import bind
-from jaxnav.policies.stream import NO_CHANGES
+from jaxnav.env.objectnav import Observation
+from jaxnav.policies.agent_loop import AgentLoop, policy_memory
+from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.methods.tpn import (
+    NUM_ATTENDED,
+    NUM_TRIALS,
+    TentativePolicy,
+    UniformTentativePolicy,
+    actor_changes,
+    learn_motion,
+)
+from jaxnav.policies.network import NO_CHANGES, bind
+from jaxnav.policies.pathways import PolicyState
 from jaxnav.scenes.task import NUM_ACTIONS
-from jaxnav.training.collect import collect
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
-from jaxnav.training.loss import replay
+from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 
 HIDDEN, BATCH = tiny.SIZES.hidden, 32
-SPEC = dataclasses.replace(tiny.SPEC, method="tpn")
-ACTING = Acting(ENV, SPEC, tiny.SETTING)
+SPEC = dataclasses.replace(tiny.SPEC, method=find_method("tpn"))
+ACTING = AgentLoop(ENV, SPEC, tiny.SETTING)
 LEARN, IMITATE = METHODS["tpn"].stages
 
 
@@ -47,7 +50,7 @@ def tentative(kind: type[TentativePolicy] = TentativePolicy) -> Any:
 
 def remembered(network, hidden, actions):
     """The trials after hidden states [M, H] and actions [M]."""
-    trials = jnp.zeros((REMEMBERED, HIDDEN + NUM_ACTIONS))
+    trials = jnp.zeros((NUM_TRIALS, HIDDEN + NUM_ACTIONS))
     for state, action in zip(hidden, actions, strict=True):
         trials = network.remember(trials, state, action)
     return trials
@@ -62,9 +65,9 @@ def test_the_trial_in_the_same_state_is_retrieved():
     trials = remembered(network, hidden, actions)
     attention = jax.vmap(lambda h: network.attention(network.state(h), trials, jnp.int32(count)))(hidden)
     np.testing.assert_allclose(attention.sum(axis=1), 1.0, rtol=1e-5)
-    np.testing.assert_array_equal(attention.argmax(axis=1), REMEMBERED - count + np.arange(count))
+    np.testing.assert_array_equal(attention.argmax(axis=1), NUM_TRIALS - count + np.arange(count))
     assert attention.max(axis=1).min() > 0.3
-    assert set((np.asarray(attention) > 0).sum(axis=1)) == {ATTENDED}
+    assert set((np.asarray(attention) > 0).sum(axis=1)) == {NUM_ATTENDED}
     # What was done there decides what is predicted.
     others = remembered(network, hidden, (actions + 1) % NUM_ACTIONS)
     predict = jax.vmap(lambda h, t: network(h, t, jnp.int32(count)), (0, None))
@@ -72,10 +75,10 @@ def test_the_trial_in_the_same_state_is_retrieved():
 
 
 def test_without_a_choice_all_trials_are_attended_to_equally():
-    network, hidden = tentative(Indiscriminate), jnp.linspace(-1, 1, 3 * HIDDEN).reshape(3, HIDDEN)
+    network, hidden = tentative(UniformTentativePolicy), jnp.linspace(-1, 1, 3 * HIDDEN).reshape(3, HIDDEN)
     trials = remembered(network, hidden, jnp.arange(3))
     attention = network.attention(network.state(hidden[0]), trials, jnp.int32(3))
-    np.testing.assert_allclose(attention, [0.0] * (REMEMBERED - 3) + [1 / 3] * 3, rtol=1e-6)
+    np.testing.assert_allclose(attention, [0.0] * (NUM_TRIALS - 3) + [1 / 3] * 3, rtol=1e-6)
 
 
 # The step
@@ -88,10 +91,10 @@ def given(spec, decisions=7, seed=0):
     row = jnp.asarray(tiny.BANK.rows[draws.integers(0, len(tiny.BANK.rows), BATCH)])
     goal = jnp.asarray(draws.integers(0, tiny.SPEC.num_categories, BATCH))
     reading = jnp.arange(BATCH) % 2 == 0
-    memory: Memory = policy.initial_memory((BATCH,))
+    memory: PolicyState = policy.initial_memory((BATCH,))
     fast = memory.fast._replace(
-        change=jnp.asarray(draws.normal(size=memory.fast.change.shape), jnp.float32),
-        decisions=jnp.full(BATCH, decisions, jnp.int32),
+        actor_change=jnp.asarray(draws.normal(size=memory.fast.actor_change.shape), jnp.float32),
+        num_decisions=jnp.full(BATCH, decisions, jnp.int32),
     )
     hidden = jnp.asarray(draws.uniform(-1, 1, memory.hidden.shape), jnp.float32)
     memory = memory._replace(hidden=hidden, action=jnp.arange(BATCH) % NUM_ACTIONS, fast=fast)
@@ -109,40 +112,46 @@ def test_the_step_descends_the_cross_entropy_at_repeated_poses(options):
     if "decision" in options:  # where experience is, no gradient is let through, though the step is the same
         pathways = do(pathways, experience=0.0)
     decision = policy.decide(pathways, memory)
-    best = decision.fast.prediction.argmax(axis=-1)
+    best = decision.fast.predicted_logits.argmax(axis=-1)
 
     def cross_entropy(change):
-        log_pi = jax.nn.log_softmax(policy.decide_plainly(pathways, memory, actor_changes(change)).logits)
+        log_pi = jax.nn.log_softmax(policy.decide_without_adaptation(pathways, memory, actor_changes(change)).logits)
         return -jnp.take_along_axis(log_pi, best[:, None], axis=-1).sum()
 
-    gradient = jax.grad(cross_entropy)(memory.fast.change)
+    gradient = jax.grad(cross_entropy)(memory.fast.actor_change)
     repeated = np.asarray(pathways.reading)
-    moved = np.asarray(decision.fast.change - memory.fast.change)
+    moved = np.asarray(decision.fast.actor_change - memory.fast.actor_change)
     np.testing.assert_allclose(moved[repeated], -0.1 * np.asarray(gradient)[repeated], rtol=1e-3, atol=1e-6)
     assert np.abs(moved[repeated]).max(axis=(1, 2)).min() > 1e-6
     assert not moved[~repeated].any()
 
 
 def test_the_actor_is_renewed():
-    for decisions, kept in ((49, True), (50, False), (0, False)):
+    for decisions, is_kept in ((49, True), (50, False), (0, False)):
         policy, pathways, memory = given(SPEC, decisions)
         decision = policy.decide(pathways, memory)
-        expected = policy.decide_plainly(pathways, memory, actor_changes(memory.fast.change) if kept else NO_CHANGES)
+        expected = policy.decide_without_adaptation(
+            pathways, memory, actor_changes(memory.fast.actor_change) if is_kept else NO_CHANGES
+        )
         np.testing.assert_allclose(decision.logits, expected.logits, rtol=1e-5, atol=1e-5)
         unrepeated = ~np.asarray(pathways.reading)
-        assert np.asarray(decision.fast.change)[unrepeated].any() == kept
+        assert np.asarray(decision.fast.actor_change)[unrepeated].any() == is_kept
 
 
 def test_an_agent_that_does_not_try_decides_plainly():
     for acting in (
         dataclasses.replace(ACTING, inner_steps=0),
-        dataclasses.replace(ACTING, spec=dataclasses.replace(SPEC, method="jaxnav.policies.methods.tpn:UNTRIED")),
+        dataclasses.replace(
+            ACTING, spec=dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.tpn:UNTRIED"))
+        ),
     ):
         policy, (_, pathways, memory) = acting.bind(tiny.lively(0, SPEC)), given(SPEC)
-        memory = memory._replace(fast=memory.fast._replace(change=jnp.zeros_like(memory.fast.change)))
+        memory = memory._replace(fast=memory.fast._replace(actor_change=jnp.zeros_like(memory.fast.actor_change)))
         decision = policy.decide(pathways, memory)
-        chex.assert_trees_all_equal(decision.fast.change, memory.fast.change)
-        np.testing.assert_allclose(decision.logits, policy.decide_plainly(pathways, memory).logits, atol=1e-6)
+        chex.assert_trees_all_equal(decision.fast.actor_change, memory.fast.actor_change)
+        np.testing.assert_allclose(
+            decision.logits, policy.decide_without_adaptation(pathways, memory).logits, atol=1e-6
+        )
     assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.lively(0, SPEC)).recurrent
 
 
@@ -173,9 +182,9 @@ def test_the_first_stage_is_orgs_and_the_second_teaches_the_tentative_policy_alo
     middle, _ = jax.jit(learner(LEARN).update)(begin, scalars, params, KNOWN)
     assert {"actor", "core", "method.maps"} <= moved(begin.params, middle.params)
     assert "method.tentative" not in moved(begin.params, middle.params)
-    chex.assert_trees_all_equal(carried(middle.agent).fast, carried(begin.agent).fast)
+    chex.assert_trees_all_equal(policy_memory(middle.agent).fast, policy_memory(begin.agent).fast)
     # No gradient reaches the rest, even where all of it might be trained.
-    open_to_all = dataclasses.replace(IMITATE, rates=None)
+    open_to_all = dataclasses.replace(IMITATE, lr_scale_by_path=None)
     after, metrics = jax.jit(learner(open_to_all).update)(begin, scalars, params, KNOWN)
     assert moved(begin.params, after.params) == {"method.tentative"}
     chex.assert_trees_all_equal_shapes_and_dtypes(begin, middle, after)
@@ -207,9 +216,9 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     def go():
         policy = ACTING.bind(weights)
         agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWN, PARAMS)
-        agent, _ = collect(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWN)
-        agent, rollout = collect(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWN)
-        return agent, rollout, replay(policy, rollout.transitions, rollout.memory, PARAMS).decisions
+        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWN)
+        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWN)
+        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.memory, PARAMS).factual
 
     agent, rollout, again = go()
     transitions = rollout.transitions
@@ -217,7 +226,7 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     log_prob = jnp.take_along_axis(log_pi, transitions.choice[..., None], axis=-1)[..., 0]
     np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-4)
     running = ~np.asarray(transitions.ended[-1])
-    change = np.asarray(carried(agent).fast.change)
-    np.testing.assert_allclose(change[running], np.asarray(again.fast.change[-1])[running], rtol=1e-3, atol=1e-4)
+    change = np.asarray(policy_memory(agent).fast.actor_change)
+    np.testing.assert_allclose(change[running], np.asarray(again.fast.actor_change[-1])[running], rtol=1e-3, atol=1e-4)
     assert np.abs(change[running]).max() > 0.01
     assert not change[~running].any()

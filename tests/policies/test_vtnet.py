@@ -14,23 +14,23 @@ from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
 from support.scenes import CATEGORIES
 
 from jaxnav.causal import do
-from jaxnav.env.types import Observation
+from jaxnav.env.objectnav import Observation
 from jaxnav.errors import InputError
-from jaxnav.policies.acting import Acting
+from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.imitation import imitation_loss
-from jaxnav.policies.methods.vtnet import AveragingTransformer, Transformer, places, squares
-from jaxnav.policies.pathways import Memory
-from jaxnav.policies.policy import bind
+from jaxnav.policies.methods.vtnet import Transformer, UniformTransformer, position_codes, view_squares
+from jaxnav.policies.network import bind
+from jaxnav.policies.pathways import PolicyState
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
+from jaxnav.training.ppo import Learner
 
 K, BATCH, AHEAD, RIGHT, GOAL = 7, 16, 2, 3, 8
 SIZES = {"token_width": 16, "feedforward": 16, "query_outputs": 4}
-SPEC = PolicySpec("vtnet", K, tiny.SIZES, tuple(SIZES.items()))
+SPEC = PolicySpec(find_method("vtnet"), K, tiny.SIZES, tuple(SIZES.items()))
 
 
 @functools.cache
@@ -110,7 +110,7 @@ def test_without_attention_all_places_get_the_same_answer():
     """Nothing tells them apart: their places are in the scores alone."""
     answers, attended = (
         np.asarray(transformer(kind=kind)(*given())).reshape(BATCH, -1, SIZES["query_outputs"])
-        for kind in (AveragingTransformer, Transformer)
+        for kind in (UniformTransformer, Transformer)
     )
     np.testing.assert_allclose(answers, np.broadcast_to(answers[:, :1], answers.shape), rtol=1e-5, atol=1e-6)
     assert np.std(answers, axis=0).max() > 0.01
@@ -145,23 +145,23 @@ def test_more_detections_than_tokens_leave_the_goals_in():
 def test_squares_cover_the_view():
     # 5 squares along 11 cells begin every 2 and are 11 - 4 x 2 = 3 wide; 7, the paper's, begin at every cell, 5 wide.
     for side, wide in ((5, 3), (7, 5), (1, 11), (11, 1)):
-        cells = squares(11, side)
+        cells = view_squares(11, side)
         assert cells.shape == (side**2, 2 * wide**2)
         assert set(cells.ravel()) == set(range(2 * 11 * 11))
     # The second square of the second line: cells 2 to 4 along and across, in free cells and again in blocked ones.
     free = [24, 25, 26, 35, 36, 37, 46, 47, 48]
-    assert squares(11, 5)[6].tolist() == [*free, *(121 + cell for cell in free)]
+    assert view_squares(11, 5)[6].tolist() == [*free, *(121 + cell for cell in free)]
 
 
 def test_every_place_has_a_code_of_its_own():
-    code = places(5, 32)
+    code = position_codes(5, 32)
     apart = np.linalg.norm(code[:, None] - code, axis=-1)
     assert apart[~np.eye(25, dtype=bool)].min() > 0.3
 
 
 def test_queries_stay_under_an_intervention():
     """The view asks within experience: do(scene=0, goal=0) leaves that, and its answer still depends on the view."""
-    spec = PolicySpec("vtnet", len(CATEGORIES), tiny.SIZES, tuple(SIZES.items()))
+    spec = PolicySpec(find_method("vtnet"), len(CATEGORIES), tiny.SIZES, tuple(SIZES.items()))
     weights, rows, detections = tiny.lively(0, spec), tiny.BANK.rows, 4 * len(CATEGORIES)
 
     @jax.jit
@@ -169,14 +169,14 @@ def test_queries_stay_under_an_intervention():
         policy = bind(spec, weights)
         pathways = policy.pathways(Observation(row, jnp.int32(0)), jnp.ones(len(CATEGORIES)))
         removed = do(pathways, scene=0.0, goal=0.0)
-        memory = Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(0))
+        memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(0))
         return removed.experience, policy.decide(removed, memory).logits
 
     row_format = RowFormat(len(CATEGORIES))
-    here = int(row_format.presence(rows).sum(axis=-1).argmax())  # a single token would answer all queries alike
-    there = int((row_format.view_cells(rows) != row_format.view_cells(rows[here])).sum(axis=-1).argmax())
-    mixed = np.concatenate([rows[here, :detections], rows[there, detections:]])  # seen from here, lying there
-    (one, logits), (other, others) = counterfactual(rows[here]), counterfactual(mixed)
+    one_pose = int(row_format.presence(rows).sum(axis=-1).argmax())  # a single token would answer all queries alike
+    other_pose = int((row_format.view_cells(rows) != row_format.view_cells(rows[one_pose])).sum(axis=-1).argmax())
+    mixed = np.concatenate([rows[one_pose, :detections], rows[other_pose, detections:]])  # seen from here, lying there
+    (one, logits), (other, others) = counterfactual(rows[one_pose]), counterfactual(mixed)
     assert np.abs(one - other).max() > 1e-3
     assert np.abs(logits - others).max() > 1e-4  # of equal experience they would be equal to the bit
 
@@ -208,11 +208,11 @@ def test_the_loss_is_the_cross_entropy_to_the_expert():
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_imitation_lowers_its_loss_and_leaves_the_policy_as_it_is():
-    spec = dataclasses.replace(tiny.SPEC, method="vtnet", method_sizes=tuple(SIZES.items()))
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("vtnet"), method_sizes=tuple(SIZES.items()))
     expert = jnp.asarray(tiny.BANK.expert)
     params = PARAMS.replace(tables=PARAMS.tables.replace(expert=expert))
     config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=2, learning_rate=3e-3)
-    learner = Learner(Acting(ENV, spec, tiny.SETTING), config, "distil", find_method("vtnet").stages[0])
+    learner = Learner(AgentLoop(ENV, spec, tiny.SETTING), config, "distil", find_method("vtnet").stages[0])
     before = jax.jit(learner.init)(jax.random.key(0), params, KNOWLEDGE)
     state, first = jax.jit(learner.train, static_argnums=4)(before, config.scalars(400), params, KNOWLEDGE, 50)
     after, last = jax.jit(learner.train, static_argnums=4)(state, config.scalars(400), params, KNOWLEDGE, 50)

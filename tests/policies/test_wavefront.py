@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.policies.wavefront import find_way, follow, holds, pack, spread, turn_to
+from jaxnav.policies.wavefront import dilate_board, find_path, follow_path, is_on_board, pack_board, turn_towards
 from jaxnav.scenes.task import MOVE_AHEAD, NEIGHBOURS, ROTATE_LEFT, ROTATE_RIGHT, Rules
 
 SIZE = 32
-find_ways = jax.jit(jax.vmap(lambda targets, passable, start: find_way(pack(targets), pack(passable), start)))
+find_ways = jax.jit(
+    jax.vmap(lambda targets, passable, start: find_path(pack_board(targets), pack_board(passable), start))
+)
 
 
 def by_queue(targets, passable, start):
@@ -42,19 +44,19 @@ def random_maps(count, size=SIZE):
 @pytest.mark.parametrize("maps", [50, pytest.param(1000, marks=pytest.mark.slow)])
 def test_ways_are_as_long_as_those_of_a_queue(maps):
     targets, passable, start = random_maps(maps)
-    found = np.asarray(find_ways(targets, passable, start).length)
-    expected = [by_queue(*each) for each in zip(targets, passable, start, strict=True)]
-    np.testing.assert_array_equal(found, expected)
-    assert (found < 0).sum() > maps / 25
-    assert (found > 10).sum() > maps / 25
+    lengths = np.asarray(find_ways(targets, passable, start).length)
+    expected = [by_queue(*maze) for maze in zip(targets, passable, start, strict=True)]
+    np.testing.assert_array_equal(lengths, expected)
+    assert (lengths < 0).sum() > maps / 25
+    assert (lengths > 10).sum() > maps / 25
 
 
 def test_following_a_way_gets_there_by_passable_cells():
-    steps = jnp.asarray(Rules().steps(), jnp.int32)
+    steps = jnp.asarray(Rules().move_steps(), jnp.int32)
 
     @jax.jit
     def act(targets, passable, place, heading):
-        return follow(find_way(pack(targets), pack(passable), place), place, heading, steps)
+        return follow_path(find_path(pack_board(targets), pack_board(passable), place), place, heading, steps)
 
     targets, passable, start = random_maps(20)
     lengths, walked = np.asarray(find_ways(targets, passable, start).length), 0
@@ -97,15 +99,15 @@ def test_a_cell_spreads_to_its_eight_neighbours(z, x):
     cells = np.zeros((SIZE, SIZE), bool)
     cells[z, x] = True
     around = np.concatenate([[(z, x)], np.add((z, x), NEIGHBOURS)])
-    board = spread(pack(jnp.asarray(cells)))
+    board = dilate_board(pack_board(jnp.asarray(cells)))
     everywhere = jnp.asarray(np.moveaxis(np.indices((SIZE, SIZE)), 0, -1), jnp.int32)
     expected = np.zeros_like(cells)
     expected[tuple((around % SIZE).T)] = True
-    np.testing.assert_array_equal(holds(board, everywhere), expected)
-    assert holds(board, jnp.asarray(around, jnp.int32)).all()  # also beyond the edges
+    np.testing.assert_array_equal(is_on_board(board, everywhere), expected)
+    assert is_on_board(board, jnp.asarray(around, jnp.int32)).all()  # also beyond the edges
 
 
 def test_turns_take_the_shorter_way():
-    turns = [int(turn_to(jnp.int32(wanted), jnp.int32(1), 8)) for wanted in range(8)]
+    turns = [int(turn_towards(jnp.int32(wanted), jnp.int32(1), 8)) for wanted in range(8)]
     right, left = ROTATE_RIGHT, ROTATE_LEFT
     assert turns == [left, MOVE_AHEAD, right, right, right, right, left, left]

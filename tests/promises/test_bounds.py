@@ -19,11 +19,11 @@ from support.fuzz import KINDS, fuzz
 from support.processes import REPOSITORY, run
 from support.tiny_world import BANK
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import run_command
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import MAX_EPISODES, episode_list
+from jaxnav.evaluation.episodes import MAX_EPISODES, draw_episodes
 from jaxnav.scenes.files.importers.pickled_arrays import read_pickle
-from jaxnav.scenes.files.record import largest, read_bytes
+from jaxnav.scenes.files.scene_file import max_decompressed_size, read_bytes
 
 MIB = 2**20
 
@@ -43,7 +43,7 @@ def test_compressed_zeros_are_refused_within_a_limit_of_memory(tmp_path):
 
 
 def test_what_a_file_may_hold_grows_with_it():
-    assert [largest(size) // MIB for size in (0, MIB, 2 * MIB, 100 * MIB)] == [64, 64, 100, 5000]
+    assert [max_decompressed_size(size) // MIB for size in (0, MIB, 2 * MIB, 100 * MIB)] == [64, 64, 100, 5000]
 
 
 @pytest.mark.parametrize(
@@ -93,11 +93,11 @@ def test_products_of_sizes_are_bounded_too(tmp_path, capsys):
     assert train(config, tmp_path / "run", "--total-steps", 10**12, "--chunk", 1) == 2
     assert "makes 7,812,500,000 chunks; give a larger chunk" in capsys.readouterr().err  # of 16 x 8 steps
     with pytest.raises(InputError, match=f"--episodes 1000001: give at least 1, and at most {MAX_EPISODES}"):
-        episode_list(BANK, MAX_EPISODES + 1)
+        draw_episodes(BANK, MAX_EPISODES + 1)
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "last_line"),
     [
         (
             MemoryError("Unable to allocate 6 GiB"),
@@ -108,13 +108,13 @@ def test_products_of_sizes_are_bounded_too(tmp_path, capsys):
         (PermissionError(errno.EACCES, "Permission denied", "a"), "error: a: Permission denied; mend the path, its"),
     ],
 )
-def test_what_the_system_refuses_is_told_in_a_line(capsys, error, told):
+def test_what_the_system_refuses_is_told_in_a_line(capsys, error, last_line):
     def command(_):
         raise error
 
-    assert exit_code(command) == 2
+    assert run_command(command) == 2
     message = capsys.readouterr().err
-    assert message.startswith(told)
+    assert message.startswith(last_line)
     assert message.count("\n") == 1
 
 
@@ -123,14 +123,14 @@ def test_a_mistake_of_the_program_is_not_hidden():
         raise KeyError("a bug")
 
     with pytest.raises(KeyError):
-        exit_code(command)
+        run_command(command)
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
         ["--help"],
-        *(pytest.param(each, marks=pytest.mark.slow) for each in (["train", "--help"], ["scenes", "stats", "rooms"])),
+        *(pytest.param(words, marks=pytest.mark.slow) for words in (["train", "--help"], ["scenes", "stats", "rooms"])),
     ],
 )
 def test_a_reader_that_leaves_ends_the_command_quietly(arguments):
@@ -160,9 +160,9 @@ def test_a_thousand_random_inputs_neither_crash_nor_hang_nor_fill_the_memory(kin
     process = run(["-m", "support.fuzz", kind, 1000, 1], PYTHONPATH=REPOSITORY / "tests")
     output, error = process.communicate()
     assert process.returncode == 0, error[-2000:]
-    found = json.loads(output.splitlines()[-1])
-    print(kind, found)
-    assert {code for code, _ in found["codes"]} <= {0, 2}, found
-    assert sum(number for _, number in found["codes"]) == 1000
-    assert found["slowest"] < 10
-    assert found["peak"] < 1024
+    result = json.loads(output.splitlines()[-1])
+    print(kind, result)
+    assert {code for code, _ in result["codes"]} <= {0, 2}, result
+    assert sum(number for _, number in result["codes"]) == 1000
+    assert result["slowest"] < 10
+    assert result["peak"] < 1024

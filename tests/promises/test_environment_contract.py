@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import pytest
 from support.real_scenes import ITHOR, require
 
-from jaxnav.env.build import build
+from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.testing import check_environment
 from jaxnav.scenes.files.scene_file import read_scenes
@@ -16,11 +16,11 @@ BANK = compile_bank(generate_rooms(4, 0, 0), Task())  # one of each type
 
 
 def test_contract_on_generated_rooms():
-    check_environment(*build(BANK, {}, 5))
+    check_environment(*build_environment(BANK, {}, 5))
 
 
 def test_contract_on_real_rooms():
-    check_environment(*build(compile_bank(read_scenes(require(ITHOR))[::25], Task()), {}, 100))
+    check_environment(*build_environment(compile_bank(read_scenes(require(ITHOR))[::25], Task()), {}, 100))
 
 
 class EndsTwice(ObjectNav):
@@ -65,7 +65,7 @@ class Lies(ObjectNav):
     ],
 )
 def test_contract_refuses_broken_environments(broken, promise):
-    env, params = build(BANK, {}, 5)
+    env, params = build_environment(BANK, {}, 5)
     check_environment(env, params, num_steps=1)
     with pytest.raises(AssertionError, match=promise):
         check_environment(broken(env.task), params)

@@ -19,15 +19,16 @@ from support.twin_episode import TwinEpisode
 from support.twin_methods import TWINS, TwinRelations
 from support.twin_policy import TwinMethod, TwinPolicy
 
-from jaxnav.env.build import build
+from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS, prior_index
-from jaxnav.evaluation.episodes import EpisodeList, episode_list
-from jaxnav.evaluation.grid import first_states
-from jaxnav.evaluation.playback import Trace, play
-from jaxnav.evaluation.variants import Row, inference_grid, table_row
-from jaxnav.layout import SETTINGS, prior_from_counts
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.methods import METHODS, Knowledge
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.evaluation.grid import start_states
+from jaxnav.evaluation.playback import EpisodeTrace, play_episodes
+from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row
+from jaxnav.layout import ESTIMATORS, prior_from_counts
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
@@ -37,7 +38,7 @@ from jaxnav.scenes.task import DONE, Task
 
 LIMIT = 30
 #: Weak prior rows: a view changes the belief much, the gaps are large, and what is removed changes actions.
-SETTING = dataclasses.replace(SETTINGS["calibrated"], strength=0.3)
+SETTING = dataclasses.replace(ESTIMATORS["calibrated"], strength=0.3)
 SIZES = {
     "vtnet": {"token_width": 8, "feedforward": 16, "tokens": 4, "encoder_layers": 1, "decoder_layers": 2},
     "tpn": {"tentative_width": 16},
@@ -62,7 +63,7 @@ FEWER = {"savn": 100}
 def world() -> tuple[Any, Any, Any, Any]:
     """Return a bank of four rooms, their environment, and poses at which categories are seen together [R, K, K]."""
     bank = compile_bank(generate_rooms(4, 0, 0), Task())
-    env, params = build(bank, {}, LIMIT)
+    env, params = build_environment(bank, {}, LIMIT)
     seen = env.row_format.presence(bank.rows).astype(np.float32)
     counts = np.ones((NUM_PRIORS, len(env.categories), len(env.categories)), np.float32)
     ends = (bank.first_cell + bank.num_cells) * bank.task.rules.poses_per_cell
@@ -74,12 +75,12 @@ def world() -> tuple[Any, Any, Any, Any]:
 class Case(NamedTuple):
     """Hold a policy of a method, and what the package plays with it."""
 
-    acting: Acting
+    acting: AgentLoop
     weights: Any
     knowledge: Knowledge
 
-    def played(self, cell: Any, episodes: EpisodeList) -> list[Trace]:
-        return play(cell, self.weights, first_states(episodes), self.acting, world()[2], self.knowledge)
+    def played(self, cell: Any, episodes: EpisodeList) -> list[EpisodeTrace]:
+        return play_episodes(cell, self.weights, start_states(episodes), self.acting, world()[2], self.knowledge)
 
 
 @functools.cache
@@ -89,7 +90,7 @@ def case(name: str, decision: Any) -> Case:
     learned = {} if method.learn is None else method.learn([bank], counts)
     prior = jax.vmap(lambda one: prior_from_counts(one, SETTING))(jnp.asarray(counts))
     spec = PolicySpec(
-        name,
+        method,
         len(env.categories),
         tiny.SIZES,
         tuple(SIZES.get(name, {}).items()),
@@ -99,7 +100,7 @@ def case(name: str, decision: Any) -> Case:
     )
     knowledge = Knowledge(prior, jax.tree.map(jnp.asarray, learned))
     weights = jax.tree.map(lambda leaf: CALMER.get(name, 1.0) * leaf, tiny.lively(3, spec))
-    return Case(Acting(env, spec, SETTING if method.hosts_layout else None), weights, knowledge)
+    return Case(AgentLoop(env, spec, SETTING if method.hosts_layout else None), weights, knowledge)
 
 
 class Compared(NamedTuple):
@@ -118,20 +119,20 @@ def noise(episode: int, time: int, size: int) -> np.ndarray:
     return np.asarray(jax.random.gumbel(key, (size,)))
 
 
-def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: type[TwinMethod]) -> Compared:
+def compare(method: str, decision: str, row: EvaluationRow, episodes: EpisodeList, twin: type[TwinMethod]) -> Compared:
     """Go along the episodes that the package plays.
 
     Where the best two choices are equal within its tolerance and the twin takes the other one, it leaves the episode.
     """
     (bank, _, params, _), played = world(), case(method, decision)
-    (acting, weights, knowledge), cell = played, tiny.at(inference_grid([row], ("layout",), 1), 0)
+    (acting, weights, knowledge), cell = played, tiny.leaves_at(inference_grid([row], ("layout",), 1), 0)
     assert acting.spec is not None
     policy = TwinPolicy(acting.spec, jax.tree.map(lambda leaf: np.asarray(leaf, float), weights), twin(knowledge))
     decisions, ties, removals, differences = 0, 0, 0, []
     errors: dict[str, list[float]] = collections.defaultdict(list)
     for number, trace in enumerate(played.played(cell, episodes)):
         goal, scene, pose = (int(getattr(episodes, name)[number]) for name in ("goal", "scene", "pose"))
-        prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.setting else None
+        prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.estimator else None
         episode, action, success = TwinEpisode(policy, bank, prior, goal, pose), NO_ACTION, False
         for time, (expected_pose, action) in enumerate(zip(trace.pose.tolist(), trace.action.tolist(), strict=True)):
             inferred = episode.infer()
@@ -147,7 +148,7 @@ def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: t
                 ties += 1
                 break
             success = action == DONE and bank.best_length[episode.pose, goal] == 1
-            episode.go_on(action)
+            episode.step(action)
         else:
             if success != trace.success or (action != DONE and len(trace.pose) != LIMIT):
                 differences.append(f"end of episode {number}")
@@ -165,35 +166,35 @@ def compare(method: str, decision: str, row: Row, episodes: EpisodeList, twin: t
     ],
 )
 def test_every_decision_is_the_twins(method, decision, count):
-    whole, removals = episode_list(world()[0], count), 0
+    whole, removals = draw_episodes(world()[0], count), 0
     for part, row in enumerate(ROWS):
-        found = compare(method, decision, row, whole.take(np.arange(part, count, len(ROWS))), TWINS[method])
-        worst = {name: max(errors) for name, errors in found.errors.items()}
-        print(method, decision, row.variant, row.decoding, found._replace(errors={}), worst)
-        assert found.differences == []
-        assert found.ties <= 1 + found.decisions / 1000
+        result = compare(method, decision, row, whole.take(np.arange(part, count, len(ROWS))), TWINS[method])
+        worst = {name: max(errors) for name, errors in result.errors.items()}
+        print(method, decision, row.variant, row.decoding, result._replace(errors={}), worst)
+        assert result.differences == []
+        assert result.ties <= 1 + result.decisions / 1000
         assert max(worst.values()) < TOLERANCE
-        assert max(np.quantile(errors, 0.99) for errors in found.errors.values()) < TOLERANCE / 2
-        removals += found.removals
+        assert max(np.quantile(errors, 0.99) for errors in result.errors.values()) < TOLERANCE / 2
+        removals += result.removals
     assert removals > 0
 
 
 class Unweighted(TwinRelations):
     """Leave the layout out."""
 
-    def encode(self, params, seen, appearance, weights, reading, memory):
-        return super().encode(params, seen, appearance, np.ones_like(weights), reading, memory)
+    def encode(self, params, features, appearance, weights, reading, memory):
+        return super().encode(params, features, appearance, np.ones_like(weights), reading, memory)
 
 
 class Mistaken(TwinRelations):
     """Take another category for the goal."""
 
-    def perceive(self, seen):
-        return seen._replace(goal=np.roll(seen.goal, 1))
+    def perceive(self, features):
+        return features._replace(goal=np.roll(features.goal, 1))
 
 
 @pytest.mark.parametrize("wrong", [Unweighted, Mistaken])
 def test_a_twin_that_is_wrong_is_noticed(wrong):
-    found = compare("org", "fused", ROWS[0], episode_list(world()[0], 4), wrong)
-    assert found.differences
-    assert max(found.errors["factual"]) > 10 * TOLERANCE
+    result = compare("org", "fused", ROWS[0], draw_episodes(world()[0], 4), wrong)
+    assert result.differences
+    assert max(result.errors["factual"]) > 10 * TOLERANCE

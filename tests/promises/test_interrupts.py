@@ -13,10 +13,10 @@ from rich.console import Console
 from support.commands import train, write_config
 from support.processes import ends, free_address, run, start
 
-from jaxnav.cli.console import exit_code
+from jaxnav.cli.console import run_command
 from jaxnav.errors import Interrupted
-from jaxnav.runs import updates
-from jaxnav.runs.interrupts import Interrupts
+from jaxnav.runs import train as updates
+from jaxnav.runs.train import Interrupts
 
 LIMIT_S = 30
 #: 60 updates; checkpoints are rare, so that the one after the signal is for the signal.
@@ -49,15 +49,16 @@ def test_a_run_that_is_asked_to_end_saves_and_goes_on_to_the_same_end(whole, tmp
     process.send_signal(number)
     _, error = process.communicate(timeout=LIMIT_S)
     assert process.returncode == code, error
-    told = error.splitlines()[-1]
-    found = re.fullmatch(
-        rf"interrupted: {ended}: stopped after update (\d+) of 60 and saved; the same command goes on from there", told
+    message = error.splitlines()[-1]
+    match = re.fullmatch(
+        rf"interrupted: {ended}: stopped after update (\d+) of 60 and saved; the same command goes on from there",
+        message,
     )
-    assert found, error
+    assert match, error
     assert "Traceback" not in error
-    assert [path.name for path in (ended / "checkpoints").iterdir()] == [found[1]]
+    assert [path.name for path in (ended / "checkpoints").iterdir()] == [match[1]]
     assert train(config_file, ended, *LONG) == 0
-    assert f"resumed after update {found[1]} of 60" in capsys.readouterr().err
+    assert f"resumed after update {match[1]} of 60" in capsys.readouterr().err
     for name in ("metrics.jsonl", "policies/baseline-1/params.safetensors", "policies/layout-0/params.safetensors"):
         assert (ended / name).read_bytes() == (whole / name).read_bytes(), name
 
@@ -73,7 +74,9 @@ def test_two_processes_end_together_when_one_is_asked(tmp_path):
     both[1].send_signal(signal.SIGTERM)
     codes, messages = ends(*both, timeout=2 * LIMIT_S)
     assert codes == [143, 143], messages
-    (done,) = {re.findall(r"interrupted: .* stopped after update (\d+) of 60 and saved", each)[-1] for each in messages}
+    (done,) = {
+        re.findall(r"interrupted: .* stopped after update (\d+) of 60 and saved", message)[-1] for message in messages
+    }
     assert [path.name for path in (ended / "checkpoints").iterdir()] == [done]
     codes, messages = ends(*(start(again, index, config_file, ended, *LONG) for index in range(2)))
     assert codes == [0, 0], messages
@@ -84,11 +87,11 @@ def test_the_first_signal_is_noted_and_the_second_ends_the_process():
     for number in (signal.SIGINT, signal.SIGTERM):
         before = signal.getsignal(number)
         with Interrupts() as interrupts:
-            assert interrupts.asked() == 0
+            assert interrupts.pending_signal() == 0
             signal.raise_signal(number)
-            assert interrupts.asked() == number
+            assert interrupts.pending_signal() == number
             # What the system does by itself: it ends the process, wherever it is.
-            assert {signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)} == {signal.SIG_DFL}
+            assert {signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} == {signal.SIG_DFL}
         assert signal.getsignal(number) == before
 
 
@@ -97,24 +100,24 @@ def test_a_signal_that_is_ignored_stays_so():
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGINT)
-        assert interrupts.asked() == 0
+        assert interrupts.pending_signal() == 0
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
 
 
 @pytest.mark.slow
 def test_a_signal_during_the_last_save_is_told(tmp_path, capsys, monkeypatch):
     """The run is saved and not exported; the same command exports it."""
-    config_file, run_dir, whole_save = write_config(tmp_path), tmp_path / "run", updates.save
+    config_file, run_dir, whole_save = write_config(tmp_path), tmp_path / "run", updates.save_checkpoint
 
     def interrupted(folder, step, *rest):
         if step == 4:  # the last
             signal.raise_signal(signal.SIGTERM)
         whole_save(folder, step, *rest)
 
-    monkeypatch.setattr(updates, "save", interrupted)
+    monkeypatch.setattr(updates, "save_checkpoint", interrupted)
     assert train(config_file, run_dir) == 143
-    told = f"interrupted: {run_dir}: stopped after update 4 of 4 and saved; the same command goes on from there"
-    assert told in capsys.readouterr().err
+    message = f"interrupted: {run_dir}: stopped after update 4 of 4 and saved; the same command goes on from there"
+    assert message in capsys.readouterr().err
     assert not (run_dir / "policies").exists()
     monkeypatch.undo()
     assert train(config_file, run_dir) == 0
@@ -126,7 +129,7 @@ def test_threads_without_signals_train_too():
 
     def enter():
         with Interrupts() as interrupts:
-            seen.append(interrupts.asked())
+            seen.append(interrupts.pending_signal())
 
     thread = threading.Thread(target=enter)
     thread.start()
@@ -135,18 +138,18 @@ def test_threads_without_signals_train_too():
 
 
 @pytest.mark.parametrize(
-    ("end", "code", "told"),
+    ("end", "code", "message"),
     [
         (Interrupted(signal.SIGTERM, "runs/a: saved"), 143, "interrupted: runs/a: saved; the same command goes on"),
         (Interrupted(signal.SIGINT, "runs/a: saved"), 130, "interrupted: runs/a: saved; the same command goes on"),
         (KeyboardInterrupt(), 130, "interrupted: "),
     ],
 )
-def test_every_command_tells_an_interrupt_in_a_line(capsys, end, code, told):
+def test_every_command_tells_an_interrupt_in_a_line(capsys, end, code, message):
     def command(_: Console) -> None:
         raise end
 
-    assert exit_code(command) == code
+    assert run_command(command) == code
     error = capsys.readouterr().err
-    assert error.startswith(told)
+    assert error.startswith(message)
     assert error.count("\n") == 1

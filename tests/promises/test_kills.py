@@ -11,7 +11,7 @@ import pytest
 from support.commands import POLICIES, SEEDS, write_config
 from support.processes import run
 
-from jaxnav.store.runlog import read_rows
+from jaxnav.store.files import read_log_rows
 
 
 def start(config_file, run_dir, cache, *options):
@@ -50,7 +50,7 @@ def test_a_killed_and_resumed_run_is_an_uninterrupted_one_bit_for_bit(tmp_path):
     names = ["metrics.jsonl", "reach.json", *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES))]
     for name in names:
         assert (killed / name).read_bytes() == (whole / name).read_bytes(), name
-    assert len(read_rows(killed / "metrics.jsonl")) == 30 * 2 * SEEDS
+    assert len(read_log_rows(killed / "metrics.jsonl")) == 30 * 2 * SEEDS
     finish(start(config_file, other, cache, *long, "--seed", "1"))
     for name in names:
         assert (other / name).read_bytes() != (whole / name).read_bytes(), name

@@ -1,8 +1,8 @@
 """A name that comes from a file, a path or a command line is shown as text, whatever it holds.
 
 Seen to fail: with a console that takes markup, `[/x]` in a path ends the commands with a `MarkupError`; without
-`printable` escapes reach the terminal; with figures that parse mathematics, `$` in the name of a scene file ends the
-drawing of the learning curves.
+`escape_control_chars` escapes reach the terminal; with figures that parse mathematics, `$` in the name of a scene file
+ends the drawing of the learning curves.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from rich.table import Table
 from support.scenes import SMALL, draw
 
 from jaxnav.__main__ import COMMANDS, main
-from jaxnav.cli.console import PlainConsole, exit_code, printable
+from jaxnav.cli.console import PlainConsole, escape_control_chars, run_command
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.viz.learning import learning_figure
@@ -52,19 +52,19 @@ GIVEN = {
 }
 
 
-def assert_harmless(told):
-    assert told
-    assert "Traceback" not in told
+def assert_harmless(output):
+    assert output
+    assert "Traceback" not in output
     hidden = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-    assert not [each for each in told.replace("\n", "") if unicodedata.category(each) in hidden]
+    assert not [char for char in output.replace("\n", "") if unicodedata.category(char) in hidden]
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [(name, given) for name, each in GIVEN.items() for given in each], ids=lambda value: str(value)
+    ("name", "given"), [(name, given) for name, lines in GIVEN.items() for given in lines], ids=lambda value: str(value)
 )
 def test_every_command_shows_hostile_names_as_text(name, given, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = [each.replace("@", HOSTILE) for each in (name, *given)]
+    arguments = [word.replace("@", HOSTILE) for word in (name, *given)]
     try:
         code = main(arguments)
     except SystemExit as end:  # from the parser
@@ -89,8 +89,8 @@ def test_what_a_parser_quotes_is_text(words, capsys):
     with pytest.raises(SystemExit) as end:
         main([word.replace("@", HOSTILE) for word in words])
     assert end.value.code == 2
-    assert_harmless(told := "".join(capsys.readouterr()))
-    assert "[/x]" in told
+    assert_harmless(output := "".join(capsys.readouterr()))
+    assert "[/x]" in output
 
 
 def test_a_help_quotes_a_configuration_as_text(tmp_path, capsys):
@@ -99,8 +99,8 @@ def test_a_help_quotes_a_configuration_as_text(tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         main(["train", "--config", str(config), "--help"])
     assert end.value.code == 0
-    assert_harmless(told := capsys.readouterr().out)
-    assert "[/x]" in told
+    assert_harmless(output := capsys.readouterr().out)
+    assert "[/x]" in output
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
@@ -111,13 +111,13 @@ def test_a_refusal_is_legible_on_a_terminal():
         [sys.executable, "-m", "jaxnav", "table", "a", "--no-such"], stdout=theirs, stderr=theirs
     )
     os.close(theirs)
-    told = b""
+    output = b""
     with contextlib.suppress(OSError):  # the other end is closed
         while part := os.read(ours, 4096):
-            told += part
+            output += part
     assert process.wait() == 2
-    assert b"--no-such" in told
-    assert b"\\x1b" not in told
+    assert b"--no-such" in output
+    assert b"\\x1b" not in output
 
 
 def test_every_command_is_given_hostile_names():
@@ -154,8 +154,8 @@ def test_hostile_names_in_a_scene_file_are_text(given, scene_file, monkeypatch, 
     target = ["out.jsonl.gz"] if command == "import" else []
     form = [options.pop(0)] if command == "import" else []
     assert main(["scenes", command, *form, str(scene_file), *target, *options]) in (0, 2)
-    told = capsys.readouterr()
-    assert_harmless(told.out + told.err)
+    output = capsys.readouterr()
+    assert_harmless(output.out + output.err)
 
 
 def test_a_console_shows_markup_and_escapes_in_lines_tables_and_titles(capsys):
@@ -164,24 +164,24 @@ def test_a_console_shows_markup_and_escapes_in_lines_tables_and_titles(capsys):
     console = PlainConsole(width=120)
     console.print(f"{HOSTILE} :smile:", style="bold")
     console.print(table)
-    told = capsys.readouterr().out
-    assert_harmless(told)
-    assert told.startswith(r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile:")
+    output = capsys.readouterr().out
+    assert_harmless(output)
+    assert output.startswith(r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile:")
 
 
 def test_a_refusal_is_one_line(capsys):
     def refused(_):
         raise InputError(f"{HOSTILE}: mend it")
 
-    assert exit_code(refused) == 2
-    told = capsys.readouterr().err
-    assert_harmless(told)
-    assert told.count("\n") == 1
+    assert run_command(refused) == 2
+    output = capsys.readouterr().err
+    assert_harmless(output)
+    assert output.count("\n") == 1
 
 
 def test_letters_of_any_language_stay():
-    assert printable("Küche, 台所, кухня, 🍳, ́") == "Küche, 台所, кухня, 🍳, ́"
-    assert printable("a\nb\x1bc", kept="\n") == "a\nb\\x1bc"
+    assert escape_control_chars("Küche, 台所, кухня, 🍳, ́") == "Küche, 台所, кухня, 🍳, ́"
+    assert escape_control_chars("a\nb\x1bc", keep="\n") == "a\nb\\x1bc"
 
 
 @pytest.mark.filterwarnings("ignore:Glyph")  # an escape is drawn as a box

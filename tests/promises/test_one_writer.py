@@ -1,8 +1,8 @@
 """One process at a time writes to a run directory.
 
-Seen to fail: without `fcntl.flock` in `Lock.acquire` a second training is not refused; with a lock that counts as held
-wherever its file exists, one that was killed blocks the next; without `Lock.check` a run whose directory was removed
-ends as if all were well.
+Seen to fail: without `fcntl.flock` in `FolderLock.acquire` a second training is not refused; with a lock that counts as
+held wherever its file exists, one that was killed blocks the next; without `FolderLock.check` a run whose directory was
+removed ends as if all were well.
 """
 
 import dataclasses
@@ -21,15 +21,15 @@ from support.drawn_run import tiny_config
 from support.processes import REPOSITORY, run
 
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import claimed
-from jaxnav.store.lock import LOCK_FILE, Lock
+from jaxnav.runs.run import lock_run_dir
+from jaxnav.store.files import LOCK_FILE, FolderLock
 
 HOLDING = """
 import sys
 from pathlib import Path
-from jaxnav.runs.directory import claimed
-from jaxnav.store.lock import Lock
-Lock(Path(sys.argv[1])).acquire()
+from jaxnav.runs.run import lock_run_dir
+from jaxnav.store.files import FolderLock
+FolderLock(Path(sys.argv[1])).acquire()
 print("held", flush=True)
 sys.stdin.read()
 """
@@ -48,7 +48,7 @@ def holder(tmp_path):
 
 def test_a_second_process_is_refused_in_a_line_that_names_the_first(tmp_path, holder):
     with pytest.raises(InputError) as error:
-        Lock(tmp_path).acquire()
+        FolderLock(tmp_path).acquire()
     named = re.escape(f"process {holder.pid} on {socket.gethostname()}")
     assert re.fullmatch(f"{tmp_path}: {named} writes to it; wait for that, end it, or choose .*", str(error.value))
 
@@ -58,18 +58,18 @@ def test_the_lock_of_a_process_that_is_gone_holds_nothing(tmp_path, holder, end)
     holder.send_signal(end)
     holder.wait()
     assert str(holder.pid) in (tmp_path / LOCK_FILE).read_text()
-    lock = Lock(tmp_path)
+    lock = FolderLock(tmp_path)
     lock.acquire()
     with pytest.raises(InputError, match=f"process {os.getpid()} on "):
-        Lock(tmp_path).acquire()
+        FolderLock(tmp_path).acquire()
     lock.release()
-    Lock(tmp_path).acquire()
+    FolderLock(tmp_path).acquire()
 
 
 def test_a_folder_that_is_removed_or_replaced_is_told(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    lock = Lock(folder)
+    lock = FolderLock(folder)
     lock.check()  # of a process that holds nothing, such as the second of a run
     lock.acquire()
     lock.check()
@@ -79,23 +79,23 @@ def test_a_folder_that_is_removed_or_replaced_is_told(tmp_path):
     ):
         lock.check()
     folder.mkdir()
-    Lock(folder).acquire()
+    FolderLock(folder).acquire()
     with pytest.raises(InputError, match="was removed or replaced"):
         lock.check()
 
 
 def test_a_run_directory_is_held_while_it_is_claimed(tmp_path):
     config = tiny_config(tmp_path)
-    with claimed(config):
+    with lock_run_dir(config):
         before = (config.run_dir / "config.json").read_bytes()
-        with pytest.raises(InputError, match=f"process {os.getpid()} on .* writes to it"), claimed(config):
+        with pytest.raises(InputError, match=f"process {os.getpid()} on .* writes to it"), lock_run_dir(config):
             pass
-        with pytest.raises(InputError, match="holds another run"), claimed(dataclasses.replace(config, seed=5)):
+        with pytest.raises(InputError, match="holds another run"), lock_run_dir(dataclasses.replace(config, seed=5)):
             pass
         assert (config.run_dir / "config.json").read_bytes() == before
-    with pytest.raises(InputError, match="holds another run"), claimed(dataclasses.replace(config, seed=5)):
+    with pytest.raises(InputError, match="holds another run"), lock_run_dir(dataclasses.replace(config, seed=5)):
         pass
-    with claimed(config):  # let go of, also after a refusal
+    with lock_run_dir(config):  # let go of, also after a refusal
         pass
 
 
@@ -103,16 +103,16 @@ def test_what_fails_while_the_directory_is_gone_fails_for_that(tmp_path):
     """A save, for one, of which Orbax tells much else."""
     config = tiny_config(tmp_path)
 
-    def failing(gone: bool) -> None:
-        with claimed(config):
-            if gone:
+    def failing(is_gone: bool) -> None:
+        with lock_run_dir(config):
+            if is_gone:
                 shutil.rmtree(config.run_dir)
             raise ValueError("No ArrayMetadata found")
 
     with pytest.raises(InputError, match=f"{config.run_dir}: was removed or replaced"):
-        failing(gone=True)
+        failing(is_gone=True)
     with pytest.raises(ValueError, match="No ArrayMetadata found"):
-        failing(gone=False)
+        failing(is_gone=False)
 
 
 @pytest.mark.slow

@@ -14,14 +14,13 @@ import pytest
 from support import tiny_world as tiny
 from support.rollouts import CONFIG, ENV, ENVS, KNOWLEDGE, LEARNER, PARAMS
 
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams
-from jaxnav.policies.acting import Acting
+from jaxnav.env.objectnav import EnvParams, ObjectNav
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.methods import METHODS
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import NUM_ACTIONS
-from jaxnav.training.collect import Transition, collect
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
+from jaxnav.training.ppo import Learner, Transition, collect_rollout
 
 GOALS, UPDATES, GAMMA = len(tiny.CATEGORIES), 80, 0.5
 RIGHT = 3  # the action that pays where one does
@@ -85,7 +84,7 @@ CASES = {
     ),
 }
 PROBES = Learner(
-    Acting(Probe(ENV.task), PolicySpec("rgb", GOALS, tiny.SIZES)),
+    AgentLoop(Probe(ENV.task), PolicySpec(METHODS["rgb"], GOALS, tiny.SIZES)),
     PPOConfig(num_envs=ENVS, rollout=4, epochs=4, minibatches=2, learning_rate=1e-2, gamma=GAMMA),
     "none",
 )
@@ -105,17 +104,17 @@ def trained(gamma: jax.Array, updates: int) -> Transition:
         state = PROBES.init(jax.random.key(0), params, KNOWLEDGE)
         scalars = PROBES.config.scalars(UPDATES).replace(gamma=gamma)
         state, _ = PROBES.train(state, scalars, params, KNOWLEDGE, updates)
-        policy = PROBES.acting.bind(state.params)
+        policy = PROBES.agent_loop.bind(state.params)
         arguments = state.agent, jax.random.key(1), 4, False, params, KNOWLEDGE
-        return collect(PROBES.acting, policy, *arguments)[1].transitions
+        return collect_rollout(PROBES.agent_loop, policy, *arguments)[1].transitions
 
     return jax.lax.map(one, (probes.pays, probes.length))
 
 
 @pytest.fixture(scope="module")
 def rollouts() -> dict[str, Transition]:
-    found = jax.device_get(trained(jnp.float32(GAMMA), UPDATES))
-    return {name: tiny.at(found, number) for number, name in enumerate(CASES)}
+    result = jax.device_get(trained(jnp.float32(GAMMA), UPDATES))
+    return {name: tiny.leaves_at(result, number) for number, name in enumerate(CASES)}
 
 
 def values(t: Transition) -> dict[tuple[int, int], np.ndarray]:
@@ -127,10 +126,13 @@ def values(t: Transition) -> dict[tuple[int, int], np.ndarray]:
 @pytest.mark.parametrize("name", CASES)
 def test_a_probe_has_its_value_and_its_choice(rollouts, name):
     case, t = CASES[name], rollouts[name]
-    found = values(t)
-    assert found.keys() == case.value.keys()
+    result = values(t)
+    assert result.keys() == case.value.keys()
+    # A value depends on the recurrent state too, by how much on the rounding of the processor. A missing discount
+    # or a missing value loss is off by 0.5.
     for key, expected in case.value.items():
-        np.testing.assert_allclose(found[key], expected, atol=0.1, err_msg=f"time and goal {key}")
+        np.testing.assert_allclose(result[key].mean(), expected, atol=0.1, err_msg=f"time and goal {key}")
+        np.testing.assert_allclose(result[key], expected, atol=0.25, err_msg=f"time and goal {key}")
     if case.right is not None:
         assert (t.choice == np.array(case.right)[t.goal]).mean() > 0.95
 
@@ -138,10 +140,10 @@ def test_a_probe_has_its_value_and_its_choice(rollouts, name):
 @pytest.mark.slow
 def test_another_discount_has_another_value(rollouts):
     """So the delayed reward is discounted, and once: nothing else about the probes changes."""
-    found = tiny.at(jax.device_get(trained(jnp.float32(0.9), UPDATES)), list(CASES).index("delayed"))
+    result = tiny.leaves_at(jax.device_get(trained(jnp.float32(0.9), UPDATES)), list(CASES).index("delayed"))
     for goal in range(GOALS):
-        np.testing.assert_allclose(values(found)[0, goal], 0.9, atol=0.1)
-        assert (np.abs(values(found)[0, goal] - values(rollouts["delayed"])[0, goal]) > 0.2).all()
+        np.testing.assert_allclose(values(result)[0, goal], 0.9, atol=0.1)
+        assert (np.abs(values(result)[0, goal] - values(rollouts["delayed"])[0, goal]) > 0.2).all()
 
 
 #: Least share of goals found on average over the updates from one number to the next.
@@ -159,5 +161,5 @@ def test_success_stays_within_stored_bounds(seed):
         state, metrics = train(state, CONFIG.scalars(400), params, KNOWLEDGE)
         success[begin, begin + 20] = float(metrics["success"])
     print(seed, success)
-    for updates, (least, most) in BOUNDS.items():
-        assert least <= success[updates] <= most, updates
+    for updates, (lowest, highest) in BOUNDS.items():
+        assert lowest <= success[updates] <= highest, updates

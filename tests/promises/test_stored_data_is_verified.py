@@ -22,14 +22,12 @@ from support.damage import damage
 from support.drawn_run import tiny_config
 
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import CONFIG_FILE, REACH_FILE, Run, claim, settings
-from jaxnav.runs.logs import Logs
-from jaxnav.runs.packaged import WEIGHTS
+from jaxnav.runs.policies import PACKAGED_POLICIES
 from jaxnav.runs.policy import load_policy
+from jaxnav.runs.run import CONFIG_FILE, REACH_FILE, Run, RunLogs, claim_run_dir, run_settings
 from jaxnav.store import checkpoint
 from jaxnav.store.export import export_params, load_params
-from jaxnav.store.manifest import make_manifest
-from jaxnav.store.signed import write_signed
+from jaxnav.store.files import make_manifest, write_json_with_digest
 
 MANIFEST = make_manifest({"seed": 1})
 CHUNKS = 4
@@ -50,19 +48,19 @@ def state(step: int) -> dict[str, jax.Array]:
 
 def save_two(folder):
     for step in (1, 2):
-        checkpoint.save(folder, step, state(step), MANIFEST)
+        checkpoint.save_checkpoint(folder, step, state(step), MANIFEST)
 
 
 def restored(folder):
     """The state of the latest checkpoint, or its number and what is told of it if it is an earlier one."""
-    found = checkpoint.restore(folder, jax.eval_shape(state, 0), MANIFEST)
-    assert found is not None
-    right = state(found.step)
-    equal = jax.tree.map(lambda a, b: bool((a == b).all()), found.state, right)
+    result = checkpoint.restore_checkpoint(folder, jax.eval_shape(state, 0), MANIFEST)
+    assert result is not None
+    right = state(result.step)
+    equal = jax.tree.map(lambda a, b: bool((a == b).all()), result.state, right)
     assert all(jax.tree.leaves(equal)), "silent"
-    if found.step < 2:
+    if result.step < 2:
         raise InputError("the one before")
-    return found.step
+    return result.step
 
 
 @functools.cache
@@ -75,14 +73,14 @@ def in_run(folder):
 
 
 def log_rows(folder):
-    logs = Logs(in_run(folder))
+    logs = RunLogs(in_run(folder))
     for step in range(2, 2 * CHUNKS + 1, 2):
         rows = [{"step": step, "arm": arm, "seed": 0, "success": step / 7} for arm in ("baseline", "layout")]
         logs.append(rows, {"step": step, "wall_s": step / 3, "cpu_s": step / 2})
 
 
 def resumed_logs(folder):
-    logs = Logs(in_run(folder))
+    logs = RunLogs(in_run(folder))
     logs.rewind(2 * CHUNKS)
     return logs.metrics(), logs.times()
 
@@ -102,18 +100,22 @@ def bank(folder):
 
 
 def reach(folder):
-    found = Run(in_run(folder)).reach()
-    if found is None:
+    result = Run(in_run(folder)).success_by_budget()
+    if result is None:
         raise InputError("is removed: as in a run without val scenes, nothing is shown")
-    return found
+    return result
 
 
 STORED = {
     "checkpoint": Stored(save_two, restored, "checkpoints/2"),
     "log": Stored(lambda folder: (folder.mkdir(), log_rows(folder)), resumed_logs),
-    "config": Stored(lambda folder: claim(in_run(folder)), lambda folder: settings(Run.open(folder).config)),
+    "config": Stored(
+        lambda folder: claim_run_dir(in_run(folder)), lambda folder: run_settings(Run.open(folder).config)
+    ),
     "reach": Stored(
-        lambda folder: write_signed(folder / REACH_FILE, {"budgets": [10, 25], "val": {"layout": [0.25, 0.5]}}),
+        lambda folder: write_json_with_digest(
+            folder / REACH_FILE, {"budgets": [10, 25], "val": {"layout": [0.25, 0.5]}}
+        ),
         reach,
     ),
     "export": Stored(lambda folder: export_params(folder, arrays(), {"method": "org", "size": 3}), exported),
@@ -163,9 +165,9 @@ def test_another_digit_in_a_record_is_told(name, file, tmp_path):
     STORED[name].write(tmp_path / "whole")
     path = tmp_path / "whole" / file
     whole = path.read_bytes()
-    places = [at for at, byte in enumerate(whole) if chr(byte).isdigit()]
-    for at in places[:: len(places) // 8]:
-        path.write_bytes(whole[:at] + str((whole[at] - ord("0") + 1) % 10).encode() + whole[at + 1 :])
+    places = [index for index, byte in enumerate(whole) if chr(byte).isdigit()]
+    for index in places[:: len(places) // 8]:
+        path.write_bytes(whole[:index] + str((whole[index] - ord("0") + 1) % 10).encode() + whole[index + 1 :])
         with pytest.raises(InputError, match=file):
             STORED[name].read(path.parent)
 
@@ -175,7 +177,7 @@ def test_another_digit_in_a_log_is_told(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(path.read_bytes().replace(b"0.57", b"0.67"))  # success of 4 / 7
     with pytest.raises(InputError, match=r"metrics.jsonl, line 3: is damaged or was changed by hand"):
-        Logs(in_run(tmp_path)).metrics()
+        RunLogs(in_run(tmp_path)).metrics()
 
 
 @pytest.mark.parametrize(
@@ -190,15 +192,15 @@ def test_another_digit_in_a_log_is_told(tmp_path):
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, hurt):
     save_two(tmp_path)
     hurt(tmp_path / "checkpoints/2")
-    found = checkpoint.restore(tmp_path, jax.eval_shape(state, 0), MANIFEST)
-    assert found is not None
-    assert found.step == found.state["step"] == 1
-    (problem,) = found.damaged
+    result = checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(state, 0), MANIFEST)
+    assert result is not None
+    assert result.step == result.state["step"] == 1
+    (problem,) = result.damaged
     # Before Orbax reads anything.
     assert problem.startswith(f"{tmp_path}/checkpoints/2: is damaged (ValueError: missing or other than saved: ")
-    checkpoint.set_aside_after(tmp_path, found.step)
+    checkpoint.set_aside_checkpoints_after(tmp_path, result.step)
     assert (tmp_path / "damaged/2").is_dir()
-    checkpoint.save(tmp_path, 2, state(2), MANIFEST)  # and the run goes on
+    checkpoint.save_checkpoint(tmp_path, 2, state(2), MANIFEST)  # and the run goes on
     assert restored(tmp_path) == 2
 
 
@@ -213,12 +215,14 @@ def test_a_run_without_a_whole_checkpoint_does_not_begin_anew(tmp_path):
     for step in (1, 2):
         (tmp_path / f"checkpoints/{step}/_CHECKPOINT_METADATA").write_text("{")
     with pytest.raises(InputError, match=r"/2: is damaged .*/1: is damaged .*no checkpoint is left; restore one or"):
-        checkpoint.restore(tmp_path, jax.eval_shape(state, 0), MANIFEST)
+        checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(state, 0), MANIFEST)
 
 
 def test_a_checkpoint_without_digests_is_restored(tmp_path, monkeypatch):
     """Those of version 0.2.0 are."""
-    monkeypatch.setattr(checkpoint, "sign", lambda record: {name: record[name] for name in ("manifest", "leaves")})
+    monkeypatch.setattr(
+        checkpoint, "add_digest", lambda record: {name: record[name] for name in ("manifest", "leaves")}
+    )
     save_two(tmp_path)
     assert restored(tmp_path) == 2
 
@@ -230,10 +234,10 @@ def test_a_log_without_a_row_is_refused_where_the_run_goes_on(tmp_path, lost):
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(lines[:lost] + lines[lost + 1 :]))
     with pytest.raises(InputError, match=f"metrics.jsonl, line {lost + 1}: rows are missing or out of order; restore"):
-        Logs(in_run(tmp_path)).rewind(2 * CHUNKS)
+        RunLogs(in_run(tmp_path)).rewind(2 * CHUNKS)
     path.write_bytes(b"".join(lines + lines[lost : lost + 1]))
     with pytest.raises(InputError, match=r"metrics.jsonl, line 9: rows are missing or out of order"):
-        Logs(in_run(tmp_path)).metrics()
+        RunLogs(in_run(tmp_path)).metrics()
 
 
 @pytest.mark.slow
@@ -243,9 +247,9 @@ def test_a_run_with_a_damaged_checkpoint_ends_as_one_without(tmp_path, tmp_path_
     shutil.rmtree(hurt / "policies")
     flip(max((hurt / "checkpoints/4/state").rglob("d/*"), key=lambda path: path.stat().st_size))
     assert train(config_file, hurt) == 0
-    told = capsys.readouterr().err
-    assert f"{hurt}/checkpoints/4: is damaged (" in told
-    assert "resumed after update 2 of 4" in told
+    output = capsys.readouterr().err
+    assert f"{hurt}/checkpoints/4: is damaged (" in output
+    assert "resumed after update 2 of 4" in output
     for path in (
         "metrics.jsonl",
         *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES)),
@@ -287,7 +291,7 @@ def test_a_finished_run_does_not_overwrite_an_export_that_differs(tmp_path, tmp_
     ],
 )
 def test_an_export_that_is_well_signed_but_wrong_is_refused(tmp_path, change, problem):
-    params, spec = load_params(WEIGHTS / "rooms-org")
+    params, spec = load_params(PACKAGED_POLICIES / "rooms-org")
     params = jax.tree.map(np.array, params)
     export_params(tmp_path / "whole", params, spec)
     load_policy(tmp_path / "whole")

@@ -84,18 +84,18 @@ def driven(tmp_path_factory):
 
 def test_the_slider_moves_both_agents_in_step(driven):
     (plan,), episode = replays().plans, replays().episodes[1]  # that in which the agents differ
-    assert [at["now"] for at in driven["seen"][:5]] == [f"step {step + 1} of 5" for step in range(5)]
-    for step, at in enumerate(driven["seen"][:5]):
+    assert [state["now"] for state in driven["seen"][:5]] == [f"step {step + 1} of 5" for step in range(5)]
+    for step, state in enumerate(driven["seen"][:5]):
         places = [plan.views[c.views[min(step, len(c.views) - 1)]] for c in episode.courses]
-        found = [tuple(map(int, re.findall(r"-?\d+", agent)[:2])) for agent in at["agents"]]
-        assert found == [(view.x, -view.z) for view in places]
-        assert at["cursors"] == [min(step, 2) + 0.5, step + 0.5]
-    assert len({tuple(at["agents"]) for at in driven["seen"][:5]}) > 3
+        poses = [tuple(map(int, re.findall(r"-?\d+", agent)[:2])) for agent in state["agents"]]
+        assert poses == [(view.x, -view.z) for view in places]
+        assert state["cursors"] == [min(step, 2) + 0.5, step + 0.5]
+    assert len({tuple(state["agents"]) for state in driven["seen"][:5]}) > 3
 
 
 def test_keys_step_and_change_the_episode(driven):
-    assert [at["step"] for at in driven["seen"][5:9]] == ["3", "2", "3", "3"]
-    goals = [replays().categories[each.goal] for each in reversed(replays().episodes)]
+    assert [state["step"] for state in driven["seen"][5:9]] == ["3", "2", "3", "3"]
+    goals = [replays().categories[episode.goal] for episode in reversed(replays().episodes)]
     assert driven["goals"] == goals  # those that differ come first
     assert driven["after"] == goals[1]
 
@@ -130,7 +130,7 @@ def test_nothing_runs_even_without_the_policy(tmp_path):
 def test_what_is_no_text_runs_unless_the_policy_forbids_it(tmp_path):
     """A control: the payload works, and the policy stops it."""
     text = page().replace("</body>", f"<script>{PAYLOAD}</script></body>")
-    ran, stopped = (browse(tmp_path, each) for each in (open_to_scripts(text), text))
+    ran, stopped = (browse(tmp_path, page_text) for page_text in (open_to_scripts(text), text))
     assert "data-ran" in ran[0].partition("<head>")[0]
     assert "data-ran" not in stopped[0].partition("<head>")[0]
     assert "Content Security Policy" in stopped[1][0]  # the console is heard

@@ -15,18 +15,16 @@ from support.drawn_run import draw_run, tiny_config
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.evaluation.accounting import accounting_table
-from jaxnav.evaluation.report_tables import console_table
-from jaxnav.report.gather import Options, measure
-from jaxnav.report.make import make_report
-from jaxnav.report.players import Player, choose
-from jaxnav.report.sections import make_sections
-from jaxnav.runs.account import account
-from jaxnav.scenes.tables.detector import Detector
+from jaxnav.evaluation.report import accounting_table, results_table
+from jaxnav.report.make import make_report, make_sections
+from jaxnav.report.measure import ReportOptions, measure_shift
+from jaxnav.report.replays import ReplayAgent, select_episodes
+from jaxnav.runs.evaluate import account
+from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS
 
 QUIET = Console(quiet=True)
-OPTIONS = Options("val", (1.0,), 24, (0.0,), 0.2, 10, 0)
+OPTIONS = ReportOptions("val", (1.0,), 24, (0.0,), 0.2, 10, 0)
 EVALUATION = {"shift": 1.0, "episodes": 24, "epsilon": (0.0, 0.2)}
 
 
@@ -37,7 +35,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def measured(run):
-    return measure(run, run, 1.0, OPTIONS, QUIET)
+    return measure_shift(run, run, 1.0, OPTIONS, QUIET)
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +57,8 @@ def printed(table):
 @pytest.mark.slow
 def test_tables_hold_the_numbers_of_eval_and_account(run, measured, evaluated):
     results, experience, *_ = make_sections(run, {1.0: measured}, 0.2)
-    (every,) = (table for table in results.folded if table.title.endswith("every threshold"))
-    assert re.findall(r"[-+]?\d+\.\d+", str(every.rows)) == printed(console_table(evaluated.report))
+    (threshold_table,) = (table for table in results.folded if table.title.endswith("every threshold"))
+    assert re.findall(r"[-+]?\d+\.\d+", str(threshold_table.rows)) == printed(results_table(evaluated.report))
     short = [row[0] for table in results.tables for row in table.rows]
     assert "+ w + sTDE (eps=0.2)" in short
     assert "+ w + sTDE (eps=0)" not in short
@@ -101,8 +99,8 @@ def test_courses_say_why_an_action_was_taken(measured):
             steps = len(course.actions)
             chances = unpack(course.chances, steps, 3, NUM_ACTIONS)
             np.testing.assert_allclose(chances.sum(axis=-1), 1, atol=NUM_ACTIONS / 510)
-            taken = np.take_along_axis(chances[:, 2], np.array(course.actions)[:, None], axis=1)[:, 0]
-            np.testing.assert_array_equal(taken, chances[:, 2].max(axis=1))  # the best of the corrected
+            action_chances = np.take_along_axis(chances[:, 2], np.array(course.actions)[:, None], axis=1)[:, 0]
+            np.testing.assert_array_equal(action_chances, chances[:, 2].max(axis=1))  # the best of the corrected
             gap, weight = unpack(course.gap, steps), unpack(course.weight, steps)
             removes = number == 2
             # ReLU(D - 0.2), of two numbers that are rounded to 1 / 255.
@@ -119,7 +117,7 @@ def test_a_page_of_sixty_episodes_is_small(run, measured):
     text = make_report(run, run, dataclasses.replace(OPTIONS, replays=20), QUIET)
     assert len(text.encode()) < 8e6 * 20 / 60
     data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
-    assert [len(each["episodes"]) for each in data] == [20]
+    assert [len(part["episodes"]) for part in data] == [20]
     assert data[0]["players"] == measured.replays.players
     for title in ("Results", "What experience is worth", "Thresholds", "The gap", "Success and similarity"):
         assert f"<h2>{html.escape(title)}</h2>" in text
@@ -127,32 +125,32 @@ def test_a_page_of_sixty_episodes_is_small(run, measured):
 
 
 def test_the_most_disputed_episodes_come_first():
-    def player(success, length):
+    def agent(success, length):
         nothing: Any = None
-        return Player("layout", "", nothing, nothing, nothing, np.array(success, bool), np.array(length))
+        return ReplayAgent("layout", "", nothing, nothing, nothing, np.array(success, bool), np.array(length))
 
     # Pairs that differ, by episode: none; two of three; all three; two of three, in success alone.
-    players = [
-        player([1, 1, 1, 1], [4, 4, 4, 4]),
-        player([1, 1, 1, 1], [4, 4, 5, 4]),
-        player([1, 1, 1, 0], [4, 5, 6, 4]),
+    agents = [
+        agent([1, 1, 1, 1], [4, 4, 4, 4]),
+        agent([1, 1, 1, 1], [4, 4, 5, 4]),
+        agent([1, 1, 1, 0], [4, 5, 6, 4]),
     ]
-    assert choose(players, 3).tolist() == [2, 1, 3]
-    assert choose(players, 9).tolist() == [2, 1, 3, 0]
+    assert select_episodes(agents, 3).tolist() == [2, 1, 3]
+    assert select_episodes(agents, 9).tolist() == [2, 1, 3, 0]
 
 
 def test_what_is_refused_is_refused_before_anything_is_run(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxnav.report.make.measure", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("jaxnav.report.make.measure_shift", lambda *_: pytest.fail("measured"))
     other, unlike = (
         draw_run(tiny_config(folder, detector=detector))
         for folder, detector in ((tmp_path / "a", run.config.detector), (tmp_path / "b", Detector(seed=1)))
     )
     (other.config.run_dir / "policies" / "layout-1" / "policy.json").unlink()
-    for beside, changes, problem in (
+    for reference_run, changes, problem in (
         (None, {"shift": ()}, "--shift: give at least one number"),
         (None, {"replays": 0}, "--replays 0: give at least 1"),
         (other, {}, "layout-1: not an exported policy"),
         (unlike, {}, "--beside: has another task or detector than the run"),
     ):
         with pytest.raises(InputError, match=problem):
-            make_report(run, beside, dataclasses.replace(OPTIONS, **changes), QUIET)
+            make_report(run, reference_run, dataclasses.replace(OPTIONS, **changes), QUIET)

@@ -8,7 +8,11 @@ import re
 from html.parser import HTMLParser
 
 import pytest
+from rich.table import Table as ConsoleTable
+from rich.text import Text
 from support.report_page import page, replays
+
+from jaxnav.report.page import to_text_table
 
 HOSTILE = (
     "</script><!--<script>alert(1)</script><img src=x onerror='alert(1)'>\" onload=\"alert(1) &amp; ${x} $y \u2028"
@@ -101,3 +105,10 @@ def test_links_lead_to_sections():
     targets = {tag["href"].removeprefix("#") for name, tag in reader.tags if name == "a"}
     assert targets <= {tag["id"] for _, tag in reader.tags if "id" in tag}
     assert "replays" in targets
+
+
+def test_cells_are_those_of_the_terminal():
+    table = ConsoleTable("Variant", "SR (%)")
+    table.add_row(Text("rooms val", style="bold"))
+    table.add_row(Text("a [b]"), Text("1.0 [0.5, 1.5]"))
+    assert to_text_table("t", table) == ("t", ("Variant", "SR (%)"), (("rooms val",), ("a [b]", "1.0 [0.5, 1.5]")))

@@ -6,7 +6,7 @@ from support.drawn_run import draw_run, tiny_config
 
 import jaxnav
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Run
+from jaxnav.runs.run import Run
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24
 

@@ -8,7 +8,7 @@ from support.commands import refusal
 
 from jaxnav.cli import account as command
 from jaxnav.errors import InputError
-from jaxnav.runs.account import leads
+from jaxnav.runs.evaluate import measure_leads
 
 
 @pytest.fixture
@@ -21,19 +21,19 @@ def halved(evaluated):
 
 @pytest.mark.slow
 def test_every_row_of_a_policy_has_a_lead_in_every_metric(evaluated, halved):
-    entries = leads(evaluated, halved)
+    entries = measure_leads(evaluated, halved)
     assert {entry.metric for entry in entries} == {"sr", "spl", "sr@20", "sr@50"}
     assert len(entries) == 28 * 4  # neither Random nor the shortest path
     rows, metrics, without = evaluated.rows, evaluated.metrics()["sr"], halved.metrics()["sr"]
     plain = {row.decoding: i for i, row in enumerate(rows) if row.variant == "baseline"}
-    found = [entry.lead.mean for entry in entries if entry.metric == "sr"]
+    means = [entry.lead.mean for entry in entries if entry.metric == "sr"]
     expected = [100 * (metrics[i].mean() - without[plain[row.decoding]].mean()) for i, row in enumerate(rows[:28])]
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(means, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow
 def test_only_rows_that_remove_something_have_a_share(evaluated, halved):
-    shares = {entry.variant: entry.left for entry in leads(evaluated, halved) if entry.metric == "sr"}
+    shares = {entry.variant: entry.left for entry in measure_leads(evaluated, halved) if entry.metric == "sr"}
     assert shares["ORG (baseline)"] is None
     assert shares["+ w (layout)"] is None
     assert shares["+ w + TDE"] is not None
@@ -41,7 +41,7 @@ def test_only_rows_that_remove_something_have_a_share(evaluated, halved):
 
 @pytest.mark.slow
 def test_an_agent_has_no_lead_over_itself(evaluated):
-    baselines = [entry for entry in leads(evaluated, evaluated) if entry.variant == "ORG (baseline)"]
+    baselines = [entry for entry in measure_leads(evaluated, evaluated) if entry.variant == "ORG (baseline)"]
     assert [entry.lead.mean for entry in baselines] == [0.0] * 8
 
 
@@ -49,13 +49,13 @@ def test_an_agent_has_no_lead_over_itself(evaluated):
 def test_runs_that_cannot_be_compared_are_refused(evaluated):
     fewer = evaluated._replace(outcome=type(evaluated.outcome)(*(leaf[:, :1] for leaf in evaluated.outcome)))
     with pytest.raises(InputError, match="2 seeds with experience and 1 without"):
-        leads(evaluated, fewer)
+        measure_leads(evaluated, fewer)
     goals = evaluated.episodes._replace(goal=evaluated.episodes.goal[::-1])
     with pytest.raises(InputError, match="do not meet the same episodes"):
-        leads(evaluated, evaluated._replace(episodes=goals))
+        measure_leads(evaluated, evaluated._replace(episodes=goals))
     layouts = evaluated._replace(rows=[row for row in evaluated.rows if row.variant != "baseline"])
     with pytest.raises(InputError, match="no arm `baseline`"):
-        leads(evaluated, layouts)
+        measure_leads(evaluated, layouts)
 
 
 def test_the_command_refuses_what_is_no_run(tmp_path, capsys):

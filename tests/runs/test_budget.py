@@ -9,11 +9,10 @@ from support.stopping import train_in_two
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.evaluation.notes import spent
-from jaxnav.policies.methods import Method, Stage
+from jaxnav.evaluation.notes import budget_note
+from jaxnav.policies.method import Method, Stage
 from jaxnav.policies.methods.rgb import NoExperience
-from jaxnav.runs.check import check
-from jaxnav.runs.config import LayoutConfig, RunConfig
+from jaxnav.runs.config import LayoutConfig, RunConfig, check_config
 from jaxnav.runs.train import train
 from jaxnav.runs.validation import Validator
 from jaxnav.training.config import PPOConfig
@@ -30,24 +29,24 @@ CONFIG = RunConfig(
 
 def test_imitation_is_part_of_the_budget():
     # A fifth of ten chunks of 1,280 steps.
-    assert CONFIG.schedule == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
-    assert CONFIG.budget == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
+    assert CONFIG.stage_by_chunk == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
+    assert CONFIG.steps_by_purpose == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
     plain = dataclasses.replace(CONFIG, method="org")
-    assert plain.schedule == 10 * [0]
+    assert plain.stage_by_chunk == 10 * [0]
     last = dataclasses.replace(CONFIG, method="tpn")
-    assert (last.schedule, last.budget) == ([0, 0, 0, 0, 0, 0, 0, 0, 1, 1], CONFIG.budget)
-    assert dataclasses.replace(last, imitation=0.5).schedule == 5 * [0] + 5 * [1]
-    assert plain.budget == {"exploration": 600, "imitation": 0, "learning": 12800}
-    told = "600 of exploration for the layout priors, 2,560 of imitation, 10,240 of learning."
-    assert told in spent(CONFIG.budget)
+    assert (last.stage_by_chunk, last.steps_by_purpose) == ([0, 0, 0, 0, 0, 0, 0, 0, 1, 1], CONFIG.steps_by_purpose)
+    assert dataclasses.replace(last, imitation=0.5).stage_by_chunk == 5 * [0] + 5 * [1]
+    assert plain.steps_by_purpose == {"exploration": 600, "imitation": 0, "learning": 12800}
+    budget = "600 of exploration for the layout priors, 2,560 of imitation, 10,240 of learning."
+    assert budget in budget_note(CONFIG.steps_by_purpose)
 
 
 @pytest.mark.parametrize(("share", "chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
 def test_its_share_can_be_set_in_whole_chunks(share, chunks):
-    config = check(dataclasses.replace(CONFIG, imitation=share))
-    assert config.schedule == chunks * [0] + (10 - chunks) * [1]
+    config = check_config(dataclasses.replace(CONFIG, imitation=share))
+    assert config.stage_by_chunk == chunks * [0] + (10 - chunks) * [1]
     assert sum(stage.share for stage in config.stages) == pytest.approx(1.0)
-    assert sum(config.budget.values()) - 600 == CONFIG.total_steps
+    assert sum(config.steps_by_purpose.values()) - 600 == CONFIG.total_steps
 
 
 @pytest.mark.parametrize(
@@ -67,7 +66,7 @@ def test_its_share_can_be_set_in_whole_chunks(share, chunks):
 )
 def test_impossible_shares_are_refused(options, message):
     with pytest.raises(InputError) as refusal:
-        check(dataclasses.replace(CONFIG, **options))
+        check_config(dataclasses.replace(CONFIG, **options))
     assert str(refusal.value).startswith(message)
     assert "\n" not in str(refusal.value)
 
@@ -93,14 +92,16 @@ def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(method
     assert asked == [method == "vtnet", True]  # measured as the stage acts
     imitated = ["imitation_loss" in row for row in run.log()]
     assert imitated == ([True, False] if method == "vtnet" else [False, True])
-    assert ["policy_loss" in row for row in run.log()] == [not each for each in imitated]
+    assert ["policy_loss" in row for row in run.log()] == [not is_imitation for is_imitation in imitated]
     for checkpoint in (run.config.run_dir / "checkpoints").iterdir():
         metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
         assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "imitation": 256, "learning": 256}
 
     resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "resumed"), monkeypatch)
     assert resumed.log() == run.log()
-    policies = [jaxnav.load_policy(each.config.run_dir / "policies" / "baseline-0").params for each in (run, resumed)]
+    policies = [
+        jaxnav.load_policy(one_run.config.run_dir / "policies" / "baseline-0").params for one_run in (run, resumed)
+    ]
     chex.assert_trees_all_equal(*policies)
     budget = jaxnav.evaluate(run, episodes=8).report["run"]["budget"]
     assert budget == {"exploration": 1280, "imitation": 256, "learning": 256}

@@ -8,15 +8,15 @@ import pytest
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.evaluation.notes import notes, spent
-from jaxnav.evaluation.variants import Row
+from jaxnav.evaluation.notes import budget_note, evaluation_notes
+from jaxnav.evaluation.variants import EvaluationRow
 
-LAYOUT, TDE = Row("layout", None, None, "argmax"), Row("tde", None, "paper", "argmax")
+LAYOUT, TDE = EvaluationRow("layout", None, None, "argmax"), EvaluationRow("tde", None, "paper", "argmax")
 
 
 def test_the_rows_are_those_of_the_table_and_the_oracle(evaluated):
     rows, epsilon = evaluated.rows, np.linspace(0, 1, 11)
-    assert rows[-2:] == [Row("random", None, None, "sample"), Row("oracle", None, None, "argmax")]
+    assert rows[-2:] == [EvaluationRow("random", None, None, "sample"), EvaluationRow("oracle", None, None, "argmax")]
     for decoding, part in (("argmax", rows[:14]), ("sample", rows[14:28])):
         assert [row.variant for row in part] == ["baseline", "layout", "tde", *["stde"] * 11]
         assert [row.epsilon for row in part[3:]] == epsilon.tolist()
@@ -56,11 +56,8 @@ def test_only_what_is_trained_varies_with_training(evaluated):
         # The baseline was trained apart; the others are the layout's networks, run by run.
         assert len(difference.get("seeds", [])) == (0 if difference["from"] == "baseline" else 2)
         assert difference["std"] is not None
-    (tde,) = (
-        each
-        for each in evaluated.report["differences"]
-        if (each["metric"], each["to"], each["decoding"]) == ("sr", "tde", "argmax")
-    )
+    differences = evaluated.report["differences"]
+    (tde,) = (row for row in differences if (row["metric"], row["to"], row["decoding"]) == ("sr", "tde", "argmax"))
     rows, success = evaluated.rows, 100 * evaluated.metrics()["sr"].mean(axis=2)
     gain = success[rows.index(TDE)] - success[rows.index(LAYOUT)]
     assert tde["seeds"] == pytest.approx(gain)
@@ -68,10 +65,10 @@ def test_only_what_is_trained_varies_with_training(evaluated):
 
 def test_the_notes_are_those_of_the_rows_and_the_run(evaluated):
     success = evaluated.metrics()["sr"]
-    expected = notes(evaluated.rows, success, evaluated.episodes, room_prior=True)
-    assert evaluated.report["notes"] == [*expected, spent(evaluated.report["run"]["budget"])]
+    expected = evaluation_notes(evaluated.rows, success, evaluated.episodes, has_room_prior=True)
+    assert evaluated.report["notes"] == [*expected, budget_note(evaluated.report["run"]["budget"])]
     assert any("told the type of the room" in note for note in expected)
-    assert expected != notes(evaluated.rows, success, evaluated.episodes, room_prior=False)
+    assert expected != evaluation_notes(evaluated.rows, success, evaluated.episodes, has_room_prior=False)
 
 
 def test_it_is_written_as_json_and_csv(evaluated, tmp_path):

@@ -12,8 +12,7 @@ import jaxnav
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
 from jaxnav.policies.methods import find_method
-from jaxnav.runs.prepare import say_what_is_cut
-from jaxnav.runs.train import train
+from jaxnav.runs.train import train, warn_if_rollout_too_short
 
 
 @pytest.mark.slow
@@ -23,7 +22,7 @@ def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
     config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1)
     worlds = dataclasses.replace(config.worlds, num_train=16)  # among them rooms as large as those of val, for maps
     config = dataclasses.replace(config, arms=("baseline",), worlds=worlds)
-    if any(stage.imitates for stage in find_method(method).stages):
+    if any(stage.uses_expert for stage in find_method(method).stages):
         config = dataclasses.replace(config, imitation=0.5)  # a chunk for each stage
     whole = train(config)
     resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "two"), monkeypatch)
@@ -43,7 +42,7 @@ def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
 PRIORS = """
 import dataclasses, functools
 from jaxnav.policies.methods import METHODS
-from jaxnav.policies.methods.graphs import graph_from_file
+from jaxnav.policies.methods.sp import graph_from_file
 
 PRIORS = dataclasses.replace(METHODS["sp"], learn=functools.partial(graph_from_file, "edges.csv"))
 """
@@ -67,11 +66,11 @@ def test_edges_of_ones_own_are_of_the_categories_of_the_world(tmp_path, monkeypa
     assert float(learned.sum()) == len(learned)
 
 
-@pytest.mark.parametrize(("rollout", "told"), [(24, True), (25, False)])
-def test_rollouts_that_hold_no_whole_choice_are_told(rollout, told, tmp_path, capsys):
+@pytest.mark.parametrize(("rollout", "is_warned"), [(24, True), (25, False)])
+def test_rollouts_that_hold_no_whole_choice_are_told(rollout, is_warned, tmp_path, capsys):
     config = dataclasses.replace(tiny_config(tmp_path), method="semexp", method_sizes={})
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout=rollout))
-    say_what_is_cut(config, Console(width=200))
-    assert ("give --ppo.rollout 50 or more" in capsys.readouterr().out) == told
-    say_what_is_cut(dataclasses.replace(config, method="org"), Console())
+    warn_if_rollout_too_short(config, Console(width=200))
+    assert ("give --ppo.rollout 50 or more" in capsys.readouterr().out) == is_warned
+    warn_if_rollout_too_short(dataclasses.replace(config, method="org"), Console())
     assert capsys.readouterr().out == ""

@@ -7,46 +7,45 @@ import pytest
 from rich.console import Console
 from support import study_results
 
-from jaxnav.cli import mixture as command
+from jaxnav.cli import study as command
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.study.bench import Bench
-from jaxnav.study.codec import from_json
 from jaxnav.study.config import StudyConfig
-from jaxnav.study.mixture import ORACLE, WAYS, measure_mixture
-from jaxnav.study.mixture_report import Mixture
+from jaxnav.study.measure import TrialRunner
+from jaxnav.study.mixture import ORACLE_NAME, REMOVAL_RULES, measure_mixture
+from jaxnav.study.records import MixtureReport, from_json
 
 QUIET = Console(quiet=True)
 VALUES = {name: (Interval(50.0, 40.0, 60.0), Interval(30.0, 20.0, 40.0)) for name in ("sr", "spl", "sr@20", "sr@50")}
-SOME = (WAYS[0], WAYS[-1])  # each is compiled anew
-BENCH = Bench(StudyConfig(shifts=(0.0, 1.0), episodes=8))
+SOME = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each is compiled anew
+BENCH = TrialRunner(StudyConfig(shifts=(0.0, 1.0), episodes=8))
 
 
 @pytest.mark.slow
 def test_every_removal_is_measured_at_both_shifts(drawn_run):
     """The run's own baseline stands in for agents without experience."""
     config = drawn_run.config
-    found = measure_mixture(config, config, "sample", BENCH, QUIET, SOME)
-    assert found.episodes >= 8
-    assert found.shifts == (0.0, 1.0)
-    names = [removal.name for removal in found.removals]
-    assert names[:2] == ["TDE", ORACLE]
+    result = measure_mixture(config, config, "sample", BENCH, QUIET, SOME)
+    assert result.episodes >= 8
+    assert result.shifts == (0.0, 1.0)
+    names = [removal.name for removal in result.removals]
+    assert names[:2] == ["TDE", ORACLE_NAME]
     assert names[-len(SOME) :] == [str(way) for way in SOME]
     assert len(set(names)) == len(names)
-    by_name = {removal.name: removal for removal in found.removals}
+    by_name = {removal.name: removal for removal in result.removals}
     assert by_name["TDE"].weight == (1.0, 1.0)
-    assert by_name[ORACLE].weight == (0.0, 1.0)
+    assert by_name[ORACLE_NAME].weight == (0.0, 1.0)
     # Told the shift: nothing is changed where there is none, everything where there is one.
-    assert [by_name[ORACLE].change["sr"][0].mean, by_name[ORACLE].change["sr"][1].mean] == [
+    assert [by_name[ORACLE_NAME].change["sr"][0].mean, by_name[ORACLE_NAME].change["sr"][1].mean] == [
         0.0,
         by_name["TDE"].change["sr"][1].mean,
     ]
-    for removal in found.removals:
+    for removal in result.removals:
         assert all(0.0 <= weight <= 1.0 for weight in removal.weight)
         for metric, change in removal.change.items():
-            lead, value = found.lead[metric], found.agent[metric]
+            lead, value = result.lead[metric], result.agent[metric]
             assert change[0].mean + value[0].mean >= -1e-9
-            assert lead[0].mean == pytest.approx(value[0].mean - found.without[metric][0].mean)
+            assert lead[0].mean == pytest.approx(value[0].mean - result.without[metric][0].mean)
     for way in SOME:
         clock = names[2 : -len(SOME)]
         assert sum(control in clock for control in by_name[str(way)].compared or ()) == 1
@@ -56,14 +55,14 @@ def test_every_removal_is_measured_at_both_shifts(drawn_run):
 def test_a_hand_over_leaves_the_agents_without_experience(drawn_run):
     """The run's own baseline stands in for them: told to hand over at once, the agent is worth what they are."""
     config = drawn_run.config
-    found = measure_mixture(config, config, "argmax", BENCH, QUIET, (), hand_over=True)
-    hard = found.removal("TDE")
-    assert found.heir == config.run_dir.name
-    for metric, without in found.without.items():
-        left = [
-            agent.mean + change.mean for agent, change in zip(found.agent[metric], hard.change[metric], strict=True)
+    result = measure_mixture(config, config, "argmax", BENCH, QUIET, (), hand_over=True)
+    hard = result.removal("TDE")
+    assert result.heir == config.run_dir.name
+    for metric, without in result.without.items():
+        expected = [
+            agent.mean + change.mean for agent, change in zip(result.agent[metric], hard.change[metric], strict=True)
         ]
-        assert left == pytest.approx([each.mean for each in without])
+        assert expected == pytest.approx([interval.mean for interval in without])
 
 
 def test_runs_that_differ_are_refused(drawn_run):
@@ -77,7 +76,7 @@ def test_runs_that_differ_are_refused(drawn_run):
 # The command
 
 
-MIXTURE = Mixture(
+MIXTURE = MixtureReport(
     run="streams",
     decoding="sample",
     world="rooms",
@@ -100,20 +99,20 @@ def test_the_command_prints_tables_and_writes_json(drawn_run, tmp_path, monkeypa
         return dataclasses.replace(MIXTURE, heir="anonymous") if hand_over else MIXTURE
 
     monkeypatch.setattr(command, "measure_mixture", measured)
-    monkeypatch.setattr(command, "gap_course", lambda run, study, console: study_results.course())
+    monkeypatch.setattr(command, "measure_gap_curves", lambda run, study, console: study_results.course())
     folder, target = str(drawn_run.config.run_dir), tmp_path / "mixture.json"
     options = ["--shift", "0.5", "--decoding", "argmax", "--episodes", "8", "--json", str(target)]
-    assert command.main([folder, folder, *options]) == 0
+    assert command.mixture_main([folder, folder, *options]) == 0
     assert (asked["decoding"], asked["study"].shifts, asked["study"].episodes) == ("argmax", (0.0, 0.5), 8)
     assert asked["run"].run_dir == asked["without"].run_dir == drawn_run.config.run_dir
     printed = capsys.readouterr().out
     assert "### What experience is worth" in printed
     assert "AUC of the gap" in printed
     report = json.loads(target.read_text())
-    assert repr(from_json(Mixture, report["mixture"])) == repr(MIXTURE)  # NaN is not equal to itself
+    assert repr(from_json(MixtureReport, report["mixture"])) == repr(MIXTURE)  # NaN is not equal to itself
     assert report["settings"]["shift"] == "0.5"
     assert not asked["hand_over"]
-    assert command.main([folder, folder, "--hand-over", "--json", str(target)]) == 0
+    assert command.mixture_main([folder, folder, "--hand-over", "--json", str(target)]) == 0
     assert asked["hand_over"]
     assert "### Removal from `streams`, which hands over to `anonymous`, sampled actions" in capsys.readouterr().out
 
@@ -128,10 +127,10 @@ def test_the_command_prints_tables_and_writes_json(drawn_run, tmp_path, monkeypa
 )
 def test_the_command_refuses_what_is_impossible(drawn_run, options, mend, capsys):
     folder = str(drawn_run.config.run_dir)
-    assert command.main([folder, folder, *options]) == 2
+    assert command.mixture_main([folder, folder, *options]) == 2
     assert mend in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_command_needs_finished_runs(tmp_path, capsys):
-    assert command.main([str(tmp_path / "none"), str(tmp_path / "none")]) == 2
+    assert command.mixture_main([str(tmp_path / "none"), str(tmp_path / "none")]) == 2
     assert "none" in capsys.readouterr().err

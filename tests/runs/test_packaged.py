@@ -10,38 +10,44 @@ from rich.console import Console
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import episode_list
-from jaxnav.runs.packaged import WEIGHTS, as_run, is_policy, policy_folder, world_of
-from jaxnav.runs.policies import POLICIES
-from jaxnav.runs.worlds import evaluation_world
-from jaxnav.viz.play import play_episode
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.runs.policies import (
+    PACKAGED_POLICIES,
+    POLICIES_DIR,
+    config_for_policy,
+    find_policy_folder,
+    is_policy,
+    load_policy_as_run,
+)
+from jaxnav.runs.worlds import compile_evaluation_world
+from jaxnav.viz.episode import play_episode
 
 
 def test_the_world_is_the_one_of_the_task(drawn_run, tmp_path):
-    assert world_of("rooms-org").world == "rooms"
-    baseline = world_of(drawn_run.config.run_dir / POLICIES / "baseline-0")
+    assert config_for_policy("rooms-org").world == "rooms"
+    baseline = config_for_policy(drawn_run.config.run_dir / POLICIES_DIR / "baseline-0")
     assert (baseline.world, baseline.arms) == ("rooms", ("baseline",))
-    export = shutil.copytree(WEIGHTS / "rooms-org", tmp_path / "mine")
+    export = shutil.copytree(PACKAGED_POLICIES / "rooms-org", tmp_path / "mine")
     policy = json.loads((export / "policy.json").read_text())
     policy["spec"]["task"]["rules"]["headings"] = 12
     (export / "policy.json").write_text(json.dumps(policy))
     with pytest.raises(InputError, match=r"no generated world has; give the run that it comes from$"):
-        world_of(export)
+        config_for_policy(export)
 
 
 def test_a_policy_read_as_a_run_has_one_seed():
-    config, policies = as_run("rooms-org")
-    assert (config.arms, policies.arms, policies.seeds) == (("layout",), ("layout",), 1)
+    config, policies = load_policy_as_run("rooms-org")
+    assert (config.arms, policies.arms, policies.num_seeds) == (("layout",), ("layout",), 1)
     loaded = jaxnav.load_policy("rooms-org")
-    np.testing.assert_array_equal(policies.of("layout")["actor"]["bias"][0], loaded.params["actor"]["bias"])
+    np.testing.assert_array_equal(policies.arm_params("layout")["actor"]["bias"][0], loaded.params["actor"]["bias"])
 
 
 def test_a_folder_comes_before_a_policy_of_the_package(tmp_path, monkeypatch):
-    assert policy_folder("rooms-org") == WEIGHTS / "rooms-org"
+    assert find_policy_folder("rooms-org") == PACKAGED_POLICIES / "rooms-org"
     assert is_policy("rooms-org")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rooms-org").mkdir()
-    assert policy_folder("rooms-org").resolve() == (tmp_path / "rooms-org").resolve()
+    assert find_policy_folder("rooms-org").resolve() == (tmp_path / "rooms-org").resolve()
     assert not is_policy("rooms-org")
 
 
@@ -56,17 +62,19 @@ def test_an_episode_is_the_same_but_for_the_layout(drawn_run):
     assert plain.scene.types != shifted.scene.types
     assert plain.goal == shifted.goal
     assert plain.trace.pose[0] == shifted.trace.pose[0]
-    worlds = [evaluation_world(drawn_run.config, "val", None, shift, Console(quiet=True)) for shift in (0.0, 1.0)]
-    episodes = episode_list(worlds[0].banks[0])
+    worlds = [
+        compile_evaluation_world(drawn_run.config, "val", None, shift, Console(quiet=True)) for shift in (0.0, 1.0)
+    ]
+    episodes = draw_episodes(worlds[0].banks[0])
     for episode, world in zip((plain, shifted), worlds, strict=True):
         bank = world.banks[0]
         assert episode.best_length == bank.best_length[episodes.pose[index], episodes.goal[index]]
         np.testing.assert_array_equal(episode.rows, bank.rows[episode.trace.pose])
-    told = [line for line in console.export_text().splitlines() if line.startswith("shift")]
-    numbers = [[int(word) for word in line.replace(":", "").split() if word.isdigit()] for line in told]
-    (_, found, total, only), (_, others, _, others_only) = numbers
+    lines = [line for line in console.export_text().splitlines() if line.startswith("shift")]
+    numbers = [[int(word) for word in line.replace(":", "").split() if word.isdigit()] for line in lines]
+    (_, successes, total, only), (_, others, _, others_only) = numbers
     assert total <= len(episodes.goal)
-    assert found - only == others - others_only  # those that are found in both
+    assert successes - only == others - others_only  # those that are found in both
     (alone,) = play_episode(drawn_run.config.run_dir, index=index, shifts=(1.0,))
     np.testing.assert_array_equal(alone.trace.action, shifted.trace.action)
 

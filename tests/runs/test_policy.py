@@ -12,22 +12,22 @@ from rich.console import Console
 from support import tiny_world as tiny
 
 import jaxnav
-from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav
-from jaxnav.env.types import State
+from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, State
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import episode_list
-from jaxnav.evaluation.grid import first_states
-from jaxnav.evaluation.playback import play
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.evaluation.grid import start_states
+from jaxnav.evaluation.playback import play_episodes
 from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.learned_loss import WINDOW
-from jaxnav.policies.methods import METHODS, Experience, Method
-from jaxnav.runs.policies import POLICIES
+from jaxnav.policies.adaptation import WINDOW
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Experience, Method
+from jaxnav.policies.methods import METHODS
+from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.runs.policy import LoadedPolicy
-from jaxnav.runs.worlds import evaluation_world
+from jaxnav.runs.worlds import compile_evaluation_world
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.tables.detector import Detector
+from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import APARTMENTS
 
 _compiled = jax.jit(LoadedPolicy.act)
@@ -36,22 +36,22 @@ LONG = 15  # actions, of an episode in which a policy adapts twice
 
 def act(policy, observation, memory, epsilon=0.1, *, key=None, heading=0, moved=False, horizon=0):
     """One step, by as few compilations as there are kinds of policies."""
-    told = {"heading": jnp.int32(heading), "moved": jnp.bool_(moved), "horizon": jnp.int32(horizon)}
-    return _compiled(policy, observation, memory, jnp.float32(epsilon), key=key, **told)
+    use_pose = {"heading": jnp.int32(heading), "moved": jnp.bool_(moved), "horizon": jnp.int32(horizon)}
+    return _compiled(policy, observation, memory, jnp.float32(epsilon), key=key, **use_pose)
 
 
 @pytest.fixture(scope="module")
 def world(drawn_run):
-    return evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    return compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
 
 
 def cell_of(variant: Variant, epsilon: float | None, decoding: Decoding = "argmax"):
     """How the evaluation infers with one set of parameters."""
     row = table_row(variant, epsilon, "residual", decoding)
-    return tiny.at(inference_grid([row], [row.arm or ""], 1), 0)
+    return tiny.leaves_at(inference_grid([row], [row.arm or ""], 1), 0)
 
 
-def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.5, told=True):
+def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.5, use_pose=True):
     """The actions of a policy from a start on, in a loop over observations, with heading and moves unless not told."""
     memory, state, before, actions = policy.init(room_type), start, start, []
     headings, horizons = env.task.rules.headings, len(env.task.rules.horizons)
@@ -62,9 +62,9 @@ def follow(policy, env, params, start, room_type, steps, *, key=None, epsilon=0.
             memory,
             epsilon,
             key=None if key is None else jax.random.fold_in(key, time),
-            heading=state.pose // horizons % headings if told else 0,
-            moved=env.cell(state.pose) != env.cell(before.pose) if told else False,
-            horizon=state.pose % horizons if told else 0,
+            heading=state.pose // horizons % headings if use_pose else 0,
+            moved=env.cell_of_pose(state.pose) != env.cell_of_pose(before.pose) if use_pose else False,
+            horizon=state.pose % horizons if use_pose else 0,
         )
         actions.append(int(action))
         before, (state, *_) = state, env.advance(state, action, params)
@@ -89,14 +89,16 @@ def alone(start):
 def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsilon, decoding):
     arm, seed = "baseline" if variant == "baseline" else "layout", 1
     key = jax.random.fold_in(jax.random.key(0), 0)  # that of the first episode played
-    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / f"{arm}-{seed}")
-    policies, params, bank = drawn_run.policies(), world.params(0), world.banks[0]
-    episodes = episode_list(bank, 8)
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / f"{arm}-{seed}")
+    policies, params, bank = drawn_run.policies(), world.make_env_params(0), world.banks[0]
+    episodes = draw_episodes(bank, 8)
     for episode in range(0, 8, 2):  # one of each room type
-        start = tiny.at(first_states(episodes), episode)
-        weights = tiny.at(policies.of(arm), seed)
+        start = tiny.leaves_at(start_states(episodes), episode)
+        weights = tiny.leaves_at(policies.arm_params(arm), seed)
         cell = cell_of(variant, epsilon, decoding)
-        (trace,) = play(cell, weights, alone(start), policies.acting(world), params, policies.knowledge)
+        (trace,) = play_episodes(
+            cell, weights, alone(start), policies.make_agent_loop(world), params, policies.knowledge
+        )
         room = bank.room_types[episodes.scene[episode]]
         steps, sampled = len(trace.action), key if decoding == "sample" else None
         actions = follow(policy, world.env, params, start, room, steps, key=sampled, epsilon=epsilon or 0.0)
@@ -106,14 +108,20 @@ def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, ep
 @pytest.mark.parametrize("setting", ["overdue", pytest.param("learned", marks=pytest.mark.slow)])
 def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setting):
     """It switches, and holds: once without experience, always without."""
-    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1", setting, hold=True, form="switch")
-    policies, params, bank = drawn_run.policies().estimating(setting, hold=True), world.params(0), world.banks[0]
-    episodes, weights = episode_list(bank, 8), tiny.at(policies.of("layout"), 1)
-    cell = tiny.at(inference_grid([table_row("stde", 0.6, "switch", "argmax")], ["layout"], 1), 0)
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1", setting, hold=True, form="switch")
+    policies, params, bank = (
+        drawn_run.policies().with_estimator(setting, hold=True),
+        world.make_env_params(0),
+        world.banks[0],
+    )
+    episodes, weights = draw_episodes(bank, 8), tiny.leaves_at(policies.arm_params("layout"), 1)
+    cell = tiny.leaves_at(inference_grid([table_row("stde", 0.6, "switch", "argmax")], ["layout"], 1), 0)
     switched = []
     for episode in range(0, 8, 2):
-        start, room = tiny.at(first_states(episodes), episode), bank.room_types[episodes.scene[episode]]
-        (trace,) = play(cell, weights, alone(start), policies.acting(world), params, policies.knowledge)
+        start, room = tiny.leaves_at(start_states(episodes), episode), bank.room_types[episodes.scene[episode]]
+        (trace,) = play_episodes(
+            cell, weights, alone(start), policies.make_agent_loop(world), params, policies.knowledge
+        )
         steps = len(trace.action)
         assert follow(policy, world.env, params, start, room, steps, epsilon=0.6) == trace.action.tolist()
         assert (np.diff(trace.gap) >= 0).all()
@@ -122,10 +130,10 @@ def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setti
 
 
 def test_removal_and_keys_change_actions(drawn_run, world):
-    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-1")
-    starts, bank = first_states(episode_list(world.banks[0], 8)), world.banks[0]
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1")
+    starts, bank = start_states(draw_episodes(world.banks[0], 8)), world.banks[0]
     room = bank.room_types[int(starts.scene[0])]
-    walk = functools.partial(follow, policy, world.env, world.params(0), tiny.at(starts, 0), room, 12)
+    walk = functools.partial(follow, policy, world.env, world.make_env_params(0), tiny.leaves_at(starts, 0), room, 12)
     assert walk(epsilon=0.0) == walk(epsilon=0.0)
     key = jax.random.key(0)
     assert len({tuple(actions) for actions in (walk(epsilon=1.0), walk(key=key), walk(key=jax.random.key(1)))}) == 3
@@ -139,7 +147,7 @@ def batch_of(policy, env, params, size=6):
     observations, memories = [], []
     for number, state in enumerate(states):
         _, memory = act(policy, env.observe(state, params), policy.init([*ROOM_TYPES, None][number % 5]))
-        moved = env.advance(state, memory.memory.action, params)[0]
+        moved = env.advance(state, memory.policy_state.action, params)[0]
         observations.append(env.observe(moved, params))
         memories.append(memory)
     return observations, memories
@@ -151,8 +159,8 @@ def stack(trees):
 
 @pytest.mark.parametrize("name", ["layout-0", "baseline-0"])
 def test_a_batch_equals_its_singles(drawn_run, world, name):
-    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / name)
-    observations, memories = batch_of(policy, world.env, world.params(0))
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / name)
+    observations, memories = batch_of(policy, world.env, world.make_env_params(0))
     standing = functools.partial(policy.act, heading=0, moved=False)
     batched = jax.jit(jax.vmap(standing, (0, 0, None)))(stack(observations), stack(memories), 0.1)
     singles = stack([act(policy, *pair) for pair in zip(observations, memories, strict=True)])
@@ -161,9 +169,9 @@ def test_a_batch_equals_its_singles(drawn_run, world, name):
 
 
 def test_several_policies_act_in_one_call(drawn_run, world):
-    folders = [drawn_run.config.run_dir / POLICIES / f"layout-{seed}" for seed in range(2)]
+    folders = [drawn_run.config.run_dir / POLICIES_DIR / f"layout-{seed}" for seed in range(2)]
     policies = [jaxnav.load_policy(folder) for folder in folders]
-    (observation, *_), (memory, *_) = batch_of(policies[0], world.env, world.params(0), 1)
+    (observation, *_), (memory, *_) = batch_of(policies[0], world.env, world.make_env_params(0), 1)
     standing = functools.partial(LoadedPolicy.act, heading=0, moved=False)
     together = jax.jit(jax.vmap(standing, (0, None, None, None)))(stack(policies), observation, memory, 0.1)
     singles = stack([act(policy, observation, memory) for policy in policies])
@@ -171,9 +179,9 @@ def test_several_policies_act_in_one_call(drawn_run, world):
 
 
 def test_the_room_type_picks_the_prior(drawn_run):
-    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     for number, room in enumerate([*ROOM_TYPES, None]):
-        layout = policy.init(room).perceived.layout
+        layout = policy.init(room).perception_state.layout
         assert layout is not None
         np.testing.assert_array_equal(layout.alpha, policy.knowledge.layout[number])
         assert int(policy.init(room).room) == number
@@ -183,14 +191,14 @@ def test_the_room_type_picks_the_prior(drawn_run):
 
 
 def test_a_policy_with_a_spatial_memory_needs_compass_and_odometry(drawn_run, world):
-    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
-    start = tiny.at(first_states(episode_list(world.banks[0], 8)), 0)
+    policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
+    start = tiny.leaves_at(start_states(draw_episodes(world.banks[0], 8)), 0)
     with pytest.raises(InputError, match="goes by compass and odometry; give `heading` and `moved`"):
-        policy.act(world.env.observe(start, world.params(0)), policy.init())
+        policy.act(world.env.observe(start, world.make_env_params(0)), policy.init())
 
 
 def test_a_policy_knows_its_task_and_is_refused_for_another(drawn_run, world):
-    folder = drawn_run.config.run_dir / POLICIES / "layout-0"
+    folder = drawn_run.config.run_dir / POLICIES_DIR / "layout-0"
     policy = jaxnav.load_policy(folder, env=world.env)
     assert policy.task == world.env.task
     rules, detector = dataclasses.replace(policy.task.rules, success_distance=1.0), Detector(miss_near=0.5)
@@ -235,7 +243,7 @@ class Steered(Experience):
 def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
     """Over a whole episode of more than a window of six actions: what is adapted changes the logits of both."""
     setting = tiny.SETTING if METHODS[name].hosts_layout else None
-    spec = dataclasses.replace(tiny.SPEC, method=name, method_sizes=())
+    spec = dataclasses.replace(tiny.SPEC, method=METHODS[name], method_sizes=())
     env, params = tiny.world()
     params = params.replace(step_limit=jnp.full(2, LONG, jnp.int32))
     learn = METHODS[name].learn
@@ -246,35 +254,37 @@ def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
         weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
     state = before = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(2), time=jnp.int32(0))
     cell = cell_of("baseline" if setting is None else "stde", None if setting is None else 0.1)
-    played = functools.partial(play, cell, weights, alone(state), params=params, knowledge=knowledge)
-    (trace,) = played(acting=Acting(env, spec, setting))
+    played = functools.partial(play_episodes, cell, weights, alone(state), env_params=params, knowledge=knowledge)
+    (trace,) = played(agent_loop=AgentLoop(env, spec, setting))
     assert len(trace.action) > WINDOW
     policy, decide = LoadedPolicy(weights, knowledge, spec, setting, env.task), jax.jit(LoadedPolicy.decide)
     memory, horizons = policy.init("kitchen"), len(env.task.rules.horizons)
     for action, logits in zip(trace.action, trace.inferred.corrected, strict=True):
-        told = {"heading": state.pose // horizons % env.task.rules.headings, "horizon": state.pose % horizons}
-        told["moved"] = env.cell(state.pose) != env.cell(before.pose)
-        made = decide(policy, env.observe(state, params), memory, jnp.float32(0.1), **told)
+        use_pose = {"heading": state.pose // horizons % env.task.rules.headings, "horizon": state.pose % horizons}
+        use_pose["moved"] = env.cell_of_pose(state.pose) != env.cell_of_pose(before.pose)
+        made = decide(policy, env.observe(state, params), memory, jnp.float32(0.1), **use_pose)
         np.testing.assert_allclose(made.logits, logits, rtol=1e-4, atol=1e-4)
-        taken, memory = policy.follow(made, jnp.argmax(made.logits).astype(jnp.int32), memory.room)
-        assert int(taken) == action
-        before, (state, *_) = state, env.advance(state, taken, params)
+        applied_action, memory = policy.apply_choice(made, jnp.argmax(made.logits).astype(jnp.int32), memory.room)
+        assert int(applied_action) == action
+        before, (state, *_) = state, env.advance(state, applied_action, params)
     if METHODS[name].adaptation is not None:
-        (plain,) = played(acting=Acting(env, spec, setting, inner_steps=0))
+        (plain,) = played(agent_loop=AgentLoop(env, spec, setting, inner_steps=0))
         assert np.abs(plain.inferred.factual[:LONG] - trace.inferred.factual[:LONG]).max() > 1e-3
 
 
 @pytest.mark.slow
-def test_a_tracker_takes_in_every_step(monkeypatch):
-    monkeypatch.setitem(METHODS, "steered", Method(Steered, tracker=Compass()))
-    spec = dataclasses.replace(tiny.SPEC, method="steered", method_sizes=())
+def test_a_tracker_takes_in_every_step():
+    steered = Method(Steered, tracker=Compass(), name="steered")
+    spec = dataclasses.replace(tiny.SPEC, method=steered, method_sizes=())
     env, params = tiny.world()
     weights, knowledge = tiny.lively(2, spec), tiny.knowledge()
     weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
     policy = LoadedPolicy(weights, knowledge, spec, tiny.SETTING, env.task)
     start = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(1), time=jnp.int32(0))
-    (trace,) = play(cell_of("stde", 0.1), weights, alone(start), Acting(env, spec, tiny.SETTING), params, knowledge)
+    (trace,) = play_episodes(
+        cell_of("stde", 0.1), weights, alone(start), AgentLoop(env, spec, tiny.SETTING), params, knowledge
+    )
     assert len(trace.action) == tiny.LIMITS[0]
     walk = functools.partial(follow, policy, env, params, start, "kitchen", len(trace.action), epsilon=0.1)
     assert walk() == trace.action.tolist()
-    assert walk(told=False) != trace.action.tolist()
+    assert walk(use_pose=False) != trace.action.tolist()

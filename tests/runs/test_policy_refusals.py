@@ -10,14 +10,14 @@ from support.records import resigned
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.policies.policy import init_params
-from jaxnav.runs.policies import POLICIES
+from jaxnav.policies.network import init_params
+from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.store.export import export_params, load_params
 
 
 @pytest.fixture
 def export(drawn_run, tmp_path):
-    return shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
+    return shutil.copytree(drawn_run.config.run_dir / POLICIES_DIR / "layout-0", tmp_path / "layout-0")
 
 
 def refused(folder):
@@ -70,7 +70,7 @@ def test_damaged_exports_are_refused(export):
     ],
 )
 def test_exports_of_other_code_are_refused(export, changes, problem):
-    assert jaxnav.load_policy(export).spec.method == "org"
+    assert jaxnav.load_policy(export).spec.method.name == "org"
     message = refused(respecified(export, **changes))
     assert problem in message
     assert any(mend in message for mend in ("install or mend its package", "choose one of", "train the run anew"))
@@ -102,4 +102,4 @@ def test_a_policy_that_is_not_there_is_refused_with_those_that_are(tmp_path, mon
         InputError, match=r"^room-org: not an exported policy .*; export it, or load one of the package: rooms-org$"
     ):
         jaxnav.load_policy("room-org")
-    assert jaxnav.load_policy("rooms-org").spec.method == "org"
+    assert jaxnav.load_policy("rooms-org").spec.method.name == "org"

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from jaxnav.runs.stopwatch import Stopwatch
+from jaxnav.runs.train import Stopwatch
 
 
 def test_it_counts_from_its_start_and_goes_on_after_an_interruption(tmp_path):

@@ -14,45 +14,43 @@ from support.tiny_world import lively
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.runs.check import check
-from jaxnav.runs.config import RunConfig
-from jaxnav.runs.exports import export_policy
-from jaxnav.runs.policies import POLICIES
-from jaxnav.runs.worlds import evaluation_world
-from jaxnav.training.exploration import Exploration
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.policies import POLICIES_DIR, export_policy
+from jaxnav.runs.worlds import compile_evaluation_world
+from jaxnav.training.calibration import Exploration
 
 
 @pytest.fixture(scope="module")
 def streams(config):
-    return check(dataclasses.replace(config, decision="streams"))
+    return check_config(dataclasses.replace(config, decision="streams"))
 
 
 def test_streams_need_no_training_of_the_counterfactual_branch(streams):
     assert (streams.direct, streams.counterfactual) == ("goal", "none")
     spec = streams.policy_spec(9)
     assert (spec.decision, spec.direct) == ("streams", "goal")
-    fused = check(RunConfig())
+    fused = check_config(RunConfig())
     assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "all", "distil")
 
 
 def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
-    drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES / "layout-0")
+    drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     params = lively(0, streams.policy_spec(len(streams.task.categories)))
     explored = Exploration(jnp.ones_like(drawn.knowledge.layout), jnp.int32(1), jnp.int32(1))
-    export_policy(tmp_path / "policy", streams, params, drawn.knowledge, drawn.setting, explored)
+    export_policy(tmp_path / "policy", streams, params, drawn.knowledge, drawn.estimator_config, explored)
     policy = jaxnav.load_policy(tmp_path / "policy")
     assert policy.spec == streams.policy_spec(len(streams.task.categories))
     chex.assert_trees_all_equal(policy.params, params)
-    world = evaluation_world(streams, "val", None, None, Console(quiet=True))
-    _, state = world.env.reset(jax.random.key(0), world.params(0))
-    observation = world.env.observe(state, world.params(0))
+    world = compile_evaluation_world(streams, "val", None, None, Console(quiet=True))
+    _, state = world.env.reset(jax.random.key(0), world.make_env_params(0))
+    observation = world.env.observe(state, world.make_env_params(0))
     action, memory = jax.jit(policy.act)(observation, policy.init(), heading=0, moved=False)
     assert 0 <= int(action) < world.env.num_actions
-    np.testing.assert_array_equal(memory.memory.experienced, 1.0)
+    np.testing.assert_array_equal(memory.policy_state.use_experience, 1.0)
 
 
 def test_exports_that_do_not_name_a_decision_are_refused(drawn_run, tmp_path):
-    folder = shutil.copytree(drawn_run.config.run_dir / POLICIES / "layout-0", tmp_path / "layout-0")
+    folder = shutil.copytree(drawn_run.config.run_dir / POLICIES_DIR / "layout-0", tmp_path / "layout-0")
     with resigned(folder / "policy.json") as exported:
         assert exported["spec"].pop("decision") == "fused"
     with pytest.raises(InputError, match=r"layout-0: its spec does not fit this code \(KeyError: 'decision'\)"):

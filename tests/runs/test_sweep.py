@@ -10,8 +10,8 @@ from support.commands import SEEDS
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.evaluation.variants import Row
-from jaxnav.runs.directory import Run
+from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.runs.run import Run
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 DECODINGS = ("argmax", "sample")
@@ -31,7 +31,7 @@ def test_a_sweep_equals_the_rows_of_an_evaluation(swept, evaluated, decoding):
     sweep, metrics = swept[decoding], evaluated.metrics()
     assert sweep.compilations == 1
     np.testing.assert_array_equal(sweep.epsilon, EPSILON)
-    rows = np.array([evaluated.rows.index(Row("stde", epsilon, "residual", decoding)) for epsilon in EPSILON])
+    rows = np.array([evaluated.rows.index(EvaluationRow("stde", epsilon, "residual", decoding)) for epsilon in EPSILON])
     chex.assert_trees_all_equal(sweep.outcome, _row(evaluated.outcome, rows))
     for name in ("sr", "spl", "dts"):
         assert getattr(sweep, name).shape == (len(EPSILON), SEEDS, EPISODES)
@@ -40,10 +40,10 @@ def test_a_sweep_equals_the_rows_of_an_evaluation(swept, evaluated, decoding):
 
 @pytest.mark.parametrize("decoding", DECODINGS)
 def test_from_epsilon_1_on_nothing_is_removed(swept, evaluated, decoding):
-    weights = swept[decoding].outcome.weight.mean((1, 2))
+    weights = swept[decoding].outcome.mean_weight.mean((1, 2))
     assert weights[-1] == 0
     assert (np.diff(weights) < 0).all()
-    layout = evaluated.rows.index(Row("layout", None, None, decoding))
+    layout = evaluated.rows.index(EvaluationRow("layout", None, None, decoding))
     row = _row(evaluated.outcome, layout)
     chex.assert_trees_all_equal(_row(swept[decoding].outcome, -1), row)
     assert (swept[decoding].outcome.length[0] != row.length).any()  # what is removed at epsilon 0 matters here

@@ -11,10 +11,9 @@ from support.drawn_run import tiny_config
 
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
-from jaxnav.runs.directory import Run, claim
-from jaxnav.runs.logs import LOG_FILE
+from jaxnav.runs.run import LOG_FILE, Run, claim_run_dir
 from jaxnav.runs.tracking import send_log
-from jaxnav.store.runlog import append_rows, truncate_after
+from jaxnav.store.files import append_log_rows, truncate_log_after
 
 MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
@@ -27,12 +26,12 @@ def row(step, arm="layout", seed=0, **values):
 def run(tmp_path):
     """A run of one arm and two seeds that has just begun: 4 updates, a row of each seed for every one."""
     config = tiny_config(tmp_path / "tiny", arms=("layout",), chunk=1)
-    claim(config)
+    claim_run_dir(config)
     return Run(config)
 
 
 def log(run, *rows):
-    append_rows(run.config.run_dir / LOG_FILE, rows)
+    append_log_rows(run.config.run_dir / LOG_FILE, rows)
 
 
 @pytest.fixture
@@ -55,8 +54,8 @@ def sent(monkeypatch):
             closed.append(("tensorboard", self.series))
 
     class WandBRun:
-        def __init__(self, **told):
-            self.told = told
+        def __init__(self, **settings):
+            self.told = settings
 
         def log(self, values, step):
             for name, value in values.items():
@@ -86,10 +85,10 @@ def test_a_run_that_goes_on_is_followed_to_its_end(run, sent):
     path = run.config.run_dir / LOG_FILE
     parts = iter(
         [
-            lambda: truncate_after(path, 1),
+            lambda: truncate_log_after(path, 1),
             lambda: log(run, row(2, loss=2.0), row(2, seed=1, loss=2.5)),
             lambda: path.write_bytes(path.read_bytes() + b'{"step": 3, "arm": "lay'),  # as it is being written
-            lambda: [truncate_after(path, 2), log(run, row(3, loss=3.0), row(3, seed=1, loss=3.5))],
+            lambda: [truncate_log_after(path, 2), log(run, row(3, loss=3.0), row(3, seed=1, loss=3.5))],
             lambda: log(run, row(4, loss=4.0), row(4, seed=1, loss=4.5)),
         ]
     )
@@ -137,22 +136,22 @@ def test_event_files_hold_the_log(run):
     for _ in range(2):
         send_log(run, ("tensorboard",))
     (file,) = (run.config.run_dir / "tensorboard" / "layout-0").iterdir()
-    data, place, found = file.read_bytes(), 0, {}
+    data, place, values = file.read_bytes(), 0, {}
     while place < len(data):
         (length,) = struct.unpack_from("<Q", data, place)
         event = event_pb2.Event.FromString(data[place + 12 : place + 12 + length])
-        found |= {(event.step, value.tag): value.simple_value for value in event.summary.value}
+        values |= {(event.step, value.tag): value.simple_value for value in event.summary.value}
         place += 16 + length
-    assert found == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
+    assert values == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
 
 
 def wandb_records(file):
     """The records of a file of wandb: LevelDB's log after 7 bytes, with blocks of 32 KiB."""
     data, place, parts = file.read_bytes(), 7, []
     while place < len(data):
-        left = 32768 - place % 32768
-        if left < 7:  # no room for a header: zeros
-            place += left
+        num_bytes = 32768 - place % 32768
+        if num_bytes < 7:  # no room for a header: zeros
+            place += num_bytes
             continue
         _, length, kind = struct.unpack_from("<IHB", data, place)
         parts.append(data[place + 7 : place + 7 + length])
@@ -171,12 +170,12 @@ def test_wandb_keeps_the_log_offline(run, monkeypatch):
     log(run, row(1, loss=0.5, success=0.25), row(2, loss=0.125))
     send_log(run, ("wandb",))
     (file,) = (run.config.run_dir / "wandb").glob("offline-run-*/*.wandb")
-    found = {}
+    values = {}
     for data in wandb_records(file):
         record = wandb_internal_pb2.Record.FromString(data)
         items = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
-        found |= {(items["_step"], name): value for name, value in items.items() if not name.startswith("_")}
-    assert found == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
+        values |= {(items["_step"], name): value for name, value in items.items() if not name.startswith("_")}
+    assert values == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
 
 
 def test_a_sink_named_twice_is_sent_to_once_and_none_is_refused(run, sent):

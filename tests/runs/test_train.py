@@ -14,16 +14,15 @@ from support.commands import POLICIES, SEEDS, contents, finished_run
 import jaxnav
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
-from jaxnav.evaluation.variants import Row
-from jaxnav.policies.methods.graphs import learn_graph
-from jaxnav.policies.methods.zones import learn_zones
-from jaxnav.runs.check import check
-from jaxnav.runs.config import RunConfig
-from jaxnav.runs.overlay import apply_yaml
-from jaxnav.runs.prepare import explore_world
-from jaxnav.runs.worlds import evaluation_world, training_world
+from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.policies.methods.hoz import learn_zones
+from jaxnav.policies.methods.sp import learn_graph
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import apply_yaml
+from jaxnav.runs.train import explore_world
+from jaxnav.runs.worlds import compile_evaluation_world, compile_training_world
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.worlds import generated
+from jaxnav.scenes.worlds import make_generated_scenes
 
 EPISODES = 4
 
@@ -57,17 +56,19 @@ def test_a_run_is_opened_from_its_path(trained):
 
 def test_the_policies_are_stacked_arm_by_arm(trained):
     policies = jaxnav.Run(trained).policies()
-    assert (policies.arms, policies.seeds) == (("baseline", "layout"), SEEDS)
+    assert (policies.arms, policies.num_seeds) == (("baseline", "layout"), SEEDS)
     assert policies.spec == trained.policy_spec(len(trained.task.categories))
     for name in POLICIES:
         arm, seed = name.split("-")
         loaded = jaxnav.load_policy(trained.run_dir / "policies" / name)
-        chex.assert_trees_all_equal(loaded.params, jax.tree.map(lambda leaf, i=int(seed): leaf[i], policies.of(arm)))
+        chex.assert_trees_all_equal(
+            loaded.params, jax.tree.map(lambda leaf, i=int(seed): leaf[i], policies.arm_params(arm))
+        )
         chex.assert_trees_all_equal(loaded.knowledge, policies.knowledge)
         assert loaded.spec == policies.spec
-        assert loaded.setting == (policies.setting if arm == "layout" else None)
+        assert loaded.estimator_config == (policies.estimator_config if arm == "layout" else None)
     layout = jaxnav.Run(trained).policies(("layout",))
-    chex.assert_trees_all_equal(layout.params, policies.of("layout"))
+    chex.assert_trees_all_equal(layout.params, policies.arm_params("layout"))
 
 
 def test_the_log_has_a_row_of_every_chunk_arm_and_seed(trained):
@@ -115,7 +116,7 @@ def test_a_method_that_cannot_host_the_layout_is_trained_without_it(config, tmp_
     assert jaxnav.Run.open(tmp_path / "run").config.arms == ("baseline",)
     assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["baseline-0"]
     policies = run.policies()
-    assert (policies.arms, policies.seeds, policies.setting) == (("baseline",), 1, None)
+    assert (policies.arms, policies.num_seeds, policies.estimator_config) == (("baseline",), 1, None)
     (row,) = run.log()
     assert (row["step"], row["arm"], row["seed"], row["env_steps"]) == (2, "baseline", 0, 256)
 
@@ -124,8 +125,12 @@ def test_a_method_that_cannot_host_the_layout_is_trained_without_it(config, tmp_
     assert contents(tmp_path / "run") == before
 
     results = jaxnav.evaluate(run, episodes=EPISODES)
-    baseline = [Row("baseline", None, None, decoding) for decoding in ("argmax", "sample")]
-    assert results.rows == [*baseline, Row("random", None, None, "sample"), Row("oracle", None, None, "argmax")]
+    baseline = [EvaluationRow("baseline", None, None, decoding) for decoding in ("argmax", "sample")]
+    assert results.rows == [
+        *baseline,
+        EvaluationRow("random", None, None, "sample"),
+        EvaluationRow("oracle", None, None, "argmax"),
+    ]
     assert {leaf.shape for leaf in results.outcome} == {(4, 1, EPISODES)}
     assert results.report["differences"] == []
     for problem in (lambda: jaxnav.sweep(run, (0.5,)), lambda: run.policies(("layout",))):
@@ -137,7 +142,7 @@ def test_a_method_that_cannot_host_the_layout_is_trained_without_it(config, tmp_
 def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
     run = jaxnav.train(small(config, tmp_path / "run", arms=("layout",)))
     assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["layout-0"]
-    assert run.policies().setting is not None
+    assert run.policies().estimator_config is not None
     results = jaxnav.evaluate(run, episodes=EPISODES)
     one = [("layout", None), ("tde", None), ("stde", 0.5)]
     assert [(row.variant, row.epsilon) for row in results.rows] == [*one, *one, ("random", None), ("oracle", None)]
@@ -148,7 +153,7 @@ def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
 
 
 def test_paths_may_be_texts():
-    config = check(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
+    config = check_config(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
     assert (config.run_dir, config.scenes) == (Path("runs/two"), Path("rooms.jsonl.gz"))
 
 
@@ -158,7 +163,7 @@ def test_zones_are_learned_in_the_training_scenes_alone_and_exported(config, tmp
     exported = jaxnav.train(hoz).policies().knowledge.method
 
     def learned(split):
-        scenes = generated(hoz.world, split, getattr(hoz.worlds, f"num_{split}"), hoz.worlds.seed)
+        scenes = make_generated_scenes(hoz.world, split, getattr(hoz.worlds, f"num_{split}"), hoz.worlds.seed)
         bank = compile_bank((scenes[i] for i in range(len(scenes))), hoz.task)
         return learn_zones([bank], np.zeros((NUM_PRIORS, *2 * [len(hoz.task.categories)])))
 
@@ -178,7 +183,7 @@ def test_nothing_that_is_known_before_training_is_of_val_or_test(config, tmp_pat
         policies = jaxnav.train(
             small(config, tmp_path / name, method="hoz", method_sizes={}, arms=("layout",), worlds=changed)
         ).policies()
-        return (policies.knowledge, policies.counts), policies.setting
+        return (policies.knowledge, policies.prior_counts), policies.estimator_config
 
     worlds = config.worlds
     one, setting = known("one")
@@ -186,7 +191,7 @@ def test_nothing_that_is_known_before_training_is_of_val_or_test(config, tmp_pat
     chex.assert_trees_all_equal(one, elsewhere)
     assert setting == of_elsewhere
     same, _ = jax.tree.map(np.array_equal, one, known("train", num_train=worlds.num_train + 3)[0])
-    assert not any(jax.tree.leaves((same.layout, same.signs, same.method["nodes"])))
+    assert not any(jax.tree.leaves((same.layout, same.cooccurrence, same.method["nodes"])))
 
 
 @pytest.mark.slow
@@ -197,9 +202,9 @@ def test_scene_priors_are_learned_in_the_training_scenes_alone_and_exported(conf
     def learned(world):
         return learn_graph(world.banks, np.asarray(explore_world(sp, world).counts))
 
-    chex.assert_trees_all_equal(exported, learned(training_world(sp, console)))
+    chex.assert_trees_all_equal(exported, learned(compile_training_world(sp, console)))
     for split in ("val", "test"):
-        other = learned(evaluation_world(sp, split, None, None, console))
+        other = learned(compile_evaluation_world(sp, split, None, None, console))
         assert np.abs(exported["mixing"] - other["mixing"]).max() > 0.01
     results = jaxnav.evaluate(jaxnav.Run.open(tmp_path / "run"), episodes=EPISODES)
     assert {leaf.shape[-1] for leaf in results.outcome} == {EPISODES}

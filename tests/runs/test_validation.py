@@ -8,14 +8,14 @@ import pytest
 from rich.console import Console
 
 import jaxnav
-from jaxnav.evaluation.variants import Row
+from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.evaluate import run_rows
+from jaxnav.runs.evaluate import evaluate_rows
 from jaxnav.runs.train import train
 from jaxnav.runs.validation import DECODINGS, Validator
-from jaxnav.runs.worlds import evaluation_world, training_world
+from jaxnav.runs.worlds import compile_evaluation_world, compile_training_world
 from jaxnav.scenes.files.scene_file import write_scenes
-from jaxnav.scenes.worlds import generated
+from jaxnav.scenes.worlds import make_generated_scenes
 from jaxnav.training.config import PPOConfig
 
 QUIET = Console(quiet=True)
@@ -25,12 +25,12 @@ QUIET = Console(quiet=True)
 def validated(drawn_run):
     """The validator of a run, and its policies as training holds them."""
     config, policies = dataclasses.replace(drawn_run.config, val_episodes=12), drawn_run.policies()
-    training = training_world(config, QUIET)
-    validator = Validator(config, policies.acting(training), policies.knowledge, training, QUIET)
+    training = compile_training_world(config, QUIET)
+    validator = Validator(config, policies.make_agent_loop(training), policies.knowledge, training, QUIET)
     held = {
         arm: [
             jaxnav.load_policy(drawn_run.config.run_dir / "policies" / f"{arm}-{seed}").params
-            for seed in range(policies.seeds)
+            for seed in range(policies.num_seeds)
         ]
         for arm in policies.arms
     }
@@ -40,9 +40,9 @@ def validated(drawn_run):
 @pytest.mark.slow
 def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
     config, policies, validator, held = validated
-    rows = [Row(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
-    world = evaluation_world(config, "val", None, None, QUIET)
-    _, outcome, _ = run_rows(rows, policies, world, config.val_episodes, 2**32)
+    rows = [EvaluationRow(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
+    world = compile_evaluation_world(config, "val", None, None, QUIET)
+    _, outcome, _ = evaluate_rows(rows, policies, world, config.val_episodes, 2**32)
     scores = validator.measure(held)
     for row, success, done in zip(rows, np.asarray(outcome.success), np.asarray(outcome.done), strict=True):
         if row.decoding == "sample":
@@ -57,7 +57,7 @@ def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
 @pytest.mark.slow
 def test_success_within_budgets_grows_to_the_whole(validated):
     _, policies, validator, held = validated
-    reach, scores = validator.reach(held), validator.measure(held)
+    reach, scores = validator.success_by_budget(held), validator.measure(held)
     assert reach["budgets"] == sorted(set(reach["budgets"]))
     for arm in policies.arms:
         for split in ("val", "train"):
@@ -73,7 +73,7 @@ def test_success_within_budgets_grows_to_the_whole(validated):
 def test_measurements_are_evenly_spaced_and_end_with_the_last_chunk(validations, after):
     ppo = PPOConfig(num_envs=64, rollout=10, minibatches=4)
     config = RunConfig(chunk=2, total_steps=12 * 640, ppo=ppo, validations=validations)
-    assert sorted(config.validated) == after
+    assert sorted(config.validation_updates) == after
 
 
 @pytest.mark.slow
@@ -89,22 +89,23 @@ def test_the_exported_policy_is_the_one_that_succeeded_most(config, tmp_path):
             course = [row["val_success"] for row in rows if (row["arm"], row["seed"]) == (arm, seed)]
             best = len(course) - 1 - int(np.argmax(course[::-1]))
             exported, final = (
-                jaxnav.load_policy(each.config.run_dir / "policies" / f"{arm}-{seed}").params for each in (run, last)
+                jaxnav.load_policy(one_run.config.run_dir / "policies" / f"{arm}-{seed}").params
+                for one_run in (run, last)
             )
             same = np.array_equal(exported["fuse"]["kernel"], final["fuse"]["kernel"])
             assert same == (best == len(course) - 1)  # measuring changes nothing of training
             differ.append(not same)
-    assert run.reach() is not None
-    assert last.reach() is None
+    assert run.success_by_budget() is not None
+    assert last.success_by_budget() is None
 
 
 @pytest.mark.slow
 def test_a_file_without_val_scenes_exports_the_last_policy(config, tmp_path):
     scenes = tmp_path / "train_only.jsonl"
-    write_scenes(scenes, [generated("rooms", "train", 2)[i] for i in range(2)])
-    told = io.StringIO()
-    console = Console(file=told, width=400)
+    write_scenes(scenes, [make_generated_scenes("rooms", "train", 2)[i] for i in range(2)])
+    output = io.StringIO()
+    console = Console(file=output, width=400)
     run = train(dataclasses.replace(config, run_dir=tmp_path / "run", scenes=scenes, validations=1), console)
-    assert "no val scenes, so the last policies are exported" in told.getvalue()
-    assert run.reach() is None
+    assert "no val scenes, so the last policies are exported" in output.getvalue()
+    assert run.success_by_budget() is None
     assert not any("val_success" in row for row in run.log())

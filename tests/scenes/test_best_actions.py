@@ -6,7 +6,7 @@ import pytest
 from support import tiny_world as tiny
 from support.scenes import BOOK, CATEGORIES, CHAIR, ROOMS, SMALL, coarse_scene, draw, maze_scene
 
-from jaxnav.env.build import build
+from jaxnav.env.make import build_environment
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import DONE, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
@@ -45,12 +45,12 @@ def test_a_walk_of_the_expert_is_a_shortest_path(scene):
 
 
 def test_the_device_holds_the_experts_actions_for_those_who_imitate():
-    _, params = build(tiny.BANK, {}, 9, expert=True)
+    _, params = build_environment(tiny.BANK, {}, 9, with_expert=True)
     assert params.tables.expert is not None
     np.testing.assert_array_equal(params.tables.expert, tiny.BANK.expert)
-    _, padded = build(tiny.BANK, {}, 9, num_cells=len(tiny.BANK.ahead) + 2, expert=True)
+    _, padded = build_environment(tiny.BANK, {}, 9, num_cells=len(tiny.BANK.ahead) + 2, with_expert=True)
     assert padded.tables.expert is not None
     assert len(padded.tables.expert) == len(padded.tables.rows)
-    _, plain = build(tiny.BANK, {}, 9)
+    _, plain = build_environment(tiny.BANK, {}, 9)
     assert plain.tables.expert is None
     assert len(jax.tree.leaves(params)) == len(jax.tree.leaves(plain)) + 1

@@ -4,8 +4,8 @@ import collections
 
 import pytest
 
-from jaxnav.scenes.scene import floor_plan
-from jaxnav.scenes.worlds import generated
+from jaxnav.scenes.scene import floor_plan_name
+from jaxnav.scenes.worlds import make_generated_scenes
 
 
 @pytest.mark.parametrize(
@@ -38,19 +38,19 @@ from jaxnav.scenes.worlds import generated
     ],
 )
 def test_the_name_tells_the_floor_plan(name, expected):
-    assert floor_plan(name) == expected
+    assert floor_plan_name(name) == expected
 
 
 @pytest.mark.parametrize("world", ["rooms", "houses"])
 def test_generated_scenes_have_floor_plans_of_their_own(world):
-    names = [generated(world, "val", 4)[i].name for i in range(4)]
-    assert [floor_plan(name) for name in names] == names
+    names = [make_generated_scenes(world, "val", 4)[i].name for i in range(4)]
+    assert [floor_plan_name(name) for name in names] == names
 
 
 def test_generated_apartments_of_a_floor_plan_share_their_walls():
-    scenes = [generated("apartments", "val", 10)[i] for i in range(10)]
+    scenes = [make_generated_scenes("apartments", "val", 10)[i] for i in range(10)]
     walls = collections.defaultdict(set)
     for scene in scenes:
-        walls[floor_plan(scene.name)].add((scene.walls.shape, scene.walls.tobytes()))
+        walls[floor_plan_name(scene.name)].add((scene.walls.shape, scene.walls.tobytes()))
     assert [len(kinds) for kinds in walls.values()] == [1, 1]
     assert len(set.union(*walls.values())) == 2

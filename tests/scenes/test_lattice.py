@@ -8,23 +8,25 @@ from hypothesis import given
 from hypothesis.extra import numpy as hnp
 from support.scenes import HOUSES, ROOMS
 
-from jaxnav.scenes.lattice import ahead_of, best_lengths, connected_parts, standable_cells, successors
+from jaxnav.scenes.lattice import best_lengths, cells_ahead, connected_parts, pose_successors, standable_cells
 
 
 def searched_parts(mask):
     """The 8-connected parts by a breadth-first search; parts and cells in row order."""
-    left, parts = dict.fromkeys(map(tuple, np.argwhere(mask).tolist())), []
-    while left:
-        start = next(iter(left))
-        del left[start]
-        queue, part = deque([start]), []
+    unvisited = dict.fromkeys(map(tuple, np.argwhere(mask).tolist()))
+    parts = []
+    while unvisited:
+        start = next(iter(unvisited))
+        del unvisited[start]
+        queue = deque([start])
+        part = []
         while queue:
             z, x = queue.popleft()
             part.append([z, x])
-            for beside in [(z + dz, x + dx) for dz in (-1, 0, 1) for dx in (-1, 0, 1)]:
-                if beside in left:
-                    del left[beside]
-                    queue.append(beside)
+            for neighbour in [(z + dz, x + dx) for dz in (-1, 0, 1) for dx in (-1, 0, 1)]:
+                if neighbour in unvisited:
+                    del unvisited[neighbour]
+                    queue.append(neighbour)
         parts.append(sorted(part))
     return parts
 
@@ -62,7 +64,7 @@ def test_standable_cells_are_the_largest_part_and_the_first_of_equal_ones():
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
 def test_best_lengths_are_those_of_a_breadth_first_search(rules):
     draws = np.random.default_rng(0)
-    successor = successors(ahead_of(standable_cells(draws.random((9, 9)) < 0.55), rules), rules)
+    successor = pose_successors(cells_ahead(standable_cells(draws.random((9, 9)) < 0.55), rules), rules)
     succeeds = draws.random((len(successor), 3)) < [0.002, 0.02, 0.0]
     lengths = best_lengths(successor, succeeds)
 

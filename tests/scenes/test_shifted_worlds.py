@@ -10,13 +10,13 @@ from support.scenes import draw
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
-from jaxnav.scenes.exchange import exchange_places
 from jaxnav.scenes.files.scene_file import write_scenes
-from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.layout_shift import exchange_places
+from jaxnav.scenes.scene import CELL_SIZE, Scene
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.tables.detector import detection_range, object_size
+from jaxnav.scenes.tables.observation_row import detection_range, object_size
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, from_file, generated, shifted
+from jaxnav.scenes.worlds import WORLDS, load_scenes, make_generated_scenes, shift_scenes
 
 NUM_SCENES = {"apartments": 48, "houses": 48, "rooms": 96}  # a room has fewer pairs
 
@@ -28,7 +28,7 @@ def scenes_of(world: str, shift: float, part: int = 0) -> list[Scene]:
     number = NUM_SCENES[world]
     if shift:
         return [exchange_places(scene, WORLDS[world].task, shift, 0) for scene in scenes_of(world, 0.0, part)]
-    scenes = generated(world, "train", (part + 1) * number)
+    scenes = make_generated_scenes(world, "train", (part + 1) * number)
     return [scenes[i] for i in range(part * number, len(scenes))]
 
 
@@ -81,24 +81,28 @@ def moved_apart(a: list[Scene], b: list[Scene], categories: tuple[str, ...], rng
 
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
 def test_scenes_are_shifted_one_by_one(world):
-    task, scenes = WORLDS[world].task, generated(world, "val", 3, 7)
-    assert shifted(scenes, task, 0.0, 7) is scenes
-    half = shifted(scenes, task, 0.5, 7)
+    task, scenes = WORLDS[world].task, make_generated_scenes(world, "val", 3, 7)
+    assert shift_scenes(scenes, task, 0.0, 7) is scenes
+    half = shift_scenes(scenes, task, 0.5, 7)
     assert len(half) == 3
     for i in range(3):
         assert_scenes_equal(half[i], exchange_places(scenes[i], task, 0.5, 7))
     with pytest.raises(InputError, match="give a seed of at least 0, a shift from 0 to 1"):
-        shifted(scenes, task, 1.5)
+        shift_scenes(scenes, task, 1.5)
 
 
 def test_what_differs_has_another_identity(tmp_path):
     names, file, task = ITHOR_CATEGORIES[:3], tmp_path / "a.jsonl.gz", Task()
     write_scenes(file, [draw([".."], *((name, 1.0 + i, 1.0, 0.0, 0.1, 0.1, 0.1) for i, name in enumerate(names)))])
-    scenes = [from_file(file, "train"), generated("rooms", "train", 1), generated("rooms", "train", 1, 1)]
+    scenes = [
+        load_scenes(file, "train"),
+        make_generated_scenes("rooms", "train", 1),
+        make_generated_scenes("rooms", "train", 1, 1),
+    ]
     few, goals = Task(names), Task(goals=names)
     changes = [(task, 0.0, 0), (task, 0.5, 0), (task, 0.6, 0), (task, 0.5, 1), (few, 0.5, 0), (goals, 0.5, 0)]
-    assert len({shifted(one, *change).identity for one in scenes for change in changes}) == 18
-    assert shifted(scenes[0], task, 0.5, 0)[0].types == (names[1], names[2], names[0])
+    assert len({shift_scenes(one, *change).identity for one in scenes for change in changes}) == 18
+    assert shift_scenes(scenes[0], task, 0.5, 0)[0].types == (names[1], names[2], names[0])
 
 
 @pytest.mark.parametrize("world", EACH)
@@ -159,7 +163,7 @@ def test_a_shift_moves_goals_to_the_wrong_room():
     def share(scenes: list[Scene], name: str, room_type: str) -> float:
         inside = []
         for scene in scenes:
-            cells = np.rint((scene.boxes[:, [2, 0]] - scene.origin[::-1]) / CELL).astype(int)
+            cells = np.rint((scene.boxes[:, [2, 0]] - scene.origin[::-1]) / CELL_SIZE).astype(int)
             where = [next(room.type for room in scene.rooms if room.cells[iz, ix]) for iz, ix in cells]
             inside += [kind == room_type for other, kind in zip(scene.types, where, strict=True) if other == name]
         return float(np.mean(inside))

@@ -17,7 +17,7 @@ import pytest
 
 from jaxnav.errors import InputError
 from jaxnav.store import checkpoint
-from jaxnav.store.manifest import FORMAT_VERSION, make_manifest
+from jaxnav.store.files import CHECKPOINT_FORMAT_VERSION, make_manifest
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -53,7 +53,7 @@ def as_data(state: State) -> State:
 
 def restored(run_dir: Path, abstract: Any = ABSTRACT, manifest: Mapping[str, Any] = MANIFEST) -> tuple[Any, int]:
     """Return the latest state and its step, which must exist."""
-    result = checkpoint.restore(run_dir, abstract, manifest)
+    result = checkpoint.restore_checkpoint(run_dir, abstract, manifest)
     assert result is not None
     assert result.damaged == ()
     return result.state, result.step
@@ -62,7 +62,7 @@ def restored(run_dir: Path, abstract: Any = ABSTRACT, manifest: Mapping[str, Any
 def test_state_round_trips_with_types_keys_and_step(tmp_path):
     state = make_state(7)
     assert not np.array_equal(state.params["dense"]["kernel"], make_state(8).params["dense"]["kernel"])
-    checkpoint.save(tmp_path, 3, state, MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 3, state, MANIFEST)
     loaded, step = restored(tmp_path)
     assert step == 3
     assert jax.tree.structure(loaded) == jax.tree.structure(state)
@@ -72,9 +72,9 @@ def test_state_round_trips_with_types_keys_and_step(tmp_path):
 
 
 def test_nothing_saved_restores_nothing(tmp_path):
-    assert checkpoint.restore(tmp_path / "none", ABSTRACT, MANIFEST) is None
+    assert checkpoint.restore_checkpoint(tmp_path / "none", ABSTRACT, MANIFEST) is None
     (tmp_path / "checkpoints").mkdir()
-    assert checkpoint.restore(tmp_path, ABSTRACT, MANIFEST) is None
+    assert checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST) is None
     assert not (tmp_path / "none").exists()
 
 
@@ -82,7 +82,7 @@ def test_the_latest_two_steps_are_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_dir = Path("run")  # Orbax itself refuses relative paths
     for step in (1, 5, 10):
-        checkpoint.save(run_dir, step, make_state(step), MANIFEST)
+        checkpoint.save_checkpoint(run_dir, step, make_state(step), MANIFEST)
     assert sorted(p.name for p in (run_dir / "checkpoints").iterdir()) == ["10", "5"]
     loaded, step = restored(run_dir)
     assert (step, loaded.step) == (10, 10)
@@ -90,29 +90,29 @@ def test_the_latest_two_steps_are_kept(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("step", [4, 5])
 def test_a_step_cannot_be_saved_twice_or_backwards(tmp_path, step):
-    checkpoint.save(tmp_path, 5, make_state(5), MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 5, make_state(5), MANIFEST)
     with pytest.raises(InputError, match="holds step 5 already"):
-        checkpoint.save(tmp_path, step, make_state(step), MANIFEST)
+        checkpoint.save_checkpoint(tmp_path, step, make_state(step), MANIFEST)
     assert restored(tmp_path)[1] == 5
 
 
 def test_another_config_is_refused_with_keys_and_values(tmp_path):
-    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
     other = make_manifest({"env": {"num_envs": 16, "view": (11, 11), "limit": 5}, "name": "run"})
     with pytest.raises(InputError) as error:
-        checkpoint.restore(tmp_path, ABSTRACT, other)
+        checkpoint.restore_checkpoint(tmp_path, ABSTRACT, other)
     assert "env.limit: (absent) != 5; env.num_envs: 8 != 16;" in str(error.value)
     assert "env.view" not in str(error.value)
 
 
 def test_another_format_version_is_refused(tmp_path):
-    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST | {"format_version": 99})
-    with pytest.raises(InputError, match=f"has format version 99, this code reads version {FORMAT_VERSION}"):
-        checkpoint.restore(tmp_path, ABSTRACT, MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST | {"format_version": 99})
+    with pytest.raises(InputError, match=f"has format version 99, this code reads version {CHECKPOINT_FORMAT_VERSION}"):
+        checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST)
 
 
 def test_other_package_versions_are_allowed(tmp_path):
-    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST | {"versions": {"jax": "0.0.1"}})
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST | {"versions": {"jax": "0.0.1"}})
     assert restored(tmp_path)[1] == 1
 
 
@@ -126,39 +126,39 @@ def test_other_package_versions_are_allowed(tmp_path):
     ],
 )
 def test_another_state_is_refused_with_its_leaves(tmp_path, change, difference):
-    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
     abstract = jax.eval_shape(lambda: change(make_state(1)))
     with pytest.raises(InputError) as error:
-        checkpoint.restore(tmp_path, abstract, MANIFEST)
+        checkpoint.restore_checkpoint(tmp_path, abstract, MANIFEST)
     assert difference in str(error.value)
 
 
 @pytest.mark.parametrize("leaf", [3, 0.5, np.zeros(2), jnp.zeros((0, 2))])
 def test_leaves_that_could_not_be_restored_are_not_saved(tmp_path, leaf):
     with pytest.raises(TypeError, match=r"state\.step is .*non-empty jax.Array"):
-        checkpoint.save(tmp_path, 1, make_state(1).replace(step=leaf), MANIFEST)
-    assert checkpoint.restore(tmp_path, ABSTRACT, MANIFEST) is None
+        checkpoint.save_checkpoint(tmp_path, 1, make_state(1).replace(step=leaf), MANIFEST)
+    assert checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST) is None
 
 
 @pytest.mark.parametrize("error", [MemoryError("full"), TypeError("a bug")])
 def test_what_is_no_damage_is_not_reported_as_such(tmp_path, monkeypatch, error):
-    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
 
     def fail(*args, **kwargs):
         raise error
 
     monkeypatch.setattr("orbax.checkpoint._src.serialization.jax_array_handlers.ArrayHandler.deserialize", fail)
     with pytest.raises(BaseException) as raised:  # noqa: PT011  (Orbax chooses the type)
-        checkpoint.restore(tmp_path, ABSTRACT, MANIFEST)
+        checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST)
     assert not isinstance(raised.value, InputError)
 
 
 def test_unfinished_commits_are_ignored_and_cleared(tmp_path):
-    checkpoint.save(tmp_path, 1, make_state(1), MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
     unfinished = tmp_path / "checkpoints" / "2.orbax-checkpoint-tmp"
     (unfinished / "state").mkdir(parents=True)
     assert restored(tmp_path)[1] == 1
-    checkpoint.save(tmp_path, 2, make_state(2), MANIFEST)
+    checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
     assert not unfinished.exists()
     assert restored(tmp_path)[1] == 2
 
@@ -169,15 +169,17 @@ import sys
 from pathlib import Path
 import jax
 from jaxnav.store import checkpoint
-from jaxnav.store.manifest import make_manifest
+from jaxnav.store.files import make_manifest
 for step in range(1, 10**6):
     state = {"bits": jax.random.bits(jax.random.key(step), (1024, 1024))}
-    checkpoint.save(Path(sys.argv[1]), step, state, make_manifest({}))
+    checkpoint.save_checkpoint(Path(sys.argv[1]), step, state, make_manifest({}))
     print(step, flush=True)
 """
 
 
-@pytest.mark.parametrize("delay", [0.0, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.01, 0.03, 0.1))])
+@pytest.mark.parametrize(
+    "delay", [0.0, *(pytest.param(seconds, marks=pytest.mark.slow) for seconds in (0.01, 0.03, 0.1))]
+)
 def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, delay):
     command = [sys.executable, "-c", ENDLESS_SAVES, str(tmp_path)]
     with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:
@@ -193,5 +195,5 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, delay):
     state, step = restored(tmp_path, abstract, make_manifest({}))
     assert step >= safe[-1] >= 2  # what was said to be safe is there; a commit just before the kill may be too
     chex.assert_trees_all_equal(state, {"bits": jax.random.bits(jax.random.key(step), (1024, 1024))})
-    checkpoint.save(tmp_path, step + 1, state, make_manifest({}))  # and the run goes on
+    checkpoint.save_checkpoint(tmp_path, step + 1, state, make_manifest({}))  # and the run goes on
     assert restored(tmp_path, abstract, make_manifest({}))[1] == step + 1

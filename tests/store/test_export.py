@@ -13,7 +13,7 @@ import pytest
 import safetensors.numpy
 
 from jaxnav.errors import InputError
-from jaxnav.store.export import FORMAT_VERSION, export_params, load_params
+from jaxnav.store.export import POLICY_FORMAT_VERSION, export_params, load_params
 
 REPOSITORY = Path(__file__).parents[2]
 PARAMS = {"torso": {"dense": {"kernel": np.arange(6, dtype=np.float32).reshape(2, 3).T}}, "scale": np.float32(2)}
@@ -103,7 +103,7 @@ def test_an_export_killed_between_its_files_is_refused_not_mixed(tmp_path, monke
 def test_an_export_of_another_format_version_is_not_overwritten(tmp_path):
     export_params(tmp_path, PARAMS, SPEC)
     policy = tmp_path / "policy.json"
-    policy.write_text(policy.read_text().replace(f'"format_version": {FORMAT_VERSION}', '"format_version": 2'))
+    policy.write_text(policy.read_text().replace(f'"format_version": {POLICY_FORMAT_VERSION}', '"format_version": 2'))
     before = policy.read_bytes()
     with pytest.raises(InputError, match="has format version 2, this code reads"):
         export_params(tmp_path, PARAMS, SPEC)

@@ -4,7 +4,7 @@ import json
 
 import jax
 
-from jaxnav.store.manifest import differences, make_manifest
+from jaxnav.store.files import list_differences, make_manifest
 
 MANIFEST = make_manifest({"env": {"num_envs": 8, "view": (11, 11)}, "name": "run"})
 
@@ -18,5 +18,5 @@ def test_manifest_is_json_with_versions():
 def test_differences_are_dotted_and_sorted():
     a = {"b": {"c": 1, "d": {"e": 2}}, "a": [1], "only": 1}
     b = {"b": {"c": 1, "d": {"e": 3}}, "a": [2], "b2": {}}
-    assert differences(a, b) == ["a: [1] != [2]", "b.d.e: 2 != 3", "b2: (absent) != {}", "only: 1 != (absent)"]
-    assert differences(a, a) == []
+    assert list_differences(a, b) == ["a: [1] != [2]", "b.d.e: 2 != 3", "b2: (absent) != {}", "only: 1 != (absent)"]
+    assert list_differences(a, a) == []

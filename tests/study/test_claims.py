@@ -9,7 +9,7 @@ from support import study_results
 from support.intervals import around, bounds
 
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.study.claims import Claim, claims
+from jaxnav.study.claims import Claim, study_claims
 from jaxnav.study.records import FullCondition
 from jaxnav.study.results import StudyResults
 
@@ -30,12 +30,12 @@ from jaxnav.study.results import StudyResults
     ],
 )
 def test_verdicts(low, high, verdict):
-    assert Claim("", "SR points", Interval((low + high) / 2, low, high), least=2.0).verdict == verdict
+    assert Claim("", "SR points", Interval((low + high) / 2, low, high), min_effect=2.0).verdict == verdict
 
 
 @pytest.fixture(scope="module")
 def by_text():
-    return {claim.text: claim for claim in claims(study_results.results())}
+    return {claim.text: claim for claim in study_claims(study_results.results())}
 
 
 def claim_about(by_text, text) -> Claim:
@@ -81,12 +81,12 @@ def test_every_claim_is_an_interval_around_its_mean(by_text):
     assert len(by_text) == 15
     for claim in by_text.values():
         assert claim.effect.low <= claim.effect.mean <= claim.effect.high
-        assert claim.least > 0
+        assert claim.min_effect > 0
 
 
 def test_the_run_with_the_goal_alone_adds_two_claims_after_those_of_stde():
-    texts = [claim.text for claim in claims(study_results.results(runs=(*study_results.RUNS, "goal")))]
-    without = [claim.text for claim in claims(study_results.results())]
+    texts = [claim.text for claim in study_claims(study_results.results(runs=(*study_results.RUNS, "goal")))]
+    without = [claim.text for claim in study_claims(study_results.results())]
     added = [
         f"The same at shift {shift} where the direct pathway sees the goal's detection alone" for shift in ("0", "1")
     ]
@@ -97,7 +97,7 @@ def test_the_real_rooms_have_other_claims():
     results = study_results.results(("main", "real"))
     real_rooms = dataclasses.replace(results.worlds["real"], instrument=study_results.instrument(loss=-3.0))
     results = dataclasses.replace(results, worlds={**results.worlds, "real": real_rooms})
-    (main, *rest), (real, *others) = (claims(results, world) for world in ("main", "real"))
+    (main, *rest), (real, *others) = (study_claims(results, world) for world in ("main", "real"))
     assert (main.effect.mean, real.effect.mean) == (9.0, -3.0)
     assert (main.verdict, real.verdict) == ("holds", "refuted")
     assert str(rest) == str(others)  # NaN is no NaN
@@ -114,10 +114,10 @@ def test_what_is_undefined_has_no_verdict():
     first = dataclasses.replace(first, similarity=dataclasses.replace(first.similarity, pearson=undefined))
     stde = dataclasses.replace(last.gains.stde, slope=undefined)
     last = dataclasses.replace(last, gains=dataclasses.replace(last.gains, stde=stde))
-    by_text = {claim.text: claim for claim in claims(world_with(first, last))}
+    by_text = {claim.text: claim for claim in study_claims(world_with(first, last))}
     for text in ("Success follows", "Gains over the baseline"):
         claim = claim_about(by_text, text)
-        assert not claim.effect.bounded
+        assert not claim.effect.has_bounds
         assert claim.verdict == "cannot be told"
 
 
@@ -127,12 +127,12 @@ def test_growth_needs_the_effects_at_both_shifts(without):
         dataclasses.replace(condition, effects=None) if i in without else condition
         for i, condition in enumerate(study_results.world_results().conditions)
     )
-    by_text = {claim.text: claim for claim in claims(world_with(first, last))}
+    by_text = {claim.text: claim for claim in study_claims(world_with(first, last))}
     growth = claim_about(by_text, "grows with the shift")
     assert math.isnan(growth.effect.mean)
     assert growth.verdict == "cannot be told"
     # All others are as they were.
-    whole = {claim.text: claim for claim in claims(study_results.results())}
+    whole = {claim.text: claim for claim in study_claims(study_results.results())}
     assert {text for text, claim in by_text.items() if str(claim) != str(whole[text])} == {growth.text}
 
 
@@ -144,7 +144,7 @@ def test_growth_is_that_of_each_scene_and_run():
         dataclasses.replace(condition, effects=dataclasses.replace(study_results.effects(1.0), gain=gain + more))
         for condition, more in zip(study_results.world_results().conditions, (0.0, 10.0), strict=True)
     ]
-    by_text = {claim.text: claim for claim in claims(world_with(*conditions))}
+    by_text = {claim.text: claim for claim in study_claims(world_with(*conditions))}
     effect = claim_about(by_text, "grows with the shift").effect
     # Sums over five episodes are 10 points more.
     assert bounds(effect) == pytest.approx((2.0, 2.0, 2.0))
@@ -152,9 +152,11 @@ def test_growth_is_that_of_each_scene_and_run():
 
 def test_a_short_course_is_read_at_its_last_step():
     world = study_results.world_results()
-    course = dataclasses.replace(world.course, steps=world.course.steps[:11])
-    results = dataclasses.replace(study_results.results(), worlds={"main": dataclasses.replace(world, course=course)})
-    by_text = {claim.text: claim for claim in claims(results)}
+    course = dataclasses.replace(world.gap_curves, steps=world.gap_curves.steps[:11])
+    results = dataclasses.replace(
+        study_results.results(), worlds={"main": dataclasses.replace(world, gap_curves=course)}
+    )
+    by_text = {claim.text: claim for claim in study_claims(results)}
     # Half way from 0.9 to 0.2.
     assert claim_about(by_text, "The gap is below 0.5 at step 10").effect.mean == pytest.approx(0.5 - 0.55)
     assert "The `evidence` gap does at step 10" in by_text

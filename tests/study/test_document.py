@@ -9,11 +9,10 @@ from support import study_results
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.study.claims import claims
-from jaxnav.study.document import READING, check_document, write_document
-from jaxnav.study.draw import draw_figures
-from jaxnav.study.tables import CONTROLS, metrics_table
-from jaxnav.study.trials import Control
+from jaxnav.study.claims import study_claims
+from jaxnav.study.document import CONTROL_LABELS, READING_MARK, check_document, metrics_table, write_study_document
+from jaxnav.study.figures import draw_study_figures
+from jaxnav.study.records import TrialControl
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +20,8 @@ def folder(tmp_path_factory):
     """Return a folder with results of both worlds, written up."""
     folder = tmp_path_factory.mktemp("study")
     study_results.write(folder / "results" / "val", study_results.parts(("main", "real")))
-    draw_figures(folder / "results" / "val", folder / "docs" / "images" / "study")
-    write_document(folder / "results", folder / "docs" / "study.md")
+    draw_study_figures(folder / "results" / "val", folder / "docs" / "images" / "study")
+    write_study_document(folder / "results", folder / "docs" / "study.md")
     return folder
 
 
@@ -52,33 +51,33 @@ def test_every_image_that_is_named_is_drawn_and_no_other(folder, text):
     assert set(named) == drawn
 
 
-@pytest.mark.parametrize("text", ["", "My own notes.\n", f"{READING}\nOne line of two.\n"])
+@pytest.mark.parametrize("text", ["", "My own notes.\n", f"{READING_MARK}\nOne line of two.\n"])
 def test_a_document_that_is_none_of_the_studys_is_not_written_over(folder, tmp_path, text):
     document = tmp_path / "study.md"
     check_document(document)
     document.write_text(text)
     with pytest.raises(InputError, match=r"study.md: is there, without two lines <!-- reading -->; give another"):
-        write_document(folder / "results", document)
+        write_study_document(folder / "results", document)
     assert document.read_text() == text
 
 
 def test_without_results_nothing_is_written(tmp_path):
     with pytest.raises(InputError, match=r"val: holds no results; run the study first"):
-        write_document(tmp_path, tmp_path / "study.md")
+        write_study_document(tmp_path, tmp_path / "study.md")
     with pytest.raises(InputError, match=r"val: holds no results; run the study first"):
-        draw_figures(tmp_path / "val", tmp_path / "images")
+        draw_study_figures(tmp_path / "val", tmp_path / "images")
     assert not list(tmp_path.iterdir())
 
 
 def test_what_is_written_by_hand_stays(folder, tmp_path):
     document = tmp_path / "study.md"
-    write_document(folder / "results", document)
+    write_study_document(folder / "results", document)
     before = document.read_text()
-    assert before.count(READING) == 2
-    head, _, tail = before.split(READING)
-    document.write_text(f"{head}{READING}\nAs found:\n\n* | a table |\n{READING}{tail}")
+    assert before.count(READING_MARK) == 2
+    head, _, tail = before.split(READING_MARK)
+    document.write_text(f"{head}{READING_MARK}\nAs found:\n\n* | a table |\n{READING_MARK}{tail}")
     by_hand = document.read_text()
-    write_document(folder / "results", document)
+    write_study_document(folder / "results", document)
     assert document.read_text() == by_hand
     # Numbers follow the results, the text by hand does not.
     parts = study_results.parts(runs=("main",))
@@ -86,7 +85,7 @@ def test_what_is_written_by_hand_stays(folder, tmp_path):
     rows = tuple(dataclasses.replace(row, sr=study_results.estimate(12.5)) for row in changed.rows)
     parts["main-shift1"] = dataclasses.replace(changed, rows=rows)
     study_results.write(tmp_path / "results" / "val", parts)
-    write_document(tmp_path / "results", document)
+    write_study_document(tmp_path / "results", document)
     assert "\nAs found:\n\n* | a table |\n" in document.read_text()
     assert "| 12.5 ± 0.5 |" in document.read_text()
 
@@ -103,7 +102,7 @@ def test_both_worlds_have_their_sections(text):
 
 def test_the_claims_are_those_of_the_results(text):
     rows = table(section(text, "Claims"))
-    expected = claims(study_results.results())
+    expected = study_claims(study_results.results())
     assert list(rows)[2:] == [claim.text for claim in expected]
     assert rows["claim"] == ["effect", "least", "verdict"]
     assert [rows[claim.text][2] for claim in expected] == [claim.verdict for claim in expected]
@@ -136,7 +135,7 @@ def test_one_training_run_has_neither_spread_nor_interval():
 
 
 def test_every_control_is_there(text):
-    assert set(CONTROLS) == {None, *get_args(Control)}
+    assert set(CONTROL_LABELS) == {None, *get_args(TrialControl)}
     rows = table(section(text, "Controls"))
     # Two uses: two gaps with five controls and none each, and the clock; no zeros in the paper's form; header and rule.
     assert len(rows) == 2 * (2 * 6 + 1) - 2 + 2
@@ -171,9 +170,12 @@ def test_the_gap_is_there_at_the_steps_that_there_are(text):
 
 def test_results_on_test_are_appended(tmp_path):
     study_results.write(tmp_path / "val", study_results.parts())
-    chosen = {f"main-shift{shift:g}": study_results.full_condition(shift, chosen=1.0) for shift in study_results.SHIFTS}
-    study_results.write(tmp_path / "test", study_results.parts() | chosen)
-    write_document(tmp_path, tmp_path / "study.md")
+    conditions = {
+        f"main-shift{shift:g}": study_results.full_condition(shift, chosen_epsilon=1.0)
+        for shift in study_results.SHIFTS
+    }
+    study_results.write(tmp_path / "test", study_results.parts() | conditions)
+    write_study_document(tmp_path, tmp_path / "study.md")
     rows = table(section((tmp_path / "study.md").read_text(), "Test, touched once"))
     assert rows["+ w + sTDE (eps 0.5)"][0] == "62.0 ± 0.5"
     assert rows["+ w + sTDE (eps 1, chosen)"][0] == "62.0 ± 0.5"

@@ -15,10 +15,20 @@ from support.study_results import band, estimate, interval, row
 
 from jaxnav.causal import Form
 from jaxnav.study import figures
-from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
-from jaxnav.study.records import GainBySimilarity, SuccessBySimilarity, TrialRow
-from jaxnav.study.trials import Trial
-from jaxnav.viz.figure import DPI, WIDTH, save_figure
+from jaxnav.study.records import (
+    AucLine,
+    AucPanel,
+    Belief,
+    Curve,
+    GainBySimilarity,
+    GapCurves,
+    GapLine,
+    GapPanel,
+    SuccessBySimilarity,
+    Trial,
+    TrialRow,
+)
+from jaxnav.viz.style import FIGURE_DPI, FIGURE_WIDTH, save_figure
 
 FORMS: tuple[Form, ...] = ("residual", "paper")
 BELIEFS: tuple[Belief, ...] = ("updated", "frozen")
@@ -74,7 +84,7 @@ AUC = AucPanel(
         AucLine("evidence", band(np.array([0.6, 0.7, 0.8, 0.8]), 0.05)),
     ),
 )
-COURSE = GapCourse(
+COURSE = GapCurves(
     steps=(0, 1, 2, 3),
     running=np.ones((2, 4)),
     panels=tuple(GapPanel(setting, LINES) for setting in ("paper", "released", "calibrated")),
@@ -120,13 +130,13 @@ def keys(figure: Figure) -> list[str]:
 
 
 def test_similarity_points_sizes_and_means(monkeypatch):
-    monkeypatch.setattr(figures, "BINS", 2)
+    monkeypatch.setattr(figures, "NUM_BINS", 2)
     axes = DRAWINGS["similarity"]().axes[0]
     (points,) = axes.collections
     assert isinstance(points, PathCollection)
     np.testing.assert_allclose(np.asarray(points.get_offsets()), [[0.9, 100], [0.1, 25], [0.5, 50], [0.3, 75]])
     # Areas are in the ratio of the episodes, 4 : 8 : 2 : 4.
-    np.testing.assert_allclose(points.get_sizes(), figures.MAX_AREA * np.array([0.5, 1.0, 0.25, 0.5]))
+    np.testing.assert_allclose(points.get_sizes(), figures.MAX_MARKER_AREA * np.array([0.5, 1.0, 0.25, 0.5]))
     # Halves by similarity, weighted by episodes: (0.1 * 8 + 0.3 * 4) / 12 = 1/6 and (25 * 8 + 75 * 4) / 12 = 125/3;
     # (0.5 * 2 + 0.9 * 4) / 6 = 23/30 and (50 * 2 + 100 * 4) / 6 = 250/3.
     np.testing.assert_allclose(lines(axes)[0], [[1 / 6, 125 / 3], [23 / 30, 250 / 3]])
@@ -150,10 +160,10 @@ def test_epsilon_has_a_row_per_form_and_a_column_per_metric():
     figure = DRAWINGS["epsilon"]()
     for i, by_epsilon in enumerate(SWEEPS.values()):
         for axes, metric in zip(figure.axes[3 * (i // 2) :][:3], ("sr", "spl", "dts"), strict=True):
-            estimates = [each.metric(metric) for each in by_epsilon.values()]
-            assert_line(axes, i % 2, list(by_epsilon), Curve.of(estimates))
+            estimates = [row.metric(metric) for row in by_epsilon.values()]
+            assert_line(axes, i % 2, list(by_epsilon), Curve.from_intervals(estimates))
             thin = [np.asarray(line.get_ydata()) for line in axes.get_lines() if line.get_marker() == "None"]
-            seeds = np.transpose([each.seeds for each in estimates])
+            seeds = np.transpose([estimate.seeds for estimate in estimates])
             np.testing.assert_allclose(thin[3 * (i % 2) : 3 * (i % 2) + 3], seeds)
     assert [axes.get_ylabel() for axes in figure.axes[:3]] == ["SR (%)", "SPL (%)", "DTS (m)"]
     assert keys(figure) == ["shift 0", "shift 1", "one training seed"]
@@ -208,7 +218,7 @@ def test_equal_data_gives_equal_bytes(name, tmp_path):
     save_figure(DRAWINGS[name](), paths[2])
     assert len({path.read_bytes() for path in paths}) == 1
     with Image.open(io.BytesIO(paths[0].read_bytes())) as png:
-        assert png.width == WIDTH * DPI
+        assert png.width == FIGURE_WIDTH * FIGURE_DPI
         assert not set(png.info) - {"dpi"}  # no text
 
 
@@ -218,5 +228,5 @@ def test_all_text_is_inside_the_figure(name):
     box = figure.get_tightbbox()  # inches
     assert box.x0 >= 0
     assert box.y0 >= 0
-    assert box.x1 <= WIDTH
+    assert box.x1 <= FIGURE_WIDTH
     assert box.y1 <= figure.get_figheight()

@@ -8,9 +8,8 @@ from scipy.stats import mannwhitneyu
 from support.intervals import around, bounds, left_out
 from support.study_results import episodes_in
 
-from jaxnav.study.curves import Curve
-from jaxnav.study.gap_statistics import auc_by_step, mean_by_step, weighted_auc
-from jaxnav.study.tracking import FROZEN, UPDATED, GapTraces
+from jaxnav.study.gap_traces import FROZEN, UPDATED, GapTraces, auc_by_step, mean_by_step, weighted_auc
+from jaxnav.study.records import Curve
 
 # AUC
 
@@ -49,39 +48,41 @@ def traces_of(gap, scene, room=None, names=None, running=None) -> GapTraces:
 
 def first_step(curve: Curve) -> tuple[float, float, float]:
     """Return mean, low and high at step 0."""
-    return bounds(curve.line(0, UPDATED).at(0))
+    return bounds(curve.select(0, UPDATED).interval_at(0))
 
 
 def plain_auc(shifted: GapTraces, unshifted: GapTraces, step: int, scene: int | None, run: int | None) -> float:
     """Return the AUC at a step without a scene and a run."""
     sides = []
     for side in (shifted, unshifted):
-        left = (
+        remains = (
             [f"room{scene:02}" != side.episodes.scenes[i] for i in side.episodes.scene] if scene is not None else True
         )
         runs = (np.arange(len(side.running)) != run)[:, None]
-        sides.append(side.gap[0, UPDATED, ..., step][side.running[..., step] & left & runs])
+        sides.append(side.gap[0, UPDATED, ..., step][side.running[..., step] & remains & runs])
     return mannwhitneyu(*sides).statistic / np.prod([len(side) for side in sides])
 
 
 def test_the_interval_is_that_of_a_plain_loop():
     # Six scenes in other orders, with more episodes at one shift, of which some end.
     draw, runs, scenes = np.random.default_rng(2), 3, 6
-    here, there = np.repeat(np.arange(scenes), 4), np.tile(np.arange(scenes), 5)
-    unshifted = traces_of(draw.integers(0, 9, (runs, 24, 2)) / 10, here, running=draw.random((runs, 24, 2)) < 0.8)
+    unshifted_scene, shifted_scene = np.repeat(np.arange(scenes), 4), np.tile(np.arange(scenes), 5)
+    unshifted = traces_of(
+        draw.integers(0, 9, (runs, 24, 2)) / 10, unshifted_scene, running=draw.random((runs, 24, 2)) < 0.8
+    )
     names = unshifted.episodes.scenes[::-1]
-    shifted = traces_of(draw.integers(2, 9, (runs, 30, 2)) / 10, there, names=names)
+    shifted = traces_of(draw.integers(2, 9, (runs, 30, 2)) / 10, shifted_scene, names=names)
     course, means = auc_by_step(shifted, unshifted), mean_by_step(unshifted)
     for step in (0, 1):
         expected = left_out(lambda s, r, step=step: plain_auc(shifted, unshifted, step, s, r), scenes, runs)
-        assert bounds(course.line(0, UPDATED).at(step)) == pytest.approx(expected)
+        assert bounds(course.select(0, UPDATED).interval_at(step)) == pytest.approx(expected)
 
         def mean(scene, run, step=step):
-            kept = unshifted.running[..., step] & (here != scene) & (np.arange(runs) != run)[:, None]
-            return unshifted.gap[0, FROZEN, ..., step][kept].mean(dtype=float)
+            is_used = unshifted.running[..., step] & (unshifted_scene != scene) & (np.arange(runs) != run)[:, None]
+            return unshifted.gap[0, FROZEN, ..., step][is_used].mean(dtype=float)
 
         expected = left_out(mean, scenes, runs)
-        assert bounds(means.line(0, FROZEN).at(step)) == pytest.approx(expected, rel=1e-5)
+        assert bounds(means.select(0, FROZEN).interval_at(step)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_twins_are_left_out_together():
@@ -108,8 +109,8 @@ def test_room_types_keep_their_shares():
     # (2 / 5)^2 0.02 / 2 + (3 / 5)^2 0.01 / 3 = 0.0028 of the mean. In one stratum it would be 0.085 / 5.
     gaps = np.tile(np.array([0.1, 0.3, 0.6, 0.7, 0.8])[:, None], (2, 1, 1))
     for room, variance, degrees in (([1, 1, 0, 0, 0], 0.0028, 3), ([1, 1, 1, 1, 1], 0.085 / 5, 4)):
-        found = first_step(mean_by_step(traces_of(gaps, range(5), room=room)))
-        assert found == pytest.approx(around(0.5, variance, degrees), rel=1e-5)
+        result = first_step(mean_by_step(traces_of(gaps, range(5), room=room)))
+        assert result == pytest.approx(around(0.5, variance, degrees), rel=1e-5)
 
 
 def test_a_policy_is_left_out_of_both_shifts_at_once():

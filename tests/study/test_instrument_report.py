@@ -5,11 +5,11 @@ import dataclasses
 from support import study_results
 
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.study.instrument_report import MEASURES, Change, console_table, verdicts
+from jaxnav.study.records import MEASURES, MeasureChange, instrument_console_table, instrument_verdicts
 
 
 def test_the_table_has_a_column_for_each_shift():
-    table = console_table(study_results.instrument())
+    table = instrument_console_table(study_results.instrument())
     assert [column.header for column in table.columns] == ["Layout shift", "0", "1"]
     cells = [str(cell) for cell in table.columns[2].cells]
     assert cells[:3] == ["80", "1000", "11.00 [10.50, 11.50]"]
@@ -18,14 +18,14 @@ def test_the_table_has_a_column_for_each_shift():
 
 def test_the_verdicts_name_every_change():
     changes = (
-        Change("random_sr", 0.0, 0.5, Interval(100.0, 100.0, 100.0), holds=False),
-        Change("random_sr", 0.0, 1.0, Interval(0.0, 0.0, 0.0), holds=True),
+        MeasureChange("random_sr", 0.0, 0.5, Interval(100.0, 100.0, 100.0), holds=False),
+        MeasureChange("random_sr", 0.0, 1.0, Interval(0.0, 0.0, 0.0), holds=True),
     )
-    blind = (Change("without_argmax_sr", 0.0, 1.0, Interval(1.0, 0.5, 1.5), holds=True),)
-    categories = (Change("goal_detected", 0.0, 1.0, Interval(6.0, 5.5, 6.5), holds=False),)
+    blind = (MeasureChange("without_argmax_sr", 0.0, 1.0, Interval(1.0, 0.5, 1.5), holds=True),)
+    categories = (MeasureChange("goal_detected", 0.0, 1.0, Interval(6.0, 5.5, 6.5), holds=False),)
     report = dataclasses.replace(study_results.instrument(), matched=changes)
-    lines = verdicts(report)
-    assert verdicts(dataclasses.replace(report, categories=categories, without=blind)) == [
+    lines = instrument_verdicts(report)
+    assert instrument_verdicts(dataclasses.replace(report, categories=categories, without=blind)) == [
         *lines[:3],
         "Categories matched (change at most 5 points in the mean over categories)?",
         "  NO   Goal detected where it is in view (%), shift 1: 6.0 [5.5, 6.5] points",

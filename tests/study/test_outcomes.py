@@ -7,10 +7,10 @@ from support.intervals import around, bounds
 from support.study_results import episodes_in
 
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.grid import Outcome
+from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.study.outcomes import TrialOutcomes, mean_weight
-from jaxnav.study.trials import Trial
+from jaxnav.study.measure import TrialOutcomes, mean_removal_weight
+from jaxnav.study.records import Trial
 
 #: Four episodes of two seeds; L* = 2, so that success after 4 actions has SPL 0.5.
 FEW = [
@@ -32,7 +32,7 @@ SIX = [0, 0, 1, 1, 0, 1]
 APARTMENTS = ("val-apartment-00-0", "val-apartment-00-1", "val-apartment-01-0", "val-apartment-02-0")
 
 
-def outcome(success, length=LENGTH, weight=WEIGHT) -> Outcome:
+def outcome(success, length=LENGTH, weight=WEIGHT) -> EpisodeOutcome:
     """Return an outcome [S, E]."""
     leaves = (
         np.ones_like(length, bool),
@@ -43,7 +43,7 @@ def outcome(success, length=LENGTH, weight=WEIGHT) -> Outcome:
         length,
         weight,
     )
-    return Outcome(*map(jnp.asarray, leaves))
+    return EpisodeOutcome(*map(jnp.asarray, leaves))
 
 
 def outcomes(success, episodes) -> TrialOutcomes:
@@ -57,9 +57,9 @@ def few():
 
 def test_the_mean_weight_is_over_steps():
     # 0.5 in 2 steps and 0.1 in 10, of 2 x 20 steps: (1 + 1) / 40. Over episodes it would be 0.6 / 8.
-    assert mean_weight(outcome(SUCCESS[2])) == pytest.approx(0.05)
+    assert mean_removal_weight(outcome(SUCCESS[2])) == pytest.approx(0.05)
     one = outcome(SUCCESS[2])
-    assert mean_weight(one._replace(choices=np.zeros_like(one.choices))) == 0.0
+    assert mean_removal_weight(one._replace(choices=np.zeros_like(one.choices))) == 0.0
 
 
 def test_success_of_a_trial(few):
@@ -67,7 +67,7 @@ def test_success_of_a_trial(few):
 
 
 def test_rows_hold_metrics_and_differences(few):
-    baseline, layout, stde, other = few.rows("evidence")
+    baseline, layout, stde, other = few.trial_rows("evidence")
     assert (stde.trial, stde.gap) == (FEW[2], "evidence")
     assert stde.mean_weight == pytest.approx(0.05)
     assert layout.sr.mean == 87.5
@@ -91,15 +91,15 @@ def test_rows_hold_metrics_and_differences(few):
 
 def test_equal_results_have_equal_intervals():
     equal = outcomes([SUCCESS[0], SUCCESS[1], SUCCESS[1]], episodes_in([0, 1, 2, 3], best_length=2))
-    _, layout, stde = equal.rows("novelty")
+    _, layout, stde = equal.trial_rows("novelty")
     assert stde.sr == layout.sr
-    assert stde.sr.bounded
+    assert stde.sr.has_bounds
     assert stde.difference is not None
     assert stde.difference.sr == Interval(0.0, 0.0, 0.0, 0.0, (0.0, 0.0))
 
 
 def test_variants_of_a_network_are_paired_and_those_trained_apart_are_not(few):
-    _, layout, stde, _ = few.rows("novelty")
+    _, layout, stde, _ = few.trial_rows("novelty")
     # sTDE less + w: 0, 100, 0, 0 points in the first run, 0, 0, 0, -100 in the second, so 25 and -25. By run
     # 1250 / 2 = 625; by scene 0, 50, 0 and -50, 5000 / 3 / 4 = 417; what is left is 25 or -25 in all eight,
     # 8 x 625 / 3 / 8 = 208. In all 417 + 625 - 208 = 833; 833^2 / (417^2 / 3 + 625^2 / 1 + 208^2 / 3) = 1.51 degrees of
@@ -117,7 +117,7 @@ def interval_of(success, episodes: EpisodeList) -> Interval:
     """Return the SR of runs that act twice in every episode."""
     length = np.full((2, len(episodes.scene)), 2)
     trials = TrialOutcomes({FEW[0]: outcome(success, length, np.zeros(length.shape, np.float32))}, episodes)
-    (row,) = trials.rows("novelty")
+    (row,) = trials.trial_rows("novelty")
     return row.sr
 
 
@@ -154,12 +154,12 @@ def test_runs_that_disagree_widen_the_interval():
 
 def test_effects_are_gains_by_scene_and_run():
     episodes = episodes_in([2, 0, 2, 0], room=[1, 0, 0], best_length=2)
-    effects = outcomes(SUCCESS, episodes).effects(FEW[2], FEW[1])
+    effects = outcomes(SUCCESS, episodes).scene_effects(FEW[2], FEW[1])
     # sTDE less + w: the second episode in the first run, and -1 at the fourth in the second; both are in scene 0.
-    found = dict(zip(effects.scenes, zip(effects.rooms, effects.episodes, effects.gain.T, strict=True), strict=True))
+    gains = dict(zip(effects.scenes, zip(effects.rooms, effects.episodes, effects.gain.T, strict=True), strict=True))
     for name, room, gain in (("room00", "kitchen", [100, -100]), ("room02", "bedroom", [0, 0])):
-        assert found[name][:2] == (room, 2)
-        assert found[name][2].tolist() == gain
+        assert gains[name][:2] == (room, 2)
+        assert gains[name][2].tolist() == gain
     # The other scene was not drawn.
-    assert found.pop("room01", ("", 0))[1] == 0
-    assert len(found) == 2
+    assert gains.pop("room01", ("", 0))[1] == 0
+    assert len(gains) == 2

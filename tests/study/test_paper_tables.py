@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from jaxnav.errors import InputError
-from jaxnav.study.compare_report import Line, Scores
-from jaxnav.study.paper_numbers import TABLE_1, TABLE_2_AI2THOR, TABLE_2_ROBOTHOR, TABLE_3
-from jaxnav.study.paper_tables import write_paper_tables
+from jaxnav.study.paper_tables import TABLE_1, TABLE_2_AI2THOR, TABLE_2_ROBOTHOR, TABLE_3, write_paper_tables
+from jaxnav.study.records import AgentScores, RunScores
 from jaxnav.study.results import write_record
 
 ROOT = Path(__file__).parents[2]
@@ -19,16 +18,16 @@ def scores(**success):
     """Results of three seeds in eight scenes of ten episodes: successes by scene, of all seeds or of each."""
     wiggle = np.array([[0.0, 0.1, 0.2, 0.3, 0.3, 0.2, 0.1, 0.0]] * 3)  # no scene is like another
     lines = [
-        Line(variant, "argmax", *(np.reshape(level, (-1, 1)) * share + wiggle for share in (1.0, 0.5, 0.1)))
+        AgentScores(variant, "argmax", *(np.reshape(level, (-1, 1)) * share + wiggle for share in (1.0, 0.5, 0.1)))
         for variant, level in success.items()
     ]
-    return Scores(SCENES, ("kitchen",) * 8, np.full(8, 10), tuple(lines))
+    return RunScores(SCENES, ("kitchen",) * 8, np.full(8, 10), tuple(lines))
 
 
 def page(tmp_path, **results):
     """The page, and its table of orderings, of results by name with _ for -."""
-    for name, each in results.items():
-        write_record(tmp_path / "val" / f"{name.replace('_', '-')}.json", {}, each)
+    for name, result in results.items():
+        write_record(tmp_path / "val" / f"{name.replace('_', '-')}.json", {}, result)
     write_paper_tables(tmp_path / "page.md", tmp_path / "val")
     text = (tmp_path / "page.md").read_text()
     rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith(("| rooms: ", "| gains"))]

@@ -4,18 +4,18 @@ import pytest
 from support import study_results
 
 from jaxnav.causal import Form
-from jaxnav.study.trials import NO_THRESHOLD, Trial
+from jaxnav.study.records import ZERO_THRESHOLD, Trial
 
-PAPER = Trial("stde", "argmax", *NO_THRESHOLD)
+PAPER = Trial("stde", "argmax", *ZERO_THRESHOLD)
 
 
 def test_a_row_is_picked_by_its_trial_and_else_is_the_main_one():
     condition = study_results.condition(1.0)
     row = condition.row(PAPER)
     assert (row.gap, row.trial) == ("novelty", PAPER)
-    assert condition.effect(PAPER).mean == 5.0  # best actions: 100 more when sampled
-    assert condition.effect(PAPER, "evidence").mean == 4.0
-    assert condition.effect(Trial("layout", "sample")).mean == 101.0
+    assert condition.sr_difference(PAPER).mean == 5.0  # best actions: 100 more when sampled
+    assert condition.sr_difference(PAPER, "evidence").mean == 4.0
+    assert condition.sr_difference(Trial("layout", "sample")).mean == 101.0
     assert condition.row(Trial("stde", "argmax", 0.0, "paper", "noise")).trial.control == "noise"
 
 
@@ -26,20 +26,20 @@ def test_a_constant_is_picked_whatever_its_weight():
 
 def test_what_is_missing_is_a_key_error():
     coin = study_results.condition(1.0, "coin")
-    assert not coin.has(Trial("baseline"))
-    assert coin.has(Trial("layout"))
+    assert not coin.has_row(Trial("baseline"))
+    assert coin.has_row(Trial("layout"))
     with pytest.raises(KeyError, match=r"no row of Trial.*baseline"):
         coin.row(Trial("baseline"))
     with pytest.raises(KeyError, match="compared with nothing"):
-        study_results.condition(1.0).effect(Trial("baseline"))
+        study_results.condition(1.0).sr_difference(Trial("baseline"))
 
 
 def test_a_sweep_holds_every_epsilon_of_its_form():
     condition = study_results.condition(1.0)
     gains: dict[Form, float] = {"residual": 2.0, "paper": 5.0}
     for form, gain in gains.items():
-        sweep = condition.sweep(form)
+        sweep = condition.rows_by_epsilon(form)
         assert list(sweep) == [0.0, 0.5, 1.0]
         for epsilon, row in sweep.items():
             assert row.trial == Trial("stde", "argmax", epsilon, form)
-            assert condition.effect(row.trial).mean == gain
+            assert condition.sr_difference(row.trial).mean == gain

@@ -1,4 +1,4 @@
-"""Files that something has happened to."""
+"""Damage to files, drawn at random."""
 
 import random
 from collections.abc import Callable
@@ -6,8 +6,8 @@ from pathlib import Path
 
 
 def _flipped(data: bytes, draw: random.Random) -> bytes:
-    at = draw.randrange(len(data))
-    return data[:at] + bytes([data[at] ^ 1 << draw.randrange(8)]) + data[at + 1 :]
+    index = draw.randrange(len(data))
+    return data[:index] + bytes([data[index] ^ 1 << draw.randrange(8)]) + data[index + 1 :]
 
 
 def _cut(data: bytes, draw: random.Random) -> bytes:
@@ -32,9 +32,9 @@ def _line_lost(data: bytes, draw: random.Random) -> bytes:
 
 
 def _digit_changed(data: bytes, draw: random.Random) -> bytes:
-    digits = [at for at, byte in enumerate(data) if chr(byte).isdigit() and byte < 128] or range(len(data))
-    at = draw.choice(digits)
-    return data[:at] + str(draw.randrange(10)).encode() + data[at + 1 :]
+    digit_indices = [index for index, byte in enumerate(data) if byte in b"0123456789"]
+    index = draw.choice(digit_indices or range(len(data)))
+    return data[:index] + str(draw.randrange(10)).encode() + data[index + 1 :]
 
 
 KINDS: tuple[Callable[[bytes, random.Random], bytes], ...] = (

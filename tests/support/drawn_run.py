@@ -6,23 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.objectnav import NUM_PRIORS
-from jaxnav.gaps import Signs
-from jaxnav.layout import SETTINGS
-from jaxnav.policies.methods import Knowledge
+from jaxnav.gaps import CooccurrenceEvidence
+from jaxnav.layout import ESTIMATORS
+from jaxnav.policies.method import Knowledge
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Run, claim
-from jaxnav.runs.exports import export_policy
-from jaxnav.runs.overlay import apply_yaml
-from jaxnav.runs.policies import POLICIES
+from jaxnav.runs.config_files import apply_yaml
+from jaxnav.runs.policies import POLICIES_DIR, export_policy
+from jaxnav.runs.run import Run, claim_run_dir
 from jaxnav.scenes.task import DONE
-from jaxnav.training.calibration import layout_priors
-from jaxnav.training.exchange import chances
-from jaxnav.training.exploration import Exploration
+from jaxnav.training.calibration import Exploration, co_visibility_from_counts, layout_priors
 from support.commands import SEEDS, write_config
 from support.tiny_world import lively
 
 #: With weak prior rows a view changes the belief much: large gaps, which sTDE acts on.
-SETTING = dataclasses.replace(SETTINGS["calibrated"], strength=1.0)
+SETTING = dataclasses.replace(ESTIMATORS["calibrated"], strength=1.0)
 
 
 def tiny_config(folder, **changes) -> RunConfig:
@@ -36,19 +33,19 @@ def draw_run(config) -> Run:
 
     Those of a few updates never choose Done, so that all their episodes are alike.
     """
-    claim(config)
+    claim_run_dir(config)
     categories = len(config.task.categories)
     counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, categories, categories)).astype(np.float32)
     counts[:, np.arange(categories), np.arange(categories)] = 9  # no pair is seen more often than each of the two
     explored = Exploration(jnp.asarray(counts), jnp.int32(1280), jnp.int32(600))
     odds = np.triu(np.random.default_rng(1).normal(size=counts.shape), 1).astype(np.float32)
-    signs = Signs(jnp.asarray(odds), chances(explored.counts))
-    knowledge = Knowledge(layout_priors(explored.counts, SETTING), signs=signs)
+    signs = CooccurrenceEvidence(jnp.asarray(odds), co_visibility_from_counts(explored.counts))
+    knowledge = Knowledge(layout_priors(explored.counts, SETTING), cooccurrence=signs)
     for number, arm in enumerate(config.arms):
         for seed in range(SEEDS):
             params = lively(SEEDS * number + seed, config.policy_spec(categories))
             params["actor"]["bias"] = params["actor"]["bias"].at[DONE].set(-2.0)  # episodes of several steps
             setting = SETTING if arm == "layout" else None
-            folder = config.run_dir / POLICIES / f"{arm}-{seed}"
+            folder = config.run_dir / POLICIES_DIR / f"{arm}-{seed}"
             export_policy(folder, config, params, knowledge, setting, explored)
     return Run(config)

@@ -16,11 +16,9 @@ from pathlib import Path
 import yaml
 
 from jaxnav.__main__ import main
-from jaxnav.cli.console import exit_code
-from jaxnav.cli.options import parse
-from jaxnav.runs.check import check
-from jaxnav.runs.config import RunConfig
-from jaxnav.runs.packaged import WEIGHTS
+from jaxnav.cli.console import parse_config, run_command
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.policies import PACKAGED_POLICIES
 from jaxnav.runs.policy import load_policy
 from jaxnav.scenes.files.scene_file import write_scenes
 from support import fuzz_importers
@@ -45,30 +43,30 @@ def _scene_file(folder: Path, draw: random.Random) -> int:
 
 
 def _export(folder: Path, draw: random.Random) -> int:
-    export = shutil.copytree(WEIGHTS / "rooms-org", folder / "export")
+    export = shutil.copytree(PACKAGED_POLICIES / "rooms-org", folder / "export")
     if draw.random() < 0.3:
         file = draw.choice([export / "params.safetensors", export / "policy.json"])
         file.write_bytes(damaged(file.read_bytes(), draw))
     else:
         policy = export / "policy.json"
         policy.write_text(json.dumps(mutated(json.loads(policy.read_text()), draw)))
-    return exit_code(lambda _: load_policy(export))
+    return run_command(lambda _: load_policy(export))
 
 
 def _config(folder: Path, draw: random.Random) -> int:
     path = folder / "run.yaml"
     plain = json.loads(json.dumps(dataclasses.asdict(RunConfig()), default=str))
-    chosen = {name: plain[name] for name in draw.sample(sorted(plain), 8)}
-    text = yaml.safe_dump(mutated(chosen, draw), allow_unicode=draw.random() < 0.5).encode("utf-8", "replace")
+    fields = {name: plain[name] for name in draw.sample(sorted(plain), 8)}
+    text = yaml.safe_dump(mutated(fields, draw), allow_unicode=draw.random() < 0.5).encode("utf-8", "replace")
     path.write_bytes(damaged(text, draw) if draw.random() < 0.3 else text)
-    return exit_code(lambda _: check(parse(RunConfig(), ["--config", str(path)], "jaxnav train", "")))
+    return run_command(lambda _: check_config(parse_config(RunConfig(), ["--config", str(path)], "jaxnav train", "")))
 
 
 def _command_line(folder: Path, draw: random.Random) -> int:
     values = [str(value) for value in NASTY if value != "\ud800"]
     words = [draw.choice([*_WORDS, *_EVERYWHERE, *values]) for _ in range(draw.randrange(6))]
     if draw.random() < 0.5:
-        return exit_code(lambda _: check(parse(RunConfig(), words, "jaxnav train", "")))
+        return run_command(lambda _: check_config(parse_config(RunConfig(), words, "jaxnav train", "")))
     with contextlib.chdir(folder):
         return main([draw.choice([*_READING, *_WORDS]), *words])
 
@@ -105,7 +103,7 @@ def fuzz(kind: str, folder: Path, runs: int, seed: int) -> tuple[collections.Cou
 
 
 def _alone(kind: str, runs: int, seed: int) -> dict[str, object]:
-    """Return what `fuzz` does, and the most memory in MiB that this process ever held."""
+    """Return the results of `fuzz`, and the peak memory of this process in MiB."""
     with tempfile.TemporaryDirectory() as folder:
         codes, slowest = fuzz(kind, Path(folder), runs, seed)
     (peak,) = (line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)

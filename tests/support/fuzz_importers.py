@@ -92,8 +92,8 @@ def damaged(data: bytes, draw: random.Random) -> bytes:
     """Return bytes without their end, or with one changed."""
     if draw.random() < 0.5:
         return data[: draw.randrange(len(data) + 1)]
-    at = draw.randrange(len(data))
-    return data[:at] + bytes([draw.randrange(256)]) + data[at + 1 :]
+    index = draw.randrange(len(data))
+    return data[:index] + bytes([draw.randrange(256)]) + data[index + 1 :]
 
 
 def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, float]:
@@ -121,8 +121,8 @@ def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, f
                 code = CRASHED
             slowest = max(slowest, time.perf_counter() - began)
             codes[code] += 1
-            left = [path.name for path in target.parent.iterdir()] if target.parent.exists() else []
-            assert left == ([target.name] if code == 0 else []), (code, left)
+            file_names = [path.name for path in target.parent.iterdir()] if target.parent.exists() else []
+            assert file_names == ([target.name] if code == 0 else []), (code, file_names)
             if code == 0:
                 read_scenes(target)
     return codes, slowest

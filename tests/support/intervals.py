@@ -33,16 +33,27 @@ def left_out(statistic: Statistic, scenes: int, seeds: int, arms: int = 1) -> tu
       seeds: training runs of each arm, numbered arm after arm.
       arms: trained apart.
     """
-    whole, runs = statistic(None, None), range(arms * seeds)
-    alone = {scene: statistic(scene, None) for scene in range(scenes)}
-    trained = {run: statistic(None, run) for run in runs}
-    crossed = [statistic(scene, run) - alone[scene] - trained[run] + whole for scene in range(scenes) for run in runs]
-    few, many = (scenes - 1) / scenes, (seeds - 1) / seeds
-    by_scene = few * sum((value - whole) ** 2 for value in alone.values())
-    by_run = many * sum((value - whole) ** 2 for value in trained.values())
-    both = few * many * sum(value**2 for value in crossed)
-    variance = max(by_scene + by_run - both, by_scene, by_run)
-    of_scenes, of_runs = scenes - 1, arms * (seeds - 1)
-    spread = by_scene**2 / of_scenes + by_run**2 / of_runs + both**2 / (of_scenes * of_runs)
-    degrees = np.clip(variance**2 / spread, min(of_scenes, of_runs), of_scenes + of_runs)
+    runs = range(arms * seeds)
+    whole = statistic(None, None)
+
+    # Sums of squares of the deviations: by scene, by run, and of what remains for both.
+    without_scene = {scene: statistic(scene, None) for scene in range(scenes)}
+    without_run = {run: statistic(None, run) for run in runs}
+    crossed_squares = 0.0
+    for scene in range(scenes):
+        for run in runs:
+            deviation = statistic(scene, run) - without_scene[scene] - without_run[run] + whole
+            crossed_squares += deviation**2
+    scene_share = (scenes - 1) / scenes
+    run_share = (seeds - 1) / seeds
+    by_scene = scene_share * sum((value - whole) ** 2 for value in without_scene.values())
+    by_run = run_share * sum((value - whole) ** 2 for value in without_run.values())
+    crossed = scene_share * run_share * crossed_squares
+    variance = max(by_scene + by_run - crossed, by_scene, by_run)
+
+    # Degrees of freedom by Satterthwaite.
+    scene_degrees = scenes - 1
+    run_degrees = arms * (seeds - 1)
+    spread = by_scene**2 / scene_degrees + by_run**2 / run_degrees + crossed**2 / (scene_degrees * run_degrees)
+    degrees = np.clip(variance**2 / spread, min(scene_degrees, run_degrees), scene_degrees + run_degrees)
     return around(whole, variance, float(degrees))

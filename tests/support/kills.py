@@ -39,18 +39,17 @@ _STARTED: dict[str, Callable[[Path, dict[str, object]], list[subprocess.Popen]]]
 }
 
 
-def kept(folder: Path) -> dict[str, bytes]:
-    """Return the files of a command that do not tell the time or where they are."""
-    those = ("metrics.jsonl", "reach.json", "params.safetensors", "study.md")
+def reproducible_files(folder: Path) -> dict[str, bytes]:
+    """Return the files of a command that hold neither times nor paths."""
+    endings = ("metrics.jsonl", "reach.json", "params.safetensors", "study.md")
     files = contents(folder)
-    return {name: files[name] for name in files if name.endswith(those) or name.startswith("results")}
+    return {name: files[name] for name in files if name.endswith(endings) or name.startswith("results")}
 
 
 def killed(processes: list[subprocess.Popen], moment: float, draw: random.Random) -> bool:
-    """Return whether any process was there to be killed.
+    """Kill one of the processes, or all, at a moment, and return whether any still ran.
 
-    One of them is killed, or all, at a moment. One of two that is left alone may refuse to go on; nothing else may be
-    refused.
+    One of two that lost the other may refuse to go on; nothing else may be refused.
     """
     while time.monotonic() < moment and any(process.poll() is None for process in processes):
         time.sleep(0.001)
@@ -71,36 +70,52 @@ def finish(processes: list[subprocess.Popen]) -> None:
 
 def main(kind: str, count: int, seed: int) -> bool:
     """Kill so often, print what becomes of it, and return whether all that ended are equal."""
-    draw, start_all = random.Random(seed), _STARTED[kind]
+    draw = random.Random(seed)
+    start_all = _STARTED[kind]
+    num_kills = 0
+    num_after_checkpoint = 0
+    num_runs = 0
+    all_equal = True
     with tempfile.TemporaryDirectory() as temporary:
-        folder, kills, begun, runs, same = Path(temporary), 0, 0, 0, True
+        folder = Path(temporary)
         cache = {"JAX_COMPILATION_CACHE_DIR": folder / "cache", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0}
 
-        def place(name: str) -> Path:
+        def make_folder(name: str) -> Path:
             (folder / name).mkdir()
             return folder / name
 
+        # Twice without kills: the second run, with compiled programs, is timed.
         seconds = 0.0
-        for alone in ("compiled", "whole"):
+        for name in ("compiled", "whole"):
             began = time.monotonic()
-            finish(start_all(place(alone), cache))
+            finish(start_all(make_folder(name), cache))
             seconds = time.monotonic() - began
-        whole = kept(folder / "whole")
-        assert whole
-        assert kept(folder / "compiled") == whole
-        while kills < count:
-            runs += 1
-            here = place(str(runs))
-            while kills < count and killed(start_all(here, cache), time.monotonic() + draw.uniform(0, seconds), draw):
-                kills, saved = kills + 1, [path.name for path in here.rglob("checkpoints/*") if path.name.isdigit()]
-                begun += bool(saved)
-                print(f"{kind}: kill {kills} in run {runs}, with checkpoints {saved}", flush=True)
-            finish(start_all(here, cache))  # what is finished ends at once
-            equal = kept(here) == whole
-            same &= equal
-            print(f"{kind}: run {runs} ended {'equal' if equal else 'OTHERWISE'}", flush=True)
-    print(f"{kind}: {kills} kills with seed {seed} in {runs} runs, {begun} after a checkpoint; all equal: {same}")
-    return same
+        expected = reproducible_files(folder / "whole")
+        assert expected
+        assert reproducible_files(folder / "compiled") == expected
+
+        while num_kills < count:
+            # Kill and start again, until a start comes to its end.
+            num_runs += 1
+            run_folder = make_folder(str(num_runs))
+            while num_kills < count:
+                processes = start_all(run_folder, cache)
+                if not killed(processes, time.monotonic() + draw.uniform(0, seconds), draw):
+                    break
+                num_kills += 1
+                saved = [path.name for path in run_folder.rglob("checkpoints/*") if path.name.isdigit()]
+                num_after_checkpoint += bool(saved)
+                print(f"{kind}: kill {num_kills} in run {num_runs}, with checkpoints {saved}", flush=True)
+            finish(start_all(run_folder, cache))  # a finished run ends at once
+
+            is_equal = reproducible_files(run_folder) == expected
+            all_equal &= is_equal
+            print(f"{kind}: run {num_runs} ended {'equal' if is_equal else 'OTHERWISE'}", flush=True)
+    print(
+        f"{kind}: {num_kills} kills with seed {seed} in {num_runs} runs, {num_after_checkpoint} after a checkpoint; "
+        f"all equal: {all_equal}"
+    )
+    return all_equal
 
 
 if __name__ == "__main__":

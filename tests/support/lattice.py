@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.scene import CELL_SIZE, Scene
 
 Points = set[tuple[float, float]]
 
@@ -22,12 +22,16 @@ class Parts(NamedTuple):
 
 def points_of(scene: Scene, mask: np.ndarray) -> Points:
     """Return the points (x, z) of a mask's cells."""
-    return {(scene.origin[0] + CELL * ix, scene.origin[1] + CELL * iz) for iz, ix in np.argwhere(mask).tolist()}
+    return {
+        (scene.origin[0] + CELL_SIZE * ix, scene.origin[1] + CELL_SIZE * iz) for iz, ix in np.argwhere(mask).tolist()
+    }
 
 
 def block(x0: float, x1: float, z0: float, z1: float) -> Points:
     """Return the lattice points (x, z) of a rectangle."""
-    return {(x, z) for x in np.arange(x0, x1 + 0.1, CELL).tolist() for z in np.arange(z0, z1 + 0.1, CELL).tolist()}
+    return {
+        (x, z) for x in np.arange(x0, x1 + 0.1, CELL_SIZE).tolist() for z in np.arange(z0, z1 + 0.1, CELL_SIZE).tolist()
+    }
 
 
 def parts_of(mask: np.ndarray, neighbours: np.ndarray) -> Parts:

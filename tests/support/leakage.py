@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.objectnav import ObjectNav
-from jaxnav.env.types import EnvParams, Observation, State
+from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation, State
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE
 from jaxnav.scenes.task import ROTATE_LEFT, ROTATE_RIGHT
@@ -81,7 +80,7 @@ def step_into(env: ObjectNav, state: State, params: EnvParams) -> dict[str, Obse
 
     The step is a turn to the right, from the heading to the left.
     """
-    before = state.replace(pose=env.after(state.pose, jnp.int32(ROTATE_LEFT), params))
+    before = state.replace(pose=env.next_pose(state.pose, jnp.int32(ROTATE_LEFT), params))
     observation, _, _, _, _, info = env.step(jax.random.key(0), before, jnp.int32(ROTATE_RIGHT), params)
     return {"observation": observation, "final_observation": info["final_observation"]}
 
@@ -94,7 +93,7 @@ def find_leaks(env: ObjectNav, params: EnvParams, bank: Bank) -> Leaks:
       bank: the scenes of `params`, all poses of which are visited.
     """
     show = jax.jit(jax.vmap(functools.partial(step_into, env), (0, None)))
-    succeed = jax.jit(jax.vmap(env.succeeds, (0, None)))
+    succeed = jax.jit(jax.vmap(env.done_succeeds, (0, None)))
     leaks = Leaks(set(), [], int(env.task.is_goal().sum()))
     for goal in np.flatnonzero(env.task.is_goal()).tolist():
         states, possible = _states(bank, goal)

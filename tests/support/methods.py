@@ -8,7 +8,7 @@ from flax import nnx
 
 from jaxnav.numerics.product import Linear
 from jaxnav.policies.features import NUM_FEATURES
-from jaxnav.policies.methods import Experience, Method, Stage
+from jaxnav.policies.method import Experience, Method, Stage
 from jaxnav.policies.methods.org import ObjectRelations
 from jaxnav.scenes.task import NUM_ACTIONS, ROTATE_RIGHT
 
@@ -46,21 +46,21 @@ STEPWISE = Method(StepwiseRelations)
 
 @dataclasses.dataclass(frozen=True)
 class Counter:
-    """Count views, moves, and what was seen, headed and done."""
+    """Numbers of views and moves, and sums of headings and actions."""
 
     def init(self, knowledge):
         return {"views": jnp.int32(0), "moves": jnp.int32(0), "headings": jnp.int32(0), "actions": jnp.int32(0)}
 
-    def update(self, note, knowledge, percept):
+    def update(self, state, knowledge, percept):
         return {
-            "views": note["views"] + 1,
-            "moves": note["moves"] + percept.moved.astype(jnp.int32),
-            "headings": note["headings"] + percept.heading,
-            "actions": note["actions"] + percept.action,
+            "views": state["views"] + 1,
+            "moves": state["moves"] + percept.moved.astype(jnp.int32),
+            "headings": state["headings"] + percept.heading,
+            "actions": state["actions"] + percept.action,
         }
 
-    def read(self, note, knowledge, goal):
-        return jnp.stack([note["views"], note["moves"], goal]).astype(jnp.float32) / 10.0
+    def read(self, state, knowledge, goal):
+        return jnp.stack([state["views"], state["moves"], goal]).astype(jnp.float32) / 10.0
 
 
 class Reading(Experience):
@@ -76,11 +76,11 @@ class Reading(Experience):
 COUNTING = Method(Reading, tracker=Counter())
 
 #: First the critic alone, then everything.
-STAGED = Method(ObjectRelations, stages=(Stage(0.25, rates=lambda path: path[0] == "critic"), Stage(0.75)))
+STAGED = Method(ObjectRelations, stages=(Stage(0.25, lr_scale_by_path=lambda path: path[0] == "critic"), Stage(0.75)))
 
 
 def squared_values(replayed):
-    penalty = jnp.square(replayed.decisions.value).mean()
+    penalty = jnp.square(replayed.factual.value).mean()
     return 3.0 * penalty, {"squared_values": penalty}
 
 
@@ -99,7 +99,7 @@ class Habit:
     def decide(self, policy, pathways, memory):
         done = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
         bias = memory.fast + self.rate * done
-        decision = policy.decide_plainly(pathways, memory)
+        decision = policy.decide_without_adaptation(pathways, memory)
         return decision._replace(logits=decision.logits + bias, fast=bias)
 
 
@@ -113,11 +113,11 @@ class TwoChoices:
     num_choices: int = 2
     interval: int = 1
 
-    def due(self, note):
+    def is_decision_step(self, state):
         return None
 
-    def act(self, choice, note, knowledge):
-        return 2 * (note["views"] % 3) + choice, note
+    def act(self, choice, state, knowledge):
+        return 2 * (state["views"] % 3) + choice, state
 
 
 CONTROLLED = Method(Reading, tracker=Counter(), control=TwoChoices())
@@ -129,11 +129,11 @@ class EverySecond(TwoChoices):
 
     interval: int = 2
 
-    def due(self, note):
-        return note["views"] % 2 == 1
+    def is_decision_step(self, state):
+        return state["views"] % 2 == 1
 
-    def act(self, choice, note, knowledge):
-        return jnp.where(self.due(note), choice, 1), note
+    def act(self, choice, state, knowledge):
+        return jnp.where(self.is_decision_step(state), choice, 1), state
 
 
 PATIENT = Method(Reading, tracker=Counter(), control=EverySecond())
@@ -156,10 +156,10 @@ class Reader:
     def init(self, knowledge):
         return jnp.int32(0)
 
-    def update(self, note, knowledge, percept):
-        return note + 1
+    def update(self, state, knowledge, percept):
+        return state + 1
 
-    def read(self, note, knowledge, goal):
+    def read(self, state, knowledge, goal):
         return knowledge.method["table"][goal, :2]
 
 
@@ -205,18 +205,18 @@ class NotFinite(BatchMean):
 
 @dataclasses.dataclass(frozen=True)
 class Growing(Counter):
-    """Return a note of another type than the first."""
+    """Return a state of another type than the first."""
 
-    def update(self, note, knowledge, percept):
-        return {**super().update(note, knowledge, percept), "views": note["views"].astype(jnp.float32) + 1.0}
+    def update(self, state, knowledge, percept):
+        return {**super().update(state, knowledge, percept), "views": state["views"].astype(jnp.float32) + 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class TooMany(TwoChoices):
     """Turn a choice into an action that there is not."""
 
-    def act(self, choice, note, knowledge):
-        return NUM_ACTIONS + choice * ROTATE_RIGHT, note
+    def act(self, choice, state, knowledge):
+        return NUM_ACTIONS + choice * ROTATE_RIGHT, state
 
 
 BROKEN = {

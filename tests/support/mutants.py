@@ -1,4 +1,4 @@
-"""Mutants of the modules that hold the science, and whether their fast tests notice.
+"""Mutants of the modules that hold the science: do their fast tests notice them?
 
 `python -m support.mutants [COUNT [SEED]]` in `tests` draws so many of all mutants, runs the tests of each one's module
 in a copy of the project, and prints the survivors and the share that was killed. It ends with code 1 below `LEAST`.
@@ -32,9 +32,24 @@ TESTS = {
     "numerics/recurrence.py": "numerics/test_recurrence.py",
     "numerics/rounding.py": "numerics/test_rounding.py",
     "numerics/sparse.py": "numerics/test_sparse.py",
-    "training/loss.py": "training/test_loss.py training/test_collect.py",
-    "evaluation/metrics.py": "evaluation/test_episodes.py",
-    "evaluation/statistics.py": "evaluation/test_statistics.py evaluation/test_interval.py",
+    "training/ppo.py": "training/test_loss.py training/test_collect.py",
+    "evaluation/grid.py": "evaluation/test_episodes.py",
+    "evaluation/statistics.py": (
+        "evaluation/test_statistics.py evaluation/test_interval.py "
+        "evaluation/test_shared_design.py evaluation/test_ranks.py"
+    ),
+}
+#: The functions that are changed, for modules of which only a part is science.
+FUNCTIONS = {
+    "training/ppo.py": {
+        "compute_advantages",
+        "replay_rollout",
+        "_replay_in_parallel",
+        "_replay_step_by_step",
+        "ppo_loss",
+        "_distillation_loss",
+    },
+    "evaluation/grid.py": {"episode_metrics"},
 }
 OPERATORS: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.MatMult: ast.Add,
@@ -42,13 +57,13 @@ OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
 }  # fmt: skip
-#: What no test of behaviour is about: types, docstrings, messages.
+#: Nodes that no test of behaviour is about: types, docstrings, messages.
 SKIPPED = (ast.Import, ast.ImportFrom, ast.Raise, ast.Assert, ast.JoinedStr)
 SKIPPED_FIELDS = {"annotation", "returns", "decorator_list"}
 
 
 class Mutant(NamedTuple):
-    """Name a changed expression, with the whole module as it is then."""
+    """A changed expression, and the source of the whole module with it."""
 
     module: str
     line: int
@@ -61,11 +76,12 @@ class Mutant(NamedTuple):
 
 
 def variants(node: ast.AST) -> list[ast.expr]:
-    """Return what may stand in the place of an expression."""
+    """Return replacements of an expression."""
     match node:
+        case ast.BinOp(left, ast.Add() | ast.Sub() as operator, right):
+            return [ast.BinOp(left, OPERATORS[type(operator)](), right), left, right]
         case ast.BinOp(left, operator, right) if type(operator) in OPERATORS:
-            swapped = ast.BinOp(left, OPERATORS[type(operator)](), right)
-            return [swapped, left, right] if isinstance(operator, ast.Add | ast.Sub) else [swapped]
+            return [ast.BinOp(left, OPERATORS[type(operator)](), right)]
         case ast.BoolOp(operator, values):
             return [ast.BoolOp(OPERATORS[type(operator)](), values), *values]
         case ast.Compare(left, [operator, *others], right) if type(operator) in OPERATORS:
@@ -82,7 +98,7 @@ def variants(node: ast.AST) -> list[ast.expr]:
 
 
 def places(node: ast.AST) -> Iterator[tuple[Callable[[ast.AST], None], ast.AST]]:
-    """Yield all nodes below a node, and what puts another one there."""
+    """Yield all nodes below a node, each with a function that replaces it."""
     for name, value in ast.iter_fields(node):
         if name in SKIPPED_FIELDS:
             continue
@@ -99,12 +115,26 @@ def places(node: ast.AST) -> Iterator[tuple[Callable[[ast.AST], None], ast.AST]]
 def mutants_of(module: str) -> Iterator[Mutant]:
     """Yield all mutants of a module, a path in `jaxnav`."""
     tree = ast.parse((ROOT / "jaxnav" / module).read_text())
-    for put, node in list(places(tree)):
+    for put, node in list(places(_changed_part(module, tree))):
         for variant in variants(node):
             assert isinstance(node, ast.expr)
             put(variant)
             yield Mutant(module, node.lineno, ast.unparse(node), ast.unparse(variant), ast.unparse(tree))
             put(node)
+
+
+def _changed_part(module: str, tree: ast.Module) -> ast.Module:
+    """Return the functions of a module that `FUNCTIONS` names, else the whole module."""
+    if module not in FUNCTIONS:
+        return tree
+
+    functions = []
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and node.name in FUNCTIONS[module]:
+            functions.append(node)
+    if len(functions) < len(FUNCTIONS[module]):
+        raise ValueError(f"{module} lacks a function of {sorted(FUNCTIONS[module])}; bring the list up to date")
+    return ast.Module(functions, type_ignores=[])
 
 
 @contextlib.contextmanager
@@ -126,25 +156,14 @@ def passes(folder: Path, tests: str) -> bool:
         "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
-    tests_there = [str(folder / "tests" / name) for name in tests.split()]
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "--timeout",
-        "0",
-        *tests_there,
-    ]
+    options = ["-x", "-n", "0", "-p", "no:cacheprovider", "--timeout", "0"]
+    test_files = [str(folder / "tests" / name) for name in tests.split()]
+    command = [sys.executable, "-m", "pytest", *options, *test_files]
     try:
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=SECONDS)
+        process = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=SECONDS)
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode == 0
+    return process.returncode == 0
 
 
 def survives(folder: Path, module: str, source: str, tests: str) -> bool:
@@ -162,16 +181,17 @@ def main(count: int, seed: int) -> bool:
     """Draw mutants, print what becomes of them, and return whether enough were killed."""
     everything = [mutant for module in TESTS for mutant in mutants_of(module)]
     drawn = random.Random(seed).sample(everything, min(count, len(everything)))
-    killed, of = collections.Counter(), collections.Counter(mutant.module for mutant in drawn)
+    num_drawn = collections.Counter(mutant.module for mutant in drawn)
+    killed = collections.Counter()
     with project() as folder:
-        for module in of:
+        for module in num_drawn:
             if not passes(folder, TESTS[module]):
                 raise SystemExit(f"the tests of {module} fail without a mutant; mend them first")
         for mutant in drawn:
             alive = survives(folder, mutant.module, mutant.source, TESTS[mutant.module])
             killed[mutant.module] += not alive
             print("SURVIVED" if alive else "killed  ", mutant, flush=True)
-    for module, number in sorted(of.items()):
+    for module, number in sorted(num_drawn.items()):
         print(f"{module}: {killed[module]} of {number} killed")
     print(f"{killed.total()} of {len(drawn)} killed; there are {len(everything)} mutants in all")
     return killed.total() >= LEAST * len(drawn)

@@ -75,9 +75,8 @@ def mutated_text(draw: st.DrawFn, text: str) -> str:
 
 @st.composite
 def mutated_bytes(draw: st.DrawFn, content: bytes) -> bytes:
-    """Draw copies of bytes that are changed and cut off.
-
-    One is replaced, the end goes, and up to 4 are added.
-    """
-    at, end = draw(st.integers(0, len(content) - 1)), draw(st.integers(0, len(content)))
-    return content[:at] + bytes([draw(st.integers(0, 255))]) + content[at + 1 : end] + draw(st.binary(max_size=4))
+    """Draw copies of bytes of which one is replaced, the end is cut off, and up to 4 are added."""
+    index = draw(st.integers(0, len(content) - 1))
+    end = draw(st.integers(0, len(content)))
+    new_byte = bytes([draw(st.integers(0, 255))])
+    return content[:index] + new_byte + content[index + 1 : end] + draw(st.binary(max_size=4))

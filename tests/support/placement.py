@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxnav.scenes.scene import CELL, Scene
+from jaxnav.scenes.scene import CELL_SIZE, Scene
 
 MILLIMETRES = 2e-3  # boxes are rounded to 1 mm
 
@@ -14,7 +14,7 @@ def corners(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def cell_centres(scene: Scene, mask: np.ndarray) -> np.ndarray:
     """Return x, z [C, 2] of a mask's cells."""
-    return np.asarray(scene.origin) + CELL * np.argwhere(mask)[:, ::-1]
+    return np.asarray(scene.origin) + CELL_SIZE * np.argwhere(mask)[:, ::-1]
 
 
 def check_form(scene: Scene) -> None:
@@ -25,7 +25,7 @@ def check_form(scene: Scene) -> None:
     rim = np.ones_like(scene.walls)
     rim[1:-1, 1:-1] = False
     assert scene.walls[rim].all()
-    assert np.remainder(np.asarray(scene.origin), CELL).tolist() == [0.0, 0.0]
+    assert np.remainder(np.asarray(scene.origin), CELL_SIZE).tolist() == [0.0, 0.0]
     n = len(scene.types)
     assert scene.boxes.shape == (n, 6)
     assert scene.yaws.shape == scene.parents.shape == (n,)
@@ -39,7 +39,7 @@ def check_nothing_overlaps(scene: Scene) -> None:
     """
     low, high = corners(scene.boxes)
     walls = cell_centres(scene, scene.walls)
-    depth = np.minimum(high[:, None, ::2], walls + CELL / 2) - np.maximum(low[:, None, ::2], walls - CELL / 2)
+    depth = np.minimum(high[:, None, ::2], walls + CELL_SIZE / 2) - np.maximum(low[:, None, ::2], walls - CELL_SIZE / 2)
     assert not (depth > MILLIMETRES).all(axis=-1).any(), scene.name
     overlap = (np.minimum(high[:, None], high) - np.maximum(low[:, None], low) > MILLIMETRES).all(axis=-1)
     related = scene.parents[:, None] == np.arange(len(low))

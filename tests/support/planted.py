@@ -11,7 +11,14 @@ from support.mutants import ROOT, passes, project, survives
 
 
 class Mistake(NamedTuple):
-    """Name a text of a module, what takes its place, and the tests that have to fail."""
+    """A mistake in a module.
+
+    Attributes:
+      module: path in `jaxnav`.
+      before: a text of the module.
+      after: the text in its place.
+      tests: path in `tests` of the tests that have to fail.
+    """
 
     module: str
     before: str
@@ -24,31 +31,33 @@ PROBES = "promises/test_ppo_learns.py"
 STORED = "promises/test_stored_data_is_verified.py"
 NAMES = "promises/test_names_are_text.py"
 LEARNER = "training/test_learner.py"
+EXTRAS = "promises/test_works_without_extras.py"
 MISTAKES = (
     Mistake("causal.py", "- s * counterfactual", "+ s * counterfactual", INFERENCE),
-    Mistake("layout.py", "state.gap * setting.decay", "state.gap * 1.01 * setting.decay", INFERENCE),
+    Mistake("layout.py", "state.gap * config.decay", "state.gap * 1.01 * config.decay", INFERENCE),
     Mistake("policies/methods/org.py", "weights[..., None] * (aggregated", "(aggregated", INFERENCE),
     Mistake("policies/spatial_memory.py", "stride: int = 2", "stride: int = 1", INFERENCE),
-    Mistake("training/loss.py", "policy_loss = -average(", "policy_loss = average(", PROBES),
-    Mistake("training/loss.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES),
-    Mistake("training/loss.py", "scalars.value * value_loss", "0.0 * value_loss", PROBES),
-    Mistake("causal.py", "jnp.where(s == 0, logits, combined)", "combined", "test_causal.py"),
+    Mistake("training/ppo.py", "policy_loss = -masked_mean(", "policy_loss = masked_mean(", PROBES),
+    Mistake("training/ppo.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES),
+    Mistake("training/ppo.py", "scalars.value * value_loss", "0.0 * value_loss", PROBES),
+    Mistake("causal.py", "jnp.where(s == 0, logits, removed)", "removed", "test_causal.py"),
     Mistake("causal.py", "gap - epsilon)", "gap - float(epsilon))", "test_causal.py"),
-    Mistake("evaluation/metrics.py", "success * best_length / length", "success * length / best_length",
+    Mistake("evaluation/grid.py", "success * best_length / length", "success * length / best_length",
             "evaluation/test_episodes.py"),
     Mistake("evaluation/episodes.py", "default_rng([seed, len", "default_rng([len", "evaluation/test_episodes.py"),
-    Mistake("training/apply.py", "max_consecutive_errors=2**30", "max_consecutive_errors=0", LEARNER),
+    Mistake("training/ppo.py", "max_consecutive_errors=2**30", "max_consecutive_errors=0", LEARNER),
     Mistake("store/export.py", '"""Exported', 'import jax  # noqa\n"""Exported', "store/test_export.py"),
     Mistake("store/export.py", "FORMAT_VERSION = 3", "FORMAT_VERSION = 2", "promises/test_old_versions.py"),
-    Mistake("store/checkpoint.py", "if found.get(name) != digest", "if False", STORED),
-    Mistake("store/export.py", 'if sha256 != policy["params_sha256"]', "if False", STORED),
-    Mistake("store/runlog.py", 'verified(where, row, "restore the file, or remove the line")', "row", STORED),
-    Mistake("store/lock.py", "fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)", "pass", "promises/test_one_writer.py"),
-    Mistake("runs/interrupts.py", "signal.signal(each, signal.SIG_DFL)", "pass", "promises/test_interrupts.py"),
+    Mistake("store/checkpoint.py", "if file_digests.get(name) != digest", "if False", STORED),
+    Mistake("store/export.py", 'if params_sha256 != policy["params_sha256"]', "if False", STORED),
+    Mistake("store/files.py", 'verify_digest(source, row, "restore the file, or remove the line")', "row", STORED),
+    Mistake("store/files.py", "fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)", "pass",
+            "promises/test_one_writer.py"),
+    Mistake("runs/train.py", "signal.signal(handled_number, signal.SIG_DFL)", "pass", "promises/test_interrupts.py"),
     Mistake("cli/console.py", "markup=False", "markup=True", NAMES),
-    Mistake("cli/console.py", 'printable(page.read(), kept="\\n")', "page.read()", NAMES),
+    Mistake("cli/console.py", 'escape_control_chars(buffer.read(), keep="\\n")', "buffer.read()", NAMES),
     Mistake("cli/console.py", "case MemoryError():", "case ZeroDivisionError():", "promises/test_bounds.py"),
-    Mistake("__init__.py", '"""', 'import matplotlib  # noqa\n"""', "promises/test_works_without_extras.py"),
+    Mistake("__init__.py", '"""Layout', 'import matplotlib  # noqa\n"""Layout', EXTRAS),
 )  # fmt: skip
 
 

@@ -4,10 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxnav.report.content import Chart, Section, Table
-from jaxnav.report.page import render
-from jaxnav.report.plans import make_plan, pack
-from jaxnav.report.replays import Course, Episode, Replays
+from jaxnav.report.page import Chart, Section, TextTable, render_page
+from jaxnav.report.replays import ReplayEpisode, Replays, ReplayTrace, make_plan, pack_shares
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 from support import tiny_world as tiny
 
@@ -21,14 +19,14 @@ def course(views, success=True):
     steps = len(views)
     chances = np.full((steps, 3, NUM_ACTIONS), 0.1)
     chances[:, :, 0] = 0.5
-    return Course(
+    return ReplayTrace(
         views=list(views),
         actions=[0] * (steps - 1) + [DONE],
         success=success,
-        gap=pack(np.linspace(1, 0, steps)),
-        weight=pack(np.linspace(0.5, 0, steps)),
-        layout=pack(np.tile(np.linspace(0, 0.9, CATEGORIES), (steps, 1))),
-        chances=pack(chances),
+        gap=pack_shares(np.linspace(1, 0, steps)),
+        weight=pack_shares(np.linspace(0.5, 0, steps)),
+        layout=pack_shares(np.tile(np.linspace(0, 0.9, CATEGORIES), (steps, 1))),
+        chances=pack_shares(chances),
     )
 
 
@@ -48,13 +46,15 @@ def replays(name=""):
         field_of_view=100.0,
         reach=500,
         plans=[make_plan(scene, tiny.BANK, 0, POSES)],
-        episodes=[Episode(0, 0, 3, [same, same]), Episode(0, 1, 3, [same, other])],
+        episodes=[ReplayEpisode(0, 0, 3, [same, same]), ReplayEpisode(0, 1, 3, [same, other])],
     )
 
 
 def page(name=""):
     """A page whose every text ends with `name`."""
-    table = Table("Shift 0" + name, ("Variant" + name, "SR"), (("group" + name,), ("row" + name, "50.0 [40.0, 60.0]")))
+    table = TextTable(
+        "Shift 0" + name, ("Variant" + name, "SR"), (("group" + name,), ("row" + name, "50.0 [40.0, 60.0]"))
+    )
     chart = Chart('<svg viewBox="0 0 1 1"><rect width="1" height="1"/></svg>', "chart" + name)
     section = Section("Results" + name, "about" + name, (chart,), (table,), (table,), ("note" + name,))
-    return render("title" + name, {"Run": "run" + name}, [section, section], [replays(name)])
+    return render_page("title" + name, {"Run": "run" + name}, [section, section], [replays(name)])

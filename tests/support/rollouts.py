@@ -1,4 +1,4 @@
-"""Rollouts in the small world, and a plain loop that goes along them decision by decision."""
+"""Rollouts in the small world, and a plain loop that repeats them decision by decision."""
 
 import functools
 from typing import Any, NamedTuple
@@ -7,20 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.pathways import NO_ACTION, Memory
-from jaxnav.training.collect import collect
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
-from jaxnav.training.loss import replay
+from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 from support import tiny_world as tiny
 
 ENVS, LENGTH = 64, tiny.LIMITS[0]
-SLOTS = 20  # that the plain loop goes through
+SLOTS = 20  # of the plain loop
 ENV, PARAMS = tiny.world()
 KNOWLEDGE = tiny.knowledge()
 PRIORS = KNOWLEDGE.layout
-ACTING = Acting(ENV, tiny.SPEC, tiny.SETTING)
+ACTING = AgentLoop(ENV, tiny.SPEC, tiny.SETTING)
 CONFIG = PPOConfig(
     num_envs=ENVS,
     rollout=LENGTH,
@@ -35,7 +33,7 @@ CONFIG = PPOConfig(
     max_grad_norm=0.5,
     distil=0.02,
 )
-LEARNER = Learner(acting=ACTING, config=CONFIG, counterfactual="distil")
+LEARNER = Learner(agent_loop=ACTING, config=CONFIG, counterfactual="distil")
 ROWS, SUCCESSOR = tiny.BANK.rows, tiny.BANK.successor
 SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)  # of each pose
 
@@ -43,7 +41,7 @@ SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)  # of each 
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def act(weights, agent, key, coin, acting=ACTING):
     """The agent after a rollout, and the rollout."""
-    return collect(acting, acting.bind(weights), agent, key, LENGTH, coin, PARAMS, KNOWLEDGE)
+    return collect_rollout(acting, acting.bind(weights), agent, key, LENGTH, coin, PARAMS, KNOWLEDGE)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -55,21 +53,21 @@ def begin(key, acting=ACTING):
 @jax.jit
 def decide_again(weights, transitions, memory):
     """The factual and the counterfactual decisions."""
-    replayed = replay(ACTING.bind(weights), transitions, memory, PARAMS)
-    return replayed.decisions, replayed.counterfactual
+    replayed = replay_rollout(ACTING.bind(weights), transitions, memory, PARAMS)
+    return replayed.factual, replayed.counterfactual
 
 
 class Rolled(NamedTuple):
-    """Hold a rollout that goes on from another, so that its episodes begin at all times.
+    """A rollout that continues another one, so that its episodes begin at all times.
+
+    All leaves are NumPy arrays, which the types of the package do not name.
 
     Attributes:
-      weights: of the policy.
-      before, after: the `Agent` before and after it.
+      weights: parameters of the policy.
+      before, after: the `Agent` before and after the rollout.
       transitions: `Transition`, leaves [T, B].
-      memory: `Memory` before the first step.
+      memory: `PolicyState` before the first step.
       next_value: float32 [T, B].
-
-    All leaves are NumPy arrays, which the types of the library do not name.
     """
 
     weights: dict[str, Any]
@@ -82,22 +80,22 @@ class Rolled(NamedTuple):
 
 @functools.cache
 def rolled(coin: bool) -> Rolled:
-    weights, key = tiny.lively(5), jax.random.key(1)
-    agent = begin(jax.random.key(0))
-    before, (agent, _) = agent, act(weights, agent, jax.random.fold_in(key, 0), coin)
-    before, (agent, rollout) = agent, act(weights, agent, jax.random.fold_in(key, 1), coin)
-    return jax.tree.map(np.asarray, Rolled(weights, before, agent, *rollout))
+    weights = tiny.lively(5)
+    key = jax.random.key(1)
+    before, _ = act(weights, begin(jax.random.key(0)), jax.random.fold_in(key, 0), coin)
+    after, rollout = act(weights, before, jax.random.fold_in(key, 1), coin)
+    return jax.tree.map(np.asarray, Rolled(weights, before, after, *rollout))
 
 
 class Retraced(NamedTuple):
-    """What the plain loop finds: leaves [T, SLOTS], and the last agent's parts as lists [SLOTS]."""
+    """Results of the plain loop: leaves [T, SLOTS], and parts of the last agents as lists [SLOTS]."""
 
     weights: np.ndarray
     value: np.ndarray
     log_prob: np.ndarray
     next_value: np.ndarray
     layout: list[Any]
-    memory: list[Memory]
+    memory: list[PolicyState]
 
 
 @functools.cache
@@ -108,37 +106,52 @@ def retrace(coin: bool) -> Retraced:
     value, log_prob, next_value = np.zeros((3, *shape), np.float32)
     retraced = Retraced(np.zeros((*shape, 3), np.float32), value, log_prob, next_value, [], [])
     for slot in range(SLOTS):
-        layout, memory = tiny.at(run.before.perceived.layout, slot), tiny.at(run.before.memory, slot)
-        for time in range(LENGTH):
-            now = tiny.at(run.transitions, time, slot)
-            weights = tiny.goal_weights(layout, now.goal)
-            factual, counterfactual = tiny.decide(run.weights, ROWS[now.pose], now.goal, weights, memory)
-            decision = factual if now.direct is None or now.direct else counterfactual
-            retraced.weights[time, slot], retraced.value[time, slot] = weights, decision.value
-            retraced.log_prob[time, slot] = jax.nn.log_softmax(decision.logits)[now.action]
+        _retrace_slot(run, retraced, slot)
 
-            memory = decision.memory(jnp.int32(now.action))
-            pose, ended = SUCCESSOR[now.pose, now.action], now.terminated | now.truncated
-            if now.truncated:  # the value of the cut state, with its own belief and memory
-                last = tiny.believe(PRIORS[PARAMS.room[SCENE[pose]]], layout, ROWS[pose])
-                cut = tiny.decide(run.weights, ROWS[pose], now.goal, tiny.goal_weights(last, now.goal), memory)[0]
-                retraced.next_value[time, slot] = cut.value
-            if ended:
-                layout, memory = None, Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
-            next_pose = (
-                run.transitions.pose[time + 1, slot] if time + 1 < LENGTH else run.after.state.pose[slot]
-            )  # after an ending, the start of the next episode
-            assert ended or next_pose == pose
-            layout = tiny.believe(PRIORS[PARAMS.room[SCENE[next_pose]]], layout, ROWS[next_pose])
-        retraced.layout.append(layout)
-        retraced.memory.append(memory)
+    # Within an episode the next value is that of the next step, or that of the agent after the rollout.
     after = run.after
     for slot in range(SLOTS):
-        weights = tiny.goal_weights(retraced.layout[slot], after.state.goal[slot])
-        row, goal = ROWS[after.state.pose[slot]], after.state.goal[slot]
-        values = np.append(
-            retraced.value[1:, slot], tiny.decide(run.weights, row, goal, weights, retraced.memory[slot])[0].value
-        )
+        row = ROWS[after.state.pose[slot]]
+        goal = after.state.goal[slot]
+        weights = tiny.goal_weights(retraced.layout[slot], goal)
+        last_decision, _ = tiny.decide(run.weights, row, goal, weights, retraced.memory[slot])
+        values = np.append(retraced.value[1:, slot], last_decision.value)
         goes_on = ~(run.transitions.terminated | run.transitions.truncated)[:, slot]
         retraced.next_value[goes_on, slot] = values[goes_on]
     return retraced
+
+
+def _retrace_slot(run: Rolled, retraced: Retraced, slot: int) -> None:
+    """Fill a column of the results, and append the last belief and memory."""
+    layout = tiny.leaves_at(run.before.perception.layout, slot)
+    memory = tiny.leaves_at(run.before.memory, slot)
+    for time in range(LENGTH):
+        # The decision.
+        now = tiny.leaves_at(run.transitions, time, slot)
+        weights = tiny.goal_weights(layout, now.goal)
+        factual, counterfactual = tiny.decide(run.weights, ROWS[now.pose], now.goal, weights, memory)
+        decision = factual if now.use_direct is None or now.use_direct else counterfactual
+        retraced.weights[time, slot] = weights
+        retraced.value[time, slot] = decision.value
+        retraced.log_prob[time, slot] = jax.nn.log_softmax(decision.logits)[now.action]
+
+        # The recorded action.
+        memory = decision.next_state(jnp.int32(now.action))
+        pose = SUCCESSOR[now.pose, now.action]
+        ended = now.terminated | now.truncated
+        if now.truncated:  # the value of the cut state, with its own belief and memory
+            last_layout = tiny.believe(PRIORS[PARAMS.room[SCENE[pose]]], layout, ROWS[pose])
+            last_weights = tiny.goal_weights(last_layout, now.goal)
+            last_decision, _ = tiny.decide(run.weights, ROWS[pose], now.goal, last_weights, memory)
+            retraced.next_value[time, slot] = last_decision.value
+        if ended:
+            layout = None
+            memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
+
+        # The next view; after an ending, that of the next episode's start.
+        next_pose = run.transitions.pose[time + 1, slot] if time + 1 < LENGTH else run.after.state.pose[slot]
+        assert ended or next_pose == pose
+        layout = tiny.believe(PRIORS[PARAMS.room[SCENE[next_pose]]], layout, ROWS[next_pose])
+
+    retraced.layout.append(layout)
+    retraced.memory.append(memory)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.files.importers.assemble import Note
+from jaxnav.scenes.files.importers.assemble import ImportNote
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
 
@@ -41,7 +41,7 @@ def as_scene(result: Scene | InputError) -> Scene:
     return result
 
 
-def scenes_and_errors(results: Iterable[Scene | InputError | Note]) -> tuple[list[Scene], list[str]]:
+def scenes_and_errors(results: Iterable[Scene | InputError | ImportNote]) -> tuple[list[Scene], list[str]]:
     """Return the scenes among results, and the errors' messages."""
     results = list(results)
     return [r for r in results if isinstance(r, Scene)], [str(r) for r in results if isinstance(r, InputError)]
@@ -51,19 +51,20 @@ def assert_scenes_equal(a: Scene | InputError, b: Scene | InputError) -> None:
     """Check that two scenes are equal, types and dtypes included."""
     a, b = as_scene(a), as_scene(b)
     for field in dataclasses.fields(Scene):
-        left, right = getattr(a, field.name), getattr(b, field.name)
-        assert type(left) is type(right), field.name
-        if isinstance(left, np.ndarray):
-            np.testing.assert_array_equal(left, right, field.name, strict=True)
+        a_value = getattr(a, field.name)
+        b_value = getattr(b, field.name)
+        assert type(a_value) is type(b_value), field.name
+        if isinstance(a_value, np.ndarray):
+            np.testing.assert_array_equal(a_value, b_value, field.name, strict=True)
         elif field.name != "rooms":
-            assert left == right, field.name
+            assert a_value == b_value, field.name
     assert [room.type for room in a.rooms] == [room.type for room in b.rooms]
     for one, other in zip(a.rooms, b.rooms, strict=True):
         np.testing.assert_array_equal(one.cells, other.cells, strict=True)
 
 
 def check_outcomes(
-    results: Iterable[Scene | InputError | Note], outcomes: collections.Counter[type], path: Path
+    results: Iterable[Scene | InputError | ImportNote], outcomes: collections.Counter[type], path: Path
 ) -> None:
     """Check that results are storable scenes or named errors.
 
@@ -71,7 +72,7 @@ def check_outcomes(
     """
     for result in results:
         outcomes[type(result)] += 1
-        if isinstance(result, Note):
+        if isinstance(result, ImportNote):
             assert result.number > 0
         elif isinstance(result, InputError):
             assert str(result).startswith(str(path))

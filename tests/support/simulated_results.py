@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import expit
 
-from jaxnav.evaluation.statistics import Interval, leave_one_out, summary
+from jaxnav.evaluation.statistics import Interval, leave_one_out, mean_interval
 from jaxnav.study.claims import Claim
 
 #: Numbers of scenes and training runs.
@@ -56,7 +56,7 @@ def coverage(rule: Rule, size: tuple[int, int], draws: int, seed: int = 0) -> fl
 def jackknifed(values: np.ndarray, scene: np.ndarray, _: np.random.Generator) -> Interval:
     """Return the interval of the package."""
     rooms = scene % ROOMS if scene.max() >= 2 * ROOMS - 1 else None
-    return summary(values, leave_one_out(scene, rooms))
+    return mean_interval(values, leave_one_out(scene, rooms))
 
 
 def episode_bootstrap(values: np.ndarray, scene: np.ndarray, draw: np.random.Generator) -> Interval:

@@ -3,7 +3,7 @@
 import pytest
 
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.directory import Run
+from jaxnav.runs.run import Run
 from jaxnav.runs.train import train
 from jaxnav.training.trainer import Trainer
 

@@ -8,28 +8,41 @@ import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.runs.policies import Gap
-from jaxnav.study.codec import to_json
-from jaxnav.study.curves import AucLine, AucPanel, Belief, Curve, GapCourse, GapLine, GapPanel
-from jaxnav.study.instrument_report import BASELINES, MATCHED, MEASURES, Change, InstrumentReport, MeasuredShift
+from jaxnav.runs.policies import GapName
 from jaxnav.study.records import (
+    BASELINE_MEASURES,
+    DIFFICULTY_MEASURES,
+    MEASURES,
+    STDE_OPTIONS,
+    AucLine,
+    AucPanel,
+    Belief,
     Condition,
-    Difference,
+    Curve,
     FullCondition,
     GainBySimilarity,
     Gains,
+    GapCurves,
+    GapLine,
+    GapPanel,
+    InstrumentReport,
+    MeasureChange,
+    PairedDifference,
     SceneEffects,
+    ShiftMeasures,
     SuccessBySimilarity,
+    Trial,
+    TrialControl,
     TrialRow,
+    to_json,
 )
 from jaxnav.study.results import StudyResults, WorldResults, condition_name
-from jaxnav.study.trials import USES, Control, Trial
 
 RUNS = ("main", "coin", "gate")
 SHIFTS, EPSILONS = (0.0, 1.0), (0.0, 0.5, 1.0)
 STEPS = 30
 STUDY = {"shifts": list(SHIFTS), "episodes": 1000, "base": {"seeds": 3, "total_steps": 1_000_000}}
-Part = Condition | InstrumentReport | GapCourse
+Part = Condition | InstrumentReport | GapCurves
 
 
 def interval(mean: float, half: float = 1.0) -> Interval:
@@ -44,7 +57,7 @@ def estimate(mean: float) -> Interval:
     return Interval(mean, mean - 1.0, mean + 1.0, 0.5, (mean - 1.0, mean, mean + 1.0))
 
 
-def row(trial: Trial, gain: float | None, gap: Gap = "novelty") -> TrialRow:
+def row(trial: Trial, gain: float | None, gap: GapName = "novelty") -> TrialRow:
     """Return a row with this difference in SR."""
     to = "baseline" if trial.variant == "layout" else "layout"
     return TrialRow(
@@ -54,7 +67,7 @@ def row(trial: Trial, gain: float | None, gap: Gap = "novelty") -> TrialRow:
         sr=estimate(60.0 + (gain or 0.0)),
         spl=estimate(30.0),
         dts=estimate(1.5),
-        difference=None if gain is None else Difference(to, effect(gain), effect(0.0), effect(0.0)),
+        difference=None if gain is None else PairedDifference(to, effect(gain), effect(0.0), effect(0.0)),
     )
 
 
@@ -67,15 +80,15 @@ def rows(shift: float, run: str = "main") -> list[TrialRow]:
     table = [] if run == "coin" else [row(Trial("baseline"), None)]
     table += [row(Trial("layout"), 3.0 - 2 * shift), row(Trial("tde"), -6.0 + shift)]
     if run != "main":
-        return table + [row(Trial("stde", "argmax", *use), 2.0 * shift) for use in USES.values()]
+        return table + [row(Trial("stde", "argmax", *use), 2.0 * shift) for use in STDE_OPTIONS.values()]
     table += [row(Trial("baseline", "sample"), None)]
     table += [row(Trial("layout", "sample"), 101.0), row(Trial("tde", "sample"), 95.0)]
     for epsilon in EPSILONS:
         table.append(row(Trial("stde", "argmax", epsilon, "residual"), 2.0 * shift))
         table.append(row(Trial("stde", "argmax", epsilon, "paper"), 5.0 * shift))
-    controls: tuple[Control, ...] = ("constant", "shuffled", "noise", "random")
-    gaps: tuple[Gap, ...] = ("novelty", "evidence")
-    for use in USES.values():
+    controls: tuple[TrialControl, ...] = ("constant", "shuffled", "noise", "random")
+    gaps: tuple[GapName, ...] = ("novelty", "evidence")
+    for use in STDE_OPTIONS.values():
         table.append(row(Trial("stde", "sample", *use), 100.0))
         table.append(row(Trial("stde", "argmax", *use), 0.5 * shift, "clock"))
         table.append(row(Trial("stde", "argmax", *use), 4.0 * shift, "evidence"))
@@ -131,7 +144,7 @@ def condition(shift: float, run: str = "main") -> Condition:
     return Condition(shift=shift, world="rooms", scenes=80, rows=table, episodes=1000, parameters=12_345)
 
 
-def full_condition(shift: float, chosen: float | None = None) -> FullCondition:
+def full_condition(shift: float, chosen_epsilon: float | None = None) -> FullCondition:
     return FullCondition(
         shift=shift,
         world="rooms",
@@ -139,7 +152,7 @@ def full_condition(shift: float, chosen: float | None = None) -> FullCondition:
         rows=tuple(rows(shift)),
         episodes=1000,
         parameters=12_345,
-        chosen=chosen,
+        chosen=chosen_epsilon,
         similarity=success(0.3 - 0.2 * shift),
         gains=Gains(gain(-1.5 - shift), gain(-1.5 - shift)),
         effects=effects(shift),
@@ -155,7 +168,7 @@ def line(start: float, end: float) -> Curve:
     return band(start + (end - start) * np.arange(STEPS) / 20)
 
 
-def course() -> GapCourse:
+def course() -> GapCurves:
     """Return a gap that falls from 0.9 at step 0.
 
     It is 0.2 at step 20, or 0.8 if frozen.
@@ -165,7 +178,7 @@ def course() -> GapCourse:
     ends: dict[Belief, float] = {"updated": 0.2, "frozen": 0.8}
     lines = [GapLine(shift, belief, line(0.9 - 0.1 * shift, end)) for shift in SHIFTS for belief, end in ends.items()]
     aucs = [AucLine(setting, line(0.5, 0.75 if setting == "evidence" else 0.5)) for setting in settings]
-    return GapCourse(
+    return GapCurves(
         steps=tuple(range(STEPS)),
         running=np.stack([1.0 - np.arange(STEPS) / STEPS for _ in SHIFTS]),
         panels=tuple(GapPanel(setting, tuple(lines)) for setting in settings),
@@ -176,11 +189,13 @@ def course() -> GapCourse:
 def instrument(loss: float = 9.0) -> InstrumentReport:
     """Return a report in which sampled actions lose 12 points."""
     measures = {shift: dict.fromkeys(MEASURES, interval(10.0 + shift, 0.5)) for shift in SHIFTS}
-    losses = zip(BASELINES, (loss, 12.0), strict=True)
+    losses = zip(BASELINE_MEASURES, (loss, 12.0), strict=True)
     return InstrumentReport(
-        shifts=tuple(MeasuredShift(shift, 80, 1000, measures[shift]) for shift in SHIFTS),
-        matched=tuple(Change(name, SHIFTS[0], SHIFTS[-1], interval(0.5, 0.25), True) for name in MATCHED),
-        discriminating=tuple(Change(name, SHIFTS[0], SHIFTS[-1], interval(loss), True) for name, loss in losses),
+        shifts=tuple(ShiftMeasures(shift, 80, 1000, measures[shift]) for shift in SHIFTS),
+        matched=tuple(
+            MeasureChange(name, SHIFTS[0], SHIFTS[-1], interval(0.5, 0.25), True) for name in DIFFICULTY_MEASURES
+        ),
+        discriminating=tuple(MeasureChange(name, SHIFTS[0], SHIFTS[-1], interval(loss), True) for name, loss in losses),
     )
 
 

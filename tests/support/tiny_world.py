@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.causal import do
-from jaxnav.env.build import build
-from jaxnav.env.objectnav import NUM_PRIORS
-from jaxnav.env.types import Observation
-from jaxnav.layout import SETTINGS, LayoutEstimator, prior_from_counts
-from jaxnav.policies.methods import Knowledge, find_method
-from jaxnav.policies.policy import bind, init_params
+from jaxnav.env.make import build_environment
+from jaxnav.env.objectnav import NUM_PRIORS, Observation
+from jaxnav.layout import ESTIMATORS, LayoutEstimator, prior_from_counts
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import bind, init_params
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.policies import Policies
 from jaxnav.scenes.tables.compile import compile_bank
@@ -21,9 +21,9 @@ from jaxnav.scenes.task import Task
 from support.scenes import CATEGORIES, SMALL, draw
 
 SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
-SPEC = PolicySpec("org", len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),), goal_row=False)
+SPEC = PolicySpec(find_method("org"), len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),), goal_row=False)
 STREAMS = dataclasses.replace(SPEC, decision="streams", direct="goal")
-SETTING = SETTINGS["calibrated"]
+SETTING = ESTIMATORS["calibrated"]
 #: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
 LIMITS = (6, 8)
 
@@ -40,7 +40,7 @@ POSES_PER_CELL = BANK.task.rules.poses_per_cell
 
 def world():
     """The environment and its parameters."""
-    return build(BANK, {"kitchen": LIMITS[0], "bedroom": LIMITS[1]}, 0)
+    return build_environment(BANK, {"kitchen": LIMITS[0], "bedroom": LIMITS[1]}, 0)
 
 
 def knowledge():
@@ -49,21 +49,23 @@ def knowledge():
     return Knowledge(jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts)))
 
 
-def untrained(spec=SPEC, known=None, task=BANK.task):
-    """Policies without parameters, for what asks for the method and what it has learned alone."""
-    known = knowledge() if known is None else known
-    return Policies({}, (), known, jnp.zeros_like(known.layout), spec, None, 0, task)
+def untrained(spec=SPEC, learned_knowledge=None, task=BANK.task):
+    """Policies without parameters, enough for callers that need only the method and its knowledge."""
+    if learned_knowledge is None:
+        learned_knowledge = knowledge()
+    return Policies({}, (), learned_knowledge, jnp.zeros_like(learned_knowledge.layout), spec, None, 0, task)
 
 
-def reading(name, count):
-    """What a method's tracker reads before anything is seen, [count, ...]; None without a tracker."""
-    method = find_method(name)
+def reading(method, count):
+    """The reading of a method's tracker before the first view, [count, ...]; None without a tracker."""
     if method.tracker is None:
         return None
-    learned = {} if method.learn is None else method.learn([BANK], np.ones((NUM_PRIORS, *2 * [len(CATEGORIES)])))
-    known = knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
-    one = method.tracker.read(method.tracker.init(known), known, jnp.int32(0))
-    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), one)
+    learned = {}
+    if method.learn is not None:
+        learned = method.learn([BANK], np.ones((NUM_PRIORS, len(CATEGORIES), len(CATEGORIES))))
+    method_knowledge = knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
+    first_reading = method.tracker.read(method.tracker.init(method_knowledge), method_knowledge, jnp.int32(0))
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), first_reading)
 
 
 _init = jax.jit(init_params, static_argnums=0)
@@ -79,9 +81,10 @@ def lively(seed, spec=SPEC):
 
 def _loud(params, seed):
     kernel = jax.random.normal(jax.random.key(seed), params["actor"]["kernel"].shape)
-    loud = {
-        name: jax.tree.map(lambda leaf: 3 * leaf, node) for name, node in params.items() if name in ("fuse", "method")
-    }
+    loud = {}
+    for name in ("fuse", "method"):
+        if name in params:
+            loud[name] = jax.tree.map(lambda leaf: 3 * leaf, params[name])
     return params | loud | {"actor": params["actor"] | {"kernel": kernel, "bias": jnp.zeros(kernel.shape[-1])}}
 
 
@@ -103,6 +106,6 @@ def believe(prior, layout, row):
 goal_weights = jax.jit(LayoutEstimator.goal_weights)
 
 
-def at(tree, *index):
+def leaves_at(tree, *index):
     """The leaves at an index."""
     return jax.tree.map(lambda leaf: leaf[index], tree)

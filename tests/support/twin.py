@@ -16,7 +16,7 @@ MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(6)
 
 
 class Twin:
-    """Hold one episode; `reset` starts another in the same scene."""
+    """One episode; `reset` starts another in the same scene."""
 
     def __init__(
         self,
@@ -29,14 +29,18 @@ class Twin:
         horizon: int,
         step_limit: int,
     ):
-        self.categories, self.rules = categories, rules
+        self.categories = categories
+        self.rules = rules
         self.scene = TwinScene(scene, categories, rules)
         self.reset(goal, cell, heading, horizon, step_limit)
 
     def reset(self, goal: int, cell: Cell, heading: int, horizon: int, step_limit: int) -> None:
         if cell not in self.scene.standable:
             raise ValueError(f"cell {cell} is not standable")
-        self.goal, self.step_limit, self.steps, self.over = goal, step_limit, 0, False
+        self.goal = goal
+        self.step_limit = step_limit
+        self.steps = 0
+        self.over = False
         self.pose: Pose = (*cell, heading, horizon)
         self.start = self.pose
 
@@ -71,25 +75,34 @@ class Twin:
         iz, ix, heading, horizon = pose
         if action == MOVE_AHEAD:
             dz, dx = neighbour(self.rules, heading)
-            return (iz + dz, ix + dx, heading, horizon) if (iz + dz, ix + dx) in self.scene.standable else pose
+            next_cell = (iz + dz, ix + dx)
+            return (*next_cell, heading, horizon) if next_cell in self.scene.standable else pose
         if action in (ROTATE_LEFT, ROTATE_RIGHT):
-            return iz, ix, (heading + (1 if action == ROTATE_RIGHT else -1)) % self.rules.headings, horizon
+            turn = 1 if action == ROTATE_RIGHT else -1
+            return iz, ix, (heading + turn) % self.rules.headings, horizon
         if action in (LOOK_UP, LOOK_DOWN):
-            looked = horizon + (1 if action == LOOK_DOWN else -1)
-            return iz, ix, heading, looked if 0 <= looked < len(self.rules.horizons) else horizon
+            next_horizon = horizon + (1 if action == LOOK_DOWN else -1)
+            return iz, ix, heading, min(max(next_horizon, 0), len(self.rules.horizons) - 1)
         return pose
 
     def detections(self) -> list[list[tuple[float, float, float]]]:
         """Return the acceptable (ahead, right, apparent size) of each category.
 
-        There are none if it is not detected, several if instances are equally near.
+        The list is empty for a category that is not detected, and has several entries where instances are equally near.
         """
-        rows: list[list[tuple[float, float, float, float]]] = [[] for _ in self.categories]
+        # Instances in view, by category, with their distances.
+        instances: list[list[tuple[float, float, float, float]]] = [[] for _ in self.categories]
         for box, distance in self.scene.detectable(self.cell):
             ahead, right, in_view = self.scene.offsets(self.cell, self.heading, self.horizon, box)
             if in_view and box.category is not None:
-                rows[box.category].append((distance, ahead, right, box.size / max(distance, 0.25)))
-        return [[row[1:] for row in category if row[0] <= min(category)[0] + 1e-9] for category in rows]
+                instances[box.category].append((distance, ahead, right, box.size / max(distance, 0.25)))
+
+        # The nearest ones of each.
+        nearest = []
+        for rows in instances:
+            min_distance = min((row[0] for row in rows), default=math.inf)
+            nearest.append([row[1:] for row in rows if row[0] <= min_distance + 1e-9])
+        return nearest
 
     def view(self) -> list[int]:
         return self.scene.view(self.cell, self.heading)
@@ -99,7 +112,8 @@ class Twin:
         return {goal for goal in range(len(self.categories)) if self._succeeds(self.pose, goal)}
 
     def _succeeds(self, pose: Pose, goal: int) -> bool:
-        cell, heading, horizon = pose[:2], *pose[2:]
+        iz, ix, heading, horizon = pose
+        cell = (iz, ix)
         limit = self.rules.success_distance + 1e-9
         if self.rules.success == "near":
             return self.scene.walk(cell, goal) <= limit
@@ -110,20 +124,18 @@ class Twin:
         )
 
     def best_length(self) -> int | None:
-        """Return the least actions from the start to success.
-
-        Done is included.
-        """
-        length, queue = {self.start: 1}, deque([self.start])
+        """Return the least number of actions from the start to success, Done included; None if there is no way."""
+        lengths = {self.start: 1}
+        queue = deque([self.start])
         while queue:
             pose = queue.popleft()
             if self._succeeds(pose, self.goal):
-                return length[pose]
+                return lengths[pose]
             for action in range(DONE):
-                after = self._moved(pose, action)
-                if after not in length:
-                    length[after] = length[pose] + 1
-                    queue.append(after)
+                next_pose = self._moved(pose, action)
+                if next_pose not in lengths:
+                    lengths[next_pose] = lengths[pose] + 1
+                    queue.append(next_pose)
         return None
 
     def goal_distance(self) -> float:

@@ -6,119 +6,161 @@ import numpy as np
 
 from support.twin_policy import (
     NUM_ACTIONS,
-    Added,
-    Memory,
+    LayerChanges,
     Params,
+    TwinMemory,
     TwinMethod,
+    append_one,
+    kernel_with_bias,
     linear,
     one_hot,
+    relu,
+    run_stream,
     softmax,
-    stream,
-    with_one,
 )
-from support.twin_transformer import forward
+from support.twin_transformer import residual_perceptron
 
-WINDOW, STEPS = 6, 4  # decisions between inner steps, and inner steps of an episode
+#: Decisions between inner steps, and inner steps of an episode.
+WINDOW = 6
+NUM_STEPS = 4
 LAYERS = ("fuse", "drive", "core", "actor")
 TINY = 1e-30  # of a complex step: its square is nothing beside 1
 
 
 class TwinTentative(TwinMethod):
-    """Imitate the tentative policy where the agent was before (`tpn`)."""
+    """Imitation of the tentative policy at poses where the agent was before (`tpn`)."""
 
     def begin(self) -> None:
-        self.been: list[tuple[Any, ...]] = []
+        self.poses: list[tuple[Any, ...]] = []
 
-    def take(self, seen: Any, percept: Any) -> None:
+    def update(self, features: Any, percept: Any) -> None:
         step = self.knowledge["steps"][int(percept.heading)]
-        before = np.array(self.been[-1][0] if self.been else (0, 0))
-        pose = (tuple((before + step * bool(percept.moved)).tolist()), int(percept.heading), int(percept.horizon))
-        self.repeated = pose in self.been
-        self.been.append(pose)
+        last_place = np.array(self.poses[-1][0] if self.poses else (0, 0))
+        place = tuple((last_place + step * bool(percept.moved)).tolist())
+        pose = (place, int(percept.heading), int(percept.horizon))
+        self.is_repeated = pose in self.poses
+        self.poses.append(pose)
 
     def read(self, goal: int) -> bool:
-        return self.repeated
+        return self.is_repeated
 
-    def start(self, params: Params) -> Any:
+    def initial_fast(self, params: Params) -> Any:
+        """Return the trials of the episode, none yet, and the change of the actor's kernel."""
         return [], np.zeros((params["actor"]["kernel"].shape[0] + 1, NUM_ACTIONS))
 
-    def changes(self, fast: Any) -> Added:
+    def layer_changes(self, fast: Any) -> LayerChanges:
+        # The change is dropped every 50 decisions.
         trials, change = fast
         return {"actor": change * (len(trials) % 50 > 0)}
 
-    def adapt(self, params: Params, parts: list[np.ndarray], before: Memory, decided: Any, reading: Any) -> Any:
-        network, (logits, hidden) = params["method"]["tentative"], decided
-        change, trials = self.changes(before.fast)["actor"], before.fast[0]
-        trial = np.concatenate([forward(network["state"], before.hidden[0]), one_hot(before.action, NUM_ACTIONS)])
-        trials = [*trials, trial]
-        state = forward(network["state"], hidden)
-        scores = np.array([trial[: len(state)] @ state for trial in trials[-100:]]) / np.sqrt(len(state))
+    def adapt(
+        self,
+        params: Params,
+        inputs: np.ndarray,
+        memory: TwinMemory,
+        logits: np.ndarray,
+        hidden: np.ndarray,
+        reading: Any,
+    ) -> Any:
+        network = params["method"]["tentative"]
+        change = self.layer_changes(memory.fast)["actor"]
+
+        # Remember the last state with the action that it led to.
+        last_state = residual_perceptron(network["state"], memory.hidden[0])
+        trial = np.concatenate([last_state, one_hot(memory.action, NUM_ACTIONS)])
+        trials = [*memory.fast[0], trial]
+
+        # Attend to the ten likeliest of the last 100 trials.
+        state = residual_perceptron(network["state"], hidden)
+        recent = np.array(trials[-100:])
+        scores = recent[:, : len(state)] @ state / np.sqrt(len(state))
         likeliest = np.argsort(-scores)[:10]
-        answer = softmax(scores[likeliest]) @ np.array(trials[-100:])[likeliest]
-        both = forward(network["both"], np.concatenate([state, forward(network["trial"], answer)]))
-        best = one_hot(int(linear(network["expert"], both).argmax()), NUM_ACTIONS)
+        answer = softmax(scores[likeliest]) @ recent[likeliest]
+
+        # Where the agent was before, the policy moves towards the expert's action.
+        experience = residual_perceptron(network["trial"], answer)
+        both = residual_perceptron(network["both"], np.concatenate([state, experience]))
+        expert_action = one_hot(int(linear(network["expert"], both).argmax()), NUM_ACTIONS)
         if reading:
-            change = change + 0.1 * np.outer(with_one(hidden), best - softmax(logits))
+            change = change + 0.1 * np.outer(append_one(hidden), expert_action - softmax(logits))
         return trials, change
 
 
 class TwinLearnedSteps(TwinMethod):
-    """Descend the learned loss every six decisions (`savn`).
+    """Descent of the learned loss every six decisions (`savn`).
 
     The gradient of the loss by the outputs of the layers is taken by complex steps, all in one batch.
     """
 
-    def start(self, params: Params) -> Any:
+    def initial_fast(self, params: Params) -> Any:
+        """Return the steps of the episode, none yet, and the changes of the layers."""
         return [], dict.fromkeys(LAYERS, 0.0)
 
-    def changes(self, fast: Any) -> Added:
+    def layer_changes(self, fast: Any) -> LayerChanges:
         return fast[1]
 
-    def adapt(self, params: Params, parts: list[np.ndarray], before: Memory, decided: Any, reading: Any) -> Any:
-        window, changes = before.fast
-        window = [*window, (np.concatenate(parts), before.hidden[0])]
-        if len(window) % WINDOW or len(window) > STEPS * WINDOW:
-            return window, changes
-        steps = window[-WINDOW:]
-        gradient = self._gradient(params, steps, changes)
-        inputs = self._inputs(params, steps, changes)
-        step = {layer: 0.01 * inputs[layer].T @ gradient[layer] for layer in LAYERS}
-        return window, {layer: changes[layer] - step[layer] for layer in LAYERS}
+    def adapt(
+        self,
+        params: Params,
+        inputs: np.ndarray,
+        memory: TwinMemory,
+        logits: np.ndarray,
+        hidden: np.ndarray,
+        reading: Any,
+    ) -> Any:
+        steps, changes = memory.fast
+        steps = [*steps, (inputs, memory.hidden[0])]
+        if len(steps) % WINDOW or len(steps) > NUM_STEPS * WINDOW:
+            return steps, changes
 
-    def _gradient(self, params: Params, steps: list, changes: Added) -> Added:
-        """Return that of the loss by the outputs of the layers, [W, N] each."""
-        hidden = len(steps[0][1])
-        sizes = np.array([hidden, 3 * hidden, 3 * hidden, NUM_ACTIONS])
-        total = WINDOW * sizes.sum()
-        moved = 1j * TINY * np.eye(total).reshape(total, WINDOW, -1)
-        parts = np.split(moved, np.cumsum(sizes)[:-1], axis=-1)
-        rows, state = [], np.broadcast_to(steps[0][1], (total, hidden))
-        for time, (inputs, _) in enumerate(steps):
-            added = {layer: part[:, time] for layer, part in zip(LAYERS, parts, strict=True)}
-            logits, state = stream(params, inputs, state, changes, added)
-            rows.append(np.concatenate([state, softmax(logits)], axis=-1))
-        loss = _loss(params["method"]["learned_loss"], np.stack(rows, axis=-1))
-        gradient = np.split((np.imag(loss) / TINY).reshape(WINDOW, -1), np.cumsum(sizes)[:-1], axis=-1)
-        return dict(zip(LAYERS, gradient, strict=True))
+        # A window is full: one step down the gradient of the loss.
+        window = steps[-WINDOW:]
+        gradient = self._output_gradient(params, window, changes)
+        layer_inputs = self._layer_inputs(params, window, changes)
+        next_changes = {}
+        for layer in LAYERS:
+            next_changes[layer] = changes[layer] - 0.01 * layer_inputs[layer].T @ gradient[layer]
+        return steps, next_changes
+
+    def _output_gradient(self, params: Params, window: list, changes: LayerChanges) -> LayerChanges:
+        """Return the gradient of the loss by the outputs of the layers, [W, N] each."""
+        # One member of the batch for each output of each layer at each decision: there it moves by a complex step.
+        num_hidden = len(window[0][1])
+        widths = np.array([num_hidden, 3 * num_hidden, 3 * num_hidden, NUM_ACTIONS])
+        layer_ends = np.cumsum(widths)[:-1]
+        batch_size = WINDOW * widths.sum()
+        steps = 1j * TINY * np.eye(batch_size).reshape(batch_size, WINDOW, -1)
+        layer_steps = np.split(steps, layer_ends, axis=-1)
+
+        entries = []
+        state = np.broadcast_to(window[0][1], (batch_size, num_hidden))
+        for time, (inputs, _) in enumerate(window):
+            output_changes = {layer: step[:, time] for layer, step in zip(LAYERS, layer_steps, strict=True)}
+            logits, state = run_stream(params, inputs, state, changes, output_changes)
+            entries.append(np.concatenate([state, softmax(logits)], axis=-1))
+
+        loss = _learned_loss(params["method"]["learned_loss"], np.stack(entries, axis=-1))
+        gradient = (np.imag(loss) / TINY).reshape(WINDOW, -1)
+        return dict(zip(LAYERS, np.split(gradient, layer_ends, axis=-1), strict=True))
 
     @staticmethod
-    def _inputs(params: Params, steps: list, changes: Added) -> Added:
+    def _layer_inputs(params: Params, window: list, changes: LayerChanges) -> LayerChanges:
         """Return the inputs of the layers along the window, [W, M] each."""
-        found: dict[str, list[np.ndarray]] = {layer: [] for layer in LAYERS}
-        state = steps[0][1]
-        for inputs, _ in steps:
-            entering = with_one(inputs) @ (
-                np.vstack([params["fuse"]["kernel"], params["fuse"]["bias"]]) + changes["fuse"]
-            )
-            after = stream(params, inputs, state, changes, {})[1]
-            entered = with_one(inputs), with_one(np.maximum(entering, 0)), state, with_one(after)
-            for layer, values in zip(LAYERS, entered, strict=True):
-                found[layer].append(values)
-            state = after
-        return {layer: np.array(values) for layer, values in found.items()}
+        fuse_kernel = kernel_with_bias(params["fuse"]) + changes["fuse"]
+        by_layer: dict[str, list[np.ndarray]] = {layer: [] for layer in LAYERS}
+        state = window[0][1]
+        for inputs, _ in window:
+            fused = relu(append_one(inputs) @ fuse_kernel)
+            next_state = run_stream(params, inputs, state, changes, {})[1]
+            by_layer["fuse"].append(append_one(inputs))
+            by_layer["drive"].append(append_one(fused))
+            by_layer["core"].append(state)
+            by_layer["actor"].append(append_one(next_state))
+            state = next_state
+        return {layer: np.array(values) for layer, values in by_layer.items()}
 
 
-def _loss(params: Params, entries: np.ndarray) -> np.ndarray:
+def _learned_loss(params: Params, entries: np.ndarray) -> np.ndarray:
     """Return the length of two causal convolutions along entries [B, L, W]."""
     for name, distance in (("first", 1), ("second", 2)):
         earlier = np.zeros_like(entries)

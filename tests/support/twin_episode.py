@@ -1,17 +1,17 @@
-"""An agent's episode in plain NumPy: look, believe, decide, go on."""
+"""An agent's episode in plain NumPy: perceive, decide, act."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxnav.policies.methods import Percept
+from jaxnav.policies.method import Percept
 from jaxnav.scenes.tables.compile import Bank
-from support.twin_percept import TwinBelief, TwinMap, cells_of, look
-from support.twin_policy import NUM_ACTIONS, Decided, TwinPolicy
+from support.twin_percept import TwinBelief, TwinMap, unpack_cells, unpack_row
+from support.twin_policy import NUM_ACTIONS, TwinDecision, TwinPolicy
 
 
-class TwinInferred(NamedTuple):
-    """Hold the weights of the layout, the gap and both decisions at one step."""
+class TwinTrace(NamedTuple):
+    """Layout weights, gap and both decisions of one step."""
 
     layout: np.ndarray
     gap: float
@@ -19,43 +19,68 @@ class TwinInferred(NamedTuple):
     counterfactual: np.ndarray
 
     def corrected(self, variant: str, epsilon: float | None, form: str | None) -> tuple[np.ndarray, float]:
-        """Return what equations 1 (`tde`) and 2 (`stde`) leave, and the weight of what they remove."""
+        """Return the logits of equation 1 (`tde`) or 2 (`stde`), and the weight of the removed ones."""
         if variant == "tde":
             return self.factual - self.counterfactual, 1.0
         s = 0.0 if epsilon is None else max(self.gap - epsilon, 0.0)
-        return (1 + s * (form == "residual")) * self.factual - s * self.counterfactual, s
+        factual = (1 + s) * self.factual if form == "residual" else self.factual
+        return factual - s * self.counterfactual, s
 
 
 class TwinEpisode:
-    """Hold one episode; its rows of bytes and where actions lead are the bank's."""
+    """One episode; observation rows and transitions come from the bank."""
 
-    decided: Decided
+    decision: TwinDecision
 
     def __init__(self, policy: TwinPolicy, bank: Bank, prior: np.ndarray | None, goal: int, pose: int):
-        self.policy, self.bank, self.goal, self.pose = policy, bank, goal, pose
+        self.policy = policy
+        self.bank = bank
+        self.goal = goal
+        self.pose = pose
         self.belief = None if prior is None else TwinBelief(prior)
-        self.map, self.memory = TwinMap(), policy.memory()
-        self.action, self.moved = NUM_ACTIONS, False
+        self.map = TwinMap()
+        self.memory = policy.initial_memory()
+        self.action = NUM_ACTIONS
+        self.moved = False
         policy.method.begin()
 
-    def infer(self) -> TwinInferred:
-        """Take in the present view, once, and decide."""
-        rules, size = self.bank.task.rules, len(self.bank.task.categories)
-        row, horizons = self.bank.rows[self.pose], len(rules.horizons)
-        heading, horizon = self.pose // horizons % rules.headings, self.pose % horizons
-        seen = look(row, self.goal, size)
-        self.map.update(cells_of(row, size), heading, self.moved)
-        numbers = np.int32(heading), np.int32(self.action), np.bool_(self.moved), np.int32(horizon), np.int32(self.goal)
-        self.policy.method.take(seen, Percept(row, *numbers))  # type: ignore[arg-type]  (NumPy for JAX)
-        layout, gap = np.ones(size), 0.0
-        if self.belief is not None:
-            self.belief.update(seen.visible > 0)
-            layout, gap = self.belief.weights(self.goal), self.belief.gap
-        self.decided = self.policy.decide(seen, self.map.inputs(), layout, self.memory)
-        return TwinInferred(layout, gap, self.decided.factual, self.decided.counterfactual)
+    def infer(self) -> TwinTrace:
+        """Perceive the present view, once, and decide."""
+        rules = self.bank.task.rules
+        num_categories = len(self.bank.task.categories)
+        row = self.bank.rows[self.pose]
+        heading = self.pose // len(rules.horizons) % rules.headings
+        horizon = self.pose % len(rules.horizons)
 
-    def go_on(self, action: int) -> None:
+        # Features, map and tracker.
+        features = unpack_row(row, self.goal, num_categories)
+        self.map.update(unpack_cells(row, num_categories), heading, self.moved)
+        percept = Percept(
+            row,  # type: ignore[arg-type]  (NumPy for JAX)
+            heading=np.int32(heading),  # type: ignore[arg-type]
+            action=np.int32(self.action),  # type: ignore[arg-type]
+            moved=np.bool_(self.moved),  # type: ignore[arg-type]
+            horizon=np.int32(horizon),  # type: ignore[arg-type]
+            goal=np.int32(self.goal),  # type: ignore[arg-type]
+        )
+        self.policy.method.update(features, percept)
+
+        # Layout weights and gap.
+        layout = np.ones(num_categories)
+        gap = 0.0
+        if self.belief is not None:
+            self.belief.update(features.visible > 0)
+            layout = self.belief.weights(self.goal)
+            gap = self.belief.gap
+
+        self.decision = self.policy.decide(features, self.map.inputs(), layout, self.memory)
+        return TwinTrace(layout, gap, self.decision.factual, self.decision.counterfactual)
+
+    def step(self, action: int) -> None:
         """Take an action after `infer`."""
-        self.memory, self.action = self.decided.memory._replace(action=action), action
-        before, self.pose = self.pose, int(self.bank.successor[self.pose, action])
-        self.moved = before // self.bank.task.rules.poses_per_cell != self.pose // self.bank.task.rules.poses_per_cell
+        poses_per_cell = self.bank.task.rules.poses_per_cell
+        next_pose = int(self.bank.successor[self.pose, action])
+        self.moved = self.pose // poses_per_cell != next_pose // poses_per_cell
+        self.pose = next_pose
+        self.memory = self.decision.memory._replace(action=action)
+        self.action = action

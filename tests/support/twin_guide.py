@@ -15,11 +15,12 @@ from support.twin_scene import largest_component
 
 
 class Guide:
-    """Hold the twin of a scene, its poses by number."""
+    """The twin of a scene, with its poses by number."""
 
     def __init__(self, scene: Scene, task: Task):
         reach = largest_component({(iz, ix) for iz, ix in np.argwhere(scene.reach).tolist()})
-        self.cells, self.rules = sorted(reach), task.rules
+        self.cells = sorted(reach)
+        self.rules = task.rules
         self.index = {cell: i for i, cell in enumerate(self.cells)}
         self.twin = Twin(scene, task.categories, task.rules, 0, self.cells[0], 0, 0, 1)
 
@@ -32,8 +33,8 @@ class Guide:
 
     def pose(self) -> int:
         """Return the index of the twin's pose within the scene."""
-        place, (headings, horizons) = self.twin, (self.rules.headings, len(self.rules.horizons))
-        return (self.index[place.cell] * headings + place.heading) * horizons + place.horizon
+        cell_and_heading = self.index[self.twin.cell] * self.rules.headings + self.twin.heading
+        return cell_and_heading * len(self.rules.horizons) + self.twin.horizon
 
 
 def agrees(entry: np.ndarray, instance: tuple[float, float, float]) -> bool:
@@ -54,7 +55,8 @@ def same_distance(metres: float, expected: float) -> bool:
 def row_differences(row: np.ndarray, twin: Twin, num_categories: int) -> Iterator[str]:
     """Yield the names of what differs between row and twin."""
     entries, view = np.split(row, [4 * num_categories])
-    if (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121].tolist() != twin.view():
+    view_cells = (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121]
+    if view_cells.tolist() != twin.view():
         yield "view"
     for entry, instances in zip(entries.reshape(-1, 4), twin.detections(), strict=True):
         if bool(entry[0]) != bool(instances):

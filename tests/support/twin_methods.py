@@ -1,6 +1,7 @@
-"""What the methods make of a view beside the direct pathways, in plain NumPy.
+"""The experience of every method in plain NumPy.
 
-All but the map and the planner of `semexp`, which are the package's here (tests/policies holds their references).
+Not twinned are the map and the planner of `semexp`: they are the package's here, and tests/policies holds their
+references.
 """
 
 import functools
@@ -11,150 +12,218 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.policies.methods import METHODS, Knowledge, Percept
+from jaxnav.policies.method import Knowledge, Percept
+from jaxnav.policies.methods import METHODS
 from support.twin_adaptation import TwinLearnedSteps, TwinTentative
-from support.twin_percept import Seen
-from support.twin_policy import NUM_ACTIONS, Memory, Params, TwinMethod, linear, one_hot, perceptron, relu, softmax
+from support.twin_percept import TwinFeatures
+from support.twin_policy import (
+    NUM_ACTIONS,
+    Params,
+    TwinMemory,
+    TwinMethod,
+    category_maps,
+    linear,
+    one_hot,
+    relu,
+    softmax,
+)
 from support.twin_transformer import TwinTransformer
 
 
 class TwinAnonymous(TwinMethod):
-    """Get the goal's own detection, without a name."""
+    """The goal's own detection, without a name (`anonymous`)."""
 
-    def perceive(self, seen: Seen) -> Seen:
-        goal = int(seen.goal.argmax())
-        only = slice(goal, goal + 1)
-        return Seen(seen.view, seen.visible[only], seen.table[only], seen.goal[only])
+    def perceive(self, features: TwinFeatures) -> TwinFeatures:
+        goal = int(features.goal.argmax())
+        goal_row = slice(goal, goal + 1)
+        return TwinFeatures(
+            features.view, features.visible[goal_row], features.table[goal_row], features.goal[goal_row]
+        )
 
 
 class TwinRelations(TwinMethod):
-    """Relate detections (`org`): rows [R^T X | T], each times its weight, through a perceptron."""
+    """Object relations (`org`): rows [R^T X | T], each times its weight, through a perceptron."""
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
-        return self.relate(params, seen, appearance, weights, seen.table)
+        return self.relate(params, features, appearance, weights, features.table)
 
     def relate(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, table: np.ndarray
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        table: np.ndarray,
     ) -> np.ndarray:
-        relation = relu(linear(params["edges"], seen.table)).T
+        """Return the maps of the relations, with the given table beside them."""
+        relation = relu(linear(params["edges"], features.table)).T
         for kernel in params["mix"]:
             relation = relu(relation @ kernel)
-        rows = np.hstack([relation @ (seen.visible[:, None] * appearance), table])
-        return perceptron(params["maps"], weights[:, None] * rows)
+        rows = np.hstack([relation @ (features.visible[:, None] * appearance), table])
+        return category_maps(params["maps"], weights[:, None] * rows)
 
 
 class TwinZones(TwinRelations):
-    """Follow the zones (`hoz`)."""
+    """Zones of rooms (`hoz`)."""
 
     def begin(self) -> None:
         graph = self.knowledge
-        self.seen = np.zeros(graph["nodes"].shape[-1], bool)
-        self.room, self.zone = int(self._odds().argmax()), 0
+        self.detected = np.zeros(graph["nodes"].shape[-1], bool)
+        self.room = int(self._room_log_odds().argmax())
+        self.zone = 0
         self.nodes = graph["nodes"][self.room].copy()
 
-    def take(self, seen: Seen, percept: Any) -> None:
-        self.seen |= seen.visible > 0
-        room = int(self._odds().argmax())
+    def update(self, features: TwinFeatures, percept: Any) -> None:
+        # The likeliest room; its zones start from those learned before.
+        self.detected |= features.visible > 0
+        room = int(self._room_log_odds().argmax())
         if room != self.room:
-            self.room, self.nodes = room, self.knowledge["nodes"][room].copy()
-        self.zone = int(((seen.visible - self.nodes) ** 2).sum(axis=1).argmin())
-        self.nodes[self.zone] += 0.005 * (seen.visible - self.nodes[self.zone])
+            self.room = room
+            self.nodes = self.knowledge["nodes"][room].copy()
+
+        # The zone that is most like the view moves a little towards it.
+        self.zone = int(((features.visible - self.nodes) ** 2).sum(axis=1).argmin())
+        self.nodes[self.zone] += 0.005 * (features.visible - self.nodes[self.zone])
 
     def read(self, goal: int) -> tuple[np.ndarray, np.ndarray]:
-        graph, sought = self.knowledge, int(self.nodes[:, goal].argmax())
-        places = [self.zone, graph["next_zone"][self.room, self.zone, sought], sought]
-        return softmax(self._odds()), graph["mixing"][self.room][places] @ self.nodes
+        graph = self.knowledge
+        goal_zone = int(self.nodes[:, goal].argmax())
+        next_zone = graph["next_zone"][self.room, self.zone, goal_zone]
+        zones = [self.zone, next_zone, goal_zone]
+        return softmax(self._room_log_odds()), graph["mixing"][self.room][zones] @ self.nodes
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
         rooms, zones = reading
-        table = np.hstack([seen.table, relu(zones @ params["embed"]["kernel"]).T])
-        return np.concatenate([self.relate(params, seen, appearance, weights, table), rooms])
+        table = np.hstack([features.table, relu(zones @ params["embed"]["kernel"]).T])
+        return np.concatenate([self.relate(params, features, appearance, weights, table), rooms])
 
-    def _odds(self) -> np.ndarray:
-        return self.knowledge["frequency"] + self.knowledge["detected"] @ self.seen.astype(float)
+    def _room_log_odds(self) -> np.ndarray:
+        return self.knowledge["frequency"] + self.knowledge["detected"] @ self.detected.astype(float)
 
 
 class TwinGraph(TwinMethod):
-    """Convolve over the graph of categories (`sp`)."""
+    """Convolutions over the graph of categories (`sp`)."""
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
         graph = self.knowledge["mixing"]
-        nodes = relu(graph @ (seen.table @ params["seen"]["kernel"] + appearance @ params["named"]["kernel"]))
+        detections = features.table @ params["seen"]["kernel"]
+        nodes = relu(graph @ (detections + appearance @ params["named"]["kernel"]))
         nodes = relu(graph @ (nodes @ params["second"]["kernel"]))
         return weights * (graph @ (nodes @ params["third"]["kernel"]))[:, 0]
 
 
 class TwinAttention(TwinMethod):
-    """Attend by cosines to goal, action and memory (`eotp`)."""
+    """Attention by cosines, asked by goal, action and memory (`eotp`)."""
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
-        hidden, maps = memory.hidden[-1], params["maps"]
-        rows = linear(maps["inner"], np.hstack([seen.visible[:, None] * appearance, seen.table]))
-        asking = (
-            seen.goal @ appearance @ params["goal"]["kernel"],
-            one_hot(memory.action, NUM_ACTIONS) @ params["action"]["kernel"],
-            hidden @ params["memory"]["kernel"],
-        )
-        query = sum(part * _directed(one) for part, one in zip(linear(params["parts"], hidden), asking, strict=True))
-        shown = np.flatnonzero(seen.visible + seen.goal)
+        hidden = memory.hidden[-1]
+        maps = params["maps"]
+        rows = linear(maps["inner"], np.hstack([features.visible[:, None] * appearance, features.table]))
+
+        # The query mixes the directions of goal, previous action and memory.
+        goal_part = features.goal @ appearance @ params["goal"]["kernel"]
+        action_part = one_hot(memory.action, NUM_ACTIONS) @ params["action"]["kernel"]
+        memory_part = hidden @ params["memory"]["kernel"]
+        shares = linear(params["parts"], hidden)
+        query = np.zeros_like(goal_part)
+        for share, part in zip(shares, (goal_part, action_part, memory_part), strict=True):
+            query += share * _direction(part)
+
+        # Attention over the goal and what is visible, by cosines.
+        attended = np.flatnonzero(features.visible + features.goal)
+        scores = [_direction(rows[category]) @ query for category in attended]
         attention = np.zeros(len(rows))
-        attention[shown] = softmax(np.array([_directed(rows[i]) @ query for i in shown]))
+        attention[attended] = softmax(np.array(scores))
+
         values = relu(rows) @ maps["outer"]["kernel"]
         return relu((attention * weights)[:, None] * values + maps["outer"]["bias"]).ravel()
 
 
 class BorrowedMap(TwinMethod):
-    """Read the package's map of the home and follow its planner (`semexp`); the network is twinned."""
+    """Map and planner of the package (`semexp`); the network is twinned."""
 
     def __init__(self, knowledge: Knowledge):
-        method, tracker = METHODS["semexp"], METHODS["semexp"].tracker
+        method = METHODS["semexp"]
+        tracker = method.tracker
         assert tracker is not None
-        self.init = functools.partial(tracker.init, knowledge)
-        self.update = jax.jit(lambda note, percept: tracker.update(note, knowledge, percept))
-        self.reading = jax.jit(lambda note, goal: tracker.read(note, knowledge, goal))
-        self.control = jax.jit(lambda choice, note: method.control.act(choice, note, knowledge))
+        self.init_state = functools.partial(tracker.init, knowledge)
+        self.update_state = jax.jit(lambda state, percept: tracker.update(state, knowledge, percept))
+        self.read_state = jax.jit(lambda state, goal: tracker.read(state, knowledge, goal))
+        self.control = jax.jit(lambda choice, state: method.control.act(choice, state, knowledge))
 
     def begin(self) -> None:
-        self.note = self.init()
+        self.state = self.init_state()
 
-    def take(self, seen: Seen, percept: Percept) -> None:
-        self.note = self.update(self.note, percept)
+    def update(self, features: TwinFeatures, percept: Percept) -> None:
+        self.state = self.update_state(self.state, percept)
 
     def read(self, goal: int) -> Any:
-        return jax.tree.map(np.asarray, self.reading(self.note, jnp.int32(goal)))
+        return jax.tree.map(np.asarray, self.read_state(self.state, jnp.int32(goal)))
 
-    def surroundings(self, reading: Any) -> np.ndarray:
+    def scene_inputs(self, reading: Any) -> np.ndarray:
         flags = [(reading.blocks >> bit & 1).astype(float) for bit in (27, 28, 29, 30)]
         return np.concatenate([*flags, reading.compass])
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
+        # Each block holds the weighted appearances of its categories, and that of the goal.
+        goal_appearance = features.goal @ appearance
         blocks = []
         for bits in reading.blocks.tolist():
-            inside = [k for k in range(len(weights)) if bits >> k & 1]
-            blocks.append(np.concatenate([weights[inside] @ appearance[inside], seen.goal @ appearance]))
+            categories = [k for k in range(len(weights)) if bits >> k & 1]
+            blocks.append(np.concatenate([weights[categories] @ appearance[categories], goal_appearance]))
         return relu(linear(params["relate"], np.array(blocks))).ravel()
 
     def act(self, choice: int) -> int:
-        action, self.note = self.control(jnp.int32(choice), self.note)
+        action, self.state = self.control(jnp.int32(choice), self.state)
         return int(action)
 
 
-def _directed(vector: np.ndarray) -> np.ndarray:
+def _direction(vector: np.ndarray) -> np.ndarray:
     return vector / math.sqrt((vector**2).sum() + 1e-12)
 
 
 class TwinTentativeRelations(TwinTentative, TwinRelations):
-    """Relate as `org`, and adapt (`tpn`)."""
+    """Relations as in `org`, with adaptation (`tpn`)."""
 
 
 TWINS: dict[str, type[TwinMethod]] = {

@@ -1,4 +1,4 @@
-"""What an agent makes of its views, in plain NumPy: features, the belief about the layout, the map of where it was.
+"""The perception of an agent in plain NumPy: features, the belief about the layout, the map of visited places.
 
 From docs/environment.md and docs/methods.md; float64 throughout, and no arithmetic of the package.
 """
@@ -11,15 +11,15 @@ from scipy.special import digamma, gammaln
 
 from support.twin_scene import NOT_STANDABLE, STANDABLE, Cell
 
-#: What is known of a cell on the map; the larger number stays.
+#: State of a cell on the map; the larger number replaces the smaller one.
 UNKNOWN, BLOCKED, FREE, VISITED = range(4)
 
 
-class Seen(NamedTuple):
-    """Hold what the networks get of a view.
+class TwinFeatures(NamedTuple):
+    """A view as the networks get it.
 
     Attributes:
-      view: float64 [242], which cells are standable, then which are not.
+      view: float64 [242], flags of standable cells, then of those that are not standable.
       visible: float64 [K], 1 where a category is detected.
       table: float64 [K, 9], the detections and the flag of the goal.
       goal: float64 [K], one-hot.
@@ -31,49 +31,68 @@ class Seen(NamedTuple):
     goal: np.ndarray
 
 
-def cells_of(row: np.ndarray, num_categories: int) -> list[int]:
+def unpack_cells(row: np.ndarray, num_categories: int) -> list[int]:
     """Return the 121 cells of the view, two bits each."""
     packed = row[4 * num_categories : 4 * num_categories + 31].tolist()
-    return [byte >> shift & 3 for byte in packed for shift in (0, 2, 4, 6)][:121]
+    cells = []
+    for byte in packed:
+        for shift in (0, 2, 4, 6):
+            cells.append(byte >> shift & 3)
+    return cells[:121]
 
 
-def look(row: np.ndarray, goal: int, num_categories: int) -> Seen:
-    """Take a row of bytes apart."""
-    cells = np.array(cells_of(row, num_categories))
+def unpack_row(row: np.ndarray, goal: int, num_categories: int) -> TwinFeatures:
+    """Unpack a row of bytes."""
+    cells = np.array(unpack_cells(row, num_categories))
+    view = np.concatenate([cells == STANDABLE, cells == NOT_STANDABLE]).astype(float)
+
     table = np.zeros((num_categories, 9))
     for category, entry in enumerate(row[: 4 * num_categories].reshape(-1, 4).tolist()):
-        if entry[0]:
-            ahead, right, apparent = entry[1] / 51, (entry[2] - 128) / 25.4, entry[3] / 127.5  # metres
-            away = max(math.hypot(ahead, right), 0.05)
-            scaled = ahead / 5, right / 5, math.hypot(ahead, right) / 5
-            table[category, :8] = 1, entry[0] / 255, *scaled, right / away, ahead / away, apparent
+        confidence, ahead_byte, right_byte, size_byte = entry
+        if confidence:
+            # Metres from the bytes, and the bearing as sine and cosine.
+            ahead = ahead_byte / 51
+            right = (right_byte - 128) / 25.4
+            distance = math.hypot(ahead, right)
+            safe_distance = max(distance, 0.05)
+            offsets = ahead / 5, right / 5, distance / 5
+            bearing = right / safe_distance, ahead / safe_distance
+            table[category, :8] = 1, confidence / 255, *offsets, *bearing, size_byte / 127.5
     table[goal, 8] = 1
-    view = np.concatenate([cells == STANDABLE, cells == NOT_STANDABLE]).astype(float)
-    return Seen(view, table[:, 0].copy(), table, table[:, 8].copy())
+    return TwinFeatures(view, table[:, 0].copy(), table, table[:, 8].copy())
 
 
 class TwinBelief:
-    """Hold the belief of the setting `calibrated`, whatever the strength of its prior."""
+    """The belief of the estimator `calibrated`, for any strength of its prior."""
 
     def __init__(self, prior: np.ndarray):
-        self.alpha, self.last, self.gap = prior.astype(float), np.zeros(len(prior), bool), 0.0
+        self.alpha = prior.astype(float)
+        self.last_visible = np.zeros(len(prior), bool)
+        self.gap = 0.0
 
     def update(self, visible: np.ndarray) -> None:
-        """Take in which categories are visible, bool [K]."""
-        if visible.sum() < 2 or (visible == self.last).all():
+        """Update with the categories that are visible, bool [K]."""
+        # The gate is shut: the gap decays.
+        if visible.sum() < 2 or (visible == self.last_visible).all():
             self.gap *= 0.8
             return
+
+        # Eq. 5: the mean divergence of the rows of visible categories, each without its own entry.
         divergences = []
         for i in np.flatnonzero(visible):
             others = np.arange(len(visible)) != i
-            before, counts = self.alpha[i, others], visible[others].astype(float)
-            divergences.append(_kl(before + counts, before))
+            prior_row = self.alpha[i, others]
+            counts = visible[others].astype(float)
+            divergences.append(_kl(prior_row + counts, prior_row))
             self.alpha[i, others] += counts
-        self.gap, self.last = math.tanh(np.mean(divergences)), visible.copy()
+        self.gap = math.tanh(np.mean(divergences))
+        self.last_visible = visible.copy()
 
     def weights(self, goal: int) -> np.ndarray:
-        """Return w x g, [K]: how likely the goal is where each category is seen."""
-        return np.array([1.0 if i == goal else row[goal] / row.sum() for i, row in enumerate(self.alpha)])
+        """Return w x g, [K]: the expectation that the goal is where each category is seen."""
+        weights = self.alpha[:, goal] / self.alpha.sum(axis=1)
+        weights[goal] = 1.0
+        return weights
 
 
 def _kl(b: np.ndarray, a: np.ndarray) -> float:
@@ -85,34 +104,40 @@ def _kl(b: np.ndarray, a: np.ndarray) -> float:
 
 
 class TwinMap:
-    """Hold what is known of the cells around an episode's start, for eight headings.
+    """State of the cells around an episode's start, for eight headings.
 
-    The scenes must be smaller than the map of the package, which goes on at its opposite edge.
+    The scenes must be smaller than the toroidal map of the package.
     """
 
     def __init__(self) -> None:
-        self.known: dict[Cell, int] = {}
-        self.place, self.heading = (0, 0), 0
+        self.cell_states: dict[Cell, int] = {}
+        self.position = (0, 0)
+        self.heading = 0
 
     def update(self, cells: list[int], heading: int, moved: bool) -> None:
-        """Take in a view of 121 cells; row 0 is nearest, column 0 leftmost."""
+        """Update with a view of 121 cells; row 0 is nearest, column 0 leftmost."""
         self.heading = heading
         if moved:
-            angle = math.radians(45 * heading)
-            self.place = (self.place[0] + round(math.cos(angle)), self.place[1] + round(math.sin(angle)))
+            self.position = self._cell_at(ahead=1, right=0)
+
         for number, cell in enumerate(cells):
-            code = {STANDABLE: FREE, NOT_STANDABLE: BLOCKED}.get(cell, UNKNOWN)
-            at = self._at(number // 11, number % 11 - 5)
-            self.known[at] = max(self.known.get(at, UNKNOWN), code)
-        self.known[self.place] = VISITED
+            state = {STANDABLE: FREE, NOT_STANDABLE: BLOCKED}.get(cell, UNKNOWN)
+            place = self._cell_at(number // 11, number % 11 - 5)
+            self.cell_states[place] = max(self.cell_states.get(place, UNKNOWN), state)
+        self.cell_states[self.position] = VISITED
 
     def inputs(self) -> np.ndarray:
-        """Return which of 11 x 11 cells, every second one, are blocked, free and visited."""
-        along = range(-10, 11, 2)
-        codes = np.array([self.known.get(self._at(ahead, right), UNKNOWN) for ahead in along for right in along])
-        return np.concatenate([codes == code for code in (BLOCKED, FREE, VISITED)]).astype(float)
+        """Return flags of 11 x 11 cells, every second one: blocked, then free, then visited."""
+        offsets = range(-10, 11, 2)
+        states = []
+        for ahead in offsets:
+            for right in offsets:
+                states.append(self.cell_states.get(self._cell_at(ahead, right), UNKNOWN))
+        return np.concatenate([np.array(states) == state for state in (BLOCKED, FREE, VISITED)]).astype(float)
 
-    def _at(self, ahead: int, right: int) -> Cell:
-        cosine, sine = math.cos(math.radians(45 * self.heading)), math.sin(math.radians(45 * self.heading))
-        dz, dx = ahead * cosine - right * sine, ahead * sine + right * cosine
-        return self.place[0] + round(round(dz, 9)), self.place[1] + round(round(dx, 9))
+    def _cell_at(self, ahead: int, right: int) -> Cell:
+        """Return the cell at an offset from the agent, in cells."""
+        angle = math.radians(45 * self.heading)
+        dz = ahead * math.cos(angle) - right * math.sin(angle)
+        dx = ahead * math.sin(angle) + right * math.cos(angle)
+        return self.position[0] + round(round(dz, 9)), self.position[1] + round(round(dx, 9))

@@ -1,80 +1,109 @@
-"""The policies' decisions in plain NumPy: pathways, streams, the counterfactual, equation 2.
+"""The policies' decisions in plain NumPy: pathways, streams, the counterfactual.
 
-Float64, one episode, no arithmetic of the package; parameters are the nested dicts of `init_params`. What differs
-between methods is a `TwinMethod`.
+Float64, one episode, no arithmetic of the package; parameters are the nested dicts of `init_params`. A `TwinMethod`
+holds the part in which methods differ.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxnav.policies.methods import Knowledge
+from jaxnav.policies.method import Knowledge
 from jaxnav.policies.spec import PolicySpec
-from support.twin_percept import Seen
+from support.twin_percept import TwinFeatures
 
 NUM_ACTIONS = 6
 Params = dict[str, Any]
-#: What is added to the kernels (the last row is the bias) or to the outputs of layers, by name.
-Added = dict[str, np.ndarray]
+#: Changes by layer: added to the kernels (the last row is the bias), or to the outputs.
+LayerChanges = dict[str, np.ndarray]
 
 
-class Memory(NamedTuple):
-    """Hold hidden states, one a stream, the previous action (6 at first) and what the method remembers."""
+class TwinMemory(NamedTuple):
+    """Memory of a policy within an episode.
+
+    Attributes:
+      hidden: recurrent states [H], one per stream.
+      action: previous action, 6 at the start.
+      fast: fast weights of the method; None without any.
+    """
 
     hidden: list[np.ndarray]
     action: int
     fast: Any
 
 
-class Decided(NamedTuple):
-    """Hold factual and counterfactual logits [A], and the memory but for the action that follows."""
+class TwinDecision(NamedTuple):
+    """Factual and counterfactual logits [A], and the memory, whose action is filled in later."""
 
     factual: np.ndarray
     counterfactual: np.ndarray
-    memory: Memory
+    memory: TwinMemory
 
 
 class TwinMethod:
-    """Make no experience: the method `rgb`. Others override what they have."""
+    """Method without experience, `rgb`. Subclasses override the parts that they have."""
 
     def __init__(self, knowledge: Knowledge):
         self.knowledge = {name: np.asarray(value) for name, value in knowledge.method.items()}
 
     def begin(self) -> None:
-        """Forget the last episode."""
+        """Start an episode."""
 
-    def perceive(self, seen: Seen) -> Seen:
-        """Return what the networks get."""
-        return seen
+    def perceive(self, features: TwinFeatures) -> TwinFeatures:
+        """Return the features that the networks get."""
+        return features
 
-    def take(self, seen: Seen, percept: Any) -> None:
-        """Take in one step."""
+    def update(self, features: TwinFeatures, percept: Any) -> None:
+        """Update the state of the tracker."""
 
     def read(self, goal: int) -> Any:
-        """Return what the experience is made of beside the view."""
+        """Return the reading of the tracker."""
         return None
 
-    def surroundings(self, reading: Any) -> np.ndarray:
-        """Return what the reading tells of the scene."""
+    def scene_inputs(self, reading: Any) -> np.ndarray:
+        """Return the part of the reading that describes the scene."""
         return np.zeros(0)
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
-        """Return Z."""
+        """Return the experience Z."""
         return np.zeros(0)
 
-    def start(self, params: Params) -> Any:
+    def initial_fast(self, params: Params) -> Any:
         """Return the fast weights at an episode's start."""
         return None
 
-    def changes(self, fast: Any) -> Added:
-        """Return what fast weights add to the kernels of the direct stream."""
+    def layer_changes(self, fast: Any) -> LayerChanges:
+        """Return the changes of the direct stream's kernels by fast weights."""
         return {}
 
-    def adapt(self, params: Params, parts: list[np.ndarray], before: Memory, decided: Any, reading: Any) -> Any:
-        """Return the fast weights after a decision."""
-        return before.fast
+    def adapt(
+        self,
+        params: Params,
+        inputs: np.ndarray,
+        memory: TwinMemory,
+        logits: np.ndarray,
+        hidden: np.ndarray,
+        reading: Any,
+    ) -> Any:
+        """Return the fast weights after a decision.
+
+        Args:
+          params: of the policy.
+          inputs: of the direct stream.
+          memory: before the decision.
+          logits: of the decision.
+          hidden: recurrent state of the direct stream after the decision.
+          reading: of the tracker.
+        """
+        return memory.fast
 
     def act(self, choice: int) -> int:
         """Return the action of a choice."""
@@ -89,12 +118,16 @@ def relu(x: np.ndarray) -> np.ndarray:
     return np.where(np.real(x) > 0, x, 0)
 
 
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
 def softmax(x: np.ndarray) -> np.ndarray:
     exponential = np.exp(x - np.real(x).max(axis=-1, keepdims=True))
     return exponential / exponential.sum(axis=-1, keepdims=True)
 
 
-def with_one(x: np.ndarray) -> np.ndarray:
+def append_one(x: np.ndarray) -> np.ndarray:
     return np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
 
 
@@ -103,93 +136,134 @@ def linear(params: Params, x: np.ndarray) -> np.ndarray:
     return product if params.get("bias") is None else product + params["bias"]
 
 
-def whole(params: Params) -> np.ndarray:
+def kernel_with_bias(params: Params) -> np.ndarray:
     """Return a layer's kernel with the bias as its last row."""
     return np.vstack([params["kernel"], params["bias"]])
 
 
-def perceptron(params: Params, rows: np.ndarray) -> np.ndarray:
+def category_maps(params: Params, rows: np.ndarray) -> np.ndarray:
     """Return the maps of rows, category by category, flat."""
     return relu(linear(params["outer"], relu(linear(params["inner"], rows)))).ravel()
 
 
-def stream(
-    params: Params, inputs: np.ndarray, hidden: np.ndarray, changes: Added, added: Added
+def run_stream(
+    params: Params, inputs: np.ndarray, hidden: np.ndarray, changes: LayerChanges, output_changes: LayerChanges
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return logits and the hidden state after one decision.
+    """Return logits and the recurrent state after one decision.
 
     Args:
       params: of the stream.
-      inputs: [I], all that enters.
+      inputs: [I], all inputs side by side.
       hidden: [H].
       changes: of the kernels `fuse`, `drive`, `core` and `actor`.
-      added: to their outputs.
+      output_changes: added to their outputs.
     """
 
     def layer(name: str, kernel: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return x @ (kernel + changes.get(name, 0.0)) + added.get(name, 0.0)
+        return x @ (kernel + changes.get(name, 0.0)) + output_changes.get(name, 0.0)
 
     core = params["core"]
-    entering = relu(layer("fuse", whole(params["fuse"]), with_one(inputs)))
-    drive = layer("drive", whole(core["dense_i"]), with_one(entering))
-    (r, z, n), (by_r, by_z, by_n) = (
-        np.split(part, 3, axis=-1) for part in (drive, layer("core", core["dense_h"]["kernel"], hidden))
-    )
-    reset, update = (1 / (1 + np.exp(-x)) for x in (r + by_r, z + by_z))
-    after = (1 - update) * np.tanh(n + reset * by_n) + update * hidden
-    return layer("actor", whole(params["actor"]), with_one(after)), after
+    fused = relu(layer("fuse", kernel_with_bias(params["fuse"]), append_one(inputs)))
+
+    # The gated recurrent unit: reset, update and new state, each from the inputs and from the last state.
+    input_gates = layer("drive", kernel_with_bias(core["dense_i"]), append_one(fused))
+    hidden_gates = layer("core", core["dense_h"]["kernel"], hidden)
+    input_reset, input_update, input_new = np.split(input_gates, 3, axis=-1)
+    hidden_reset, hidden_update, hidden_new = np.split(hidden_gates, 3, axis=-1)
+    reset = sigmoid(input_reset + hidden_reset)
+    update = sigmoid(input_update + hidden_update)
+    new_state = np.tanh(input_new + reset * hidden_new)
+    next_hidden = (1 - update) * new_state + update * hidden
+
+    return layer("actor", kernel_with_bias(params["actor"]), append_one(next_hidden)), next_hidden
 
 
 class TwinPolicy:
-    """Decide as one policy does, `fused` or in `streams`."""
+    """One policy, `fused` or in `streams`."""
 
     def __init__(self, spec: PolicySpec, params: Params, method: TwinMethod):
-        self.spec, self.params, self.method = spec, params, method
-        self.streams = spec.decision == "streams"
+        self.spec = spec
+        self.params = params
+        self.method = method
+        self.has_streams = spec.decision == "streams"
 
-    def memory(self) -> Memory:
+    def initial_memory(self) -> TwinMemory:
         """Return the memory at an episode's start."""
+        num_streams = 2 if self.has_streams else 1
         hidden = np.zeros(self.spec.sizes.hidden)
-        return Memory([hidden] * (1 + self.streams), NUM_ACTIONS, self.method.start(self.params))
+        return TwinMemory([hidden] * num_streams, NUM_ACTIONS, self.method.initial_fast(self.params))
 
-    def decide(self, seen: Seen, surroundings: np.ndarray, weights: np.ndarray, memory: Memory) -> Decided:
+    def decide(
+        self, features: TwinFeatures, surroundings: np.ndarray, weights: np.ndarray, memory: TwinMemory
+    ) -> TwinDecision:
         """Return both decisions.
 
         Args:
-          seen: the view.
-          surroundings: what the map tells, of no length without one.
+          features: of the view.
+          surroundings: inputs from the map; empty without a map.
           weights: [K], the layout's.
           memory: before the decision.
         """
-        params, seen = self.params, self.method.perceive(seen)
-        reading = self.method.read(int(seen.goal.argmax()))
-        inputs = np.concatenate([seen.view, surroundings, self.method.surroundings(reading)])
-        scene, goal = relu(linear(params["view"], inputs)), self._goal(seen)
-        appearance = params["known_appearance" if self.streams else "appearance"]["embedding"]
-        known = self.method.encode(params.get("method", {}), seen, appearance, weights, reading, memory)
-        previous, changes = one_hot(memory.action, NUM_ACTIONS), self.method.changes(memory.fast)
-        if not self.streams:
-            parts = [scene, goal, known, previous]
-            logits, hidden = stream(params, np.concatenate(parts), memory.hidden[0], changes, {})
-            without = np.concatenate([0 * scene, 0 * goal, known, previous])
-            counterfactual, _ = stream(params, without, memory.hidden[0], changes, {})
-            fast = self.method.adapt(params, parts, memory, (logits, hidden), reading)
-            return Decided(logits, counterfactual, Memory([hidden], -1, fast))
-        view, other_view = np.split(scene, 2)
-        parts = [with_one(view), goal, previous]
-        direct, hidden = stream(params, np.concatenate(parts), memory.hidden[0], changes, {})
-        entering = np.concatenate([known, other_view, [1], previous])
-        experience, experienced = stream(params["experience_stream"], entering, memory.hidden[1], {}, {})
-        direct, experience = np.round(1024 * direct) / 1024, np.round(1024 * experience) / 1024
-        fast = self.method.adapt(params, parts, memory, (direct + experience, hidden), reading)
-        return Decided(direct + experience, experience, Memory([hidden, experienced], -1, fast))
+        params = self.params
+        features = self.method.perceive(features)
+        reading = self.method.read(int(features.goal.argmax()))
 
-    def _goal(self, seen: Seen) -> np.ndarray:
-        """Return the embedding of detections and what is sought."""
-        spec, params = self.spec, self.params
-        shown = {"all": np.ones_like(seen.goal), "goal": seen.goal, "none": 0 * seen.goal}[spec.direct]
-        rows = np.hstack([seen.visible[:, None] * params["appearance"]["embedding"], seen.table])
-        parts = [perceptron(params["detections"], shown[:, None] * rows)]
-        if spec.goal_row:
-            parts.append(perceptron(params["detections"], (seen.goal * shown) @ rows))
-        return np.concatenate([*parts, seen.goal @ params["sought"]["embedding"]])
+        # The three pathways.
+        scene_inputs = [features.view, surroundings, self.method.scene_inputs(reading)]
+        scene = relu(linear(params["view"], np.concatenate(scene_inputs)))
+        goal = self._embed_goal(features)
+        appearance = params["known_appearance" if self.has_streams else "appearance"]["embedding"]
+        experience = self.method.encode(params.get("method", {}), features, appearance, weights, reading, memory)
+
+        decide = self._decide_in_streams if self.has_streams else self._decide_fused
+        return decide(scene, goal, experience, memory, reading)
+
+    def _decide_fused(
+        self, scene: np.ndarray, goal: np.ndarray, experience: np.ndarray, memory: TwinMemory, reading: Any
+    ) -> TwinDecision:
+        """Decide from all pathways at once; the counterfactual zeroes scene and goal."""
+        changes = self.method.layer_changes(memory.fast)
+        previous_action = one_hot(memory.action, NUM_ACTIONS)
+
+        inputs = np.concatenate([scene, goal, experience, previous_action])
+        logits, hidden = run_stream(self.params, inputs, memory.hidden[0], changes, {})
+        indirect_inputs = np.concatenate([0 * scene, 0 * goal, experience, previous_action])
+        counterfactual, _ = run_stream(self.params, indirect_inputs, memory.hidden[0], changes, {})
+
+        fast = self.method.adapt(self.params, inputs, memory, logits, hidden, reading)
+        return TwinDecision(logits, counterfactual, TwinMemory([hidden], -1, fast))
+
+    def _decide_in_streams(
+        self, scene: np.ndarray, goal: np.ndarray, experience: np.ndarray, memory: TwinMemory, reading: Any
+    ) -> TwinDecision:
+        """Decide by the sum of two streams; the counterfactual is the stream of experience."""
+        changes = self.method.layer_changes(memory.fast)
+        previous_action = one_hot(memory.action, NUM_ACTIONS)
+        direct_view, experience_view = np.split(scene, 2)
+
+        direct_inputs = np.concatenate([append_one(direct_view), goal, previous_action])
+        direct, direct_hidden = run_stream(self.params, direct_inputs, memory.hidden[0], changes, {})
+        experience_inputs = np.concatenate([experience, experience_view, [1], previous_action])
+        stream_params = self.params["experience_stream"]
+        indirect, experience_hidden = run_stream(stream_params, experience_inputs, memory.hidden[1], {}, {})
+
+        # Logits are rounded, so that their sum can be undone.
+        direct = np.round(1024 * direct) / 1024
+        indirect = np.round(1024 * indirect) / 1024
+        logits = direct + indirect
+
+        fast = self.method.adapt(self.params, direct_inputs, memory, logits, direct_hidden, reading)
+        return TwinDecision(logits, indirect, TwinMemory([direct_hidden, experience_hidden], -1, fast))
+
+    def _embed_goal(self, features: TwinFeatures) -> np.ndarray:
+        """Return the embedding of detections and goal."""
+        # Categories whose detections enter the direct pathway.
+        is_direct = {"all": np.ones_like(features.goal), "goal": features.goal, "none": 0 * features.goal}[
+            self.spec.direct
+        ]
+        appearance = self.params["appearance"]["embedding"]
+        rows = np.hstack([features.visible[:, None] * appearance, features.table])
+        parts = [category_maps(self.params["detections"], is_direct[:, None] * rows)]
+        if self.spec.goal_row:
+            parts.append(category_maps(self.params["detections"], (features.goal * is_direct) @ rows))
+        return np.concatenate([*parts, features.goal @ self.params["sought"]["embedding"]])

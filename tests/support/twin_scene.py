@@ -6,6 +6,7 @@ theorem, and walks are those of Dijkstra's algorithm.
 
 import functools
 import heapq
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -23,24 +24,29 @@ VIEW = 11
 
 
 def largest_component(reach: set[Cell]) -> set[Cell]:
-    best: set[Cell] = set()
-    left = set(reach)
+    """Return the largest connected part of cells, the first in row order among equal ones."""
+    largest: set[Cell] = set()
+    unvisited = set(reach)
     for seed in sorted(reach):  # row order
-        if seed not in left:
+        if seed not in unvisited:
             continue
-        left.remove(seed)
-        part, queue = {seed}, [seed]
+
+        # Everything that is connected with the seed.
+        unvisited.remove(seed)
+        component = {seed}
+        queue = [seed]
         while queue:
             iz, ix = queue.pop()
             for dz, dx in NEIGHBOURS:
                 cell = (iz + dz, ix + dx)
-                if cell in left:
-                    left.remove(cell)
-                    part.add(cell)
+                if cell in unvisited:
+                    unvisited.remove(cell)
+                    component.add(cell)
                     queue.append(cell)
-        if len(part) > len(best):
-            best = part
-    return best
+
+        if len(component) > len(largest):
+            largest = component
+    return largest
 
 
 def degrees(rules: Rules, heading: int) -> float:
@@ -59,29 +65,26 @@ def neighbour(rules: Rules, heading: int) -> Cell:
 
 @functools.cache
 def view_lines(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None]:
-    """Return the place (dz, dx) of each view cell.
-
-    With it come the places that the line to it passes. Both are None outside the cone.
-    """
+    """Return the offset (dz, dx) of each view cell and the offsets on the line to it; None outside the cone."""
     yaw = math.radians(degrees(rules, heading))
+    half_width = math.tan(math.radians(rules.field_of_view[0] / 2))
     view: list[tuple[Cell, set[Cell]] | None] = []
     for ahead in range(VIEW):
         for right in range(-(VIEW // 2), VIEW // 2 + 1):
-            if abs(right) > math.tan(math.radians(rules.field_of_view[0] / 2)) * ahead:
+            if abs(right) > half_width * ahead:
                 view.append(None)
                 continue
-            place = (
-                ahead * math.cos(yaw) - right * math.sin(yaw),
-                ahead * math.sin(yaw) + right * math.cos(yaw),
-            )
-            dz, dx = (round(round(value, 9)) for value in place)  # 2.4999999999999996 is a half, too
-            passed = {(round(Fraction(dz * k, 22)), round(Fraction(dx * k, 22))) for k in range(1, 22)}
-            view.append(((dz, dx), passed - {(0, 0), (dz, dx)}))
+
+            # Rounded twice, for 2.4999999999999996 is a half, too.
+            dz = round(round(ahead * math.cos(yaw) - right * math.sin(yaw), 9))
+            dx = round(round(ahead * math.sin(yaw) + right * math.cos(yaw), 9))
+            on_line = {(round(Fraction(dz * k, 22)), round(Fraction(dx * k, 22))) for k in range(1, 22)}
+            view.append(((dz, dx), on_line - {(0, 0), (dz, dx)}))
     return view
 
 
 class TwinScene:
-    """Hold a scene under some rules, with what was computed."""
+    """A scene under some rules, with computed distances and detections."""
 
     def __init__(self, scene: Scene, categories: tuple[str, ...], rules: Rules):
         self.rules = rules
@@ -91,15 +94,18 @@ class TwinScene:
         self.standable = largest_component({cell for cell in self.lattice if scene.reach[cell]})
         self.boxes = []
         for name, values in zip(scene.types, scene.boxes, strict=True):
-            name = name if name in categories else ALIASES.get(name, name)
-            self.boxes.append(Box(values, categories.index(name) if name in categories else None))
-        tall = [box for box in self.boxes if box.opaque and box.top >= self.rules.camera - 1e-9]
-        #: Cells that hide the floor behind them: walls, and those under what is as high as the camera.
-        self.hiding = self.walls | {
-            cell
-            for cell in self.lattice
-            if any(contains(self.position(cell), box.centre[::2], box.half[::2], 1e-9) for box in tall)
-        }
+            if name not in categories:
+                name = ALIASES.get(name, name)
+            category = categories.index(name) if name in categories else None
+            self.boxes.append(Box(values, category))
+
+        #: Cells that hide the floor behind them: walls, and those under boxes as high as the camera.
+        self.hiding = set(self.walls)
+        tall_boxes = [box for box in self.boxes if box.opaque and box.top >= self.rules.camera - 1e-9]
+        for cell in self.lattice:
+            position = self.position(cell)
+            if any(contains(position, box.centre[::2], box.half[::2], 1e-9) for box in tall_boxes):
+                self.hiding.add(cell)
         self._detectable: dict[Cell, list[tuple[Box, float]]] = {}
         self._walks: dict[int, dict[Cell, float]] = {}
 
@@ -110,26 +116,33 @@ class TwinScene:
         return math.dist(self.position(cell), (box.centre[0], box.centre[2]))
 
     def detectable(self, cell: Cell) -> list[tuple[Box, float]]:
-        """Return the objects detected from a cell, and their distances.
+        """Return the objects that can be detected from a cell, with their distances.
 
         They have a category and a clear line of sight, and are within their range.
         """
-        if cell not in self._detectable:
-            near = [(box, self.distance(cell, box)) for box in self.boxes if box.category is not None]
-            self._detectable[cell] = [
-                (box, distance) for box, distance in near if distance <= box.range + 1e-9 and self._clear(cell, box)
-            ]
-        return self._detectable[cell]
+        if cell in self._detectable:
+            return self._detectable[cell]
+
+        detectable = []
+        for box in self.boxes:
+            distance = self.distance(cell, box)
+            if box.category is not None and distance <= box.range + 1e-9 and self._clear(cell, box):
+                detectable.append((box, distance))
+        self._detectable[cell] = detectable
+        return detectable
 
     def _clear(self, cell: Cell, target: Box) -> bool:
         """Check that the camera over a cell sees a box."""
         x, z = self.position(cell)
-        camera, goal = (x, self.rules.camera, z), target.centre
+        camera = (x, self.rules.camera, z)
+        goal = target.centre
+
+        # The line of sight ends 0.3 m before the target.
         length = math.dist(camera, goal)
         if length < 0.3:
             return True
-        part = (length - 0.3) / length
-        end = tuple(c + part * (g - c) for c, g in zip(camera, goal, strict=True))
+        share = (length - 0.3) / length
+        end = tuple(c + share * (g - c) for c, g in zip(camera, goal, strict=True))
         for box in self.boxes:
             exempt = (
                 box is target
@@ -146,11 +159,16 @@ class TwinScene:
         Those that contain its start or the target do not count.
         """
         # Only the cells around the segment can meet it.
-        columns, rows = (
-            range(round((min(a, b) - o) / 0.25) - 1, round((max(a, b) - o) / 0.25) + 2)
-            for a, b, o in zip(start, end, self.origin, strict=True)
-        )
-        for wall in ((iz, ix) for iz in rows for ix in columns if (iz, ix) in self.walls):
+        ranges = []
+        for a, b, origin in zip(start, end, self.origin, strict=True):
+            first = round((min(a, b) - origin) / 0.25) - 1
+            last = round((max(a, b) - origin) / 0.25) + 1
+            ranges.append(range(first, last + 1))
+        columns, rows = ranges
+
+        for wall in itertools.product(rows, columns):
+            if wall not in self.walls:
+                continue
             centre = self.position(wall)
             exempt = any(contains(point, centre, (0.125, 0.125)) for point in (start, target))
             if not exempt and meets(start, end, centre, (0.125 - SHRINK, 0.125 - SHRINK)):
@@ -158,53 +176,74 @@ class TwinScene:
         return False
 
     def offsets(self, cell: Cell, heading: int, horizon: int, box: Box) -> tuple[float, float, bool]:
-        """Return metres ahead and right of a box, and visibility."""
+        """Return metres ahead and right of a box, and whether the camera's frustum holds its centre."""
+        # From the camera to the box, in the world's axes.
         x, z = self.position(cell)
-        vx, up, vz = box.centre[0] - x, box.centre[1] - self.rules.camera, box.centre[2] - z
-        yaw, pitch = math.radians(degrees(self.rules, heading)), math.radians(self.rules.horizons[horizon])
-        fx, fz = math.sin(yaw), math.cos(yaw)
-        ahead, right = vx * fx + vz * fz, vx * fz - vz * fx
+        vx = box.centre[0] - x
+        up = box.centre[1] - self.rules.camera
+        vz = box.centre[2] - z
+
+        # Turned by the heading, then tilted by the horizon.
+        yaw = math.radians(degrees(self.rules, heading))
+        fx = math.sin(yaw)
+        fz = math.cos(yaw)
+        ahead = vx * fx + vz * fz
+        right = vx * fz - vz * fx
+        pitch = math.radians(self.rules.horizons[horizon])
         depth = ahead * math.cos(pitch) - up * math.sin(pitch)
         rise = ahead * math.sin(pitch) + up * math.cos(pitch)
-        across, high = (math.tan(math.radians(angle / 2)) * depth for angle in self.rules.field_of_view)
-        return ahead, right, depth > 0 and abs(right) <= across and abs(rise) <= high
+
+        half_width, half_height = (math.tan(math.radians(angle / 2)) * depth for angle in self.rules.field_of_view)
+        return ahead, right, depth > 0 and abs(right) <= half_width and abs(rise) <= half_height
 
     def walk(self, cell: Cell, category: int) -> float:
-        """Return the metres to walk to a category's nearest object.
-
-        They are infinite if there is no way.
-        """
+        """Return the metres to walk to a category's nearest object, infinite if there is no way."""
         if category not in self._walks:
-            queue = [way for box in self.boxes if box.category == category for way in self._straight(box)]
-            heapq.heapify(queue)
-            walks = self._walks[category] = {}
-            while queue:
-                length, (iz, ix) = heapq.heappop(queue)
-                if (iz, ix) in walks:
-                    continue
-                walks[iz, ix] = length
-                for dz, dx in NEIGHBOURS:
-                    if (iz + dz, ix + dx) in self.standable:
-                        heapq.heappush(queue, (length + 0.25 * math.hypot(dz, dx), (iz + dz, ix + dx)))
+            self._walks[category] = self._walks_to(category)
         return self._walks[category].get(cell, math.inf)
 
-    def _straight(self, box: Box) -> Iterator[tuple[float, Cell]]:
-        """Yield length and first cell of walks' last parts."""
+    def _walks_to(self, category: int) -> dict[Cell, float]:
+        """Return the metres from every cell to a category, by Dijkstra's algorithm from the objects on."""
+        queue = []
+        for box in self.boxes:
+            if box.category == category:
+                queue.extend(self._last_parts(box))
+        heapq.heapify(queue)
+
+        walks = {}
+        while queue:
+            length, (iz, ix) = heapq.heappop(queue)
+            if (iz, ix) in walks:
+                continue
+            walks[iz, ix] = length
+            for dz, dx in NEIGHBOURS:
+                neighbour_cell = (iz + dz, ix + dx)
+                if neighbour_cell in self.standable:
+                    heapq.heappush(queue, (length + 0.25 * math.hypot(dz, dx), neighbour_cell))
+        return walks
+
+    def _last_parts(self, box: Box) -> Iterator[tuple[float, Cell]]:
+        """Yield length and first cell of the straight last parts of walks to a box."""
         for cell in self.standable:
-            here = self.position(cell)
-            end = box.nearest(*here)
-            length = math.dist(here, end)
-            if length <= 1 + 1e-9 and not self._walled(here, end, box.centre[::2]):
+            start = self.position(cell)
+            end = box.nearest(*start)
+            length = math.dist(start, end)
+            if length <= 1 + 1e-9 and not self._walled(start, end, box.centre[::2]):
                 yield length, cell
 
     def view(self, cell: Cell, heading: int) -> list[int]:
         """Return the ego-centric view, near edge and left first."""
         iz, ix = cell
         view = []
-        for look in view_lines(self.rules, heading):
-            if look is None or any((iz + dz, ix + dx) in self.hiding for dz, dx in look[1]):
+        for line in view_lines(self.rules, heading):
+            if line is None:
                 view.append(UNKNOWN)
+                continue
+            (dz, dx), on_line = line
+            if any((iz + line_dz, ix + line_dx) in self.hiding for line_dz, line_dx in on_line):
+                view.append(UNKNOWN)
+            elif (iz + dz, ix + dx) in self.standable:
+                view.append(STANDABLE)
             else:
-                there = iz + look[0][0], ix + look[0][1]
-                view.append(STANDABLE if there in self.standable else NOT_STANDABLE)
+                view.append(NOT_STANDABLE)
         return view

@@ -5,70 +5,97 @@ from typing import Any
 
 import numpy as np
 
-from support.twin_percept import Seen
-from support.twin_policy import Memory, Params, TwinMethod, linear, relu, softmax
+from support.twin_percept import TwinFeatures
+from support.twin_policy import Params, TwinMemory, TwinMethod, linear, relu, softmax
 
-SIDE, VIEW = 5, 11
+#: Squares along a side of the view, and its cells.
+SIDE = 5
+VIEW = 11
 
 
-def normalised(params: Params, rows: np.ndarray) -> np.ndarray:
+def layer_norm(params: Params, rows: np.ndarray) -> np.ndarray:
     """Normalise rows to mean 0 and variance 1, then scale and shift."""
-    mean, variance = rows.mean(axis=-1, keepdims=True), rows.var(axis=-1, keepdims=True)
+    mean = rows.mean(axis=-1, keepdims=True)
+    variance = rows.var(axis=-1, keepdims=True)
     return (rows - mean) / np.sqrt(variance + 1e-6) * params["scale"] + params["bias"]
 
 
-def forward(params: Params, rows: np.ndarray) -> np.ndarray:
-    """Add what a perceptron makes of each row, and normalise."""
-    return normalised(params["norm"], rows + linear(params["outer"], relu(linear(params["inner"], rows))))
+def residual_perceptron(params: Params, rows: np.ndarray) -> np.ndarray:
+    """Add the output of a perceptron to each row, and normalise."""
+    return layer_norm(params["norm"], rows + linear(params["outer"], relu(linear(params["inner"], rows))))
 
 
-def attended(params: Params, values: np.ndarray, query: np.ndarray, key: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """Add what two heads attend to, and normalise."""
-    asked, keys, answers = linear(params["query"], query), linear(params["key"], key), linear(params["value"], memory)
-    width, found = values.shape[-1] // 2, []
+def residual_attention(
+    params: Params, values: np.ndarray, query: np.ndarray, key: np.ndarray, memory: np.ndarray
+) -> np.ndarray:
+    """Add the answers of two attention heads, and normalise."""
+    queries = linear(params["query"], query)
+    keys = linear(params["key"], key)
+    memories = linear(params["value"], memory)
+    width = values.shape[-1] // 2
+    answers = []
     for head in (slice(0, width), slice(width, None)):
-        scores = asked[:, head] @ keys[:, head].T / math.sqrt(width)
-        found.append(softmax(scores) @ answers[:, head])
-    return normalised(params["norm"], values + linear(params["out"], np.hstack(found)))
+        scores = queries[:, head] @ keys[:, head].T / math.sqrt(width)
+        answers.append(softmax(scores) @ memories[:, head])
+    return layer_norm(params["norm"], values + linear(params["out"], np.hstack(answers)))
 
 
-def square(number: int) -> list[int]:
+def square_cells(number: int) -> list[int]:
     """Return the cells of a square, 3 x 3 every two cells, of both planes of the view."""
     row, column = divmod(number, SIDE)
-    cells = [(2 * row + i) * VIEW + 2 * column + j for i in range(3) for j in range(3)]
+    cells = []
+    for i in range(3):
+        for j in range(3):
+            cells.append((2 * row + i) * VIEW + 2 * column + j)
     return cells + [VIEW**2 + cell for cell in cells]
 
 
-def place(number: int, width: int) -> np.ndarray:
+def position_code(number: int, width: int) -> np.ndarray:
     """Return the code of a square's place: sines and cosines of its row, then of its column."""
     code = []
-    for along in divmod(number, SIDE):
-        angles = [along * math.pi / SIDE / 2**i for i in range(width // 4)]
-        code += [math.sin(angle) for angle in angles] + [math.cos(angle) for angle in angles]
+    for coordinate in divmod(number, SIDE):
+        angles = [coordinate * math.pi / SIDE / 2**i for i in range(width // 4)]
+        code.extend(math.sin(angle) for angle in angles)
+        code.extend(math.cos(angle) for angle in angles)
     return np.array(code)
 
 
 class TwinTransformer(TwinMethod):
-    """Let squares of the view ask what is detected (`vtnet`), with `tokens` of them at most."""
+    """Squares of the view attend to detections (`vtnet`), at most `num_tokens` of them."""
 
-    tokens = 4
+    num_tokens = 4
 
     def encode(
-        self, params: Params, seen: Seen, appearance: np.ndarray, weights: np.ndarray, reading: Any, memory: Memory
+        self,
+        params: Params,
+        features: TwinFeatures,
+        appearance: np.ndarray,
+        weights: np.ndarray,
+        reading: Any,
+        memory: TwinMemory,
     ) -> np.ndarray:
-        goal = int(seen.goal.argmax())
-        shown = [goal, *(k for k in np.flatnonzero(seen.visible).tolist() if k != goal)][: self.tokens]
-        tokens = linear(params["token"], np.hstack([appearance[shown], seen.table[shown]]))
+        # A token for the goal and for each detection, encoded and weighted by the layout.
+        goal = int(features.goal.argmax())
+        visible = np.flatnonzero(features.visible).tolist()
+        categories = [goal, *(category for category in visible if category != goal)][: self.num_tokens]
+        tokens = linear(params["token"], np.hstack([appearance[categories], features.table[categories]]))
         for layer in self._layers(params["encoder"]):
-            tokens = forward(layer["forward"], attended(layer["tokens"], tokens, tokens, tokens, tokens))
-        known = weights[shown][:, None] * tokens
-        query = relu(linear(params["query"], np.array([seen.view[square(i)] for i in range(SIDE**2)])))
-        query += np.array([place(i, query.shape[1]) for i in range(SIDE**2)])
+            attended = residual_attention(layer["tokens"], tokens, tokens, tokens, tokens)
+            tokens = residual_perceptron(layer["forward"], attended)
+        experience = weights[categories][:, None] * tokens
+
+        # A query for each square, with the code of its place.
+        squares = np.array([features.view[square_cells(i)] for i in range(SIDE**2)])
+        query = relu(linear(params["query"], squares))
+        query += np.array([position_code(i, query.shape[1]) for i in range(SIDE**2)])
+
+        # The squares attend to each other (but for the first layer), then to the tokens.
         answer = np.zeros_like(query)
         for layer in self._layers(params["decoder"]):
             if "answers" in layer:
-                answer = attended(layer["answers"], answer, answer + query, answer + query, answer)
-            answer = forward(layer["forward"], attended(layer["tokens"], answer, answer + query, known, known))
+                answer = residual_attention(layer["answers"], answer, answer + query, answer + query, answer)
+            attended = residual_attention(layer["tokens"], answer, answer + query, experience, experience)
+            answer = residual_perceptron(layer["forward"], attended)
         return relu(linear(params["maps"], answer)).ravel()
 
     @staticmethod

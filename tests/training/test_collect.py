@@ -38,8 +38,8 @@ def test_the_rollout_holds_every_case():
     assert t.truncated[-1].any()
     assert (run.before.state.time > 0).any()
     assert len(np.unique(SCENE[t.pose])) == 2
-    assert rolled(True).transitions.direct.mean() == pytest.approx(0.5, abs=0.2)
-    assert t.direct is None
+    assert rolled(True).transitions.use_direct.mean() == pytest.approx(0.5, abs=0.2)
+    assert t.use_direct is None
 
 
 @COIN
@@ -65,8 +65,8 @@ def test_returns_go_on_with_the_last_state_at_a_limit_and_with_nothing_after_don
 def test_the_agent_after_the_rollout_is_that_of_the_plain_loop(coin):
     after, plain = rolled(coin).after, retrace(coin)
     for slot in range(SLOTS):
-        chex.assert_trees_all_close(tiny.at(after.memory, slot), plain.memory[slot], rtol=1e-4, atol=1e-5)
-        chex.assert_trees_all_close(tiny.at(after.perceived.layout, slot), plain.layout[slot], rtol=1e-5)
+        chex.assert_trees_all_close(tiny.leaves_at(after.memory, slot), plain.memory[slot], rtol=1e-4, atol=1e-5)
+        chex.assert_trees_all_close(tiny.leaves_at(after.perception.layout, slot), plain.layout[slot], rtol=1e-5)
 
 
 @COIN
@@ -118,10 +118,10 @@ def test_equal_keys_give_equal_rollouts_and_others_do_not():
 
 
 def test_without_a_setting_no_layout_is_carried_and_its_weights_are_ones():
-    acting = dataclasses.replace(ACTING, setting=None)
+    acting = dataclasses.replace(ACTING, estimator=None)
     key = jax.random.key(0)
     agent, rollout = jax.eval_shape(lambda: act(tiny.lively(0), begin(key, acting), key, False, acting))
-    assert agent.perceived.layout is None
+    assert agent.perception.layout is None
     assert rollout.transitions.weights.shape == (LENGTH, ENVS, 3)
     weights = acting.view(begin(key, acting), KNOWLEDGE, PARAMS).weights
     np.testing.assert_array_equal(weights, np.ones((ENVS, 3)))

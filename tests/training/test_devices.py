@@ -20,9 +20,9 @@ import collections, dataclasses, json, re, sys
 import jax, numpy as np
 from support import tiny_world as tiny
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.prepare import make_trainer
+from jaxnav.runs.train import make_trainer
 from jaxnav.errors import InputError
-from jaxnav.layout import SETTINGS
+from jaxnav.layout import ESTIMATORS
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.devices import Devices
 
@@ -35,8 +35,8 @@ env, params = tiny.world()
 exchanged = {}
 
 def policies(count):
-    parts = config, env, SETTINGS["calibrated"], tiny.knowledge()
-    mesh = Devices(count=count).mesh(seeds=2, num_envs=16, minibatches=2)
+    parts = config, env, ESTIMATORS["calibrated"], tiny.knowledge()
+    mesh = Devices(count=count).mesh(num_seeds=2, num_envs=16, minibatches=2)
     trainer = make_trainer(*parts, mesh if count > 1 else None)
     states = trainer.init(params)
     shards = trainer.unpack(states)["layout"][0].agent.state.pose.addressable_shards
@@ -62,7 +62,7 @@ def exchanges(text):
 found = {count: policies(count) for count in map(int, sys.argv[1:])}
 found["exchanged"] = exchanged
 try:
-    Devices(count=4).mesh(seeds=2, num_envs=18, minibatches=2)
+    Devices(count=4).mesh(num_seeds=2, num_envs=18, minibatches=2)
 except InputError as error:
     found["refused"] = str(error)
 print(json.dumps(found))
@@ -87,8 +87,8 @@ def distance(a, b):
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", [2, 4])
 def test_any_number_of_devices_trains_the_same_policies(devices):
-    found = trained(1, 4) | (trained(devices) if devices != 4 else {})
-    for ours, theirs in zip(found["1"], found[str(devices)], strict=True):
+    result = trained(1, 4) | (trained(devices) if devices != 4 else {})
+    for ours, theirs in zip(result["1"], result[str(devices)], strict=True):
         assert distance(ours, theirs) < TOLERANCE
         assert ours["poses"] == theirs["poses"]
         assert theirs["metrics"] == pytest.approx(ours["metrics"], rel=1e-3, abs=TOLERANCE)

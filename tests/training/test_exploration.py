@@ -9,7 +9,7 @@ from support import tiny_world as tiny
 from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.task import DONE
-from jaxnav.training.exploration import explore
+from jaxnav.training.calibration import explore
 
 ENV, PARAMS = tiny.world()
 PRESENCE = np.asarray(ENV.row_format.presence(tiny.BANK.rows))
@@ -29,11 +29,11 @@ def count(poses):
 
 
 def test_walks_that_see_everything_count_every_pose_once():
-    found = run(ENV, PARAMS, jax.random.key(0), 128, 200)
-    assert found.poses == len(PRESENCE)  # on average 70 visits of every pose
-    assert found.steps == 128 * 200
-    np.testing.assert_array_equal(found.counts, count(range(len(PRESENCE))))
-    assert found.counts.max() > 10
+    result = run(ENV, PARAMS, jax.random.key(0), 128, 200)
+    assert result.poses == len(PRESENCE)  # on average 70 visits of every pose
+    assert result.steps == 128 * 200
+    np.testing.assert_array_equal(result.counts, count(range(len(PRESENCE))))
+    assert result.counts.max() > 10
 
 
 def test_short_walks_count_what_they_pass():
@@ -45,9 +45,9 @@ def test_short_walks_count_what_they_pass():
     for actions in np.asarray(jax.random.randint(jax.random.fold_in(key, 1), (steps, walks), 0, DONE)):
         pose = tiny.BANK.successor[pose, actions]
         passed |= set(pose.tolist())
-    found = run(ENV, PARAMS, key, walks, steps)
-    assert walks < found.poses == len(passed) <= walks * (steps + 1)
-    np.testing.assert_array_equal(found.counts, count(passed))
+    result = run(ENV, PARAMS, key, walks, steps)
+    assert walks < result.poses == len(passed) <= walks * (steps + 1)
+    np.testing.assert_array_equal(result.counts, count(passed))
 
 
 def test_rooms_without_scenes_have_no_counts():
@@ -61,8 +61,8 @@ def test_done_is_never_chosen():
     only = {name: getattr(PARAMS.tables, name)[:1] for name in ("first_cell", "num_cells", "goals", "num_goals")}
 
     class Leaving(ObjectNav):
-        def after(self, pose, action, params):
-            return jax.numpy.where(action == DONE, KITCHEN_POSES, super().after(pose, action, params))
+        def next_pose(self, pose, action, params):
+            return jax.numpy.where(action == DONE, KITCHEN_POSES, super().next_pose(pose, action, params))
 
     params = PARAMS.replace(tables=PARAMS.tables.replace(**only), room=PARAMS.room[:1])
     assert run(Leaving(ENV.task), params, jax.random.key(0), 128, 200).poses == KITCHEN_POSES

@@ -11,9 +11,10 @@ import pytest
 from support import tiny_world as tiny
 from support.rollouts import ACTING, CONFIG, KNOWLEDGE, LEARNER, PARAMS, act
 
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.methods import Knowledge
-from jaxnav.training.learner import block_order, regroup
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.methods import find_method
+from jaxnav.training.ppo import draw_minibatches, split_minibatches
 
 UPDATES = 400
 SCALARS = CONFIG.scalars(UPDATES)
@@ -52,7 +53,7 @@ def chunks(seeds):
     """Both seeds after one update, and the first one, alone, after two; compiled side by side."""
     with ThreadPoolExecutor() as pool:
         one = pool.submit(one_update, seeds, SCALARS, PARAMS, KNOWLEDGE)
-        two = pool.submit(two_updates, tiny.at(seeds, 0), SCALARS, PARAMS, KNOWLEDGE)
+        two = pool.submit(two_updates, tiny.leaves_at(seeds, 0), SCALARS, PARAMS, KNOWLEDGE)
         return one.result(), two.result()
 
 
@@ -76,32 +77,32 @@ def kernel(states):
 
 def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, whole):
     second = one_update(first[0], SCALARS, PARAMS, KNOWLEDGE)
-    assert_same(tiny.at(second[0], 0), whole[0])
+    assert_same(tiny.leaves_at(second[0], 0), whole[0])
     assert whole[0].update == 2
     # Metrics of the whole are those of the parts: sums of episodes, means over updates, means over episodes.
     parts = [{name: float(value[0]) for name, value in metrics.items()} for _, metrics in (first, second)]
-    found = {name: float(value) for name, value in whole[1].items()}
-    assert found["episodes"] == sum(part["episodes"] for part in parts)
+    logged = {name: float(value) for name, value in whole[1].items()}
+    assert logged["episodes"] == sum(part["episodes"] for part in parts)
     for name in ("success", "return", "length", "truncated"):
-        assert found[name] * found["episodes"] == pytest.approx(sum(part[name] * part["episodes"] for part in parts))
+        assert logged[name] * logged["episodes"] == pytest.approx(sum(part[name] * part["episodes"] for part in parts))
     for name in ("policy_loss", "entropy", "gradient_norm"):
-        assert found[name] == pytest.approx(sum(part[name] for part in parts) / 2)
+        assert logged[name] == pytest.approx(sum(part[name] for part in parts) / 2)
 
 
 def test_the_best_policy_is_kept_and_a_later_one_among_equals(first):
     keep = jax.jit(LEARNER.keep)
-    state = tiny.at(first[0], 0)
-    assert state.kept.score == -1.0
-    chex.assert_trees_all_equal(state.kept.params, init(jax.random.key(0), PARAMS, KNOWLEDGE).params)
-    kept = keep(state, jnp.float32(0.5))
+    state = tiny.leaves_at(first[0], 0)
+    assert state.best.score == -1.0
+    chex.assert_trees_all_equal(state.best.params, init(jax.random.key(0), PARAMS, KNOWLEDGE).params)
+    best = keep(state, jnp.float32(0.5))
     for score, update in ((0.4, 1), (0.5, 7), (0.6, 7)):
         later = keep(
-            kept.replace(update=jnp.int32(7), params=jax.tree.map(jnp.negative, kept.params)), jnp.float32(score)
+            best.replace(update=jnp.int32(7), params=jax.tree.map(jnp.negative, best.params)), jnp.float32(score)
         )
-        assert (float(later.kept.score), int(later.kept.update)) == (pytest.approx(max(score, 0.5)), update)
-        chex.assert_trees_all_equal(later.kept.params, later.params if update == 7 else kept.params)
+        assert (float(later.best.score), int(later.best.update)) == (pytest.approx(max(score, 0.5)), update)
+        chex.assert_trees_all_equal(later.best.params, later.params if update == 7 else best.params)
     # Nothing of training follows from what was kept.
-    chex.assert_trees_all_equal(kept.params, state.params)
+    chex.assert_trees_all_equal(best.params, state.params)
 
 
 def test_another_seed_gives_another_policy(first, seeds):
@@ -125,7 +126,7 @@ def test_metrics_are_finite_scalars(whole):
 
 def test_episode_statistics_are_those_of_the_episodes_that_ended(seeds, first):
     """Of one update, recounted from the rollout that it makes."""
-    start = tiny.at(seeds, 0)
+    start = tiny.leaves_at(seeds, 0)
     key = jax.random.fold_in(jax.random.fold_in(start.key, start.update), 0)
     t = jax.tree.map(np.asarray, act(start.params, start.agent, key, False)[1].transitions)
     metrics = {name: float(value[0]) for name, value in first[1].items()}
@@ -176,10 +177,10 @@ def test_the_learning_rate_falls_to_zero(seeds):
 
 def test_minibatches_take_every_episode_once_and_one_of_every_block():
     """Six episodes in two minibatches: blocks 01, 23, 45; all leaves are cut alike."""
-    order = block_order(jax.random.key(3), 6, 2)
+    order = draw_minibatches(jax.random.key(3), 6, 2)
     episodes = jnp.arange(6)
     steps = jnp.broadcast_to(10 * episodes, (4, 6))  # [T, B]
-    parts, memory = regroup(steps, order, axis=1), regroup(episodes, order, axis=0)
+    parts, memory = split_minibatches(steps, order, axis=1), split_minibatches(episodes, order, axis=0)
     assert parts.shape == (2, 4, 3)
     np.testing.assert_array_equal(parts, np.broadcast_to(10 * memory[:, None], parts.shape))
     np.testing.assert_array_equal(np.sort(np.ravel(memory)), episodes)
@@ -187,14 +188,14 @@ def test_minibatches_take_every_episode_once_and_one_of_every_block():
 
 
 def test_minibatches_differ_between_epochs():
-    orders = {tuple(np.ravel(block_order(jax.random.key(i), 32, 4))) for i in range(8)}
+    orders = {tuple(np.ravel(draw_minibatches(jax.random.key(i), 32, 4))) for i in range(8)}
     assert len(orders) == 8
 
 
 @pytest.mark.slow
 def test_a_method_without_experience_trains():
-    spec = dataclasses.replace(tiny.SPEC, method="rgb")
-    learner = dataclasses.replace(LEARNER, acting=Acting(ACTING.env, spec))
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("rgb"))
+    learner = dataclasses.replace(LEARNER, agent_loop=AgentLoop(ACTING.env, spec))
     before = learner.init(jax.random.key(0), PARAMS, KNOWLEDGE)
     after, metrics = jax.jit(learner.update)(before, SCALARS, PARAMS, KNOWLEDGE)
     chex.assert_tree_all_finite((after.params, metrics))

@@ -14,10 +14,9 @@ from support import tiny_world as tiny
 from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, ROWS, decide_again, rolled
 
 from jaxnav.policies.methods import METHODS
-from jaxnav.policies.pathways import NO_ACTION, Memory, Pathways
-from jaxnav.training.collect import zero_direct
+from jaxnav.policies.pathways import NO_ACTION, Pathways, PolicyState
 from jaxnav.training.config import PPOConfig, PPOScalars
-from jaxnav.training.loss import advantages, ppo_loss, replay
+from jaxnav.training.ppo import compute_advantages, mask_direct_pathways, ppo_loss, replay_rollout
 
 F = np.float32
 
@@ -40,8 +39,8 @@ def test_advantages_by_hand():
     # delta_2 = 2 + 1/2 - 1 = 1.5                    A_2 = 1.5 + 2/4 = 2
     # delta_1 = 0 + 0/2 - 2 = -2, it ends:           A_1 = -2
     # delta_0 = 1 + 2/2 - 1 = 1                      A_0 = 1 - 2/4 = 0.5
-    found = advantages(reward, value, next_value, ended, jnp.float32(0.5), jnp.float32(0.5))
-    np.testing.assert_array_equal(found, column(0.5, -2.0, 2.0, 2.0, 4.0))
+    result = compute_advantages(reward, value, next_value, ended, jnp.float32(0.5), jnp.float32(0.5))
+    np.testing.assert_array_equal(result, column(0.5, -2.0, 2.0, 2.0, 4.0))
 
 
 def test_advantages_of_a_macro_step_by_hand():
@@ -54,8 +53,8 @@ def test_advantages_of_a_macro_step_by_hand():
     reward, last = column(F(1), F(0), F(1)), F(6)
     for between in (F(2), F(-8)):
         value, next_value = column(F(1), between, F(1)), column(between, F(1), last)
-        found = advantages(reward, value, next_value, ended, jnp.float32(0.5), jnp.float32(0.5), due)
-        np.testing.assert_array_equal(found[::2], column(0.625, 3.0))
+        result = compute_advantages(reward, value, next_value, ended, jnp.float32(0.5), jnp.float32(0.5), due)
+        np.testing.assert_array_equal(result[::2], column(0.625, 3.0))
 
 
 @given(st.integers(0, 1000), st.floats(0, 1, width=32), st.floats(0, 1, width=32))
@@ -66,7 +65,9 @@ def test_advantages_over_macro_steps_are_those_of_their_sums(seed, gamma, lambda
     due = np.random.default_rng(seed + 1).random(reward.shape) < 0.4
     due[0] = True
     due[1:] |= ended[:-1]  # an episode begins with a choice
-    found = advantages(*(jnp.asarray(x) for x in (reward, value, next_value, ended)), F(gamma), F(lambda_), due)
+    result = compute_advantages(
+        *(jnp.asarray(x) for x in (reward, value, next_value, ended)), F(gamma), F(lambda_), due
+    )
     for b in range(reward.shape[1]):
         starts = np.flatnonzero(due[:, b])
         advantage = 0.0
@@ -75,7 +76,7 @@ def test_advantages_over_macro_steps_are_those_of_their_sums(seed, gamma, lambda
             total = (discounts * reward[start:end, b]).sum() + gamma ** (end - start) * next_value[end - 1, b]
             carry = 0.0 if ended[end - 1, b] else gamma ** (end - start) * lambda_ * advantage
             advantage = total - value[start, b] + carry
-            np.testing.assert_allclose(found[start, b], advantage, rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(result[start, b], advantage, rtol=1e-3, atol=1e-4)
 
 
 def random_steps(seed, length=7, envs=5):
@@ -98,8 +99,8 @@ def test_advantages_in_numpy(seed, gamma, lambda_):
             delta = reward[t, b] + gamma * next_value[t, b] - value[t, b]
             advantage = delta if ended[t, b] else delta + gamma * lambda_ * advantage
             expected[t, b] = advantage
-    found = jax.jit(advantages)(reward, value, next_value, ended, F(gamma), F(lambda_))
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    result = jax.jit(compute_advantages)(reward, value, next_value, ended, F(gamma), F(lambda_))
+    np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-5)
 
 
 @given(st.integers(0, 1000), st.floats(0, 1, width=32))
@@ -113,8 +114,8 @@ def test_at_lambda_one_the_advantage_is_the_discounted_return_minus_the_value(se
             last = next((i for i in range(t, length) if ended[i, b]), length - 1)
             rewards = sum(gamma ** (i - t) * reward[i, b] for i in range(t, last + 1))
             expected[t, b] = rewards + gamma ** (last + 1 - t) * next_value[last, b] - value[t, b]
-    found = jax.jit(advantages)(reward, value, next_value, ended, F(gamma), F(1))
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    result = jax.jit(compute_advantages)(reward, value, next_value, ended, F(gamma), F(1))
+    np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-5)
 
 
 # The PPO loss
@@ -129,7 +130,7 @@ def scalars(**changes) -> PPOScalars:
 @functools.partial(jax.jit, static_argnums=3)
 def loss(weights, advantage, scalars, distil):
     run = rolled(True)
-    replayed = replay(ACTING.bind(weights), run.transitions, run.memory, PARAMS)
+    replayed = replay_rollout(ACTING.bind(weights), run.transitions, run.memory, PARAMS)
     return ppo_loss(replayed, advantage, scalars, distil, METHODS["org"])
 
 
@@ -170,12 +171,12 @@ def test_the_loss_is_that_of_numpy(distil):
         total += 0.4 * expected["distil_loss"]
     else:
         del expected["distil_loss"]
-    found, parts = loss(NEW, advantage, scalars(), distil)
+    result, parts = loss(NEW, advantage, scalars(), distil)
     assert parts.keys() == expected.keys()
     for name, value in expected.items():
         assert parts[name] == pytest.approx(value, rel=1e-4), name
         assert abs(value) > 1e-3, name
-    assert found == pytest.approx(total, rel=1e-4)
+    assert result == pytest.approx(total, rel=1e-4)
 
 
 def test_with_the_policy_that_acted_nothing_is_clipped():
@@ -187,7 +188,7 @@ def test_with_the_policy_that_acted_nothing_is_clipped():
 def test_a_term_of_the_method_is_added():
     run, named = rolled(True), {"told": jnp.float32(3)}
     method = dataclasses.replace(METHODS["org"], auxiliary=lambda _: (jnp.float32(0.25), named))
-    replayed = replay(ACTING.bind(NEW), run.transitions, run.memory, PARAMS)
+    replayed = replay_rollout(ACTING.bind(NEW), run.transitions, run.memory, PARAMS)
     without, parts = loss(NEW, some_advantage(), scalars(), False)
     total, more = ppo_loss(replayed, jnp.asarray(some_advantage()), scalars(), False, method)
     assert total == pytest.approx(float(without) + 0.25, rel=1e-5)
@@ -213,15 +214,15 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
     run = rolled(True)
     t, slot = run.transitions, 1
     rows, log_pi, memories = ROWS[t.pose[:, slot]], [], []
-    memory = tiny.at(run.memory, slot)
+    memory = tiny.leaves_at(run.memory, slot)
     for time in range(LENGTH):
-        now = tiny.at(t, time, slot)
+        now = tiny.leaves_at(t, time, slot)
         memories.append(memory)
-        decision = tiny.decide(NEW, rows[time], now.goal, now.weights, memory)[0 if now.direct else 1]
+        decision = tiny.decide(NEW, rows[time], now.goal, now.weights, memory)[0 if now.use_direct else 1]
         log_pi.append(log_softmax(np.asarray(decision.logits)))
-        memory = decision.memory(now.action)
+        memory = decision.next_state(now.action)
         if now.terminated | now.truncated:
-            memory = Memory(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
+            memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
     target, memories = np.array(log_pi), jax.tree.map(lambda *leaves: np.array(leaves), *memories)
 
     def divergence(weights):
@@ -233,20 +234,20 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
         one = jax.tree.map(lambda leaf: leaf[:, [slot]], t)
         memory = jax.tree.map(lambda leaf: leaf[[slot]], run.memory)
         nothing = jnp.zeros((LENGTH, 1))
-        replayed = replay(ACTING.bind(weights), one, memory, PARAMS)
+        replayed = replay_rollout(ACTING.bind(weights), one, memory, PARAMS)
         return ppo_loss(replayed, nothing, scalars(**DISTIL_ONLY), True, METHODS["org"])[0]
 
-    assert t.direct[:, slot].any()
-    assert not t.direct[:, slot].all()
-    (expected, wanted), (found, gradient) = (jax.jit(jax.value_and_grad(f))(NEW) for f in (divergence, distil_loss))
+    assert t.use_direct[:, slot].any()
+    assert not t.use_direct[:, slot].all()
+    (expected, wanted), (result, gradient) = (jax.jit(jax.value_and_grad(f))(NEW) for f in (divergence, distil_loss))
     assert float(expected) > 0.01
-    assert found == pytest.approx(float(expected), rel=1e-4)
+    assert result == pytest.approx(float(expected), rel=1e-4)
     chex.assert_trees_all_close(gradient, wanted, rtol=1e-3, atol=1e-5)
 
 
 def test_the_coin_zeroes_both_direct_pathways_and_nothing_else():
     fields = {"scene": (3, 1.0), "goal": (4, 2.0), "experience": (5, 3.0), "gate": (1, 4.0)}
     pathways = Pathways(**{name: jnp.full((2, width), value) for name, (width, value) in fields.items()})
-    kept, zeroed = (tiny.at(zero_direct(pathways, jnp.array([True, False])), i) for i in range(2))
-    chex.assert_trees_all_equal(kept, tiny.at(pathways, 0))
+    unmasked, zeroed = (tiny.leaves_at(mask_direct_pathways(pathways, jnp.array([True, False])), i) for i in range(2))
+    chex.assert_trees_all_equal(unmasked, tiny.leaves_at(pathways, 0))
     chex.assert_trees_all_equal(zeroed, Pathways(jnp.zeros(3), jnp.zeros(4), jnp.full(5, 3.0), jnp.full(1, 4.0)))

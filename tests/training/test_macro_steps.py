@@ -11,15 +11,14 @@ from support import tiny_world as tiny
 from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, rolled
 from support.scenes import CATEGORIES, SMALL, draw
 
-from jaxnav.env.build import build
-from jaxnav.policies.acting import Acting
-from jaxnav.policies.methods.home import learn_home
-from jaxnav.policies.methods.semexp import SEMEXP
+from jaxnav.env.make import build_environment
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.methods.semexp import SEMEXP, learn_search_setup
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.learner import Learner
-from jaxnav.training.loss import ppo_loss, replay
+from jaxnav.training.ppo import Learner, ppo_loss, replay_rollout
 
 #: A corridor of 10 m with a book at its north end; the actions are enough for one way, not for both.
 CORRIDOR = draw([["."]] * 40, ("Book", 0.0, 0.8, 9.75, *SMALL))
@@ -31,12 +30,12 @@ def test_choices_that_do_not_count_teach_no_policy():
     before = rolled(False)
     due = jnp.asarray(np.random.default_rng(0).random((LENGTH, ENVS)) < 0.3)
     advantage = np.random.default_rng(1).normal(size=(LENGTH, ENVS)).astype(np.float32)
-    transitions = jax.tree.map(jnp.asarray, before.transitions)._replace(due=due)
+    transitions = jax.tree.map(jnp.asarray, before.transitions)._replace(is_decision_step=due)
 
     @jax.jit
     def learn(weights, transitions, advantage):
         def loss(weights):
-            replayed = replay(ACTING.bind(weights), transitions, before.memory, PARAMS)
+            replayed = replay_rollout(ACTING.bind(weights), transitions, before.memory, PARAMS)
             return ppo_loss(replayed, advantage, PPOConfig(value=0.0).scalars(1), True, SEMEXP)[0]
 
         return jax.value_and_grad(loss)(weights)
@@ -45,9 +44,9 @@ def test_choices_that_do_not_count_teach_no_policy():
     off = transitions._replace(
         choice=jnp.where(due, transitions.choice, 0), log_prob=jnp.where(due, transitions.log_prob, -9.0)
     )
-    found = learn(before.weights, off, jnp.where(due, advantage, 9.0))
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), found, expected)
-    counted = learn(before.weights, transitions._replace(due=None), jnp.asarray(advantage))
+    result = learn(before.weights, off, jnp.where(due, advantage, 9.0))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), result, expected)
+    counted = learn(before.weights, transitions._replace(is_decision_step=None), jnp.asarray(advantage))
     assert abs(float(counted[0] - expected[0])) > 1e-4
 
 
@@ -66,11 +65,11 @@ def test_where_to_search_is_learned():
 
 def _success(learning_rate: float, updates: int) -> float:
     """Return the success of the last 20 updates."""
-    env, params = build(BANK, {}, LIMIT)
-    knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_home([BANK], np.zeros(0))))
-    spec = dataclasses.replace(tiny.SPEC, method="semexp", method_sizes=())
+    env, params = build_environment(BANK, {}, LIMIT)
+    knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_search_setup([BANK], np.zeros(0))))
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("semexp"), method_sizes=())
     config = PPOConfig(num_envs=ENVS, rollout=LIMIT, epochs=4, minibatches=2, gamma=0.97, learning_rate=learning_rate)
-    learner = Learner(Acting(env, spec, tiny.SETTING), config, "none")
+    learner = Learner(AgentLoop(env, spec, tiny.SETTING), config, "none")
     state = jax.jit(learner.init)(jax.random.key(0), params, knowledge)
     train = jax.jit(functools.partial(learner.train, num_updates=20))
     metrics = {}

@@ -12,14 +12,14 @@ import pytest
 from support import tiny_world as tiny
 from support.rollouts import ENV, ENVS, KNOWLEDGE, PARAMS
 
-from jaxnav.policies.acting import Acting
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import ActionControl
 from jaxnav.policies.methods import METHODS
-from jaxnav.policies.methods.base import Primitive
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
+from jaxnav.training.calibration import explore
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.exploration import explore
-from jaxnav.training.learner import Learner
+from jaxnav.training.ppo import Learner
 
 LIMIT, CHUNK, CHUNKS = 20, 20, 20
 CONFIG = PPOConfig(num_envs=ENVS, rollout=10, epochs=4, minibatches=2, gamma=0.97)
@@ -39,15 +39,15 @@ def random_success():
     what follows the five other actions.
     """
     right = tiny.BANK.best_length == 1  # [poses, categories]
-    found = np.zeros(right.shape)
+    success = np.zeros(right.shape)
     others = [action for action in range(NUM_ACTIONS) if action != DONE]
     for _ in range(LIMIT):
-        found = (right + found[tiny.BANK.successor[:, others]].sum(axis=1)) / NUM_ACTIONS
+        success = (right + success[tiny.BANK.successor[:, others]].sum(axis=1)) / NUM_ACTIONS
     chances, first = [], 0
     for scene, cells in enumerate(tiny.BANK.num_cells):
         goals = tiny.BANK.goals[scene][: tiny.BANK.num_goals[scene]]
         starts = slice(first * tiny.POSES_PER_CELL, (first + cells) * tiny.POSES_PER_CELL, 2)  # horizon 0
-        chances.append(found[starts][:, goals].mean())
+        chances.append(success[starts][:, goals].mean())
         first += cells
     return np.mean(chances)
 
@@ -65,18 +65,18 @@ def test_random_actions_seldom_succeed():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.control == Primitive()])
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.control == ActionControl()])
 def test_a_method_learns(name):
     method = METHODS[name]
     learned = {} if method.learn is None else method.learn([tiny.BANK], counts())
     knowledge = KNOWLEDGE._replace(method=jax.tree.map(jnp.asarray, learned))
     tables = PARAMS.tables.replace(expert=jnp.asarray(tiny.BANK.expert))
     params = PARAMS.replace(step_limit=jnp.full(2, LIMIT, jnp.int32), tables=tables)
-    spec = PolicySpec(name, 3, tiny.SIZES, tuple(SMALLER.get(name, {}).items()))
-    acting = Acting(ENV, spec, tiny.SETTING if method.hosts_layout else None)
+    spec = PolicySpec(method, 3, tiny.SIZES, tuple(SMALLER.get(name, {}).items()))
+    agent_loop = AgentLoop(ENV, spec, tiny.SETTING if method.hosts_layout else None)
     state, begin, metrics = None, 0, {}
     for stage in method.stages:
-        learner = Learner(acting, CONFIG, "none", stage)
+        learner = Learner(agent_loop, CONFIG, "none", stage)
         chunks = max(1, round(stage.share * CHUNKS_OF.get(name, CHUNKS)))
         scalars = CONFIG.scalars(chunks * CHUNK, begin)
         train = jax.jit(functools.partial(learner.train, num_updates=CHUNK))

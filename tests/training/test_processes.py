@@ -10,7 +10,7 @@ from support.commands import evaluate, train, write_config
 from support.processes import ends, free_address, start
 
 from jaxnav.store.export import load_params
-from jaxnav.store.runlog import read_rows
+from jaxnav.store.files import read_log_rows
 
 TOLERANCE = 1e-5
 
@@ -100,7 +100,7 @@ def assert_same_run(one, two):
     for name in ("baseline-0", "layout-0"):
         ours, theirs = (load_params(folder / "policies" / name)[0] for folder in (one, two))
         chex.assert_trees_all_close(ours, theirs, rtol=0, atol=TOLERANCE)
-    ours, theirs = (read_rows(folder / "metrics.jsonl") for folder in (one, two))
+    ours, theirs = (read_log_rows(folder / "metrics.jsonl") for folder in (one, two))
     for row, other in zip(ours, theirs, strict=True):
         assert row.pop("arm") == other.pop("arm")
         assert row == pytest.approx(other, rel=1e-3, abs=TOLERANCE)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxnav.viz.figure import save_figure
 from jaxnav.viz.learning import learning_figure
+from jaxnav.viz.style import save_figure
 
 ROWS = [
     {"arm": "baseline", "seed": seed, "env_steps": steps, "success": success}

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from support.scenes import SMALL, draw
 
-from jaxnav.scenes.scene import Room, extent, scene_size
-from jaxnav.scenes.tables.detector import PERFECT
+from jaxnav.scenes.scene import Room, scene_extent, scene_size
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, generated
-from jaxnav.viz.plan import draw_room
-from jaxnav.viz.scene import scene_figure
-from jaxnav.viz.view import view_from
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
+from jaxnav.viz.scene import draw_plan, scene_figure, view_from_pose
 
-TASK = Task(detector=PERFECT)
+TASK = Task(detector=PERFECT_DETECTOR)
 # Cells (0, 0) to (0, 2) m and, with no way there, one at (1, 0); a wall on the right.
 HALL = draw(
     [".##.#"] + [".####"] * 8,
@@ -32,27 +30,26 @@ def names(axes):
 
 def test_a_pose_is_drawn_as_it_was_asked_for():
     # From (0, 1.5) to the book is 1 m, to the bowl the root of 1 + 1/16; the chair is behind.
-    view = view_from(HALL, TASK, (0.05, 1.45, 0.0))
+    view = view_from_pose(HALL, TASK, (0.05, 1.45, 0.0))
     assert view.place.tolist() == [0.0, 1.5]
-    assert [(name, place.tolist()) for _, name, place in view.seen] == [("Book", [0, 2.5]), ("Bowl", [0.25, 2.5])]
-    np.testing.assert_allclose([distance for distance, *_ in view.seen], [1.0, np.sqrt(1.0625)])
-    back = view_from(HALL, TASK, (0.0, 1.5, -180.0))
+    assert [(name, place.tolist()) for _, name, place in view.detections] == [("Book", [0, 2.5]), ("Bowl", [0.25, 2.5])]
+    np.testing.assert_allclose([distance for distance, *_ in view.detections], [1.0, np.sqrt(1.0625)])
+    back = view_from_pose(HALL, TASK, (0.0, 1.5, -180.0))
     assert back.yaw == 180.0
-    assert [name for _, name, _ in back.seen] == ["Chair"]
+    assert [name for _, name, _ in back.detections] == ["Chair"]
 
 
 def test_the_default_pose_detects_most():
-    view = view_from(HALL, TASK, None)
-    assert [name for _, name, _ in view.seen] == ["Book", "Bowl"]
-    everywhere = [
-        len(view_from(HALL, TASK, (0.0, 0.25 * iz, 45.0 * heading)).seen) for iz in range(9) for heading in range(8)
-    ]
-    assert len(view.seen) == max(everywhere)
+    view = view_from_pose(HALL, TASK, None)
+    assert [name for _, name, _ in view.detections] == ["Book", "Bowl"]
+    poses = [(0.0, 0.25 * iz, 45.0 * heading) for iz in range(9) for heading in range(8)]
+    everywhere = [len(view_from_pose(HALL, TASK, pose).detections) for pose in poses]
+    assert len(view.detections) == max(everywhere)
     assert min(everywhere) == 0
 
 
 def test_what_is_on_the_picture():
-    figure = scene_figure(HALL, TASK, view_from(HALL, TASK, (0.0, 1.5, 0.0)))
+    figure = scene_figure(HALL, TASK, view_from_pose(HALL, TASK, (0.0, 1.5, 0.0)))
     plan = figure.axes[0]
     assert names(plan) == ["  1 m", "Book", "Bowl", "Chair"]  # a sofa is no category here
     boxes, cells, crosses, rings = plan.collections
@@ -78,14 +75,14 @@ def test_what_is_on_the_picture():
 
 
 def test_sizes_of_a_scene():
-    low, high = extent(HALL)
+    low, high = scene_extent(HALL)
     np.testing.assert_allclose([low, high], [[-0.3, -1.25], [1.125, 2.525]])
     np.testing.assert_allclose(scene_size(HALL), [0.875 + 0.3, 2.525 + 1.25])
 
 
 def test_a_scene_without_objects():
     bare = draw(["..", ".."])
-    figure = scene_figure(bare, TASK, view_from(bare, TASK, None))
+    figure = scene_figure(bare, TASK, view_from_pose(bare, TASK, None))
     assert names(figure.axes[0]) == ["  1 m"]
     assert any("nothing is detected" in text.get_text() for text in figure.texts)
 
@@ -94,9 +91,9 @@ def test_rooms_are_tinted_and_named():
     left, right = np.zeros((9, 5), bool), np.zeros((9, 5), bool)
     left[:, 0], right[:, 3] = True, True
     home = dataclasses.replace(HALL, rooms=(Room("living_room", left), Room("bedroom", right)))
-    plan = scene_figure(home, TASK, view_from(home, TASK, None)).axes[0]
+    plan = scene_figure(home, TASK, view_from_pose(home, TASK, None)).axes[0]
     assert {"living room", "bedroom"} < set(names(plan))
-    untinted = scene_figure(HALL, TASK, view_from(HALL, TASK, None)).axes[0]
+    untinted = scene_figure(HALL, TASK, view_from_pose(HALL, TASK, None)).axes[0]
     colours, plain = (np.asarray(axes.images[0].get_array()) for axes in (plan, untinted))
     assert (colours != plain).any(axis=-1).tolist() == (left | right).tolist()
     assert not np.array_equal(colours[0, 0], colours[0, 3])
@@ -104,8 +101,11 @@ def test_rooms_are_tinted_and_named():
 
 @pytest.mark.parametrize(("world", "index"), [("rooms", 0), ("rooms", 3), ("apartments", 0), ("houses", 0)])
 def test_no_names_overlap_or_are_clipped(world, index):
-    scene, task = generated(world, "val")[index], dataclasses.replace(WORLDS[world].task, detector=PERFECT)
-    figure = scene_figure(scene, task, view_from(scene, task, None))
+    scene, task = (
+        make_generated_scenes(world, "val")[index],
+        dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR),
+    )
+    figure = scene_figure(scene, task, view_from_pose(scene, task, None))
     plan = figure.axes[0]
     boxes = [text.get_window_extent() for text in plan.texts if text.get_text() != "  1 m"]
     assert len(boxes) >= 3
@@ -123,7 +123,7 @@ def test_a_crowd_of_names_finds_space():
     kinds = [TASK.categories[i % 22] for i in range(24)]
     crowd = [(kind, 0.5 + 0.15 * i, 0.8, 1.0 + 1.1 * (i % 2), *SMALL) for i, kind in enumerate(kinds)]
     scene = draw(["." * 20] * 16, *crowd)
-    figure = scene_figure(scene, TASK, view_from(scene, TASK, None))
+    figure = scene_figure(scene, TASK, view_from_pose(scene, TASK, None))
     boxes = [text.get_window_extent() for text in figure.axes[0].texts]
     overlaps = sum(box.overlaps(other) for i, box in enumerate(boxes) for other in boxes[:i])
     assert len(boxes) >= 23
@@ -131,8 +131,8 @@ def test_a_crowd_of_names_finds_space():
 
 
 def test_the_goal_is_a_star():
-    figure = scene_figure(HALL, TASK, view_from(HALL, TASK, None))
+    figure = scene_figure(HALL, TASK, view_from_pose(HALL, TASK, None))
     axes = figure.add_axes((0, 0, 1, 1))
-    draw_room(axes, HALL, TASK.categories, TASK.categories.index("Bowl"))
+    draw_plan(axes, HALL, TASK.categories, TASK.categories.index("Bowl"))
     stars = [line for line in axes.lines if line.get_marker() == "*"]
     assert [np.asarray(line.get_data()).tolist() for line in stars] == [[[0.25], [2.5]]]

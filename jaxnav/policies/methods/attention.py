@@ -1,4 +1,4 @@
-"""Layers of a transformer (Vaswani et al., NeurIPS 2017), normalised after each."""
+"""Layers of a transformer (Vaswani et al., NeurIPS 2017), each with a residual and a layer norm after it."""
 
 import jax
 import jax.numpy as jnp
@@ -8,43 +8,55 @@ from flax import nnx
 from jaxnav.numerics.product import Linear
 
 
-class Attention(nnx.Module):
-    """Add what several heads attend to, and normalise."""
+class MultiHeadAttention(nnx.Module):
+    """Multi-head attention, residual and layer norm."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs) -> None:
         self.heads = heads
-        self.query, self.key, self.value, self.out = (Linear(width, width, rngs=rngs) for _ in range(4))
+        self.query = Linear(width, width, rngs=rngs)
+        self.key = Linear(width, width, rngs=rngs)
+        self.value = Linear(width, width, rngs=rngs)
+        self.out = Linear(width, width, rngs=rngs)
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(
         self, values: jax.Array, query: jax.Array, key: jax.Array, memory: jax.Array, present: jax.Array | None = None
     ) -> jax.Array:
-        """Return the values after they have attended.
+        """Add to the values what their queries read, and normalise.
 
         Args:
-          values: float32 [..., Q, d], to add to.
-          query: float32 [..., Q, d], what asks.
-          key, memory: float32 [..., N, d], what is asked and what it answers.
-          present: bool [..., N], of which at least one can be attended to; None for all.
+          values: float32 [..., Q, d], the residual.
+          query: float32 [..., Q, d], inputs of the queries.
+          key: float32 [..., N, d], inputs of the keys.
+          memory: float32 [..., N, d], inputs of the values that are read.
+          present: bool [..., N], True where there is an entry to attend to, at least once; None for all.
         """
-        q, k, v = self._split(self.query(query)), self._split(self.key(key)), self._split(self.value(memory))
-        scores = self.scores(q, k)
+        # Project the inputs and divide them among the heads, [..., h, Q or N, d / h].
+        queries = self._split_heads(self.query(query))
+        keys = self._split_heads(self.key(key))
+        head_values = self._split_heads(self.value(memory))
+
+        # Attention weights [..., h, Q, N].
+        scores = self.scores(queries, keys)
         if present is not None:
             scores = jnp.where(present[..., None, None, :], scores, -jnp.inf)
-        answer = jnp.swapaxes(jax.nn.softmax(scores) @ v, -2, -3).reshape(values.shape)
-        return self.norm(values + self.out(answer))
+        answers = jax.nn.softmax(scores) @ head_values
+
+        # Join the heads, [..., Q, d].
+        joined_answers = jnp.swapaxes(answers, -2, -3).reshape(values.shape)
+        return self.norm(values + self.out(joined_answers))
 
     def scores(self, query: jax.Array, key: jax.Array) -> jax.Array:
-        """Return how much is attended to what, [..., h, Q, N]."""
+        """Return attention scores, [..., h, Q, N]."""
         return query @ jnp.swapaxes(key, -1, -2) / np.float32(np.sqrt(query.shape[-1]))
 
-    def _split(self, values: jax.Array) -> jax.Array:
-        """Divide [..., N, d] among the heads, [..., h, N, e]."""
+    def _split_heads(self, values: jax.Array) -> jax.Array:
+        """Divide [..., N, d] among the heads, [..., h, N, d / h]."""
         return jnp.swapaxes(values.reshape(*values.shape[:-1], self.heads, -1), -2, -3)
 
 
-class Averaging(Attention):
-    """Attend to everything equally."""
+class UniformMultiHeadAttention(MultiHeadAttention):
+    """Attention with equal weights, for ablations."""
 
     def scores(self, query: jax.Array, key: jax.Array) -> jax.Array:
         """Return zeros, [..., h, Q, N]."""
@@ -52,12 +64,13 @@ class Averaging(Attention):
 
 
 class FeedForward(nnx.Module):
-    """Add what a perceptron makes of each row, and normalise."""
+    """Two-layer perceptron on each row, residual and layer norm."""
 
     def __init__(self, width: int, hidden: int, rngs: nnx.Rngs) -> None:
-        self.inner, self.outer = Linear(width, hidden, rngs=rngs), Linear(hidden, width, rngs=rngs)
+        self.inner = Linear(width, hidden, rngs=rngs)
+        self.outer = Linear(hidden, width, rngs=rngs)
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(self, values: jax.Array) -> jax.Array:
-        """Take rows [..., N, d] to rows."""
+        """Return rows [..., N, d] for rows [..., N, d]."""
         return self.norm(values + self.outer(nnx.relu(self.inner(values))))

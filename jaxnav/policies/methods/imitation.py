@@ -1,4 +1,8 @@
-"""Imitation of shortest paths, for stages of training."""
+"""Imitation of shortest paths, for stages of training that use an expert.
+
+A stage with `uses_expert` has `SceneTables.expert`, the first action of a shortest path from every pose to every goal.
+`expert_actions` looks it up along a rollout and `imitation_loss` is the cross-entropy to it.
+"""
 
 from typing import Any
 
@@ -7,26 +11,27 @@ import jax.numpy as jnp
 
 
 def expert_actions(replayed: Any) -> jax.Array:
-    """Return what a shortest path does along a rollout, int32 [T, B].
+    """Return the first action of a shortest path at every step of a rollout, int32 [T, B].
 
     Args:
-      replayed: a `jaxnav.training.loss.Replay`, in a stage that imitates.
+      replayed: a `jaxnav.training.ppo.Replay`, in a stage that uses an expert.
     """
     transitions = replayed.transitions
-    return replayed.params.tables.expert[transitions.pose, transitions.goal].astype(jnp.int32)
+    return replayed.env_params.tables.expert[transitions.pose, transitions.goal].astype(jnp.int32)
 
 
 def imitation_loss(logits: jax.Array, expert: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the cross-entropy to the expert's actions.
+    """Return the cross-entropy to the actions of the expert.
 
     Args:
       logits: float32 [..., A].
-      expert: int32 [...]; steps with `NUM_ACTIONS`, from where there is no way, count as no loss.
+      expert: int32 [...]; `NUM_ACTIONS`, where no path leads to the goal, adds nothing to the loss.
 
     Returns:
       The loss float32 [], and by name the loss and the share of steps at which the likeliest action is the expert's.
     """
-    one_hot = jax.nn.one_hot(expert, logits.shape[-1], dtype=jnp.float32)
-    loss = -(one_hot * jax.nn.log_softmax(logits)).sum(axis=-1).mean()
+    # The one-hot row of `NUM_ACTIONS` is zero.
+    expert_one_hot = jax.nn.one_hot(expert, logits.shape[-1], dtype=jnp.float32)
+    loss = -(expert_one_hot * jax.nn.log_softmax(logits)).sum(axis=-1).mean()
     agreement = (logits.argmax(axis=-1) == expert).astype(jnp.float32).mean()
     return loss, {"imitation_loss": loss, "imitation_agreement": agreement}

@@ -1,4 +1,12 @@
-"""The object relation graph (Du et al., ECCV 2020)."""
+"""ORG: the object relation graph.
+
+Source: H. Du, X. Yu and L. Zheng, *Learning Object Relation Graph and Tentative Policy for Visual Navigation*, ECCV
+2020; a host of L-sTDE in the paper. (`jaxnav.policies.methods.tpn` adds its tentative policy.)
+
+Kept: relations R between categories are computed from their boxes and the goal, and mix the appearances of what is
+detected. Changed: appearances are learned embeddings of the categories, and a perceptron shared by all categories reads
+each row.
+"""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -7,31 +15,35 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from jaxnav.numerics.product import Linear, product
-from jaxnav.policies.category_maps import CategoryMaps
-from jaxnav.policies.features import NUM_FEATURES, Features
-from jaxnav.policies.methods.base import Experience, Method
+from jaxnav.numerics.product import Linear, matmul_rows
+from jaxnav.policies.features import NUM_FEATURES, CategoryMaps, Features
+from jaxnav.policies.method import Experience, Method
 from jaxnav.policies.spec import PolicySpec
 
 
 class ObjectRelations(Experience):
-    """Relate the detected categories and the goal.
+    """Relations between the detected categories and the goal.
 
-    The table [R^T X | T | g] of K rows, X the appearance and T the boxes of the detected categories, is the experience
-    that the layout weights multiply (eq. 7), before the perceptron that reads it. Its first layer is linear: the
-    weights multiply what has passed it, which is the same.
+    The table [R^T X | T | g] of K rows, with the appearance X and the boxes T of the detected categories, is the
+    experience that the layout weights multiply (eq. 7), before the perceptron that reads it. The first layer of the
+    perceptron is linear, so the weights multiply its output instead, which is equivalent.
 
     Attributes:
-      columns: of T and g; a subclass may have more of its own.
+      columns: number of columns of T and g; a subclass may add columns of its own.
     """
 
     columns: ClassVar[int] = NUM_FEATURES
     sizes: ClassVar[Mapping[str, int]] = {"relation_layers": 1}
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
-        self.edges = Linear(NUM_FEATURES, spec.num_categories, rngs=rngs)
-        shape = (self.size(spec, "relation_layers"), spec.num_categories, spec.num_categories)
-        self.mix = nnx.Param(nnx.initializers.lecun_normal(batch_axis=0)(rngs.params(), shape))
+        num_categories = spec.num_categories
+        self.edges = Linear(NUM_FEATURES, num_categories, rngs=rngs)
+
+        # One kernel [K, K] for each layer of relations.
+        kernel_shape = (self.size(spec, "relation_layers"), num_categories, num_categories)
+        init_kernels = nnx.initializers.lecun_normal(batch_axis=0)
+        self.mix = nnx.Param(init_kernels(rngs.params(), kernel_shape))
+
         self.maps = CategoryMaps(spec.sizes.appearance + self.columns, spec, rngs)
         self.width = self.maps.width
 
@@ -41,12 +53,15 @@ class ObjectRelations(Experience):
 
     def relate(self, features: Features, appearance: jax.Array, weights: jax.Array, table: jax.Array) -> jax.Array:
         """Return the weighted experience of a table [..., K, columns]."""
-        relation = jnp.swapaxes(nnx.relu(self.edges(features.table)), -1, -2)
+        # Relations R^T [..., K, K] from the boxes.
+        relations = jnp.swapaxes(nnx.relu(self.edges(features.table)), -1, -2)
         for kernel in self.mix[...]:
-            relation = nnx.relu(product(relation, kernel))
-        # R^T X with X = visible * appearance, the appearance already through the first layer of the maps.
-        aggregated = product(relation * features.visible[..., None, :], self.maps.project_appearance(appearance))
+            relations = nnx.relu(matmul_rows(relations, kernel))
+
+        # R^T X, where X = visible * appearance; the appearance has already passed the first layer of the maps.
+        visible_relations = relations * features.visible[..., None, :]
+        aggregated = matmul_rows(visible_relations, self.maps.project_appearance(appearance))
         return self.maps.finish(weights[..., None] * (aggregated + self.maps.project_rows(table)))
 
 
-ORG = Method(ObjectRelations)
+ORG = Method(ObjectRelations, name="org")

@@ -1,4 +1,14 @@
-"""RGB+RL: detections without a model of experience (A3C in the paper)."""
+"""RGB+RL: reinforcement learning on detections without a model of experience, and `anonymous`, which knows no layout.
+
+Source: the baseline *RGB+RL* of Zhang et al., *Layout-based Causal Inference for Object Navigation*, CVPR 2023.
+
+Kept: detections and view reach the policy directly and Z is empty. Changed: the view is a plan of the floor seen ahead,
+as depth would give it, and the learner is PPO in place of A3C.
+
+`anonymous` has no counterpart in the paper. Its networks receive the view and the goal's own detection as that of a
+single category without a name, so it cannot learn any layout: the gain of a method over `anonymous` is the value of
+experience.
+"""
 
 from typing import Any
 
@@ -7,19 +17,35 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxnav.policies.features import Features
-from jaxnav.policies.methods.base import Experience, Method
+from jaxnav.policies.method import Experience, Method
 from jaxnav.policies.spec import PolicySpec
 
 
 class NoExperience(Experience):
-    """Make no experience: Z is empty."""
+    """Empty experience: Z has no entries."""
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         self.width = 0
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Any) -> jax.Array:
-        """Return experience of no width."""
+        """Return the empty experience, float32 [..., 0]."""
         return jnp.zeros((*weights.shape[:-1], 0), jnp.float32)
 
 
-RGB = Method(NoExperience)
+def keep_goal_detection(features: Features) -> Features:
+    """Keep the view and the detection of the goal.
+
+    The detection becomes that of a single nameless category, K = 1. Which goal is sought, all other detections and with
+    them every co-occurrence are removed.
+    """
+    goal_row = (features.goal[..., None] * features.table).sum(axis=-2, keepdims=True)
+    return Features(
+        view=features.view,
+        visible=(features.goal * features.visible).sum(axis=-1, keepdims=True),
+        table=goal_row,
+        goal=jnp.ones_like(features.goal[..., :1]),
+    )
+
+
+RGB = Method(NoExperience, name="rgb")
+ANONYMOUS = Method(NoExperience, perceive=keep_goal_detection, hosts_layout=False, name="anonymous")

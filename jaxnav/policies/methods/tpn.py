@@ -1,7 +1,17 @@
-"""ORG with a memory-augmented tentative policy network (Du et al., ECCV 2020)."""
+"""ORG+TPN: ORG with a tentative policy network, which learns within the episode from past trials.
+
+Source: H. Du, X. Yu and L. Zheng, *Learning Object Relation Graph and Tentative Policy for Visual Navigation*, ECCV
+2020, and its released code.
+
+Kept: ORG is trained first. The tentative policy then learns to imitate shortest paths at repeated poses, from the
+hidden state and the ten most similar of the last 100 trials of the episode, while the trained policy is fixed and acts.
+In an episode the policy takes a step of gradient descent towards the tentative policy's best action at every repeated
+pose, and is reset every 50 decisions. Changed: only the actor adapts, which has a closed form; a trial holds the
+one-hot action, not probabilities; and a repeated pose is recognised by compass, odometry and horizon.
+"""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
@@ -10,79 +20,163 @@ import numpy as np
 from flax import nnx
 
 from jaxnav.numerics.product import Linear
+from jaxnav.policies.method import Knowledge, Method, Percept, Stage
 from jaxnav.policies.methods.attention import FeedForward
-from jaxnav.policies.methods.base import Method, Stage
 from jaxnav.policies.methods.imitation import expert_actions, imitation_loss
 from jaxnav.policies.methods.org import ObjectRelations
-from jaxnav.policies.methods.trail import PoseTracker, learn_motion
+from jaxnav.policies.network import LayerChanges, append_one
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.policies.stream import Changes, with_one
+from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.task import NUM_ACTIONS
 
 if TYPE_CHECKING:
-    from jaxnav.policies.pathways import Decision, Memory, Pathways
-    from jaxnav.policies.policy import Policy
+    from jaxnav.policies.network import Policy
+    from jaxnav.policies.pathways import Decision, Pathways, PolicyState
 
-#: Share of all updates in which the tentative policy learns what shortest paths do where the agent was before.
-IMITATION = 0.2
-REMEMBERED, ATTENDED = 100, 10  # steps of an episode, and those of them that are attended to
+#: Trials of an episode that are remembered, and those of them that a decision attends to.
+NUM_TRIALS, NUM_ATTENDED = 100, 10
+
+#: Share of all updates in which the tentative policy learns to imitate.
+_IMITATION_SHARE = 0.2
+_CELLS_PER_LINE = 2**13  # with 12 headings and 2 horizons, pose numbers fit in 31 bits
+_NO_POSE = np.iinfo(np.int32).min
+
+
+# Tracker: which poses are repeated
+
+
+class PoseHistory(NamedTuple):
+    """Past poses of one episode.
+
+    Attributes:
+      poses: int32 [N], numbers of the last poses, the present one at the end.
+      position: int32 [2], (dz, dx) in cells from the start of the episode.
+      is_repeated: bool [], True where the present pose is one of the earlier ones.
+    """
+
+    poses: jax.Array
+    position: jax.Array
+    is_repeated: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseTracker:
+    """Tracker that recognises repeated poses by compass, odometry and horizon.
+
+    A pose is cell, heading and horizon. The method's knowledge is that of `learn_motion`.
+
+    Attributes:
+      length: N, number of poses that are remembered.
+    """
+
+    length: int = 100
+
+    def init(self, knowledge: Knowledge) -> PoseHistory:
+        """Return a history without poses."""
+        no_poses = jnp.full(self.length, _NO_POSE, jnp.int32)
+        return PoseHistory(no_poses, jnp.zeros(2, jnp.int32), jnp.bool_(False))
+
+    def update(self, state: PoseHistory, knowledge: Knowledge, percept: Percept) -> PoseHistory:
+        """Append the present pose."""
+        strides = knowledge.method["steps"]
+        num_horizons = knowledge.method["horizons"]
+        position = state.position + jnp.where(percept.moved, strides[percept.heading], 0)
+
+        # One number per pose.
+        cell = position[0] * _CELLS_PER_LINE + position[1]
+        pose = (cell * len(strides) + percept.heading) * num_horizons + percept.horizon
+        poses = jnp.concatenate([state.poses[1:], pose[None]])
+        return PoseHistory(poses, position, is_repeated=(state.poses == pose).any())
+
+    def read(self, state: PoseHistory, knowledge: Knowledge, goal: jax.Array) -> jax.Array:
+        """Return True where the present pose is repeated, bool []."""
+        return state.is_repeated
+
+
+def learn_motion(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarray]:
+    """Return how the agent of the task moves.
+
+    Args:
+      banks: of training scenes, which all have the task of the first one.
+      counts: of exploration, unused.
+
+    Returns:
+      By name `steps`, int32 [H, 2], the displacement (dz, dx) of a step ahead by heading, and `horizons`, int32 [], the
+      number of horizons.
+    """
+    rules = next(iter(banks)).task.rules
+    return {"steps": rules.move_steps().astype(np.int32), "horizons": np.array(len(rules.horizons), np.int32)}
+
+
+# Network: the tentative policy
 
 
 class TentativePolicy(nnx.Module):
-    """Tell from past trials what a shortest path would do.
+    """Network that predicts the action of a shortest path from past trials.
 
-    A trial is a state that the agent was in, as this network represents it, and what it did there.
+    A trial is a state of the agent, as this network represents it, and the one-hot action that followed.
     """
 
     def __init__(self, spec: PolicySpec, width: int, rngs: nnx.Rngs) -> None:
-        state, trial = spec.sizes.hidden, spec.sizes.hidden + NUM_ACTIONS
-        self.state, self.trial, self.both = (FeedForward(n, width, rngs) for n in (state, trial, state + trial))
-        self.expert = Linear(state + trial, NUM_ACTIONS, rngs=rngs)
+        state_width = spec.sizes.hidden
+        trial_width = spec.sizes.hidden + NUM_ACTIONS
+        self.state = FeedForward(state_width, width, rngs)
+        self.trial = FeedForward(trial_width, width, rngs)
+        self.both = FeedForward(state_width + trial_width, width, rngs)
+        self.expert = Linear(state_width + trial_width, NUM_ACTIONS, rngs=rngs)
 
     def remember(self, trials: jax.Array, hidden: jax.Array, action: jax.Array) -> jax.Array:
-        """Return trials float32 [..., N, H + A] and one more, fixed.
+        """Append a trial, through which no gradient passes, and drop the oldest one.
 
         Args:
-          trials: float32 [..., N, H + A]; the first is forgotten.
+          trials: float32 [..., N, H + A].
           hidden: float32 [..., H], the policy's hidden state.
-          action: int32 [...], that followed.
+          action: int32 [...], the action that followed.
+
+        Returns:
+          float32 [..., N, H + A].
         """
-        trial = jnp.concatenate([self.state(hidden), jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)], axis=-1)
+        action_one_hot = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
+        trial = jnp.concatenate([self.state(hidden), action_one_hot], axis=-1)
         return jnp.concatenate([trials[..., 1:, :], jax.lax.stop_gradient(trial)[..., None, :]], axis=-2)
 
     def __call__(self, hidden: jax.Array, trials: jax.Array, count: jax.Array) -> jax.Array:
-        """Return logits of a shortest path's action, float32 [..., A].
+        """Return logits of the action of a shortest path, float32 [..., A].
 
         Args:
           hidden: float32 [..., H], the policy's present hidden state.
-          trials: float32 [..., N, H + A].
-          count: int32 [...], trials so far, at least 1; the last ones are there.
+          trials: float32 [..., N, H + A], the latest at the end.
+          count: int32 [...], number of trials so far, at least 1.
         """
+        # Read from the trials in similar states, and predict from both.
         state = self.state(hidden)
-        answer = self.trial((self.attention(state, trials, count)[..., None, :] @ trials)[..., 0, :])
+        attention = self.attention(state, trials, count)
+        attended_trial = (attention[..., None, :] @ trials)[..., 0, :]
+        answer = self.trial(attended_trial)
         return self.expert(self.both(jnp.concatenate([state, answer], axis=-1)))
 
     def attention(self, state: jax.Array, trials: jax.Array, count: jax.Array) -> jax.Array:
-        """Return how much a state float32 [..., H] attends to trials.
-
-        Those that are most alike share it.
+        """Return the attention of a state float32 [..., H] to trials.
 
         Returns:
-          float32 [..., N], sums to 1.
+          float32 [..., N], with sum 1 over the `NUM_ATTENDED` most similar trials.
         """
+        # Mask the slots that hold no trial yet.
         ages = jnp.arange(trials.shape[-2], 0, -1).reshape((1,) * count.ndim + (-1,))
         scores = jnp.where(ages <= count[..., None], self.scores(state, trials), -jnp.inf)
-        least = jax.lax.top_k(scores, ATTENDED)[0][..., -1:]
-        return jax.nn.softmax(jnp.where(scores >= least, scores, -jnp.inf))
+
+        # Mask all but the best ones.
+        lowest_attended = jax.lax.top_k(scores, NUM_ATTENDED)[0][..., -1:]
+        return jax.nn.softmax(jnp.where(scores >= lowest_attended, scores, -jnp.inf))
 
     def scores(self, state: jax.Array, trials: jax.Array) -> jax.Array:
-        """Return how much alike they are, [..., N]."""
+        """Return the scaled dot products of the state and those of the trials, [..., N]."""
         width = state.shape[-1]
         return (trials[..., :width] @ state[..., None])[..., 0] / np.float32(np.sqrt(width))
 
 
-class Indiscriminate(TentativePolicy):
-    """Attend to all trials equally."""
+class UniformTentativePolicy(TentativePolicy):
+    """Tentative policy with equal attention to all trials, for an ablation."""
 
     def scores(self, state: jax.Array, trials: jax.Array) -> jax.Array:
         """Return zeros, [..., N]."""
@@ -90,108 +184,132 @@ class Indiscriminate(TentativePolicy):
 
 
 class TentativeRelations(ObjectRelations):
-    """Relate the detected categories and the goal.
+    """Experience of ORG; the tentative policy is attached to it but no part of Z."""
 
-    That is ORG; a tentative policy, which is no part of experience, stands by.
-    """
-
-    tentative_policy: ClassVar[type[TentativePolicy]] = TentativePolicy
+    tentative_class: ClassVar[type[TentativePolicy]] = TentativePolicy
     sizes: ClassVar[Mapping[str, int]] = {**ObjectRelations.sizes, "tentative_width": 64}
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)
-        self.tentative = self.tentative_policy(spec, self.size(spec, "tentative_width"), rngs)
+        self.tentative = self.tentative_class(spec, self.size(spec, "tentative_width"), rngs)
 
 
-class IndiscriminateRelations(TentativeRelations):
-    """Relate as ORG; all trials are attended to equally."""
+class UniformTentativeRelations(TentativeRelations):
+    """Experience of ORG, with equal attention to all trials."""
 
-    tentative_policy = Indiscriminate
+    tentative_class = UniformTentativePolicy
 
 
-class Trials(NamedTuple):
-    """Hold the fast weights, and what they are learned from.
+# Adaptation: steps towards the tentative policy
+
+
+class TentativeState(NamedTuple):
+    """Fast weights of the actor, and the trials that they are learned from.
 
     Attributes:
-      past: float32 [..., N, H + A], the last trials, the latest at the end.
-      decisions: int32 [...], so far.
-      change: float32 [..., H + 1, A], of the actor's kernel and bias.
-      prediction: float32 [..., A], logits of a shortest path's action at the last decision.
+      trials: float32 [..., N, H + A], the last trials, the latest at the end.
+      num_decisions: int32 [...], decisions so far.
+      actor_change: float32 [..., H + 1, A], change of the actor's kernel and bias.
+      predicted_logits: float32 [..., A], logits of a shortest path's action at the last decision.
     """
 
-    past: jax.Array
-    decisions: jax.Array
-    change: jax.Array
-    prediction: jax.Array
+    trials: jax.Array
+    num_decisions: jax.Array
+    actor_change: jax.Array
+    predicted_logits: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
-class TentativeSteps:
-    """Imitate the tentative policy where the agent was before.
+class TentativeAdaptation:
+    """Gradient descent towards the tentative policy at repeated poses.
 
-    After a decision at a repeated pose the actor takes a step of gradient descent on the cross-entropy to the action
-    that the tentative policy holds for best. With streams it is the actor of the direct stream.
+    After a decision at a repeated pose, the actor takes a step on the cross-entropy to the action that the tentative
+    policy considers best. With streams it is the actor of the direct stream.
 
     Attributes:
-      rate: of the step.
-      renewal: decisions after which the actor is again as it was trained.
+      learning_rate: of the step.
+      reset_interval: number of decisions after which the actor is reset to its trained state.
     """
 
-    rate: float = 0.1
-    renewal: int = 50
+    learning_rate: float = 0.1
+    reset_interval: int = 50
 
-    def init(self, policy: "Policy", batch: tuple[int, ...]) -> Trials:
-        """Return no trial and no change."""
-        hidden = policy.hidden
-        return Trials(
-            past=jnp.zeros((*batch, REMEMBERED, hidden + NUM_ACTIONS)),
-            decisions=jnp.zeros(batch, jnp.int32),
-            change=jnp.zeros((*batch, hidden + 1, NUM_ACTIONS)),
-            prediction=jnp.zeros((*batch, NUM_ACTIONS)),
+    def init(self, policy: "Policy", batch: tuple[int, ...]) -> TentativeState:
+        """Return a state without trials and without a change."""
+        hidden_width = policy.hidden
+        return TentativeState(
+            trials=jnp.zeros((*batch, NUM_TRIALS, hidden_width + NUM_ACTIONS)),
+            num_decisions=jnp.zeros(batch, jnp.int32),
+            actor_change=jnp.zeros((*batch, hidden_width + 1, NUM_ACTIONS)),
+            predicted_logits=jnp.zeros((*batch, NUM_ACTIONS)),
         )
 
-    def decide(self, policy: "Policy", pathways: "Pathways", memory: "Memory") -> "Decision":
-        """Decide with the changed actor, then learn from the pose."""
+    def decide(self, policy: "Policy", pathways: "Pathways", memory: "PolicyState") -> "Decision":
+        """Decide with the changed actor, then adapt it where the pose is repeated."""
         assert isinstance(policy.method, TentativeRelations)
-        tentative, (past, decisions, change, _) = policy.method.tentative, memory.fast
-        change = jnp.where((decisions % self.renewal == 0)[..., None, None], 0.0, change)
-        decision = policy.decide_plainly(pathways, memory, actor_changes(change))
-        before, now = (jax.lax.stop_gradient(each.hidden[..., : policy.hidden]) for each in (memory, decision))
-        past = tentative.remember(past, before, memory.action)
-        prediction = tentative(now, past, decisions + 1)
-        best = jax.nn.one_hot(prediction.argmax(axis=-1), NUM_ACTIONS, dtype=jnp.float32)
-        descent = policy.gated(best - jax.nn.softmax(decision.logits), pathways)
-        step = self.rate * with_one(now)[..., None] * descent[..., None, :]
-        change = change + jnp.where(pathways.reading[..., None, None], step, 0.0)
-        return decision._replace(fast=Trials(past, decisions + 1, change, prediction))
+        tentative = policy.method.tentative
+        trials, num_decisions, actor_change, _ = memory.fast
+
+        # Decide, with a reset actor every `reset_interval` decisions.
+        is_reset = num_decisions % self.reset_interval == 0
+        actor_change = jnp.where(is_reset[..., None, None], 0.0, actor_change)
+        output = policy.decide_without_adaptation(pathways, memory, actor_changes(actor_change))
+
+        # Hidden states, with streams those of the direct stream; the tentative policy does not train the policy.
+        hidden_before = jax.lax.stop_gradient(memory.hidden[..., : policy.hidden])
+        hidden_now = jax.lax.stop_gradient(output.hidden[..., : policy.hidden])
+
+        # Remember the previous state with the action that followed, and predict a shortest path's action.
+        trials = tentative.remember(trials, hidden_before, memory.action)
+        predicted_logits = tentative(hidden_now, trials, num_decisions + 1)
+        best_one_hot = jax.nn.one_hot(predicted_logits.argmax(axis=-1), NUM_ACTIONS, dtype=jnp.float32)
+
+        # Negative gradient of the cross-entropy by the actor's kernel and bias: the outer product of [h, 1] and
+        # one_hot - softmax(logits).
+        logits_descent = policy.gate_done(best_one_hot - jax.nn.softmax(output.logits), pathways)
+        step = self.learning_rate * append_one(hidden_now)[..., None] * logits_descent[..., None, :]
+        is_repeated = pathways.reading[..., None, None]
+        actor_change = actor_change + jnp.where(is_repeated, step, 0.0)
+        return output._replace(fast=TentativeState(trials, num_decisions + 1, actor_change, predicted_logits))
 
 
-def actor_changes(change: jax.Array) -> Changes:
-    """Change the actor's kernel and bias, [..., H + 1, A]."""
-    return {"actor": lambda inputs: (inputs[..., None] * change).sum(axis=-2)}
+def actor_changes(actor_change: jax.Array) -> LayerChanges:
+    """Return the layer changes for a change of the actor's kernel and bias, [..., H + 1, A]."""
+    return {"actor": lambda inputs: (inputs[..., None] * actor_change).sum(axis=-2)}
 
 
 def tentative_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return how badly shortest paths are told at repeated poses.
+    """Return the imitation loss of the tentative policy at repeated poses.
 
-    No gradient reaches the policy.
+    No gradient reaches the policy itself.
+
+    Args:
+      replayed: a `jaxnav.training.ppo.Replay`.
     """
-    repeated = replayed.transitions.reading
-    expert = jnp.where(repeated, expert_actions(replayed), NUM_ACTIONS)
-    loss, parts = imitation_loss(replayed.decisions.fast.prediction, expert)
-    return loss, parts | {"repeated": repeated.astype(jnp.float32).mean()}
+    # Steps at other poses get the label NUM_ACTIONS, which adds nothing to the loss.
+    is_repeated = replayed.transitions.reading
+    expert = jnp.where(is_repeated, expert_actions(replayed), NUM_ACTIONS)
+    loss, metrics = imitation_loss(replayed.factual.fast.predicted_logits, expert)
+    return loss, metrics | {"repeated": is_repeated.astype(jnp.float32).mean()}
 
 
 TPN = Method(
     TentativeRelations,
-    tracker=PoseTracker(REMEMBERED),
+    tracker=PoseTracker(NUM_TRIALS),
     learn=learn_motion,
     stages=(
-        Stage(1.0 - IMITATION, adapts=False),
-        Stage(IMITATION, tentative_loss, rates=lambda path: path[:2] == ("method", "tentative"), imitates=True),
+        Stage(1.0 - _IMITATION_SHARE, adapts_online=False),
+        Stage(
+            _IMITATION_SHARE,
+            tentative_loss,
+            lr_scale_by_path=lambda path: path[:2] == ("method", "tentative"),
+            uses_expert=True,
+        ),
     ),
-    adaptation=TentativeSteps(),
+    adaptation=TentativeAdaptation(),
+    name="tpn",
 )
-#: The ablations that it must beat: without a step at test time, and without a choice among past trials.
-UNTRIED = dataclasses.replace(TPN, adaptation=TentativeSteps(rate=0.0))
-INDISCRIMINATE = dataclasses.replace(TPN, experience=IndiscriminateRelations)
+#: Ablation without steps at test time.
+UNTRIED = dataclasses.replace(TPN, adaptation=TentativeAdaptation(learning_rate=0.0))
+#: Ablation with equal attention to all past trials.
+INDISCRIMINATE = dataclasses.replace(TPN, experience=UniformTentativeRelations)

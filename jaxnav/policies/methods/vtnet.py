@@ -1,4 +1,13 @@
-"""The visual transformer network (Du et al., ICLR 2021)."""
+"""VTNet: the visual transformer network.
+
+Source: H. Du, X. Yu and L. Zheng, *VTNet: Visual Transformer Network for Object Goal Navigation*, ICLR 2021, and its
+released code; a host of L-sTDE in the paper.
+
+Kept: each detection is a token, a post-norm encoder relates the tokens, and a decoder reads them from queries, which
+are squares of the view with a fixed sine code of their position. A head of its own imitates shortest paths before the
+rest of the policy is trained. Changed: only the goal and the detected categories are tokens, queries are 5 x 5 squares
+of the plan of the floor, the networks are smaller, there is no dropout, and all parameters have one learning rate.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -10,28 +19,28 @@ import numpy as np
 from flax import nnx
 
 from jaxnav.errors import InputError
-from jaxnav.numerics.product import Linear, biased, product
+from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.policies.features import NUM_FEATURES, Features
-from jaxnav.policies.methods.attention import Attention, Averaging, FeedForward
-from jaxnav.policies.methods.base import Experience, Method, Stage
+from jaxnav.policies.method import Experience, Method, Stage
+from jaxnav.policies.methods.attention import FeedForward, MultiHeadAttention, UniformMultiHeadAttention
 from jaxnav.policies.methods.imitation import expert_actions, imitation_loss
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import NUM_ACTIONS
 
-#: Share of all updates in which the transformer learns what shortest paths do, before it is trained with the policy.
-IMITATION = 0.2
+#: Share of all updates in which the transformer learns to imitate, before it is trained with the policy.
+_IMITATION_SHARE = 0.2
 
 
 class Transformer(Experience):
-    """Let places in view ask what is detected.
+    """Transformer from the detected categories to squares of the view.
 
-    An encoder relates the detected categories and the goal, each a token of what it is and where it is detected. The
-    layout weights multiply what it returns (eq. 7): before its last normalisation they would be undone. A decoder then
-    attends to it from queries, squares of the view in front of the agent.
+    An encoder relates the detected categories and the goal; each token embeds a category and its detection. The layout
+    weights multiply the output of the encoder (eq. 7): before its last normalisation they would be undone. A decoder
+    then attends to this output from queries, which are squares of the view in front of the agent.
     """
 
-    attention: ClassVar[type[Attention]] = Attention
+    attention: ClassVar[type[MultiHeadAttention]] = MultiHeadAttention
     sizes: ClassVar[Mapping[str, int]] = {
         "token_width": 32,
         "heads": 2,
@@ -44,127 +53,168 @@ class Transformer(Experience):
     }
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
-        width, heads, hidden, self.num_tokens, encoders, decoders, side, outputs = (
-            self.size(spec, name) for name in self.sizes
-        )
-        view = RowFormat(spec.num_categories).view
-        if width % heads or width % 4:
+        # Sizes, which command-line options can change.
+        token_width = self.size(spec, "token_width")
+        num_heads = self.size(spec, "heads")
+        query_outputs = self.size(spec, "query_outputs")
+        self.num_tokens = self.size(spec, "tokens")
+        self.side = self.size(spec, "queries")
+        self.view = RowFormat(spec.num_categories).view
+        if token_width % num_heads or token_width % 4:
             raise InputError(
-                f"config: method_sizes.token_width is {width}; give a multiple of 4 and of heads ({heads})"
+                f"config: method_sizes.token_width is {token_width}; give a multiple of 4 and of heads ({num_heads})"
             )
-        if side > view:
-            raise InputError(f"config: method_sizes.queries is {side}; give at most {view}, the cells along the view")
+        if self.side > self.view:
+            raise InputError(
+                f"config: method_sizes.queries is {self.side}; give at most {self.view}, the cells along the view"
+            )
 
-        def layer(*attentions: str) -> nnx.Dict:
-            parts: dict[str, nnx.Module] = {name: self.attention(width, heads, rngs) for name in attentions}
-            return nnx.Dict(parts | {"forward": FeedForward(width, hidden, rngs)})
+        def build_layer(*attention_names: str) -> nnx.Dict:
+            """Build attention modules by name, and the perceptron after them."""
+            modules: dict[str, nnx.Module] = {}
+            for name in attention_names:
+                modules[name] = self.attention(token_width, num_heads, rngs)
+            modules["forward"] = FeedForward(token_width, self.size(spec, "feedforward"), rngs)
+            return nnx.Dict(modules)
 
-        self.token = Linear(spec.sizes.appearance + NUM_FEATURES, width, rngs=rngs)
-        self.encoder = nnx.Dict({f"{i}": layer("tokens") for i in range(encoders)})
-        self.view, self.side = view, side
-        self.query = Linear(squares(view, side).shape[1], width, rngs=rngs)
-        # At first there are no answers to exchange: the first layer would attend to zeros.
-        self.decoder = nnx.Dict({f"{i}": layer(*["answers"] * (i > 0), "tokens") for i in range(decoders)})
-        self.maps = Linear(width, outputs, rngs=rngs)
-        self.width = side**2 * outputs
-        self.expert = Linear(self.width, NUM_ACTIONS, rngs=rngs)  # for imitation alone
+        self.token = Linear(spec.sizes.appearance + NUM_FEATURES, token_width, rngs=rngs)
+        encoder_layers: dict[str, nnx.Dict] = {}
+        for i in range(self.size(spec, "encoder_layers")):
+            encoder_layers[str(i)] = build_layer("tokens")
+        self.encoder = nnx.Dict(encoder_layers)
+
+        # The first decoder layer does not attend to the answers of the queries, which are still zero.
+        self.query = Linear(view_squares(self.view, self.side).shape[1], token_width, rngs=rngs)
+        decoder_layers: dict[str, nnx.Dict] = {}
+        for i in range(self.size(spec, "decoder_layers")):
+            decoder_layers[str(i)] = build_layer("tokens") if i == 0 else build_layer("answers", "tokens")
+        self.decoder = nnx.Dict(decoder_layers)
+
+        self.maps = Linear(token_width, query_outputs, rngs=rngs)
+        self.width = self.side**2 * query_outputs
+        self.expert = Linear(self.width, NUM_ACTIONS, rngs=rngs)  # only for imitation
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Any) -> jax.Array:
         """Return experience, each encoded category weighted by the layout."""
+        # Tokens [..., N, d] of appearance and detection. Appearances pass the linear layer once, before the selection.
         slots = self._slots(features)
-        kernel, split = self.token.kernel[...], appearance.shape[-1]
-        rows = product(slots @ features.table, kernel[split:])
-        tokens = biased(rows + product(slots, appearance @ kernel[:split]), self.token)
+        num_appearance = appearance.shape[-1]
+        kernel = self.token.kernel[...]
+        detections = matmul_rows(slots @ features.table, kernel[num_appearance:])
+        appearances = matmul_rows(slots, appearance @ kernel[:num_appearance])
+        tokens = add_bias(detections + appearances, self.token)
+
+        # Encode the tokens, then weight them by the layout.
         present = slots.any(axis=-1)
         for layer in self.encoder.values():
             tokens = layer.forward(layer.tokens(tokens, tokens, tokens, tokens, present))
-        known = slots @ weights[..., None] * tokens
+        weighted_tokens = slots @ weights[..., None] * tokens
 
-        query = nnx.relu(self.query(features.view[..., squares(self.view, self.side)]))
-        query = query + jnp.broadcast_to(places(self.side, query.shape[-1]), query.shape)
-        answer = jnp.zeros_like(query)
+        # Queries [..., side^2, d]: what is seen of each square of the view, and where it is.
+        squares = features.view[..., view_squares(self.view, self.side)]
+        query = nnx.relu(self.query(squares))
+        query = query + jnp.broadcast_to(position_codes(self.side, query.shape[-1]), query.shape)
+
+        # Decode: the queries attend to each other and to the tokens.
+        answers = jnp.zeros_like(query)
         for layer in self.decoder.values():
             if "answers" in layer:
-                answer = layer.answers(answer, answer + query, answer + query, answer)
-            answer = layer.forward(layer.tokens(answer, answer + query, known, known, present))
-        maps = nnx.relu(self.maps(answer))
+                answers = layer.answers(answers, answers + query, answers + query, answers)
+            answers = layer.forward(layer.tokens(answers, answers + query, weighted_tokens, weighted_tokens, present))
+        maps = nnx.relu(self.maps(answers))
         return maps.reshape(*maps.shape[:-2], -1)
 
     def _slots(self, features: Features) -> jax.Array:
-        """Return which category each token is.
+        """Return the category of each token.
 
-        The goal's is the first, detected or not, for it says what is sought; the other detected ones follow.
+        The first token is the goal, detected or not; the other detected categories follow in their order.
 
         Returns:
-          float32 [..., N, K], one-hot or, where there are fewer, zero.
+          float32 [..., N, K], one-hot, or zero where there are fewer categories than tokens.
         """
-        others = features.visible * (1.0 - features.goal)
-        rank = jnp.where(features.goal > 0, 0.0, jnp.where(others > 0, jnp.cumsum(others, axis=-1), -1.0))
+        # Ranks [..., K] of the categories among the tokens, -1 for those without one.
+        other_visible = features.visible * (1.0 - features.goal)
+        other_rank = jnp.where(other_visible > 0, jnp.cumsum(other_visible, axis=-1), -1.0)
+        rank = jnp.where(features.goal > 0, 0.0, other_rank)
         slot = jnp.arange(self.num_tokens, dtype=jnp.float32).reshape((1,) * (rank.ndim - 1) + (-1, 1))
         return (rank[..., None, :] == slot).astype(jnp.float32)
 
 
-class AveragingTransformer(Transformer):
-    """Let places in view get the same answer."""
+class UniformTransformer(Transformer):
+    """Transformer with equal attention: all queries get the same answer."""
 
-    attention = Averaging
+    attention = UniformMultiHeadAttention
 
 
-def squares(view: int, side: int) -> np.ndarray:
-    """Return the cells of each query's square of the view.
+def view_squares(view: int, side: int) -> np.ndarray:
+    """Return the cells of the view in each query's square.
 
-    The squares cover the view; with V cells along it, they are as large as they must be to begin every V // side cells.
+    A square begins every V // side cells, and the squares are just large enough to cover the V x V cells of the view.
 
     Args:
       view: V.
       side: squares along each side.
 
     Returns:
-      int [side^2, 2 cells], indices into `Features.view`.
+      int [side^2, 2 cells], indices into `Features.view`, whose two halves are free and blocked cells.
     """
     stride = view // side
-    size = view - stride * (side - 1)
-    begin, offset = stride * np.arange(side), np.arange(size)
-    rows = (begin[:, None, None, None] + offset[:, None]) * view
-    cells = (rows + begin[:, None, None] + offset).reshape(side**2, -1)
-    return np.concatenate([cells, view**2 + cells], axis=1)
+    square_size = view - stride * (side - 1)
+    starts = stride * np.arange(side)
+    offsets = np.arange(square_size)
+
+    # [square row, square column, cell row, cell column]
+    line_starts = (starts[:, None, None, None] + offsets[:, None]) * view
+    free_cells = (line_starts + starts[:, None, None] + offsets).reshape(side**2, -1)
+    blocked_cells = view**2 + free_cells
+    return np.concatenate([free_cells, blocked_cells], axis=1)
 
 
-def places(side: int, width: int) -> np.ndarray:
-    """Return fixed codes of the squares' places.
-
-    Sines and cosines of row and column.
+def position_codes(side: int, width: int) -> np.ndarray:
+    """Return fixed codes of the squares' positions: sines and cosines of row and column.
 
     Returns:
       float32 [side^2, width].
     """
-    rates = np.pi / side / 2.0 ** np.arange(width // 4)
-    along = np.arange(side)[:, None] * rates
-    code = np.concatenate([np.sin(along), np.cos(along)], axis=1)
-    return np.concatenate([code.repeat(side, axis=0), np.tile(code, (side, 1))], axis=1).astype(np.float32)
+    # A quarter of the width for each of sine and cosine, of row and column.
+    frequencies = np.pi / side / 2.0 ** np.arange(width // 4)
+    angles = np.arange(side)[:, None] * frequencies
+    line_codes = np.concatenate([np.sin(angles), np.cos(angles)], axis=1)
+
+    row_codes = line_codes.repeat(side, axis=0)
+    column_codes = np.tile(line_codes, (side, 1))
+    return np.concatenate([row_codes, column_codes], axis=1).astype(np.float32)
 
 
-def expert_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return how badly experience alone tells a shortest path's actions.
+def experience_imitation_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Return the imitation loss of a linear head on experience.
 
-    A head of its own reads it, and nothing else does: the policy only explores in this stage.
+    Only this loss reads the head; the policy itself just explores in this stage.
+
+    Args:
+      replayed: a `jaxnav.training.ppo.Replay`.
     """
+    # With streams the view follows the experience of the method.
     transformer = replayed.policy.method
     experience = replayed.pathways.experience[..., : transformer.width]
     return imitation_loss(transformer.expert(experience), expert_actions(replayed))
 
 
-VTNET = Method(
-    Transformer,
-    stages=(
-        Stage(IMITATION, expert_loss, rates=lambda path: path[0] == "method", imitates=True),
-        Stage(1.0 - IMITATION),
-    ),
+_IMITATION = Stage(
+    _IMITATION_SHARE,
+    experience_imitation_loss,
+    lr_scale_by_path=lambda path: path[0] == "method",
+    uses_expert=True,
 )
-#: The ablations that it must beat: without attention, and without imitation.
-AVERAGED = dataclasses.replace(VTNET, experience=AveragingTransformer)
+_REINFORCEMENT = Stage(1.0 - _IMITATION_SHARE)
+_SLOW_REINFORCEMENT = dataclasses.replace(
+    _REINFORCEMENT, lr_scale_by_path=lambda path: 0.1 if path[0] == "method" else 1.0
+)
+
+VTNET = Method(Transformer, stages=(_IMITATION, _REINFORCEMENT), name="vtnet")
+#: Ablation without attention.
+AVERAGED = dataclasses.replace(VTNET, experience=UniformTransformer)
+#: Ablation without imitation.
 UNTAUGHT = dataclasses.replace(VTNET, stages=(Stage(),))
-#: VTNet whose transformer, once it has imitated, learns at a tenth of the rate, as in the released code.
-_imitate, _reinforce = VTNET.stages
-_slowly = dataclasses.replace(_reinforce, rates=lambda path: 0.1 if path[0] == "method" else 1.0)
-SLOWER = dataclasses.replace(VTNET, stages=(_imitate, _slowly))
+#: Variant whose transformer learns at a tenth of the rate after it has imitated, as in the released code.
+SLOWER = dataclasses.replace(VTNET, stages=(_IMITATION, _SLOW_REINFORCEMENT))

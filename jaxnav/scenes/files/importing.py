@@ -1,4 +1,9 @@
-"""Import of scenes from the formats of simulators and datasets."""
+"""Import of scenes from the formats of simulators and datasets.
+
+`read_source` yields the scenes of a source in any of the formats, `filter_scenes` leaves out unwanted ones, and
+`import_scenes` checks the rest and writes them to a scene file. Scenes flow between them one by one, together with the
+errors of scenes that cannot be used and notes of guesses.
+"""
 
 import dataclasses
 import fnmatch
@@ -9,24 +14,21 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.categories import category_ids, unknown_types
-from jaxnav.scenes.files.importers.ai2thor import read_ai2thor
-from jaxnav.scenes.files.importers.assemble import Note
-from jaxnav.scenes.files.importers.controller import read_controller
+from jaxnav.scenes.categories import category_ids, count_unknown_types
+from jaxnav.scenes.files.importers.ai2thor import read_ai2thor, read_controller, read_replacements, read_scene_data
+from jaxnav.scenes.files.importers.assemble import ImportNote
 from jaxnav.scenes.files.importers.habitat import read_habitat
 from jaxnav.scenes.files.importers.procthor import read_procthor
-from jaxnav.scenes.files.importers.replacements import read_replacements
-from jaxnav.scenes.files.importers.scene_data import read_scene_data
 from jaxnav.scenes.files.scene_file import iterate_scenes, write_scenes
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.worlds import WORLDS, world_named
+from jaxnav.scenes.worlds import WORLDS, world_name_of_origin
 
-Format = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
-Split = Literal["train", "val", "test"]
-Imported = Iterator[Scene | InputError | Note]
+SceneFormat = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
+SceneSplit = Literal["train", "val", "test"]
+ImportStream = Iterator[Scene | InputError | ImportNote]
 
-#: Format that each option of `read_format` is for.
+#: Format that each option of `read_source` is for.
 FORMAT_OPTIONS = {
     "assets": "procthor",
     "agent_part": "procthor",
@@ -37,109 +39,131 @@ FORMAT_OPTIONS = {
 
 
 class ImportSummary(NamedTuple):
-    """Summarize an import.
+    """Summary of an import.
 
     Attributes:
-      scenes: those that were written, by name.
-      refused: number of scenes that could not be used.
-      unknown: number of objects of each type that is in no vocabulary.
-      unconnected: standable cells outside the largest connected part, of each scene that has such cells.
-      notes: what else was done to the scenes, and its number.
+      scenes: the scenes that were written, by name.
+      num_refused: number of scenes that could not be used.
+      unknown_type_counts: number of objects of each type that is in no vocabulary.
+      unconnected_cell_counts: standable cells outside the largest connected part, of each scene that has such cells.
+      notes: number of guesses and other changes to the scenes, by their text.
     """
 
     scenes: dict[str, Scene]
-    refused: int
-    unknown: Counter[str]
-    unconnected: Counter[str]
+    num_refused: int
+    unknown_type_counts: Counter[str]
+    unconnected_cell_counts: Counter[str]
     notes: Counter[str]
 
 
-def read_format(
-    form: Format,
+def read_source(
+    scene_format: SceneFormat,
     source: str,
-    split: Split = "train",
+    split: SceneSplit = "train",
     assets: Path | None = None,
     maps: Path | None = None,
     from_controller: bool = False,
     base: Path | None = None,
     agent_part: bool = False,
-) -> Imported:
+) -> ImportStream:
     """Yield the scenes of a source.
 
     Args:
-      form: the format.
+      scene_format: the format.
       source: path of a file or folder; with `from_controller` names of scenes with commas between them.
       split: split of the scenes; scenes of a scene file keep theirs.
       assets: asset database of ProcTHOR.
       maps: semantic floor maps for Habitat episodes.
       from_controller: whether to read from an installed AI2-THOR simulator.
       base: scene file with the rooms that re-placements are of.
-      agent_part: of ProcTHOR houses only what is connected with the agent's place in the file.
+      agent_part: of ProcTHOR houses only the cells that are connected with the agent's place in the file.
 
     Yields:
-      A scene, or why it cannot be used; also notes of what was done.
+      A scene, or why it cannot be used; also notes of guesses and other changes.
 
     Raises:
       InputError: the source cannot be read, or an option is missing or is for another format.
     """
-    options = {"assets": assets, "agent_part": agent_part, "maps": maps, "base": base}
-    _check_options(form, options | {"from_controller": from_controller})
-    path = Path(source)
-    match form:
+    given_options = {
+        "assets": assets,
+        "agent_part": agent_part,
+        "maps": maps,
+        "from_controller": from_controller,
+        "base": base,
+    }
+
+    # An option that the format does not use is a mistake.
+    for option_name, option_format in FORMAT_OPTIONS.items():
+        if given_options[option_name] and scene_format != option_format:
+            problem = f"is for the format {option_format}, not for {scene_format}; leave it out"
+            raise InputError(f"--{option_name.replace('_', '-')}: {problem}")
+
+    # The importers read one scene after the other, as their caller asks for them.
+    source_path = Path(source)
+    match scene_format:
         case "procthor":
-            yield from read_procthor(path, split, assets, agent_part)
+            yield from read_procthor(source_path, split, assets, agent_part)
+        case "ai2thor" if from_controller:
+            yield from read_controller(source.split(","), split)
         case "ai2thor":
-            yield from read_controller(source.split(","), split) if from_controller else read_ai2thor(path, split)
+            yield from read_ai2thor(source_path, split)
         case "scene-data":
-            yield from read_scene_data(path, split)
+            yield from read_scene_data(source_path, split)
         case "habitat":
-            yield from read_habitat(path, split, maps)
+            yield from read_habitat(source_path, split, maps)
         case "replacements":
             if base is None:
                 raise InputError("--base: is missing; replacements need the scene file of their rooms")
-            yield from read_replacements(path, base)
+            yield from read_replacements(source_path, base)
         case "scenes":
-            yield from iterate_scenes(path)
+            yield from iterate_scenes(source_path)
 
 
-def select(scenes: Imported, room_types: tuple[str, ...] = (), largest: int | None = None) -> Imported:
+def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_side: int | None = None) -> ImportStream:
     """Leave out scenes of other room types or sizes.
 
     Args:
-      scenes: see `read_format`.
+      scenes: see `read_source`.
       room_types: of the scenes to keep; empty for all.
-      largest: cells along the longer side of the largest scene to keep; None for any.
+      max_side: cells along the longer side of the largest scene to keep; None for any.
 
     Yields:
-      Scenes to keep, a note for each scene that is left out, and all else.
+      Scenes to keep, a note for each scene that is left out, and all errors and notes.
 
     Raises:
-      InputError: no scene is kept.
+      InputError: no scene remains.
     """
-    kept, others, sides = 0, set[str](), set[int]()
+    # Remember why scenes are left out, for the error where none remains.
+    num_scenes = 0
+    other_room_types: set[str] = set()
+    excessive_sides: set[int] = set()
     for scene in scenes:
         if not isinstance(scene, Scene):
             yield scene
         elif room_types and scene.room_type not in room_types:
-            others.add(scene.room_type)
-            yield Note(f"scenes are left out, for their room type is not {' or '.join(room_types)}", 1)
-        elif largest is not None and max(scene.reach.shape) > largest:
-            sides.add(max(scene.reach.shape))
-            yield Note(f"scenes are left out, for they are longer than {largest} cells", 1)
+            other_room_types.add(scene.room_type)
+            yield ImportNote(f"scenes are left out, for their room type is not {' or '.join(room_types)}", 1)
+        elif max_side is not None and max(scene.reach.shape) > max_side:
+            excessive_sides.add(max(scene.reach.shape))
+            yield ImportNote(f"scenes are left out, for they are longer than {max_side} cells", 1)
         else:
-            kept += 1
+            num_scenes += 1
             yield scene
-    if sides and not kept:
-        raise InputError(f"--largest {largest}: leaves no scene; the smallest is {min(sides)} cells long")
-    if others and not kept:
-        raise InputError(f"--room-types {' '.join(room_types)}: leaves no scene; there are {', '.join(sorted(others))}")
+
+    # Tell which limit would have left a scene.
+    if excessive_sides and num_scenes == 0:
+        smallest_side = min(excessive_sides)
+        raise InputError(f"--largest {max_side}: leaves no scene; the smallest is {smallest_side} cells long")
+    if other_room_types and num_scenes == 0:
+        present_types = ", ".join(sorted(other_room_types))
+        raise InputError(f"--room-types {' '.join(room_types)}: leaves no scene; there are {present_types}")
 
 
 def import_scenes(
-    scenes: Iterable[Scene | InputError | Note],
+    scenes: Iterable[Scene | InputError | ImportNote],
     source: str,
     out: Path,
-    split: Split = "train",
+    split: SceneSplit = "train",
     val: tuple[str, ...] = (),
     test: tuple[str, ...] = (),
     categories: tuple[str, ...] | None = None,
@@ -148,7 +172,7 @@ def import_scenes(
     """Write usable scenes to a scene file.
 
     Args:
-      scenes: see `read_format`.
+      scenes: see `read_source`.
       source: what they were read from, for error messages.
       out: scene file to write (`*.jsonl.gz`).
       split: of the scenes whose names no pattern fits.
@@ -161,69 +185,83 @@ def import_scenes(
     """
     if not out.name.endswith(".jsonl.gz"):
         raise InputError(f"{out}: give a name that ends in .jsonl.gz")
-    summary = _usable(scenes, source, categories, report)
-    kept = summary.scenes
-    if not kept:
-        raise InputError(f"{source}: none of its {summary.refused} scenes can be used; mend what is said of them above")
-    for pattern in (*val, *test):
-        if not fnmatch.filter(kept, pattern):
-            raise InputError(f"pattern {pattern!r}: fits no scene; there are {reprlib.repr(sorted(kept))}")
+
+    # Read all scenes before anything is written.
+    summary = _collect_usable_scenes(scenes, source, categories, report)
+    if not summary.scenes:
+        problem = f"none of its {summary.num_refused} scenes can be used; mend what is said of them above"
+        raise InputError(f"{source}: {problem}")
+
+    # A pattern that fits no scene is a typing error.
+    for name_pattern in (*val, *test):
+        if not fnmatch.filter(summary.scenes, name_pattern):
+            scene_names = reprlib.repr(sorted(summary.scenes))
+            raise InputError(f"pattern {name_pattern!r}: fits no scene; there are {scene_names}")
+
+    # Assign the splits by name; `val` comes before `test`.
+    divided_scenes: list[Scene] = []
+    for name, scene in summary.scenes.items():
+        if _fits_any(name, val):
+            scene_split = "val"
+        elif _fits_any(name, test):
+            scene_split = "test"
+        else:
+            scene_split = split
+        divided_scenes.append(dataclasses.replace(scene, split=scene_split))
     try:
-        write_scenes(out, [_with_split(scene, {"val": val, "test": test}, split) for scene in kept.values()])
+        write_scenes(out, divided_scenes)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another name") from error
     return summary
 
 
-def _check_options(form: Format, options: dict[str, Path | bool | None]) -> None:
-    """Refuse options that are for another format."""
-    for option, usable in FORMAT_OPTIONS.items():
-        if options[option] and form != usable:
-            name = option.replace("_", "-")
-            raise InputError(f"--{name}: is for the format {usable}, not for {form}; leave it out")
-
-
-def _usable(
-    scenes: Iterable[Scene | InputError | Note],
+def _collect_usable_scenes(
+    scenes: Iterable[Scene | InputError | ImportNote],
     source: str,
     categories: tuple[str, ...] | None,
     report: Callable[[InputError], None],
 ) -> ImportSummary:
-    """Return the usable scenes and what is told of them."""
-    kept: dict[str, Scene] = {}
-    unknown, unconnected, notes = Counter[str](), Counter[str](), Counter[str]()
-    refused = 0
+    """Collect the scenes that can be used, and count all else."""
+    summary = ImportSummary({}, 0, Counter(), Counter(), Counter())
+    num_refused = 0
     for scene in scenes:
+        if isinstance(scene, ImportNote):
+            summary.notes[scene.text] += scene.number
+            continue
+
+        # Refuse scenes that an importer or the following checks find unusable.
         try:
             if isinstance(scene, InputError):
                 raise scene
-            if isinstance(scene, Note):
-                notes += Counter({scene.text: scene.number})
-                continue
-            vocabulary = categories or WORLDS[world_named(scene.world)].task.categories
-            _check(scene, kept, vocabulary, source)
+            vocabulary = categories or WORLDS[world_name_of_origin(scene.world)].task.categories
+            _check_scene(scene, summary.scenes, vocabulary, source)
         except InputError as error:
-            refused += 1
+            num_refused += 1
             report(error)
-        else:
-            kept[scene.name] = scene
-            unknown += unknown_types([scene], vocabulary)
-            unconnected += Counter({scene.name: int(scene.reach.sum()) - len(standable_cells(scene.reach))})
-    return ImportSummary(kept, refused, unknown, unconnected, notes)
+            continue
+
+        # Count the oddities of a usable scene, for the report after the import.
+        summary.scenes[scene.name] = scene
+        summary.unknown_type_counts.update(count_unknown_types([scene], vocabulary))
+        num_unconnected = int(scene.reach.sum()) - len(standable_cells(scene.reach))
+        if num_unconnected:
+            summary.unconnected_cell_counts[scene.name] = num_unconnected
+    return summary._replace(num_refused=num_refused)
 
 
-def _check(scene: Scene, kept: dict[str, Scene], categories: tuple[str, ...], source: str) -> None:
+def _check_scene(scene: Scene, earlier_scenes: dict[str, Scene], categories: tuple[str, ...], source: str) -> None:
     """Refuse a scene without categories, or of an earlier name."""
-    where = f"{source}, scene {scene.name!r}"
-    if scene.name in kept:
-        raise InputError(f"{where}: name is that of an earlier scene; import them to two files")
+    location = f"{source}, scene {scene.name!r}"
+    if scene.name in earlier_scenes:
+        raise InputError(f"{location}: name is that of an earlier scene; import them to two files")
+
+    # Without an object of the vocabulary there is neither a goal nor anything to detect.
     if max(category_ids(scene.types, categories), default=-1) < 0:
+        known_names = ", ".join(categories)
         raise InputError(
-            f"{where}: objects are of no known type; known are {', '.join(categories)} (see --world and --categories)"
+            f"{location}: objects are of no known type; known are {known_names} (see --world and --categories)"
         )
 
 
-def _with_split(scene: Scene, patterns: dict[Split, tuple[str, ...]], default: Split) -> Scene:
-    """Set the first split with a pattern that fits."""
-    fits = (split for split, names in patterns.items() if any(fnmatch.fnmatchcase(scene.name, name) for name in names))
-    return dataclasses.replace(scene, split=next(fits, default))
+def _fits_any(scene_name: str, name_patterns: tuple[str, ...]) -> bool:
+    return any(fnmatch.fnmatchcase(scene_name, pattern) for pattern in name_patterns)

@@ -1,8 +1,18 @@
-"""Reading and writing of scene files, see docs/scene_format.md."""
+"""Reading and writing of scene files, and checked access to the JSON of users' files.
 
+`read_scenes` and `write_scenes` convert between files `*.jsonl.gz` (docs/scene_format.md) and `Scene`s;
+`iterate_scenes` reads line by line and reports bad scenes instead of raising. `derive_walls` gives scenes walls where
+their file has none. The importers of other formats use `read_bytes`, `parse_json` and `JsonRecord` too: every error
+names the place of the bad value and how to mend it.
+"""
+
+import dataclasses
 import gzip
+import io
 import json
+import re
 import reprlib
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,16 +20,24 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.files.record import Record, parse_json, read_bytes
-from jaxnav.scenes.files.walls import derive_walls
 from jaxnav.scenes.generate.sizes import typical_box
-from jaxnav.scenes.scene import CELL, MAX_SIDE, SPLITS, Room, Scene
+from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, SPLITS, Room, Scene
 from jaxnav.store.files import write_atomic
 
-_POSITION, _SIZE = ("x", "y", "z"), ("sx", "sy", "sz")
-_REQUIRED = ("type", *_POSITION, *_SIZE)
-_COLUMNS = (*_REQUIRED, "yaw", "parent")
-_SNAP = 0.02  # metres; an origin may be this far off the lattice
+#: Distance in metres that a position in a file may lie off the lattice.
+SNAP_TOLERANCE = 0.02
+
+_NUMBER_LIMIT = 1e6  # metres or degrees; a number beyond it is a mistake
+
+_HALF_CHARACTER = re.compile("[\ud800-\udfff]")  # a surrogate without its partner
+
+_CENTRE_COLUMNS = ("x", "y", "z")
+_SIZE_COLUMNS = ("sx", "sy", "sz")
+_REQUIRED_COLUMNS = ("type", *_CENTRE_COLUMNS, *_SIZE_COLUMNS)
+_COLUMNS = (*_REQUIRED_COLUMNS, "yaw", "parent")
+
+_WALL_DISTANCE = 3  # cells
+_BOX_DISTANCE = 0.25 + 1e-9  # metres
 
 
 def read_scenes(path: str | Path) -> list[Scene]:
@@ -58,17 +76,19 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
     Raises:
       InputError: the file is missing or damaged.
     """
-    lines: dict[str, int] = {}
-    for line, text in enumerate(read_bytes(path).splitlines(), start=1):
+    line_by_name: dict[str, int] = {}
+    for line_number, line_bytes in enumerate(read_bytes(path).splitlines(), start=1):
         try:
-            record = _parse(path, line, text)
-            scene = _scene(record)
-            if scene.name in lines:
-                raise record.error("name", f"is that of line {lines[scene.name]} too; make it unique")
+            record = _parse_line(path, line_number, line_bytes)
+            scene = _decode_scene(record)
+
+            # Names must be unique, because results and shifts refer to scenes by name.
+            if scene.name in line_by_name:
+                raise record.error("name", f"is that of line {line_by_name[scene.name]} too; make it unique")
         except InputError as error:
             yield error
         else:
-            lines[scene.name] = line
+            line_by_name[scene.name] = line_number
             yield scene
 
 
@@ -80,126 +100,379 @@ def write_scenes(path: str | Path, scenes: Iterable[Scene]) -> None:
     Raises:
       ValueError: a number is NaN or infinite.
     """
-    lines = [json.dumps(_fields(scene), allow_nan=False, separators=(",", ":")) + "\n" for scene in scenes]
-    write_atomic(Path(path), gzip.compress("".join(lines).encode(), mtime=0))
+    # One compact line per scene; without a time in the gzip header equal scenes give equal bytes.
+    scene_lines: list[str] = []
+    for scene in scenes:
+        scene_lines.append(json.dumps(_encode_scene(scene), allow_nan=False, separators=(",", ":")) + "\n")
+    write_atomic(Path(path), gzip.compress("".join(scene_lines).encode(), mtime=0))
 
 
-def _parse(path: Path, line: int, text: bytes) -> Record:
-    where = f"{path}, line {line}"
-    fields = parse_json(where, text)
+# Checked access to JSON
+
+
+@dataclasses.dataclass(frozen=True)
+class JsonRecord:
+    """A JSON object and its name in errors.
+
+    The methods `get_*` read a required member, and `check_*` a value that the caller looked up under the name `field`.
+    All of them raise an `InputError` for a missing or unsuitable value.
+
+    Attributes:
+      location: place of the object, for example `rooms.jsonl.gz, line 3, scene 'FloorPlan1'`.
+      fields: members of the object.
+    """
+
+    location: str
+    fields: dict[str, Any]
+
+    def error(self, field: str, problem: str) -> InputError:
+        """Return an error about one field, to be raised."""
+        return InputError(f"{self.location}: {field} {problem}")
+
+    def get(self, field: str) -> Any:
+        """Return a required member."""
+        if field not in self.fields:
+            raise self.error(field, "is missing; add it")
+        return self.fields[field]
+
+    def get_text(self, field: str) -> str:
+        """Return a required member that is a text, not empty."""
+        return self.check_text(field, self.get(field))
+
+    def get_list(self, field: str, length: int | None = None) -> list[Any]:
+        """Return a required member that is a list (of `length`)."""
+        return self.check_list(field, self.get(field), length)
+
+    def get_list_or_empty(self, field: str) -> list[Any]:
+        """Return a member that is a list; an empty one where it is missing or null."""
+        return self.check_list(field, self.fields.get(field) or [])
+
+    def get_record(self, field: str) -> "JsonRecord":
+        """Return a required member that is an object."""
+        return self.check_record(field, self.get(field))
+
+    def get_vector(self, field: str, axes: str = "xyz") -> list[float]:
+        """Return the numbers `axes` of a required member such as {"x": 0, "y": 0, "z": 0}."""
+        return self.check_vector(field, self.get(field), axes)
+
+    def check_text(self, field: str, value: Any) -> str:
+        """Return a value that must be a text, not empty."""
+        if not isinstance(value, str) or not value:
+            raise self.error(field, f"is {reprlib.repr(value)}; give a text")
+        # Half of a surrogate pair can be read but not written.
+        if _HALF_CHARACTER.search(value):
+            raise self.error(field, f"is {reprlib.repr(value)}, which holds half a character; write the whole one")
+        return value
+
+    def check_number(self, field: str, value: Any) -> float:
+        """Return a value that must be a finite number."""
+        if value is None:
+            raise self.error(field, "is null; give the number or leave the object out")
+        if type(value) not in (int, float) or not abs(value) <= _NUMBER_LIMIT:  # also refuses NaN
+            raise self.error(field, f"is {reprlib.repr(value)}; give a finite number, at most {_NUMBER_LIMIT:g}")
+        return float(value)
+
+    def check_list(self, field: str, value: Any, length: int | None = None) -> list[Any]:
+        """Return a value that must be a list (of `length`)."""
+        if not isinstance(value, list) or length not in (None, len(value)):
+            expected = "a list" if length is None else f"a list of {length}"
+            raise self.error(field, f"is {reprlib.repr(value)}; give {expected}")
+        return value
+
+    def check_record(self, field: str, value: Any) -> "JsonRecord":
+        """Return a value that must be an object; its errors name `field` too."""
+        if not isinstance(value, dict):
+            raise self.error(field, f"is {reprlib.repr(value)}; give an object")
+        return JsonRecord(f"{self.location}: {field}", value)
+
+    def check_vector(self, field: str, value: Any, axes: str = "xyz") -> list[float]:
+        """Return the numbers `axes` of a value such as {"x": 0, "y": 0, "z": 0}."""
+        vector = self.check_record(field, value)
+        components: list[float] = []
+        for axis in axes:
+            components.append(vector.check_number(axis, vector.get(axis)))
+        return components
+
+    def check_numbers(self, field: str, values: Iterable[Any]) -> list[float]:
+        """Return values that must be finite numbers."""
+        return [self.check_number(field, value) for value in values]
+
+    def iterate_records(self, field: str, values: Any) -> Iterator["JsonRecord"]:
+        """Yield the items of a list of objects, named `field[0]`, `field[1]`, ... in their errors."""
+        for index, value in enumerate(self.check_list(field, values)):
+            yield self.check_record(f"{field}[{index}]", value)
+
+    def check_vectors(self, field: str, values: Sequence[Any], axes: str = "xyz") -> list[list[float]]:
+        """Return the numbers `axes` of each item of a list."""
+        vectors: list[list[float]] = []
+        for index, value in enumerate(values):
+            vectors.append(self.check_vector(f"{field}[{index}]", value, axes))
+        return vectors
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file, and decompress it if it is gzip.
+
+    Raises:
+      InputError: the file is missing or damaged, or too large when decompressed.
+    """
+    try:
+        content = path.read_bytes()
+        if content[:2] != b"\x1f\x8b":
+            return content
+        # Reading one byte more than the limit shows that there is more, without decompressing all of it.
+        max_size = max_decompressed_size(len(content))
+        with gzip.open(io.BytesIO(content)) as file:
+            content = file.read(max_size + 1)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise InputError(f"{path}: is cut short or damaged ({error}); fetch or write it again") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    if len(content) > max_size:
+        raise InputError(f"{path}: holds more than {max_size:,} bytes; split it, or give it uncompressed")
+    return content
+
+
+def max_decompressed_size(compressed_size: int) -> int:
+    """Return the number of bytes that a gzip file of `compressed_size` bytes may hold.
+
+    Scenes hold 4 to 10 times as many; 64 MiB are allowed in any case.
+    """
+    return max(2**26, 50 * compressed_size)
+
+
+def parse_json(location: str, text: bytes) -> Any:
+    """Parse JSON.
+
+    Raises:
+      InputError: the bytes are not JSON.
+    """
+    try:
+        return json.loads(text.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{location}: not JSON ({error}); give valid JSON") from error
+
+
+# From JSON to scenes
+
+
+def _parse_line(path: Path, line_number: int, line_bytes: bytes) -> JsonRecord:
+    location = f"{path}, line {line_number}"
+    fields = parse_json(location, line_bytes)
     if not isinstance(fields, dict):
-        raise InputError(f"{where}: {reprlib.repr(fields)} is no scene; write one JSON object per line")
-    return Record(f"{where}, scene {reprlib.repr(fields.get('name', '(no name)'))}", fields)
+        raise InputError(f"{location}: {reprlib.repr(fields)} is no scene; write one JSON object per line")
+    return JsonRecord(f"{location}, scene {reprlib.repr(fields.get('name', '(no name)'))}", fields)
 
 
-def _scene(record: Record) -> Scene:
-    name, world, room_type, split = (
-        record.text(field, record.get(field)) for field in ("name", "world", "room_type", "split")
-    )
+def _decode_scene(record: JsonRecord) -> Scene:
+    """Build the scene of one line."""
+    # The names that describe the scene.
+    name = record.get_text("name")
+    world = record.get_text("world")
+    room_type = record.get_text("room_type")
+    split = record.get_text("split")
     if split not in SPLITS:
         raise record.error("split", f"is {split!r}; give one of {', '.join(SPLITS)}")
-    if record.get("cell") != CELL:
-        raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL} is known")
-    origin = _origin(record)
-    shape = record.sequence("shape", record.get("shape"), 2)
-    if not all(type(n) is int and 0 < n <= MAX_SIDE for n in shape):
-        raise record.error("shape", f"is {reprlib.repr(shape)}; give two whole numbers [nz, nx] from 1 to {MAX_SIDE}")
-    reach = _mask(record, "reach", shape)
+
+    # The lattice has one spacing, and its sides are limited.
+    if record.get("cell") != CELL_SIZE:
+        raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL_SIZE} is known")
+    origin = _decode_origin(record)
+    shape = record.get_list("shape", 2)
+    for side in shape:
+        if type(side) is not int or not 0 < side <= MAX_SIDE_CELLS:
+            expected = f"give two whole numbers [nz, nx] from 1 to {MAX_SIDE_CELLS}"
+            raise record.error("shape", f"is {reprlib.repr(shape)}; {expected}")
+
+    # Episodes may start beside the reachable cells, so the agent can stand there too.
+    reach = _decode_mask(record, "reach", shape)
     if "episode_starts" in record.fields:
-        reach |= _mask(record, "episode_starts", shape)
+        reach |= _decode_mask(record, "episode_starts", shape)
     if not reach.any():
         raise record.error("reach", "has no standable cell; mark at least one with '.'")
-    types, boxes, yaws, parents = _objects(record)
-    walls = ~_mask(record, "walls", shape) if "walls" in record.fields else derive_walls(reach, origin, boxes)
+
+    types, boxes, yaws, parents = _decode_objects(record)
+
+    # In the file '.' marks the cells that are no wall.
+    walls = ~_decode_mask(record, "walls", shape) if "walls" in record.fields else derive_walls(reach, origin, boxes)
+
     return Scene(
-        name, world, room_type, split, origin, reach, walls, types, boxes, yaws, parents, _rooms(record, shape)
+        name=name,
+        world=world,
+        room_type=room_type,
+        split=split,
+        origin=origin,
+        reach=reach,
+        walls=walls,
+        types=types,
+        boxes=boxes,
+        yaws=yaws,
+        parents=parents,
+        rooms=_decode_rooms(record, shape),
     )
 
 
-def _rooms(record: Record, shape: Sequence[int]) -> tuple[Room, ...]:
-    rooms = []
-    for i, value in enumerate(record.sequence("rooms", record.fields.get("rooms", []))):
-        room = record.record(f"rooms[{i}]", value)
-        rooms.append(Room(room.text("type", room.get("type")), _mask(room, "cells", shape)))
-    return tuple(rooms)
+def _decode_origin(record: JsonRecord) -> tuple[float, float]:
+    x, z = record.check_numbers("origin", record.get_list("origin", 2))
+    # Small errors of rounding are mended, larger ones are mistakes.
+    snapped_origin = (round(x / CELL_SIZE) * CELL_SIZE, round(z / CELL_SIZE) * CELL_SIZE)
+    if max(abs(x - snapped_origin[0]), abs(z - snapped_origin[1])) > SNAP_TOLERANCE:
+        expected = f"both must be multiples of {CELL_SIZE} (within {SNAP_TOLERANCE})"
+        raise record.error("origin", f"is [{x}, {z}]; {expected}")
+    return snapped_origin
 
 
-def _origin(record: Record) -> tuple[float, float]:
-    x, z = (record.number("origin", v) for v in record.sequence("origin", record.get("origin"), 2))
-    snapped = (round(x / CELL) * CELL, round(z / CELL) * CELL)
-    if max(abs(x - snapped[0]), abs(z - snapped[1])) > _SNAP:
-        raise record.error("origin", f"is [{x}, {z}]; both must be multiples of {CELL} (within {_SNAP})")
-    return snapped
-
-
-def _mask(record: Record, field: str, shape: Sequence[int]) -> np.ndarray:
+def _decode_mask(record: JsonRecord, field: str, shape: Sequence[int]) -> np.ndarray:
     """Read a mask, bool [nz, nx], True at '.'."""
-    rows = record.sequence(field, record.get(field), shape[0])
-    for i, row in enumerate(rows):
-        if not isinstance(row, str) or len(row) != shape[1] or not set(row) <= {".", "#"}:
-            raise record.error(f"{field}[{i}]", f"is {reprlib.repr(row)}; give {shape[1]} characters '.' or '#'")
-    return np.array([[character == "." for character in row] for row in rows])
+    # Each row is checked on its own, so that an error can name it.
+    mask_rows = record.get_list(field, shape[0])
+    for row_index, mask_row in enumerate(mask_rows):
+        if not isinstance(mask_row, str) or len(mask_row) != shape[1] or not set(mask_row) <= {".", "#"}:
+            expected = f"give {shape[1]} characters '.' or '#'"
+            raise record.error(f"{field}[{row_index}]", f"is {reprlib.repr(mask_row)}; {expected}")
+    return np.array([list(mask_row) for mask_row in mask_rows]) == "."
 
 
-def _objects(record: Record) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
-    columns = record.sequence("columns", record.get("columns"))
-    if not all(isinstance(c, str) for c in columns) or len(set(columns)) < len(columns):
-        raise record.error("columns", f"is {reprlib.repr(columns)}; give names, each once")
-    if missing := [column for column in _REQUIRED if column not in columns]:
-        raise record.error("columns", f"lacks {', '.join(missing)}; add it")
-    rows = [
-        dict(zip(columns, record.sequence(f"objects[{i}]", values, len(columns)), strict=True))
-        for i, values in enumerate(record.sequence("objects", record.get("objects")))
-    ]
-    placed = [i for i, row in enumerate(rows) if row["x"] is not None or row["z"] is not None]
-    new_index = {old: new for new, old in enumerate(placed)}
-    types, boxes, yaws, parents = [], [], [], []
-    for i in placed:
-        row = {column: value for column, value in rows[i].items() if value is not None}
-        types.append(record.text(f"objects[{i}].type", row.get("type")))
-        boxes.append(_box(record, i, dict(zip(("sx", "sy", "sz", "y"), typical_box(types[-1]), strict=True)) | row))
-        yaws.append(record.number(f"objects[{i}].yaw", row.get("yaw", 0.0)))
-        parents.append(new_index.get(_parent(record, i, row.get("parent", -1), len(rows)), -1))
+def _decode_rooms(record: JsonRecord, shape: Sequence[int]) -> tuple[Room, ...]:
+    decoded_rooms: list[Room] = []
+    for room_record in record.iterate_records("rooms", record.fields.get("rooms", [])):
+        decoded_rooms.append(Room(room_record.get_text("type"), _decode_mask(room_record, "cells", shape)))
+    return tuple(decoded_rooms)
+
+
+def _decode_objects(record: JsonRecord) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+    """Read the objects that have a place.
+
+    Returns:
+      Types [N], boxes float64 [N, 6], yaws float64 [N] and parents int64 [N], as in `Scene`.
+    """
+    # The file may order the columns as it likes, and may have more of them.
+    column_names = record.get_list("columns")
+    if not all(isinstance(column, str) for column in column_names) or len(set(column_names)) < len(column_names):
+        raise record.error("columns", f"is {reprlib.repr(column_names)}; give names, each once")
+    missing_columns = [column for column in _REQUIRED_COLUMNS if column not in column_names]
+    if missing_columns:
+        raise record.error("columns", f"lacks {', '.join(missing_columns)}; add it")
+
+    # One dict per object, by column.
+    object_rows: list[dict[str, Any]] = []
+    for object_index, row_values in enumerate(record.get_list("objects")):
+        cell_values = record.check_list(f"objects[{object_index}]", row_values, len(column_names))
+        object_rows.append(dict(zip(column_names, cell_values, strict=True)))
+
+    # Objects without a place are left out, so the others get new indices; parents refer to the old ones.
+    new_index: dict[int, int] = {}
+    for object_index, object_row in enumerate(object_rows):
+        if object_row["x"] is not None or object_row["z"] is not None:
+            new_index[object_index] = len(new_index)
+
+    object_types: list[str] = []
+    object_boxes: list[list[float]] = []
+    object_yaws: list[float] = []
+    parent_indices: list[int] = []
+    for object_index in new_index:
+        # A value that is null counts as missing.
+        object_row = _without_nulls(object_rows[object_index])
+        object_type = record.check_text(f"objects[{object_index}].type", object_row.get("type"))
+        object_types.append(object_type)
+        object_boxes.append(_decode_box(record, object_index, object_type, object_row))
+        object_yaws.append(record.check_number(f"objects[{object_index}].yaw", object_row.get("yaw", 0.0)))
+        old_parent = _decode_parent(record, object_index, object_row.get("parent", -1), len(object_rows))
+        parent_indices.append(new_index.get(old_parent, -1))
+
     return (
-        tuple(types),
-        np.array(boxes, np.float64).reshape(-1, 6),
-        np.array(yaws, np.float64),
-        np.array(parents, np.int64),
+        tuple(object_types),
+        np.array(object_boxes, np.float64).reshape(-1, 6),
+        np.array(object_yaws, np.float64),
+        np.array(parent_indices, np.int64),
     )
 
 
-def _box(record: Record, i: int, row: dict[str, Any]) -> list[float]:
-    box = [record.number(f"objects[{i}].{column}", row.get(column)) for column in (*_POSITION, *_SIZE)]
-    for column, size in zip(_SIZE, box[3:], strict=True):
-        if size < 0:
-            raise record.error(f"objects[{i}].{column}", f"is {size}; a size is at least 0")
+def _without_nulls(object_row: dict[str, Any]) -> dict[str, Any]:
+    return {column_name: cell_value for column_name, cell_value in object_row.items() if cell_value is not None}
+
+
+def _decode_box(record: JsonRecord, object_index: int, object_type: str, object_row: dict[str, Any]) -> list[float]:
+    """Read centre and size; the size and the height y default to those typical of the type."""
+    typical_values = dict(zip((*_SIZE_COLUMNS, "y"), typical_box(object_type), strict=True))
+    object_row = typical_values | object_row
+
+    # Centre x, y, z and size sx, sy, sz, in the order of a scene's boxes.
+    box: list[float] = []
+    for column_name in (*_CENTRE_COLUMNS, *_SIZE_COLUMNS):
+        box.append(record.check_number(f"objects[{object_index}].{column_name}", object_row.get(column_name)))
+    for column_name, side_length in zip(_SIZE_COLUMNS, box[3:], strict=True):
+        if side_length < 0:
+            raise record.error(f"objects[{object_index}].{column_name}", f"is {side_length}; a size is at least 0")
     return box
 
 
-def _parent(record: Record, i: int, value: Any, count: int) -> int:
-    if type(value) is not int or not -1 <= value < count or value == i:
-        raise record.error(f"objects[{i}].parent", f"is {reprlib.repr(value)}; give the index of another object or -1")
-    return value
+def _decode_parent(record: JsonRecord, object_index: int, parent_index: Any, num_objects: int) -> int:
+    if type(parent_index) is not int or not -1 <= parent_index < num_objects or parent_index == object_index:
+        expected = "give the index of another object or -1"
+        raise record.error(f"objects[{object_index}].parent", f"is {reprlib.repr(parent_index)}; {expected}")
+    return parent_index
 
 
-def _fields(scene: Scene) -> dict[str, Any]:
-    rooms = [{"type": room.type, "cells": _text(room.cells)} for room in scene.rooms]
-    rows = zip(scene.types, scene.boxes.tolist(), scene.yaws.tolist(), scene.parents.tolist(), strict=True)
-    return {
+def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarray) -> np.ndarray:
+    """Return the cells that can be neither floor nor furniture.
+
+    Args:
+      reach: bool [nz, nx], standable cells.
+      origin: world (x, z) in metres of the centre of cell [0, 0].
+      boxes: float [N, 6], centre and full size of the objects in metres.
+
+    Returns:
+      bool [nz, nx], True where every standable cell is three or more cells away in x or in z, and every box more than
+      0.25 m (horizontally) from the cell's centre.
+    """
+    # Cells with no standable cell in the square around them.
+    radius = _WALL_DISTANCE - 1
+    window_shape = (2 * radius + 1, 2 * radius + 1)
+    reach_windows = np.lib.stride_tricks.sliding_window_view(np.pad(reach, radius), window_shape)
+    wall_mask = np.logical_not(reach_windows.any(axis=(2, 3)))
+
+    # Without the cells near boxes; only rows and columns near a box are measured.
+    column_x = origin[0] + CELL_SIZE * np.arange(reach.shape[1])
+    row_z = origin[1] + CELL_SIZE * np.arange(reach.shape[0])
+    for box in boxes:
+        distance_x = np.maximum(np.abs(column_x - box[0]) - box[3] / 2, 0.0)
+        distance_z = np.maximum(np.abs(row_z - box[2]) - box[5] / 2, 0.0)
+        near_cells = np.ix_(distance_z <= _BOX_DISTANCE, distance_x <= _BOX_DISTANCE)
+        wall_mask[near_cells] &= np.hypot(distance_z[near_cells[0]], distance_x[near_cells[1]]) > _BOX_DISTANCE
+    return wall_mask
+
+
+# From scenes to JSON
+
+
+def _encode_scene(scene: Scene) -> dict[str, Any]:
+    # The order of the fields is part of the file's bytes.
+    fields: dict[str, Any] = {
         "name": scene.name,
         "world": scene.world,
         "room_type": scene.room_type,
         "split": scene.split,
-        "cell": CELL,
+        "cell": CELL_SIZE,
         "origin": list(scene.origin),
         "shape": list(scene.reach.shape),
-        "reach": _text(scene.reach),
-        "walls": _text(~scene.walls),
-        **({"rooms": rooms} if rooms else {}),
-        "columns": list(_COLUMNS),
-        "objects": [[kind, *box, yaw, parent] for kind, box, yaw, parent in rows],
+        "reach": _encode_mask(scene.reach),
+        "walls": _encode_mask(~scene.walls),
     }
+    if scene.rooms:
+        fields["rooms"] = []
+        for room in scene.rooms:
+            fields["rooms"].append({"type": room.type, "cells": _encode_mask(room.cells)})
+
+    # One row per object, in the order of the columns.
+    fields["columns"] = list(_COLUMNS)
+    fields["objects"] = []
+    object_attributes = zip(scene.types, scene.boxes.tolist(), scene.yaws.tolist(), scene.parents.tolist(), strict=True)
+    for object_type, box, yaw, parent in object_attributes:
+        fields["objects"].append([object_type, *box, yaw, parent])
+    return fields
 
 
-def _text(mask: np.ndarray) -> list[str]:
-    return ["".join("." if free else "#" for free in row) for row in mask]
+def _encode_mask(mask: np.ndarray) -> list[str]:
+    """Write a mask, bool [nz, nx], as rows of '.' where it is True and '#' elsewhere."""
+    return ["".join(row) for row in np.where(mask, ".", "#").tolist()]

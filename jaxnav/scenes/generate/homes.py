@@ -1,36 +1,98 @@
-"""Procedural homes: apartments with partitions, and houses with rooms.
+"""Procedural homes: apartments with partitions (after RoboTHOR) and houses with rooms (after ProcTHOR and Gibson).
 
-Apartments are modelled on RoboTHOR, houses on ProcTHOR and Gibson.
+`generate_apartment` and `generate_house` are the entry points. Both sample a `FloorPlan`, furnish it room by room with
+a `HomeBuilder`, and repeat until the home has a realistic size and its goals are within reach.
 """
 
+import copy
 import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxnav.scenes.categories import GIBSON_GOALS, ROBOTHOR_GOALS
-from jaxnav.scenes.generate.arguments import check_scene_arguments
-from jaxnav.scenes.generate.floor_plans import apartment_plan, house_plan
-from jaxnav.scenes.generate.home import GoalRange, Home
-from jaxnav.scenes.generate.room_rules import home_rules
-from jaxnav.scenes.scene import SPLITS, Scene
+from jaxnav.scenes.generate.room_shapes import CellRectangle, RoomShape, check_scene_arguments
+from jaxnav.scenes.generate.rooms import (
+    FORWARD_XZ,
+    MIN_CONNECTED_SHARE,
+    RIGHT_XZ,
+    FurnishedRoom,
+    ObjectSpec,
+    PlacementRule,
+    cells_away_from_boxes,
+    cells_away_from_walls,
+    furnish_room,
+    home_rules,
+    largest_connected_part,
+    make_scene,
+    sample_contents,
+)
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.scene import CELL_SIZE, SPLITS, Room, Scene
 from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.task import APARTMENTS
 
-FURNISHINGS = 5  # of each apartment
-APARTMENT_CELLS = (155, 340)  # standable cells of an apartment
-HOUSE_CELLS = (250, 1500)  # of a house
+# Apartments.
+APARTMENT_SHAPE = (17, 37)  # cells of floor within the outer walls, (nz, nx)
+BARE_APARTMENT_CELLS = (395, 445)  # range of the standable cells without furniture
+FURNISHED_APARTMENT_CELLS = (155, 340)  # range of the standable cells
+FURNISHINGS_PER_PLAN = 5
+PASSAGE_CELLS = 4  # cells between a partition and the outer wall, if they do not touch
+
+# Houses.
+FURNISHED_HOUSE_CELLS = (250, 1500)  # range of the standable cells
+MIN_ROOM_SIDE = 9  # cells
+ROOM_CELLS = (235.0, 0.25)  # median floor of a room, and the standard deviation of its logarithm
+CORRIDOR_WIDTHS = (5, 6)  # cells
+DOOR_WIDTHS = (4, 6, 8, 8)  # cells; bathrooms have the first
+EXTRA_DOOR_PROBABILITY = 0.2  # of a door between rooms that are already connected
+#: Probability of each number of rooms.
+ROOM_COUNT_PROBABILITIES = {4: 0.18, 5: 0.24, 6: 0.18, 7: 0.14, 8: 0.16, 10: 0.1}
+BATHROOM_COUNTS = {4: 1, 5: 1, 6: 2, 7: 2, 8: 2, 10: 3}
+LIVING_ROOM_COUNTS = {4: 1, 5: 1, 6: 1, 7: 2, 8: 2, 10: 2}
+#: Rooms with a lower rank are preferred for passing through.
+PASSAGE_RANK = {"corridor": 0, "living_room": 1, "kitchen": 2, "bedroom": 3, "bathroom": 8}
+
+MAX_CONTENTS_ATTEMPTS = 8  # to sample contents that a room has space for
+MAX_FURNISHING_ATTEMPTS = 10  # to furnish a room with its contents
+
+# Object types that stand for walls and doors while a room is being furnished; the scene has cells instead.
+PARTITION = "Partition"
+DOORWAY = "Doorway"
+_FIXTURES = (PARTITION, DOORWAY)
+_FIXTURE_HEIGHT = 2.5  # metres
+_PARTITION_SPEC = ObjectSpec(size=(0.0, 0.0, 0.0), rule=PlacementRule({}))
+_DOORWAY_SPEC = dataclasses.replace(_PARTITION_SPEC, clear=0.7)
 
 # One stream of random numbers each: apartments share their walls.
-_PLAN, _APARTMENT, _HOUSE = 2, 3, 4
+_PLAN_STREAM = 2
+_APARTMENT_STREAM = 3
+_HOUSE_STREAM = 4
+
+
+class GoalRange(NamedTuple):
+    """Requirement that a standable cell is near every goal.
+
+    Attributes:
+      goals: the goal categories.
+      max_distance: from the goal to the nearest standable cell, metres.
+      to_footprint: True if the distance is to the nearest point of the object, False if it is to its centre.
+    """
+
+    goals: tuple[str, ...]
+    max_distance: float
+    to_footprint: bool
+
 
 _APARTMENT_RANGE = GoalRange(ROBOTHOR_GOALS, 0.85, to_footprint=False)
 _HOUSE_RANGE = GoalRange(GIBSON_GOALS, 0.6, to_footprint=True)
 
 
 def generate_apartment(split: str, index: int, seed: int) -> Scene:
-    """Generate one furnishing of an apartment.
+    """Generate one furnishing of an apartment, with all twelve goals within reach.
 
-    It has all twelve goals, and each of them can be reached. `index // 5` is the floor plan, shared by five scenes.
+    Five consecutive scenes share the floor plan `index // 5`.
 
     Args:
       split: `train`, `val` or `test`.
@@ -44,25 +106,29 @@ def generate_apartment(split: str, index: int, seed: int) -> Scene:
       InputError: unknown split, or a negative index or seed.
     """
     check_scene_arguments("generate_apartment", split, index, seed)
-    plan_index, furnishing = divmod(index, FURNISHINGS)
-    key = (seed, SPLITS.index(split))
-    plan = apartment_plan(np.random.default_rng((*key, plan_index, _PLAN)))
-    rng = np.random.default_rng((*key, index, _APARTMENT))
-    home = Home(plan, home_rules("apartments"), _APARTMENT_RANGE)
+    plan_index, furnishing = divmod(index, FURNISHINGS_PER_PLAN)
+    apartment_key = (seed, SPLITS.index(split))
+    plan = sample_apartment_plan(np.random.default_rng((*apartment_key, plan_index, _PLAN_STREAM)))
+    builder = HomeBuilder(plan, home_rules("apartments"), _APARTMENT_RANGE)
+
+    rng = np.random.default_rng((*apartment_key, index, _APARTMENT_STREAM))
     name = f"{split}-apartment-{plan_index:02d}-{furnishing}"
-    low, high = APARTMENT_CELLS
     while True:
-        rooms = home.furnished(rng)
-        if rooms and low <= home.reach(rooms).sum() <= high:
-            scene = home.scene(name, "apartments", "apartment", split, rooms)
-            if compile_scene(scene, APARTMENTS).best_length[:, APARTMENTS.is_goal()].any(axis=0).all():
-                return scene
+        rooms = builder.furnish_rooms(rng)
+        if rooms is None or not _has_cells(builder, rooms, FURNISHED_APARTMENT_CELLS):
+            continue
+
+        # Accept the apartment if an agent succeeds for every goal from some pose.
+        scene = builder.build_scene(name, "apartments", "apartment", split, rooms)
+        best_length = compile_scene(scene, APARTMENTS).best_length  # [P, K]
+        if best_length[:, APARTMENTS.is_goal()].any(axis=0).all():
+            return scene
 
 
 def generate_house(split: str, index: int, seed: int) -> Scene:
     """Generate a house of four to ten rooms.
 
-    The scene's `rooms` are their types and floors.
+    The scene's `rooms` are the types and floors of its rooms.
 
     Args:
       split: `train`, `val` or `test`.
@@ -77,12 +143,415 @@ def generate_house(split: str, index: int, seed: int) -> Scene:
     """
     check_scene_arguments("generate_house", split, index, seed)
     rules = home_rules("houses")
-    key = (seed, SPLITS.index(split), index)
-    rng = np.random.default_rng((*key, _HOUSE))
-    low, high = HOUSE_CELLS
+    rng = np.random.default_rng((seed, SPLITS.index(split), index, _HOUSE_STREAM))
     while True:
-        home = Home(house_plan(rng), rules, _HOUSE_RANGE)
-        rooms = home.furnished(rng)
-        if rooms and low <= home.reach(rooms).sum() <= high:
-            scene = home.scene(f"{split}-house-{index:05d}", "houses", "house", split, rooms)
-            return dataclasses.replace(scene, rooms=home.floors())
+        builder = HomeBuilder(sample_house_plan(rng), rules, _HOUSE_RANGE)
+        rooms = builder.furnish_rooms(rng)
+        if rooms is not None and _has_cells(builder, rooms, FURNISHED_HOUSE_CELLS):
+            scene = builder.build_scene(f"{split}-house-{index:05d}", "houses", "house", split, rooms)
+            return dataclasses.replace(scene, rooms=builder.scene_rooms())
+
+
+def _has_cells(builder: "HomeBuilder", rooms: list[FurnishedRoom], cell_range: tuple[int, int]) -> bool:
+    """Return True if the number of standable cells is in a range."""
+    low, high = cell_range
+    return bool(low <= builder.standable_mask(rooms).sum() <= high)
+
+
+# Floor plans.
+
+
+class FloorPlan(NamedTuple):
+    """Walls and rooms of a home.
+
+    Attributes:
+      walls: bool [nz, nx], with a ring of walls around.
+      rooms: the floors of the rooms.
+      types: their room types.
+      doors: openings in the walls between rooms.
+      partitions: walls that stand in a room.
+    """
+
+    walls: np.ndarray
+    rooms: tuple[CellRectangle, ...]
+    types: tuple[str, ...]
+    doors: tuple[CellRectangle, ...] = ()
+    partitions: tuple[CellRectangle, ...] = ()
+
+
+def sample_apartment_plan(rng: np.random.Generator) -> FloorPlan:
+    """Sample the plan of an apartment.
+
+    An apartment is one open space with straight, L-shaped, U-shaped or nearly closed partitions.
+    """
+    num_z, num_x = APARTMENT_SHAPE
+    min_cells, max_cells = BARE_APARTMENT_CELLS
+    while True:
+        # One partition in each half of the apartment, or one in the whole of it.
+        middle = int(rng.integers(num_x // 3, 2 * num_x // 3))
+        spans = [(0, middle), (middle, num_x)] if rng.random() < 0.7 else [(0, num_x)]
+        partitions = []
+        for low, high in spans:
+            partitions += _sample_partition(low, high, rng)
+
+        walls = np.ones((num_z + 2, num_x + 2), bool)
+        walls[1:-1, 1:-1] = False
+        for wall in partitions:
+            walls[wall.cells] = True
+
+        # Accept the plan if its standable cells are connected.
+        free_cells = cells_away_from_walls(walls)
+        if min_cells <= free_cells.sum() <= max_cells and len(standable_cells(free_cells)) == free_cells.sum():
+            floor = CellRectangle(1, 1, num_z + 1, num_x + 1)
+            return FloorPlan(walls, (floor,), ("apartment",), partitions=tuple(partitions))
+
+
+def _sample_partition(low: int, high: int, rng: np.random.Generator) -> list[CellRectangle]:
+    """Sample some sides of a rectangle as walls.
+
+    The rectangle lies between the columns `low` and `high` of the floor; one side may extend to the outer wall.
+    """
+    num_z, num_x = APARTMENT_SHAPE
+    first = low + 1 + (PASSAGE_CELLS if low == 0 else 1)
+    last = high + 1 - (PASSAGE_CELLS if high == num_x else 1)
+
+    # The rectangle and its four sides, each one cell thick.
+    width = int(rng.integers(6, min(18, last - first) + 1))
+    depth = int(rng.integers(5, 9))
+    x0 = int(rng.integers(first, last - width + 1))
+    z0 = 1 + int(rng.integers(PASSAGE_CELLS, num_z - PASSAGE_CELLS - depth + 1))
+    x1 = x0 + width
+    z1 = z0 + depth
+    sides = [
+        CellRectangle(z0, x0, z0 + 1, x1),
+        CellRectangle(z1 - 1, x0, z1, x1),
+        CellRectangle(z0, x0, z1, x0 + 1),
+        CellRectangle(z0, x1 - 1, z1, x1),
+    ]
+
+    # One to three of the sides are walls.
+    side_order = rng.permutation(4)
+    num_sides = rng.choice([1, 2, 3], p=[0.2, 0.45, 0.35])
+    walls = [sides[i] for i in side_order[:num_sides]]
+
+    # Sometimes the last wall extends to the outer wall: along z to either end, along x to the nearer one.
+    if rng.random() < 0.4:
+        wall = walls.pop()
+        if wall.z1 - wall.z0 > 1:
+            wall = wall._replace(z0=1) if rng.random() < 0.5 else wall._replace(z1=num_z + 1)
+        else:
+            wall = wall._replace(x0=1) if low == 0 else wall._replace(x1=num_x + 1)
+        walls.append(wall)
+    return walls
+
+
+def sample_house_plan(rng: np.random.Generator) -> FloorPlan:
+    """Sample the plan of a house.
+
+    A house has rectangular rooms, half of the time along a corridor, and doors that connect all of them.
+    """
+    median_cells, log_std = ROOM_CELLS
+    while True:
+        # Outer dimensions from the number of rooms.
+        num_rooms = int(rng.choice(list(ROOM_COUNT_PROBABILITIES), p=list(ROOM_COUNT_PROBABILITIES.values())))
+        area = num_rooms * median_cells * np.exp(log_std * rng.standard_normal())
+        stretch = np.sqrt(rng.uniform(1.0, 1.8))
+        sides = np.round(rng.permutation([stretch, 1.0 / stretch]) * np.sqrt(area))
+        num_z, num_x = int(sides[0]), int(sides[1])
+
+        # Divide the house, or the two parts beside its corridor, into rooms.
+        corridors: list[CellRectangle] = []
+        parts = [CellRectangle(1, 1, num_z + 1, num_x + 1)]
+        if rng.random() < 0.5:
+            corridors, parts = _sample_corridor(num_z, num_x, rng)
+        rooms = _divide_into_rooms(parts, num_rooms, rng)
+        if rooms is None:
+            continue
+
+        # Room types go by size; corridors come last.
+        rooms.sort(key=lambda room: -room.area)
+        types = _sample_room_types(num_rooms, rng) + ["corridor"] * len(corridors)
+        rooms += corridors
+        doors = _sample_doors(rooms, types, rng)
+        if doors is None:
+            continue
+
+        walls = np.ones((num_z + 2, num_x + 2), bool)
+        for opening in (*rooms, *doors):
+            walls[opening.cells] = False
+        return FloorPlan(walls, tuple(rooms), tuple(types), tuple(doors))
+
+
+def _sample_corridor(
+    num_z: int, num_x: int, rng: np.random.Generator
+) -> tuple[list[CellRectangle], list[CellRectangle]]:
+    """Sample a corridor along the longer side.
+
+    Returns:
+      The corridor alone, and the two parts of the house beside it.
+    """
+    width = int(rng.choice(CORRIDOR_WIDTHS))
+    breadth = min(num_z, num_x)
+    low = 1 + int(np.round((breadth - width) * rng.uniform(0.4, 0.6)))
+
+    # Ranges across the corridor, with a wall of one cell between them.
+    band_ranges = [(low, low + width), (1, low - 1), (low + width + 1, breadth + 1)]
+    if num_z <= num_x:
+        corridor, *sides = (CellRectangle(z0, 1, z1, num_x + 1) for z0, z1 in band_ranges)
+    else:
+        corridor, *sides = (CellRectangle(1, x0, num_z + 1, x1) for x0, x1 in band_ranges)
+    return [corridor], sides
+
+
+def _divide_into_rooms(
+    parts: list[CellRectangle], num_rooms: int, rng: np.random.Generator
+) -> list[CellRectangle] | None:
+    """Divide the largest part until there are `num_rooms` parts.
+
+    Returns:
+      The parts, or None if a room would be too narrow.
+    """
+    rooms = list(parts)
+    while len(rooms) < num_rooms:
+        largest_room = int(np.argmax([room.area for room in rooms]))
+        z0, x0, z1, x1 = rooms.pop(largest_room)
+
+        # A wall of one cell across the longer side.
+        length = max(z1 - z0, x1 - x0)
+        wall = int(np.round(length * rng.uniform(0.36, 0.64)))
+        if z1 - z0 >= x1 - x0:
+            rooms += [CellRectangle(z0, x0, z0 + wall, x1), CellRectangle(z0 + wall + 1, x0, z1, x1)]
+        else:
+            rooms += [CellRectangle(z0, x0, z1, x0 + wall), CellRectangle(z0, x0 + wall + 1, z1, x1)]
+
+    shortest_side = min(min(z1 - z0, x1 - x0) for z0, x0, z1, x1 in rooms)
+    return rooms if shortest_side >= MIN_ROOM_SIDE else None
+
+
+def _sample_room_types(num_rooms: int, rng: np.random.Generator) -> list[str]:
+    """Sample room types, from the largest room to the smallest."""
+    num_living = LIVING_ROOM_COUNTS[num_rooms]
+    num_baths = BATHROOM_COUNTS[num_rooms]
+    medium_rooms = ["kitchen"] + ["bedroom"] * (num_rooms - num_living - num_baths - 1)
+    medium_types = [str(name) for name in rng.permutation(medium_rooms)]
+    return ["living_room"] * num_living + medium_types + ["bathroom"] * num_baths
+
+
+def _sample_doors(rooms: list[CellRectangle], types: list[str], rng: np.random.Generator) -> list[CellRectangle] | None:
+    """Sample doors that connect all rooms, and some more.
+
+    Connections through corridors and living rooms are preferred to those through bathrooms.
+
+    Returns:
+      The doors, or None if they cannot connect all rooms.
+    """
+    # All pairs of rooms with a wall that has space for a door, the preferred ones first.
+    pairs = []
+    for b in range(len(rooms)):
+        for a in range(b):
+            wall = _shared_wall(rooms[a], rooms[b])
+            if wall is not None:
+                pairs.append((a, b, wall))
+    pairs.sort(key=lambda pair: PASSAGE_RANK[types[pair[0]]] + PASSAGE_RANK[types[pair[1]]] + rng.random())
+
+    # Kruskal's spanning tree, with some extra doors; `component` numbers the connected rooms.
+    component = list(range(len(rooms)))
+    doors = []
+    for a, b, wall in pairs:
+        has_bathroom = "bathroom" in (types[a], types[b])
+        if component[a] == component[b] and (has_bathroom or rng.random() > EXTRA_DOOR_PROBABILITY):
+            continue
+        old_component = component[b]
+        component = [component[a] if number == old_component else number for number in component]
+        width = DOOR_WIDTHS[0] if has_bathroom else int(rng.choice(DOOR_WIDTHS))
+        doors.append(_sample_door(wall, width, rng))
+    return doors if len(set(component)) == 1 else None
+
+
+def _sample_door(wall: CellRectangle, max_width: int, rng: np.random.Generator) -> CellRectangle:
+    """Sample the position of a door in a wall of one cell's thickness."""
+    wall_length = max(wall.z1 - wall.z0, wall.x1 - wall.x0)
+    width = min(max_width, wall_length)
+    offset = int(rng.integers(wall_length - width + 1))
+    if wall.z1 - wall.z0 > 1:
+        return wall._replace(z0=wall.z0 + offset, z1=wall.z0 + offset + width)
+    return wall._replace(x0=wall.x0 + offset, x1=wall.x0 + offset + width)
+
+
+def _shared_wall(a: CellRectangle, b: CellRectangle) -> CellRectangle | None:
+    """Return the cells for a door between two rooms.
+
+    Returns:
+      Their common wall without a cell at each end, or None if it is too short.
+    """
+    # The ranges that the rooms have in common; a range of length -1 is the wall between them.
+    z_low = max(a.z0, b.z0)
+    z_high = min(a.z1, b.z1)
+    x_low = max(a.x0, b.x0)
+    x_high = min(a.x1, b.x1)
+    if z_high - z_low - 2 >= DOOR_WIDTHS[0] and x_low - x_high == 1:
+        return CellRectangle(z_low + 1, x_high, z_high - 1, x_low)
+    if x_high - x_low - 2 >= DOOR_WIDTHS[0] and z_low - z_high == 1:
+        return CellRectangle(z_high, x_low + 1, z_low, x_high - 1)
+    return None
+
+
+def room_shape_from_walls(walls: np.ndarray) -> RoomShape:
+    """Return the shape of a rectangular room.
+
+    A partition in the room is a wall with two faces. A door interrupts the wall, so nothing can be placed at it.
+
+    Args:
+      walls: bool [nz, nx], of the room and of the ring of cells around it; a cell of the ring that is no wall is a
+        door.
+    """
+    floor = ~walls[1:-1, 1:-1]
+    num_z, num_x = floor.shape
+    wall_starts, wall_turns, wall_lengths = [], [], []
+    for turn, ((x, z), right) in enumerate(zip(FORWARD_XZ, RIGHT_XZ, strict=True)):
+        # Floor cells with a wall right behind an object that faces this way, one lattice line per row.
+        has_wall_behind = floor & walls[1 - z : 1 - z + num_z, 1 - x : 1 - x + num_x]
+        wall_lines = has_wall_behind if z else has_wall_behind.T
+
+        # Each run of such cells is a wall; it runs to the right, which is towards lower indices for two turns.
+        edges = np.diff(np.pad(wall_lines.astype(int), ((0, 0), (1, 1))), axis=1)
+        line, first = np.nonzero(edges == 1)
+        _, span_end = np.nonzero(edges == -1)
+        along = first if right.sum() > 0 else span_end
+        across = line + (0 if x + z > 0 else 1)
+        wall_starts.append(CELL_SIZE * np.stack([along, across] if z else [across, along], axis=-1))
+        wall_turns.append(np.full(len(line), turn))
+        wall_lengths.append(CELL_SIZE * (span_end - first))
+
+    size = CELL_SIZE * np.array([num_x, num_z])
+    no_notch = np.zeros((2, 2))
+    return RoomShape(
+        size, no_notch, np.concatenate(wall_starts), np.concatenate(wall_turns), np.concatenate(wall_lengths)
+    )
+
+
+# Furnishing.
+
+
+class HomeBuilder:
+    """Furnishes a floor plan room by room.
+
+    The origin of each room is the low corner of its floor.
+    """
+
+    def __init__(self, plan: FloorPlan, rules: Mapping[str, Mapping[str, ObjectSpec]], goal_range: GoalRange):
+        self.plan = plan
+        self.goal_range = goal_range
+        self.away_from_walls = cells_away_from_walls(plan.walls)
+        self.room_specs = [rules[room_type] for room_type in plan.types]
+        self.bare_rooms = [self._make_bare_room(floor) for floor in plan.rooms]
+
+    def furnish_rooms(self, rng: np.random.Generator) -> list[FurnishedRoom] | None:
+        """Furnish the rooms by the rules of their types.
+
+        Returns:
+          The rooms, or None if one has no space for its furniture.
+        """
+        rooms = []
+        for room_index in range(len(self.bare_rooms)):
+            room = self._furnish_room(room_index, rng)
+            if room is None:
+                return None
+            rooms.append(room)
+        return rooms
+
+    def is_usable(self, room_index: int, room: FurnishedRoom) -> bool:
+        """Return True if an agent can walk through the room.
+
+        All doors and nearly all free cells must be connected, with a standable cell near every goal.
+        """
+        floor = self.plan.rooms[room_index]
+        free_cells = cells_away_from_boxes(self.away_from_walls[floor.with_ring.cells], _furniture_boxes(room))
+        reach = largest_connected_part(free_cells)
+
+        # Free cells in the ring around the floor are doors.
+        door_cells = free_cells.copy()
+        door_cells[1:-1, 1:-1] = False
+        if (door_cells & ~reach).any() or reach.sum() < MIN_CONNECTED_SHARE * free_cells.sum():
+            return False
+        if not reach[1:-1, 1:-1].any():
+            return False
+
+        # Distances from C standable cells to G goals, [C, G].
+        goal_footprints = room.boxes_of_types(self.goal_range.goals)[:, :, [0, 2]]
+        if self.goal_range.to_footprint:
+            low, high = goal_footprints.swapaxes(0, 1)
+        else:
+            low = high = goal_footprints.mean(axis=1)
+        cell_centres = CELL_SIZE * (np.argwhere(reach)[:, None, ::-1] - 0.5)
+        offsets = np.maximum(np.maximum(low - cell_centres, cell_centres - high), 0.0)
+        distances = np.linalg.norm(offsets, axis=-1)
+        return bool((distances.min(axis=0, initial=np.inf) <= self.goal_range.max_distance).all())
+
+    def standable_mask(self, rooms: list[FurnishedRoom]) -> np.ndarray:
+        """Return the standable cells of the home, bool [nz, nx]."""
+        return largest_connected_part(cells_away_from_boxes(self.away_from_walls, self._merge_rooms(rooms).boxes))
+
+    def scene_rooms(self) -> tuple[Room, ...]:
+        """Return the types and floors of the rooms."""
+        rooms = []
+        for room_type, floor in zip(self.plan.types, self.plan.rooms, strict=True):
+            cells = np.zeros(self.plan.walls.shape, bool)
+            cells[floor.cells] = True
+            rooms.append(Room(room_type, cells))
+        return tuple(rooms)
+
+    def build_scene(self, name: str, world: str, room_type: str, split: str, rooms: list[FurnishedRoom]) -> Scene:
+        """Return the scene of the furnished rooms."""
+        reach = self.standable_mask(rooms)
+        return make_scene(name, world, room_type, split, self.plan.walls, reach, self._merge_rooms(rooms))
+
+    def _furnish_room(self, room_index: int, rng: np.random.Generator) -> FurnishedRoom | None:
+        """Return a usable furnished room, or None if all attempts fail."""
+        specs = self.room_specs[room_index]
+        for _ in range(MAX_CONTENTS_ATTEMPTS):
+            room_contents = sample_contents(specs, rng)
+            for _ in range(MAX_FURNISHING_ATTEMPTS):
+                room = furnish_room(copy.deepcopy(self.bare_rooms[room_index]), specs, room_contents, rng)
+                if room is not None and self.is_usable(room_index, room):
+                    return room
+        return None
+
+    def _make_bare_room(self, floor: CellRectangle) -> FurnishedRoom:
+        """Return a room with its partitions and doors alone.
+
+        Nothing can be placed in them or right in front of a door.
+        """
+        room = FurnishedRoom(room_shape_from_walls(self.plan.walls[floor.with_ring.cells]))
+        for wall in self.plan.partitions:
+            low, high = wall.to_box(floor, _FIXTURE_HEIGHT)
+            room.add_object(PARTITION, low, high, 0, -1, _PARTITION_SPEC, in_middle=False)
+
+        for door in self.plan.doors:
+            if not door.is_inside(floor.with_ring):
+                continue
+            # The box of a door is flat, in the plane of the wall, and faces the room.
+            is_at_side = [door.z1 == floor.z0, door.x1 == floor.x0, door.z0 == floor.z1, door.x0 == floor.x1]
+            low, high = door.to_box(floor, _FIXTURE_HEIGHT)
+            room.add_object(DOORWAY, low, high, is_at_side.index(True), -1, _DOORWAY_SPEC, in_middle=False)
+        return room
+
+    def _merge_rooms(self, rooms: list[FurnishedRoom]) -> FurnishedRoom:
+        """Return the furniture of all rooms in the frame of the home."""
+        home = FurnishedRoom(self.bare_rooms[0].shape)
+        for floor, room in zip(self.plan.rooms, rooms, strict=True):
+            # Fixtures are the first objects of a room.
+            num_fixtures = sum(name in _FIXTURES for name in room.types)
+            index_shift = len(home.types) - num_fixtures
+            for parent_index in room.parents[num_fixtures:]:
+                home.parents.append(parent_index if parent_index < 0 else parent_index + index_shift)
+            home.types += room.types[num_fixtures:]
+            home.turns += room.turns[num_fixtures:]
+            corner = CELL_SIZE * np.array([floor.x0 - 1, 0.0, floor.z0 - 1])
+            home.boxes = np.concatenate([home.boxes, room.boxes[num_fixtures:] + corner])
+        return home
+
+
+def _furniture_boxes(room: FurnishedRoom) -> np.ndarray:
+    """Return the boxes of the furniture without fixtures, [N, 2, 3]."""
+    return room.boxes[[name not in _FIXTURES for name in room.types]]

@@ -1,4 +1,4 @@
-"""Typical sizes of objects, for files without sizes."""
+"""Typical sizes of objects, for scene files without sizes."""
 
 import functools
 import pathlib
@@ -8,25 +8,25 @@ import yaml
 from jaxnav.scenes.categories import ALIASES
 
 #: Width, height, depth and height of the centre in metres of an unknown type.
-UNKNOWN = (0.3, 0.3, 0.3, 0.8)
+UNKNOWN_BOX = (0.3, 0.3, 0.3, 0.8)
 
 
 def typical_box(name: str) -> tuple[float, float, float, float]:
-    """Return the typical size of a type, from `sizes.yaml`.
+    """Return the typical size of an object type, from `sizes.yaml`.
 
     Returns:
       Width, height and depth, and the height of the centre above the floor, metres.
     """
-    sizes = _sizes()
-    return sizes.get(name) or sizes.get(ALIASES.get(name, name), UNKNOWN)
+    boxes = _read_boxes()
+    return boxes.get(name) or boxes.get(ALIASES.get(name, name), UNKNOWN_BOX)
 
 
 def typical_types() -> tuple[str, ...]:
-    """Return the types whose typical size is known."""
-    return tuple(_sizes())
+    """Return the types with a known typical size."""
+    return tuple(_read_boxes())
 
 
 @functools.cache
-def _sizes() -> dict[str, tuple[float, float, float, float]]:
+def _read_boxes() -> dict[str, tuple[float, float, float, float]]:
     table = yaml.safe_load(pathlib.Path(__file__).with_name("sizes.yaml").read_text())
     return {name: tuple(numbers) for name, numbers in table.items()}

@@ -1,4 +1,10 @@
-"""Compilation of scenes to flat tables over every pose."""
+"""Compilation of scenes to flat tables over every pose.
+
+`compile_scene` computes everything an episode in a scene may need: moves, observation rows, shortest path lengths and
+distances. `compile_bank` joins the tables of many scenes into one `Bank`, whose poses and cells are numbered globally.
+
+Symbols in shapes: S scenes, C cells, H headings, T horizons, P = C H T poses, K categories, R bytes of a row.
+"""
 
 import itertools
 import zlib
@@ -10,34 +16,39 @@ import numpy as np
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import (
-    ahead_of,
     best_actions,
     best_lengths,
+    cells_ahead,
+    pose_successors,
     standable_cells,
-    successors,
     walking_distances,
 )
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.tables.detector import MAX_RANGE, detection_range, object_size
-from jaxnav.scenes.tables.ego_view import ego_views
-from jaxnav.scenes.tables.observation_row import RowFormat
-from jaxnav.scenes.tables.sightings import Targets, detect, find_sightings
-from jaxnav.scenes.tables.visibility import TOLERANCE, cell_centres, clear_of_walls
+from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, detection_range, object_size
+from jaxnav.scenes.tables.visibility import (
+    TOLERANCE,
+    Targets,
+    cell_centres,
+    clear_of_walls,
+    detect_objects,
+    ego_views,
+    find_sightings,
+)
 from jaxnav.scenes.task import Task
 
 
-class SceneTable(NamedTuple):
-    """Hold the tables of one scene.
-
-    P = C H T poses of C cells, H headings and T horizons; pose = (cell * H + heading) * T + horizon.
+class CompiledScene(NamedTuple):
+    """Tables of one scene; pose = (cell * H + heading) * T + horizon.
 
     Attributes:
-      name, room_type: of the scene.
+      name: name of the scene.
+      room_type: its room type.
       ahead: int32 [C, H], cell after MoveAhead.
-      rows: uint8 [P, R], what is perceived, see `RowFormat`.
-      best_length: uint16 [P, K], L*, 0 where a goal cannot be reached or is none.
-      goal_distance: float32 [C, K], metres to the nearest object of a category, inf without one: horizontally to its
-        centre where success is to see it, else the walk to its footprint.
+      rows: uint8 [P, R], observation row of each pose, see `RowFormat`.
+      best_length: uint16 [P, K], length L* of a shortest path, Done included; 0 where a goal cannot be reached, or
+        where a category is no goal.
+      goal_distance: float32 [C, K], metres to the nearest object of a category, inf without one. The distance is the
+        horizontal one to the object's centre if success means seeing the object, else the walk to its footprint.
     """
 
     name: str
@@ -49,23 +60,21 @@ class SceneTable(NamedTuple):
 
 
 class Bank(NamedTuple):
-    """Hold the tables of S scenes end to end.
-
-    Indices of poses and cells are global.
+    """Tables of S scenes end to end; poses and cells are numbered over all scenes.
 
     Attributes:
-      task: what they were compiled for.
+      task: the task for which the scenes are compiled.
       names: [S] scene names.
       room_types: [S] room type names.
       ahead: int32 [C, H].
       rows: uint8 [P, R].
       best_length: uint16 [P, K].
       goal_distance: float32 [C, K].
-      first_cell: int32 [S], the first cell of each scene.
+      first_cell: int32 [S], first cell of each scene.
       num_cells: int32 [S].
-      goals: int32 [S, K], the possible goals of each scene, first `num_goals` entries valid.
+      goals: int32 [S, K], possible goals of each scene, of which the first `num_goals` entries are valid.
       num_goals: int32 [S].
-      skipped: names of scenes without any possible goal, which are not in the bank.
+      skipped: names of the scenes without a possible goal, which are not in the bank.
     """
 
     task: Task
@@ -83,163 +92,195 @@ class Bank(NamedTuple):
 
     @property
     def successor(self) -> np.ndarray:
-        """Return the pose after every action, int32 [P, 6]."""
-        return successors(self.ahead, self.task.rules)
+        """Pose after every action, int32 [P, 6]."""
+        return pose_successors(self.ahead, self.task.rules)
 
     @property
     def expert(self) -> np.ndarray:
-        """Return the first action of a shortest path to every goal.
-
-        Returns:
-          uint8 [P, K], see `best_actions`.
-        """
-        successor, poses = self.successor, np.arange(len(self.rows))
-        goals = [np.full_like(poses, goal) for goal in range(self.best_length.shape[1])]
-        actions = [best_actions(successor, self.best_length, poses, goal).astype(np.uint8) for goal in goals]
-        return np.stack(actions, axis=-1)
-
-
-def compile_scene(scene: Scene, task: Task) -> SceneTable:
-    """Compile one scene by the rules of docs/environment.md."""
-    rules, row_format = task.rules, RowFormat(len(task.categories))
-    cells = standable_cells(scene.reach)
-    centres, ahead = cell_centres(scene, cells), ahead_of(cells, rules)
-    targets = _targets(scene, task, centres)
-    limit = np.maximum(detection_range(object_size(scene.boxes[targets.objects])), rules.success_distance)
-    sightings = find_sightings(scene, rules, centres, targets, limit)
-    shape = (len(cells) * rules.poses_per_cell, len(task.categories))
-    if rules.success == "seen":
-        success = sightings.within(rules.success_distance, shape)
-        goal_distance = np.full((len(cells), shape[1]), np.inf)
-        np.minimum.at(goal_distance.T, targets.category, targets.distance.T)
-    else:
-        goal_distance = _walks(scene, task, centres, ahead, targets)
-        success = np.repeat(goal_distance <= rules.success_distance + TOLERANCE, rules.poses_per_cell, axis=0)
-    success &= task.is_goal()
-    return SceneTable(
-        name=scene.name,
-        room_type=scene.room_type,
-        ahead=ahead,
-        rows=row_format.pack(detect(scene, task, sightings, shape[0]), ego_views(scene, rules, cells, row_format.view)),
-        best_length=best_lengths(successors(ahead, rules), success),
-        goal_distance=goal_distance.astype(np.float32),
-    )
-
-
-def in_view(scene: Scene, task: Task) -> np.ndarray:
-    """Return which categories are in view from every pose.
-
-    They are those of which a detector without misses, and of the same range (`MAX_RANGE`) for objects of all sizes,
-    would see an object.
-
-    Returns:
-      bool [P, K], poses in the order of `SceneTable.rows`.
-    """
-    cells = standable_cells(scene.reach)
-    centres = cell_centres(scene, cells)
-    targets = _targets(scene, task, centres)
-    sightings = find_sightings(scene, task.rules, centres, targets, np.full(len(targets.objects), MAX_RANGE))
-    return sightings.within(MAX_RANGE, (len(cells) * task.rules.poses_per_cell, len(task.categories)))
+        """First action of a shortest path to every goal, uint8 [P, K], see `best_actions`."""
+        successor = self.successor
+        poses = np.arange(len(self.rows))
+        goal_actions = []
+        for goal in range(self.best_length.shape[1]):
+            goals = np.full_like(poses, goal)
+            goal_actions.append(best_actions(successor, self.best_length, poses, goals).astype(np.uint8))
+        return np.stack(goal_actions, axis=-1)
 
 
 def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
     """Compile scenes into one bank.
 
-    Scenes in which no goal can be reached are left out and named in `skipped`.
+    Scenes without a reachable goal are skipped and named in `skipped`.
 
     Raises:
-      InputError: no scene is left.
+      InputError: no scene has a reachable goal.
     """
-    return join([compile_scene(scene, task) for scene in scenes], task)
+    return join_scenes([compile_scene(scene, task) for scene in scenes], task)
 
 
-def join(tables: Sequence[SceneTable], task: Task) -> Bank:
-    """Join the tables of scenes end to end; see `compile_bank`."""
-    possible = [np.flatnonzero((table.best_length > 0).any(axis=0)) for table in tables]
-    kept = [_bank(table, goals, task) for table, goals in zip(tables, possible, strict=True) if len(goals)]
-    if not kept:
-        raise no_goal(len(tables), task)
-    skipped = tuple(table.name for table, goals in zip(tables, possible, strict=True) if not len(goals))
-    return concatenate(kept)._replace(skipped=skipped)
+def compile_scene(scene: Scene, task: Task) -> CompiledScene:
+    """Compile one scene by the rules of docs/environment.md."""
+    rules = task.rules
+    row_format = RowFormat(len(task.categories))
+    num_categories = len(task.categories)
+
+    # Where the agent can stand and move.
+    cells = standable_cells(scene.reach)  # [C, 2]
+    centres = cell_centres(scene, cells)
+    ahead = cells_ahead(cells, rules)
+    num_poses = len(cells) * rules.poses_per_cell
+
+    # Which objects are in view, up to the distance at which they can be detected or count as found.
+    targets = _find_targets(scene, task, centres)
+    detection_ranges = detection_range(object_size(scene.boxes[targets.objects]))
+    distance_limits = np.maximum(detection_ranges, rules.success_distance)
+    sightings = find_sightings(scene, rules, centres, targets, distance_limits)
+
+    # Where Done succeeds, and how far the goals are.
+    if rules.success == "seen":
+        success = sightings.within(rules.success_distance, (num_poses, num_categories))
+        goal_distance = np.full((len(cells), num_categories), np.inf)
+        np.minimum.at(goal_distance.T, targets.category, targets.distance.T)
+    else:
+        goal_distance = _walks_to_goals(scene, task, centres, ahead, targets)
+        success = np.repeat(goal_distance <= rules.success_distance + TOLERANCE, rules.poses_per_cell, axis=0)
+    success &= task.is_goal()
+
+    detections = detect_objects(scene, task, sightings, num_poses)
+    views = ego_views(scene, rules, cells, row_format.view)
+    return CompiledScene(
+        name=scene.name,
+        room_type=scene.room_type,
+        ahead=ahead,
+        rows=row_format.pack(detections, views),
+        best_length=best_lengths(pose_successors(ahead, rules), success),
+        goal_distance=goal_distance.astype(np.float32),
+    )
 
 
-def concatenate(banks: Sequence[Bank]) -> Bank:
-    """Put the scenes of banks of one task end to end."""
-    first = np.cumsum([0] + [len(bank.ahead) for bank in banks[:-1]], dtype=np.int32)
-    moved = [
-        bank._replace(ahead=bank.ahead + start, first_cell=bank.first_cell + start)
-        for bank, start in zip(banks, first, strict=True)
-    ]
+def categories_in_view(scene: Scene, task: Task) -> np.ndarray:
+    """Return True for the categories in view from every pose.
 
-    def together(name: str) -> Any:
-        parts = [getattr(bank, name) for bank in moved]
-        return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else tuple(itertools.chain(*parts))
+    A category is in view where a perfect detector with range `MAX_RANGE` for objects of all sizes would detect it.
 
-    return Bank(banks[0].task, *(together(name) for name in Bank._fields[1:]))
+    Returns:
+      bool [P, K], poses in the order of `CompiledScene.rows`.
+    """
+    cells = standable_cells(scene.reach)
+    centres = cell_centres(scene, cells)
+    targets = _find_targets(scene, task, centres)
+    distance_limits = np.full(len(targets.objects), MAX_RANGE)
+    sightings = find_sightings(scene, task.rules, centres, targets, distance_limits)
+    return sightings.within(MAX_RANGE, (len(cells) * task.rules.poses_per_cell, len(task.categories)))
 
 
-def no_goal(num_scenes: int, task: Task) -> InputError:
-    """Return the error of scenes without a reachable goal."""
+def join_scenes(compiled_scenes: Sequence[CompiledScene], task: Task) -> Bank:
+    """Join compiled scenes end to end; see `compile_bank`."""
+    banks = []
+    skipped = []
+    for compiled in compiled_scenes:
+        # A category is a possible goal where some pose has a path to it.
+        goals = np.flatnonzero((compiled.best_length > 0).any(axis=0))
+        if len(goals):
+            banks.append(_single_scene_bank(compiled, goals, task))
+        else:
+            skipped.append(compiled.name)
+    if not banks:
+        raise no_goal_error(len(compiled_scenes), task)
+    return concatenate_banks(banks)._replace(skipped=tuple(skipped))
+
+
+def concatenate_banks(banks: Sequence[Bank]) -> Bank:
+    """Concatenate banks of one task, and number their cells anew."""
+    # Cells are numbered over all banks, so those of a bank begin after the earlier ones.
+    cell_offsets = np.cumsum([0] + [len(bank.ahead) for bank in banks[:-1]], dtype=np.int32)
+    renumbered_banks = []
+    for bank, cell_offset in zip(banks, cell_offsets, strict=True):
+        renumbered_banks.append(bank._replace(ahead=bank.ahead + cell_offset, first_cell=bank.first_cell + cell_offset))
+
+    fields: dict[str, Any] = {}
+    for name in Bank._fields[1:]:
+        field_parts = [getattr(bank, name) for bank in renumbered_banks]
+        is_array = isinstance(field_parts[0], np.ndarray)
+        fields[name] = np.concatenate(field_parts) if is_array else tuple(itertools.chain(*field_parts))
+    return Bank(task=banks[0].task, **fields)
+
+
+def no_goal_error(num_scenes: int, task: Task) -> InputError:
+    """Return the error for scenes without a reachable goal."""
     return InputError(
         f"none of the {num_scenes} scenes has a reachable goal: give scenes with objects of the categories "
         f"{', '.join(task.goals or task.categories)} near standable cells"
     )
 
 
-def checksum(bank: Bank) -> int:
+def bank_checksum(bank: Bank) -> int:
     """Return the CRC-32 of everything in a bank."""
     crc = 0
-    for part in bank:
-        crc = zlib.crc32(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode(), crc)
+    for field_value in bank:
+        content_bytes = field_value.tobytes() if isinstance(field_value, np.ndarray) else repr(field_value).encode()
+        crc = zlib.crc32(content_bytes, crc)
     return crc
 
 
-def _bank(table: SceneTable, goals: np.ndarray, task: Task) -> Bank:
+def _single_scene_bank(compiled: CompiledScene, goals: np.ndarray, task: Task) -> Bank:
     """Return the bank of one scene with its possible goals."""
-    filled = np.zeros((1, len(task.categories)), np.int32)
-    filled[0, : len(goals)] = goals
+    # Goals are padded to K entries, so that scenes can be joined.
+    padded_goals = np.zeros((1, len(task.categories)), np.int32)
+    padded_goals[0, : len(goals)] = goals
     return Bank(
         task=task,
-        names=(table.name,),
-        room_types=(table.room_type,),
-        ahead=table.ahead,
-        rows=table.rows,
-        best_length=table.best_length,
-        goal_distance=table.goal_distance,
+        names=(compiled.name,),
+        room_types=(compiled.room_type,),
+        ahead=compiled.ahead,
+        rows=compiled.rows,
+        best_length=compiled.best_length,
+        goal_distance=compiled.goal_distance,
         first_cell=np.zeros(1, np.int32),
-        num_cells=np.array([len(table.ahead)], np.int32),
-        goals=filled,
+        num_cells=np.array([len(compiled.ahead)], np.int32),
+        goals=padded_goals,
         num_goals=np.array([len(goals)], np.int32),
         skipped=(),
     )
 
 
-def _targets(scene: Scene, task: Task, centres: np.ndarray) -> Targets:
-    """Return the objects of categories."""
+def _find_targets(scene: Scene, task: Task, centres: np.ndarray) -> Targets:
+    """Return the objects whose type is one of the categories."""
     categories = np.asarray(category_ids(scene.types, task.categories), np.int64)
-    index = np.flatnonzero(categories >= 0)
-    distance = np.linalg.norm(scene.boxes[index][:, [0, 2]] - centres[:, None], axis=-1)
-    return Targets(index, categories[index], distance)
+    objects = np.flatnonzero(categories >= 0)
+    distance = np.linalg.norm(scene.boxes[objects][:, [0, 2]] - centres[:, None], axis=-1)
+    return Targets(objects, categories[objects], distance)
 
 
-def _walks(scene: Scene, task: Task, centres: np.ndarray, ahead: np.ndarray, targets: Targets) -> np.ndarray:
-    """Return the walk from each cell to each goal category.
+def _walks_to_goals(scene: Scene, task: Task, centres: np.ndarray, ahead: np.ndarray, targets: Targets) -> np.ndarray:
+    """Return the length of the walk from each cell to each goal category.
 
-    It ends at the footprint of the nearest object. The last part, at most the success distance, is straight and past no
-    wall.
+    A walk ends at the footprint of the nearest object. Its last part is straight, crosses no wall and is no longer than
+    the success distance.
 
     Returns:
       float64 [C, K], metres.
     """
-    rules, is_goal = task.rules, task.is_goal()
+    rules = task.rules
+    is_goal = task.is_goal()
+
+    # Nearest point of each footprint, as seen from each cell.
     boxes = scene.boxes[targets.objects]
-    half = boxes[:, [3, 5]] / 2
-    nearest = np.clip(centres[:, None], boxes[:, [0, 2]] - half, boxes[:, [0, 2]] + half)  # [C, N, 2]
-    straight = np.linalg.norm(nearest - centres[:, None], axis=-1)
-    cell, target = np.nonzero((straight <= rules.success_distance + TOLERANCE) & is_goal[targets.category])
-    clear = clear_of_walls(scene, centres[cell], nearest[cell, target], boxes[target][:, [0, 2]])
-    cell, target = cell[clear], target[clear]
-    direct = np.full((len(centres), len(is_goal)), np.inf)
-    np.minimum.at(direct, (cell, targets.category[target]), straight[cell, target])
-    direct[:, is_goal] = walking_distances(ahead, rules, direct[:, is_goal])
-    return direct
+    half_size = boxes[:, [3, 5]] / 2
+    low_corner = boxes[:, [0, 2]] - half_size
+    high_corner = boxes[:, [0, 2]] + half_size
+    nearest_point = np.clip(centres[:, None], low_corner, high_corner)  # [C, N, 2]
+    distance = np.linalg.norm(nearest_point - centres[:, None], axis=-1)
+
+    # Straight last parts that cross no wall.
+    is_candidate = (distance <= rules.success_distance + TOLERANCE) & is_goal[targets.category]
+    cell, target = np.nonzero(is_candidate)
+    is_clear = clear_of_walls(scene, centres[cell], nearest_point[cell, target], boxes[target][:, [0, 2]])
+    cell = cell[is_clear]
+    target = target[is_clear]
+    straight_lengths = np.full((len(centres), len(is_goal)), np.inf)
+    np.minimum.at(straight_lengths, (cell, targets.category[target]), distance[cell, target])
+
+    walk_lengths = straight_lengths
+    walk_lengths[:, is_goal] = walking_distances(ahead, rules, straight_lengths[:, is_goal])
+    return walk_lengths

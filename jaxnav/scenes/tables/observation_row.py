@@ -1,48 +1,33 @@
-"""The packed row of a pose: what an agent perceives."""
+"""Observation rows: the packed bytes that an agent perceives at one pose, and the simulated detector behind them.
+
+A row holds the detection of each category and an ego-centric view of the floor. `RowFormat` packs and unpacks rows, on
+NumPy and on JAX arrays. `Detector` simulates an object detector, whose errors are drawn once per pose.
+
+Detections are four bytes: confidence, metres ahead, metres to the right and apparent size, all 0 without a detection.
+"""
 
 import dataclasses
+import zlib
 from typing import Any
 
 import numpy as np
 
+#: Cells of the ego-centric view.
 VIEW_UNKNOWN, VIEW_FREE, VIEW_BLOCKED = range(3)
-#: Bytes per metre (ahead), per metre around 128 (right) and per unit of apparent size.
+#: Bytes per metre ahead, per metre to the right (0 m is byte 128) and per unit of apparent size.
 AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE = 51.0, 25.4, 127.5
 
-
-def relative_position(detections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return metres ahead and to the right of detections.
-
-    Args:
-      detections: [..., 4], confidence, ahead, right and apparent size in bytes.
-
-    Returns:
-      float64 [...] each.
-    """
-    return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - 128.0) / RIGHT_SCALE
-
-
-def detected_places(detections: np.ndarray, place: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Return where detections from one pose lie, world (x, z).
-
-    Args:
-      detections: [..., 4], see `relative_position`.
-      place: float64 [2], world (x, z) of the agent.
-      forward: float64 [2], unit vector (x, z) of its heading.
-
-    Returns:
-      float64 [..., 2].
-    """
-    ahead, right = relative_position(detections)
-    rightward = np.array([forward[1], -forward[0]])
-    return place + ahead[..., None] * forward + right[..., None] * rightward
+#: Least and greatest detection range, metres.
+MIN_RANGE, MAX_RANGE = 1.5, 5.0
+FALSE_ALARM_SIZE = 0.3  # metres
+MIN_APPARENT_SIZE = 0.12  # about 15 pixels of a 300 x 300 picture with a field of view of 100 degrees
 
 
 @dataclasses.dataclass(frozen=True)
 class RowFormat:
-    """Describe the bytes of a row.
+    """Layout of the bytes of a row: detections, the view at two bits per cell, padding.
 
-    Its methods take NumPy and JAX arrays.
+    All methods accept NumPy and JAX arrays.
 
     Attributes:
       num_categories: K.
@@ -54,11 +39,11 @@ class RowFormat:
 
     @property
     def num_bytes(self) -> int:
-        """Return the length of a row, padded to 32-byte lines."""
-        return -(-(self._view_at + self._view_bytes) // 32) * 32
+        """Length of a row, padded to a multiple of 32 bytes."""
+        return -(-(self._view_start + self._view_bytes) // 32) * 32
 
     @property
-    def _view_at(self) -> int:
+    def _view_start(self) -> int:
         return 4 * self.num_categories
 
     @property
@@ -69,46 +54,167 @@ class RowFormat:
         """Pack detections and views into rows.
 
         Args:
-          detections: uint8 [..., K, 4], confidence, ahead, right and apparent size.
+          detections: uint8 [..., K, 4].
           view: uint8 [..., V, V], ego-centric views.
 
         Returns:
           uint8 [..., num_bytes].
         """
-        xp, poses = view.__array_namespace__(), view.shape[:-2]
+        xp = view.__array_namespace__()
+        batch_shape = view.shape[:-2]
+        num_cells = self.view * self.view
 
-        def zeros(number: int) -> Any:
-            return xp.zeros((*poses, number), dtype=np.uint8)
+        # Four cells of the view share a byte.
+        cell_padding = xp.zeros((*batch_shape, 4 * self._view_bytes - num_cells), dtype=np.uint8)
+        cells = xp.concat([view.reshape(*batch_shape, num_cells), cell_padding], axis=-1)
+        cell_groups = cells.reshape(*batch_shape, self._view_bytes, 4)
+        packed_view = xp.sum(cell_groups << _cell_shifts(cell_groups.ndim), axis=-1, dtype=np.uint8)
 
-        cells = xp.concat(
-            [view.reshape(*poses, self.view * self.view), zeros(4 * self._view_bytes - self.view * self.view)], axis=-1
-        )
-        groups = cells.reshape(*poses, self._view_bytes, 4)
-        packed = xp.sum(groups << _shifts(groups.ndim), axis=-1, dtype=np.uint8)
-        rest = zeros(self.num_bytes - self._view_at - self._view_bytes)
-        return xp.concat([detections.reshape(*poses, self._view_at), packed, rest], axis=-1)
+        row_padding = xp.zeros((*batch_shape, self.num_bytes - self._view_start - self._view_bytes), dtype=np.uint8)
+        return xp.concat([detections.reshape(*batch_shape, self._view_start), packed_view, row_padding], axis=-1)
 
     def detections(self, rows: Any) -> Any:
-        """Return the detections of rows uint8 [..., num_bytes].
-
-        They are uint8 [..., K, 4], confidence, ahead, right and apparent size.
-        """
-        return rows[..., : self._view_at].reshape(*rows.shape[:-1], self.num_categories, 4)
+        """Return the detections in rows uint8 [..., num_bytes], uint8 [..., K, 4]."""
+        return rows[..., : self._view_start].reshape(*rows.shape[:-1], self.num_categories, 4)
 
     def presence(self, rows: Any) -> Any:
-        """Return which categories are detected, bool [..., K]."""
-        return rows[..., 0 : self._view_at : 4] > 0
+        """Return True for the categories that are detected, bool [..., K]."""
+        return rows[..., 0 : self._view_start : 4] > 0
 
     def view_cells(self, rows: Any) -> Any:
         """Return the ego-centric view, uint8 [..., V * V].
 
-        Row 0 is nearest to the agent, column 0 leftmost.
+        Row 0 of the view is nearest to the agent, column 0 leftmost.
         """
-        packed = rows[..., self._view_at : self._view_at + self._view_bytes]
-        cells = (packed[..., None] >> _shifts(packed.ndim + 1)) & np.uint8(3)
+        packed_view = rows[..., self._view_start : self._view_start + self._view_bytes]
+        cells = (packed_view[..., None] >> _cell_shifts(packed_view.ndim + 1)) & np.uint8(3)
         return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]
 
 
-def _shifts(rank: int) -> np.ndarray:
-    """Return where the four cells of a byte lie in it, uint8 [1, ..., 1, 4]."""
+def _cell_shifts(rank: int) -> np.ndarray:
+    """Return the bit positions of the four cells of a byte, uint8 [1, ..., 1, 4]."""
     return np.array([0, 2, 4, 6], np.uint8).reshape((1,) * (rank - 1) + (4,))
+
+
+def relative_position(detections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return metres ahead and metres to the right of detections.
+
+    Args:
+      detections: uint8 [..., 4].
+
+    Returns:
+      float64 [...] each.
+    """
+    return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - 128.0) / RIGHT_SCALE
+
+
+def detected_positions(detections: np.ndarray, agent_position: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return the world positions of detections from one pose.
+
+    Args:
+      detections: uint8 [..., 4].
+      agent_position: float64 [2], world (x, z).
+      forward: float64 [2], unit vector (x, z) of the agent's heading.
+
+    Returns:
+      float64 [..., 2], world (x, z).
+    """
+    ahead, right = relative_position(detections)
+    rightward = np.array([forward[1], -forward[0]])
+    return agent_position + ahead[..., None] * forward + right[..., None] * rightward
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    """Simulated object detector; the probabilities are in [0, 1].
+
+    Attributes:
+      miss_near: probability of missing an object right in front.
+      miss_far: probability of missing an object at the end of its range.
+      false_alarm: probability per pose and category of a false detection.
+      seed: seed of the errors, used together with the scene's name.
+    """
+
+    miss_near: float = 0.05
+    miss_far: float = 0.4
+    false_alarm: float = 0.005
+    seed: int = 0
+
+    def detect(
+        self,
+        name: str,
+        half_view: float,
+        visible: np.ndarray,
+        ahead: np.ndarray,
+        right: np.ndarray,
+        distance: np.ndarray,
+        size: np.ndarray,
+    ) -> np.ndarray:
+        """Sample the detections of one scene, with errors.
+
+        Args:
+          name: name of the scene, so that errors do not depend on the other scenes of a bank.
+          half_view: tangent of half the horizontal field of view.
+          visible: bool [P, K], True where a perfect detector detects a category.
+          ahead, right, distance, size: float [P, K], metres, of the nearest visible object.
+
+        Returns:
+          uint8 [P, K, 4].
+        """
+        rng = np.random.default_rng([self.seed, zlib.crc32(name.encode())])
+        error_draw, noise, range_draw, bearing_draw = rng.random((4, *visible.shape), dtype=np.float32)
+
+        # Misses become more likely with distance; false alarms only occur without a visible object.
+        nearness = np.clip(distance / detection_range(size), 0.0, 1.0)
+        is_missed = error_draw < self.miss_near + (self.miss_far - self.miss_near) * nearness**2
+        false_alarm = ~visible & (error_draw < self.false_alarm)
+        has_errors = self.miss_near > 0 or self.miss_far > 0 or self.false_alarm > 0
+        confidence = 1.0 - 0.5 * nearness + (0.2 * (noise - 0.5) if has_errors else 0.0)
+        confidence = np.where(false_alarm, 0.3 + 0.3 * noise, confidence)
+
+        # A false alarm lies uniformly in the part of the view cone where an object of its size could be detected.
+        alarm_distance = detection_range(FALSE_ALARM_SIZE) * np.sqrt(range_draw)
+        alarm_angle = np.arctan(half_view) * (2.0 * bearing_draw - 1.0)
+        ahead = np.where(false_alarm, alarm_distance * np.cos(alarm_angle), ahead)
+        right = np.where(false_alarm, alarm_distance * np.sin(alarm_angle), right)
+        size = np.where(false_alarm, FALSE_ALARM_SIZE, size)
+        apparent_size = size / np.maximum(np.hypot(ahead, right), 0.25)
+
+        is_detected = (visible & ~is_missed) | false_alarm
+        detection_bytes = _scale_to_bytes(confidence, ahead, right, apparent_size)
+        return np.where(is_detected[..., None], detection_bytes, 0.0).astype(np.uint8)
+
+
+#: A detector without errors.
+PERFECT_DETECTOR = Detector(miss_near=0.0, miss_far=0.0, false_alarm=0.0)
+
+
+def object_size(boxes: np.ndarray) -> np.ndarray:
+    """Return the size of boxes [N, 6], the geometric mean of their two largest sides, float64 [N], metres."""
+    side_lengths = np.sort(boxes[:, 3:], axis=1)
+    return np.sqrt(side_lengths[:, 1] * side_lengths[:, 2])
+
+
+def detection_range(size: np.ndarray | float) -> np.ndarray:
+    """Return the greatest distance at which objects are detected.
+
+    Args:
+      size: sizes of the objects, metres, see `object_size`.
+
+    Returns:
+      Distances, metres, in the shape of `size`.
+    """
+    return np.clip(size / MIN_APPARENT_SIZE, MIN_RANGE, MAX_RANGE)
+
+
+def _scale_to_bytes(
+    confidence: np.ndarray, ahead: np.ndarray, right: np.ndarray, apparent_size: np.ndarray
+) -> np.ndarray:
+    """Scale detections to whole numbers in [0, 255], float64 [..., 4]; confidence is at least 1."""
+    byte_channels = (
+        np.maximum(np.rint(255.0 * np.clip(confidence, 0.0, 1.0)), 1.0),
+        np.rint(AHEAD_SCALE * ahead),
+        128.0 + np.rint(RIGHT_SCALE * right),
+        np.rint(SIZE_SCALE * apparent_size),
+    )
+    return np.clip(np.stack(byte_channels, axis=-1), 0.0, 255.0)

@@ -1,50 +1,63 @@
-"""Banks of scenes on disk, compiled once and memory-mapped."""
+"""Banks of scenes on disk, compiled once, verified when opened, and memory-mapped.
+
+`compile_shards` compiles scenes in one or several processes, into one folder per shard, and returns `Shards`: a
+sequence of banks whose arrays are read from disk where they are used. Shards are cached. The name of their folder
+depends on everything they are computed from, the code included.
+"""
 
 import dataclasses
 import hashlib
 import itertools
+import multiprocessing
 import os
 import shutil
+import signal
+import threading
+import uuid
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.tables.compile import Bank, checksum, no_goal
-from jaxnav.scenes.tables.shard_workers import ARRAYS, TEXTS, ShardWork, compile_missing
+from jaxnav.scenes.tables.compile import Bank, bank_checksum, compile_scene, join_scenes, no_goal_error
 from jaxnav.scenes.task import Task
-from jaxnav.store.signed import read_signed
+from jaxnav.store.files import read_json_with_digest, write_json_with_digest
 
 if TYPE_CHECKING:
     from jaxnav.scenes.worlds import Scenes
 
-#: The code that shards follow from, below `_SOURCE`; importers write scene files, whose checksums count instead.
+
+#: Fields of a `Bank` that a shard stores as JSON, and fields that it stores as arrays.
+TEXT_FIELDS = ("names", "room_types", "skipped")
+ARRAY_FIELDS = tuple(field for field in Bank._fields if field not in ("task", *TEXT_FIELDS))
+
+#: The code that determines shards, below `_SOURCE`. Importers are not part of it: scene files have their own checksums.
 _CODE = (
-    *("categories.py", "exchange.py", "lattice.py", "scene.py", "task.py", "worlds.py"),
+    *("categories.py", "lattice.py", "layout_shift.py", "scene.py", "task.py", "worlds.py"),
     *("generate/*.py", "generate/*.yaml", "tables/*.py"),
-    *("files/record.py", "files/scene_file.py", "files/walls.py"),
+    "files/scene_file.py",
 )
 _SOURCE = Path(__file__).parents[1]
-_MEND = "delete the folder {}, then it is compiled again"
+_REPAIR_HINT = "delete the folder {}, then it is compiled again"
 
 
 @dataclasses.dataclass(frozen=True)
 class Shards:
-    """Hold a sequence of banks on disk.
-
-    The arrays of an element are memory-mapped, read-only, and read where they are used.
+    """Sequence of banks on disk, whose arrays are memory-mapped and read-only.
 
     Attributes:
-      folder: of all shards.
-      task: what they were compiled for.
+      folder: folder of all shards.
+      task: the task for which the scenes are compiled.
       paths: folder of each shard.
       counts: number of scenes in each shard, at least 1.
-      num_cells: the most cells of any shard.
-      num_scenes: the most scenes of any shard.
-      skipped: names of scenes without any possible goal, which are in no shard.
+      num_cells: greatest number of cells of any shard.
+      num_scenes: greatest number of scenes of any shard.
+      skipped: names of the scenes without a possible goal, which are in no shard.
       checksum: CRC-32 of everything in the shards.
     """
 
@@ -67,13 +80,15 @@ class Shards:
         """Map one shard.
 
         Raises:
-          IndexError: there is no such shard.
-          InputError: a file of it is missing or damaged.
+          IndexError: no shard has this index.
+          InputError: a file of the shard is missing or damaged.
         """
+        # Texts are read, arrays are only mapped.
         path = self.paths[index]
-        texts = _read_texts(path)
-        arrays = {field: _intact(path / f"{field}.npy", _map) for field in ARRAYS}
-        return Bank(task=self.task, **{field: tuple(texts[field]) for field in TEXTS}, **arrays)
+        metadata = _read_metadata(path)
+        fields: dict[str, Any] = {field: tuple(metadata[field]) for field in TEXT_FIELDS}
+        fields |= {field: _map_array(path / f"{field}.npy") for field in ARRAY_FIELDS}
+        return Bank(task=self.task, **fields)
 
 
 def compile_shards(
@@ -84,92 +99,216 @@ def compile_shards(
     report: Callable[[int, int], None],
     workers: int | None = None,
 ) -> Shards:
-    """Compile scenes into shards, or open those compiled before.
+    """Compile scenes into shards, or open the shards of an earlier call.
 
-    Shards hold nearly equal numbers of scenes, in order. Their folder is named after everything they follow from:
-    scenes, task, `shard_scenes`, NumPy and the code that makes scenes and tables. A shard is written whole or not at
-    all: after a kill the next call compiles those that are missing, and several processes may compile the same shards
-    at once. With several workers the calling script needs its `if __name__ == "__main__"`.
+    Shards hold nearly equal numbers of scenes, in order. Their folder is named by a hash of the scenes, the task,
+    `shard_scenes`, the NumPy version and the code that makes scenes and tables. A shard is written completely or not at
+    all, so that an interrupted call can be repeated, and several processes may compile the same shards at once. With
+    several workers the calling script needs its `if __name__ == "__main__"`.
 
     Args:
       scenes: sent to every worker once; each scene is made where it is compiled.
-      task: what they are compiled for.
-      shard_scenes: scenes of a shard at most, at least 1.
-      cache: where the folder is, or will be made.
-      report: called with the number of finished shards, and of all, after each.
-      workers: processes that compile one shard at a time each, None for one per core; a single one is the caller's.
+      task: the task for which the scenes are compiled.
+      shard_scenes: greatest number of scenes per shard, at least 1.
+      cache: parent of the folder, created if necessary.
+      report: called after each shard with the number of finished shards and the number of all shards.
+      workers: number of processes that compile one shard at a time each; None for one per core. A single worker runs in
+        the calling process.
 
     Raises:
-      InputError: no scene has a reachable goal, a scene cannot be made, or a shard in the cache is damaged.
+      InputError: no scene has a reachable goal, a scene cannot be made, or a cached shard is damaged.
     """
     if shard_scenes < 1:
         raise InputError(f"shard_scenes is {shard_scenes}; give a number of at least 1")
-    folder = cache / _key(scenes, task, shard_scenes)
+    folder = cache / _cache_key(scenes, task, shard_scenes)
     folder.mkdir(parents=True, exist_ok=True)
-    total = -(-len(scenes) // shard_scenes)
-    work = ShardWork(scenes, task, tuple(folder / f"{number:05d}" for number in range(total)))
-    missing = [number for number in range(total) if not work.paths[number].exists()]
-    present = itertools.count(1)
-    for _ in range(total - len(missing)):
-        report(next(present), total)
-    compile_missing(work, missing, workers or os.cpu_count() or 1, lambda: report(next(present), total))
-    for part in folder.glob(".*.tmp"):  # left by processes that were killed
-        shutil.rmtree(part, ignore_errors=True)
-    return _open(folder, work)
+    num_shards = -(-len(scenes) // shard_scenes)
+    job = ShardJob(scenes, task, tuple(folder / f"{index:05d}" for index in range(num_shards)))
+
+    # Compile the missing shards; cached ones are reported first.
+    missing = []
+    for index, path in enumerate(job.paths):
+        if not path.exists():
+            missing.append(index)
+    finished_count = itertools.count(1)
+    for _ in range(num_shards - len(missing)):
+        report(next(finished_count), num_shards)
+    compile_missing(job, missing, workers or os.cpu_count() or 1, lambda: report(next(finished_count), num_shards))
+
+    # Remove the unfinished shards of processes that were killed.
+    for unfinished_folder in folder.glob(".*.tmp"):
+        shutil.rmtree(unfinished_folder, ignore_errors=True)
+    return _open_shards(folder, job)
 
 
-def _open(folder: Path, work: ShardWork) -> Shards:
-    """Describe compiled shards by their texts, and compare their checksums.
+@dataclasses.dataclass(frozen=True)
+class ShardJob:
+    """Everything that a worker needs to compile shards.
+
+    Attributes:
+      scenes: scenes of all shards.
+      task: the task for which they are compiled.
+      paths: folder of each shard.
+    """
+
+    scenes: "Scenes"
+    task: Task
+    paths: tuple[Path, ...]
+
+    def compile(self, index: int) -> None:
+        """Compile and write one shard; a shard without a reachable goal has metadata but no arrays."""
+        # Scenes of this shard; shards differ by at most one scene.
+        first_scene = len(self.scenes) * index // len(self.paths)
+        end_scene = len(self.scenes) * (index + 1) // len(self.paths)
+        compiled_scenes = [compile_scene(self.scenes[scene], self.task) for scene in range(first_scene, end_scene)]
+
+        metadata: dict[str, Any]
+        if any(compiled.best_length.any() for compiled in compiled_scenes):
+            bank = join_scenes(compiled_scenes, self.task)
+            metadata = {field: getattr(bank, field) for field in TEXT_FIELDS}
+            metadata |= {"cells": len(bank.ahead), "checksum": bank_checksum(bank)}
+            arrays = {field: getattr(bank, field) for field in ARRAY_FIELDS}
+        else:
+            skipped = [compiled.name for compiled in compiled_scenes]
+            metadata = {"names": (), "room_types": (), "skipped": skipped, "cells": 0}
+            arrays = {}
+        _write_shard(self.paths[index], metadata, arrays)
+
+
+def compile_missing(job: ShardJob, missing: Sequence[int], workers: int, on_finished: Callable[[], None]) -> None:
+    """Compile shards by index, and call `on_finished` after each.
+
+    Several workers are separate processes, which end with the calling process, however that one ends.
+    """
+    workers = min(workers, len(missing))
+    if workers <= 1:
+        for index in missing:
+            job.compile(index)
+            on_finished()
+        return
+
+    # Workers watch one end of a pipe. The other end closes when this process leaves the block or dies.
+    spawn_context = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
+    parent_alive, parent_end = spawn_context.Pipe(duplex=False)
+    with ProcessPoolExecutor(workers, spawn_context, _start_worker, (job, parent_alive)) as pool, parent_end:
+        for shard_future in as_completed([pool.submit(_compile_in_worker, index) for index in missing]):
+            shard_future.result()
+            on_finished()
+
+
+_worker_job: ShardJob  # set in worker processes
+
+
+def _start_worker(job: ShardJob, parent_alive: Connection) -> None:
+    """Initialise a worker process, which exits when `parent_alive` is closed."""
+    global _worker_job
+    _worker_job = job
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
+
+    def exit_with_parent() -> None:
+        try:
+            parent_alive.recv_bytes()
+        finally:
+            os._exit(1)
+
+    threading.Thread(target=exit_with_parent, daemon=True).start()
+
+
+def _compile_in_worker(index: int) -> None:
+    _worker_job.compile(index)
+
+
+def _write_shard(path: Path, metadata: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Write a complete shard or nothing; an existing shard is left alone."""
+    unfinished_folder = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        unfinished_folder.mkdir()
+        for field, array in arrays.items():
+            # Arrays must be on the disk before the folder gets its final name.
+            with (unfinished_folder / f"{field}.npy").open("wb") as file:
+                np.save(file, array)
+                file.flush()
+                os.fsync(file.fileno())
+        write_json_with_digest(unfinished_folder / "shard.json", metadata)
+        unfinished_folder.rename(path)  # fails if the shard exists
+    except OSError:
+        # Another process may have finished the same shard first, and removed the unfinished folder.
+        if not path.exists():
+            raise
+    finally:
+        shutil.rmtree(unfinished_folder, ignore_errors=True)
+
+
+def _open_shards(folder: Path, job: ShardJob) -> Shards:
+    """Open compiled shards and verify their checksums.
 
     Raises:
       InputError: no scene has a reachable goal, or a shard is damaged.
     """
-    texts = [_read_texts(path) for path in work.paths]
-    usable = [(path, text) for path, text in zip(work.paths, texts, strict=True) if text["names"]]
-    if not usable:
-        raise no_goal(len(work.scenes), work.task)
-    counts = tuple(len(text["names"]) for _, text in usable)
+    # Shards without a reachable goal only contribute the names of their scenes.
+    paths = []
+    usable_metadata = []
+    scene_counts = []
+    cell_counts = []
+    checksums = []
+    skipped = []
+    for path in job.paths:
+        metadata = _read_metadata(path)
+        skipped.extend(metadata["skipped"])
+        if metadata["names"]:
+            paths.append(path)
+            usable_metadata.append(metadata)
+            scene_counts.append(len(metadata["names"]))
+            cell_counts.append(metadata["cells"])
+            checksums.append(metadata["checksum"])
+    if not paths:
+        raise no_goal_error(len(job.scenes), job.task)
+
     shards = Shards(
         folder=folder,
-        task=work.task,
-        paths=tuple(path for path, _ in usable),
-        counts=counts,
-        num_cells=max(text["cells"] for _, text in usable),
-        num_scenes=max(counts),
-        skipped=tuple(name for text in texts for name in text["skipped"]),
-        checksum=zlib.crc32(repr([text["checksum"] for _, text in usable]).encode()),
+        task=job.task,
+        paths=tuple(paths),
+        counts=tuple(scene_counts),
+        num_cells=max(cell_counts),
+        num_scenes=max(scene_counts),
+        skipped=tuple(skipped),
+        checksum=zlib.crc32(repr(checksums).encode()),
     )
-    for bank, (path, text) in zip(shards, usable, strict=True):
-        if (len(bank.ahead), checksum(bank)) != (text["cells"], text["checksum"]):
-            raise InputError(f"{path}: is damaged (its checksum is another); {_MEND.format(path)}")
+
+    # Verify that the arrays are those that were written.
+    for bank, path, metadata in zip(shards, paths, usable_metadata, strict=True):
+        if (len(bank.ahead), bank_checksum(bank)) != (metadata["cells"], metadata["checksum"]):
+            raise InputError(f"{path}: is damaged (its checksum is another); {_REPAIR_HINT.format(path)}")
     return shards
 
 
-def _key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
-    """Return a name that differs wherever the shards may differ."""
-    key = hashlib.sha256(repr((scenes.identity, task, shard_scenes, np.__version__)).encode())
-    files = {path for pattern in _CODE for path in _SOURCE.glob(pattern)}
-    for path in sorted(path for path in files if path.name != "__init__.py"):
-        code = path.read_bytes()
-        key.update(f"{path.relative_to(_SOURCE).as_posix()} {len(code)} ".encode() + code)
-    return key.hexdigest()[:20]
+def _cache_key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
+    """Return a hash of everything that determines the shards."""
+    # Scenes and settings first, then the path and content of each file of the code.
+    code_digest = hashlib.sha256(repr((scenes.identity, task, shard_scenes, np.__version__)).encode())
+    code_files = set()
+    for code_pattern in _CODE:
+        code_files.update(_SOURCE.glob(code_pattern))
+    for path in sorted(code_files):
+        if path.name == "__init__.py":
+            continue
+        code_bytes = path.read_bytes()
+        code_digest.update(f"{path.relative_to(_SOURCE).as_posix()} {len(code_bytes)} ".encode() + code_bytes)
+    return code_digest.hexdigest()[:20]
 
 
-def _read_texts(path: Path) -> dict[str, Any]:
-    return read_signed(path / "shard.json", _MEND.format(path))
+def _read_metadata(path: Path) -> dict[str, Any]:
+    """Read the metadata of a shard."""
+    return read_json_with_digest(path / "shard.json", _REPAIR_HINT.format(path))
 
 
-def _map(path: Path) -> np.ndarray:
-    return np.lib.format.open_memmap(path, mode="r")
-
-
-def _intact(path: Path, read: Callable[[Path], Any]) -> Any:
-    """Read a file of a shard.
+def _map_array(path: Path) -> np.ndarray:
+    """Map an array of a shard.
 
     Raises:
-      InputError: it is missing or damaged.
+      InputError: the file is missing or damaged.
     """
     try:
-        return read(path)
-    except Exception as error:  # a damaged header can bring about any
-        raise InputError(f"{path}: is missing or damaged ({error}); {_MEND.format(path.parent)}") from error
+        return np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # a damaged header can raise anything
+        raise InputError(f"{path}: is missing or damaged ({error}); {_REPAIR_HINT.format(path.parent)}") from error

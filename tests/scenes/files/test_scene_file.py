@@ -13,7 +13,7 @@ from support.real_scenes import ITHOR, require
 from support.scene_records import RECORD, assert_scenes_equal, write_records
 
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
-from jaxnav.scenes.generate.sizes import UNKNOWN, typical_box
+from jaxnav.scenes.generate.sizes import UNKNOWN_BOX, typical_box
 from jaxnav.scenes.scene import Scene
 
 
@@ -85,7 +85,7 @@ def test_numbers_that_are_null_become_those_typical_of_the_type(tmp_path):
     assert scene.types == ("Fridge", "Fridge", "Gizmo")  # the apple has no place
     assert scene.boxes[0].tolist() == [1.0, y, 2.0, width, height, depth]
     assert scene.boxes[1].tolist() == [1.0, 0.9, 2.0, 0.5, height, 0.6]
-    assert scene.boxes[2].tolist() == [1.0, UNKNOWN[3], 2.0, *UNKNOWN[:3]]
+    assert scene.boxes[2].tolist() == [1.0, UNKNOWN_BOX[3], 2.0, *UNKNOWN_BOX[:3]]
     assert typical_box("Stool") != typical_box("Chair")  # its own size before its alias's
     assert typical_box("couch") == typical_box("Sofa")
 

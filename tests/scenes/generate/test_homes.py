@@ -8,9 +8,8 @@ from support.scene_records import assert_scenes_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, GIBSON_GOALS, ROBOTHOR_GOALS
-from jaxnav.scenes.generate.floor_plans import DOOR_WIDTHS
-from jaxnav.scenes.generate.homes import generate_apartment, generate_house
-from jaxnav.scenes.scene import CELL, Room, Scene
+from jaxnav.scenes.generate.homes import DOOR_WIDTHS, generate_apartment, generate_house
+from jaxnav.scenes.scene import CELL_SIZE, Room, Scene
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +113,7 @@ def test_all_rooms_of_a_house_can_be_walked_into(houses: list[Scene]):
 def test_objects_stand_in_the_rooms_that_they_belong_to(houses: list[Scene]):
     belongs = {"Toilet": "bathroom", "Bed": "bedroom", "Sofa": "living_room", "Oven": "kitchen"}
     for scene in houses:
-        cells = np.rint((scene.boxes[:, [2, 0]] - scene.origin[::-1]) / CELL).astype(int)
+        cells = np.rint((scene.boxes[:, [2, 0]] - scene.origin[::-1]) / CELL_SIZE).astype(int)
         for name, (iz, ix) in zip(scene.types, cells, strict=True):
             if name in belongs:
                 assert [room.type for room in scene.rooms if room.cells[iz, ix]] == [belongs[name]]

@@ -9,8 +9,14 @@ from support.scene_records import assert_scenes_equal
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
-from jaxnav.scenes.generate.room_rules import room_statistics
-from jaxnav.scenes.generate.rooms import AGENT_RADIUS, FIND_DISTANCE, free_cells, generate_room_at, generate_rooms
+from jaxnav.scenes.generate.rooms import (
+    AGENT_RADIUS,
+    MAX_TARGET_DISTANCE,
+    free_cells,
+    generate_room,
+    generate_rooms,
+    room_statistics,
+)
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 
@@ -29,7 +35,7 @@ def test_a_scene_depends_on_seed_split_and_index_alone():
 def test_rooms_are_the_same_one_by_one():
     places = [("train", 0), ("train", 1), ("train", 2), ("val", 0), ("test", 0)]
     for scene, (split, i) in zip(generate_rooms(3, 1, 1, seed=2), places, strict=True):
-        assert_scenes_equal(generate_room_at(split, i, 2), scene)
+        assert_scenes_equal(generate_room(split, i, 2), scene)
 
 
 def test_splits_are_balanced_and_names_unique():
@@ -87,7 +93,7 @@ def test_the_agent_fits_and_every_target_is_within_reach(rooms: list[Scene]):
         check_agent_fits(scene, AGENT_RADIUS)
         targets = scene.boxes[np.isin(scene.types, ITHOR_CATEGORIES)][:, [0, 2]]
         distances = np.linalg.norm(targets[:, None] - cell_centres(scene, scene.reach), axis=-1).min(axis=1)
-        assert distances.max() <= FIND_DISTANCE + MILLIMETRES
+        assert distances.max() <= MAX_TARGET_DISTANCE + MILLIMETRES
 
 
 def test_free_cells_of_a_room_with_one_box():

@@ -9,9 +9,8 @@ from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, FRIDGE, HOUSES, 
 from jaxnav.errors import InputError
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
-from jaxnav.scenes.tables.compile import compile_bank, compile_scene, concatenate
-from jaxnav.scenes.tables.detector import PERFECT
-from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.tables.compile import compile_bank, compile_scene, concatenate_banks
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, RowFormat
 from jaxnav.scenes.task import Task
 
 ROW_FORMAT = RowFormat(len(CATEGORIES))
@@ -19,7 +18,7 @@ BOOK_AHEAD = ("Book", 0, 1.5, 2, *SMALL)
 
 
 def table_of(scene, rules=ROOMS):
-    return compile_scene(scene, Task(CATEGORIES, rules=rules, detector=PERFECT))
+    return compile_scene(scene, Task(CATEGORIES, rules=rules, detector=PERFECT_DETECTOR))
 
 
 def test_the_bytes_of_a_detection():
@@ -134,7 +133,7 @@ def test_scenes_without_a_reachable_goal_are_left_out_by_name():
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
 def test_only_goals_of_the_task_are_looked_for(rules):
     scene = draw(["."], ("Book", 0, 1.0, 0.5, *SMALL), ("Chair", 0, 1.0, 0.6, *SMALL), ("Fridge", 5, 1, 0, 1, 2, 1))
-    task = Task(CATEGORIES, ("Chair", "Fridge"), rules, PERFECT)
+    task = Task(CATEGORIES, ("Chair", "Fridge"), rules, PERFECT_DETECTOR)
     bank = compile_bank([scene], task)
     assert bank.goals[0, : bank.num_goals[0]].tolist() == [CHAIR]
     assert not bank.best_length[:, [BOOK, FRIDGE]].any()
@@ -151,7 +150,7 @@ def test_banks_end_to_end_are_the_bank_of_all_scenes():
     scenes = [draw(["..", ".."], near), draw(["..."], ("Chair", 0.25, 1.5, 1, *SMALL)), draw(["."], near)]
     task = Task(CATEGORIES, rules=ROOMS)
     whole = compile_bank(scenes, task)
-    parts = concatenate([compile_bank(scenes[:1], task), compile_bank(scenes[1:], task)])
+    parts = concatenate_banks([compile_bank(scenes[:1], task), compile_bank(scenes[1:], task)])
     assert whole.first_cell.tolist() == [0, 4, 7]
     for name, one, other in zip(whole._fields, whole, parts, strict=True):
         assert getattr(one, "dtype", None) == getattr(other, "dtype", None)

@@ -9,12 +9,11 @@ from support.scenes import APARTMENTS, HOUSES, ROOMS
 
 from jaxnav.scenes.generate.rooms import generate_rooms
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.tables.detector import PERFECT, Detector, detection_range
-from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, Detector, RowFormat, detection_range
 from jaxnav.scenes.task import Task
 
 
-def detect(detector, seen, distance, half_view=ROOMS.half_view[0], num_poses=40_000):
+def detect(detector, seen, distance, half_view=ROOMS.half_view_tangents[0], num_poses=40_000):
     """Return detections uint8 [P, 2, 4] of objects straight ahead.
 
     They are of 0.6 m (range 5 m).
@@ -63,7 +62,7 @@ def test_false_alarms_fill_the_view_cone():
 
 
 def test_false_alarms_keep_to_a_narrower_view():
-    entries = detect(Detector(false_alarm=0.1), False, 1.0, APARTMENTS.half_view[0])
+    entries = detect(Detector(false_alarm=0.1), False, 1.0, APARTMENTS.half_view_tangents[0])
     alarms = entries[entries[..., 0] > 0]
     bearing = np.rad2deg(np.arctan2((alarms[:, 2] - 128.0) / 25.4, alarms[:, 1] / 51))[alarms[:, 1] > 51]
     assert 38 < np.abs(bearing).max() < 39.5 + 2  # a quantum is 0.04 m, over 1 m away
@@ -84,6 +83,6 @@ def test_errors_are_frozen_and_belong_to_the_scene():
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
 def test_success_is_never_noisy(rules):
     scenes, row_format, blind = generate_rooms(2, 0, 0), RowFormat(22), Detector(miss_near=1.0, miss_far=1.0)
-    blind, perfect = (compile_bank(scenes, Task(rules=rules, detector=d)) for d in (blind, PERFECT))
+    blind, perfect = (compile_bank(scenes, Task(rules=rules, detector=d)) for d in (blind, PERFECT_DETECTOR))
     np.testing.assert_array_equal(blind.best_length, perfect.best_length)
     assert row_format.presence(blind.rows).sum() < 0.1 * row_format.presence(perfect.rows).sum()

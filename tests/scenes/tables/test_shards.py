@@ -37,16 +37,16 @@ def copied_code(tmp_path, monkeypatch):
     return code
 
 
-def needed_code(code, *left):
+def needed_code(code, *missing):
     """What modules import of the scenes, directly or not, and the data beside them."""
-    found, left = set(), list(left)
-    while left:
-        name = left.pop()
-        found.add(name)
-        found |= {path.relative_to(code).as_posix() for path in (code / name).parent.glob("*.yaml")}
+    covered, missing = set(), list(missing)
+    while missing:
+        name = missing.pop()
+        covered.add(name)
+        covered |= {path.relative_to(code).as_posix() for path in (code / name).parent.glob("*.yaml")}
         imported = re.findall(r"^ *from jaxnav\.scenes\.([\w.]+) import", (code / name).read_text(), re.MULTILINE)
-        left += {f"{each.replace('.', '/')}.py" for each in imported} - found
-    return found
+        missing += {f"{module_name.replace('.', '/')}.py" for module_name in imported} - covered
+    return covered
 
 
 # What is in them
@@ -119,14 +119,14 @@ def test_whatever_the_shards_follow_from_is_in_their_folder(tmp_path, monkeypatc
 
 def test_their_folder_follows_from_the_code_that_makes_them_alone(tmp_path, monkeypatch):
     code = copied_code(tmp_path, monkeypatch)
-    key = module._key(Corridors(), TASK, 2)
+    key = module._cache_key(Corridors(), TASK, 2)
     needed = needed_code(code, "tables/shards.py")
     assert {"tables/compile.py", "worlds.py", "generate/rooms.yaml", "files/scene_file.py"} <= needed
     changes = set()
     for path in [path for path in code.rglob("*.*") if path.is_file()]:
         content = path.read_text()
         path.write_text(f"{content}\n# changed\n")
-        if module._key(Corridors(), TASK, 2) != key:
+        if module._cache_key(Corridors(), TASK, 2) != key:
             changes.add(path.relative_to(code).as_posix())
         path.write_text(content)
     assert changes == needed
@@ -143,17 +143,17 @@ def test_only_what_is_missing_is_compiled(tmp_path):
 
     shards = build(tmp_path, Watched())
     assert made == list(range(7))
-    before, kept = contents(shards.folder), times(shards.folder)
+    before, before_times = contents(shards.folder), times(shards.folder)
     shutil.rmtree(shards.paths[1])
-    left = shards.folder / ".00001.0123.tmp"  # by a kill
-    left.mkdir()
-    (left / "rows.npy").write_bytes(b"half")
+    leftover = shards.folder / ".00001.0123.tmp"  # by a kill
+    leftover.mkdir()
+    (leftover / "rows.npy").write_bytes(b"half")
     made.clear()
     assert build(tmp_path, Watched(), report=lambda *numbers: reports.append(numbers)) == shards
     assert made == [1, 2]
     assert reports == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert contents(shards.folder) == before  # and nothing else is left
-    changed = {path.parent for path, modified in times(shards.folder).items() if kept[path] != modified}
+    changed = {path.parent for path, modified in times(shards.folder).items() if before_times[path] != modified}
     assert changed == {shards.paths[1]}
 
 
@@ -177,13 +177,13 @@ def test_a_build_that_is_killed_leaves_whole_shards_and_no_process(tmp_path, num
     process.communicate(timeout=60)  # until the last worker, which has the pipe too, is gone
     assert process.returncode == -number
     (folder,) = tmp_path.glob("*")
-    kept = times(folder)
-    assert {path.parent.name for path in kept} == {"00000", "00001"}
+    before_times = times(folder)
+    assert {path.parent.name for path in before_times} == {"00000", "00001"}
     (tmp_path / "gate").touch()
     shards = build(tmp_path, gated)
     assert shards.folder == folder
     assert contents(folder) == contents(build(tmp_path / "whole").folder)
-    assert kept.items() <= times(folder).items()
+    assert before_times.items() <= times(folder).items()
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -1,20 +1,28 @@
-"""Scenes from standable points and objects."""
+"""Building blocks of the importers: scenes from standable points and objects, and polygons and boxes on the lattice.
 
-from collections.abc import Sequence
-from typing import NamedTuple
+An importer describes objects as `SceneObject`s. Those that know standable points turn them to cells with
+`lattice_cells`, and `build_scene_from_cells` lays out the arrays and derives the walls; importers that know the walls
+call `build_scene`. The functions on polygons and boxes find the cells of rooms, walls and obstacles.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, ParamSpec
 
 import numpy as np
 
-from jaxnav.scenes.files.record import Record
-from jaxnav.scenes.files.walls import derive_walls
-from jaxnav.scenes.scene import CELL, MAX_SIDE, Room, Scene
+from jaxnav.errors import InputError
+from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, derive_walls
+from jaxnav.scenes.lattice import connected_parts
+from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene
+from jaxnav.scenes.tables.visibility import TOLERANCE
 
-SNAP = 0.02  # metres; a standable point may be this far off the lattice
-MARGIN = 3  # cells around the standable ones; what lies beyond is indistinguishable from a wall
+Arguments = ParamSpec("Arguments")
+
+_MARGIN = 3  # cells around the standable ones; a cell beyond them is indistinguishable from a wall
 
 
-class Note(NamedTuple):
-    """Say what was done to scenes, to be told once after an import.
+class ImportNote(NamedTuple):
+    """A remark about what an importer did to scenes, printed once after an import.
 
     Attributes:
       text: what was done, in words that follow a number.
@@ -25,8 +33,8 @@ class Note(NamedTuple):
     number: int
 
 
-class Thing(NamedTuple):
-    """Describe an object of a scene.
+class SceneObject(NamedTuple):
+    """An object of a scene.
 
     Attributes:
       type: name of its type.
@@ -41,7 +49,17 @@ class Thing(NamedTuple):
     parent: int = -1
 
 
-def lattice_cells(record: Record, field: str, points: Sequence[Sequence[float]]) -> np.ndarray:
+def scene_or_error(
+    build: Callable[Arguments, Scene], *args: Arguments.args, **kwargs: Arguments.kwargs
+) -> Scene | InputError:
+    """Return the scene that a function builds, or the `InputError` that it raises."""
+    try:
+        return build(*args, **kwargs)
+    except InputError as error:
+        return error
+
+
+def lattice_cells(record: JsonRecord, field: str, points: Sequence[Sequence[float]]) -> np.ndarray:
     """Return the lattice indices of points.
 
     Args:
@@ -57,38 +75,44 @@ def lattice_cells(record: Record, field: str, points: Sequence[Sequence[float]])
     """
     if not len(points):
         raise record.error(field, "holds no point to stand on; give at least one")
-    xz = np.asarray(points, np.float64)
-    cells = np.rint(xz / CELL).astype(np.int64)
-    off = np.abs(xz - CELL * cells).max(axis=1)
-    if (off > SNAP).any():
-        worst = xz[off.argmax()].tolist()
-        raise record.error(field, f"holds {worst}; x and z must be multiples of {CELL} (within {SNAP})")
-    if (np.ptp(cells, axis=0) > MAX_SIDE).any():
-        raise record.error(field, f"spans more than {MAX_SIDE * CELL:g} m; give one scene at a time")
-    return cells[:, ::-1]
+
+    # Index = metres / 0.25, to the nearest whole number, [N, 2].
+    point_positions = np.asarray(points, np.float64)
+    lattice_indices = np.rint(point_positions / CELL_SIZE).astype(np.int64)
+
+    # A point off the lattice, or far away, is a mistake in the file.
+    lattice_offsets = np.abs(point_positions - CELL_SIZE * lattice_indices).max(axis=1)
+    if (lattice_offsets > SNAP_TOLERANCE).any():
+        worst_point = point_positions[lattice_offsets.argmax()].tolist()
+        expected = f"x and z must be multiples of {CELL_SIZE} (within {SNAP_TOLERANCE})"
+        raise record.error(field, f"holds {worst_point}; {expected}")
+    if (np.ptp(lattice_indices, axis=0) > MAX_SIDE_CELLS).any():
+        raise record.error(field, f"spans more than {MAX_SIDE_CELLS * CELL_SIZE:g} m; give one scene at a time")
+    return lattice_indices[:, ::-1]
 
 
-def scene_of_cells(
-    name: str, world: str, room_type: str, split: str, cells: np.ndarray, things: Sequence[Thing]
+def build_scene_from_cells(
+    name: str, world: str, room_type: str, split: str, cells: np.ndarray, objects: Sequence[SceneObject]
 ) -> Scene:
     """Build a scene and derive its walls.
 
-    Walls are what can be neither standable nor furniture, see `derive_walls`.
+    Walls are the cells that can be neither standable nor furniture, see `derive_walls`.
 
     Args:
       name, world, room_type, split: see `Scene`.
       cells: int [N, 2], standable lattice indices (iz, ix), z = 0.25 iz and x = 0.25 ix.
-      things: the objects.
+      objects: the objects of the scene.
     """
-    low = cells.min(axis=0) - MARGIN
-    reach = np.zeros(cells.max(axis=0) - low + MARGIN + 1, bool)
-    reach[tuple((cells - low).T)] = True
-    origin = (CELL * float(low[1]), CELL * float(low[0]))
-    boxes = np.array([thing.box for thing in things], np.float64).reshape(-1, 6)
-    return scene(name, world, room_type, split, origin, reach, derive_walls(reach, origin, boxes), things)
+    # Shift the indices so that the array begins a margin before the first cell.
+    low_corner = cells.min(axis=0) - _MARGIN
+    reach_mask = np.zeros(cells.max(axis=0) - low_corner + _MARGIN + 1, bool)
+    reach_mask[tuple((cells - low_corner).T)] = True
+    lattice_origin = (CELL_SIZE * float(low_corner[1]), CELL_SIZE * float(low_corner[0]))
+    wall_mask = derive_walls(reach_mask, lattice_origin, object_boxes(objects))
+    return build_scene(name, world, room_type, split, lattice_origin, reach_mask, wall_mask, objects)
 
 
-def scene(
+def build_scene(
     name: str,
     world: str,
     room_type: str,
@@ -96,10 +120,10 @@ def scene(
     origin: tuple[float, float],
     reach: np.ndarray,
     walls: np.ndarray,
-    things: Sequence[Thing],
+    objects: Sequence[SceneObject],
     rooms: tuple[Room, ...] = (),
 ) -> Scene:
-    """Build a scene of objects from its other attributes."""
+    """Build a scene of objects from its other attributes, see `Scene`."""
     return Scene(
         name=name,
         world=world,
@@ -108,9 +132,172 @@ def scene(
         origin=origin,
         reach=reach,
         walls=walls,
-        types=tuple(thing.type for thing in things),
-        boxes=np.array([thing.box for thing in things], np.float64).reshape(-1, 6),
-        yaws=np.array([thing.yaw for thing in things], np.float64),
-        parents=np.array([thing.parent for thing in things], np.int64),
+        types=tuple(scene_object.type for scene_object in objects),
+        boxes=object_boxes(objects),
+        yaws=np.array([scene_object.yaw for scene_object in objects], np.float64),
+        parents=np.array([scene_object.parent for scene_object in objects], np.int64),
         rooms=rooms,
     )
+
+
+def object_boxes(objects: Sequence[SceneObject]) -> np.ndarray:
+    """Return the boxes of objects, float64 [N, 6], centre and full size in metres."""
+    return np.array([scene_object.box for scene_object in objects], np.float64).reshape(-1, 6)
+
+
+# Polygons and boxes on the lattice
+
+
+def is_simple_polygon(corners: np.ndarray) -> bool:
+    """Return True for a polygon, corners [P, 2] with P >= 3, that neither crosses nor touches itself."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    next_edges = np.roll(edges, -1, axis=0)
+
+    # An edge that turns back on the one before it.
+    is_fold = (_cross_product(edges, next_edges) == 0) & ((edges * next_edges).sum(axis=1) <= 0)
+
+    # Edge j straddles the line through edge i unless both of its ends are strictly on one side of this line.
+    side_of_edge = np.sign(_cross_product(edges[:, None], corners - corners[:, None]))  # [P, P], of edge i, of corner j
+    does_straddle = side_of_edge * np.roll(side_of_edge, -1, axis=1) <= 0
+
+    # The bounding boxes of the edges decide where edges are on one line.
+    edge_low = np.minimum(corners, corners + edges)
+    edge_high = np.maximum(corners, corners + edges)
+    boxes_overlap = ((edge_low[:, None] <= edge_high) & (edge_low <= edge_high[:, None])).all(axis=-1)
+
+    # Neighbouring edges always share a corner.
+    corner_index = np.arange(len(corners))
+    index_distance = np.subtract.outer(corner_index, corner_index) % len(corners)
+    are_neighbours = (index_distance <= 1) | (index_distance == len(corners) - 1)
+
+    is_crossing = does_straddle & does_straddle.T & boxes_overlap & ~are_neighbours
+    return not (is_fold.any() or is_crossing.any())
+
+
+def points_in_polygon(corners: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return which lattice points a polygon encloses, by the even-odd rule along the rows.
+
+    A point on an edge that two polygons share is in exactly one of them: in the one beyond it in x, or else in z.
+
+    Args:
+      corners: float64 [P, 2], (x, z) in metres.
+      x, z: float64 [nx] and [nz], ascending.
+
+    Returns:
+      bool [nz, nx].
+    """
+    start_x, start_z = corners.T
+    end_x, end_z = np.roll(corners, -1, axis=0).T
+
+    # Where edges cross the line through a row of points.
+    row_indices, edge_indices = np.nonzero((start_z <= z[:, None]) != (end_z <= z[:, None]))
+    edge_fraction = (z[row_indices] - start_z[edge_indices]) / (end_z - start_z)[edge_indices]
+    crossing_x = start_x[edge_indices] + edge_fraction * (end_x - start_x)[edge_indices]
+
+    # A point is inside after an odd number of crossings.
+    crossing_counts = np.zeros((len(z), len(x) + 1), np.int64)
+    np.add.at(crossing_counts, (row_indices, np.searchsorted(x, crossing_x)), 1)
+    return crossing_counts.cumsum(axis=1)[:, :-1] % 2 == 1
+
+
+def subtract_openings(wall_line: np.ndarray, openings: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the pieces of a wall between openings.
+
+    Args:
+      wall_line: float64 [2, 2], both ends (x, z) of the wall, along x or z, metres.
+      openings: both ends of each, also of those in other walls.
+
+    Returns:
+      Low and high corner [2, 2] of each piece.
+    """
+    low_end = wall_line.min(axis=0)
+    high_end = wall_line.max(axis=0)
+    along_axis = int(np.argmax(high_end - low_end))
+    across_axis = 1 - along_axis
+
+    # The intervals of the openings in this wall.
+    opening_spans: list[list[float]] = []
+    for opening in openings:
+        if np.abs(opening[:, across_axis] - low_end[across_axis]).max() <= SNAP_TOLERANCE:
+            opening_spans.append(sorted(opening[:, along_axis]))
+
+    # Each piece ends where an opening begins, the last one at the end of the wall.
+    wall_pieces: list[np.ndarray] = []
+    for span_start, span_end in [*sorted(opening_spans), (high_end[along_axis], high_end[along_axis])]:
+        wall_piece = np.stack([low_end, high_end])
+        wall_piece[1, along_axis] = min(span_start, high_end[along_axis])
+        if wall_piece[0, along_axis] < wall_piece[1, along_axis]:
+            wall_pieces.append(wall_piece)
+        low_end[along_axis] = max(low_end[along_axis], span_end)
+    return wall_pieces
+
+
+def cells_touching_boxes(boxes: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return the cells that any box touches, bool [nz, nx].
+
+    A cell is a closed square of 0.25 m.
+
+    Args:
+      boxes: float64 [M, 2, 2], low and high corner (x, z), metres.
+      x, z: float64 [nx] and [nz], centres of the cells.
+    """
+    cell_mask = np.zeros((len(z), len(x)), bool)
+    for _, window in _iterate_windows(boxes, x, z, CELL_SIZE / 2 + TOLERANCE):
+        cell_mask[window] = True
+    return cell_mask
+
+
+def cells_near_boxes(boxes: np.ndarray, x: np.ndarray, z: np.ndarray, distance: float) -> np.ndarray:
+    """Return the cells nearer than `distance` to any box.
+
+    Args:
+      boxes: float64 [M, 2, 2], low and high corner (x, z), metres.
+      x, z: float64 [nx] and [nz], centres of the cells.
+      distance: of a cell's centre, metres.
+
+    Returns:
+      bool [nz, nx].
+    """
+    cell_mask = np.zeros((len(z), len(x)), bool)
+    for (box_low, box_high), (row_slice, column_slice) in _iterate_windows(boxes, x, z, distance):
+        distance_x = np.maximum(np.maximum(box_low[0] - x[column_slice], x[column_slice] - box_high[0]), 0.0)
+        distance_z = np.maximum(np.maximum(box_low[1] - z[row_slice], z[row_slice] - box_high[1]), 0.0)
+        cell_mask[row_slice, column_slice] |= np.hypot(distance_z[:, None], distance_x[None]) < distance - TOLERANCE
+    return cell_mask
+
+
+def component_containing(free: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the 8-connected component of a cell, bool [nz, nx].
+
+    Args:
+      free: bool [nz, nx].
+      start: int [2], (iz, ix), a cell of `free`.
+    """
+    cell_mask = np.zeros_like(free)
+    for part_cells in connected_parts(free):
+        # The parts are disjoint, so exactly one of them holds the cell.
+        if (part_cells == start).all(axis=1).any():
+            cell_mask[tuple(part_cells.T)] = True
+            break
+    return cell_mask
+
+
+def _cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _iterate_windows(
+    boxes: np.ndarray, x: np.ndarray, z: np.ndarray, margin: float
+) -> Iterator[tuple[np.ndarray, tuple[slice, slice]]]:
+    """Yield each box with the rows and columns of cells that are at most `margin` from it in z and in x."""
+    # The coordinates are ascending, so two searches give the range of cells of every box.
+    low_corners = boxes[:, 0] - margin
+    high_corners = boxes[:, 1] + margin
+    column_ranges = zip(
+        np.searchsorted(x, low_corners[:, 0]), np.searchsorted(x, high_corners[:, 0], "right"), strict=True
+    )
+    row_ranges = zip(
+        np.searchsorted(z, low_corners[:, 1]), np.searchsorted(z, high_corners[:, 1], "right"), strict=True
+    )
+    for box, row_range, column_range in zip(boxes, row_ranges, column_ranges, strict=True):
+        yield box, (slice(*row_range), slice(*column_range))

@@ -10,7 +10,7 @@ from support.scene_records import as_scene
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.ai2thor import read_ai2thor
-from jaxnav.scenes.files.importers.assemble import Note
+from jaxnav.scenes.files.importers.assemble import ImportNote
 from jaxnav.scenes.files.importers.procthor import read_procthor
 from jaxnav.scenes.scene import Scene
 
@@ -33,8 +33,8 @@ def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
         (tmp_path / "assets.json").write_text(json.dumps(assets))
         database = tmp_path / "assets.json" if assets else None
         result, *notes = read_procthor(tmp_path / "house.json", "val", database, agent_part)
-        assert all(isinstance(note, Note) for note in notes)
-        assert not isinstance(result, Note)
+        assert all(isinstance(note, ImportNote) for note in notes)
+        assert not isinstance(result, ImportNote)
         return result
 
     return read

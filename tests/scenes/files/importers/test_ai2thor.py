@@ -6,7 +6,7 @@ from support.importer_inputs.ai2thor import METADATA, PLACES, TABLE
 from support.mutations import changed, without
 from support.scene_records import assert_scenes_equal
 
-from jaxnav.scenes.files.importers.ai2thor import scene_name, world_and_room_type
+from jaxnav.scenes.files.importers.ai2thor import strip_physics_suffix, world_and_room_type
 from jaxnav.scenes.files.scene_file import derive_walls, read_scenes, write_scenes
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import standable_cells
@@ -91,7 +91,7 @@ def test_names_tell_world_and_room_type(name, expected):
 
 
 def test_suffix_of_names_is_dropped():
-    assert [scene_name(name) for name in ("FloorPlan1_physics", "FloorPlan1", "_physics")] == [
+    assert [strip_physics_suffix(name) for name in ("FloorPlan1_physics", "FloorPlan1", "_physics")] == [
         "FloorPlan1",
         "FloorPlan1",
         "_physics",

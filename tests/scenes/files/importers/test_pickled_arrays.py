@@ -89,7 +89,7 @@ def test_a_pickle_cannot_change_how_later_ones_are_read(tmp_path, name):
 def test_damaged_missing_and_exploding_files_are_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "a.pbz2", pickle.dumps(np.zeros(100_000, np.uint8)))
     whole = path.read_bytes()
-    monkeypatch.setattr(pickled_arrays, "_MOST", 50_000)
+    monkeypatch.setattr(pickled_arrays, "_MAX_BYTE_LIMIT", 50_000)
     with pytest.raises(InputError, match="holds more than 50,000 bytes"):
         read_pickle(path)
     monkeypatch.undo()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.scenes.files.importers import polygons
+from jaxnav.scenes.files.importers import assemble as polygons
 
 
 @pytest.mark.parametrize(
@@ -27,21 +27,21 @@ from jaxnav.scenes.files.importers import polygons
 def test_simple_polygons(corners, simple):
     for shift in range(len(corners)):
         turned = np.roll(np.array(corners, float), shift, axis=0)
-        assert polygons.is_simple(turned) == polygons.is_simple(turned[::-1]) == simple
+        assert polygons.is_simple_polygon(turned) == polygons.is_simple_polygon(turned[::-1]) == simple
 
 
 @given(st.lists(st.floats(0.5, 3.0), min_size=7, max_size=7))
 def test_inside_equals_the_winding_number(radii):
     angles = np.linspace(0, 2 * np.pi, 7, endpoint=False) + 0.1
     corners = np.array(radii)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    assert polygons.is_simple(corners)  # radii around a centre
+    assert polygons.is_simple_polygon(corners)  # radii around a centre
     x, z = np.arange(-12, 13) * 0.25, np.arange(-10, 11) * 0.25
     to = corners - np.stack(np.meshgrid(x, z), axis=-1)[..., None, :]
     after = np.roll(to, -1, axis=-2)
     cross = to[..., 0] * after[..., 1] - to[..., 1] * after[..., 0]
     turns = np.arctan2(cross, (to * after).sum(axis=-1)).sum(axis=-1) / (2 * np.pi)
     clear = np.abs(cross).min(axis=-1) > 1e-9  # not on the line of an edge
-    np.testing.assert_array_equal(polygons.inside(corners, x, z)[clear], (np.abs(turns) > 0.5)[clear])
+    np.testing.assert_array_equal(polygons.points_in_polygon(corners, x, z)[clear], (np.abs(turns) > 0.5)[clear])
 
 
 def test_openings_are_taken_out_of_walls_along_them():
@@ -54,5 +54,5 @@ def test_openings_are_taken_out_of_walls_along_them():
         np.array([(2.0, 2.5), (2.5, 2.5)]),  # in a parallel wall
         np.array([(2.0, 1.5), (2.0, 2.5)]),  # across
     ]
-    pieces = polygons.without_openings(wall_line, openings)
+    pieces = polygons.subtract_openings(wall_line, openings)
     assert np.array(pieces).tolist() == [[[1.5, 2.0], [3.0, 2.0]], [[4.0, 2.0], [5.0, 2.0]]]

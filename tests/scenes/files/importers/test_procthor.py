@@ -9,7 +9,7 @@ from support.lattice import block, points_of
 from support.mutations import changed
 from support.scene_records import as_scene, assert_scenes_equal
 
-from jaxnav.scenes.files.importers.assemble import Note
+from jaxnav.scenes.files.importers.assemble import ImportNote
 from jaxnav.scenes.files.importers.procthor import read_procthor
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.scenes.lattice import standable_cells
@@ -63,7 +63,7 @@ LOW, HIGH = block(3, 3, 0.75, 1.25), block(3, 3, 1.75, 2.25)
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 3, 0, 1), (0, 1, 3, 2), (0, 2, 1, 3)])
 def test_holes_run_along_the_first_wall_from_its_first_corner(scene_of, owner, upwards, order, expected):
     house = changed(HOUSE, "doors", [door("3.00|0.00|3.00|3.00", 0.5, 1.5, (owner, 5 - owner))])
-    (shared,) = [each for each in house["walls"] if each["id"] == f"wall|{owner}|3.00|0.00|3.00|3.00"]
+    (shared,) = [record for record in house["walls"] if record["id"] == f"wall|{owner}|3.00|0.00|3.00|3.00"]
     corners = wall(owner, *sorted([(3, 0), (3, 3)], reverse=not upwards))["polygon"]
     shared["polygon"] = [corners[i] for i in order]
     scene = scene_of(house)
@@ -73,8 +73,8 @@ def test_holes_run_along_the_first_wall_from_its_first_corner(scene_of, owner, u
 
 def test_walls_that_are_empty_are_none(scene_of):
     house = changed(HOUSE, "doors", [])
-    for each in house["walls"]:
-        each["empty"] = each["id"].endswith("3.00|0.00|3.00|3.00")
+    for record in house["walls"]:
+        record["empty"] = record["id"].endswith("3.00|0.00|3.00|3.00")
     scene = scene_of(house)
     assert points_of(scene, scene.reach) == ROOM_2 | ROOM_3 | block(3, 3, 0.25, 2.75)
     assert points_of(scene, scene.walls) == OUTER
@@ -118,12 +118,12 @@ def test_the_agents_part_is_kept_if_asked_for(tmp_path, place, part, moved):
     (tmp_path / "house.json").write_text(json.dumps(house))
     (tmp_path / "assets.json").write_text(json.dumps(ASSETS))
     result, *notes = read_procthor(tmp_path / "house.json", "val", tmp_path / "assets.json", agent_part=True)
-    assert not isinstance(result, Note)
+    assert not isinstance(result, ImportNote)
     assert points_of(as_scene(result), as_scene(result).reach) == part
     # 121 and 106 cells: the part that is not kept is the other one.
     expected = {"cells are not connected with the agent and left out": 227 - len(part)}
     expected |= {"agents are moved to the nearest free cell": 1} if moved else {}
-    assert {note.text: note.number for note in notes if isinstance(note, Note)} == expected
+    assert {note.text: note.number for note in notes if isinstance(note, ImportNote)} == expected
 
 
 def test_a_house_of_one_room_has_its_type(scene_of):

@@ -4,10 +4,13 @@ import pytest
 from support.real_scenes import PROCTHOR, require
 
 from jaxnav.scenes.categories import category_ids
-from jaxnav.scenes.files.importers.assemble import Note
-from jaxnav.scenes.files.importers.procthor import read_procthor
-from jaxnav.scenes.files.importers.procthor_names import asset_type, object_type
-from jaxnav.scenes.files.importers.procthor_objects import read_assets
+from jaxnav.scenes.files.importers.assemble import ImportNote
+from jaxnav.scenes.files.importers.procthor import (
+    normalize_object_type,
+    read_assets,
+    read_procthor,
+    type_from_asset_name,
+)
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import HOUSES
 
@@ -28,7 +31,7 @@ from jaxnav.scenes.task import HOUSES
     ],
 )
 def test_names_of_assets_tell_types(name, kind):
-    assert asset_type(name) == kind
+    assert type_from_asset_name(name) == kind
 
 
 @pytest.mark.parametrize(
@@ -46,13 +49,13 @@ def test_names_of_assets_tell_types(name, kind):
     ],
 )
 def test_types_of_objaverse_that_are_categories_are_renamed(name, kind):
-    assert object_type(name) == kind
+    assert normalize_object_type(name) == kind
 
 
 def test_names_tell_the_type_of_every_asset_of_the_database():
     assets = read_assets(require(PROCTHOR / "asset-database.json"))
     assert len(assets) == 1653
-    assert {name: asset.type for name, asset in assets.items() if asset_type(name) != asset.type} == {}
+    assert {name: asset.type for name, asset in assets.items() if type_from_asset_name(name) != asset.type} == {}
 
 
 @pytest.mark.parametrize(("file", "houses", "guessed"), [("100k", 30, 2821), ("ai2", 20, 1431), ("objaverse", 100, 0)])
@@ -62,10 +65,10 @@ def test_real_houses_lose_no_goal_without_the_database(file, houses, guessed):
     for database in (PROCTHOR / "asset-database.json", None):
         results = list(read_procthor(path, "train", database))
         types.append([result.types for result in results if isinstance(result, Scene)])
-        notes = [note for note in results if isinstance(note, Note)]
+        notes = [note for note in results if isinstance(note, ImportNote)]
         numbers.append(sum(note.number for note in notes if note.text.startswith("types of objects are guessed")))
     assert len(types[0]) == houses
     assert types[0] == types[1]
     assert numbers == [0, guessed]
-    known = sum(category >= 0 for house in types[1] for category in category_ids(house, HOUSES.categories))
-    assert known > 17 * houses
+    num_known = sum(category >= 0 for house in types[1] for category in category_ids(house, HOUSES.categories))
+    assert num_known > 17 * houses

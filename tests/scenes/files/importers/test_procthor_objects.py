@@ -11,8 +11,8 @@ from support.mutations import changed
 from support.real_scenes import PROCTHOR, require
 from support.scene_records import assert_scenes_equal
 
-from jaxnav.scenes.files.importers.procthor_objects import Asset, read_assets, read_objects
-from jaxnav.scenes.files.record import Record
+from jaxnav.scenes.files.importers.procthor import AssetInfo, read_assets, read_objects
+from jaxnav.scenes.files.scene_file import JsonRecord
 from jaxnav.scenes.generate.sizes import typical_box
 
 
@@ -63,7 +63,7 @@ def test_counters_around_a_corner_are_strips(asset, yaw, strips):
     size = {"L": [3.0, 0.9, 2.4], "C": [2.4, 0.9, 1.8], "I": [2.4, 0.9, 1.8]}[asset[11]]
     pot = item("Pot|2|1", "Pot_1", 10.0, 1.0, 19.3)
     counter = item("CounterTop|2|0", asset, 10.0, 0.45, 20.0, yaw, children=[pot])
-    things = read_objects(Record("house", {"objects": [counter]}), {asset: Asset("CounterTop", size)}).things
+    things = read_objects(JsonRecord("house", {"objects": [counter]}), {asset: AssetInfo("CounterTop", size)}).objects
     boxes = np.array([thing.box for thing in things[:-1]])
     np.testing.assert_allclose(boxes[:, [0, 2, 3, 5]], strips, atol=1e-9)
     np.testing.assert_allclose(boxes[:, [1, 4]], [(0.45, 0.9)] * len(strips))
@@ -77,7 +77,7 @@ def test_all_that_stands_on_real_counters_stands_on_their_strips():
     corners, on_them = 0, 0
     for file in ("100k", "ai2", "objaverse"):
         lines = gzip.decompress((PROCTHOR / f"houses_{file}.jsonl.gz").read_bytes()).splitlines()
-        for things in (read_objects(Record("house", json.loads(line)), assets).things for line in lines):
+        for things in (read_objects(JsonRecord("house", json.loads(line)), assets).objects for line in lines):
             boxes = np.array([thing.box for thing in things])[:, [0, 2, 3, 5]]
             parents = np.array([thing.parent for thing in things])
             counters = np.array([thing.type == "CounterTop" for thing in things])
@@ -92,10 +92,10 @@ def test_all_that_stands_on_real_counters_stands_on_their_strips():
 
 def test_the_name_of_a_counter_tells_its_size_in_feet():
     counter = item("CounterTop|2|0", "Countertop_Island_10x3", 10.0, 0.47, 20.0)
-    objects = read_objects(Record("house", {"objects": [counter]}), {})
+    objects = read_objects(JsonRecord("house", {"objects": [counter]}), {})
     # 10 and 3 feet of 0.305 m.
-    assert objects.things[0].box == pytest.approx((10.0, 0.47, 20.0, 3.05, 0.94, 0.915))
-    assert (objects.types, objects.sizes) == (0, 0)
+    assert objects.objects[0].box == pytest.approx((10.0, 0.47, 20.0, 3.05, 0.94, 0.915))
+    assert (objects.num_guessed_types, objects.num_guessed_sizes) == (0, 0)
 
 
 def test_children_follow_their_parents(scene_of):

@@ -34,12 +34,15 @@ class RandomHouse(NamedTuple):
         return self.width // 0.25 * 0.25 - 0.25, 0.5
 
     def document(self) -> dict[str, Any]:
-        width, depth, at, side = self.width, self.depth, self.middle, self.door_start
+        width = self.width
+        depth = self.depth
+        middle = self.middle
+        side = self.door_start
         openness = 0.0 if self.shut else 0.3
         return build(
-            ("Kitchen", [(0, 0), (at, 0), (at, depth), (0, depth)]),
-            ("Bedroom", [(at, 0), (width, 0), (width, depth), (at, depth)]),
-            doors=(door(f"{at:.2f}|0.00|{at:.2f}|{depth:.2f}", side, side + 1.0, openness=openness),),
+            ("Kitchen", [(0, 0), (middle, 0), (middle, depth), (0, depth)]),
+            ("Bedroom", [(middle, 0), (width, 0), (width, depth), (middle, depth)]),
+            doors=(door(f"{middle:.2f}|0.00|{middle:.2f}|{depth:.2f}", side, side + 1.0, openness=openness),),
             objects=(item("Fridge|2|0", "Fridge_1", self.fridge[0], 0.9, self.fridge[1], self.yaw),),
             agent=self.start,
         )
@@ -56,9 +59,16 @@ class RandomHouse(NamedTuple):
 
     def wall_lines(self) -> list[tuple[float, ...]]:
         """Return the walls: low x, z and high x, z."""
-        width, depth, at, side = self.width, self.depth, self.middle, self.door_start
+        width = self.width
+        depth = self.depth
+        middle = self.middle
+        side = self.door_start
         outer = [(0, 0, width, 0), (0, depth, width, depth), (0, 0, 0, depth), (width, 0, width, depth)]
-        return outer + ([(at, 0, at, depth)] if self.shut else [(at, 0, at, side), (at, side + 1.0, at, depth)])
+        return outer + (
+            [(middle, 0, middle, depth)]
+            if self.shut
+            else [(middle, 0, middle, side), (middle, side + 1.0, middle, depth)]
+        )
 
 
 @st.composite

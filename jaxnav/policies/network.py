@@ -1,0 +1,534 @@
+"""The policy network: from an observation to pathways, and from pathways to a decision.
+
+`Policy` is the network of the paper: three pathways (scene, goal, experience) fused before one recurrent core.
+`StreamsPolicy` has two recurrent cores whose logits are added: one for scene and goal, one for experience. Both are NNX
+modules that are built once; only their parameters, a nested dict of arrays, are kept in states and on disk:
+
+    params = init_params(spec, key)
+    policy = bind(spec, params)
+    pathways = policy.pathways(observation, weights, reading, surroundings, memory)
+    decision = policy.decide(pathways, memory)
+    counterfactual = policy.decide(do(pathways, scene=0, goal=0), memory)
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from jaxnav.env.objectnav import Observation
+from jaxnav.numerics.product import Linear, add_bias, matmul_rows
+from jaxnav.numerics.recurrence import gru_step
+from jaxnav.numerics.rounding import round_to_grid
+from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, unpack_features
+from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyState, mask_experience
+from jaxnav.policies.spatial_memory import SpatialMemory
+from jaxnav.policies.spec import PolicySpec, Sizes
+from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.task import DONE, NUM_ACTIONS
+
+Params = dict[str, Any]
+
+#: Initial bias of Done's logit: without the Done gate Done is then chosen about once in 60 steps. An agent that gives
+#: up at once never learns what it might have found.
+INITIAL_DONE_LOGIT = -2.5
+#: Factor of the Done gate, times the confidence of the goal's detection.
+DONE_GATE = 0.58
+
+#: What an adaptation adds to the outputs [..., N] of the layers `fuse`, `drive` (the core's input kernel), `core` (its
+#: recurrent kernel) and `actor`, given the inputs [..., M] of each. Where the layer has a bias the last input is 1.
+LayerChanges = Mapping[str, Callable[[jax.Array], jax.Array]]
+NO_CHANGES: LayerChanges = MappingProxyType({})
+
+
+# Building and binding
+
+
+def init_params(spec: PolicySpec, key: jax.Array) -> Params:
+    """Draw fresh parameters, a nested dict of float32 arrays."""
+    policy = _POLICIES[spec.decision](spec, nnx.Rngs(params=key))
+    return nnx.to_pure_dict(nnx.state(policy, nnx.Param))
+
+
+def bind(spec: PolicySpec, params: Params) -> "Policy":
+    """Bind parameters to a policy; cheap, so that jitted functions may call it."""
+    return nnx.merge(_graph(spec), params)
+
+
+@functools.lru_cache(maxsize=16)
+def _graph(spec: PolicySpec) -> "nnx.GraphDef[Policy]":
+    """Return the structure of a policy without its parameters."""
+    # Abstract evaluation gives the structure without drawing parameters.
+    abstract_policy = nnx.eval_shape(lambda: _POLICIES[spec.decision](spec, nnx.Rngs(0)))
+    return nnx.split(abstract_policy)[0]
+
+
+# One recurrent core
+
+
+class Stream(nnx.Module):
+    """A recurrent core with what enters it (`fuse`) and the heads on it (`actor`, `critic`).
+
+    The parts of a step are methods of their own, so that training can compute each for whole rollouts at once:
+
+        mediated_input + direct input -> input_gates -+
+                                                      +-> GRU -> apply_heads
+        hidden state                 -> hidden_gates -+
+    """
+
+    def __init__(
+        self,
+        widths: tuple[int, ...],
+        num_choices: int,
+        spec: PolicySpec,
+        rngs: nnx.Rngs,
+        done_logit: float = INITIAL_DONE_LOGIT,
+    ) -> None:
+        """Create the layers.
+
+        Args:
+          widths: of all inputs; the last two are those of experience and previous action.
+          num_choices: A.
+          spec: of the policy.
+          rngs: of the parameters.
+          done_logit: first bias of Done's logit, where choices are actions.
+        """
+        self.widths = widths
+        self.hidden = spec.sizes.hidden
+        self.done_gate = spec.done_gate
+        self.fuse = Linear(sum(widths), self.hidden, rngs=rngs)
+        self.core = nnx.GRUCell(self.hidden, self.hidden, rngs=rngs)
+
+        # Small first logits: the first policy is close to uniform but for Done.
+        small_kernel = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
+        first_logits = np.zeros(num_choices, np.float32)
+        if num_choices == NUM_ACTIONS:
+            first_logits[DONE] = done_logit
+        self.actor = Linear(
+            self.hidden,
+            num_choices,
+            kernel_init=small_kernel,
+            bias_init=lambda *_: jnp.asarray(first_logits),
+            rngs=rngs,
+        )
+        self.critic = Linear(self.hidden, 1, rngs=rngs)
+
+    def mediated_input(self, pathways: Pathways, action: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Project experience and previous action; float32 [..., H].
+
+        Args:
+          pathways: leaves [..., ...].
+          action: int32 [...], the previous action.
+          changes: of the layers. A change of `fuse`, which reads all pathways, is added here.
+        """
+        # The kernel of `fuse` is a sum over its inputs, so the direct ones can be added separately.
+        *_, experience_kernel, action_kernel = self.fuse_kernels
+        previous_action = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
+        projected = matmul_rows(pathways.experience, experience_kernel) + matmul_rows(previous_action, action_kernel)
+        mediated = add_bias(projected, self.fuse)
+        if "fuse" not in changes:
+            return mediated
+
+        # A change of `fuse` reads all inputs at once, with a 1 for the bias.
+        all_inputs = pathways.scene, pathways.goal, pathways.experience, previous_action
+        return mediated + changes["fuse"](append_one(jnp.concatenate(all_inputs, axis=-1)))
+
+    def input_gates(self, fused: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Project the fused input float32 [..., H] to the input part of the GRU's gates, float32 [..., 3 H]."""
+        inputs = nnx.relu(fused)
+        gates = add_bias(matmul_rows(inputs, self.core.dense_i.kernel[...]), self.core.dense_i)
+        return gates + changes["drive"](append_one(inputs)) if "drive" in changes else gates
+
+    def hidden_gates(self, hidden: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Project the hidden state float32 [..., H] to the recurrent part of the GRU's gates, float32 [..., 3 H]."""
+        gates = hidden @ self.core.dense_h.kernel[...]
+        return gates + changes["core"](hidden) if "core" in changes else gates
+
+    def apply_heads(self, hidden: jax.Array, pathways: Pathways, changes: LayerChanges = NO_CHANGES) -> Decision:
+        """Compute logits and value from a hidden state float32 [..., H]."""
+        logits = self.actor(hidden)
+        if "actor" in changes:
+            logits = logits + changes["actor"](append_one(hidden))
+        # The critic has no changes: an adaptation is about actions.
+        value = self.critic(hidden)[..., 0]
+        return Decision(logits=self.gate_done(logits, pathways), value=value, hidden=hidden)
+
+    def gate_done(self, logits: jax.Array, pathways: Pathways) -> jax.Array:
+        """Multiply the logit of Done by the gate, where there is one."""
+        if not self.done_gate:
+            return logits
+        return jnp.concatenate([logits[..., :DONE], pathways.gate * logits[..., DONE:]], axis=-1)
+
+    @property
+    def layer_widths(self) -> dict[str, tuple[int, int]]:
+        """Widths of inputs and outputs of the layers that an adaptation may change."""
+        num_gates = 3 * self.hidden
+        return {
+            "fuse": (sum(self.widths) + 1, self.hidden),
+            "drive": (self.hidden + 1, num_gates),
+            "core": (self.hidden, num_gates),
+            "actor": (self.hidden + 1, self.actor.out_features),
+        }
+
+    @property
+    def recurrent_kernel(self) -> jax.Array:
+        """Kernel of the hidden state, float32 [H, 3 H]."""
+        return self.core.dense_h.kernel[...]
+
+    @property
+    def fuse_kernels(self) -> list[jax.Array]:
+        """Kernel of each input, in the order of `widths`."""
+        return jnp.split(self.fuse.kernel[...], np.cumsum(self.widths)[:-1])
+
+
+def append_one(values: jax.Array) -> jax.Array:
+    """Append a 1 to values [..., N]."""
+    return jnp.concatenate([values, jnp.ones_like(values[..., :1])], axis=-1)
+
+
+# The paper's network
+
+
+class Policy(Stream):
+    """Three pathways, fused before one recurrent core; works on single observations and batches."""
+
+    num_views: ClassVar[int] = 1  # embeddings of the view
+
+    def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
+        method = spec.method
+        sizes = spec.sizes
+        self.row_format = RowFormat(spec.num_categories)
+        self.perceive = method.perceive
+        self.adaptation = method.adaptation
+        self.direct = spec.direct
+        self.goal_row = spec.goal_row
+        # A method may restrict what the networks see, down to the number of categories.
+        perceived_spec = dataclasses.replace(spec, num_categories=self._num_perceived_categories())
+
+        # Scene S: the view, the spatial memory and the method's inputs about the scene.
+        num_scene_inputs = 2 * self.row_format.view**2 + method.experience.num_scene_inputs
+        if spec.spatial_memory is not None:
+            num_scene_inputs += spec.spatial_memory.num_inputs
+        self.appearance = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
+        self.view = Linear(num_scene_inputs, self.num_views * sizes.view_outputs, rngs=rngs)
+
+        # Goal G: detections and the category that is sought. Experience Z: the method's own module.
+        self.detections = CategoryMaps.for_detections(perceived_spec, rngs)
+        self.sought = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
+        self.method = method.experience(perceived_spec, rngs)
+
+        super().__init__(self._input_widths(sizes), method.control.num_choices, spec, rngs)
+
+    def pathways(
+        self,
+        observation: Observation,
+        weights: jax.Array,
+        reading: Any = None,
+        surroundings: jax.Array | None = None,
+        memory: PolicyState | None = None,
+    ) -> Pathways:
+        """Embed what is seen (S), what is sought (G), and what experience makes of both (Z).
+
+        Args:
+          observation: a batch [...] of observations.
+          weights: float32 [..., K], the layout's weights for the goal (eq. 7); ones leave the layout out.
+          reading: what the method's tracker read, leaves [...]; None without a tracker.
+          surroundings: uint8 [..., M], what the spatial memory read; None without one.
+          memory: leaves [...]; needed where the method attends with it.
+
+        Raises:
+          ValueError: the method attends with its memory, and there is none.
+        """
+        # Memory enters in `attend` alone, so that everything before can run for whole rollouts at once.
+        encoded = self.encode(observation, weights, reading, surroundings)
+        if not self.method.recurrent:
+            return encoded
+        if memory is None:
+            raise ValueError("pathways: the method attends with its memory; give it")
+        return self.attend(encoded, memory)
+
+    def encode(
+        self,
+        observation: Observation,
+        weights: jax.Array,
+        reading: Any = None,
+        surroundings: jax.Array | None = None,
+    ) -> Pathways:
+        """Embed without memory, in parallel over time; the experience may still have to `attend`."""
+        # Unpack the rows, and restrict them to what the method lets the networks see.
+        features = unpack_features(observation.row, observation.goal, self.row_format)
+        if self.perceive is not None:
+            features = self.perceive(features)
+
+        # S: everything about the scene that does not depend on objects.
+        scene_inputs = features.view
+        if surroundings is not None:
+            scene_inputs = jnp.concatenate([scene_inputs, SpatialMemory.encode_surroundings(surroundings)], axis=-1)
+        if self.method.num_scene_inputs:
+            scene_inputs = jnp.concatenate([scene_inputs, self.method.scene_inputs(reading)], axis=-1)
+        scene = nnx.relu(self.view(scene_inputs))
+
+        # G: detections and the goal.
+        goal = self._embed_goal(features, self.appearance.embedding[...])
+
+        # Z: the method, with eq. 7's weights. The belief is no function of the parameters.
+        layout_weights = jax.lax.stop_gradient(weights)
+        experience = self.method.encode(features, self.experience_appearance, layout_weights, reading)
+
+        # The gate of Done follows the confidence with which the goal is detected.
+        confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)
+        gate = DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence)
+        return Pathways(scene, goal, experience, gate, reading)
+
+    def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
+        """Let the experience of `encode` attend with the memory."""
+        return encoded._replace(experience=self.method.attend(encoded.experience, memory))
+
+    def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
+        """Return action logits and value.
+
+        Where a factual and a counterfactual decision stand in one compiled function, what they share (the products of
+        experience and of memory) is computed once.
+        """
+        # Some training episodes are without experience, so that the direct stream learns to act alone.
+        pathways = mask_experience(pathways, memory.use_experience)
+        if self.adaptation is None:
+            decision = self.decide_without_adaptation(pathways, memory)
+        else:
+            decision = self.adaptation.decide(self, pathways, memory)
+        return decision._replace(use_experience=memory.use_experience)
+
+    def decide_without_adaptation(
+        self, pathways: Pathways, memory: PolicyState, changes: LayerChanges = NO_CHANGES
+    ) -> Decision:
+        """Decide without the method's adaptation, which may call this with changes of the layers.
+
+        With streams these are the layers of the direct stream.
+        """
+        # Fuse the pathways and the previous action, [..., H], or [..., 2 H] with streams.
+        fused = self.direct_input(pathways) + self.mediated_input(pathways, memory.action, changes)
+        input_gates = self.input_gates(fused, changes)
+        hidden_gates = self.hidden_gates(memory.hidden, changes)
+        # Step the recurrent core, and decide from its new hidden state.
+        hidden = gru_step(input_gates, hidden_gates, memory.hidden)
+        return self.apply_heads(hidden, pathways, changes)._replace(fast=memory.fast)
+
+    def direct_input(self, pathways: Pathways) -> jax.Array:
+        """Project both direct pathways, float32 [..., H]; linear, so zero where both are zero."""
+        scene_kernel, goal_kernel, *_ = self.fuse_kernels
+        return matmul_rows(pathways.scene, scene_kernel) + matmul_rows(pathways.goal, goal_kernel)
+
+    def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
+        """Return the memory at the start of an episode, leaves [*batch, ...]."""
+        memory = PolicyState(hidden=jnp.zeros((*batch, self.hidden)), action=jnp.full(batch, NO_ACTION, jnp.int32))
+        return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
+
+    @property
+    def recurrent(self) -> bool:
+        """True where training has to unroll the policy step by step."""
+        return self.method.recurrent or self.adaptation is not None
+
+    @property
+    def experience_appearance(self) -> jax.Array:
+        """Embeddings of the categories that experience reads, float32 [K, d]."""
+        return self.appearance.embedding[...]
+
+    @property
+    def pathway_widths(self) -> tuple[int, ...]:
+        """Widths of scene, goal, experience and gate."""
+        return *self.widths[:3], 1
+
+    def _input_widths(self, sizes: Sizes) -> tuple[int, ...]:
+        """Widths of scene, goal, experience and previous action."""
+        # Maps of the categories, the row of the goal where it is used, and the embedding of the goal.
+        goal_width = self.detections.width + sizes.row_outputs * self.goal_row + sizes.appearance
+        return sizes.view_outputs, goal_width, self.method.width, NUM_ACTIONS
+
+    def _num_perceived_categories(self) -> int:
+        """Number of categories that the networks see, after the method's `perceive`."""
+        num_categories = self.row_format.num_categories
+        if self.perceive is None:
+            return num_categories
+        # Only shapes are needed: trace `perceive` without computing it.
+        row = jax.ShapeDtypeStruct((self.row_format.num_bytes,), jnp.uint8)
+        features = jax.eval_shape(lambda row: unpack_features(row, jnp.int32(0), self.row_format), row)
+        return jax.eval_shape(self.perceive, features).visible.shape[-1]
+
+    def _embed_goal(self, features: Features, appearance: jax.Array) -> jax.Array:
+        """Embed detections and the category that is sought, without experience.
+
+        With `goal_row` the goal's detection enters twice: in the row of its category and in a row of its own. When to
+        say Done is then learned for all goals at once.
+        """
+        # Rows [..., K, h]; the setting of `direct` decides which of them enter.
+        rows = self.detections.project_detections(features, appearance)
+        if self.direct == "goal":
+            rows = rows * features.goal[..., None]
+        elif self.direct == "none":
+            rows = rows * jnp.zeros_like(features.goal)[..., None]
+
+        # All categories first, then the row of the goal, then which goal is sought.
+        embeddings = [self.detections.finish(rows)]
+        if self.goal_row:
+            goal_row = (rows * features.goal[..., None]).sum(axis=-2, keepdims=True)
+            embeddings.append(self.detections.finish(goal_row))
+        embeddings.append(features.goal @ self.sought.embedding[...])
+        return jnp.concatenate(embeddings, axis=-1)
+
+
+# Two streams
+
+
+class StreamsPolicy(Policy):
+    """Two streams, whose logits and values are added.
+
+    The direct stream reads scene and goal; the stream of experience reads all of `Pathways.experience`, which
+    includes a view of its own. Scene and experience end with a 1, a factor on the stream: setting the pathway to 0
+    removes the stream. The direct stream learns where it acts alone; the stream of experience learns what to add to it.
+    """
+
+    num_views = 2
+
+    def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
+        super().__init__(spec, rngs)
+        # Its inputs: experience with a view of its own and the factor 1, and the previous action.
+        experience_widths = self.method.width + spec.sizes.view_outputs + 1, NUM_ACTIONS
+        num_choices = self.actor.out_features
+        self.experience_stream = Stream(experience_widths, num_choices, spec, rngs, done_logit=0.0)
+        # Embeddings of its own, so that experience shares none with the direct stream.
+        self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
+
+    def encode(
+        self,
+        observation: Observation,
+        weights: jax.Array,
+        reading: Any = None,
+        surroundings: jax.Array | None = None,
+    ) -> Pathways:
+        """Embed without memory; the experience may still have to `attend`."""
+        encoded = super().encode(observation, weights, reading, surroundings)
+        # The layer of the view embeds it twice, once per stream; the appended 1 is the factor of the stream.
+        direct_view, experience_view = jnp.split(encoded.scene, 2, axis=-1)
+        experience = encoded.experience, append_one(experience_view)
+        encoded = encoded._replace(scene=append_one(direct_view), experience=experience)
+        return encoded if self.method.recurrent else _join_experience(encoded)
+
+    def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
+        """Let the experience of `encode` attend with the memory of its stream."""
+        if not self.method.recurrent:
+            return encoded
+        experience, experience_view = encoded.experience
+        # The second half of the hidden state belongs to the stream of experience.
+        stream_memory = memory._replace(hidden=memory.hidden[..., self.hidden :])
+        attended = self.method.attend(experience, stream_memory)
+        return _join_experience(encoded._replace(experience=(attended, experience_view)))
+
+    def direct_input(self, pathways: Pathways) -> jax.Array:
+        """Project both direct pathways, float32 [..., 2 H]; zero for the stream of experience."""
+        direct = super().direct_input(pathways)
+        return jnp.concatenate([direct, jnp.zeros_like(direct)], axis=-1)
+
+    def mediated_input(self, pathways: Pathways, action: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Project experience and previous action, float32 [..., 2 H]; the direct stream reads the action alone."""
+        # The experience of the direct stream has width 0.
+        no_experience = pathways._replace(experience=pathways.experience[..., :0])
+        direct = super().mediated_input(no_experience, action, changes)
+        experience = self.experience_stream.mediated_input(pathways, action)
+        return jnp.concatenate([direct, experience], axis=-1)
+
+    def input_gates(self, fused: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Project the fused input float32 [..., 2 H] to the input part of both cores' gates, float32 [..., 6 H]."""
+        direct, experience = jnp.split(fused, 2, axis=-1)
+        direct_gates = super().input_gates(direct, changes)
+        experience_gates = self.experience_stream.input_gates(experience)
+        return _interleave_gates(direct_gates, experience_gates)
+
+    def hidden_gates(self, hidden: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Project both hidden states float32 [..., 2 H] to the recurrent part of their gates, float32 [..., 6 H]."""
+        direct, experience = jnp.split(hidden, 2, axis=-1)
+        direct_gates = super().hidden_gates(direct, changes)
+        experience_gates = self.experience_stream.hidden_gates(experience)
+        return _interleave_gates(direct_gates, experience_gates)
+
+    def apply_heads(self, hidden: jax.Array, pathways: Pathways, changes: LayerChanges = NO_CHANGES) -> Decision:
+        """Add logits and values of both streams, each times its factor; hidden is float32 [..., 2 H]."""
+        # Each stream has its half of the hidden state and heads of its own.
+        direct_hidden, experience_hidden = jnp.split(hidden, 2, axis=-1)
+        direct = super().apply_heads(direct_hidden, pathways, changes)
+        experience = self.experience_stream.apply_heads(experience_hidden, pathways)
+
+        # Where experience takes part, the direct stream is fixed and experience learns what to add.
+        direct_factor = pathways.scene[..., -1:]
+        experience_factor = pathways.experience[..., -1:]
+        direct = _stop_gradient_where(direct, experience_factor != 0)
+
+        # Rounded, so that the sum is exact and removing one stream (eq. 1) leaves the other bit-identical.
+        logits = round_to_grid(direct_factor * direct.logits) + round_to_grid(experience_factor * experience.logits)
+        value = direct_factor[..., 0] * direct.value + experience_factor[..., 0] * experience.value
+        return Decision(logits, value, hidden)
+
+    def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
+        """Return the memory at the start of an episode, leaves [*batch, ...]."""
+        memory = super().initial_memory(batch)
+        return memory._replace(hidden=jnp.zeros((*batch, 2 * self.hidden)), use_experience=jnp.ones(batch))
+
+    @property
+    def experience_appearance(self) -> jax.Array:
+        """Embeddings of the categories that experience reads, float32 [K, d]."""
+        return self.known_appearance.embedding[...]
+
+    @property
+    def recurrent_kernel(self) -> jax.Array:
+        """Kernel of both hidden states, float32 [2 H, 6 H]: block-diagonal gate by gate."""
+        # The order of the gates is that of `_interleave_gates`: for each gate, the direct stream first.
+        direct_gates = _split_gates(super().recurrent_kernel)
+        experience_gates = _split_gates(self.experience_stream.recurrent_kernel)
+        blocks = map(jax.scipy.linalg.block_diag, direct_gates, experience_gates)
+        return jnp.concatenate(list(blocks), axis=-1)
+
+    @property
+    def pathway_widths(self) -> tuple[int, ...]:
+        """Widths of scene, goal, experience and gate."""
+        return *self.widths[:2], self.experience_stream.widths[0], 1
+
+    def _input_widths(self, sizes: Sizes) -> tuple[int, ...]:
+        """Widths of the direct stream's inputs."""
+        scene_width, goal_width, _, num_actions = super()._input_widths(sizes)
+        return scene_width + 1, goal_width, 0, num_actions
+
+
+def _stop_gradient_where(decision: Decision, condition: jax.Array) -> Decision:
+    """Stop the gradient of logits and value where the condition, bool [..., 1], holds."""
+    # The hidden state keeps its gradient.
+    fixed = jax.lax.stop_gradient(decision)
+    return decision._replace(
+        logits=jnp.where(condition, fixed.logits, decision.logits),
+        value=jnp.where(condition[..., 0], fixed.value, decision.value),
+    )
+
+
+def _join_experience(encoded: Pathways) -> Pathways:
+    """Concatenate the method's experience and the view of its stream."""
+    return encoded._replace(experience=jnp.concatenate(encoded.experience, axis=-1))
+
+
+def _interleave_gates(direct: jax.Array, experience: jax.Array) -> jax.Array:
+    """Join gates [..., 3 H] of both streams gate by gate, [..., 6 H]."""
+    joined = []
+    for direct_gate, experience_gate in zip(_split_gates(direct), _split_gates(experience), strict=True):
+        joined += [direct_gate, experience_gate]
+    return jnp.concatenate(joined, axis=-1)
+
+
+def _split_gates(values: jax.Array) -> list[jax.Array]:
+    """Split [..., 3 H] into reset gate, update gate and candidate."""
+    return jnp.split(values, 3, axis=-1)
+
+
+_POLICIES: dict[str, type[Policy]] = {"fused": Policy, "streams": StreamsPolicy}

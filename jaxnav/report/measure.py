@@ -1,0 +1,180 @@
+"""Measurements for the report: evaluates finished runs at one layout shift and replays some of their episodes.
+
+`measure_shift` is the entry point; `ReportOptions` configures it.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.report import ExperienceLead, row_label
+from jaxnav.evaluation.similarity import cooccurrence_counts
+from jaxnav.report.replays import ReplayAgent, Replays, make_replays
+from jaxnav.runs.evaluate import Results, evaluate, measure_leads
+from jaxnav.runs.policies import Policies
+from jaxnav.runs.run import Run
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+from jaxnav.study.gap_traces import GapTraces, trace_gaps
+from jaxnav.study.records import SuccessBySimilarity
+from jaxnav.study.similarity import compute_similarity_points, relate_success_to_similarity
+from jaxnav.training.calibration import layout_priors
+
+#: Length of the curves of the gap, steps.
+GAP_STEPS = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportOptions:
+    """Options of the measurements for a report.
+
+    Attributes:
+      split: scenes to evaluate on.
+      shift: layout shifts, from 0 to 1.
+      episodes: number of episodes in the fixed list, at each shift.
+      epsilon: thresholds of sTDE.
+      threshold: threshold of the tables and of the replays; added to `epsilon`.
+      replays: number of episodes to replay, in all.
+      seed: seed of the episode list and the sampled actions.
+    """
+
+    split: str
+    shift: tuple[float, ...]
+    episodes: int
+    epsilon: tuple[float, ...]
+    threshold: float
+    replays: int
+    seed: int
+
+    def evaluate_run(self, run: Run, shift: float, world: CompiledWorld, console: Console) -> Results:
+        """Evaluate a run at a shift, as `jaxnav eval` does."""
+        return evaluate(
+            run,
+            split=self.split,
+            shift=shift,
+            episodes=self.episodes,
+            epsilon=sorted({*self.epsilon, self.threshold}),
+            seed=self.seed,
+            compiled=world,
+            console=console,
+        )
+
+
+class ShiftMeasurements(NamedTuple):
+    """Measurements at one layout shift.
+
+    Attributes:
+      results: evaluation of the run.
+      account: leads of the run over agents without experience; None without a run of such agents.
+      similarity: success by layout similarity; None where scenes are streamed.
+      gaps: layout gap along the episodes; None where scenes are streamed, or without the layout.
+      replays: episodes, step by step.
+    """
+
+    results: Results
+    account: list[ExperienceLead] | None
+    similarity: SuccessBySimilarity | None
+    gaps: GapTraces | None
+    replays: Replays
+
+
+def measure_shift(
+    run: Run, reference_run: Run | None, shift: float, options: ReportOptions, console: Console
+) -> ShiftMeasurements:
+    """Measure a run at one layout shift.
+
+    Args:
+      run: a finished run.
+      reference_run: a finished run of agents that cannot know any layout, in the same world; None for none.
+      shift: layout shift.
+      options: options of the measurements.
+      console: receives messages about the progress.
+
+    Raises:
+      InputError: no finished run, an impossible option, or runs that cannot be compared.
+    """
+    # Evaluate the run.
+    world = compile_evaluation_world(run.config, options.split, None, shift, console)
+    results = options.evaluate_run(run, shift, world, console)
+    policies = run.policies()
+    agents = _select_agents(results, policies, world, options.threshold)
+
+    # Compare with agents without experience, and replay the best of them, too.
+    account = None
+    if reference_run is not None:
+        quiet_console = Console(quiet=True)
+        reference_world = compile_evaluation_world(reference_run.config, options.split, None, shift, quiet_console)
+        reference_results = options.evaluate_run(reference_run, shift, reference_world, quiet_console)
+        account = measure_leads(results, reference_results)
+
+        # Among the replays these agents have a role of their own.
+        reference_policies = reference_run.policies()
+        for agent in _select_agents(reference_results, reference_policies, reference_world, options.threshold):
+            if agent.role == "baseline":
+                agents.append(agent._replace(role="without"))
+
+    # Similarity and gap need all scenes in one bank.
+    episodes = _episodes_of_first_bank(results.episodes, world)
+    has_one_bank = len(world.banks) == 1
+    similarity = _measure_similarity(results, policies, world) if has_one_bank else None
+    gap_traces = None
+    if has_one_bank and policies.estimator_config is not None:
+        gap_traces = _measure_gaps(episodes, policies, world, options.seed)
+
+    # The number of replays is that of the whole page.
+    replays_per_shift = options.replays // len(set(options.shift))
+    replays = make_replays(agents, episodes, replays_per_shift, shift, options.split)
+    return ShiftMeasurements(results, account, similarity, gap_traces, replays)
+
+
+def _select_agents(results: Results, policies: Policies, world: CompiledWorld, threshold: float) -> list[ReplayAgent]:
+    """Return the agents whose episodes are replayed: those with best actions, and sTDE at the threshold."""
+    num_episodes = len(_episodes_of_first_bank(results.episodes, world).goal)
+
+    # Rows of the oracle and of TDE have no place among the pairs that the page compares.
+    agents = []
+    for row_index, row in enumerate(results.rows):
+        if row.decoding != "argmax" or row.variant in ("oracle", "tde") or row.epsilon not in (None, threshold):
+            continue
+        # Results of the first seed: [rows, seeds, E].
+        episode_success = np.asarray(results.outcome.success)[row_index, 0, :num_episodes]
+        episode_length = np.asarray(results.outcome.length)[row_index, 0, :num_episodes]
+        agent_name = row_label(results.report["rows"][row_index])
+        agents.append(ReplayAgent(row.variant, agent_name, policies, world, row, episode_success, episode_length))
+    return agents
+
+
+def _episodes_of_first_bank(episodes: EpisodeList, world: CompiledWorld) -> EpisodeList:
+    """Return the episodes of the first bank; all banks have equally many."""
+    return episodes.take(np.arange(len(episodes.goal) // len(world.banks)))
+
+
+def _measure_similarity(results: Results, policies: Policies, world: CompiledWorld) -> SuccessBySimilarity:
+    """Relate the success of the first row to layout similarity."""
+    # Counts of the prior for each scene's type of room, [scenes, K, K].
+    bank = world.banks[0]
+    room_of_scene = np.asarray(world.make_env_params(0).room)[: len(bank.names)]
+    prior_counts = np.asarray(policies.prior_counts, np.float64)[room_of_scene]
+
+    # One point for each scene and goal, with the success of the episodes that belong to it.
+    similarity_points = compute_similarity_points(results.episodes, cooccurrence_counts(bank), prior_counts)
+    return relate_success_to_similarity(similarity_points, np.asarray(results.outcome.success)[0])
+
+
+def _measure_gaps(episodes: EpisodeList, policies: Policies, world: CompiledWorld, seed: int) -> GapTraces:
+    """Trace the layout gap of the layout arm along the episodes."""
+    assert policies.estimator_config is not None
+    return trace_gaps(
+        policies.arm_params("layout"),
+        episodes,
+        world.make_env_params(0),
+        policies.make_agent_loop(world),
+        policies.knowledge,
+        [policies.estimator_config],
+        layout_priors(policies.prior_counts, policies.estimator_config)[None],
+        GAP_STEPS,
+        jax.random.key(seed),
+    )

@@ -1,0 +1,229 @@
+"""Configurations in YAML files, applied to frozen dataclasses.
+
+`apply_yaml` replaces the values that a file names in a tree of dataclasses, and checks each value against the
+annotation of its field. `apply_values` does the same for values that were read from elsewhere, and `parse_setting`
+reads one value from the command line.
+"""
+
+import dataclasses
+import difflib
+import math
+import reprlib
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union
+
+import yaml
+
+from jaxnav.errors import InputError
+
+Config = TypeVar("Config")
+
+#: Configurations that come with jaxnav, by name.
+CONFIGS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))}
+
+#: Settings that were renamed: old name to new name.
+RENAMED_SETTINGS = {"sizes.relation_layers": "method_sizes.relation_layers"}
+
+
+def apply_yaml(default: Config, source: str | Path) -> Config:
+    """Apply a YAML configuration to a dataclass.
+
+    Only fields that the file names change, and each value is checked against the annotation of its field. Supported
+    annotations are `bool`, `int`, `float`, `str`, `Path`, `Any`, `Literal`, `X | None`, `tuple`, `dict` and nested
+    dataclasses. A float field also accepts whole numbers, and text such as `3e-4` (which is text in YAML 1.1).
+
+    Args:
+      default: instance of a frozen dataclass.
+      source: name of a packaged configuration, see `CONFIGS`, or a YAML file; an empty file changes nothing.
+
+    Returns:
+      A copy of `default` with the values of the file.
+
+    Raises:
+      InputError: the file is missing or is no YAML mapping, has a key twice, an unknown key or a value of another type.
+        The message names the file, the line or dotted key, and a remedy.
+    """
+    path = CONFIGS.get(str(source), Path(source))
+    values = _load_yaml(path)
+    return default if values is None else _apply_mapping(default, values, path, "")
+
+
+def apply_values(default: Config, values: dict[str, Any], source: Path) -> Config:
+    """Apply values that were read from the file `source` to a dataclass; see `apply_yaml`.
+
+    Raises:
+      InputError: see `apply_yaml`.
+    """
+    return _apply_mapping(default, values, source, "")
+
+
+def parse_setting(text: str, annotation: Any) -> Any:
+    """Parse the YAML text of one setting, or raise `ValueError` where it does not fit the annotation."""
+    try:
+        return _convert(yaml.load(text, _UniqueKeyLoader), annotation)
+    except (_MismatchError, yaml.YAMLError) as error:
+        raise ValueError(f"{text!r}: give {_describe_type(annotation)} in YAML") from error
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """Safe YAML loader that refuses repeated keys, of which `SafeLoader` would silently use the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        mapping_keys = set()
+        for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                continue
+            if key_node.value in mapping_keys:
+                problem = f"{key_node.value} is given twice"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
+            mapping_keys.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+def _load_yaml(path: Path) -> Any:
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), _UniqueKeyLoader)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such configuration; choose from {', '.join(CONFIGS)}, or give a file") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except yaml.MarkedYAMLError as error:
+        line_note = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise InputError(f"{path}{line_note}: not valid YAML ({error.problem}); mend the line") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # no text, impossible dates, deep nesting
+        raise InputError(f"{path}: not valid YAML ({error}); mend the file") from error
+
+
+def _apply_mapping(default: Any, values: Any, path: Path, prefix: str) -> Any:
+    """Apply a mapping to a dataclass; `prefix` is the dotted key of the dataclass, with a final dot."""
+    if not isinstance(values, dict):
+        mapping_name = f"{prefix.rstrip('.')} " if prefix else ""
+        raise InputError(f"{path}: {mapping_name}holds {_describe_value(values)}; give a mapping of names to values")
+
+    field_types = typing.get_type_hints(type(default))
+    field_names = [config_field.name for config_field in dataclasses.fields(default)]
+    changed_fields = {}
+    for name, value in values.items():
+        key = f"{prefix}{name}"
+        _check_key(name, key, field_names, path, prefix)
+
+        # Nested dataclasses are changed field by field.
+        current_value = getattr(default, name)
+        if dataclasses.is_dataclass(current_value):
+            changed_fields[name] = _apply_mapping(current_value, value, path, f"{key}.")
+            continue
+        try:
+            changed_fields[name] = _convert(value, field_types[name])
+        except _MismatchError as error:
+            expected_type = _describe_type(field_types[name])
+            raise InputError(
+                f"{path}: {key} must be {expected_type}, but is {_describe_value(value)}; change the value"
+            ) from error
+    return dataclasses.replace(default, **changed_fields)
+
+
+def _check_key(name: Any, key: str, field_names: list[str], path: Path, prefix: str) -> None:
+    """Refuse a key that is no field, and name the most likely one."""
+    for old_name, new_name in RENAMED_SETTINGS.items():
+        if f".{key}".endswith(f".{old_name}"):
+            raise InputError(f"{path}: unknown key {key}; it is {new_name} now")
+    # A key that was never known is probably a slip.
+    if name not in field_names:
+        close_names = difflib.get_close_matches(str(name), field_names, n=1)
+        if close_names:
+            advice = f"did you mean {prefix}{close_names[0]}?"
+        else:
+            advice = f"known here are {', '.join(field_names)}"
+        raise InputError(f"{path}: unknown key {key}; {advice}")
+
+
+class _MismatchError(Exception):
+    """Error for a value that does not fit its annotation."""
+
+
+def _convert(value: Any, annotation: Any) -> Any:
+    """Convert a value to the annotated type, or raise `_MismatchError`."""
+    type_origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
+    if type_origin in (Union, types.UnionType):
+        for argument_type in arguments:
+            try:
+                return _convert(value, argument_type)
+            except _MismatchError:
+                continue
+    elif type_origin is Literal:
+        # The types must agree too, because True == 1.
+        if any(type(value) is type(literal_option) and value == literal_option for literal_option in arguments):
+            return value
+    elif type_origin is tuple:
+        return _convert_tuple(value, arguments)
+    elif type_origin is dict:
+        return _convert_dict(value, arguments)
+    elif annotation is float:
+        return _convert_float(value)
+    elif annotation is Any:
+        return value
+    elif annotation is Path:
+        return Path(_convert(value, str))
+    elif annotation in (bool, int, str, types.NoneType):
+        if type(value) is annotation:
+            return value
+    else:
+        raise TypeError(f"config fields of type {annotation!r} cannot be read from YAML")
+    raise _MismatchError
+
+
+def _convert_tuple(value: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise _MismatchError
+    # `tuple[X, ...]` takes lists of any length.
+    if arguments[1:] == (Ellipsis,):
+        arguments = arguments[:1] * len(value)
+    if len(value) != len(arguments):
+        raise _MismatchError
+    return tuple(_convert(yaml_item, argument_type) for yaml_item, argument_type in zip(value, arguments, strict=True))
+
+
+def _convert_dict(value: Any, arguments: tuple[Any, ...]) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        raise _MismatchError
+    key_type, item_type = arguments
+    return {_convert(key, key_type): _convert(yaml_item, item_type) for key, yaml_item in value.items()}
+
+
+def _convert_float(value: Any) -> float:
+    if type(value) not in (int, float, str):
+        raise _MismatchError
+    try:
+        # YAML reads some notations, such as 1e-3, as text.
+        float_value = float(value)
+    except (ValueError, OverflowError):
+        raise _MismatchError from None
+    if math.isnan(float_value):
+        raise _MismatchError
+    return float_value
+
+
+def _describe_type(annotation: Any) -> str:
+    """Describe an annotation: `float or null`, `one of 'a', 'b'`."""
+    type_origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
+    if type_origin in (Union, types.UnionType):
+        return " or ".join(map(_describe_type, arguments))
+    if type_origin is Literal:
+        return f"one of {', '.join(map(repr, arguments))}"
+    if type_origin is tuple and arguments[1:] == (Ellipsis,):
+        return f"a list of {_describe_type(arguments[0])}"
+    if type_origin is tuple:
+        return f"a list [{', '.join(map(_describe_type, arguments))}]"
+    if type_origin is dict:
+        return f"a mapping of {_describe_type(arguments[0])} to {_describe_type(arguments[1])}"
+    # Other types have their own name, such as `float`.
+    type_names: dict[Any, str] = {Path: "a path", Any: "anything", types.NoneType: "null"}
+    return type_names.get(annotation) or annotation.__name__
+
+
+def _describe_value(value: Any) -> str:
+    return "null" if value is None else f"{reprlib.repr(value)} ({type(value).__name__})"

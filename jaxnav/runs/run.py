@@ -1,0 +1,248 @@
+"""A run directory: its configuration, logs and lock.
+
+`Run` opens a finished or interrupted run and gives access to its policies and logs. Training holds the directory with
+`lock_run_dir` while it writes. `config.json` keeps the settings that identify the run (`run_settings`), so that
+training can resume only with the same settings.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import apply_values
+from jaxnav.runs.policies import POLICIES_DIR, Policies, load_policies
+from jaxnav.store.files import (
+    FolderLock,
+    LogRow,
+    append_log_rows,
+    list_differences,
+    read_json_with_digest,
+    read_log_rows,
+    truncate_log_after,
+    write_json_with_digest,
+)
+from jaxnav.training.devices import run_on_first_process
+
+CONFIG_FILE = "config.json"
+#: Training metrics, a row for each chunk, arm and seed.
+LOG_FILE = "metrics.jsonl"
+#: Seconds of training, a row for each chunk.
+TIMES_FILE = "times.jsonl"
+#: Success of the exported policies within budgets of actions; see `Validator.success_by_budget`.
+REACH_FILE = "reach.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A training run.
+
+    Attributes:
+      config: configuration of the run; `config.run_dir` is its directory.
+    """
+
+    config: RunConfig
+
+    @classmethod
+    def open(cls, run_dir: str | Path) -> "Run":
+        """Open an earlier run.
+
+        Raises:
+          InputError: the directory holds no run, or its configuration file is damaged or of another version.
+        """
+        return cls(load_run_config(Path(run_dir)))
+
+    def policies(self, arms: Sequence[str] | None = None) -> Policies:
+        """Load the exported policies; see `load_policies`."""
+        return load_policies(self.config, arms)
+
+    def log(self) -> list[dict[str, Any]]:
+        """Training log, a row for each chunk, arm and seed."""
+        return RunLogs(self.config).metrics()
+
+    def times(self) -> list[dict[str, Any]]:
+        """Seconds that training took, a row for each chunk.
+
+        `wall_s` and `cpu_s` count from the start, and include compilation, validation and earlier, interrupted calls.
+        """
+        return RunLogs(self.config).times()
+
+    def success_by_budget(self) -> dict[str, Any] | None:
+        """Success within budgets of actions, see `Validator.success_by_budget`; None for a run without val scenes."""
+        path = self.config.run_dir / REACH_FILE
+        if not path.exists():
+            return None
+        return read_json_with_digest(path, "remove it and train again with this --run-dir")
+
+
+def run_settings(config: RunConfig) -> dict[str, Any]:
+    """Settings that identify a run, as JSON.
+
+    Paths, devices and the number of calls between checkpoints are left out, because they may change when a run resumes.
+    """
+    setting_fields = dataclasses.asdict(config)
+    setting_fields = json.loads(json.dumps(setting_fields, default=str))  # tuples become lists, as in the file
+    for name in ("run_dir", "save_every", "cache", "devices"):
+        del setting_fields[name]
+    return setting_fields
+
+
+def load_run_config(run_dir: Path) -> RunConfig:
+    """Read the configuration of an earlier run.
+
+    Raises:
+      InputError: the directory holds no run, or its configuration file is damaged or of another version.
+    """
+    path = run_dir / CONFIG_FILE
+    if not path.exists():
+        raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
+    # The digest reveals edits and damage.
+    saved_settings = read_json_with_digest(path, "restore the file or train in another --run-dir")
+
+    # Settings that are missing in the file would silently take their default values.
+    config = apply_values(RunConfig(), saved_settings, path)
+    setting_differences = list_differences(saved_settings, run_settings(config))
+    if setting_differences:
+        raise InputError(
+            f"{path}: lacks settings ({'; '.join(setting_differences)}); restore the file or train the run anew"
+        )
+    return check_config(dataclasses.replace(config, run_dir=run_dir))
+
+
+@contextlib.contextmanager
+def lock_run_dir(config: RunConfig) -> Iterator[FolderLock]:
+    """Hold the run directory for this run while the context is entered.
+
+    Of several processes of a run, the first one holds the directory for all.
+
+    Raises:
+      InputError: the directory holds another run or other files, or another process trains in it.
+    """
+    folder_lock = FolderLock(config.run_dir)
+
+    def claim_and_lock() -> None:
+        claim_run_dir(config)
+        folder_lock.acquire()
+        claim_run_dir(config)  # another process may have claimed it before the lock was acquired
+
+    try:
+        run_on_first_process(claim_and_lock)
+        yield folder_lock
+    except Exception:
+        folder_lock.check()  # a missing directory explains whatever else failed
+        raise
+    finally:
+        folder_lock.release()
+
+
+def claim_run_dir(config: RunConfig) -> None:
+    """Write the settings to the run directory, or check that they are there.
+
+    Raises:
+      InputError: the directory holds another run or other files.
+    """
+    run_dir = config.run_dir
+    path = run_dir / CONFIG_FILE
+
+    # A directory with a run must hold this run.
+    if path.exists():
+        setting_differences = list_differences(run_settings(load_run_config(run_dir)), run_settings(config))
+        if setting_differences:
+            raise InputError(
+                f"{run_dir}: holds another run (there != asked for): {'; '.join(setting_differences)}; "
+                "choose another --run-dir or the same settings"
+            )
+        return
+
+    # Any other directory must be empty, except for temporary files of a call that was killed in this function.
+    if run_dir.exists() and not run_dir.is_dir():
+        raise InputError(f"{run_dir}: is a file; choose another --run-dir")
+    if run_dir.exists() and any(not folder_item.match(f".{CONFIG_FILE}.*.tmp") for folder_item in run_dir.iterdir()):
+        raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
+    write_json_with_digest(path, run_settings(config))
+
+
+@dataclasses.dataclass(frozen=True)
+class RunLogs:
+    """Logs of a run: `metrics.jsonl` and `times.jsonl`.
+
+    Attributes:
+      config: configuration of the run.
+    """
+
+    config: RunConfig
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Rows of the training metrics; empty without the file.
+
+        Raises:
+          InputError: a row is damaged or missing.
+        """
+        return self._read(LOG_FILE)
+
+    def times(self) -> list[dict[str, Any]]:
+        """Rows of seconds; empty without the file.
+
+        Raises:
+          InputError: a row is damaged or missing.
+        """
+        return self._read(TIMES_FILE)
+
+    def append(self, metrics: Sequence[LogRow], times: LogRow) -> None:
+        """Append the rows of one chunk."""
+        append_log_rows(self.config.run_dir / LOG_FILE, metrics)
+        append_log_rows(self.config.run_dir / TIMES_FILE, [times])
+
+    def rewind(self, update: int) -> None:
+        """Drop the rows after an update, because training resumes there and will log them again.
+
+        Raises:
+          InputError: a row up to the update is damaged or missing.
+        """
+        for name in (LOG_FILE, TIMES_FILE):
+            path = self.config.run_dir / name
+            truncate_log_after(path, update)
+            self._check_rows(name, read_log_rows(path), update)
+
+    def _read(self, name: str) -> list[dict[str, Any]]:
+        rows = read_log_rows(self.config.run_dir / name)
+
+        # The logs of a finished run must be complete.
+        is_finished = bool(rows) and (self.config.run_dir / POLICIES_DIR).exists()
+        self._check_rows(name, rows, self.config.total_updates if is_finished else 0)
+        return rows
+
+    def _check_rows(self, name: str, rows: Sequence[dict[str, Any]], last_update: int) -> None:
+        """Refuse rows that are out of order or incomplete up to `last_update`."""
+        config = self.config
+
+        # Rows of a log without gaps: every chunk in order, and in it every arm and seed.
+        last_row_update = max([last_update, *(row["step"] for row in rows)])
+        logged_updates = range(config.chunk, last_row_update + 1, config.chunk)
+        arm_seeds: list[tuple[str | None, int | None]] = [(None, None)]
+        if name == LOG_FILE:
+            arm_seeds = list(itertools.product(config.arms, range(config.seeds)))
+        expected_rows = []
+        for update in logged_updates:
+            for arm, seed in arm_seeds:
+                expected_rows.append((update, arm, seed))
+        actual_rows = [(row["step"], row.get("arm"), row.get("seed")) for row in rows]
+
+        # The log may end early, but only after `last_update`.
+        num_equal = 0
+        for actual_row, expected_row in zip(actual_rows, expected_rows, strict=False):
+            if actual_row != expected_row:
+                break
+            num_equal += 1
+        has_wrong_row = num_equal < len(actual_rows)
+        ends_early = num_equal < len(expected_rows) and expected_rows[num_equal][0] <= last_update
+        if has_wrong_row or ends_early:
+            raise InputError(
+                f"{config.run_dir / name}, line {num_equal + 1}: rows are missing or out of order; restore the file or "
+                "train in another --run-dir"
+            )

@@ -1,0 +1,128 @@
+"""Layout shift: categories of similar size exchange their places.
+
+`exchange_places` is a dial for how much of the learned layout is wrong in a scene, from 0 (none) to 1 (all categories).
+"""
+
+import dataclasses
+import zlib
+
+import numpy as np
+
+from jaxnav.errors import InputError
+from jaxnav.scenes.categories import category_ids
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.tables.observation_row import detection_range, object_size
+from jaxnav.scenes.tables.visibility import cell_centres
+from jaxnav.scenes.task import Task
+
+
+def exchange_places(scene: Scene, task: Task, shift: float, seed: int) -> Scene:
+    """Exchange the places of categories of similar size.
+
+    The categories present, ordered by the mean volume of their boxes, form pairs of neighbours: goals among goals,
+    other categories among other categories. The three largest form one group if their number is odd. In a random order
+    of the groups, the first `shift` of them, rounded, and at least one, exchange: the objects of each category go to
+    the places of the next smaller one, those of the smallest to the places of the largest. If there are more places
+    than objects, objects are repeated; if there are fewer, the last objects are dropped.
+
+    A place is a centre (x, z), the height of the underside, a yaw and a support. An object keeps its own box, turned
+    with the place, and with it the range in which it is detected. Only where its box would cover a standable cell, or
+    where other objects rest on a place and the range is equal, it gets the box of the place's former object. Standable
+    cells, walls and the number of objects stay.
+
+    Args:
+      scene: the scene.
+      task: its categories and goals.
+      shift: share of the groups, from 0 to 1.
+      seed: at least 0; with the scene's name it fixes the order of the groups.
+
+    Returns:
+      The shifted scene; `scene` itself if `shift` is 0 or nothing can be exchanged.
+    """
+    category = np.array(category_ids(scene.types, task.categories), int)
+    volumes = scene.boxes[:, 3:].prod(axis=1)
+    size_groups = _group_by_size(category, volumes, task.is_goal())
+    if shift == 0 or not size_groups:
+        return scene
+
+    # The order of the groups depends on seed and name alone, so a larger shift exchanges a superset of categories.
+    rng = np.random.default_rng([seed, zlib.crc32(scene.name.encode())])
+    group_order = rng.permutation(len(size_groups))
+    num_exchanged = max(1, round(shift * len(size_groups)))
+
+    # The object that moves to each place.
+    new_objects = np.arange(len(category))
+    for group_index in group_order[:num_exchanged]:
+        size_group = size_groups[group_index]
+        next_larger = size_group[1:] + size_group[:1]
+        for old_category, new_category in zip(size_group, next_larger, strict=True):
+            old_places = np.flatnonzero(category == old_category)
+            moving_objects = np.flatnonzero(category == new_category)
+            new_objects[old_places] = np.resize(moving_objects, len(old_places))
+
+    new_types = tuple(scene.types[i] for i in new_objects)
+    return dataclasses.replace(scene, types=new_types, boxes=_boxes_at_new_places(scene, new_objects))
+
+
+def check_shift(shift: float, seed: int) -> None:
+    """Check the numbers of a layout shift.
+
+    Raises:
+      InputError: `shift` or `seed` is out of range.
+    """
+    if seed < 0 or not 0.0 <= shift <= 1.0:  # also rejects NaN
+        raise InputError(f"layout shift: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
+
+
+def _group_by_size(category: np.ndarray, volumes: np.ndarray, is_goal: np.ndarray) -> list[list[int]]:
+    """Group the categories present by size, two or three in a group.
+
+    Args:
+      category: int [N], category of each object, -1 for none.
+      volumes: float [N], of the objects' boxes.
+      is_goal: bool [K]; goals and other categories are in different groups.
+    """
+    # The categories present from the smallest to the largest mean volume; ties in the order of the vocabulary.
+    present_categories = sorted(set(category.tolist()) - {-1})
+    by_size = sorted(present_categories, key=lambda k: volumes[category == k].mean())
+
+    # Neighbours in size form pairs; the last one of an odd number joins the last pair.
+    size_groups: list[list[int]] = []
+    for among_goals in (True, False):
+        candidates = [k for k in by_size if is_goal[k] == among_goals]
+        size_pairs: list[list[int]] = []
+        for i in range(0, len(candidates) - 1, 2):
+            size_pairs.append(candidates[i : i + 2])
+        if size_pairs and len(candidates) % 2:
+            size_pairs[-1].append(candidates[-1])
+        size_groups += size_pairs
+    return size_groups
+
+
+def _boxes_at_new_places(scene: Scene, new_objects: np.ndarray) -> np.ndarray:
+    """Return the boxes after the exchange, float64 [N, 6].
+
+    Args:
+      scene: the places, and the objects.
+      new_objects: int [N], the object that moves to each place.
+    """
+    old_boxes = scene.boxes
+    new_boxes = old_boxes.copy()
+
+    # Objects keep their size, with width and depth swapped where the place is turned by a quarter.
+    new_boxes[:, 3:] = old_boxes[new_objects, 3:]
+    is_quarter_turned = np.rint((scene.yaws - scene.yaws[new_objects]) / 90.0) % 2 == 1
+    new_boxes[is_quarter_turned, 3:] = new_boxes[is_quarter_turned][:, [5, 4, 3]]
+    new_boxes[:, 1] += (new_boxes[:, 4] - old_boxes[:, 4]) / 2  # the underside stays
+
+    # The old box stays where the new one would cover a standable cell.
+    cells = cell_centres(scene, standable_cells(scene.reach))
+    is_within = np.abs(cells[:, None] - new_boxes[:, [0, 2]]) < new_boxes[:, [3, 5]] / 2  # [C, N, 2]
+    covers_cell = is_within.all(axis=-1).any(axis=0)
+
+    # It also stays under objects that rest on it, if the range of detection is equal.
+    is_support = np.isin(np.arange(len(old_boxes)), scene.parents)
+    same_range = detection_range(object_size(new_boxes)) == detection_range(object_size(old_boxes))
+    keep_old_box = covers_cell | (is_support & same_range)
+    return np.where(keep_old_box[:, None], old_boxes, new_boxes)

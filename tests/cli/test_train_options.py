@@ -1,0 +1,145 @@
+"""The options of the train command: renamed ones, those of the method, the help."""
+
+import dataclasses
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+from support.commands import refusal, train
+
+from jaxnav.__main__ import main
+from jaxnav.cli import train as train_command
+from jaxnav.cli.console import parse_config
+from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import CONFIGS, apply_yaml
+
+PRESETS = [
+    "ablations",
+    "long",
+    "paper",
+    "paper_vtnet",
+    "small_goals",
+    "smoke",
+    "study",
+    "study_quick",
+    "table2",
+    "table3",
+]
+
+
+@pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
+@pytest.mark.parametrize("value", [" 2", "=2"])
+def test_renamed_options_are_refused_with_their_new_name(tmp_path, capsys, option, value):
+    assert train_command.main(["--run-dir", str(tmp_path / "run"), *f"{option}{value}".split()]) == 2
+    assert refusal(capsys) == f"error: {option}: unknown option; it is --method-sizes relation_layers N now"
+    assert not (tmp_path / "run").exists()
+
+
+def test_renamed_options_keep_the_group_they_are_nested_in():
+    with pytest.raises(InputError, match=r"it is --base\.method-sizes relation_layers N now"):
+        parse_config(RunConfig(), ["--base.sizes.relation-layers", "2"], "study", "")
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "expected"),
+    [
+        ("", ["--method-sizes", "relation_layers", "2"], {"relation_layers": 2}),
+        ("method_sizes: {relation_layers: 3}", [], {"relation_layers": 3}),
+        ("method_sizes: {relation_layers: 3}", ["--method-sizes", "relation_layers", "2"], {"relation_layers": 2}),
+        (
+            "method_sizes: {relation_layers: 3}",
+            ["--method-sizes", "a", "1", "b", "2", "--seeds", "1"],
+            {"a": 1, "b": 2},
+        ),
+        ("method_sizes: {relation_layers: 3}", ["--method-sizes"], {}),
+    ],
+)
+def test_sizes_of_the_method_are_one_option(tmp_path, file, options, expected):
+    path = tmp_path / "config.yaml"
+    path.write_text(file)
+    assert parse_config(RunConfig(), ["--config", str(path), *options], "train.py", "").method_sizes == expected
+
+
+def test_the_help_names_every_setting(capsys):
+    with pytest.raises(SystemExit) as exit:
+        train_command.main(["--help"])
+    assert exit.value.code == 0
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    for words in (
+        "--method STR how experience is made",
+        "--method-sizes [NAME INT [NAME INT ...]]",
+        "--config NAME|FILE.yaml",
+    ):
+        assert words in text
+    for field in dataclasses.fields(RunConfig):
+        assert f"--{field.name.replace('_', '-')}" in text
+
+
+def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
+    for missing in (tmp_path / "none.yaml", "smoek"):
+        assert train(missing, tmp_path / "run") == 2
+        mend = f"choose from {', '.join(PRESETS)}, or give a file"
+        assert refusal(capsys) == f"error: {missing}: no such configuration; {mend}"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_config_is_the_name_of_a_packaged_one_or_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "smoke").write_text("seeds: 4")  # the name goes first
+
+    def seeds(config):
+        return parse_config(RunConfig(), ["--config", config], "train.py", "").seeds
+
+    assert list(CONFIGS) == PRESETS
+    assert (seeds("smoke"), seeds("./smoke"), seeds(str(CONFIGS["smoke"]))) == (1, 4, 1)
+
+
+def test_the_example_of_a_configuration_is_a_possible_run():
+    (example,) = (Path(__file__).parents[2] / "configs").glob("*.yaml")
+    config = check_config(apply_yaml(RunConfig(), example))
+    assert config.seeds == 5
+    assert config not in (RunConfig(), apply_yaml(RunConfig(), "smoke"))
+
+
+@pytest.mark.parametrize("command", ["train", "study", "compare", "instrument"])
+def test_the_help_lists_the_option_of_the_configuration(capsys, command):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    assert text.startswith(f"usage: jaxnav {command} ")
+    assert "--config NAME|FILE.yaml settings to lay over the defaults: a packaged configuration (ablations, " in text
+
+
+@pytest.mark.parametrize(
+    ("script", "usage"),
+    [
+        ("train.py", "usage: train.py "),
+        ("eval.py", "usage: eval.py "),
+        ("eval.py study", "usage: eval.py study "),
+        ("eval.py instrument", "usage: eval.py instrument "),
+    ],
+)
+def test_the_help_of_a_script_names_the_script(monkeypatch, capsys, script, usage):
+    monkeypatch.setattr("sys.argv", [*script.split(), "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(Path(__file__).parents[2] / script.split()[0]), run_name="__main__")
+    assert capsys.readouterr().out.startswith(usage)
+
+
+@pytest.mark.parametrize("value", [["nonsense"], ["relation_layers"], ["relation_layers", "two"]])
+def test_sizes_without_whole_numbers_are_refused(tmp_path, capsys, value):
+    with pytest.raises(SystemExit) as exit:
+        train_command.main(["--run-dir", str(tmp_path / "run"), "--method-sizes", *value])
+    assert exit.value.code == 2
+    assert "--method-sizes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--ppo.gamma", "--seeds", "--layout.setting"])
+def test_bad_options_are_refused(tmp_path, capsys, option):
+    with pytest.raises(SystemExit) as exit:
+        train_command.main(["--run-dir", str(tmp_path / "run"), option, "nonsense"])
+    assert exit.value.code == 2
+    assert option in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,121 @@
+"""Two policies of which one acts: a hand-over leaves the one without experience, as if it had acted all along."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+
+from jaxnav.causal import do
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.evaluation.grid import Evaluator
+from jaxnav.evaluation.removal import GapSource
+from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.numerics.rounding import round_to_grid
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.spatial_memory import SpatialMemory
+from jaxnav.runs.policies import Policies
+
+ENV, PARAMS = tiny.world()
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
+ANONYMOUS = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
+PAIR = AgentLoop(ENV, tiny.SPEC, tiny.SETTING, fallback_spec=ANONYMOUS)
+ALONE = AgentLoop(ENV, ANONYMOUS)
+AGENT, WITHOUT = tiny.lively(6), tiny.lively(9, ANONYMOUS)
+BOTH = {"agent": AGENT, "without": WITHOUT}
+EPISODES, KEY = draw_episodes(tiny.BANK, 24, seed=1), jax.random.key(3)
+
+
+def outcome(acting, weights, row, **changes):
+    """How the episodes go."""
+    cells = inference_grid([row], ("layout",), 1)
+    cells = cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
+    stacked = jax.tree.map(lambda leaf: leaf[None], weights)
+    return Evaluator(acting)(cells, stacked, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+
+
+def alike(one, other):
+    """Check that episodes went alike, whatever was removed in them."""
+    chex.assert_trees_all_equal(one._replace(mean_weight=0), other._replace(mean_weight=0))
+
+
+@pytest.fixture(scope="module")
+def unaware():
+    """Episodes of the policy without experience, which wears the name of the one arm that is there."""
+    return outcome(ALONE, WITHOUT, table_row("layout", None, None, "argmax"))
+
+
+def test_what_removal_leaves_is_the_policy_without_experience_to_the_bit():
+    decider = PAIR.decider(BOTH)
+    batch = jnp.arange(8)
+    agent = PAIR.start(KEY, len(batch), decider.initial_memory(batch.shape), KNOWLEDGE, PARAMS)
+    memory = agent.memory
+    assert memory is not None
+    view = PAIR.view(agent, KNOWLEDGE, PARAMS)
+    pathways = decider.pathways(*view, memory)
+    factual = decider.decide(pathways, memory)
+    removed = decider.decide(do(pathways, scene=0.0, goal=0.0), memory)
+    own, other = PAIR.bind(AGENT), ALONE.bind(WITHOUT)
+    knowing = own.decide(own.pathways(*view), own.initial_memory(batch.shape))
+    unknowing = other.decide(
+        other.pathways(view.observation, jnp.ones_like(view.weights), None, view.surroundings),
+        other.initial_memory(batch.shape),
+    )
+    chex.assert_trees_all_equal(factual.logits - removed.logits, round_to_grid(unknowing.logits))
+    chex.assert_trees_all_equal(factual.logits, round_to_grid(knowing.logits))
+    chex.assert_trees_all_equal(factual.hidden, jnp.concatenate([knowing.hidden, unknowing.hidden], axis=-1))
+    assert np.abs(knowing.logits - unknowing.logits).max() > 0.1
+
+
+def test_without_removal_the_policy_with_experience_acts():
+    row = table_row("layout", None, None, "argmax")
+    alike(outcome(PAIR, BOTH, row), outcome(AgentLoop(ENV, tiny.SPEC, tiny.SETTING), AGENT, row))
+
+
+def test_under_tde_the_policy_without_experience_acts(unaware):
+    alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), unaware)
+
+
+def test_handed_over_at_the_first_step_it_is_the_same(unaware):
+    switch = table_row("stde", 0.5, "switch", "argmax")
+    at_once = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=0, gap_end=2**30)
+    alike(at_once, unaware)
+    # Two steps later it is neither of the two, but begins as the one with experience.
+    later = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=2**30)
+    assert (np.asarray(later.length) != np.asarray(at_once.length)).any()
+    assert (np.asarray(later.mean_weight) > 0).any()
+    assert (np.asarray(later.mean_weight) < 1).all()
+
+
+def policies(spec, params):
+    knowledge = Knowledge(KNOWLEDGE.layout)
+    return Policies(params, ("layout",), knowledge, knowledge.layout, spec, None, 0, tiny.BANK.task)
+
+
+def test_parameters_stand_side_by_side():
+    one, other = (jax.tree.map(lambda leaf: leaf[None], tree) for tree in (AGENT, WITHOUT))
+    pair = policies(tiny.SPEC, one).with_handover_to(policies(ANONYMOUS, other))
+    assert pair.handover_spec == ANONYMOUS
+    assert pair.num_seeds == 1
+    chex.assert_trees_all_equal(pair.params, {"agent": one, "without": other})
+
+
+@pytest.mark.parametrize(
+    ("changes", "mend"),
+    [
+        ({"method": find_method("hoz")}, "'org' cannot hand over to 'hoz'; train a run with --method anonymous"),
+        ({"method": find_method("semexp")}, "'org' cannot hand over to 'semexp'"),
+        ({"spatial_memory": None}, "one of the runs has no spatial memory; train both alike"),
+    ],
+)
+def test_what_cannot_be_handed_over_to_is_refused(changes, mend):
+    own = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
+    other = dataclasses.replace(ANONYMOUS, **{"spatial_memory": own.spatial_memory} | changes)
+    with pytest.raises(InputError, match=mend):
+        policies(own, AGENT).with_handover_to(policies(other, WITHOUT))

@@ -1,0 +1,200 @@
+"""YAML over config dataclasses: what is taken, what is refused and how the message helps."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.config_files import CONFIGS, apply_yaml
+
+
+@dataclasses.dataclass(frozen=True)
+class Ppo:
+    learning_rate: float = 1e-3
+    clip: float | None = 0.2
+    epochs: int = 4
+    anneal: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    ppo: Ppo = Ppo(epochs=2)
+    name: str = "run"
+    setting: Literal["paper", "calibrated", 1] = "paper"
+    epsilons: tuple[float, ...] = (0.1,)
+    view: tuple[int, int] = (11, 11)
+    limit: "int | None" = None
+
+
+@pytest.fixture
+def overlay(tmp_path):
+    def apply(text: str | bytes) -> Config:
+        path = tmp_path / "config.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return apply_yaml(Config(), path)
+
+    return apply
+
+
+def test_only_named_values_change(overlay):
+    # ppo.epochs is 2 in the default instance (4 in the class): what the file leaves out stays as in the instance.
+    assert overlay("ppo:\n  learning_rate: 0.5\nname: x\n") == Config(ppo=Ppo(learning_rate=0.5, epochs=2), name="x")
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "{}"])
+def test_empty_file_changes_nothing(overlay, text):
+    assert overlay(text) == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("ppo: {learning_rate: 3e-4}", Config(ppo=Ppo(learning_rate=3e-4, epochs=2))),  # a text in YAML 1.1
+        ("ppo: {learning_rate: 1}", Config(ppo=Ppo(learning_rate=1.0, epochs=2))),
+        ("ppo: {clip: null}", Config(ppo=Ppo(clip=None, epochs=2))),
+        ("ppo: {clip: 1e-1}", Config(ppo=Ppo(clip=0.1, epochs=2))),
+        ("ppo: {anneal: false}", Config(ppo=Ppo(anneal=False, epochs=2))),
+        ("epsilons: [1e-2, 1, .inf]", Config(epsilons=(0.01, 1.0, float("inf")))),
+        ("epsilons: []", Config(epsilons=())),
+        ("view: [5, 7]", Config(view=(5, 7))),
+        ("limit: 3", Config(limit=3)),
+        ("setting: calibrated", Config(setting="calibrated")),
+        ("setting: 1", Config(setting=1)),
+        ("name: '3'", Config(name="3")),
+    ],
+)
+def test_values_are_taken_by_annotation(overlay, text, expected):
+    result = overlay(text)
+    assert result == expected
+    assert repr(result) == repr(expected)  # 1 == 1.0, but their texts differ
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "expected", "wrong_type"),
+    [
+        ("ppo: {learning_rate: fast}", "ppo.learning_rate", "float", "'fast' (str)"),
+        ("ppo: {learning_rate: true}", "ppo.learning_rate", "float", "True (bool)"),
+        ("ppo: {learning_rate: null}", "ppo.learning_rate", "float", "null"),
+        ("ppo: {learning_rate: .nan}", "ppo.learning_rate", "float", "nan (float)"),
+        ("ppo: {epochs: 4.0}", "ppo.epochs", "int", "4.0 (float)"),
+        ("ppo: {epochs: true}", "ppo.epochs", "int", "True (bool)"),
+        ("ppo: {epochs: 1e3}", "ppo.epochs", "int", "'1e3' (str)"),
+        ("ppo: {anneal: 1}", "ppo.anneal", "bool", "1 (int)"),
+        ("ppo: {clip: [1]}", "ppo.clip", "float or null", "[1] (list)"),
+        ("name: 3", "name", "str", "3 (int)"),
+        ("setting: papr", "setting", "one of 'paper', 'calibrated', 1", "'papr' (str)"),
+        ("setting: true", "setting", "one of", "True (bool)"),
+        ("epsilons: 0.1", "epsilons", "a list of float", "0.1 (float)"),
+        ("epsilons: [0.1, x]", "epsilons", "a list of float", "[0.1, 'x'] (list)"),
+        ("view: [1]", "view", "a list [int, int]", "[1] (list)"),
+        ("limit: many", "limit", "int or null", "'many' (str)"),
+        ("ppo: 3", "ppo", "a mapping", "3 (int)"),
+        ("ppo:", "ppo", "a mapping", "null"),
+    ],
+)
+def test_wrong_types_are_refused(overlay, text, key, expected, wrong_type):
+    with pytest.raises(InputError) as error:
+        overlay(text)
+    for part in ("config.yaml: ", f" {key} ", expected, wrong_type):
+        assert part in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("ppo: {learning_rat: 1}", ["unknown key ppo.learning_rat", "did you mean ppo.learning_rate?"]),
+        ("nmae: x", ["unknown key nmae", "did you mean name?"]),
+        ("qqqq: 1", ["unknown key qqqq", "known here are ppo, name, setting"]),
+        ("learning_rate: 1", ["unknown key learning_rate"]),  # a key of another level is not searched for
+        ("1: x", ["unknown key 1"]),
+        ("- 1", ["holds [1] (list)", "give a mapping"]),
+        ("just words", ["holds 'just words' (str)", "give a mapping"]),
+    ],
+)
+def test_unknown_keys_and_other_shapes_are_refused(overlay, text, parts):
+    with pytest.raises(InputError) as error:
+        overlay(text)
+    for part in ["config.yaml: ", *parts]:
+        assert part in str(error.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Nested:
+    base: RunConfig = RunConfig()
+
+
+def test_renamed_keys_are_refused_with_their_new_name(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("sizes: {relation_layers: 2}")
+    with pytest.raises(InputError, match=r"key sizes.relation_layers; it is method_sizes.relation_layers now$"):
+        apply_yaml(RunConfig(), path)
+    path.write_text("base: {sizes: {hidden: 8, relation_layers: 2}}")
+    with pytest.raises(InputError, match=r"key base.sizes.relation_layers; it is method_sizes.relation_layers now$"):
+        apply_yaml(Nested(), path)
+    path.write_text("base: {method_sizes: {relation_layers: 2}}")
+    assert apply_yaml(Nested(), path).base == RunConfig(method_sizes={"relation_layers": 2})
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("name: x\nname: y\n", "line 2: not valid YAML (name is given twice)"),
+        ("ppo:\n  epochs: 1\n  anneal: true\n  'epochs': 2\n", "line 4: not valid YAML (epochs is given twice)"),
+        ("name: x\nppo: [1\n", "line 3: not valid YAML"),
+        ("name: x\n---\nname: y\n", "line 2: not valid YAML"),
+        ("name: !!python/object:os.system x\n", "line 1: not valid YAML"),
+        ("? [a]\n: 1\n", "line 1: not valid YAML"),
+        ("name: 2024-99-99\n", "not valid YAML (month must be"),
+        (b"name: \xff\n", "not valid YAML ("),
+        ("[" * 5000, "not valid YAML ("),
+    ],
+)
+def test_broken_yaml_is_refused_with_its_line(overlay, text, place):
+    with pytest.raises(InputError) as error:
+        overlay(text)
+    assert place in str(error.value)
+
+
+def test_missing_file_and_folder_are_refused(tmp_path):
+    for path, problem in ((tmp_path / "none.yaml", "no such configuration; choose"), (tmp_path, "cannot be read")):
+        with pytest.raises(InputError, match=f"{path}: {problem}"):
+            apply_yaml(Config(), path)
+
+
+def test_a_name_is_that_of_a_packaged_configuration():
+    assert apply_yaml(RunConfig(), "smoke") == apply_yaml(RunConfig(), CONFIGS["smoke"])
+    assert apply_yaml(RunConfig(), Path("smoke")).seeds == 1
+
+
+@given(
+    st.builds(
+        Config,
+        ppo=st.builds(Ppo, st.floats(allow_nan=False), st.none() | st.floats(allow_nan=False), st.integers()),
+        name=st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"])),
+        setting=st.sampled_from(["paper", "calibrated", 1]),
+        epsilons=st.lists(st.floats(allow_nan=False), max_size=3).map(tuple),
+        view=st.tuples(st.integers(), st.integers()),
+        limit=st.none() | st.integers(),
+    )
+)
+def test_a_dumped_config_reads_back(tmp_path_factory, config):
+    path = tmp_path_factory.getbasetemp() / "dumped.yaml"
+    values = dataclasses.asdict(config) | {"epsilons": list(config.epsilons), "view": list(config.view)}
+    path.write_text(yaml.safe_dump(values, allow_unicode=True), encoding="utf-8")
+    assert apply_yaml(Config(), path) == config
+
+
+@given(st.binary(max_size=60) | st.text("ponamepochs: {}[]&*!|>-'\"\n\t1.e", max_size=60).map(str.encode))
+def test_any_bytes_give_a_config_or_an_input_error(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_bytes(data)
+    try:
+        assert isinstance(apply_yaml(Config(), path), Config)
+    except InputError as error:
+        assert str(error).startswith(str(path))  # noqa: PT017  (reading may also succeed)
