@@ -61,10 +61,10 @@ def compile_rollout(setup: TrainingSetup, arm: str) -> Program:
             policy,
             state.agent,
             state.key,
-            learner.config.rollout,
-            use_coin,
             env_params,
             knowledge,
+            num_steps=learner.config.rollout,
+            use_coin=use_coin,
         )
 
     return compile_program(act, state, env_params, knowledge)

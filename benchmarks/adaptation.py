@@ -81,7 +81,7 @@ def percent_falling(run: jaxnav.Run) -> list[float]:
     """Return the percentage of windows whose loss falls, for each seed."""
     policies = run.policies()
     world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
-    agent_loop = dataclasses.replace(policies.make_agent_loop(world), estimator=None)
+    agent_loop = dataclasses.replace(policies.make_agent_loop(world), estimator_config=None)
     arm_params = policies.arm_params("baseline")
 
     percentages = []
@@ -109,7 +109,7 @@ def measure_windows(
 
     def step(agent: Agent, key: jax.Array) -> tuple[Agent, tuple[jax.Array, ...]]:
         memory = policy_memory(agent)
-        pathways = policy.pathways(*agent_loop.view(agent, knowledge, params), memory)
+        pathways = policy.pathways(agent_loop.policy_inputs(agent, knowledge, params), memory)
         decision = policy.decide(pathways, memory)
 
         # The same window with the weights before and after the inner step.
@@ -120,7 +120,7 @@ def measure_windows(
 
         choice = jax.random.categorical(key, decision.logits)
         keys = jax.random.split(key, NUM_EPISODES)
-        agent, _ = agent_loop.step(agent, choice, knowledge, params, policy=policy, decision=decision, keys=keys)
+        agent, _ = agent_loop.step(agent, choice, knowledge, params, policy=policy, decision=decision, reset_keys=keys)
         losses = (jax.vmap(learned_loss)(fast_before), jax.vmap(learned_loss)(fast_after))
         return agent, (is_complete & is_adapting, *losses)
 

@@ -101,12 +101,12 @@ def decide(agent_loop: AgentLoop, inputs: FixedInputs, agent: Agent, state: Stat
     # The factual decision, from which sTDE subtracts the counterfactual one.
     policy = agent_loop.bind(inputs.weights)
     memory = policy_memory(agent)
-    pathways = policy.pathways(*agent_loop.view(agent, inputs.knowledge, inputs.params), memory)
+    pathways = policy.pathways(agent_loop.policy_inputs(agent, inputs.knowledge, inputs.params), memory)
     factual = policy.decide(pathways, memory)
     logits = factual.logits
     if agent.perception.layout is not None:
         counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory)
-        logits = stde(logits, counterfactual.logits, agent_loop.gap(agent), EPSILON)
+        logits = stde(logits, counterfactual.logits, agent_loop.layout_gap(agent), EPSILON)
     action = jnp.argmax(logits, axis=-1).astype(jnp.int32)
 
     # The next state is given: perceive it.
@@ -118,7 +118,7 @@ def decide(agent_loop: AgentLoop, inputs: FixedInputs, agent: Agent, state: Stat
 def start_walk(agent_loop: AgentLoop, inputs: FixedInputs, state: State) -> Agent:
     """Return the agent at the start of a walk, after its first view."""
     memory = agent_loop.bind(inputs.weights).initial_memory(state.pose.shape)
-    return agent_loop.begin(state, memory, inputs.knowledge, inputs.params)
+    return agent_loop.start_from(state, memory, inputs.knowledge, inputs.params)
 
 
 def make_walk(env: ObjectNav, params: EnvParams, num_episodes: int) -> list[State]:

@@ -23,7 +23,8 @@ from _common import print_report, summarize, time_call
 from jaxnav.env.make import build_environment
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import start_states
-from jaxnav.policies.agent_loop import AgentLoop, select
+from jaxnav.numerics.trees import tree_where
+from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.map_tracker import FREE_BIT, WALL_BIT, PlacedView, SemanticMap
@@ -135,7 +136,7 @@ def run_episodes(
     @jax.jit
     def act() -> tuple[jax.Array, jax.Array]:
         # Start all episodes, with complete maps where given.
-        agent = agent_loop.begin(start_states(episodes), None, knowledge, params)
+        agent = agent_loop.start_from(start_states(episodes), None, knowledge, params)
         if maps is not None:
             tracker_state = agent.perception.tracker_state
             tracker_state = tracker_state._replace(cells=tracker_state.cells | maps)
@@ -150,7 +151,7 @@ def run_episodes(
             next_agent, result = agent_loop.step(agent, choice, knowledge, params)
             success = success | (running & result.success)
             length = length + running.astype(jnp.int32)
-            return select(running, next_agent, agent), running & ~result.ended, success, length
+            return tree_where(running, next_agent, agent), running & ~result.ended, success, length
 
         running = jnp.ones(num_episodes, bool)
         success = jnp.zeros(num_episodes, bool)

@@ -17,6 +17,7 @@ import jaxnav
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import bind, init_params
+from jaxnav.policies.pathways import PolicyInputs
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -89,7 +90,7 @@ def test_the_methods_of_the_page_decide_in_both_ways(own_modules, name, decision
         policy = bind(spec, params)
         memory = policy.initial_memory(goal.shape)
         reading = None if find_method(name).tracker is None else jnp.zeros((*goal.shape, 2))
-        pathways = policy.pathways(Observation(row, goal), jnp.ones((*goal.shape, 3)), reading, None, memory)
+        pathways = policy.pathways(PolicyInputs(Observation(row, goal), jnp.ones((*goal.shape, 3)), reading), memory)
         return policy.decide(pathways, memory)
 
     params = jax.eval_shape(lambda key: init_params(spec, key), jax.random.key(0))

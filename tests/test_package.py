@@ -20,6 +20,7 @@ from jaxnav.__main__ import main
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import bind, init_params
+from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.scenes.task import NUM_ACTIONS
 
 ROOT = Path(__file__).parent.parent
@@ -104,7 +105,7 @@ def test_the_method_of_the_readme_makes_experience(folder, monkeypatch):
     spec = dataclasses.replace(tiny.SPEC, method=find_method("my_method:MINE"), method_sizes=())
     params = jax.jit(init_params, static_argnums=0)(spec, jax.random.key(0))
     observation = Observation(row=jnp.asarray(tiny.BANK.rows[:4]), goal=jnp.zeros(4, jnp.int32))
-    pathways = jax.jit(lambda params, weights: bind(spec, params).pathways(observation, weights))
+    pathways = jax.jit(lambda params, weights: bind(spec, params).pathways(PolicyInputs(observation, weights)))
     weights = jnp.ones((4, len(tiny.CATEGORIES)))
     experience, other = (pathways(params, w).experience for w in (weights, 2 * weights))
     assert experience.shape == (4, bind(spec, params).method.width)

@@ -85,8 +85,8 @@ def replay_actions(actions: jax.Array, state: State, params: EnvParams, env: Obj
         outcome = outcome.add_step(running, action, result, no_weight)
         return (agent, running & ~result.ended, outcome), None
 
-    agent = agent_loop.begin(state, None, None, params)
-    initial_carry = (agent, jnp.ones(batch_shape, bool), EpisodeOutcome.start(batch_shape))
+    agent = agent_loop.start_from(state, None, None, params)
+    initial_carry = (agent, jnp.ones(batch_shape, bool), EpisodeOutcome.zeros(batch_shape))
     (agent, _, outcome), _ = jax.lax.scan(step, initial_carry, actions)
 
     final_state = agent.state

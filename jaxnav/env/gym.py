@@ -21,6 +21,7 @@ from gymnasium.vector.utils import batch_space
 
 from jaxnav.env.make import make
 from jaxnav.env.objectnav import EnvParams, ObjectNav, State
+from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import WORLDS
@@ -253,11 +254,7 @@ class _BatchedEnv:
 
         # Replace an episode that has ended by a new one, which is drawn in any case.
         has_ended = signals.terminated | signals.truncated
-        episode, observation = jax.tree.map(
-            lambda new_leaf, old_leaf: jnp.where(has_ended, new_leaf, old_leaf),
-            self._reset(key),
-            (final_episode, final_observation),
-        )
+        episode, observation = tree_where(has_ended, self._reset(key), (final_episode, final_observation))
         return episode, observation, final_observation, signals
 
     def _observe(self, episode: EpisodeState) -> NamedValues:

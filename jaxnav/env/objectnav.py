@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.env.spaces import Box, Dict, Discrete
+from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
@@ -182,18 +183,16 @@ class ObjectNav:
         # Select the reset state where the episode has ended.
         _, reset_state = self.reset(key, params)
         has_ended = terminated | truncated
-        state = jax.tree.map(
-            lambda new_leaf, old_leaf: jnp.where(has_ended, new_leaf, old_leaf), reset_state, final_state
-        )
+        next_state = tree_where(has_ended, reset_state, final_state)
 
-        # The old episode, which a trainer needs for bootstrapping and metrics.
-        step_info = {
+        # The state before the reset, for bootstrapping and metrics.
+        info = {
             "final_state": final_state,
             "final_observation": self.observe(final_state, params),
             "success": terminated & self.done_succeeds(final_state, params),
             "length": final_state.time,
         }
-        return self.observe(state, params), state, reward, terminated, truncated, step_info
+        return self.observe(next_state, params), next_state, reward, terminated, truncated, info
 
     def advance(
         self, state: State, action: jax.Array | int, params: EnvParams

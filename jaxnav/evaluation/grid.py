@@ -1,13 +1,14 @@
 """The evaluation grid: every variant, epsilon and seed over every episode, in one compiled call.
 
-A grid is an `InferenceConfig` with leaves [C]. `Evaluator` runs its cells one after the other (`lax.map`), and in each
-the E episodes of a list side by side until the last one has ended (`_run_episodes`). One step is `infer_and_act`:
-decide, remove experience, choose, act. (A choice is an action unless the method has macro-actions.) `episode_metrics`
-turns the outcomes into SR, SPL, SAE and DTS.
+A grid is an `InferenceConfig` with leaves [C]. `Evaluator` runs its C entries one after the other (`lax.map`). For each
+entry it steps all E episodes of a list as one batch until every episode has ended (`_run_episodes`). One step is
+`infer_and_act`: decide, remove experience, choose, act. The policy's *choice* is the action itself, except for methods
+with macro-actions, where one choice lasts several steps. `episode_metrics` turns the outcomes into success rate (SR),
+success weighted by path length (SPL), success weighted by action efficiency (SAE) and distance to success (DTS).
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,9 @@ import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace, apply_removal, counterfactual_logits, select_gap
-from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, decide, policy_memory, select
+from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace, apply_removal, logits_to_remove, select_gap
+from jaxnav.numerics.trees import tree_where
+from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, decide, policy_memory
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params
@@ -26,21 +28,22 @@ Tree = TypeVar("Tree")
 
 #: Metres that DTS subtracts from the distance to the goal.
 GOAL_RADIUS = 1.0
-#: Few episodes are long: once at most 1 / divisor of the episodes still run, the batch shrinks to that size.
+#: Batch sizes, as divisors of E: most episodes are short, so the batch shrinks once so few episodes still run.
 _BATCH_DIVISORS = (2, 4, 16)
 
 
 class EpisodeOutcome(NamedTuple):
-    """Outcome of episodes, leaves [C, E].
+    """Outcome of episodes, leaves [...]; [C, E] for a grid.
 
     Attributes:
-      done: bool, ended by Done; False for a time-out.
-      success: bool.
-      length: int32, actions taken, Done included.
-      moves: int32, MoveAheads chosen.
-      distance: float32, metres from the last cell to the nearest goal object's centre.
+      done: bool, the agent chose Done; False for a time-out.
+      success: bool, the agent chose Done where it succeeds.
+      length: int32, number of actions, Done included.
+      moves: int32, number of MoveAheads.
+      distance: float32, metres from the final cell to the centre of the nearest goal object.
       choices: int32, number of decision steps: all steps unless the method has macro-actions.
-      mean_weight: float32, mean weight of the removed logits over these steps.
+      mean_weight: float32, mean weight of the removed logits over the decision steps. While episodes run, `add_step`
+        keeps the sum of the weights here.
     """
 
     done: jax.Array
@@ -52,8 +55,8 @@ class EpisodeOutcome(NamedTuple):
     mean_weight: jax.Array
 
     @classmethod
-    def start(cls, shape: tuple[int, ...]) -> "EpisodeOutcome":
-        """Return the outcome of episodes before their first step."""
+    def zeros(cls, shape: tuple[int, ...]) -> "EpisodeOutcome":
+        """Outcome of episodes before their first step."""
         return cls(
             done=jnp.zeros(shape, bool),
             success=jnp.zeros(shape, bool),
@@ -72,24 +75,25 @@ class EpisodeOutcome(NamedTuple):
         weight: jax.Array,
         is_decision_step: jax.Array | None = None,
     ) -> "EpisodeOutcome":
-        """Add one step; until the end `mean_weight` is the sum of the weights.
+        """Add one step of every running episode.
 
         Args:
-          running: bool, before the step.
-          action: int32, taken.
-          result: of the step.
-          weight: float32, of the removed logits.
-          is_decision_step: bool, False where a macro-action was running and the choice was ignored; None where choices
-            are actions.
+          running: bool [...], episodes that had not ended before the step.
+          action: int32 [...], executed actions.
+          result: result of the step.
+          weight: float32 [...], weight of the removed logits.
+          is_decision_step: bool [...], False where a macro-action was running and the choice was ignored; None if
+            choices are actions.
         """
-        counted = running if is_decision_step is None else running & is_decision_step
+        # While a macro-action runs, the policy's output is ignored.
+        makes_choice = running if is_decision_step is None else running & is_decision_step
         return self._replace(
             done=self.done | (running & result.terminated),
             success=self.success | (running & result.success),
             length=self.length + running.astype(jnp.int32),
             moves=self.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
-            choices=self.choices + counted.astype(jnp.int32),
-            mean_weight=self.mean_weight + jnp.where(counted, weight, 0.0),
+            choices=self.choices + makes_choice.astype(jnp.int32),
+            mean_weight=self.mean_weight + jnp.where(makes_choice, weight, 0.0),
         )
 
 
@@ -103,7 +107,7 @@ class _Batch(NamedTuple):
 
 
 class Evaluator:
-    """Evaluation of grids; those of equal shape share a compilation.
+    """Evaluation of grids; one compilation serves all grids and banks of equal shapes.
 
     Attributes:
       compilations: number of compilations so far.
@@ -113,9 +117,9 @@ class Evaluator:
         """Prepare the compiled function.
 
         Args:
-          agent_loop: environment, policy and layout estimator.
-          can_remove: whether experience may be removed; without, only the factual decision is compiled, in half the
-            time.
+          agent_loop: environment, policy specification and layout estimator.
+          can_remove: whether experience may be removed. False compiles only the factual decision, which halves the
+            compilation time; the grid must then remove nothing.
         """
         self.compilations = 0
         self._agent_loop = agent_loop
@@ -126,28 +130,28 @@ class Evaluator:
         self,
         grid: InferenceConfig,
         policy_params: Params,
-        parts: Iterable[tuple[EpisodeList, EnvParams]],
+        banks: Iterable[tuple[EpisodeList, EnvParams]],
         knowledge: Knowledge,
         key: jax.Array,
     ) -> EpisodeOutcome:
-        """Run every cell of a grid over every episode.
+        """Run every entry of a grid over every episode.
 
         Args:
           grid: leaves [C].
           policy_params: parameters of all policies, leaves [N, ...].
-          parts: episodes, E in all, with the parameters of the environment where they take place, bank by bank.
-          knowledge: learned before training.
-          key: of sampled actions and of the controls, folded with part, policy index, episode and time: cells of one
-            policy share random numbers.
+          banks: for every bank of scenes, its episodes and its environment parameters; E episodes in total.
+          knowledge: layout priors and statistics from before training.
+          key: typed PRNG key []. Bank index, policy index, episode and time are folded in, so that all entries of one
+            policy see the same random numbers.
 
         Returns:
-          The outcomes [C, E]. One compilation serves all parts of equal shape.
+          The outcomes, leaves [C, E].
         """
         outcomes = []
-        for part_index, (episodes, env_params) in enumerate(parts):
-            part_key = jax.random.fold_in(key, part_index)
-            start = start_states(episodes)
-            outcome = self._compiled_run(grid, policy_params, start, env_params, knowledge, part_key)
+        for bank_index, (episodes, env_params) in enumerate(banks):
+            bank_key = jax.random.fold_in(key, bank_index)
+            initial_states = start_states(episodes)
+            outcome = self._compiled_run(grid, policy_params, initial_states, env_params, knowledge, bank_key)
             outcomes.append(jax.tree.map(np.asarray, outcome))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *outcomes)
 
@@ -155,23 +159,33 @@ class Evaluator:
         self,
         grid: InferenceConfig,
         policy_params: Params,
-        start: State,
+        initial_states: State,
         env_params: EnvParams,
         knowledge: Knowledge,
         key: jax.Array,
     ) -> EpisodeOutcome:
-        self.compilations += 1  # traced once per shape
+        """Run all entries of a grid over the episodes of one bank; jitted."""
+        self.compilations += 1  # Python runs this line only while JAX traces
 
-        def run_cell(config: InferenceConfig) -> EpisodeOutcome:
-            cell_params = jax.tree.map(lambda leaf: leaf[config.policy_index], policy_params)
-            policy = self._agent_loop.decider(cell_params)
-            return _run_episodes(config, policy, start, self._agent_loop, self._can_remove, env_params, knowledge, key)
+        def run_entry(config: InferenceConfig) -> EpisodeOutcome:
+            entry_params = jax.tree.map(lambda leaf: leaf[config.policy_index], policy_params)
+            policy = self._agent_loop.bind_decider(entry_params)
+            return _run_episodes(
+                config,
+                policy,
+                initial_states,
+                key,
+                agent_loop=self._agent_loop,
+                env_params=env_params,
+                knowledge=knowledge,
+                can_remove=self._can_remove,
+            )
 
-        return jax.lax.map(run_cell, grid)
+        return jax.lax.map(run_entry, grid)
 
 
 def start_states(episodes: EpisodeList) -> State:
-    """Return the states that episodes start in, leaves [E]."""
+    """Initial states of episodes, leaves [E]."""
     return State(
         pose=jnp.asarray(episodes.pose),
         scene=jnp.asarray(episodes.scene),
@@ -183,15 +197,16 @@ def start_states(episodes: EpisodeList) -> State:
 def _run_episodes(
     config: InferenceConfig,
     policy: Decider,
-    start: State,
+    initial_states: State,
+    key: jax.Array,
+    *,
     agent_loop: AgentLoop,
-    can_remove: bool,
     env_params: EnvParams,
     knowledge: Knowledge,
-    key: jax.Array,
+    can_remove: bool,
 ) -> EpisodeOutcome:
-    """Run the episodes of one cell until the last one has ended."""
-    num_episodes = len(start.pose)
+    """Run all episodes of one grid entry until every episode has ended."""
+    num_episodes = len(initial_states.pose)
     policy_key = jax.random.fold_in(key, config.policy_index)
     episode_keys = jax.vmap(lambda episode: jax.random.fold_in(policy_key, episode))(jnp.arange(num_episodes))
 
@@ -202,16 +217,18 @@ def _run_episodes(
             batch.agent,
             batch.running,
             batch.episode_keys,
-            agent_loop,
-            env_params,
-            knowledge,
-            can_remove,
+            agent_loop=agent_loop,
+            env_params=env_params,
+            knowledge=knowledge,
+            can_remove=can_remove,
         )
+        # The executed action differs from the choice while a macro-action runs.
         action = policy_memory(result.agent).action
-        is_decision_step = agent_loop.is_decision_step(batch.agent)
-        outcome = batch.outcome.add_step(batch.running, action, result, trace.weight, is_decision_step)
+        is_decision_step = agent_loop.is_decision_step(batch.agent)  # of the state before the step
+        outcome = batch.outcome.add_step(batch.running, action, result, trace.removal_weight, is_decision_step)
+        # Ended episodes keep their agent.
         return _Batch(
-            agent=select(batch.running, next_agent, batch.agent),
+            agent=tree_where(batch.running, next_agent, batch.agent),
             running=batch.running & ~result.ended,
             outcome=outcome,
             episode_keys=batch.episode_keys,
@@ -223,41 +240,42 @@ def _run_episodes(
     # Start all episodes in one batch.
     memory = policy.initial_memory((num_episodes,))
     batch = _Batch(
-        agent=agent_loop.begin(start, memory, knowledge, env_params),
+        agent=agent_loop.start_from(initial_states, memory, knowledge, env_params),
         running=jnp.ones(num_episodes, bool),
-        outcome=EpisodeOutcome.start((num_episodes,)),
+        outcome=EpisodeOutcome.zeros((num_episodes,)),
         episode_keys=episode_keys,
     )
     batch_ids = jnp.arange(num_episodes)
-    results = batch.outcome, start  # outcomes and last states of all episodes
+    episode_table = batch.outcome, initial_states  # outcomes and final states of all episodes
 
-    # Carry on with ever smaller batches: whenever enough episodes have ended, keep only those that still run.
+    # Carry on with ever smaller batches: whenever enough episodes have ended, keep only those that still run. The loop
+    # is unrolled, one `while_loop` for each static batch size.
     smaller_sizes = [num_episodes // divisor for divisor in _BATCH_DIVISORS if num_episodes >= divisor]
     for next_size in (*smaller_sizes, 0):
         batch = run_until(batch, max_running=next_size)
-        results = _write_rows(results, batch_ids, (batch.outcome, batch.agent.state))
+        episode_table = _write_rows(episode_table, batch_ids, (batch.outcome, batch.agent.state))
         kept_rows = jnp.argsort(~batch.running)[:next_size]  # running episodes first
         batch_ids = batch_ids[kept_rows]
         batch = _take_rows(batch, kept_rows)
 
-    # Distances are those of the last cells; weights were added up.
-    outcome, last_state = results
+    # DTS needs the distance from the final cell; the sum of the weights becomes their mean.
+    outcome, final_state = episode_table
     num_choices = jnp.maximum(outcome.choices, 1).astype(jnp.float32)
-    last_cell = agent_loop.env.cell_of_pose(last_state.pose)
+    final_cell = agent_loop.env.cell_of_pose(final_state.pose)
     return outcome._replace(
-        distance=env_params.tables.goal_distance[last_cell, last_state.goal],
+        distance=env_params.tables.goal_distance[final_cell, final_state.goal],
         mean_weight=outcome.mean_weight / num_choices,
     )
 
 
-def _write_rows(table: Any, rows: jax.Array, values: Any) -> Any:
-    """Write leaves [B, ...] into rows int [B] of leaves [E, ...]."""
-    return jax.tree.map(lambda leaf, value: leaf.at[rows].set(value), table, values)
+def _write_rows(table: Tree, row_indices: jax.Array, values: Tree) -> Tree:
+    """Copy of `table` (leaves [E, ...]) with the rows `row_indices`, int [B], set to `values` (leaves [B, ...])."""
+    return jax.tree.map(lambda leaf, value: leaf.at[row_indices].set(value), table, values)
 
 
-def _take_rows(table: Tree, rows: jax.Array) -> Tree:
-    """Take rows int [B] of leaves [E, ...]."""
-    return jax.tree.map(lambda leaf: leaf[rows], table)
+def _take_rows(table: Tree, row_indices: jax.Array) -> Tree:
+    """Rows `row_indices`, int [B], of leaves [E, ...]."""
+    return jax.tree.map(lambda leaf: leaf[row_indices], table)
 
 
 def infer_and_act(
@@ -266,6 +284,7 @@ def infer_and_act(
     agent: Agent,
     running: jax.Array,
     episode_keys: jax.Array,
+    *,
     agent_loop: AgentLoop,
     env_params: EnvParams,
     knowledge: Knowledge,
@@ -274,42 +293,53 @@ def infer_and_act(
     """Decide, remove experience, choose and act: one step of each of E episodes.
 
     Args:
-      config: of the grid cell.
-      policy: with the cell's parameters.
-      agent: the episodes, [E].
+      config: configuration of the grid entry.
+      policy: policy with the entry's parameters.
+      agent: agents in E episodes, with the states of their environments.
       running: bool [E], episodes that have not ended.
-      episode_keys: [E]; folded with the time for a sampled action.
-      agent_loop: how to act.
-      env_params: of the environment.
-      knowledge: learned before training.
+      episode_keys: PRNG keys [E]; the time is folded in for a sampled action.
+      agent_loop: runs policy and environment.
+      env_params: parameters of the environment.
+      knowledge: layout priors and statistics from before training.
       can_remove: whether experience may be removed.
 
     Returns:
-      The agent after the step, the result of the step, and how the action was inferred.
+      The agents after the step [E], the result of the step, leaves [E], and the trace of the inference, leaves
+      [E, ...].
     """
-    # Decide, with or without the layout's weights.
-    view = agent_loop.view(agent, knowledge, env_params)
-    view = view._replace(weights=jnp.where(config.use_layout, view.weights, 1.0))
+    # Factual decision; entries without the layout replace its weights by ones.
+    inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
+    layout_weights = jnp.where(config.use_layout, inputs.layout_weights, 1.0)
     memory = policy_memory(agent)
-    pathways, decision = decide(policy, view, memory)
+    pathways, decision = decide(policy, inputs._replace(layout_weights=layout_weights), memory)
 
     # Remove experience (eqs. 1, 2).
     step_keys = jax.vmap(jax.random.fold_in)(episode_keys, agent.state.time)
-    logits = decision.logits
-    counterfactual = decision.logits
-    gap = agent_loop.gap(agent)
-    weight = jnp.zeros(running.shape)
+    gap = agent_loop.layout_gap(agent)
     if can_remove:
-        counterfactual = counterfactual_logits(config, policy, pathways, memory, episode_keys, step_keys)
+        removed_logits = logits_to_remove(config, policy, pathways, memory, episode_keys, step_keys)
         gap = select_gap(config, gap, running, episode_keys, agent.state.time)
-        logits, weight = apply_removal(config, logits, counterfactual, gap)
+        logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap)
+    else:
+        removed_logits = decision.logits
+        logits = decision.logits
+        removal_weight = jnp.zeros(running.shape)
+
+    # The random agent: equal logits.
     logits = jnp.where(config.act_randomly, 0.0, logits)
 
     # Choose the best action or sample one, then act.
     sampled_choice = jax.vmap(jax.random.categorical)(step_keys, logits)
     choice = jnp.where(config.greedy, jnp.argmax(logits, axis=-1), sampled_choice).astype(jnp.int32)
     next_agent, result = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
-    trace = InferenceTrace(view.weights, gap, weight, decision.logits, counterfactual, logits)
+    trace = InferenceTrace(
+        layout_weights=layout_weights,
+        gap=gap,
+        removal_weight=removal_weight,
+        factual_logits=decision.logits,
+        removed_logits=removed_logits,
+        action_logits=logits,
+    )
     return next_agent, result, trace
 
 
@@ -324,8 +354,14 @@ def episode_metrics(
       budgets: numbers of actions; `sr@N` is success within N.
 
     Returns:
-      float64 [..., E] by name: `sr`, `spl`, `sae`, `timeout` (no Done before the step limit) and `wrong_done` (Done
-      where it fails), each in [0, 1], and `dts` in metres. Every episode succeeds, times out or ends by a wrong Done.
+      float64 [..., E] by name, each in [0, 1] but `dts`:
+        `sr`: success;
+        `spl`: success * L* / length;
+        `sae`: success * MoveAheads / actions before Done;
+        `dts`: max(distance to the goal - 1 m, 0), in metres;
+        `timeout`: the step limit was reached without Done;
+        `wrong_done`: Done was chosen where the goal is not reached.
+      Every episode succeeds, times out or ends by a wrong Done.
     """
     success = np.asarray(outcome.success, np.float64)
     done = np.asarray(outcome.done, np.float64)

@@ -13,7 +13,8 @@ import numpy as np
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.grid import infer_and_act
 from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace
-from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory, select
+from jaxnav.numerics.trees import tree_where
+from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params
 
@@ -97,7 +98,7 @@ def _episode_trace(all_steps: _Step, episode: int) -> EpisodeTrace:
 @functools.partial(jax.jit, static_argnames="agent_loop")
 def _begin(weights: Params, start: State, agent_loop: AgentLoop, env_params: EnvParams, knowledge: Knowledge) -> Agent:
     initial_memory = agent_loop.bind(weights).initial_memory(start.pose.shape)
-    return agent_loop.begin(start, initial_memory, knowledge, env_params)
+    return agent_loop.start_from(start, initial_memory, knowledge, env_params)
 
 
 @functools.partial(jax.jit, static_argnames="agent_loop")
@@ -119,7 +120,14 @@ def _step(
     # Act in all episodes, including those that have ended: shapes stay fixed.
     policy = agent_loop.bind(weights)
     next_agent, step_result, inferred = infer_and_act(
-        cell, policy, agent, running, episode_keys, agent_loop, env_params, knowledge
+        cell,
+        policy,
+        agent,
+        running,
+        episode_keys,
+        agent_loop=agent_loop,
+        env_params=env_params,
+        knowledge=knowledge,
     )
 
     # Record the pose before the action, so that a trace pairs each action with the view it was chosen from.
@@ -132,4 +140,4 @@ def _step(
     )
 
     # Agents of ended episodes stay as they were.
-    return select(running, next_agent, agent), running & ~step_result.ended, recorded_step
+    return tree_where(running, next_agent, agent), running & ~step_result.ended, recorded_step

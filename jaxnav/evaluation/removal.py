@@ -1,10 +1,10 @@
 """Removal of experience from a decision: sTDE (eq. 2), TDE (eq. 1), and the controls that they are compared with.
 
-The subtracted logits are the counterfactual ones, to which experience alone contributes.
+Both subtract the counterfactual logits, to which only experience contributes (scene and goal are set to zero).
 
-An `InferenceConfig` says how one cell of an evaluation grid turns a decision into logits to act by. At every step
-`counterfactual_logits` decides without the direct pathways, `select_gap` picks the layout gap, and `apply_removal`
-combines both with the factual logits. All three are traced: one compilation serves every configuration.
+An `InferenceConfig` says how one entry of an evaluation grid turns a decision into logits to act by. At every step
+`logits_to_remove` decides without the direct pathways, `select_gap` picks the layout gap, and `apply_removal` combines
+both with the factual logits. Every field of the configuration is a traced array, so one compilation serves all entries.
 """
 
 import enum
@@ -19,8 +19,12 @@ from jaxnav.causal import FORMS, do, removal_weight, stde, tde
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.pathways import Pathways, PolicyState
 
-# Purposes folded into an episode's key; no time step is that late.
-_NOISE, _ORDER = 2**30, 2**30 + 1
+# Constants folded into the key of a step.
+_SCENE_TAG = 0
+_GOAL_TAG = 1
+# Constants folded into the key of an episode. Its time steps are folded into the same key, and are smaller.
+_NOISE_TAG = 2**30
+_ORDER_TAG = 2**30 + 1
 
 
 class RemovedLogits(enum.IntEnum):
@@ -39,8 +43,8 @@ class GapSource(enum.IntEnum):
     """Origin of the layout gap of a step.
 
     `OWN`: the episode's own belief. Controls: `OTHER`, the belief of another running episode at the same time, drawn at
-    random and kept as long as both run (the own one in the last episode that runs); `MEAN`, the mean of all running
-    episodes; `GIVEN`, a number fixed beforehand, within [gap_begin, gap_end).
+    random and kept as long as both run (the last running episode keeps its own belief); `MEAN`, the mean of all running
+    episodes; `GIVEN`, the constant `given_gap` during steps [gap_begin, gap_end), 0 otherwise.
     """
 
     OWN = 0
@@ -50,7 +54,7 @@ class GapSource(enum.IntEnum):
 
 
 class InferenceConfig(struct.PyTreeNode):
-    """Inference of one cell of an evaluation grid, leaves []; or of all C cells, leaves [C].
+    """Inference of one entry of an evaluation grid, leaves []; or of all C entries, leaves [C].
 
     Experience is removed by sTDE (eq. 2) with the threshold `epsilon`, or by TDE (eq. 1) where `use_tde` holds; with
     epsilon = inf sTDE removes nothing. The fields from `gap_source` on are controls.
@@ -60,13 +64,14 @@ class InferenceConfig(struct.PyTreeNode):
       epsilon: float32, threshold of sTDE.
       use_tde: bool, remove by TDE instead.
       form: int32, index of the form of eq. 2 in `causal.FORMS`.
-      use_layout: bool, multiply the layout's weights in; otherwise they are ones.
-      greedy: bool, take the best action rather than sample.
+      use_layout: bool, use the layout's weights; otherwise they are ones.
+      greedy: bool, take the best action instead of sampling.
       act_randomly: bool, ignore the policy.
       gap_source: int32, a `GapSource`.
       given_gap: float32, the gap of `GapSource.GIVEN` from step `gap_begin` to before step `gap_end`; 0 at other times.
       gap_begin, gap_end: int32, steps.
-      intervention: float32, upper bound of the uniform random numbers that scene and goal are set to; 0 in sTDE.
+      intervention: float32, upper bound of the uniform noise that replaces scene and goal; 0 sets them to zero, as in
+        sTDE.
       removed: int32, a `RemovedLogits`.
     """
 
@@ -89,23 +94,23 @@ class InferenceTrace(NamedTuple):
     """Inference of one step, leaves [E, ...].
 
     Attributes:
-      layout: float32 [K], the layout's weights for the goal (eq. 7); ones without the layout.
-      gap: float32, layout gap at the step; after `select_gap` where experience may be removed.
-      weight: float32, weight of the removed logits.
-      factual: float32 [A], logits of the decision.
-      counterfactual: float32 [A], logits to remove; those of the decision where nothing can be removed.
-      corrected: float32 [A], logits that chose the action.
+      layout_weights: float32 [K], the layout's weights for the goal (eq. 7); ones without the layout.
+      gap: float32, layout gap at the step; after `select_gap` if experience may be removed.
+      removal_weight: float32, weight of the removed logits.
+      factual_logits: float32 [A], logits of the decision.
+      removed_logits: float32 [A], logits to remove; equal to `factual_logits` if nothing can be removed.
+      action_logits: float32 [A], logits that chose the action.
     """
 
-    layout: jax.Array
+    layout_weights: jax.Array
     gap: jax.Array
-    weight: jax.Array
-    factual: jax.Array
-    counterfactual: jax.Array
-    corrected: jax.Array
+    removal_weight: jax.Array
+    factual_logits: jax.Array
+    removed_logits: jax.Array
+    action_logits: jax.Array
 
 
-def counterfactual_logits(
+def logits_to_remove(
     config: InferenceConfig,
     policy: Decider,
     pathways: Pathways,
@@ -113,33 +118,33 @@ def counterfactual_logits(
     episode_keys: jax.Array,
     step_keys: jax.Array,
 ) -> jax.Array:
-    """Return the logits to remove from E decisions, float32 [E, A].
+    """Logits to remove from E decisions, float32 [E, A]: counterfactual logits, or those of a control.
 
     The counterfactual decision shares experience and memory with the factual one; its updated memory is discarded.
 
     Args:
-      config: of the grid cell.
-      policy: with the cell's parameters.
-      pathways, memory: of the factual decisions, [E].
-      episode_keys, step_keys: [E], of the episodes, and of their present step; folded further.
+      config: configuration of the grid entry.
+      policy: policy with the entry's parameters.
+      pathways, memory: inputs of the factual decisions, leaves [E, ...].
+      episode_keys, step_keys: PRNG keys [E] of the episodes and of their current step; folded further.
     """
 
-    def sample(keys: jax.Array, purpose: int, like: jax.Array, sampler: Callable[..., jax.Array]) -> jax.Array:
-        """Sample an array of a given shape [E, ...], each row with a key of its own."""
-        purpose_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, purpose)
-        return jax.vmap(lambda key: sampler(key, like.shape[1:]))(purpose_keys)
+    def sample_rows(keys: jax.Array, tag: int, row_shape: tuple[int, ...], sampler: Callable[..., jax.Array]):
+        """Sample float32 [E, *row_shape], each row with a key of its own."""
+        row_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, tag)
+        return jax.vmap(lambda key: sampler(key, row_shape))(row_keys)
 
-    def intervention_value(purpose: int, pathway: jax.Array) -> jax.Array:
-        """Zeros, or random numbers where the control asks for them."""
+    def intervention_value(tag: int, pathway: jax.Array) -> jax.Array:
+        """Zeros, or the uniform noise of the control; `cond` skips the noise for all other rows of a table."""
         return jax.lax.cond(
             config.intervention > 0,
-            lambda: config.intervention * sample(step_keys, purpose, pathway, jax.random.uniform),
+            lambda: config.intervention * sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform),
             lambda: jnp.zeros_like(pathway),
         )
 
     # do(S = 0, G = 0) with the factual experience and memory.
-    scene_value = intervention_value(0, pathways.scene)
-    goal_value = intervention_value(1, pathways.goal)
+    scene_value = intervention_value(_SCENE_TAG, pathways.scene)
+    goal_value = intervention_value(_GOAL_TAG, pathways.goal)
     counterfactual_pathways = do(pathways, scene=scene_value, goal=goal_value)
     logits = policy.decide(counterfactual_pathways, memory).logits
 
@@ -147,7 +152,10 @@ def counterfactual_logits(
     branches = (
         lambda: logits,
         lambda: jnp.zeros_like(logits),
-        lambda: logits.std(axis=-1, keepdims=True) * sample(episode_keys, _NOISE, logits, jax.random.normal),
+        lambda: (
+            logits.std(axis=-1, keepdims=True)
+            * sample_rows(episode_keys, _NOISE_TAG, logits.shape[1:], jax.random.normal)
+        ),
     )
     return jax.lax.switch(config.removed, branches)
 
@@ -155,22 +163,22 @@ def counterfactual_logits(
 def select_gap(
     config: InferenceConfig, gap: jax.Array, running: jax.Array, episode_keys: jax.Array, time: jax.Array
 ) -> jax.Array:
-    """Select the layout gaps to remove experience by, float32 [E].
+    """Select the layout gaps that weigh the removal, float32 [E].
 
     Args:
-      config: of the grid cell.
-      gap: float32 [E], of the episodes' own beliefs.
+      config: configuration of the grid entry.
+      gap: float32 [E], gaps of the episodes' own beliefs.
       running: bool [E], episodes that have not ended.
-      episode_keys: [E]; folded further.
+      episode_keys: PRNG keys [E] of the episodes; folded further.
       time: int32 [E], steps so far.
     """
-    is_given_time = (time >= config.gap_begin) & (time < config.gap_end)
+    in_given_window = (time >= config.gap_begin) & (time < config.gap_end)
     # One branch per member of `GapSource`.
     branches = (
         lambda: gap,
         lambda: gap[_other_running_episode(running, episode_keys)],
         lambda: jnp.broadcast_to(jnp.mean(gap, where=running), gap.shape),
-        lambda: jnp.where(is_given_time, config.given_gap, 0.0),
+        lambda: jnp.where(in_given_window, config.given_gap, 0.0),
     )
     return jax.lax.switch(config.gap_source, branches)
 
@@ -181,15 +189,15 @@ def apply_removal(
     """Remove experience from logits by equation 1 or 2.
 
     Args:
-      config: of the grid cell.
-      logits: float32 [E, A], factual.
-      counterfactual: float32 [E, A], to remove.
+      config: configuration of the grid entry.
+      logits: float32 [E, A], factual logits.
+      counterfactual: float32 [E, A], logits to remove.
       gap: float32 [E], layout gaps.
 
     Returns:
       Logits float32 [E, A], and the weight float32 [E] of the removed ones.
     """
-    # The form is traced: compute all three and pick one.
+    # The form is a traced index: compute every form, then pick one.
     soft_logits = jnp.stack([stde(logits, counterfactual, gap, config.epsilon, form) for form in FORMS])[config.form]
     soft_weight = jnp.stack([removal_weight(gap, config.epsilon, form) for form in FORMS])[config.form]
 
@@ -199,13 +207,15 @@ def apply_removal(
 
 
 def _other_running_episode(running: jax.Array, episode_keys: jax.Array) -> jax.Array:
-    """Return for each running episode the index of another one, int [E]; meaningless for ended episodes.
+    """Index of another running episode for each running one, int [E]; undefined for ended episodes.
 
-    The other one is the next, cyclically, in an order drawn from the keys, so that pairs outlast the end of other
-    episodes.
+    The other episode is the next one in a cyclic order. The order depends only on the keys, so two paired episodes stay
+    paired while both run, also when the batch shrinks.
     """
-    score = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, _ORDER)))(episode_keys)
-    running_first = jnp.argsort(jnp.where(running, score, 1.0))
-    rank = jnp.zeros_like(running_first).at[running_first].set(jnp.arange(len(running_first)))
+    # Ended episodes sort last: their score is 1.
+    score = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, _ORDER_TAG)))(episode_keys)
+    cyclic_order = jnp.argsort(jnp.where(running, score, 1.0))
+    # The rank of each episode is the inverse permutation.
+    rank = jnp.zeros_like(cyclic_order).at[cyclic_order].set(jnp.arange(len(cyclic_order)))
     next_rank = (rank + 1) % jnp.maximum(running.sum(), 1)
-    return running_first[next_rank]
+    return cyclic_order[next_rank]

@@ -78,7 +78,7 @@ def play_game(game: Game, keys: Iterable[str], show: Callable[[GameView], None])
     return GameResult(poses, shortest_poses, success=False, said_done=False, has_quit=True)
 
 
-_begin = jax.jit(AgentLoop.begin, static_argnums=0)
+_begin = jax.jit(AgentLoop.start_from, static_argnums=0)
 _step = jax.jit(AgentLoop.step, static_argnums=0)
 
 
@@ -120,7 +120,7 @@ def _read_belief(
     agent_loop: AgentLoop, agent: Agent, knowledge: Knowledge, params: EnvParams
 ) -> tuple[jax.Array, jax.Array]:
     """Return w x g of eq. 7 [1, K], and the layout gap [1]."""
-    return agent_loop.view(agent, knowledge, params).weights, agent_loop.gap(agent)
+    return agent_loop.policy_inputs(agent, knowledge, params).layout_weights, agent_loop.layout_gap(agent)
 
 
 def _make_view(

@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxnav.numerics.trees import tree_where
+
 #: Number of parts of a batch, which are computed one after the other or skipped.
 _NUM_PARTS = 8
 
@@ -60,11 +62,7 @@ def _update(function: Function, shared: Any, mask: jax.Array, inputs: Any, state
 def _update_members(function: Function, shared: Any, mask: jax.Array, inputs: Any, state: Any) -> Any:
     """Update the members of one part; unmasked members keep their state."""
     next_state = jax.vmap(function, (None, 0, 0))(shared, inputs, state)
-
-    def select(new_leaf: jax.Array, old_leaf: jax.Array) -> jax.Array:
-        return jnp.where(jnp.expand_dims(mask, [*range(1, new_leaf.ndim)]), new_leaf, old_leaf)
-
-    return jax.tree.map(select, next_state, state)
+    return tree_where(mask, next_state, state)
 
 
 def _update_forward(function: Function, *arguments: Any) -> tuple[Any, Any]:

@@ -155,7 +155,7 @@ class LearnedLossAdaptation:
     def decide(self, policy: "Policy", pathways: Pathways, memory: PolicyState) -> Decision:
         """Decide with the changed layers, then adapt where the window is full."""
         fast = _append_decision(memory.fast, pathways, memory)
-        output = policy.decide_without_adaptation(pathways, memory, dict(fast.layer_changes))
+        output = policy.decide_with_changes(pathways, memory, dict(fast.layer_changes))
         return output._replace(fast=self.adapt_if_due(policy, fast))
 
     def adapt_if_due(self, policy: "Policy", fast: FastWeights) -> FastWeights:
@@ -253,7 +253,7 @@ def replay_window(
             return fast.layer_changes[layer](inputs) + step_changes[layer]
 
         changes = {layer: functools.partial(change_output, layer) for layer in step_changes}
-        output = policy.decide_without_adaptation(pathways, PolicyState(hidden, action), changes)
+        output = policy.decide_with_changes(pathways, PolicyState(hidden, action), changes)
 
         # With streams the loss reads the hidden state of the direct stream, which is the first.
         row = jnp.concatenate([output.hidden[: policy.hidden], jax.nn.softmax(output.logits)])

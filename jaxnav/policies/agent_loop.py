@@ -4,33 +4,31 @@
 map and the state of the method's tracker. `decide` runs a policy on such a view. `AgentLoop` ties both to an
 environment: it starts B parallel episodes, and steps them with or without auto-reset.
 
-    loop = AgentLoop(env, spec, estimator)
+    loop = AgentLoop(env, spec, estimator_config)
     agent = loop.start(start_key, num_envs, policy.initial_memory((num_envs,)), knowledge, env_params)
-    view = loop.view(agent, knowledge, env_params)
-    _, decision = decide(policy, view, policy_memory(agent))
+    inputs = loop.policy_inputs(agent, knowledge, env_params)
+    _, decision = decide(policy, inputs, policy_memory(agent))
     choice = jax.random.categorical(choice_key, decision.logits)
-    agent, result = loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision, keys=keys)
+    agent, result = loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision, reset_keys=keys)
 """
 
 import dataclasses
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation, State
 from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState
+from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.adaptation import limit_inner_steps
 from jaxnav.policies.handover import Decider, HandoverPolicy
 from jaxnav.policies.method import Knowledge, Method, Percept
 from jaxnav.policies.network import Params, Policy, bind
-from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyState
+from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_direct_pathways
 from jaxnav.policies.spatial_memory import ExplorationMap, SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
-
-Tree = TypeVar("Tree")
 
 
 class PerceptionState(NamedTuple):
@@ -47,38 +45,22 @@ class PerceptionState(NamedTuple):
     tracker_state: Any
 
 
-class View(NamedTuple):
-    """Inputs of a policy at one step.
-
-    Attributes:
-      observation: packed row and goal.
-      weights: float32 [K], the layout's weights for the goal (eq. 7); ones without the layout.
-      reading: what the tracker reads from its state, a pytree; None without a tracker.
-      surroundings: uint8 [M], known cells around the agent; None without a spatial memory.
-    """
-
-    observation: Observation
-    weights: jax.Array
-    reading: Any
-    surroundings: jax.Array | None
-
-
 @dataclasses.dataclass(frozen=True)
 class Perception:
     """Perception of one episode, without trained parameters; hashable.
 
-    Each view is taken in exactly once, the first one of an episode included. All functions handle one episode; use
+    Call `update` exactly once per view, including the first one of an episode. All functions handle one episode; use
     `jax.vmap` for batches.
 
     Attributes:
       row_format: format of the observation rows.
       spec: of the policy; None where actions are given.
-      estimator: configuration of the layout estimator; None leaves the layout out.
+      estimator_config: configuration of the layout estimator; None leaves the layout out.
     """
 
     row_format: RowFormat
     spec: PolicySpec | None = None
-    estimator: EstimatorConfig | None = None
+    estimator_config: EstimatorConfig | None = None
 
     def init(self, knowledge: Knowledge | None, room: jax.Array) -> PerceptionState:
         """Return the state before the first view.
@@ -97,11 +79,11 @@ class Perception:
         )
 
     def update(self, state: PerceptionState, percept: Percept, knowledge: Any, room: jax.Array) -> PerceptionState:
-        """Take in one view.
+        """Update layout belief, map and tracker state with one view.
 
         Args:
-          state: before the view.
-          percept: the view, and how the agent got there.
+          state: the state before the view.
+          percept: observation row, heading and odometry of one step.
           knowledge, room: as in `init`.
         """
         layout, spatial_map, tracker_state = state
@@ -119,20 +101,20 @@ class Perception:
                 spatial_map, percept.row, percept.heading, percept.moved, self.row_format
             )
 
-        # Whatever else the method remembers.
+        # State of the method's tracker.
         if self.tracker is not None:
             tracker_state = self.tracker.update(tracker_state, knowledge, percept)
 
         return PerceptionState(layout, spatial_map, tracker_state)
 
-    def view(self, state: PerceptionState, observation: Observation, knowledge: Any) -> View:
-        """Return the policy's inputs, given the present observation."""
-        # Layout weights of the goal, [K]; ones leave the layout out.
-        weights = jnp.ones(self.row_format.num_categories)
+    def policy_inputs(self, state: PerceptionState, observation: Observation, knowledge: Any) -> PolicyInputs:
+        """Inputs of the policy for one episode, leaves without a batch axis, given its observation."""
+        # Layout weights of the goal, [K]; ones disable the layout.
+        layout_weights = jnp.ones(self.row_format.num_categories)
         if state.layout is not None:
-            weights = LayoutEstimator.goal_weights(state.layout, observation.goal)
+            layout_weights = LayoutEstimator.goal_weights(state.layout, observation.goal)
 
-        # What the method's tracker contributes.
+        # Output of the method's tracker.
         reading = None
         if self.tracker is not None:
             reading = self.tracker.read(state.tracker_state, knowledge, observation.goal)
@@ -143,7 +125,7 @@ class Perception:
         if spatial_memory is not None and state.spatial_map is not None:
             surroundings = spatial_memory.read(state.spatial_map)
 
-        return View(observation, weights, reading, surroundings)
+        return PolicyInputs(observation, layout_weights, reading, surroundings)
 
     @property
     def uses_odometry(self) -> bool:
@@ -161,44 +143,31 @@ class Perception:
 
     def _layout_estimator(self, knowledge: Any, room: jax.Array) -> LayoutEstimator | None:
         """The estimator with the prior of a room type; None without the layout."""
-        if self.estimator is None:
+        if self.estimator_config is None:
             return None
         # Rows of this room type; without evidence the tree has no leaves and stays None.
         cooccurrence = jax.tree.map(lambda leaf: leaf[room], knowledge.cooccurrence)
-        return LayoutEstimator(knowledge.layout[room], self.estimator, cooccurrence)
+        return LayoutEstimator(knowledge.layout[room], self.estimator_config, cooccurrence)
 
 
 def decide(
-    policy: Decider, view: View, memory: PolicyState, use_direct: jax.Array | None = None
+    policy: Decider, inputs: PolicyInputs, memory: PolicyState, use_direct: jax.Array | None = None
 ) -> tuple[Pathways, Decision]:
-    """Run a policy on a view: embed the pathways, then decide on them.
+    """Run a policy: embed the pathways, then decide on them.
 
     Args:
-      policy: with bound parameters.
-      view: leaves [..., ...].
-      memory: of the policy, leaves [..., ...].
-      use_direct: bool [...], False where both direct pathways are set to zero; None keeps them.
+      policy: policy with bound parameters.
+      inputs: inputs of a batch [...] of decisions.
+      memory: the policy's state, batch [...].
+      use_direct: bool [...], False where both direct pathways are set to zero (training with `counterfactual: coin`);
+        None keeps them.
 
     Returns:
       The pathways after masking, for interventions, and the decision on them.
     """
-    pathways = policy.pathways(*view, memory)
+    pathways = policy.pathways(inputs, memory)
     pathways = mask_direct_pathways(pathways, use_direct)
     return pathways, policy.decide(pathways, memory)
-
-
-def mask_direct_pathways(pathways: Pathways, use_direct: jax.Array | None) -> Pathways:
-    """Set both direct pathways to zero where `use_direct` is False.
-
-    Args:
-      pathways: leaves [..., ...].
-      use_direct: bool [...]; None keeps all.
-    """
-    if use_direct is None:
-        return pathways
-    masked_scene = jnp.where(use_direct[..., None], pathways.scene, 0.0)
-    masked_goal = jnp.where(use_direct[..., None], pathways.goal, 0.0)
-    return do(pathways, scene=masked_scene, goal=masked_goal)
 
 
 class Agent(NamedTuple):
@@ -242,19 +211,19 @@ class StepResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class AgentLoop:
-    """Acting in B parallel episodes; hashable, so that jitted functions may take it as a static argument.
+    """Runs agents in B parallel episodes; hashable, so that jitted functions may take it as a static argument.
 
     Attributes:
       env: the environment.
       spec: of the policy; None where actions are given.
-      estimator: configuration of the layout estimator; None leaves the layout out.
+      estimator_config: configuration of the layout estimator; None leaves the layout out.
       inner_steps: adaptation steps that the method may take in an episode; 0 for none, None for its default.
       fallback_spec: of a policy without experience that decisions are handed over to; None without one.
     """
 
     env: ObjectNav
     spec: PolicySpec | None = None
-    estimator: EstimatorConfig | None = None
+    estimator_config: EstimatorConfig | None = None
     inner_steps: int | None = None
     fallback_spec: PolicySpec | None = None
 
@@ -272,11 +241,11 @@ class AgentLoop:
             policy.adaptation = limit_inner_steps(policy.adaptation, self.inner_steps)
         return policy
 
-    def decider(self, params: Params) -> Decider:
-        """Bind parameters to the policy, or to the pair of the policy and its fallback.
+    def bind_decider(self, params: Params) -> Decider:
+        """Bind parameters to the policy, or to a `HandoverPolicy` of the policy and its fallback.
 
         Args:
-          params: of the policy; {"agent": ..., "without": ...} with a fallback.
+          params: parameters of the policy; {"agent": ..., "without": ...} with a fallback.
         """
         if self.fallback_spec is None:
             return self.bind(params)
@@ -296,28 +265,28 @@ class AgentLoop:
         """
         # Every episode has a key of its own.
         _, state = jax.vmap(self.env.reset, (0, None))(jax.random.split(key, num_envs), env_params)
-        return self.begin(state, memory, knowledge, env_params)
+        return self.start_from(state, memory, knowledge, env_params)
 
-    def begin(self, state: State, memory: PolicyState | None, knowledge: Any, env_params: EnvParams) -> Agent:
+    def start_from(self, state: State, memory: PolicyState | None, knowledge: Any, env_params: EnvParams) -> Agent:
         """Start episodes in given states, leaves [B], and perceive the first view."""
-        agent = self._unseeing_agent(state, memory, knowledge, env_params)
+        agent = self._init_agent(state, memory, knowledge, env_params)
         # No action led to the first view.
         no_action = jnp.full(state.pose.shape, NO_ACTION, jnp.int32)
         not_moved = jnp.zeros(state.pose.shape, bool)
         return self.perceive(agent, no_action, not_moved, knowledge, env_params)
 
-    def view(self, agent: Agent, knowledge: Knowledge | None, env_params: EnvParams) -> View:
-        """Return the policy's inputs in the present states, leaves [B, ...]."""
+    def policy_inputs(self, agent: Agent, knowledge: Knowledge | None, env_params: EnvParams) -> PolicyInputs:
+        """Inputs of the policy in the current states, leaves [B, ...]."""
         observation = jax.vmap(self.env.observe, (0, None))(agent.state, env_params)
-        return jax.vmap(self._perception.view, (0, 0, None))(agent.perception, observation, knowledge)
+        return jax.vmap(self._perception.policy_inputs, (0, 0, None))(agent.perception, observation, knowledge)
 
-    def gap(self, agent: Agent) -> jax.Array:
-        """Return the layout gaps D, float32 [B]; 0 without the layout."""
+    def layout_gap(self, agent: Agent) -> jax.Array:
+        """Layout gaps D of the current beliefs, float32 [B]; 0 without the layout."""
         layout = agent.perception.layout
         return jnp.zeros(agent.state.goal.shape) if layout is None else layout.gap
 
     def is_decision_step(self, agent: Agent) -> jax.Array | None:
-        """True where the policy's choice has an effect now, bool [B]; None where every choice has."""
+        """True in episodes where the policy's next choice takes effect, bool [B]; None if every choice does."""
         return None if self.method is None else self.method.control.is_decision_step(agent.perception.tracker_state)
 
     def step(
@@ -329,7 +298,7 @@ class AgentLoop:
         *,
         policy: Decider | None = None,
         decision: Decision | None = None,
-        keys: jax.Array | None = None,
+        reset_keys: jax.Array | None = None,
     ) -> tuple[Agent, StepResult]:
         """Act once in every episode and perceive the next view.
 
@@ -338,31 +307,42 @@ class AgentLoop:
           choice: int32 [B], sampled from the decision; an action unless the method has a control of its own.
           knowledge: learned before training; None where neither layout nor tracker is used.
           env_params: of the environment.
-          policy, decision: the policy and its decision; None where actions are given.
-          keys: [B], of the episodes that follow those that end (same-step auto-reset); None lets episodes go on.
+          policy, decision: the policy, which gives new episodes their initial memory, and its decision; None where
+            actions are given.
+          reset_keys: PRNG keys [B] of new episodes; ended episodes then reset in the same step. None disables the
+            auto-reset.
 
         Returns:
-          The agent after the step, in a new episode where one has ended and keys are given, and the result of the step.
+          The agent after the step (after the reset, if its episode has ended and `reset_keys` are given), and the
+          result of the step.
         """
         # Choice -> action -> environment.
         action, agent = self._apply_control(agent, choice, knowledge)
-        last_state, reward, terminated, truncated, success, next_state = self._step_env(
-            agent.state, action, keys, env_params
+        final_state, reward, terminated, truncated, success, next_state = self._step_env(
+            agent.state, action, reset_keys, env_params
         )
-        # Odometry compares the cells before and after the action, and not after a reset.
-        moved = self.env.cell_of_pose(last_state.pose) != self.env.cell_of_pose(agent.state.pose)
-        next_memory = None if decision is None else decision.next_state(action)
-        before_reset = agent._replace(state=last_state, memory=next_memory)
-        result = StepResult(reward, terminated, truncated, success, moved, before_reset)
 
-        # Without keys the episodes simply go on.
-        if keys is None:
+        # Odometry: did the action change the cell? Compare before any reset.
+        moved = self.env.cell_of_pose(final_state.pose) != self.env.cell_of_pose(agent.state.pose)
+        next_memory = None if decision is None else decision.next_state(action)
+        before_reset = agent._replace(state=final_state, memory=next_memory)
+        result = StepResult(
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            success=success,
+            moved=moved,
+            agent=before_reset,
+        )
+
+        # Without auto-reset the episodes go on.
+        if reset_keys is None:
             return self.perceive(before_reset, action, moved, knowledge, env_params), result
 
-        # With keys, those that have ended start anew: fresh memory and beliefs, no previous action.
+        # Auto-reset: ended episodes get fresh memory and beliefs, and no previous action.
         fresh_memory = None if policy is None else policy.initial_memory(next_state.pose.shape)
-        fresh_agent = self._unseeing_agent(next_state, fresh_memory, knowledge, env_params)
-        next_agent = select(result.ended, fresh_agent, before_reset)._replace(state=next_state)
+        fresh_agent = self._init_agent(next_state, fresh_memory, knowledge, env_params)
+        next_agent = tree_where(result.ended, fresh_agent, before_reset)._replace(state=next_state)
         action = jnp.where(result.ended, NO_ACTION, action)
         moved = moved & ~result.ended
         return self.perceive(next_agent, action, moved, knowledge, env_params), result
@@ -370,19 +350,25 @@ class AgentLoop:
     def perceive(
         self, agent: Agent, action: jax.Array, moved: jax.Array, knowledge: Any, env_params: EnvParams
     ) -> Agent:
-        """Take the present views into beliefs, maps and tracker states.
+        """Update beliefs, maps and tracker states with the views at the current poses.
 
         Args:
           agent: the episodes, [B].
-          action: int32 [B], that led to the present pose.
+          action: int32 [B], the action that led to the current pose.
           moved: bool [B], whether that action changed the cell.
           knowledge, env_params: as in `step`.
         """
         pose = agent.state.pose
         room = env_params.room[agent.state.scene]
         _, heading, horizon = self.env.task.rules.split_pose(pose)
-        # Views are rows of the compiled tables, looked up by pose.
-        percept = Percept(env_params.tables.rows[pose], heading, action, moved, horizon, agent.state.goal)
+        percept = Percept(
+            row=env_params.tables.rows[pose],
+            heading=heading,
+            action=action,
+            moved=moved,
+            horizon=horizon,
+            goal=agent.state.goal,
+        )
 
         # Knowledge is shared by the batch.
         update = jax.vmap(self._perception.update, (0, 0, None, 0))
@@ -390,7 +376,7 @@ class AgentLoop:
 
     @property
     def _perception(self) -> Perception:
-        return Perception(self.env.row_format, self.spec, self.estimator)
+        return Perception(self.env.row_format, self.spec, self.estimator_config)
 
     def _apply_control(self, agent: Agent, choice: jax.Array, knowledge: Any) -> tuple[jax.Array, Agent]:
         """Turn choices into actions; the method's control may change the tracker states."""
@@ -402,43 +388,32 @@ class AgentLoop:
         return action, agent._replace(perception=agent.perception._replace(tracker_state=tracker_state))
 
     def _step_env(
-        self, state: State, action: jax.Array, keys: jax.Array | None, env_params: EnvParams
+        self, state: State, action: jax.Array, reset_keys: jax.Array | None, env_params: EnvParams
     ) -> tuple[State, jax.Array, jax.Array, jax.Array, jax.Array, State]:
-        """Step the environment, with auto-reset where keys are given.
+        """Step the environment, with auto-reset if keys are given.
 
         Returns:
           The state after the action, reward, terminated, truncated, success, and the state to go on with.
         """
-        if keys is None:
-            # Without a reset the last state is also the next one.
+        if reset_keys is None:
+            # Without a reset the final state is also the next one. Done keeps the pose, so success may be read before.
             success = jax.vmap(self.env.done_succeeds, (0, None))(state, env_params)
             advance = jax.vmap(self.env.advance, (0, 0, None))
-            last_state, reward, terminated, truncated = advance(state, action, env_params)
-            return last_state, reward, terminated, truncated, terminated & success, last_state
+            final_state, reward, terminated, truncated = advance(state, action, env_params)
+            return final_state, reward, terminated, truncated, terminated & success, final_state
 
-        # With a reset the environment hands the last state over in `info`.
+        # With a reset the environment returns the final state in `info`.
         step = jax.vmap(self.env.step, (0, 0, 0, None))
-        _, next_state, reward, terminated, truncated, info = step(keys, state, action, env_params)
+        _, next_state, reward, terminated, truncated, info = step(reset_keys, state, action, env_params)
         return info["final_state"], reward, terminated, truncated, info["success"], next_state
 
-    def _unseeing_agent(self, state: State, memory: PolicyState | None, knowledge: Any, env_params: EnvParams) -> Agent:
-        """Return agents that have not perceived anything yet."""
+    def _init_agent(self, state: State, memory: PolicyState | None, knowledge: Any, env_params: EnvParams) -> Agent:
+        """Agents before their first view."""
         perception = jax.vmap(self._perception.init, (None, 0))(knowledge, env_params.room[state.scene])
         return Agent(state, perception, memory)
 
 
 def policy_memory(agent: Agent) -> PolicyState:
-    """Return the policy's memories, for agents that a policy acts for."""
+    """The policies' memories of agents that a policy acts for."""
     assert agent.memory is not None
     return agent.memory
-
-
-def select(condition: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
-    """Choose the leaves [B, ...] of either tree, per episode, by bool [B]."""
-
-    def select_leaf(true_leaf: jax.Array, false_leaf: jax.Array) -> jax.Array:
-        # [B] becomes [B, 1, ...], with the number of axes of the leaf.
-        batch_condition = condition.reshape(condition.shape + (1,) * (true_leaf.ndim - 1))
-        return jnp.where(batch_condition, true_leaf, false_leaf)
-
-    return jax.tree.map(select_leaf, on_true, on_false)

@@ -2,13 +2,11 @@
 
 from typing import Any, cast
 
-import jax
 import jax.numpy as jnp
 
-from jaxnav.env.objectnav import Observation
 from jaxnav.numerics.rounding import round_to_grid
 from jaxnav.policies.network import Policy
-from jaxnav.policies.pathways import Decision, Pathways, PolicyState
+from jaxnav.policies.pathways import Decision, Pathways, PolicyInputs, PolicyState
 
 
 class HandoverPolicy:
@@ -33,29 +31,21 @@ class HandoverPolicy:
         state_without = self.without_experience.initial_memory(batch)
         return state_with._replace(hidden=jnp.concatenate([state_with.hidden, state_without.hidden], axis=-1))
 
-    def pathways(
-        self,
-        observation: Observation,
-        weights: jax.Array,
-        reading: Any,
-        surroundings: jax.Array | None,
-        memory: PolicyState,
-    ) -> Pathways:
-        """Embed the inputs of both policies.
+    def pathways(self, inputs: PolicyInputs, memory: PolicyState) -> Pathways:
+        """Embed the inputs of both policies; arguments as in `Policy.pathways`.
 
-        Arguments: see `Policy.pathways`. The pathways of the two policies are together the experience of this one;
-          scene and goal
-        are 1 [..., 1], and setting them to 0 removes the policy without experience.
+        The experience is the pair of the two policies' pathways. Scene and goal are 1 [..., 1]; setting them to 0
+        removes the policy without experience.
         """
         state_with, state_without = self._split_state(memory)
         # The policy with experience reads everything, the layout weights included.
-        pathways_with = self.with_experience.pathways(observation, weights, reading, surroundings, state_with)
+        pathways_with = self.with_experience.pathways(inputs, state_with)
         # The policy without experience knows no layout and has no tracker.
-        no_weights = jnp.ones_like(weights)
-        pathways_without = self.without_experience.pathways(observation, no_weights, None, surroundings, state_without)
+        plain_inputs = inputs._replace(layout_weights=jnp.ones_like(inputs.layout_weights), reading=None)
+        pathways_without = self.without_experience.pathways(plain_inputs, state_without)
 
         # Scene and goal are factors on the policy without experience, float32 [..., 1].
-        ones = jnp.ones_like(weights[..., :1])
+        ones = jnp.ones_like(inputs.layout_weights[..., :1])
         both_pathways: Any = (pathways_with, pathways_without)
         return Pathways(scene=ones, goal=ones, experience=both_pathways, gate=ones)
 
@@ -84,5 +74,5 @@ class HandoverPolicy:
         return memory._replace(hidden=hidden_with), PolicyState(hidden_without, memory.action)
 
 
-#: A policy as an evaluation runs it.
+#: Either kind of policy that an agent loop can run.
 Decider = Policy | HandoverPolicy

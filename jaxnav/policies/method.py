@@ -97,7 +97,7 @@ class Experience(nnx.Module):
     sizes: ClassVar[Mapping[str, int]] = {}
     num_scene_inputs: ClassVar[int] = 0
     width: int
-    recurrent = False
+    reads_memory = False
 
     def __init__(self, spec: "PolicySpec", rngs: nnx.Rngs) -> None:
         raise NotImplementedError
@@ -186,7 +186,7 @@ class Adaptation(Protocol):
     def decide(self, policy: "Policy", pathways: "Pathways", memory: "PolicyState", /) -> "Decision":
         """Decide with the fast weights `memory.fast`; the decision holds the next ones.
 
-        `policy.decide_without_adaptation` is the decision without them.
+        `policy.decide_with_changes` is the decision without them.
         """
         ...
 

@@ -6,7 +6,7 @@ modules that are built once; only their parameters, a nested dict of arrays, are
 
     params = init_params(spec, key)
     policy = bind(spec, params)
-    pathways = policy.pathways(observation, weights, reading, surroundings, memory)
+    pathways = policy.pathways(PolicyInputs(observation, layout_weights, reading, surroundings), memory)
     decision = policy.decide(pathways, memory)
     counterfactual = policy.decide(do(pathways, scene=0, goal=0), memory)
 """
@@ -22,12 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from jaxnav.env.objectnav import Observation
 from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.numerics.recurrence import gru_step
 from jaxnav.numerics.rounding import round_to_grid
 from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, unpack_features
-from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyState, mask_experience
+from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_experience
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import RowFormat
@@ -41,8 +40,8 @@ INITIAL_DONE_LOGIT = -2.5
 #: Factor of the Done gate, times the confidence of the goal's detection.
 DONE_GATE = 0.58
 
-#: What an adaptation adds to the outputs [..., N] of the layers `fuse`, `drive` (the core's input kernel), `core` (its
-#: recurrent kernel) and `actor`, given the inputs [..., M] of each. Where the layer has a bias the last input is 1.
+#: Additive changes of layer outputs by an adaptation: layer name (`fuse`, `input_gates`, `hidden_gates` or `actor`) ->
+#: function from the layer's inputs [..., M] to a change [..., N]. A 1 is appended to the inputs of layers with a bias.
 LayerChanges = Mapping[str, Callable[[jax.Array], jax.Array]]
 NO_CHANGES: LayerChanges = MappingProxyType({})
 
@@ -143,12 +142,12 @@ class Stream(nnx.Module):
         """Project the fused input float32 [..., H] to the input part of the GRU's gates, float32 [..., 3 H]."""
         inputs = nnx.relu(fused)
         gates = add_bias(matmul_rows(inputs, self.core.dense_i.kernel[...]), self.core.dense_i)
-        return gates + changes["drive"](append_one(inputs)) if "drive" in changes else gates
+        return gates + changes["input_gates"](append_one(inputs)) if "input_gates" in changes else gates
 
     def hidden_gates(self, hidden: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
         """Project the hidden state float32 [..., H] to the recurrent part of the GRU's gates, float32 [..., 3 H]."""
         gates = hidden @ self.core.dense_h.kernel[...]
-        return gates + changes["core"](hidden) if "core" in changes else gates
+        return gates + changes["hidden_gates"](hidden) if "hidden_gates" in changes else gates
 
     def apply_heads(self, hidden: jax.Array, pathways: Pathways, changes: LayerChanges = NO_CHANGES) -> Decision:
         """Compute logits and value from a hidden state float32 [..., H]."""
@@ -171,8 +170,8 @@ class Stream(nnx.Module):
         num_gates = 3 * self.hidden
         return {
             "fuse": (sum(self.widths) + 1, self.hidden),
-            "drive": (self.hidden + 1, num_gates),
-            "core": (self.hidden, num_gates),
+            "input_gates": (self.hidden + 1, num_gates),
+            "hidden_gates": (self.hidden, num_gates),
             "actor": (self.hidden + 1, self.actor.out_features),
         }
 
@@ -225,66 +224,54 @@ class Policy(Stream):
 
         super().__init__(self._input_widths(sizes), method.control.num_choices, spec, rngs)
 
-    def pathways(
-        self,
-        observation: Observation,
-        weights: jax.Array,
-        reading: Any = None,
-        surroundings: jax.Array | None = None,
-        memory: PolicyState | None = None,
-    ) -> Pathways:
-        """Embed what is seen (S), what is sought (G), and what experience makes of both (Z).
+    def pathways(self, inputs: PolicyInputs, memory: PolicyState | None = None) -> Pathways:
+        """Embed the scene (S), the goal (G) and the experience (Z).
 
         Args:
-          observation: a batch [...] of observations.
-          weights: float32 [..., K], the layout's weights for the goal (eq. 7); ones leave the layout out.
-          reading: what the method's tracker read, leaves [...]; None without a tracker.
-          surroundings: uint8 [..., M], what the spatial memory read; None without one.
-          memory: leaves [...]; needed where the method attends with it.
+          inputs: leaves [...].
+          memory: leaves [...]; None unless the method's experience reads the memory.
+
+        Returns:
+          Embeddings with leaves [..., size], see `Pathways`.
 
         Raises:
-          ValueError: the method attends with its memory, and there is none.
+          ValueError: the experience reads the memory, and none is given.
         """
-        # Memory enters in `attend` alone, so that everything before can run for whole rollouts at once.
-        encoded = self.encode(observation, weights, reading, surroundings)
-        if not self.method.recurrent:
+        # Only `attend` reads the memory; everything before it runs in parallel over time.
+        encoded = self.encode(inputs)
+        if not self.method.reads_memory:
             return encoded
         if memory is None:
-            raise ValueError("pathways: the method attends with its memory; give it")
+            raise ValueError("pathways: the experience of the method reads the memory; give it")
         return self.attend(encoded, memory)
 
-    def encode(
-        self,
-        observation: Observation,
-        weights: jax.Array,
-        reading: Any = None,
-        surroundings: jax.Array | None = None,
-    ) -> Pathways:
-        """Embed without memory, in parallel over time; the experience may still have to `attend`."""
-        # Unpack the rows, and restrict them to what the method lets the networks see.
-        features = unpack_features(observation.row, observation.goal, self.row_format)
+    def encode(self, inputs: PolicyInputs) -> Pathways:
+        """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
+        # Unpack the rows; a method may restrict the features that its network reads.
+        features = unpack_features(inputs.observation.row, inputs.observation.goal, self.row_format)
         if self.perceive is not None:
             features = self.perceive(features)
 
         # S: everything about the scene that does not depend on objects.
         scene_inputs = features.view
-        if surroundings is not None:
-            scene_inputs = jnp.concatenate([scene_inputs, SpatialMemory.encode_surroundings(surroundings)], axis=-1)
+        if inputs.surroundings is not None:
+            map_inputs = SpatialMemory.encode_surroundings(inputs.surroundings)
+            scene_inputs = jnp.concatenate([scene_inputs, map_inputs], axis=-1)
         if self.method.num_scene_inputs:
-            scene_inputs = jnp.concatenate([scene_inputs, self.method.scene_inputs(reading)], axis=-1)
+            scene_inputs = jnp.concatenate([scene_inputs, self.method.scene_inputs(inputs.reading)], axis=-1)
         scene = nnx.relu(self.view(scene_inputs))
 
-        # G: detections and the goal.
-        goal = self._embed_goal(features, self.appearance.embedding[...])
+        # G: the detections of all categories and the goal.
+        goal_embedding = self._embed_goal(features, self.appearance.embedding[...])
 
-        # Z: the method, with eq. 7's weights. The belief is no function of the parameters.
-        layout_weights = jax.lax.stop_gradient(weights)
-        experience = self.method.encode(features, self.experience_appearance, layout_weights, reading)
+        # Z: the method's experience, weighted by w x g (eq. 7). No gradient enters the layout belief.
+        layout_weights = jax.lax.stop_gradient(inputs.layout_weights)
+        experience = self.method.encode(features, self.experience_appearance, layout_weights, inputs.reading)
 
-        # The gate of Done follows the confidence with which the goal is detected.
+        # The Done gate follows the confidence of the goal's detection.
         confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)
         gate = DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence)
-        return Pathways(scene, goal, experience, gate, reading)
+        return Pathways(scene=scene, goal=goal_embedding, experience=experience, gate=gate, reading=inputs.reading)
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
         """Let the experience of `encode` attend with the memory."""
@@ -299,12 +286,12 @@ class Policy(Stream):
         # Some training episodes are without experience, so that the direct stream learns to act alone.
         pathways = mask_experience(pathways, memory.use_experience)
         if self.adaptation is None:
-            decision = self.decide_without_adaptation(pathways, memory)
+            decision = self.decide_with_changes(pathways, memory)
         else:
             decision = self.adaptation.decide(self, pathways, memory)
         return decision._replace(use_experience=memory.use_experience)
 
-    def decide_without_adaptation(
+    def decide_with_changes(
         self, pathways: Pathways, memory: PolicyState, changes: LayerChanges = NO_CHANGES
     ) -> Decision:
         """Decide without the method's adaptation, which may call this with changes of the layers.
@@ -330,9 +317,9 @@ class Policy(Stream):
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
 
     @property
-    def recurrent(self) -> bool:
-        """True where training has to unroll the policy step by step."""
-        return self.method.recurrent or self.adaptation is not None
+    def needs_stepwise_replay(self) -> bool:
+        """True if training must unroll the policy step by step, because experience or adaptation reads the memory."""
+        return self.method.reads_memory or self.adaptation is not None
 
     @property
     def experience_appearance(self) -> jax.Array:
@@ -404,24 +391,18 @@ class StreamsPolicy(Policy):
         # Embeddings of its own, so that experience shares none with the direct stream.
         self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
 
-    def encode(
-        self,
-        observation: Observation,
-        weights: jax.Array,
-        reading: Any = None,
-        surroundings: jax.Array | None = None,
-    ) -> Pathways:
-        """Embed without memory; the experience may still have to `attend`."""
-        encoded = super().encode(observation, weights, reading, surroundings)
+    def encode(self, inputs: PolicyInputs) -> Pathways:
+        """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
+        encoded = super().encode(inputs)
         # The layer of the view embeds it twice, once per stream; the appended 1 is the factor of the stream.
         direct_view, experience_view = jnp.split(encoded.scene, 2, axis=-1)
         experience = encoded.experience, append_one(experience_view)
         encoded = encoded._replace(scene=append_one(direct_view), experience=experience)
-        return encoded if self.method.recurrent else _join_experience(encoded)
+        return encoded if self.method.reads_memory else _join_experience(encoded)
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
         """Let the experience of `encode` attend with the memory of its stream."""
-        if not self.method.recurrent:
+        if not self.method.reads_memory:
             return encoded
         experience, experience_view = encoded.experience
         # The second half of the hidden state belongs to the stream of experience.

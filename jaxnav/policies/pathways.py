@@ -11,12 +11,30 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from jaxnav.causal import do
+from jaxnav.env.objectnav import Observation
 from jaxnav.scenes.task import NUM_ACTIONS
 
 #: The previous action at the start of an episode.
 NO_ACTION = NUM_ACTIONS
+
+
+class PolicyInputs(NamedTuple):
+    """Inputs of a policy at one step, leaves [...] of a batch or of one decision.
+
+    Attributes:
+      observation: packed row and goal.
+      layout_weights: float32 [..., K], w x g of eq. 7, the layout's weights for the goal; ones disable the layout.
+      reading: output of the method's tracker, a pytree; None without a tracker.
+      surroundings: uint8 [..., M], known cells around the agent; None without a spatial memory.
+    """
+
+    observation: Observation
+    layout_weights: jax.Array
+    reading: Any = None
+    surroundings: jax.Array | None = None
 
 
 class Pathways(NamedTuple):
@@ -91,3 +109,17 @@ def mask_experience(pathways: Pathways, use_experience: jax.Array | None) -> Pat
     if use_experience is None:
         return pathways
     return do(pathways, experience=use_experience[..., None] * pathways.experience)
+
+
+def mask_direct_pathways(pathways: Pathways, use_direct: jax.Array | None) -> Pathways:
+    """Set both direct pathways to zero where `use_direct` is False.
+
+    Args:
+      pathways: leaves [..., ...].
+      use_direct: bool [...]; None keeps all.
+    """
+    if use_direct is None:
+        return pathways
+    masked_scene = jnp.where(use_direct[..., None], pathways.scene, 0.0)
+    masked_goal = jnp.where(use_direct[..., None], pathways.goal, 0.0)
+    return do(pathways, scene=masked_scene, goal=masked_goal)

@@ -16,7 +16,7 @@ from jaxnav.causal import do
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
 from jaxnav.layout import ESTIMATORS, prior_from_counts
-from jaxnav.policies.agent_loop import Agent, AgentLoop, View, decide, policy_memory
+from jaxnav.policies.agent_loop import Agent, AgentLoop, PolicyInputs, decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Percept
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import Params, Policy, init_params
@@ -125,7 +125,7 @@ def _act_once(
 ) -> tuple[Agent, jax.Array]:
     """Act once without auto-reset, and return the agent and its choices."""
     memory = policy_memory(agent)
-    _, decision = decide(policy, agent_loop.view(agent, knowledge, env_params), memory)
+    _, decision = decide(policy, agent_loop.policy_inputs(agent, knowledge, env_params), memory)
     # Sample the choices, and step all episodes without a reset.
     choice = jax.random.categorical(key, decision.logits)
     next_agent, _ = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
@@ -191,19 +191,19 @@ def _check_decision(
     env_params: EnvParams,
 ) -> None:
     """Check pathways and decisions in the middle of episodes."""
-    view = agent_loop.view(agent, knowledge, env_params)
+    inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
     memory = policy_memory(agent)
 
     @jax.jit
-    def embed(view: View, memory: PolicyState) -> Pathways:
-        return agent_loop.bind(params).pathways(*view, memory)
+    def embed(inputs: PolicyInputs, memory: PolicyState) -> Pathways:
+        return agent_loop.bind(params).pathways(inputs, memory)
 
     @jax.jit
     def decide(pathways: Pathways, memory: PolicyState) -> Decision:
         return agent_loop.bind(params).decide(pathways, memory)
 
     # Shapes, dtypes, finite values.
-    pathways = embed(view, memory)
+    pathways = embed(inputs, memory)
     decision = decide(pathways, memory)
     chex.assert_shape(pathways.experience, (_BATCH_SIZE, agent_loop.bind(params).method.width))
     chex.assert_shape([decision.logits, decision.value], [(_BATCH_SIZE, num_choices), (_BATCH_SIZE,)])
@@ -213,9 +213,9 @@ def _check_decision(
 
     # Single members of the batch.
     for i in range(_BATCH_SIZE):
-        member_view = _member(view, i)
+        member_inputs = _member(inputs, i)
         member_memory = _member(memory, i)
-        member_decision = decide(embed(member_view, member_memory), member_memory)
+        member_decision = decide(embed(member_inputs, member_memory), member_memory)
         chex.assert_trees_all_close(member_decision, _member(decision, i), rtol=1e-4, atol=1e-5)
 
     # An intervention leaves the experience unchanged, and then only the experience matters.

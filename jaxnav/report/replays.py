@@ -308,7 +308,7 @@ def _make_trace(trace: EpisodeTrace, plan_poses: np.ndarray, has_layout: bool) -
     """
     # Logits of the three inferences, [T, 3, A].
     inferred = trace.inferred
-    logits = np.stack([inferred.factual, inferred.counterfactual, inferred.corrected], axis=1)
+    logits = np.stack([inferred.factual_logits, inferred.removed_logits, inferred.action_logits], axis=1)
 
     # Policies that choose among other things than actions have no probabilities to show.
     chooses_actions = logits.shape[-1] == NUM_ACTIONS
@@ -317,8 +317,8 @@ def _make_trace(trace: EpisodeTrace, plan_poses: np.ndarray, has_layout: bool) -
         actions=trace.action.tolist(),
         success=trace.success,
         gap=pack_shares(trace.gap),
-        weight=pack_shares(np.asarray(inferred.weight)),
-        layout=pack_shares(np.asarray(inferred.layout)) if has_layout else "",
+        weight=pack_shares(np.asarray(inferred.removal_weight)),
+        layout=pack_shares(np.asarray(inferred.layout_weights)) if has_layout else "",
         chances=pack_shares(softmax(logits, axis=-1)) if chooses_actions else "",
     )
 

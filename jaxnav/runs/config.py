@@ -19,7 +19,7 @@ from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars, stage_index_at
+from jaxnav.training.config import CounterfactualTraining, PPOConfig, PPOScalars, stage_index_at
 from jaxnav.training.devices import Devices
 
 Arm = Literal["baseline", "layout"]
@@ -134,7 +134,7 @@ class RunConfig:
     total_steps: int | None = None
     imitation: float | None = None
     seed: int = 0
-    counterfactual: Counterfactual = "distil"
+    counterfactual: CounterfactualTraining = "distil"
     decision: DecisionKind = "fused"
     direct: Direct = "all"
     spatial_memory: bool = True

@@ -397,11 +397,11 @@ def check_knowledge(params: Params, spec: PolicySpec, knowledge: Knowledge) -> N
         )
         perception_state = perception.init(knowledge, zero_index)
         perception_state = perception.update(perception_state, percept, knowledge, zero_index)
-        view = perception.view(perception_state, Observation(row, goal=zero_index), knowledge)
+        inputs = perception.policy_inputs(perception_state, Observation(row, goal=zero_index), knowledge)
 
         # Build the pathways, and turn a choice into an action.
         policy = bind(spec, params)
-        pathways = policy.pathways(*view, policy.initial_memory())
+        pathways = policy.pathways(inputs, policy.initial_memory())
         return pathways, spec.method.control.act(zero_index, perception_state.tracker_state, knowledge)
 
     try:

@@ -180,11 +180,11 @@ class LoadedPolicy(struct.PyTreeNode):
             goal=observation.goal,
         )
         perception_state = perception.update(memory.perception_state, percept, self.knowledge, memory.room)
-        view = perception.view(perception_state, observation, self.knowledge)
+        inputs = perception.policy_inputs(perception_state, observation, self.knowledge)
 
         # Factual decision.
         policy = bind(self.spec, self.params)
-        pathways, decision = decide(policy, view, memory.policy_state)
+        pathways, decision = decide(policy, inputs, memory.policy_state)
         factual = decision.logits
         layout = perception_state.layout
         if layout is None or self.estimator_config is None:
@@ -193,7 +193,9 @@ class LoadedPolicy(struct.PyTreeNode):
         # Counterfactual decision by experience alone, and its removal.
         counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.policy_state).logits
         logits = stde(factual, counterfactual, layout.gap, epsilon, self.estimator_config.form)
-        return PolicyOutput(logits, factual, counterfactual, layout.gap, view.weights, perception_state, decision)
+        return PolicyOutput(
+            logits, factual, counterfactual, layout.gap, inputs.layout_weights, perception_state, decision
+        )
 
     def apply_choice(self, output: PolicyOutput, choice: jax.Array, room: jax.Array) -> tuple[jax.Array, EpisodeMemory]:
         """Turn a choice into an action, and advance the memory.

@@ -247,7 +247,7 @@ def _walk_episodes(
 
         # Before the first view, both beliefs equal the prior.
         beliefs = [observer.init() for observer in observers]
-        agent = agent_loop.begin(start, policy.initial_memory((num_episodes,)), knowledge, env_params)
+        agent = agent_loop.start_from(start, policy.initial_memory((num_episodes,)), knowledge, env_params)
         carry = (agent, jnp.ones(num_episodes, bool), beliefs)
         _, (gaps, running) = jax.lax.scan(step, carry, length=num_steps + 1)
         return gaps, running
@@ -270,8 +270,8 @@ def _sample_step(
       The agents after the step, and which of their episodes ended, bool [E].
     """
     # Logits from the present view, without any removal.
-    view = agent_loop.view(agent, knowledge, env_params)
-    _, decision = decide(policy, view, policy_memory(agent))
+    inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
+    _, decision = decide(policy, inputs, policy_memory(agent))
 
     # The key of a step depends on the episode's own time only.
     step_keys = jax.vmap(jax.random.fold_in)(episode_keys, agent.state.time)

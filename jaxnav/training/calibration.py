@@ -247,7 +247,7 @@ def _measure_gaps(
       priors: float32 [rooms, K, K], of one strength.
       env_params, env, key, num_walks: as in `calibrate`.
     """
-    agent_loop = AgentLoop(env, estimator=estimator_config)
+    agent_loop = AgentLoop(env, estimator_config=estimator_config)
     knowledge = Knowledge(priors)
     agent, actions = _start_walks(agent_loop, env_params, knowledge, key, num_walks, LATE_STEP)
 
@@ -259,10 +259,10 @@ def _measure_gaps(
     def step(agent: Agent, action: jax.Array) -> tuple[Agent, tuple[jax.Array, jax.Array]]:
         next_agent, _ = agent_loop.step(agent, action, knowledge, env_params)
         is_accepted = (belief(next_agent) != belief(agent)).any(axis=(1, 2))
-        return next_agent, (agent_loop.gap(next_agent), is_accepted)
+        return next_agent, (agent_loop.layout_gap(next_agent), is_accepted)
 
     prior = priors[env_params.room[agent.state.scene]]
-    first_gap = agent_loop.gap(agent)
+    first_gap = agent_loop.layout_gap(agent)
     first_accepted = (belief(agent) != prior).any(axis=(1, 2))
     _, (later_gaps, later_accepted) = jax.lax.scan(step, agent, actions)
     gaps = jnp.concatenate([first_gap[None], later_gaps])  # [T + 1, W]

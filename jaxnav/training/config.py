@@ -15,7 +15,7 @@ from jaxnav.policies.method import Stage
 
 #: Training of the branch that counterfactual decisions use: not at all (the paper's text), by zeroing both direct
 #: pathways with probability 1/2 (the released code), or by matching the factual policy along the rollout.
-Counterfactual = Literal["none", "coin", "distil"]
+CounterfactualTraining = Literal["none", "coin", "distil"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ class PPOConfig:
             value=jnp.float32(self.value),
             distil=jnp.float32(self.distil),
             experience=jnp.float32(self.experience),
-            begin=jnp.float32(first_update),
+            first_update=jnp.float32(first_update),
             num_updates=jnp.float32(num_updates),
         )
 
@@ -95,7 +95,7 @@ class PPOScalars(struct.PyTreeNode):
     The settings are those of `PPOConfig`; the schedule of a stage is given by two more.
 
     Attributes:
-      begin: updates before the stage.
+      first_update: updates before the stage.
       num_updates: updates in the stage.
     """
 
@@ -108,7 +108,7 @@ class PPOScalars(struct.PyTreeNode):
     value: jax.Array
     distil: jax.Array
     experience: jax.Array
-    begin: jax.Array
+    first_update: jax.Array
     num_updates: jax.Array
 
 

@@ -30,7 +30,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxnav.errors import InputError
 from jaxnav.training.ppo import LearnerState
-from jaxnav.training.shares import EPISODE_AXIS, SEED_AXIS
+from jaxnav.training.shares import ENV_AXIS, SEED_AXIS
 
 Tree = TypeVar("Tree")
 
@@ -123,7 +123,7 @@ class Devices:
                 f"config: ppo.num_envs is {num_envs}; with {count} devices for {num_seeds} seeds the episodes of each "
                 f"are shared by {group_size}: give a multiple of {group_size} x ppo.minibatches ({minibatches})"
             )
-        return Mesh(np.array(devices[:count]).reshape(num_groups, group_size), (SEED_AXIS, EPISODE_AXIS))
+        return Mesh(np.array(devices[:count]).reshape(num_groups, group_size), (SEED_AXIS, ENV_AXIS))
 
 
 # Placing arrays on a mesh
@@ -143,11 +143,11 @@ def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
     """
     seed_axes = (SEED_AXIS,) if stacked else ()
     copied = NamedSharding(mesh, PartitionSpec(*seed_axes))
-    divided = NamedSharding(mesh, PartitionSpec(*seed_axes, EPISODE_AXIS))
+    divided = NamedSharding(mesh, PartitionSpec(*seed_axes, ENV_AXIS))
 
     # Untyped, because the fields hold shardings here rather than arrays.
     state_type: Any = LearnerState
-    return state_type(params=copied, best=copied, optimizer=copied, agent=divided, key=copied, update=copied)
+    return state_type(params=copied, best=copied, opt_state=copied, agent=divided, key=copied, update=copied)
 
 
 def replicate_on_devices(mesh: Mesh, tree: Tree) -> Tree:

@@ -1,29 +1,38 @@
 """Recurrent PPO on one page: collect a rollout, estimate advantages, compute the loss, update.
 
-`Learner.train` is what gets compiled: a `lax.scan` over updates. Each update
+`Learner.train` is the function to jit: a `lax.scan` over `Learner.update`. One update is
 
-1. collects a rollout of T steps in B slots, parallel environments with same-step auto-reset (`collect_rollout`),
-2. estimates advantages (`compute_advantages`),
-3. evaluates the policy again on the stored rollout with the parameters to differentiate by (`replay_rollout`),
-4. takes a gradient step of `ppo_loss` for each minibatch of each epoch (`Learner`).
+    rollout = collect_rollout(...)                    # T steps in B environments, same-step auto-reset
+    advantages = compute_advantages(...)              # once per update
+    for epoch in epochs:
+        for minibatch in split_minibatches(...):      # whole trajectories of T steps in B / M environments
+            replay = replay_rollout(...)              # current parameters on the stored inputs
+            gradient = grad(ppo_loss(replay, ...))
+            apply_gradient(...)
 
-What is added to plain PPO:
+The recurrent state at the start of a rollout is the stored one. There is no value clipping.
 
-* Three pathways lead to the action: the two *direct* ones, scene and goal, and *experience*, the method's mediator. The
-  *counterfactual branch* is the same network at the same memory with both direct pathways zero. `Counterfactual` says
-  how the branch is trained: not at all, by zeroing the direct pathways with a coin while acting, or by distillation.
-* *Experience dropout*: policies of two streams may go without experience, for whole episodes or single steps.
+Extensions of plain PPO:
+
+* *Pathways*: a policy has three inputs to the action, the scene and the goal (*direct*), and the method's *experience*
+  features (the mediator). The *counterfactual branch* is the same network at the same memory with both direct pathways
+  zero. `CounterfactualTraining` says how this branch is trained: not at all, by zeroing the direct pathways at random
+  while acting (a coin), or by distillation.
+* *Experience dropout*: policies with `decision: streams` may act without experience, for whole episodes or single
+  steps.
 * *Macro-actions*: a choice of the policy may last for several actions. Choices sampled meanwhile are ignored
-  (`is_decision_step` False): they do not enter the policy loss, and advantages are those of macro-steps.
-* *Stages*: each has its own loss, frozen parameters and schedules, and begins with a fresh Adam. *Fast weights* are
-  those that a method adapts within an episode.
-* Devices may share the slots of a minibatch; gradients are then averaged over them.
+  (`is_decision_step` is False): they do not enter the policy loss, and advantages are those of macro-steps.
+* *Stages*: each stage has its own loss, frozen parameters and schedules, and begins with a fresh Adam. Episodes
+  continue across a stage boundary.
+* *Fast weights* are changes of layers that a method adapts within an episode.
+* *Devices* may share the environments of a minibatch; gradients are then averaged over the devices.
 """
 
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -33,20 +42,32 @@ from jax.sharding import PartitionSpec
 from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, Observation
 from jaxnav.numerics.recurrence import gru_step, unroll_gru
-from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, mask_direct_pathways, policy_memory, select
+from jaxnav.numerics.trees import tree_where
+from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Stage
 from jaxnav.policies.network import Params, Policy, init_params
-from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyState, mask_experience
-from jaxnav.training.config import Counterfactual, PPOConfig, PPOScalars
-from jaxnav.training.shares import EPISODE_AXIS, masked_mean, mean_and_std, mean_over_devices
+from jaxnav.policies.pathways import (
+    NO_ACTION,
+    Decision,
+    Pathways,
+    PolicyInputs,
+    PolicyState,
+    mask_direct_pathways,
+    mask_experience,
+)
+from jaxnav.training.config import CounterfactualTraining, PPOConfig, PPOScalars
+from jaxnav.training.shares import ENV_AXIS, masked_mean, mean_and_std, mean_over_devices
 
 Metrics = dict[str, jax.Array]
+#: Parameters and optimizer state.
+TrainCarry = tuple[Params, Any]
 
 # Tags of the keys that are folded from a seed's key, from an update's key, and from a step's key.
 _INIT, _START, _UPDATES = range(3)
 _ROLLOUT, _SHUFFLE, _RESTART = range(3)
 _DIRECT_MASK, _ACTION, _ENV, _EXPERIENCE_DROPOUT = range(4)
-#: Tag of the experience dropout at a start. `AgentLoop.start` splits the same key; this tag cannot collide with that.
+#: Tag of the experience dropout at a start. `AgentLoop.start` splits the same key into one key per environment, and
+#: split keys equal folded ones, so this tag must exceed every environment index.
 _START_DROPOUT = 2**31 - 1
 
 
@@ -54,29 +75,29 @@ _START_DROPOUT = 2**31 - 1
 
 
 class Transition(NamedTuple):
-    """One step of B slots.
+    """One step of B environments.
 
-    Poses and goals stand for observations, which are gathered from the scene tables again when needed.
+    Stores poses and goals instead of observations; `replay_rollout` gathers the observations from the scene tables.
 
     Attributes:
       pose, goal: int32 [B].
-      weights: float32 [B, K], the layout's weights for the goal (eq. 7).
-      reading: what the method's tracker read, leaves [B, ...]; None without one.
-      surroundings: uint8 [B, M], what the spatial memory read; None without one.
+      layout_weights: float32 [B, K], the layout's weights for the goal (eq. 7).
+      reading: output of the method's tracker, leaves [B, ...]; None without one.
+      surroundings: uint8 [B, M], map cells around the agent; None without a spatial memory.
       use_direct: bool [B], False where the coin zeroed both direct pathways; None without a coin.
       use_experience: float32 [B], 0 where experience was dropped, otherwise 1; None without experience dropout.
-      is_decision_step: bool [B], False where a macro-action was running and the choice was ignored; None where choices
-        are actions.
-      choice: int32 [B], sampled from the policy.
-      action: int32 [B], taken in the environment.
+      is_decision_step: bool [B], False where a macro-action was running and the choice was ignored; None if choices are
+        actions.
+      choice: int32 [B], index sampled from the policy's logits: an action, or a macro-action.
+      action: int32 [B], action passed to the environment.
       log_prob, value, reward: float32 [B].
       terminated, truncated, success: bool [B].
-      length: int32 [B], actions of the episode so far.
+      episode_length: int32 [B], actions of the episode so far.
     """
 
     pose: jax.Array
     goal: jax.Array
-    weights: jax.Array
+    layout_weights: jax.Array
     reading: Any
     surroundings: jax.Array | None
     use_direct: jax.Array | None
@@ -90,7 +111,7 @@ class Transition(NamedTuple):
     terminated: jax.Array
     truncated: jax.Array
     success: jax.Array
-    length: jax.Array
+    episode_length: jax.Array
 
     @property
     def ended(self) -> jax.Array:
@@ -99,34 +120,35 @@ class Transition(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """T steps of B slots.
+    """T steps of B environments.
 
     Attributes:
       transitions: leaves [T, B, ...].
-      memory: the policy's memories at the start, leaves [B, ...].
-      next_value: float32 [T, B], value of the state after each step within the same episode: 0 after a termination,
-        that of the last state after a truncation.
+      initial_memory: the policy's memories before the first step, leaves [B, ...].
+      next_value: float32 [T, B], bootstrap value of each step: V(s_{t+1}); 0 after a termination, V(final state) after
+        a truncation.
     """
 
     transitions: Transition
-    memory: PolicyState
+    initial_memory: PolicyState
     next_value: jax.Array
 
 
-class TruncatedState(NamedTuple):
-    """The last state of the truncated episode of each slot; its value is estimated after the rollout.
+class TruncatedAgents(NamedTuple):
+    """The agent of each environment at the end of its truncated episode, for its value after the rollout.
 
-    A slot has at most one in a rollout, as a rollout is no longer than the shortest step limit.
+    Each environment is truncated at most once in a rollout, because T is at most the shortest step limit (see
+    `PPOConfig.rollout`).
 
     Attributes:
-      agent: the agents; their last view has not entered memory and beliefs yet.
-      moved: bool [B], whether the last action changed the cell.
-      time: int32 [B], step of the rollout; -1 where no episode was truncated.
+      agent: the agents [B]; they have not perceived their last view yet.
+      has_moved: bool [B], whether the last action changed the cell.
+      rollout_step: int32 [B], step of the rollout; -1 where no episode was truncated.
     """
 
     agent: Agent
-    moved: jax.Array
-    time: jax.Array
+    has_moved: jax.Array
+    rollout_step: jax.Array
 
 
 def collect_rollout(
@@ -134,36 +156,38 @@ def collect_rollout(
     policy: Policy,
     agent: Agent,
     key: jax.Array,
-    length: int,
-    use_coin: bool,
     env_params: EnvParams,
     knowledge: Knowledge,
+    *,
+    num_steps: int,
+    use_coin: bool = False,
     experience_prob: jax.Array | float = 1.0,
     redraw_every_step: bool = False,
 ) -> tuple[Agent, Rollout]:
-    """Act for some steps with sampled actions and same-step auto-reset.
+    """Act for `num_steps` steps with sampled actions and same-step auto-reset.
 
     Args:
       agent_loop: runs policy and environment.
-      policy: with bound parameters.
-      agent: the episodes to go on with, [B].
-      key: consumed.
-      length: T, steps.
+      policy: policy with bound parameters.
+      agent: B running episodes.
+      key: PRNG key [].
+      env_params: parameters of the environment.
+      knowledge: layout priors and statistics from before training.
+      num_steps: T.
       use_coin: zero both direct pathways with probability 1/2 at every step.
-      env_params: of the environment.
-      knowledge: learned before training.
       experience_prob: probability that an episode has experience, for policies with experience dropout.
       redraw_every_step: redraw the experience dropout at every step, not only where an episode begins.
 
     Returns:
-      The episodes after the rollout, and the rollout. Values of truncated states and of the state after the rollout are
-      those with both direct pathways, whatever the coin.
+      The agents after the rollout, and the rollout. Its bootstrap values always use both direct pathways.
     """
     num_envs = agent.state.pose.shape[0]
 
-    def step(carry: tuple[Agent, TruncatedState], inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Transition]:
-        agent, truncated_state = carry
-        time, step_key = inputs
+    def act_once(
+        carry: tuple[Agent, TruncatedAgents], time_and_key: tuple[jax.Array, jax.Array]
+    ) -> tuple[Any, Transition]:
+        agent, truncated_agents = carry
+        rollout_step, step_key = time_and_key
         direct_key = jax.random.fold_in(step_key, _DIRECT_MASK)
         action_key = jax.random.fold_in(step_key, _ACTION)
         env_keys = jax.random.split(jax.random.fold_in(step_key, _ENV), num_envs)
@@ -171,30 +195,33 @@ def collect_rollout(
 
         # Decide and sample.
         use_direct = jax.random.bernoulli(direct_key, 0.5, (num_envs,)) if use_coin else None
-        view = agent_loop.view(agent, knowledge, env_params)
-        _, decision = decide(policy, view, policy_memory(agent), use_direct)
+        inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
+        _, decision = decide(policy, inputs, policy_memory(agent), use_direct)
         choice = jax.random.categorical(action_key, decision.logits)
         log_probs = jax.nn.log_softmax(decision.logits)
         log_prob = jnp.take_along_axis(log_probs, choice[:, None], axis=-1)[:, 0]
 
-        # Act. `result.agent` is the agent before a reset, `next_agent` after it; new episodes draw their experience.
+        # Act. `result.agent` is the agent after the action and before a reset: its memory has advanced, but its new
+        # view is not perceived yet. `next_agent` has perceived it, or the first view of a new episode.
         next_agent, result = agent_loop.step(
-            agent, choice, knowledge, env_params, policy=policy, decision=decision, keys=env_keys
+            agent, choice, knowledge, env_params, policy=policy, decision=decision, reset_keys=env_keys
         )
-        redraw = redraw_every_step | result.ended
-        next_memory = sample_experience_dropout(policy_memory(next_agent), redraw, dropout_key, experience_prob)
+
+        # Draw the experience dropout of new episodes.
+        should_redraw = redraw_every_step | result.ended
+        next_memory = sample_experience_dropout(policy_memory(next_agent), should_redraw, dropout_key, experience_prob)
         next_agent = next_agent._replace(memory=next_memory)
 
-        # Remember the last state of truncated episodes.
-        latest_state = TruncatedState(result.agent, result.moved, jnp.broadcast_to(time, (num_envs,)))
-        truncated_state = select(result.truncated, latest_state, truncated_state)
+        # Keep the agents of truncated episodes.
+        latest_agents = TruncatedAgents(result.agent, result.moved, jnp.broadcast_to(rollout_step, (num_envs,)))
+        truncated_agents = tree_where(result.truncated, latest_agents, truncated_agents)
 
         transition = Transition(
             pose=agent.state.pose,
             goal=agent.state.goal,
-            weights=view.weights,
-            reading=view.reading,
-            surroundings=view.surroundings,
+            layout_weights=inputs.layout_weights,
+            reading=inputs.reading,
+            surroundings=inputs.surroundings,
             use_direct=use_direct,
             use_experience=decision.use_experience,
             is_decision_step=agent_loop.is_decision_step(agent),
@@ -206,62 +233,69 @@ def collect_rollout(
             terminated=result.terminated,
             truncated=result.truncated,
             success=result.success,
-            length=result.agent.state.time,
+            episode_length=result.agent.state.time,
         )
-        return (next_agent, truncated_state), transition
+        return (next_agent, truncated_agents), transition
 
-    start_memory = policy_memory(agent)
-    no_truncation = TruncatedState(agent, jnp.zeros(num_envs, bool), jnp.full((num_envs,), -1))
-    steps = jnp.arange(length), jax.random.split(key, length)
-    (agent, truncated_state), transitions = jax.lax.scan(step, (agent, no_truncation), steps)
+    initial_memory = policy_memory(agent)
+    no_truncation = TruncatedAgents(agent, jnp.zeros(num_envs, bool), jnp.full((num_envs,), -1))
+    scan_inputs = jnp.arange(num_steps), jax.random.split(key, num_steps)
+    (agent, truncated_agents), transitions = jax.lax.scan(act_once, (agent, no_truncation), scan_inputs)
 
-    # Values to bootstrap from: of truncated states, once their last view is perceived, and of the states after the
-    # rollout. Slots without a truncation compute a value that is not used.
+    # Bootstrap values: of truncated agents, once their last view is perceived, and of the agents after the rollout.
+    # Environments without a truncation compute a value that is not used (their step is -1).
     def estimate_value(agent: Agent) -> jax.Array:
-        _, decision = decide(policy, agent_loop.view(agent, knowledge, env_params), policy_memory(agent))
+        _, decision = decide(policy, agent_loop.policy_inputs(agent, knowledge, env_params), policy_memory(agent))
         return decision.value
 
-    last_action = policy_memory(truncated_state.agent).action
-    truncated_agent = agent_loop.perceive(
-        truncated_state.agent, last_action, truncated_state.moved, knowledge, env_params
+    truncated_action = policy_memory(truncated_agents.agent).action
+    perceived_agent = agent_loop.perceive(
+        truncated_agents.agent, truncated_action, truncated_agents.has_moved, knowledge, env_params
     )
-    truncated_value = estimate_value(truncated_agent)
+    truncated_value = estimate_value(perceived_agent)
     final_value = estimate_value(agent)
-    next_value = _next_values(transitions, truncated_state.time, truncated_value, final_value)
-    return agent, Rollout(transitions, start_memory, next_value)
+    next_value = _bootstrap_values(transitions, truncated_agents.rollout_step, truncated_value, final_value)
+    return agent, Rollout(transitions, initial_memory, next_value)
 
 
 def sample_experience_dropout(
-    memory: PolicyState, redraw: jax.Array | bool, key: jax.Array, experience_prob: jax.Array | float
+    memory: PolicyState, should_redraw: jax.Array | bool, key: jax.Array, experience_prob: jax.Array | float
 ) -> PolicyState:
-    """Draw which episodes have experience, for policies with experience dropout; episodes not redrawn keep theirs.
+    """Draw whether episodes have experience; the remaining ones keep their flag.
 
     Args:
-      memory: of the policy, leaves [B, ...]; returned as it is where `use_experience` is None.
-      redraw: bool [] or [B], episodes to draw for.
-      key: consumed.
+      memory: the policy's memories, leaves [B, ...]; returned unchanged for policies without experience dropout, whose
+        `use_experience` is None.
+      should_redraw: bool [] or [B], episodes to draw for.
+      key: PRNG key [].
       experience_prob: probability of having experience.
     """
     if memory.use_experience is None:
         return memory
-    drawn = jax.random.bernoulli(key, experience_prob, memory.use_experience.shape).astype(jnp.float32)
-    return memory._replace(use_experience=jnp.where(redraw, drawn, memory.use_experience))
+    new_flag = jax.random.bernoulli(key, experience_prob, memory.use_experience.shape).astype(jnp.float32)
+    return memory._replace(use_experience=jnp.where(should_redraw, new_flag, memory.use_experience))
 
 
-def _next_values(
-    transitions: Transition, truncated_at: jax.Array, truncated_value: jax.Array, final_value: jax.Array
+def _bootstrap_values(
+    transitions: Transition, truncation_step: jax.Array, truncated_value: jax.Array, final_value: jax.Array
 ) -> jax.Array:
-    """Return the value of the state after each step, float32 [T, B]; see `Rollout.next_value`.
+    """Bootstrap value of each step, float32 [T, B]; see `Rollout.next_value`.
 
     Args:
       transitions: leaves [T, B].
-      truncated_at: int32 [B], step of a truncation; -1 without one.
+      truncation_step: int32 [B], step of the rollout with a truncation; -1 without one.
       truncated_value, final_value: float32 [B], values after a truncation and after the rollout.
     """
+    # Within an episode: the value of the next step.
     next_value = jnp.concatenate([transitions.value[1:], final_value[None]])
-    is_truncation = jnp.arange(len(next_value))[:, None] == truncated_at[None, :]
+    # After a truncation: the value of the final state. After a termination: 0.
+    is_truncation = jnp.arange(len(next_value))[:, None] == truncation_step[None, :]
     next_value = jnp.where(is_truncation, truncated_value[None, :], next_value)
     return jnp.where(transitions.terminated, 0.0, next_value)
+
+
+#: Transitions [T, B / M, ...], initial memory [B / M, ...] and advantages [T, B / M] in B / M environments.
+Minibatch = tuple[Transition, PolicyState, jax.Array]
 
 
 # 2. Advantages
@@ -285,16 +319,25 @@ def compute_advantages(
       reward: float32 [T, B].
       value: float32 [T, B], of the state before each step.
       next_value: float32 [T, B], see `Rollout.next_value`.
-      ended: bool [T, B], the episode ended with this step, either way.
+      ended: bool [T, B], the episode terminated or was truncated with this step.
       gamma: float32 [], discount.
       gae_lambda: float32 [].
-      is_decision_step: bool [T, B], see `Transition`. Elsewhere the estimate is that of the rest of the macro-step.
+      is_decision_step: bool [T, B], see `Transition`; None if every step is one. At other steps the estimate covers the
+        remainder of the macro-action.
     """
+    chex.assert_equal_shape([reward, value, next_value, ended])
+
+    # TD errors, [T, B].
     delta = reward + gamma * next_value - value
+
+    # Lambda is 1 until the next decision step. The last entry has no effect, because A_T = 0.
+    step_lambda = gae_lambda
     if is_decision_step is not None:
-        next_is_decision = jnp.concatenate([is_decision_step[1:], jnp.ones_like(is_decision_step[:1])])
-        gae_lambda = jnp.where(next_is_decision, gae_lambda, 1.0)
-    decay = gamma * gae_lambda * (1.0 - ended.astype(jnp.float32))
+        next_is_decision_step = jnp.concatenate([is_decision_step[1:], jnp.ones_like(is_decision_step[:1])])
+        step_lambda = jnp.where(next_is_decision_step, gae_lambda, 1.0)
+
+    # A_t = delta_t + decay_t A_{t+1}, backwards; no credit crosses the end of an episode.
+    decay = gamma * step_lambda * (1.0 - ended.astype(jnp.float32))
 
     def backward(next_advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         delta_t, decay_t = inputs
@@ -309,16 +352,18 @@ def compute_advantages(
 
 
 class Replay(NamedTuple):
-    """The decisions of a rollout with the parameters to differentiate by, leaves [T, B, ...].
+    """Decisions of a rollout under the parameters to differentiate; arrays have leaves [T, B, ...].
+
+    Policy and environment are included for the losses of methods (`Method.auxiliary`, `Stage.loss`).
 
     Attributes:
-      policy: with these parameters.
-      transitions: of the rollout.
-      pathways: before masking, and before the experience attends to the memory.
+      policy: policy bound to the parameters under differentiation.
+      transitions: the rollout's transitions.
+      pathways: output of `policy.encode`, before masking and before the experience attends to the memory.
       factual: decisions as in the rollout.
       counterfactual: decisions with both direct pathways zero, and the same experience and memory; no gradient enters
         the memory.
-      env_params: of the environment.
+      env_params: parameters of the environment.
     """
 
     policy: Policy
@@ -333,153 +378,183 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
     """Evaluate a policy again on a stored rollout.
 
     Args:
-      policy: with the parameters to differentiate by.
-      transitions: [T, B].
-      memory: at the start of the rollout, [B].
-      env_params: observations are gathered from its tables.
+      policy: policy bound to the parameters to differentiate.
+      transitions: leaves [T, B, ...].
+      memory: memories before the first step, leaves [B, ...].
+      env_params: parameters of the environment; observations are gathered from its tables.
     """
+    # Gather the observations, and embed them for all steps at once.
     observation = Observation(row=env_params.tables.rows[transitions.pose], goal=transitions.goal)
-    pathways = policy.encode(observation, transitions.weights, transitions.reading, transitions.surroundings)
-    replay_decisions = _replay_step_by_step if policy.recurrent else _replay_in_parallel
-    decisions, counterfactual = replay_decisions(policy, pathways, transitions, memory)
-    return Replay(policy, transitions, pathways, decisions, counterfactual, env_params)
+    inputs = PolicyInputs(
+        observation=observation,
+        layout_weights=transitions.layout_weights,
+        reading=transitions.reading,
+        surroundings=transitions.surroundings,
+    )
+    pathways = policy.encode(inputs)
+
+    # A recurrent core alone is unrolled on precomputed inputs. If the experience or an adaptation reads the memory, the
+    # whole policy is scanned over time.
+    replay_decisions = _replay_step_by_step if policy.needs_stepwise_replay else _replay_in_parallel
+    factual_decision, counterfactual_decision = replay_decisions(policy, pathways, transitions, memory)
+    return Replay(
+        policy=policy,
+        transitions=transitions,
+        pathways=pathways,
+        factual=factual_decision,
+        counterfactual=counterfactual_decision,
+        env_params=env_params,
+    )
 
 
 def _replay_in_parallel(
     policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
-    """Evaluate all steps at once but for the recurrent core, which alone needs the memory."""
+    """Apply inputs and heads for all T steps in parallel; only the GRU runs step by step.
+
+    Returns:
+      Factual and counterfactual decisions, leaves [T, B, ...].
+    """
+    # Mask as while acting. `policy.decide` is not called here, so the experience is masked by hand.
     pathways = mask_experience(pathways, transitions.use_experience)
-    factual = mask_direct_pathways(pathways, transitions.use_direct)
-    counterfactual = do(pathways, scene=0.0, goal=0.0)
+    factual_pathways = mask_direct_pathways(pathways, transitions.use_direct)
+    counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
 
-    # Previous actions: that of the memory first, none where an episode begins.
-    last_action = jnp.where(transitions.ended, NO_ACTION, transitions.action)
-    previous_action = jnp.concatenate([memory.action[None], last_action[:-1]])
+    # previous_action[t] = action[t - 1]: from the initial memory at t = 0, NO_ACTION where an episode begins.
+    next_previous_action = jnp.where(transitions.ended, NO_ACTION, transitions.action)
+    previous_action = jnp.concatenate([memory.action[None], next_previous_action[:-1]])
 
-    # The factual branch runs the core through time. At every step the counterfactual one takes the same hidden state
-    # (a constant, see `UnrolledGRU`), without the direct input.
+    # Factual: unroll the GRU through time, input gates [T, B, 3 H].
     mediated_input = policy.mediated_input(pathways, previous_action)
-    input_gates = policy.input_gates(policy.direct_input(factual) + mediated_input)
-    core = unroll_gru(policy.recurrent_kernel, input_gates, transitions.ended, memory.hidden)
-    counterfactual_hidden = gru_step(policy.input_gates(mediated_input), core.hidden_gates, core.hidden_before)
-    decisions = policy.apply_heads(core.hidden_after, factual)
-    return decisions, policy.apply_heads(counterfactual_hidden, counterfactual)
+    factual_gates = policy.input_gates(policy.direct_input(factual_pathways) + mediated_input)
+    unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
+    factual_decision = policy.apply_heads(unrolled_core.hidden_after, factual_pathways)
+
+    # Counterfactual: one GRU step at each time, from the factual hidden state before it (no gradient enters that state)
+    # and with the mediated input only.
+    counterfactual_gates = policy.input_gates(mediated_input)
+    counterfactual_hidden = gru_step(counterfactual_gates, unrolled_core.hidden_gates, unrolled_core.hidden_before)
+    return factual_decision, policy.apply_heads(counterfactual_hidden, counterfactual_pathways)
 
 
 def _replay_step_by_step(
     policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
-    """Evaluate step by step where experience or adaptation need the memory."""
+    """Scan the whole policy over time, for policies whose experience or adaptation reads the memory.
+
+    Returns:
+      Factual and counterfactual decisions, leaves [T, B, ...].
+    """
     fresh_memory = policy.initial_memory(memory.action.shape)
 
-    def step(memory: PolicyState, inputs: tuple[Pathways, Any, Any, jax.Array, jax.Array]) -> tuple[PolicyState, Any]:
-        encoded, use_direct, use_experience, action, ended = inputs
-        memory = memory._replace(use_experience=use_experience)  # as drawn in the rollout
-        factual = mask_direct_pathways(policy.attend(encoded, memory), use_direct)
-        decision = policy.decide(factual, memory)
+    def replay_step(memory: PolicyState, inputs: tuple[Pathways, Transition]) -> tuple[PolicyState, Any]:
+        encoded, transition = inputs
+        # `policy.decide` masks the experience by the flag of the memory, drawn in the rollout.
+        memory = memory._replace(use_experience=transition.use_experience)
+        factual_pathways = mask_direct_pathways(policy.attend(encoded, memory), transition.use_direct)
+        factual_decision = policy.decide(factual_pathways, memory)
 
         # No gradient of the counterfactual branch enters the memory.
         fixed_memory = jax.lax.stop_gradient(memory)
         counterfactual_pathways = do(policy.attend(encoded, fixed_memory), scene=0.0, goal=0.0)
-        counterfactual = policy.decide(counterfactual_pathways, fixed_memory)
-        return select(ended, fresh_memory, decision.next_state(action)), (decision, counterfactual)
+        counterfactual_decision = policy.decide(counterfactual_pathways, fixed_memory)
 
-    inputs = (
-        pathways,
-        transitions.use_direct,
-        transitions.use_experience,
-        transitions.action,
-        transitions.ended,
-    )
-    _, decisions = jax.lax.scan(step, memory, inputs)
+        # New episodes start from fresh memory.
+        next_memory = tree_where(transition.ended, fresh_memory, factual_decision.next_state(transition.action))
+        return next_memory, (factual_decision, counterfactual_decision)
+
+    _, decisions = jax.lax.scan(replay_step, memory, (pathways, transitions))
     return decisions
 
 
 def ppo_loss(
-    replay: Replay, advantages: jax.Array, scalars: PPOScalars, distil: bool, method: Method
+    replay: Replay, advantages: jax.Array, scalars: PPOScalars, use_distillation: bool, method: Method
 ) -> tuple[jax.Array, Metrics]:
-    """The clipped PPO loss over [T, B], and what is trained beside it.
+    """Clipped PPO loss of a minibatch [T, B], plus distillation and the method's auxiliary loss.
 
-    With `distil` the loss adds KL(stop_gradient(pi) || counterfactual); a method may add an auxiliary loss. Ignored
-    choices are masked out. Values are learned at every step, for a rollout may end within a macro-action.
+    Distillation adds KL(stop_gradient(pi) || counterfactual). Policy terms average over decision steps only; the value
+    loss uses all steps, because a rollout may end (and bootstrap) within a macro-action.
 
     Args:
-      replay: decisions with the parameters to differentiate by.
+      replay: decisions under the parameters to differentiate.
       advantages: float32 [T, B].
-      scalars: weights and the clip.
-      distil: whether the counterfactual branch is trained.
-      method: may bring an auxiliary loss.
+      scalars: weights of the loss terms, and the clip range.
+      use_distillation: whether the counterfactual branch is distilled.
+      method: method, whose auxiliary loss is added if it has one.
 
     Returns:
-      The loss float32 [] and its parts by name.
+      The loss float32 [] and its terms by name.
     """
     transitions = replay.transitions
     is_decision_step = transitions.is_decision_step
     log_probs = jax.nn.log_softmax(replay.factual.logits)
     log_prob = jnp.take_along_axis(log_probs, transitions.choice[..., None], axis=-1)[..., 0]
 
-    # Policy: the clipped surrogate with normalised advantages.
+    # Policy: clipped surrogate; advantages are normalised per minibatch, over all devices.
+    advantage_mean, advantage_std = mean_and_std(advantages, is_decision_step)
+    normalised_advantages = (advantages - advantage_mean) / (advantage_std + 1e-8)
     ratio = jnp.exp(log_prob - transitions.log_prob)
-    value_target = advantages + transitions.value
-    mean, deviation = mean_and_std(advantages, is_decision_step)
-    normalised_advantages = (advantages - mean) / (deviation + 1e-8)
     clipped_ratio = jnp.clip(ratio, 1.0 - scalars.clip, 1.0 + scalars.clip)
     surrogate = jnp.minimum(ratio * normalised_advantages, clipped_ratio * normalised_advantages)
     policy_loss = -masked_mean(surrogate, is_decision_step)
 
-    # Value and entropy.
+    # Value (squared error to the lambda-return) and entropy.
+    value_target = advantages + transitions.value
     value_loss = 0.5 * jnp.square(replay.factual.value - value_target).mean()
     entropy = -masked_mean((jnp.exp(log_probs) * log_probs).sum(axis=-1), is_decision_step)
     loss = policy_loss + scalars.value * value_loss - scalars.entropy * entropy
-    parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
+    loss_terms = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
 
-    # The counterfactual branch, and whatever the method adds.
-    if distil:
+    # Distillation of the counterfactual branch.
+    if use_distillation:
         distil_loss = _distillation_loss(log_probs, replay.counterfactual.logits, is_decision_step)
         loss = loss + scalars.distil * distil_loss
-        parts["distil_loss"] = distil_loss
+        loss_terms["distil_loss"] = distil_loss
+
+    # Auxiliary loss of the method.
     if method.auxiliary is not None:
-        auxiliary_loss, auxiliary_parts = method.auxiliary(replay)
+        auxiliary_loss, auxiliary_terms = method.auxiliary(replay)
         loss = loss + auxiliary_loss
-        parts = parts | auxiliary_parts
-    return loss, parts
+        loss_terms = loss_terms | auxiliary_terms
+    return loss, loss_terms
 
 
 def _distillation_loss(
     log_probs: jax.Array, counterfactual_logits: jax.Array, is_decision_step: jax.Array | None
 ) -> jax.Array:
-    """Mean KL(pi || counterfactual), pi fixed."""
-    target = jax.lax.stop_gradient(log_probs)
-    divergence = (jnp.exp(target) * (target - jax.nn.log_softmax(counterfactual_logits))).sum(axis=-1)
+    """Mean KL(pi || pi_counterfactual) over decision steps, float32 []; no gradient enters pi."""
+    target_log_probs = jax.lax.stop_gradient(log_probs)
+    log_ratio = target_log_probs - jax.nn.log_softmax(counterfactual_logits)
+    divergence = (jnp.exp(target_log_probs) * log_ratio).sum(axis=-1)
     return masked_mean(divergence, is_decision_step)
 
 
-# 4. Update
+# 4. Gradient steps
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam behind a clip by the global norm; a step whose gradient is not finite is skipped and counted."""
+    """Clip by the global norm, then Adam without a learning rate; steps with a non-finite gradient are skipped.
+
+    `apply_gradient` multiplies by the learning rate. Skipped steps are counted in the state, without an upper limit.
+    """
     chain = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     return optax.apply_if_finite(chain, max_consecutive_errors=2**30)
 
 
-def reset_optimizer_if(config: PPOConfig, optimizer: Any, policy_params: Params, condition: jax.Array) -> Any:
-    """Reset the optimizer state where a condition, bool [], holds; the count of skipped steps goes on.
+def reset_optimizer_if(config: PPOConfig, opt_state: Any, policy_params: Params, condition: jax.Array) -> Any:
+    """Reset Adam's moments and step count where `condition`, bool [], holds; the count of skipped steps is kept.
 
-    Adam's bias correction uses one step count, so parameters that begin to learn late would take too large steps.
+    Adam's bias correction has one step count for all parameters. A parameter unfrozen late would have zero moments but
+    an old count, so its first steps would be about three times too large.
     """
-    fresh: Any = make_optimizer(config).init(policy_params)
-    inner_state = jax.tree.map(
-        lambda new_leaf, old_leaf: jnp.where(condition, new_leaf, old_leaf), fresh.inner_state, optimizer.inner_state
-    )
-    return optimizer._replace(inner_state=inner_state)
+    new_state: Any = make_optimizer(config).init(policy_params)
+    return opt_state._replace(inner_state=tree_where(condition, new_state.inner_state, opt_state.inner_state))
 
 
 def apply_gradient(
     config: PPOConfig,
     policy_params: Params,
-    optimizer: Any,
+    opt_state: optax.OptState,
     gradient: Params,
     learning_rate: jax.Array,
     lr_scale_by_path: Callable[[tuple[str, ...]], float] | None = None,
@@ -487,33 +562,33 @@ def apply_gradient(
     """Take one step of the optimizer.
 
     Args:
-      config: of the optimizer.
+      config: settings of the optimizer.
       policy_params: parameters before the step.
-      optimizer: its state.
-      gradient: by the parameters.
+      opt_state: state of the optimizer before the step.
+      gradient: gradient of the loss, a tree like `policy_params`.
       learning_rate: float32 [].
-      lr_scale_by_path: factor on the learning rate of the parameter at a path of names, 0 for one that is frozen; None
-        for 1.
+      lr_scale_by_path: learning-rate factor by parameter path; 0 freezes a parameter. None for 1 everywhere.
 
     Returns:
       Parameters and optimizer state after the step.
     """
-    # Frozen parameters neither move nor count in the gradient's norm.
+    # Zero the gradient of frozen parameters, so that the norm to clip by excludes them.
     if lr_scale_by_path is not None:
         gradient = _scale_by_path(gradient, lambda path: float(lr_scale_by_path(path) > 0))
 
     with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
-        updates, optimizer = make_optimizer(config).update(gradient, optimizer, policy_params)
+        param_updates, opt_state = make_optimizer(config).update(gradient, opt_state, policy_params)
 
-    # Momentum can still move frozen parameters, and the factors apply to steps.
+    # Scale Adam's step, not the gradient: Adam is invariant to the scale of gradients, and momentum would still move
+    # frozen parameters.
     if lr_scale_by_path is not None:
-        updates = _scale_by_path(updates, lr_scale_by_path)
-    policy_params = jax.tree.map(lambda param, update: param - learning_rate * update, policy_params, updates)
-    return policy_params, optimizer
+        param_updates = _scale_by_path(param_updates, lr_scale_by_path)
+    policy_params = jax.tree.map(lambda param, step: param - learning_rate * step, policy_params, param_updates)
+    return policy_params, opt_state
 
 
 def _scale_by_path(tree: Any, scale: Callable[[tuple[str, ...]], float]) -> Any:
-    """Multiply leaves by a factor of their path; a factor of 0 gives zeros, also of leaves that are not finite."""
+    """Multiply leaves by the factor of their path; a factor of 0 gives zeros even for NaN leaves."""
 
     def scale_leaf(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
         factor = float(scale(tuple(str(entry.key) for entry in path)))
@@ -522,13 +597,15 @@ def _scale_by_path(tree: Any, scale: Callable[[tuple[str, ...]], float]) -> Any:
     return jax.tree_util.tree_map_with_path(scale_leaf, tree)
 
 
-def draw_minibatches(key: jax.Array, num_envs: int, num_minibatches: int) -> jax.Array:
-    """Draw the slots of each minibatch, one of every block of `num_minibatches` neighbours.
+def assign_minibatches(key: jax.Array, num_envs: int, num_minibatches: int) -> jax.Array:
+    """Assign each environment to a minibatch at random.
 
-    No device then needs the slots of another.
+    Environments form consecutive blocks of `num_minibatches`, and each block gives one environment to every minibatch,
+    so that no data moves between devices. Example: for 4 environments, 2 minibatches and the result [[1, 0], [0, 1]],
+    minibatch 0 holds environments 1 and 2, minibatch 1 holds environments 0 and 3.
 
     Returns:
-      int32 [blocks, minibatches]; minibatch m takes the slot `num_minibatches * b + order[b, m]` of every block b.
+      int32 [B / M, M]; minibatch m takes environment `M * b + order[b, m]` of every block b.
     """
     offsets = jnp.broadcast_to(jnp.arange(num_minibatches), (num_envs // num_minibatches, num_minibatches))
     return jax.random.permutation(key, offsets, axis=1, independent=True)
@@ -538,27 +615,33 @@ def split_minibatches(tree: Any, order: jax.Array, axis: int) -> Any:
     """Split leaves [..., B, ...] into minibatches [M, ..., B / M, ...].
 
     Args:
-      tree: leaves with the episodes along `axis`.
-      order: as from `draw_minibatches`.
-      axis: of the episodes.
+      tree: leaves with B environments along `axis`.
+      order: int32 [B / M, M], from `assign_minibatches`.
+      axis: axis of the environments.
     """
 
     def split_leaf(leaf: jax.Array) -> jax.Array:
+        # [..., B, ...] -> [..., B / M, M, ...]
         blocks = leaf.reshape(*leaf.shape[:axis], *order.shape, *leaf.shape[axis + 1 :])
+        # Permute within blocks: unlike a gather over B, this stays on the device.
         other_axes = [*range(axis), *range(axis + 2, blocks.ndim)]
         shuffled = jnp.take_along_axis(blocks, jnp.expand_dims(order, other_axes), axis + 1)
+        # The minibatch axis comes first.
         return jnp.moveaxis(shuffled, axis + 1, 0)
 
     return jax.tree.map(split_leaf, tree)
 
 
+# 5. The learner: one training seed
+
+
 class BestPolicy(struct.PyTreeNode):
-    """The best policy of a seed so far.
+    """The policy of a seed with the best validation so far.
 
     Attributes:
-      params: of the policy.
-      score: float32 [], see `Learner.keep`; -1 before anything was measured.
-      update: int32 [], updates done when it was measured.
+      params: parameters of the policy.
+      score: float32 [], validation score; -1 before the first validation.
+      update: int32 [], number of updates before that validation.
     """
 
     params: Params
@@ -570,17 +653,17 @@ class LearnerState(struct.PyTreeNode):
     """State of one training seed.
 
     Attributes:
-      params: of the policy.
-      best: the policy to export, where validation measures policies during training.
-      optimizer: state of the optimizer.
-      agent: the parallel episodes, [B].
+      params: parameters of the policy.
+      best: the policy with the best validation, which is exported.
+      opt_state: state of the optimizer.
+      agent: agents in B environments.
       key: typed PRNG key []; update u uses `fold_in(key, u)`.
-      update: int32 [], updates done.
+      update: int32 [], number of updates done.
     """
 
     params: Params
     best: BestPolicy
-    optimizer: Any
+    opt_state: Any
     agent: Agent
     key: jax.Array
     update: jax.Array
@@ -588,7 +671,7 @@ class LearnerState(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """PPO for one stage of training: all that is static during a run.
+    """PPO for one training stage; holds the static configuration.
 
     Attributes:
       agent_loop: runs policy and environment.
@@ -599,11 +682,11 @@ class Learner:
 
     agent_loop: AgentLoop
     config: PPOConfig
-    counterfactual: Counterfactual
+    counterfactual: CounterfactualTraining
     stage: Stage = Stage()
 
     def init(self, key: jax.Array, env_params: EnvParams, knowledge: Knowledge) -> LearnerState:
-        """Start a seed; the key is consumed."""
+        """Initial state of one training seed."""
         init_key = jax.random.fold_in(key, _INIT)
         start_key = jax.random.fold_in(key, _START)
         update_key = jax.random.fold_in(key, _UPDATES)
@@ -613,23 +696,21 @@ class Learner:
         return LearnerState(
             params=policy_params,
             best=BestPolicy(params=policy_params, score=jnp.float32(-1.0), update=jnp.int32(0)),
-            optimizer=make_optimizer(self.config).init(policy_params),
+            opt_state=make_optimizer(self.config).init(policy_params),
             agent=self._start_episodes(policy_params, start_key, env_params, knowledge),
             key=update_key,
             update=jnp.int32(0),
         )
 
-    def restart(self, state: LearnerState, env_params: EnvParams, knowledge: Knowledge) -> LearnerState:
-        """Start new episodes, in scenes other than before."""
+    def restart_episodes(self, state: LearnerState, env_params: EnvParams, knowledge: Knowledge) -> LearnerState:
+        """Start new episodes in the scenes of `env_params`; parameters and optimizer state are kept."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.update), _RESTART)
         return state.replace(agent=self._start_episodes(state.params, key, env_params, knowledge))
 
-    def keep(self, state: LearnerState, score: jax.Array) -> LearnerState:
-        """Keep the present policy as the best if none scored higher; the score is float32 []."""
-        present = BestPolicy(state.params, score, state.update)
-        is_better = score >= state.best.score
-        best = jax.tree.map(lambda new_leaf, old_leaf: jnp.where(is_better, new_leaf, old_leaf), present, state.best)
-        return state.replace(best=best)
+    def keep_if_best(self, state: LearnerState, score: jax.Array) -> LearnerState:
+        """Keep the current policy as the best one unless an earlier score, float32 [], is higher."""
+        current = BestPolicy(state.params, score, state.update)
+        return state.replace(best=tree_where(score >= state.best.score, current, state.best))
 
     def train(
         self,
@@ -639,20 +720,21 @@ class Learner:
         knowledge: Knowledge,
         num_updates: int,
     ) -> tuple[LearnerState, Metrics]:
-        """Do some updates.
+        """Run `num_updates` updates.
 
         Returns:
-          The state after them and float32 [] metrics: the losses' means over the updates, `success`, `return`
+          The state after the updates and float32 [] metrics: the losses' means over the updates, `success`, `return`
           (undiscounted, without shaping), `length` and `truncated` averaged over the `episodes` that ended, and the
           number of `skipped_steps` of the optimizer whose gradient was not finite.
         """
 
-        def step(state: LearnerState, _: None) -> tuple[LearnerState, Metrics]:
+        def update_once(state: LearnerState, _: None) -> tuple[LearnerState, Metrics]:
             return self.update(state, scalars, env_params, knowledge)
 
-        begins_stage = state.update.astype(jnp.float32) == scalars.begin
-        optimizer = reset_optimizer_if(self.config, state.optimizer, state.params, begins_stage)
-        state, metrics = jax.lax.scan(step, state.replace(optimizer=optimizer), None, length=num_updates)
+        # The first call of a stage starts with a fresh optimizer.
+        is_stage_start = state.update.astype(jnp.float32) == scalars.first_update
+        opt_state = reset_optimizer_if(self.config, state.opt_state, state.params, is_stage_start)
+        state, metrics = jax.lax.scan(update_once, state.replace(opt_state=opt_state), None, length=num_updates)
 
         # Sums over episodes become means per episode, losses means per update.
         totals = {name: value.sum() for name, value in metrics.items()}
@@ -668,12 +750,13 @@ class Learner:
     def update(
         self, state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge
     ) -> tuple[LearnerState, Metrics]:
-        """Collect a rollout and learn from it for some epochs."""
+        """One PPO update: rollout, advantages, epochs of minibatch steps."""
         update_key = jax.random.fold_in(state.key, state.update)
         rollout_key = jax.random.fold_in(update_key, _ROLLOUT)
         shuffle_key = jax.random.fold_in(update_key, _SHUFFLE)
 
-        # Fast weights may be large: in a stage without adaptation they are set aside, and put back after the rollout.
+        # 1. Rollout. A stage without adaptation does not read the fast weights, which may be large: the scan does not
+        # carry them, and they are put back unchanged for the next stage that adapts.
         agent = state.agent
         fast_weights = policy_memory(agent).fast
         if not self.stage.adapts_online:
@@ -683,31 +766,17 @@ class Learner:
             self._stage_agent_loop.bind(state.params),
             agent,
             rollout_key,
-            self.config.rollout,
-            self.counterfactual == "coin",
             env_params,
             knowledge,
-            experience_prob=0.0 if self.stage.direct_stream_only else scalars.experience,
+            num_steps=self.config.rollout,
+            use_coin=self.counterfactual == "coin",
+            experience_prob=self._experience_prob(scalars.experience),
             redraw_every_step=self.config.experience_drawn == "step",
         )
         if not self.stage.adapts_online:
             agent = _with_fast_weights(agent, fast_weights)
 
-        (policy_params, optimizer), losses = self._learn(state, rollout, shuffle_key, scalars, env_params)
-
-        # Losses are means over the minibatches, statistics of episodes are sums.
-        metrics = {name: value.mean() for name, value in losses.items()}
-        metrics = metrics | _episode_sums(rollout.transitions, env_params)
-        num_skipped = optimizer.total_notfinite - state.optimizer.total_notfinite
-        metrics["skipped_steps"] = num_skipped.astype(jnp.float32)
-        state = state.replace(params=policy_params, optimizer=optimizer, agent=agent, update=state.update + 1)
-        return state, metrics
-
-    def _learn(
-        self, state: LearnerState, rollout: Rollout, key: jax.Array, scalars: PPOScalars, env_params: EnvParams
-    ) -> tuple[tuple[Params, Any], Metrics]:
-        """Take a gradient step for every minibatch of every epoch."""
-        config = self.config
+        # 2. Advantages, once per update.
         transitions = rollout.transitions
         advantages = compute_advantages(
             transitions.reward,
@@ -719,63 +788,96 @@ class Learner:
             transitions.is_decision_step,
         )
 
-        # Schedules: both are linear within the stage.
-        progress = (state.update.astype(jnp.float32) - scalars.begin) / scalars.num_updates
+        # 3. and 4. Gradient steps.
+        (policy_params, opt_state), losses = self._run_epochs(
+            state, rollout, advantages, shuffle_key, scalars, env_params
+        )
+
+        # Losses are means over the minibatches, statistics of episodes are sums.
+        metrics = {name: value.mean() for name, value in losses.items()}
+        metrics = metrics | _episode_sums(transitions, env_params)
+        num_skipped = opt_state.total_notfinite - state.opt_state.total_notfinite
+        metrics["skipped_steps"] = num_skipped.astype(jnp.float32)
+        state = state.replace(params=policy_params, opt_state=opt_state, agent=agent, update=state.update + 1)
+        return state, metrics
+
+    def _run_epochs(
+        self,
+        state: LearnerState,
+        rollout: Rollout,
+        advantages: jax.Array,
+        key: jax.Array,
+        scalars: PPOScalars,
+        env_params: EnvParams,
+    ) -> tuple[tuple[Params, Any], Metrics]:
+        """Take a gradient step for every minibatch of every epoch."""
+        config = self.config
+
+        # Schedules: both are linear within the stage. From here on `scalars.entropy` is the scheduled weight.
+        progress = (state.update.astype(jnp.float32) - scalars.first_update) / scalars.num_updates
         learning_rate = scalars.learning_rate * (1.0 - progress)
         entropy_weight = scalars.entropy + progress * (scalars.final_entropy - scalars.entropy)
         scalars = scalars.replace(entropy=entropy_weight)
 
-        # Devices share the slots of a minibatch, and average loss and gradient. The specs are those of policy_params,
-        # minibatch (transitions, memory, advantages), env_params and scalars.
-        everywhere = PartitionSpec()
-        by_time = PartitionSpec(None, EPISODE_AXIS)
-        minibatch_specs = by_time, PartitionSpec(EPISODE_AXIS), by_time
-        gradient_of_loss = mean_over_devices(
-            jax.grad(self._loss, has_aux=True), everywhere, minibatch_specs, everywhere, everywhere
+        # Each device computes loss and gradient on its share of the environments; their means over the devices are
+        # those of the minibatch. The specs follow the arguments of `_minibatch_loss`.
+        replicated = PartitionSpec()
+        split_over_envs = PartitionSpec(None, ENV_AXIS)  # [T, B, ...]
+        minibatch_specs = split_over_envs, PartitionSpec(ENV_AXIS), split_over_envs
+        loss_gradient = mean_over_devices(
+            jax.grad(self._minibatch_loss, has_aux=True), replicated, minibatch_specs, replicated, replicated
         )
 
-        def minibatch_step(carry: tuple[Params, Any], minibatch: tuple[Any, ...]) -> tuple[tuple[Params, Any], Metrics]:
-            policy_params, optimizer = carry
-            gradient, losses = gradient_of_loss(policy_params, minibatch, env_params, scalars)
+        def update_on_minibatch(carry: TrainCarry, minibatch: Minibatch) -> tuple[TrainCarry, Metrics]:
+            policy_params, opt_state = carry
+            gradient, losses = loss_gradient(policy_params, minibatch, env_params, scalars)
             carry = apply_gradient(
-                config, policy_params, optimizer, gradient, learning_rate, self.stage.lr_scale_by_path
+                config, policy_params, opt_state, gradient, learning_rate, self.stage.lr_scale_by_path
             )
             return carry, losses | {"gradient_norm": optax.tree.norm(gradient)}
 
-        def epoch(carry: tuple[Params, Any], epoch_key: jax.Array) -> tuple[tuple[Params, Any], Metrics]:
-            order = draw_minibatches(epoch_key, config.num_envs, config.minibatches)
-            steps, step_advantages = split_minibatches((transitions, advantages), order, axis=1)
-            memory = split_minibatches(rollout.memory, order, axis=0)
-            return jax.lax.scan(minibatch_step, carry, (steps, memory, step_advantages))
+        def run_epoch(carry: TrainCarry, epoch_key: jax.Array) -> tuple[TrainCarry, Metrics]:
+            order = assign_minibatches(epoch_key, config.num_envs, config.minibatches)
+            transitions, minibatch_advantages = split_minibatches((rollout.transitions, advantages), order, axis=1)
+            initial_memory = split_minibatches(rollout.initial_memory, order, axis=0)
+            return jax.lax.scan(update_on_minibatch, carry, (transitions, initial_memory, minibatch_advantages))
 
         epoch_keys = jax.random.split(key, config.epochs)
-        return jax.lax.scan(epoch, (state.params, state.optimizer), epoch_keys)
+        return jax.lax.scan(run_epoch, (state.params, state.opt_state), epoch_keys)
 
-    def _loss(
-        self, policy_params: Params, minibatch: tuple[Any, ...], env_params: EnvParams, scalars: PPOScalars
+    def _minibatch_loss(
+        self, policy_params: Params, minibatch: Minibatch, env_params: EnvParams, scalars: PPOScalars
     ) -> tuple[jax.Array, Metrics]:
-        """The stage's loss on a minibatch (transitions, memory, advantages)."""
-        transitions, memory, advantages = minibatch
+        """Loss of the stage on a minibatch, float32 [], and its terms."""
         assert self.agent_loop.method is not None
-        replay = replay_rollout(self._stage_agent_loop.bind(policy_params), transitions, memory, env_params)
+        transitions, initial_memory, advantages = minibatch
+        policy = self._stage_agent_loop.bind(policy_params)
+        replay = replay_rollout(policy, transitions, initial_memory, env_params)
         loss_fn = self.stage.loss or ppo_loss
-        return loss_fn(replay, advantages, scalars, self.counterfactual == "distil", self.agent_loop.method)
+        use_distillation = self.counterfactual == "distil"
+        return loss_fn(replay, advantages, scalars, use_distillation, self.agent_loop.method)
 
     def _start_episodes(
         self, policy_params: Params, key: jax.Array, env_params: EnvParams, knowledge: Knowledge
     ) -> Agent:
-        """Start the parallel episodes, and draw which of them have experience."""
+        """Start an episode in every environment, and draw its experience dropout."""
         num_envs = self.config.num_envs
-        experience_prob = 0.0 if self.stage.direct_stream_only else self.config.experience
+        experience_prob = self._experience_prob(self.config.experience)
         memory = self.agent_loop.bind(policy_params).initial_memory((num_envs,))
         dropout_key = jax.random.fold_in(key, _START_DROPOUT)
         memory = sample_experience_dropout(memory, True, dropout_key, experience_prob)
         return self.agent_loop.start(key, num_envs, memory, knowledge, env_params)
 
+    def _experience_prob(self, experience_prob: jax.Array | float) -> jax.Array | float:
+        """Probability that an episode has experience: 0 in a stage of the direct stream alone."""
+        return 0.0 if self.stage.direct_stream_only else experience_prob
+
     @property
     def _stage_agent_loop(self) -> AgentLoop:
         """The agent loop of the stage, with or without adaptation."""
-        return dataclasses.replace(self.agent_loop, inner_steps=None if self.stage.adapts_online else 0)
+        # None: the method's own number of adaptation steps; 0: no adaptation.
+        inner_steps = None if self.stage.adapts_online else 0
+        return dataclasses.replace(self.agent_loop, inner_steps=inner_steps)
 
 
 def _with_fast_weights(agent: Agent, fast_weights: Any) -> Agent:
@@ -786,17 +888,17 @@ def _with_fast_weights(agent: Agent, fast_weights: Any) -> Agent:
 def _episode_sums(transitions: Transition, env_params: EnvParams) -> Metrics:
     """Sum the statistics of the episodes that ended, float32 [] each."""
     ended = transitions.ended
-    statistics = ended, transitions.success, transitions.length, transitions.truncated
-    # One array, which devices exchange at once.
+    statistics = ended, transitions.success, transitions.episode_length, transitions.truncated
+    # One [4, T, B] array, so that devices need a single all-reduce.
     table = jnp.stack([values.astype(jnp.float32) for values in statistics])
-    episodes, success, length, truncated = jnp.where(ended, table, 0.0).sum(axis=(1, 2))
+    num_episodes, num_successes, total_length, num_truncated = jnp.where(ended, table, 0.0).sum(axis=(1, 2))
 
     # Every step but a successful Done costs the same, so the return (without shaping) follows from length and success.
-    return_sum = env_params.success_reward * success + env_params.step_reward * (length - success)
+    return_sum = env_params.success_reward * num_successes + env_params.step_reward * (total_length - num_successes)
     return {
-        "episodes": episodes,
-        "success": success,
-        "length": length,
-        "truncated": truncated,
+        "episodes": num_episodes,
+        "success": num_successes,
+        "length": total_length,
+        "truncated": num_truncated,
         "return": return_sum,
     }

@@ -15,7 +15,7 @@ from jax.sharding import PartitionSpec
 
 #: Axes of a mesh of devices: groups of devices for different seeds, and the devices of a group for their episodes.
 SEED_AXIS = "seeds"
-EPISODE_AXIS = "episodes"
+ENV_AXIS = "envs"
 
 
 def mean_over_devices(function: Callable[..., Any], *in_specs: Any) -> Callable[..., Any]:
@@ -26,12 +26,12 @@ def mean_over_devices(function: Callable[..., Any], *in_specs: Any) -> Callable[
       in_specs: sharding of each argument, a pytree prefix as for `jax.shard_map`.
     """
     mesh = jax.sharding.get_abstract_mesh()
-    if mesh.shape.get(EPISODE_AXIS, 1) == 1:
+    if mesh.shape.get(ENV_AXIS, 1) == 1:
         return function
 
     def averaged_function(*arguments: Any) -> Any:
         flat_result, unravel = ravel_pytree(function(*arguments))
-        return unravel(jax.lax.pmean(flat_result, EPISODE_AXIS))
+        return unravel(jax.lax.pmean(flat_result, ENV_AXIS))
 
     return jax.shard_map(averaged_function, in_specs=in_specs, out_specs=PartitionSpec(), check_vma=False)
 
@@ -51,7 +51,7 @@ def masked_mean(values: jax.Array, mask: jax.Array | None = None) -> jax.Array:
 
     share = mask.astype(jnp.float32).mean()
     if _is_inside_mean_over_devices():
-        share = jax.lax.pmean(share, EPISODE_AXIS)
+        share = jax.lax.pmean(share, ENV_AXIS)
     return jnp.where(mask, values, 0.0).mean() / jnp.maximum(share, 1.0 / 2**24)
 
 
@@ -65,7 +65,7 @@ def mean_and_std(values: jax.Array, mask: jax.Array | None = None) -> tuple[jax.
     # Several devices send both moments as one array.
     if _is_inside_mean_over_devices():
         local_moments = jnp.stack([masked_mean(values, mask), masked_mean(jnp.square(values), mask)])
-        mean, mean_square = jax.lax.pmean(local_moments, EPISODE_AXIS)
+        mean, mean_square = jax.lax.pmean(local_moments, ENV_AXIS)
         return mean, jnp.sqrt(jnp.maximum(mean_square - jnp.square(mean), 0.0))
 
     if mask is None:
@@ -75,4 +75,4 @@ def mean_and_std(values: jax.Array, mask: jax.Array | None = None) -> tuple[jax.
 
 
 def _is_inside_mean_over_devices() -> bool:
-    return EPISODE_AXIS in jax.sharding.get_abstract_mesh().manual_axes
+    return ENV_AXIS in jax.sharding.get_abstract_mesh().manual_axes

@@ -171,7 +171,7 @@ class Trainer:
         return dataclasses.replace(self.learners[arm], stage=self._stages[stage_index])
 
     def _restart_function(self, arm: str, stage_index: int) -> Any:
-        """Jitted `Learner.restart` of an arm in a stage."""
+        """Jitted `Learner.restart_episodes` of an arm in a stage."""
         if (arm, stage_index) not in self._restart_functions:
             learner = self._stage_learner(arm, stage_index)
             self._restart_functions[arm, stage_index] = self._jit_restart(learner)
@@ -191,10 +191,10 @@ class Trainer:
         return jax.jit(learner.init)
 
     def _jit_keep(self, learner: Learner) -> Any:
-        return jax.jit(learner.keep, donate_argnums=0)
+        return jax.jit(learner.keep_if_best, donate_argnums=0)
 
     def _jit_restart(self, learner: Learner) -> Any:
-        return jax.jit(learner.restart, donate_argnums=0)
+        return jax.jit(learner.restart_episodes, donate_argnums=0)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
         def train(state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
@@ -295,10 +295,10 @@ class ShardedTrainer(Trainer):
         return jax.jit(learner.init, out_shardings=self._seed_sharding)
 
     def _jit_keep(self, learner: Learner) -> Any:
-        return jax.jit(jax.vmap(learner.keep), out_shardings=self._stacked_sharding, donate_argnums=0)
+        return jax.jit(jax.vmap(learner.keep_if_best), out_shardings=self._stacked_sharding, donate_argnums=0)
 
     def _jit_restart(self, learner: Learner) -> Any:
-        restart_seeds = jax.vmap(learner.restart, in_axes=(0, None, None))
+        restart_seeds = jax.vmap(learner.restart_episodes, in_axes=(0, None, None))
         return jax.jit(restart_seeds, out_shardings=self._stacked_sharding, donate_argnums=0)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:

@@ -88,7 +88,7 @@ def take_snapshot(episode: PlayedEpisode, step: int) -> SearchSnapshot:
         _, next_state = control.act(choice, tracker.update(state, knowledge, percept), knowledge)
         return next_state, None
 
-    choices = jnp.asarray(episode.trace.inferred.corrected.argmax(axis=-1))
+    choices = jnp.asarray(episode.trace.inferred.action_logits.argmax(axis=-1))
     inputs = jax.tree.map(lambda leaf: leaf[: step + 1], (_percepts(episode), choices))
     search_state, _ = jax.jit(lambda inputs: jax.lax.scan(update_map, tracker.init(knowledge), inputs))(inputs)
 

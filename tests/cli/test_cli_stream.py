@@ -97,7 +97,7 @@ def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
     copied = jax.tree.map(np.array, before["layout"][0].replace(key=None))
     after = trainer.restart(before, world.make_env_params(1))["layout"][0]
     chex.assert_trees_all_equal(
-        (after.params, after.optimizer, after.update), (copied.params, copied.optimizer, copied.update)
+        (after.params, after.opt_state, after.update), (copied.params, copied.opt_state, copied.update)
     )
     assert not np.array_equal(after.agent.state.pose, copied.agent.state.pose)
     assert not np.asarray(after.agent.state.time).any()

@@ -214,12 +214,13 @@ def test_outcomes_are_those_of_a_plain_loop(outcome, variant, epsilon, form):
 @jax.jit
 def begin(weights):
     memory = ACTING.bind(weights).initial_memory(EPISODES.goal.shape)
-    return ACTING.begin(start_states(EPISODES), memory, KNOWLEDGE, PARAMS)
+    return ACTING.start_from(start_states(EPISODES), memory, KNOWLEDGE, PARAMS)
 
 
 @jax.jit
 def take(cell, weights, agent, running, keys):
-    return infer_and_act(cell, ACTING.bind(weights), agent, running, keys, ACTING, PARAMS, KNOWLEDGE)
+    policy = ACTING.bind(weights)
+    return infer_and_act(cell, policy, agent, running, keys, agent_loop=ACTING, env_params=PARAMS, knowledge=KNOWLEDGE)
 
 
 @pytest.mark.parametrize("number", range(len(CONTROLS)))
@@ -238,7 +239,7 @@ def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, numbe
             agent, step_result, inferred = take(cell, weights, agent, running, keys)
             success |= running & np.asarray(step_result.success)
             length += running
-            total += np.where(running, inferred.weight, 0.0)
+            total += np.where(running, inferred.removal_weight, 0.0)
             running &= ~np.asarray(step_result.ended)
         result = tiny.leaves_at(outcome, len(ROWS) + number, seed)
         np.testing.assert_array_equal(result.success, success)
@@ -259,12 +260,12 @@ def test_playing_an_episode_agrees_with_the_grid(outcome):
         assert not (trace.action[:-1] == DONE).any()
         assert np.maximum(trace.gap - 0.2, 0).mean() == pytest.approx(result.mean_weight, abs=1e-6)
         how, weight = trace.inferred, np.maximum(trace.gap - 0.2, 0)[:, None]
-        np.testing.assert_allclose(how.weight, weight[:, 0], atol=1e-7)
+        np.testing.assert_allclose(how.removal_weight, weight[:, 0], atol=1e-7)
         # Equation 2 in its residual form, and the best action of what it gives.
-        expected = (1 + weight) * how.factual - weight * how.counterfactual
-        np.testing.assert_allclose(how.corrected, expected, rtol=1e-5, atol=1e-5)
-        np.testing.assert_array_equal(trace.action, how.corrected.argmax(axis=1))
-        assert how.layout.shape == (len(trace.pose), len(tiny.CATEGORIES))
+        expected = (1 + weight) * how.factual_logits - weight * how.removed_logits
+        np.testing.assert_allclose(how.action_logits, expected, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(trace.action, how.action_logits.argmax(axis=1))
+        assert how.layout_weights.shape == (len(trace.pose), len(tiny.CATEGORIES))
 
 
 def test_episodes_end_once(outcome):

@@ -12,7 +12,7 @@ from support import tiny_world as tiny
 from jaxnav.causal import Form, do
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import infer_and_act, start_states
-from jaxnav.evaluation.removal import GapSource, RemovedLogits, counterfactual_logits, select_gap
+from jaxnav.evaluation.removal import GapSource, RemovedLogits, logits_to_remove, select_gap
 from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.agent_loop import AgentLoop
@@ -52,22 +52,23 @@ EVERY = np.ones(EPISODES, bool)
 @jax.jit
 def begin(weights):
     """The episodes after their first view."""
-    return ACTING.begin(START, ACTING.bind(weights).initial_memory((EPISODES,)), KNOWLEDGE, PARAMS)
+    return ACTING.start_from(START, ACTING.bind(weights).initial_memory((EPISODES,)), KNOWLEDGE, PARAMS)
 
 
 @jax.jit
 def take(cell, weights, agent, running, keys):
     """One step."""
-    return infer_and_act(cell, ACTING.bind(weights), agent, running, keys, ACTING, PARAMS, KNOWLEDGE)
+    policy = ACTING.bind(weights)
+    return infer_and_act(cell, policy, agent, running, keys, agent_loop=ACTING, env_params=PARAMS, knowledge=KNOWLEDGE)
 
 
 @jax.jit
 def both(cell, weights, agent, keys, step_keys):
     """The logits that are taken out, and those of the counterfactual decision."""
     policy = ACTING.bind(weights)
-    pathways = policy.pathways(*ACTING.view(agent, KNOWLEDGE, PARAMS), agent.memory)
+    pathways = policy.pathways(ACTING.policy_inputs(agent, KNOWLEDGE, PARAMS), agent.memory)
     zeroed = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-    return counterfactual_logits(cell, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
+    return logits_to_remove(cell, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
 
 
 WEIGHTS = tiny.lively(6)
@@ -86,7 +87,7 @@ def agent():
 def step(agent, running=EVERY, **options):
     """What one step takes, and the weights that it takes it with."""
     _, step_result, inferred = take(cell(**options), WEIGHTS, agent, running, EPISODE_KEYS)
-    return np.asarray(step_result.agent.memory.action), np.asarray(inferred.weight)
+    return np.asarray(step_result.agent.memory.action), np.asarray(inferred.removal_weight)
 
 
 # What is taken out
@@ -125,7 +126,7 @@ def test_a_random_intervention_sets_scene_and_goal_alone(highest):
     keys = jax.random.split(jax.random.key(0), (2, count))
 
     def logits(**changes):
-        return np.asarray(counterfactual_logits(cell(**changes), policy, pathways, memory, *keys))
+        return np.asarray(logits_to_remove(cell(**changes), policy, pathways, memory, *keys))
 
     result = logits(intervention=highest)
     np.testing.assert_array_equal(result[:, 4], 9.0)

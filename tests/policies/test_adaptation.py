@@ -24,7 +24,7 @@ from jaxnav.policies.adaptation import (
 )
 from jaxnav.policies.methods import METHODS, find_method
 from jaxnav.policies.network import bind
-from jaxnav.policies.pathways import mask_experience
+from jaxnav.policies.pathways import PolicyInputs, mask_experience
 from jaxnav.scenes.task import NUM_ACTIONS
 
 STEPS, RATE, K = 27, 0.05, tiny.SPEC.num_categories
@@ -54,7 +54,7 @@ def acted(spec, weights, adaptation, observation, action):
 
     def step(memory, part):
         observation, action = part
-        pathways = policy.pathways(observation, jnp.ones((*action.shape, K)), memory=memory)
+        pathways = policy.pathways(PolicyInputs(observation, jnp.ones((*action.shape, K))), memory)
         decision = policy.decide(pathways, memory)
         return decision.next_state(action), (decision.logits, decision.fast)
 
@@ -74,9 +74,9 @@ def acted_plainly(spec, weights, observation, action, order=2):
     for time in range(STEPS):
         policy = bind(spec, fast)
         seen = jax.tree.map(lambda leaf, time=time: leaf[time], observation)
-        pathways = policy.pathways(seen, jnp.ones(K), memory=memory)
+        pathways = policy.pathways(PolicyInputs(seen, jnp.ones(K)), memory)
         window.append((pathways, memory))
-        decision = policy.decide_without_adaptation(pathways, memory)
+        decision = policy.decide_with_changes(pathways, memory)
         logits.append(decision.logits)
         memory = decision.next_state(action[time])
         if len(window) == WINDOW and time < 4 * WINDOW:
@@ -97,7 +97,7 @@ def judged(spec, window, method, fast):
     alone = None if spec.decision == "fused" else jnp.float32(0.0)
     hidden, rows = window[0][1].hidden, []
     for pathways, memory in window:
-        decision = policy.decide_without_adaptation(mask_experience(pathways, alone), memory._replace(hidden=hidden))
+        decision = policy.decide_with_changes(mask_experience(pathways, alone), memory._replace(hidden=hidden))
         hidden = decision.hidden
         rows.append(jnp.concatenate([hidden[: policy.hidden], jax.nn.softmax(decision.logits)]))
     return cast(HasLearnedLoss, policy.method).learned_loss(jnp.stack(rows))
@@ -186,7 +186,7 @@ def test_nothing_is_learned_before_a_window_is_full_nor_after_the_fourth():
     _, fast = jax.jit(functools.partial(acted, SAVN, tiny.lively(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)))(
         *given(4)
     )
-    changes = fast.layer_changes["core"].outputs
+    changes = fast.layer_changes["hidden_gates"].outputs
     times = [time + 1 for time in range(STEPS) if np.any(changes[time] != (changes[time - 1] if time else 0.0))]
     assert times == [6, 12, 18, 24]
 
@@ -197,7 +197,7 @@ def test_the_window_is_what_was_decided():
     policy, (observation, action) = bind(SAVN, tiny.lively(0, SAVN)), given(5)
 
     def step(memory, part):
-        decision = policy.decide(policy.pathways(part[0], jnp.ones(K)), memory)
+        decision = policy.decide(policy.pathways(PolicyInputs(part[0], jnp.ones(K))), memory)
         return decision.next_state(part[1]), (memory, decision)
 
     # The second window: after the first step, before the second.
@@ -208,7 +208,7 @@ def test_the_window_is_what_was_decided():
     rows, inputs = replay_window(policy, after.fast._replace(layer_changes=last.fast.layer_changes), nothing)
     np.testing.assert_allclose(rows[:, : policy.hidden], decision.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(rows[-1, policy.hidden :], jax.nn.softmax(after.logits), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(inputs["core"], before.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(inputs["hidden_gates"], before.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", SPECS)

@@ -14,6 +14,7 @@ from support.scenes import BOOK, CHAIR, FRIDGE
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import bind
+from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.scenes.tables.observation_row import RowFormat
 
 ROW_FORMAT = RowFormat(3)
@@ -28,7 +29,7 @@ def deciding(method):
 
     @jax.jit
     def decide(observation):
-        return policy.decide(policy.pathways(observation, jnp.ones(3)), policy.initial_memory()).logits
+        return policy.decide(policy.pathways(PolicyInputs(observation, jnp.ones(3))), policy.initial_memory()).logits
 
     return decide
 

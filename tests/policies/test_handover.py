@@ -52,19 +52,19 @@ def unaware():
 
 
 def test_what_removal_leaves_is_the_policy_without_experience_to_the_bit():
-    decider = PAIR.decider(BOTH)
+    decider = PAIR.bind_decider(BOTH)
     batch = jnp.arange(8)
     agent = PAIR.start(KEY, len(batch), decider.initial_memory(batch.shape), KNOWLEDGE, PARAMS)
     memory = agent.memory
     assert memory is not None
-    view = PAIR.view(agent, KNOWLEDGE, PARAMS)
-    pathways = decider.pathways(*view, memory)
+    view = PAIR.policy_inputs(agent, KNOWLEDGE, PARAMS)
+    pathways = decider.pathways(view, memory)
     factual = decider.decide(pathways, memory)
     removed = decider.decide(do(pathways, scene=0.0, goal=0.0), memory)
     own, other = PAIR.bind(AGENT), ALONE.bind(WITHOUT)
-    knowing = own.decide(own.pathways(*view), own.initial_memory(batch.shape))
+    knowing = own.decide(own.pathways(view), own.initial_memory(batch.shape))
     unknowing = other.decide(
-        other.pathways(view.observation, jnp.ones_like(view.weights), None, view.surroundings),
+        other.pathways(view._replace(layout_weights=jnp.ones_like(view.layout_weights), reading=None)),
         other.initial_memory(batch.shape),
     )
     chex.assert_trees_all_equal(factual.logits - removed.logits, round_to_grid(unknowing.logits))

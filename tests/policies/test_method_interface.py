@@ -42,7 +42,7 @@ def rolled(name):
 
     @jax.jit
     def go(agent, key):
-        return collect_rollout(acting, acting.bind(weights), agent, key, LENGTH, False, PARAMS, KNOWN)
+        return collect_rollout(acting, acting.bind(weights), agent, key, PARAMS, KNOWN, num_steps=LENGTH)
 
     memory = acting.bind(weights).initial_memory((ENVS,))
     agent = acting.start(jax.random.key(0), ENVS, memory, KNOWN, PARAMS)
@@ -122,7 +122,7 @@ def test_methods_of_other_packages_are_found_by_entry_point(monkeypatch):
 def test_replay_decides_as_the_rollout_did(name):
     weights, _, _, rollout = rolled(name)
     again = jax.jit(
-        lambda: replay_rollout(acting_with(name).bind(weights), rollout.transitions, rollout.memory, PARAMS)
+        lambda: replay_rollout(acting_with(name).bind(weights), rollout.transitions, rollout.initial_memory, PARAMS)
     )()
     log_pi = jax.nn.log_softmax(again.factual.logits)
     log_prob = jnp.take_along_axis(log_pi, rollout.transitions.choice[..., None], axis=-1)[..., 0]
@@ -141,7 +141,8 @@ def test_a_step_by_step_replay_is_the_parallel_one():
 
     @functools.partial(jax.jit, static_argnums=1)
     def loss(weights, spec):
-        replayed = replay_rollout(AgentLoop(ENV, spec).bind(weights), rollout.transitions, rollout.memory, PARAMS)
+        policy = AgentLoop(ENV, spec).bind(weights)
+        replayed = replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS)
         total, _ = ppo_loss(replayed, advantage, scalars, True, METHODS["org"])
         return total, (replayed.factual, replayed.counterfactual._replace(fast=None))
 
@@ -159,13 +160,13 @@ def test_a_step_by_step_replay_is_the_parallel_one():
 def test_experience_attends_with_the_memory():
     acting = acting_with("ATTENTIVE")
     weights, before, _, _ = rolled("ATTENTIVE")
-    policy, view = acting.bind(weights), acting.view(before, KNOWN, PARAMS)
+    policy, view = acting.bind(weights), acting.policy_inputs(before, KNOWN, PARAMS)
     assert before.memory is not None
-    experience = jax.jit(lambda memory: policy.pathways(*view, memory).experience)
+    experience = jax.jit(lambda memory: policy.pathways(view, memory).experience)
     first, other = experience(before.memory), experience(before.memory._replace(hidden=-before.memory.hidden))
     assert np.abs(first - other).max() > 1e-3
     with pytest.raises(ValueError, match="attends with its memory"):
-        policy.pathways(*view)
+        policy.pathways(view)
 
 
 @pytest.mark.slow
@@ -204,7 +205,8 @@ def test_stages_train_their_own_part():
 @pytest.mark.slow
 def test_an_auxiliary_loss_is_added_and_reported():
     weights, _, _, rollout = rolled("AUXILIARY")
-    replayed = replay_rollout(acting_with("AUXILIARY").bind(weights), rollout.transitions, rollout.memory, PARAMS)
+    policy = acting_with("AUXILIARY").bind(weights)
+    replayed = replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS)
     advantage, scalars = jnp.ones((LENGTH, ENVS)), PPOConfig().scalars(1)
     plain, parts = ppo_loss(replayed, advantage, scalars, False, METHODS["org"])
     total, more = ppo_loss(replayed, advantage, scalars, False, methods.AUXILIARY)
@@ -263,10 +265,10 @@ def test_the_weight_of_an_episode_is_the_mean_over_choices_that_count():
     outcome = tiny.leaves_at(Evaluator(acting)(grid, stacked, [(episodes, PARAMS)], KNOWN, jax.random.key(0)), 0)
     traces = play_episodes(tiny.leaves_at(grid, 0), weights, start_states(episodes), acting, PARAMS, KNOWN)
     np.testing.assert_array_equal(outcome.choices, [-(-len(trace.action) // 2) for trace in traces])
-    expected = [trace.inferred.weight[::2].mean() for trace in traces]
+    expected = [trace.inferred.removal_weight[::2].mean() for trace in traces]
     np.testing.assert_allclose(outcome.mean_weight, expected, rtol=1e-5)
     # Over all actions it is another number.
-    assert np.abs(outcome.mean_weight - [trace.inferred.weight.mean() for trace in traces]).max() > 0.01
+    assert np.abs(outcome.mean_weight - [trace.inferred.removal_weight.mean() for trace in traces]).max() > 0.01
 
 
 def test_a_method_is_one_hashable_entry():

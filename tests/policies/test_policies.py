@@ -19,7 +19,7 @@ from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import METHODS, find_method
 from jaxnav.policies.network import INITIAL_DONE_LOGIT, bind, init_params
-from jaxnav.policies.pathways import NO_ACTION, PolicyState
+from jaxnav.policies.pathways import NO_ACTION, PolicyInputs, PolicyState
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.lattice import NUM_ACTIONS
 from jaxnav.store.export import export_params
@@ -50,7 +50,7 @@ class Compiled:
         )
         policy = bind(spec, lively(0, spec))
         self.experience_width = policy.method.width
-        self.pathways = jax.jit(lambda observation, weights: policy.pathways(observation, weights))
+        self.pathways = jax.jit(lambda *inputs: policy.pathways(PolicyInputs(*inputs)))
         self.decide = jax.jit(lambda pathways, memory: policy.decide(pathways, memory))
         self.initial_memory = policy.initial_memory
 
@@ -217,6 +217,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxnav.policies.network import bind
 from jaxnav.policies.methods.org import ORG
+from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.store.export import load_params
 from jaxnav.env.objectnav import Observation
@@ -224,7 +225,7 @@ params, fields = load_params(Path(sys.argv[1]))
 bound = bind(PolicySpec.from_json(fields, ORG, fields["num_categories"]), params)
 given = np.load(sys.argv[2])
 observation = Observation(row=jnp.asarray(given["row"]), goal=jnp.asarray(given["goal"]))
-pathways = bound.pathways(observation, jnp.asarray(given["weights"]))
+pathways = bound.pathways(PolicyInputs(observation, jnp.asarray(given["weights"])))
 decision = bound.decide(pathways, bound.initial_memory((len(given["goal"]),)))
 print(json.dumps({"modules": sorted(sys.modules), "logits": decision.logits.tolist()}))
 """

@@ -15,7 +15,7 @@ from support.tiny_world import BANK, SIZES, SPEC, lively
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.network import DONE_GATE, bind, init_params
-from jaxnav.policies.pathways import Pathways, PolicyState
+from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
 from jaxnav.policies.spec import Direct
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
@@ -52,7 +52,7 @@ class Compiled:
     def __init__(self, **options):
         spec = dataclasses.replace(SPEC, **options)
         policy = bind(spec, lively(0))
-        self.pathways = jax.jit(lambda observation: policy.pathways(observation, jnp.ones((BATCH, K))))
+        self.pathways = jax.jit(lambda observation: policy.pathways(PolicyInputs(observation, jnp.ones((BATCH, K)))))
         self.decide = jax.jit(lambda pathways, memory: policy.decide(pathways, memory))
 
 
@@ -97,13 +97,14 @@ def test_the_detection_of_the_goal_enters_in_one_place_whatever_is_sought():
     weights = lively(0, spec)
     weights["appearance"]["embedding"] = jnp.ones_like(weights["appearance"]["embedding"])
     observation = with_detections(detections(SEEN, UNSEEN))
-    goal = np.asarray(bind(spec, weights).pathways(observation, jnp.ones((BATCH, K))).goal)
+    goal = np.asarray(bind(spec, weights).pathways(PolicyInputs(observation, jnp.ones((BATCH, K)))).goal)
     by_category, own, _ = np.split(goal, [K * outputs, (K + 1) * outputs], axis=1)
     assert goal.shape[1] == (K + 1) * outputs + appearance
     assert len(np.unique(by_category, axis=0)) == len(np.unique(GOAL))
     assert len(np.unique(own, axis=0)) == 1
     others = with_detections(detections(UNSEEN, SEEN))
-    unseen = np.asarray(bind(spec, weights).pathways(others, jnp.ones((BATCH, K))).goal)[:, K * outputs : -appearance]
+    pathways = bind(spec, weights).pathways(PolicyInputs(others, jnp.ones((BATCH, K))))
+    unseen = np.asarray(pathways.goal)[:, K * outputs : -appearance]
     assert np.all(np.any(unseen != own, axis=1))
 
 

@@ -81,12 +81,12 @@ def test_exactly_the_repeated_poses_of_random_walks_are_told(world):
     @jax.jit
     def walk(key):
         # Half of them look down, where one can.
-        start = acting.begin(start_states(episodes), None, method_knowledge, params)
+        start = acting.start_from(start_states(episodes), None, method_knowledge, params)
 
         def step(agent, key):
             draw = jax.random.randint(key, (walks,), 0, NUM_ACTIONS - 1)
             agent, _ = acting.step(agent, jnp.where(draw % 2 == 0, MOVE_AHEAD, draw), method_knowledge, params)
-            return agent, (agent.state.pose, acting.view(agent, method_knowledge, params).reading)
+            return agent, (agent.state.pose, acting.policy_inputs(agent, method_knowledge, params).reading)
 
         _, (poses, repeated) = jax.lax.scan(step, start, jax.random.split(key, steps))
         return jnp.concatenate([start.state.pose[None], poses]), repeated

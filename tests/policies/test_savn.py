@@ -42,9 +42,9 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     def go():
         policy = ACTING.bind(weights)
         agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
-        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWLEDGE)
-        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWLEDGE)
-        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.memory, PARAMS).factual
+        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), PARAMS, KNOWLEDGE, num_steps=LENGTH)
+        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), PARAMS, KNOWLEDGE, num_steps=LENGTH)
+        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS).factual
 
     agent, rollout, again = go()
     transitions = rollout.transitions
@@ -100,10 +100,10 @@ def fall(weights, steps):
 
     def step(agent, key):
         memory = policy_memory(agent)
-        decision = policy.decide(policy.pathways(*ACTING.view(agent, KNOWLEDGE, LONG), memory), memory)
+        decision = policy.decide(policy.pathways(ACTING.policy_inputs(agent, KNOWLEDGE, LONG), memory), memory)
         after, before = decision.fast, decision.fast._replace(layer_changes=memory.fast.layer_changes)
         choice, keys = jax.random.categorical(key, decision.logits), jax.random.split(key, ENVS)
-        agent, _ = ACTING.step(agent, choice, KNOWLEDGE, LONG, policy=policy, decision=decision, keys=keys)
+        agent, _ = ACTING.step(agent, choice, KNOWLEDGE, LONG, policy=policy, decision=decision, reset_keys=keys)
         full = (after.num_decisions % WINDOW == 0) & (after.num_decisions <= 4 * WINDOW)
         return agent, (full, jax.vmap(loss)(before), jax.vmap(loss)(after))
 

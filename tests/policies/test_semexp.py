@@ -15,7 +15,8 @@ from jaxnav.env.objectnav import State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import start_states
-from jaxnav.policies.agent_loop import AgentLoop, select
+from jaxnav.numerics.trees import tree_where
+from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Percept
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.local_policy import LocalPolicy
@@ -61,7 +62,7 @@ def acting(method="semexp", env=ENV):
 
 def walk(start, choices):
     """Agents and actions of an episode in the corridor, given one choice for every step, and what came of it."""
-    agents, actions = [jax.jit(acting().begin)(State(*start), None, knowledge_of(), PARAMS)], []
+    agents, actions = [jax.jit(acting().start_from)(State(*start), None, knowledge_of(), PARAMS)], []
     step = jax.jit(acting().step)
     step_result = None
     for choice in choices:
@@ -203,19 +204,19 @@ def test_the_layout_enters_by_the_categories_on_the_map_alone():
     weights = tiny.lively(0, SPEC)
     policy = bind(SPEC, weights)
     agents, _, _ = walk(state_at(10, 0), [block_ahead(10)] * 8)
-    view = acting().view(agents[-1], knowledge_of(), PARAMS)
+    view = acting().policy_inputs(agents[-1], knowledge_of(), PARAMS)
     assert int(np.bitwise_or.reduce(np.asarray(view.reading.blocks[0]))) & 1 << BOOK
-    plain = policy.pathways(*view)
-    louder = policy.pathways(*view._replace(weights=view.weights.at[:, BOOK].set(3.0)))
+    plain = policy.pathways(view)
+    louder = policy.pathways(view._replace(layout_weights=view.layout_weights.at[:, BOOK].set(3.0)))
     assert np.abs(plain.experience - louder.experience).max() > 1e-3
     np.testing.assert_array_equal(plain.scene, louder.scene)
     np.testing.assert_array_equal(plain.goal, louder.goal)
     # The categories on the map are no part of the direct pathway; floor and walls are no part of Z.
     bare = view._replace(reading=view.reading._replace(blocks=view.reading.blocks & ~np.uint32(7)))
-    np.testing.assert_array_equal(plain.scene, policy.pathways(*bare).scene)
+    np.testing.assert_array_equal(plain.scene, policy.pathways(bare).scene)
     flat = view._replace(reading=view.reading._replace(blocks=view.reading.blocks & np.uint32(7)))
-    np.testing.assert_array_equal(plain.experience, policy.pathways(*flat).experience)
-    assert np.abs(plain.scene - policy.pathways(*flat).scene).max() > 1e-3
+    np.testing.assert_array_equal(plain.experience, policy.pathways(flat).experience)
+    assert np.abs(plain.scene - policy.pathways(flat).scene).max() > 1e-3
 
 
 @pytest.mark.parametrize("world", ["rooms", "houses"])
@@ -258,13 +259,13 @@ def test_homes_are_searched_without_learning(world):
     @jax.jit
     def success(start, method):
         knowledge_ = knowledge._replace(layout=prior, method=method)
-        agent = act.begin(start, None, knowledge_, params)
+        agent = act.start_from(start, None, knowledge_, params)
 
         def step(carry):
             agent, running, has_found = carry
             after, step_result = act.step(agent, jnp.zeros(count, jnp.int32), knowledge_, params)
             return (
-                select(running, after, agent),
+                tree_where(running, after, agent),
                 running & ~step_result.ended,
                 has_found | (running & step_result.success),
             )

@@ -106,17 +106,17 @@ def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episod
     def go(key):
         policy = acting.bind(weights)
         agent = acting.start(key, 4, policy.initial_memory((4,)), KNOWLEDGE, PARAMS)
-        view = acting.view(agent, KNOWLEDGE, PARAMS)
+        view = acting.policy_inputs(agent, KNOWLEDGE, PARAMS)
         assert view.surroundings is not None
         elsewhere = view._replace(surroundings=jnp.full_like(view.surroundings, VISITED))
         memory = policy.initial_memory((4,))
-        embedded = policy.pathways(*view, memory), policy.pathways(*elsewhere, memory)
+        embedded = policy.pathways(view, memory), policy.pathways(elsewhere, memory)
         direct = [policy.decide(pathways, memory).logits for pathways in embedded]
         alone = [policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits for pathways in embedded]
         decision = policy.decide(embedded[0], memory)
         done = jnp.array([DONE, DONE, MOVE_AHEAD, MOVE_AHEAD])
         keys = jax.random.split(key, 4)
-        after, _ = acting.step(agent, done, KNOWLEDGE, PARAMS, policy=policy, decision=decision, keys=keys)
+        after, _ = acting.step(agent, done, KNOWLEDGE, PARAMS, policy=policy, decision=decision, reset_keys=keys)
         return embedded, direct, alone, after
 
     embedded, direct, alone, after = go(jax.random.key(0))

@@ -16,7 +16,7 @@ from jaxnav.causal import do, stde, tde
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import METHODS, find_method
 from jaxnav.policies.network import StreamsPolicy, bind, init_params
-from jaxnav.policies.pathways import Decision, PolicyState
+from jaxnav.policies.pathways import Decision, PolicyInputs, PolicyState
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import NUM_ACTIONS
@@ -48,7 +48,7 @@ def compiled(spec):
     @jax.jit
     def decide(weights, observation, layout, surroundings, memory):
         policy = bind(spec, weights)
-        pathways = policy.pathways(observation, layout, reading, surroundings, memory)
+        pathways = policy.pathways(PolicyInputs(observation, layout, reading, surroundings), memory)
         counterfactual = do(pathways, scene=0.0, goal=0.0)
         given = pathways, counterfactual, do(pathways, experience=0.0), do(counterfactual, experience=0.0)
         return Decisions(*(policy.decide(pathways_i, memory) for pathways_i in given))
@@ -181,7 +181,7 @@ def test_each_stream_has_a_core_of_its_own():
     generator = np.random.default_rng(0)
     observation, memory, spec = observations(generator), memories(generator), streams("org")
     policy = cast(StreamsPolicy, bind(spec, tiny.lively(0, spec)))
-    pathways = policy.pathways(observation, jnp.ones((BATCH, K)))
+    pathways = policy.pathways(PolicyInputs(observation, jnp.ones((BATCH, K))))
     after = policy.decide(pathways, memory).hidden
     previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
     entering = {

@@ -26,7 +26,7 @@ from jaxnav.policies.methods.tpn import (
     learn_motion,
 )
 from jaxnav.policies.network import NO_CHANGES, bind
-from jaxnav.policies.pathways import PolicyState
+from jaxnav.policies.pathways import PolicyInputs, PolicyState
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
@@ -98,7 +98,8 @@ def given(spec, decisions=7, seed=0):
     )
     hidden = jnp.asarray(draws.uniform(-1, 1, memory.hidden.shape), jnp.float32)
     memory = memory._replace(hidden=hidden, action=jnp.arange(BATCH) % NUM_ACTIONS, fast=fast)
-    pathways = policy.pathways(Observation(row, goal), jnp.ones((BATCH, tiny.SPEC.num_categories)), reading)
+    inputs = PolicyInputs(Observation(row, goal), jnp.ones((BATCH, tiny.SPEC.num_categories)), reading)
+    pathways = policy.pathways(inputs)
     return policy, pathways, memory
 
 
@@ -115,7 +116,7 @@ def test_the_step_descends_the_cross_entropy_at_repeated_poses(options):
     best = decision.fast.predicted_logits.argmax(axis=-1)
 
     def cross_entropy(change):
-        log_pi = jax.nn.log_softmax(policy.decide_without_adaptation(pathways, memory, actor_changes(change)).logits)
+        log_pi = jax.nn.log_softmax(policy.decide_with_changes(pathways, memory, actor_changes(change)).logits)
         return -jnp.take_along_axis(log_pi, best[:, None], axis=-1).sum()
 
     gradient = jax.grad(cross_entropy)(memory.fast.actor_change)
@@ -130,7 +131,7 @@ def test_the_actor_is_renewed():
     for decisions, is_kept in ((49, True), (50, False), (0, False)):
         policy, pathways, memory = given(SPEC, decisions)
         decision = policy.decide(pathways, memory)
-        expected = policy.decide_without_adaptation(
+        expected = policy.decide_with_changes(
             pathways, memory, actor_changes(memory.fast.actor_change) if is_kept else NO_CHANGES
         )
         np.testing.assert_allclose(decision.logits, expected.logits, rtol=1e-5, atol=1e-5)
@@ -149,10 +150,8 @@ def test_an_agent_that_does_not_try_decides_plainly():
         memory = memory._replace(fast=memory.fast._replace(actor_change=jnp.zeros_like(memory.fast.actor_change)))
         decision = policy.decide(pathways, memory)
         chex.assert_trees_all_equal(decision.fast.actor_change, memory.fast.actor_change)
-        np.testing.assert_allclose(
-            decision.logits, policy.decide_without_adaptation(pathways, memory).logits, atol=1e-6
-        )
-    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.lively(0, SPEC)).recurrent
+        np.testing.assert_allclose(decision.logits, policy.decide_with_changes(pathways, memory).logits, atol=1e-6)
+    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.lively(0, SPEC)).needs_stepwise_replay
 
 
 # Training
@@ -216,9 +215,9 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
     def go():
         policy = ACTING.bind(weights)
         agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWN, PARAMS)
-        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWN)
-        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), LENGTH, False, PARAMS, KNOWN)
-        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.memory, PARAMS).factual
+        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), PARAMS, KNOWN, num_steps=LENGTH)
+        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), PARAMS, KNOWN, num_steps=LENGTH)
+        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS).factual
 
     agent, rollout, again = go()
     transitions = rollout.transitions

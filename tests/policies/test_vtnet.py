@@ -22,7 +22,7 @@ from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.imitation import imitation_loss
 from jaxnav.policies.methods.vtnet import Transformer, UniformTransformer, position_codes, view_squares
 from jaxnav.policies.network import bind
-from jaxnav.policies.pathways import PolicyState
+from jaxnav.policies.pathways import PolicyInputs, PolicyState
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.training.config import PPOConfig
@@ -167,7 +167,7 @@ def test_queries_stay_under_an_intervention():
     @jax.jit
     def counterfactual(row):
         policy = bind(spec, weights)
-        pathways = policy.pathways(Observation(row, jnp.int32(0)), jnp.ones(len(CATEGORIES)))
+        pathways = policy.pathways(PolicyInputs(Observation(row, jnp.int32(0)), jnp.ones(len(CATEGORIES))))
         removed = do(pathways, scene=0.0, goal=0.0)
         memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(0))
         return removed.experience, policy.decide(removed, memory).logits

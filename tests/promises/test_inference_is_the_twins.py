@@ -132,16 +132,16 @@ def compare(method: str, decision: str, row: EvaluationRow, episodes: EpisodeLis
     errors: dict[str, list[float]] = collections.defaultdict(list)
     for number, trace in enumerate(played.played(cell, episodes)):
         goal, scene, pose = (int(getattr(episodes, name)[number]) for name in ("goal", "scene", "pose"))
-        prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.estimator else None
+        prior = np.asarray(knowledge.layout[params.room[scene]]) if acting.estimator_config else None
         episode, action, success = TwinEpisode(policy, bank, prior, goal, pose), NO_ACTION, False
         for time, (expected_pose, action) in enumerate(zip(trace.pose.tolist(), trace.action.tolist(), strict=True)):
             inferred = episode.infer()
-            corrected, weight = inferred.corrected(row.variant, row.epsilon, row.form)
-            for name, value in {**inferred._asdict(), "corrected": corrected, "weight": weight}.items():
+            corrected, weight = inferred.action_logits(row.variant, row.epsilon, row.form)
+            for name, value in {**inferred._asdict(), "action_logits": corrected, "removal_weight": weight}.items():
                 expected = getattr(trace.inferred, name)[time]
                 errors[name].append(float(np.abs(expected - value).max()))
             scores = corrected + (noise(number, time, len(corrected)) if row.decoding == "sample" else 0.0)
-            decisions, removals = decisions + 1, removals + int(corrected.argmax() != inferred.factual.argmax())
+            decisions, removals = decisions + 1, removals + int(corrected.argmax() != inferred.factual_logits.argmax())
             if (episode.pose, policy.method.act(int(scores.argmax()))) != (expected_pose, action):
                 if np.subtract(*np.sort(scores)[:-3:-1]) > TOLERANCE:
                     differences.append(f"episode {number}, step {time}")
@@ -197,4 +197,4 @@ class Mistaken(TwinRelations):
 def test_a_twin_that_is_wrong_is_noticed(wrong):
     result = compare("org", "fused", ROWS[0], draw_episodes(world()[0], 4), wrong)
     assert result.differences
-    assert max(result.errors["factual"]) > 10 * TOLERANCE
+    assert max(result.errors["factual_logits"]) > 10 * TOLERANCE

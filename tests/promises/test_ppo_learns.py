@@ -105,8 +105,8 @@ def trained(gamma: jax.Array, updates: int) -> Transition:
         scalars = PROBES.config.scalars(UPDATES).replace(gamma=gamma)
         state, _ = PROBES.train(state, scalars, params, KNOWLEDGE, updates)
         policy = PROBES.agent_loop.bind(state.params)
-        arguments = state.agent, jax.random.key(1), 4, False, params, KNOWLEDGE
-        return collect_rollout(PROBES.agent_loop, policy, *arguments)[1].transitions
+        arguments = policy, state.agent, jax.random.key(1), params, KNOWLEDGE
+        return collect_rollout(PROBES.agent_loop, *arguments, num_steps=4)[1].transitions
 
     return jax.lax.map(one, (probes.pays, probes.length))
 
@@ -119,8 +119,8 @@ def rollouts() -> dict[str, Transition]:
 
 def values(t: Transition) -> dict[tuple[int, int], np.ndarray]:
     """The values [N] that the policy saw at each time and goal."""
-    keys = {(int(time), int(goal)) for time, goal in zip(t.length.ravel() - 1, t.goal.ravel(), strict=True)}
-    return {key: np.asarray(t.value[(t.length - 1 == key[0]) & (t.goal == key[1])]) for key in keys}
+    keys = {(int(time), int(goal)) for time, goal in zip(t.episode_length.ravel() - 1, t.goal.ravel(), strict=True)}
+    return {key: np.asarray(t.value[(t.episode_length - 1 == key[0]) & (t.goal == key[1])]) for key in keys}
 
 
 @pytest.mark.parametrize("name", CASES)

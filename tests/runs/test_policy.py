@@ -259,7 +259,7 @@ def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
     assert len(trace.action) > WINDOW
     policy, decide = LoadedPolicy(weights, knowledge, spec, setting, env.task), jax.jit(LoadedPolicy.decide)
     memory, horizons = policy.init("kitchen"), len(env.task.rules.horizons)
-    for action, logits in zip(trace.action, trace.inferred.corrected, strict=True):
+    for action, logits in zip(trace.action, trace.inferred.action_logits, strict=True):
         use_pose = {"heading": state.pose // horizons % env.task.rules.headings, "horizon": state.pose % horizons}
         use_pose["moved"] = env.cell_of_pose(state.pose) != env.cell_of_pose(before.pose)
         made = decide(policy, env.observe(state, params), memory, jnp.float32(0.1), **use_pose)
@@ -269,7 +269,7 @@ def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
         before, (state, *_) = state, env.advance(state, applied_action, params)
     if METHODS[name].adaptation is not None:
         (plain,) = played(agent_loop=AgentLoop(env, spec, setting, inner_steps=0))
-        assert np.abs(plain.inferred.factual[:LONG] - trace.inferred.factual[:LONG]).max() > 1e-3
+        assert np.abs(plain.inferred.factual_logits[:LONG] - trace.inferred.factual_logits[:LONG]).max() > 1e-3
 
 
 @pytest.mark.slow

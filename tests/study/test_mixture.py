@@ -36,7 +36,7 @@ def outcome(success, length=20, weight=0.0):
     """Return outcomes of three runs; `success` is what share of the four episodes of each scene succeeds."""
     shape = (RUNS, 2 * SCENES * EACH)
     lucky = np.tile(np.arange(EACH), 2 * SCENES) < EACH * np.where(SHIFT == 0, *success)
-    start = EpisodeOutcome.start(shape)
+    start = EpisodeOutcome.zeros(shape)
     return start._replace(
         done=jnp.ones(shape, bool),
         success=jnp.asarray(np.broadcast_to(lucky, shape)),

@@ -16,7 +16,7 @@ from jaxnav.scenes.task import NUM_ACTIONS, ROTATE_RIGHT
 class Attention(Experience):
     """Attend to the categories' rows with the memory."""
 
-    recurrent = True
+    reads_memory = True
 
     def __init__(self, spec, rngs):
         self.query = Linear(spec.sizes.hidden + NUM_ACTIONS, NUM_FEATURES, rngs=rngs)
@@ -38,7 +38,7 @@ ATTENTIVE = Method(Attention)
 class StepwiseRelations(ObjectRelations):
     """ORG, unrolled step by step though it does not attend."""
 
-    recurrent = True
+    reads_memory = True
 
 
 STEPWISE = Method(StepwiseRelations)
@@ -99,7 +99,7 @@ class Habit:
     def decide(self, policy, pathways, memory):
         done = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
         bias = memory.fast + self.rate * done
-        decision = policy.decide_without_adaptation(pathways, memory)
+        decision = policy.decide_with_changes(pathways, memory)
         return decision._replace(logits=decision.logits + bias, fast=bias)
 
 

@@ -41,7 +41,7 @@ SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)  # of each 
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def act(weights, agent, key, coin, acting=ACTING):
     """The agent after a rollout, and the rollout."""
-    return collect_rollout(acting, acting.bind(weights), agent, key, LENGTH, coin, PARAMS, KNOWLEDGE)
+    return collect_rollout(acting, acting.bind(weights), agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, use_coin=coin)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -90,7 +90,7 @@ def rolled(coin: bool) -> Rolled:
 class Retraced(NamedTuple):
     """Results of the plain loop: leaves [T, SLOTS], and parts of the last agents as lists [SLOTS]."""
 
-    weights: np.ndarray
+    layout_weights: np.ndarray
     value: np.ndarray
     log_prob: np.ndarray
     next_value: np.ndarray
@@ -131,7 +131,7 @@ def _retrace_slot(run: Rolled, retraced: Retraced, slot: int) -> None:
         weights = tiny.goal_weights(layout, now.goal)
         factual, counterfactual = tiny.decide(run.weights, ROWS[now.pose], now.goal, weights, memory)
         decision = factual if now.use_direct is None or now.use_direct else counterfactual
-        retraced.weights[time, slot] = weights
+        retraced.layout_weights[time, slot] = weights
         retraced.value[time, slot] = decision.value
         retraced.log_prob[time, slot] = jax.nn.log_softmax(decision.logits)[now.action]
 

@@ -13,6 +13,7 @@ from jaxnav.layout import ESTIMATORS, LayoutEstimator, prior_from_counts
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import bind, init_params
+from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.policies import Policies
 from jaxnav.scenes.tables.compile import compile_bank
@@ -92,7 +93,7 @@ def _loud(params, seed):
 def decide(weights, row, goal, layout_weights, memory):
     """One decision and its counterfactual, both direct pathways zero."""
     policy = bind(SPEC, weights)
-    pathways = policy.pathways(Observation(row=row, goal=goal), layout_weights)
+    pathways = policy.pathways(PolicyInputs(Observation(row=row, goal=goal), layout_weights))
     return policy.decide(pathways, memory), policy.decide(do(pathways, scene=0.0, goal=0.0), memory)
 
 

@@ -23,7 +23,7 @@ from support.twin_transformer import residual_perceptron
 #: Decisions between inner steps, and inner steps of an episode.
 WINDOW = 6
 NUM_STEPS = 4
-LAYERS = ("fuse", "drive", "core", "actor")
+LAYERS = ("fuse", "input_gates", "hidden_gates", "actor")
 TINY = 1e-30  # of a complex step: its square is nothing beside 1
 
 
@@ -153,8 +153,8 @@ class TwinLearnedSteps(TwinMethod):
             fused = relu(append_one(inputs) @ fuse_kernel)
             next_state = run_stream(params, inputs, state, changes, {})[1]
             by_layer["fuse"].append(append_one(inputs))
-            by_layer["drive"].append(append_one(fused))
-            by_layer["core"].append(state)
+            by_layer["input_gates"].append(append_one(fused))
+            by_layer["hidden_gates"].append(state)
             by_layer["actor"].append(append_one(next_state))
             state = next_state
         return {layer: np.array(values) for layer, values in by_layer.items()}

@@ -13,18 +13,18 @@ from support.twin_policy import NUM_ACTIONS, TwinDecision, TwinPolicy
 class TwinTrace(NamedTuple):
     """Layout weights, gap and both decisions of one step."""
 
-    layout: np.ndarray
+    layout_weights: np.ndarray
     gap: float
-    factual: np.ndarray
-    counterfactual: np.ndarray
+    factual_logits: np.ndarray
+    removed_logits: np.ndarray
 
-    def corrected(self, variant: str, epsilon: float | None, form: str | None) -> tuple[np.ndarray, float]:
+    def action_logits(self, variant: str, epsilon: float | None, form: str | None) -> tuple[np.ndarray, float]:
         """Return the logits of equation 1 (`tde`) or 2 (`stde`), and the weight of the removed ones."""
         if variant == "tde":
-            return self.factual - self.counterfactual, 1.0
+            return self.factual_logits - self.removed_logits, 1.0
         s = 0.0 if epsilon is None else max(self.gap - epsilon, 0.0)
-        factual = (1 + s) * self.factual if form == "residual" else self.factual
-        return factual - s * self.counterfactual, s
+        factual = (1 + s) * self.factual_logits if form == "residual" else self.factual_logits
+        return factual - s * self.removed_logits, s
 
 
 class TwinEpisode:

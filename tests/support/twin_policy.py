@@ -166,8 +166,8 @@ def run_stream(
     fused = relu(layer("fuse", kernel_with_bias(params["fuse"]), append_one(inputs)))
 
     # The gated recurrent unit: reset, update and new state, each from the inputs and from the last state.
-    input_gates = layer("drive", kernel_with_bias(core["dense_i"]), append_one(fused))
-    hidden_gates = layer("core", core["dense_h"]["kernel"], hidden)
+    input_gates = layer("input_gates", kernel_with_bias(core["dense_i"]), append_one(fused))
+    hidden_gates = layer("hidden_gates", core["dense_h"]["kernel"], hidden)
     input_reset, input_update, input_new = np.split(input_gates, 3, axis=-1)
     hidden_reset, hidden_update, hidden_new = np.split(hidden_gates, 3, axis=-1)
     reset = sigmoid(input_reset + hidden_reset)

@@ -45,7 +45,7 @@ def test_the_rollout_holds_every_case():
 @COIN
 def test_weights_values_and_probabilities_are_those_of_a_plain_loop(coin):
     stored, plain = rolled(coin).transitions, retrace(coin)
-    for name in ("weights", "value", "log_prob"):
+    for name in ("layout_weights", "value", "log_prob"):
         np.testing.assert_allclose(
             getattr(stored, name)[:, :SLOTS], getattr(plain, name), rtol=1e-4, atol=1e-5, err_msg=name
         )
@@ -85,12 +85,12 @@ def test_rewards_and_lengths():
     np.testing.assert_array_equal(t.terminated, t.action == DONE)
     np.testing.assert_array_equal(t.success, t.terminated & succeeds)
     np.testing.assert_array_equal(t.reward, np.where(t.success, np.float32(5), np.float32(-0.01)))
-    np.testing.assert_array_equal(t.length[t.truncated], np.array(tiny.LIMITS)[SCENE[t.pose]][t.truncated])
+    np.testing.assert_array_equal(t.episode_length[t.truncated], np.array(tiny.LIMITS)[SCENE[t.pose]][t.truncated])
 
 
 def test_poses_are_stored_as_integers():
     t = rolled(False).transitions
-    chex.assert_type([t.pose, t.goal, t.action, t.length], jnp.int32)
+    chex.assert_type([t.pose, t.goal, t.action, t.episode_length], jnp.int32)
     chex.assert_shape([t.pose, t.value, t.reward], (LENGTH, ENVS))
 
 
@@ -118,10 +118,10 @@ def test_equal_keys_give_equal_rollouts_and_others_do_not():
 
 
 def test_without_a_setting_no_layout_is_carried_and_its_weights_are_ones():
-    acting = dataclasses.replace(ACTING, estimator=None)
+    acting = dataclasses.replace(ACTING, estimator_config=None)
     key = jax.random.key(0)
     agent, rollout = jax.eval_shape(lambda: act(tiny.lively(0), begin(key, acting), key, False, acting))
     assert agent.perception.layout is None
-    assert rollout.transitions.weights.shape == (LENGTH, ENVS, 3)
-    weights = acting.view(begin(key, acting), KNOWLEDGE, PARAMS).weights
+    assert rollout.transitions.layout_weights.shape == (LENGTH, ENVS, 3)
+    weights = acting.policy_inputs(begin(key, acting), KNOWLEDGE, PARAMS).layout_weights
     np.testing.assert_array_equal(weights, np.ones((ENVS, 3)))

@@ -14,7 +14,7 @@ from support.rollouts import ACTING, CONFIG, KNOWLEDGE, LEARNER, PARAMS, act
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import find_method
-from jaxnav.training.ppo import draw_minibatches, split_minibatches
+from jaxnav.training.ppo import assign_minibatches, split_minibatches
 
 UPDATES = 400
 SCALARS = CONFIG.scalars(UPDATES)
@@ -90,7 +90,7 @@ def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, w
 
 
 def test_the_best_policy_is_kept_and_a_later_one_among_equals(first):
-    keep = jax.jit(LEARNER.keep)
+    keep = jax.jit(LEARNER.keep_if_best)
     state = tiny.leaves_at(first[0], 0)
     assert state.best.score == -1.0
     chex.assert_trees_all_equal(state.best.params, init(jax.random.key(0), PARAMS, KNOWLEDGE).params)
@@ -133,8 +133,8 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended(seeds, first):
     ended = t.terminated | t.truncated
     assert metrics["episodes"] == ended.sum() > 20
     # A successful episode's last action earns 5, every other one costs 0.01.
-    returns = np.where(t.success, 5 + 0.01, 0) - 0.01 * t.length
-    for name, values in {"success": t.success, "length": t.length, "truncated": t.truncated, "return": returns}.items():
+    returns = np.where(t.success, 5 + 0.01, 0) - 0.01 * t.episode_length
+    for name, values in {"success": t.success, "length": t.episode_length, "truncated": t.truncated, "return": returns}.items():
         assert metrics[name] == pytest.approx(values[ended].mean(), rel=1e-5), name
 
 
@@ -162,7 +162,7 @@ def test_gradients_that_are_not_finite_are_skipped_and_counted(seeds, poison):
     np.testing.assert_array_equal(metrics["skipped_steps"], [8, 8])  # 4 epochs of 2 minibatches
     # Neither the parameters nor the moments have changed, so that learning goes on as if nothing had been.
     chex.assert_trees_all_equal(states.params, seeds.params)
-    chex.assert_trees_all_equal(states.optimizer.inner_state, seeds.optimizer.inner_state)
+    chex.assert_trees_all_equal(states.opt_state.inner_state, seeds.opt_state.inner_state)
     healed, metrics = one_update(states, SCALARS, PARAMS, KNOWLEDGE)
     np.testing.assert_array_equal(metrics["skipped_steps"], [0, 0])
     chex.assert_tree_all_finite(healed.params)
@@ -177,7 +177,7 @@ def test_the_learning_rate_falls_to_zero(seeds):
 
 def test_minibatches_take_every_episode_once_and_one_of_every_block():
     """Six episodes in two minibatches: blocks 01, 23, 45; all leaves are cut alike."""
-    order = draw_minibatches(jax.random.key(3), 6, 2)
+    order = assign_minibatches(jax.random.key(3), 6, 2)
     episodes = jnp.arange(6)
     steps = jnp.broadcast_to(10 * episodes, (4, 6))  # [T, B]
     parts, memory = split_minibatches(steps, order, axis=1), split_minibatches(episodes, order, axis=0)
@@ -188,7 +188,7 @@ def test_minibatches_take_every_episode_once_and_one_of_every_block():
 
 
 def test_minibatches_differ_between_epochs():
-    orders = {tuple(np.ravel(draw_minibatches(jax.random.key(i), 32, 4))) for i in range(8)}
+    orders = {tuple(np.ravel(assign_minibatches(jax.random.key(i), 32, 4))) for i in range(8)}
     assert len(orders) == 8
 
 

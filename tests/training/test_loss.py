@@ -218,7 +218,7 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
     for time in range(LENGTH):
         now = tiny.leaves_at(t, time, slot)
         memories.append(memory)
-        decision = tiny.decide(NEW, rows[time], now.goal, now.weights, memory)[0 if now.use_direct else 1]
+        decision = tiny.decide(NEW, rows[time], now.goal, now.layout_weights, memory)[0 if now.use_direct else 1]
         log_pi.append(log_softmax(np.asarray(decision.logits)))
         memory = decision.next_state(now.action)
         if now.terminated | now.truncated:
@@ -226,7 +226,7 @@ def test_distillation_moves_towards_a_fixed_target_along_a_fixed_memory():
     target, memories = np.array(log_pi), jax.tree.map(lambda *leaves: np.array(leaves), *memories)
 
     def divergence(weights):
-        given = (rows, t.goal[:, slot], t.weights[:, slot], memories)
+        given = (rows, t.goal[:, slot], t.layout_weights[:, slot], memories)
         counterfactual = jax.vmap(functools.partial(tiny.decide, weights))(*given)[1]
         return (np.exp(target) * (target - jax.nn.log_softmax(counterfactual.logits))).sum(axis=-1).mean()
 

@@ -44,7 +44,9 @@ def rolled(method):
 
     @jax.jit
     def go(agent, key, share):
-        return collect_rollout(acting, acting.bind(weights), agent, key, LENGTH, False, PARAMS, KNOWLEDGE, share)
+        return collect_rollout(
+            acting, acting.bind(weights), agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, experience_prob=share
+        )
 
     agent, rollouts = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE).agent, []
     for number in range(ROLLOUTS):
@@ -83,14 +85,21 @@ def test_its_share_is_as_configured(share):
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
     first = state.agent.memory.use_experience
     assert first.mean() == pytest.approx(share, abs=0.05)
-    again = jax.jit(learner.restart)(state, PARAMS, KNOWLEDGE).agent.memory.use_experience
+    again = jax.jit(learner.restart_episodes)(state, PARAMS, KNOWLEDGE).agent.memory.use_experience
     assert again.mean() == pytest.approx(share, abs=0.05)
     assert (again != first).any()
 
     acting = learner.agent_loop
     after, rollout = jax.jit(
         lambda share: collect_rollout(
-            acting, acting.bind(weights), state.agent, jax.random.key(1), LENGTH, False, PARAMS, KNOWLEDGE, share
+            acting,
+            acting.bind(weights),
+            state.agent,
+            jax.random.key(1),
+            PARAMS,
+            KNOWLEDGE,
+            num_steps=LENGTH,
+            experience_prob=share,
         )
     )(jnp.float32(share))
     fresh = rollout.transitions.ended.any(axis=0)
@@ -145,7 +154,7 @@ def test_the_direct_stream_is_alone_first():
     assert states["layout"][0].agent.memory.use_experience.mean() == pytest.approx(SHARE, abs=0.25)
     after = jax.device_get(trainer.train(states, PARAMS, 1)[0]["layout"][0])
     assert {"experience_stream", "known_appearance", "method"} <= moved(middle.params, after.params)
-    counts = [leaf for leaf in jax.tree.leaves(after.optimizer.inner_state) if leaf.dtype == jnp.int32]
+    counts = [leaf for leaf in jax.tree.leaves(after.opt_state.inner_state) if leaf.dtype == jnp.int32]
     assert [int(count) for count in counts] == [2 * learner_with("org").config.minibatches]  # those of its stage alone
 
 
@@ -165,7 +174,7 @@ def test_the_rate_runs_its_course_in_every_stage():
     config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
     assert config.stage_by_chunk == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert [stage.direct_stream_only for stage in config.stages] == [False, True, False]
-    assert [(float(scalars.begin), float(scalars.num_updates)) for scalars in config.stage_scalars] == [
+    assert [(float(scalars.first_update), float(scalars.num_updates)) for scalars in config.stage_scalars] == [
         (0, 4),
         (4, 8),
         (12, 8),
@@ -173,7 +182,7 @@ def test_the_rate_runs_its_course_in_every_stage():
     assert [float(scalars.learning_rate) for scalars in config.stage_scalars] == pytest.approx([4e-3, 4e-3, 2e-3])
     assert config.steps_by_purpose["imitation"] == 2 * 2 * 3840
     fused = dataclasses.replace(config, method="org", decision="fused")
-    assert [(float(scalars.begin), float(scalars.num_updates)) for scalars in fused.stage_scalars] == [(0, 20)]
+    assert [(float(scalars.first_update), float(scalars.num_updates)) for scalars in fused.stage_scalars] == [(0, 20)]
 
 
 # Replay

@@ -44,7 +44,7 @@ def walked():
     env, params = build_environment(BANK, {}, 100)
     acting = AgentLoop(env, SPEC)
     start = State(*(jnp.array([number], jnp.int32) for number in (6 * tiny.POSES_PER_CELL, 0, BOOK, 0)))
-    agent, step = jax.jit(acting.begin)(start, None, KNOWN, params), jax.jit(acting.step)
+    agent, step = jax.jit(acting.start_from)(start, None, KNOWN, params), jax.jit(acting.step)
     poses, actions, notes = [], [], []
     act = jax.jit(lambda note: SEMEXP.control.act(jnp.int32(NORTH), note, KNOWN))
     for _ in range(STEPS):

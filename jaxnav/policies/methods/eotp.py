@@ -52,7 +52,7 @@ class SpatialAttention(Experience):
     linear, so both factors multiply its output instead, which is equivalent.
     """
 
-    recurrent = True
+    reads_memory = True
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         sizes = spec.sizes

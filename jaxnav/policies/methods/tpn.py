@@ -253,7 +253,7 @@ class TentativeAdaptation:
         # Decide, with a reset actor every `reset_interval` decisions.
         is_reset = num_decisions % self.reset_interval == 0
         actor_change = jnp.where(is_reset[..., None, None], 0.0, actor_change)
-        output = policy.decide_without_adaptation(pathways, memory, actor_changes(actor_change))
+        output = policy.decide_with_changes(pathways, memory, actor_changes(actor_change))
 
         # Hidden states, with streams those of the direct stream; the tentative policy does not train the policy.
         hidden_before = jax.lax.stop_gradient(memory.hidden[..., : policy.hidden])
