@@ -3,9 +3,12 @@
 In the causal graph three pathways lead to the action: the scene S, the goal G, and the mediator Z that both produce,
 the paper's *experience*: features of what tends to stand near what, learned in training.
 
-    S ------> A        a      logits of the factual decision
-    G ------> A        a_bar  logits under do(S = 0, G = 0), with the factual experience Z
-    S, G -> Z -> A     D      layout gap; epsilon, its threshold
+    S ---------> A
+    G ---------> A
+    S, G -> Z -> A
+
+With the logits a of the factual decision, the logits a_bar under do(S = 0, G = 0) with the factual experience Z, the
+layout gap D and its threshold epsilon:
 
     counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
     tde(logits, counterfactual)                    # eq. 1: a - a_bar
@@ -25,7 +28,7 @@ Pathways = TypeVar("Pathways", bound=Any)
 
 
 def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
-    """Set pathways to given values (the do-operator); those not named keep their factual values.
+    """Set pathways to given values (the do-operator); fields that are not named keep their factual values.
 
     Args:
       pathways: a `NamedTuple` of arrays, such as (scene, goal, experience).
@@ -46,7 +49,7 @@ def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
 
 
 def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
-    """Return the total direct effect a - a_bar (eq. 1).
+    """Total direct effect a - a_bar (eq. 1).
 
     Args:
       logits: float [..., A], factual logits a.
@@ -59,7 +62,7 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
 
 
 def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "residual") -> jax.Array:
-    """Return the weight s of the removed logits in eq. 2.
+    """Weight s of the removed logits in eq. 2.
 
     Args:
       gap: float32 [...], layout gap D in [0, 1].
@@ -86,7 +89,9 @@ def stde(
     epsilon: jax.Array | float,
     form: Form = "residual",
 ) -> jax.Array:
-    """Return the soft total direct effect (eq. 2).
+    """Soft total direct effect (eq. 2).
+
+    `form="paper"` is eq. 2 as printed. The default `residual` keeps the scale of the logits.
 
     Args:
       logits: float [..., A], factual logits a.
@@ -95,8 +100,8 @@ def stde(
       epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
       form: with s = `removal_weight`,
         `paper` and `switch`: a - s a_bar, which is `tde` at s = 1;
-        `residual`: (1 + s) a - s a_bar, whose coefficients add up to 1, so that logits keep their scale. The ranking of
-        actions is that of the paper's form with the weight s / (1 + s).
+        `residual`: (1 + s) a - s a_bar, whose coefficients add up to 1, so that logits keep their scale. It ranks
+        actions as the paper's form does with the weight s / (1 + s).
 
     Returns:
       float [..., A], bit-identical to `logits` where s is 0.
@@ -106,5 +111,6 @@ def stde(
     """
     s = removal_weight(gap, epsilon, form)[..., None].astype(logits.dtype)
     factual = (1 + s) * logits if form == "residual" else logits
-    removed = factual - s * counterfactual
-    return jnp.where(s == 0, logits, removed)  # 0 * a_bar may still flip the sign of a zero
+    effect = factual - s * counterfactual
+    # Subtracting 0 * a_bar could still turn -0.0 into 0.0, so the factual logits are copied.
+    return jnp.where(s == 0, logits, effect)

@@ -1,4 +1,4 @@
-"""Layout gaps other than that of equation 5: scores that the episode's layout differs from that of training.
+"""Alternative layout gaps: scores of how far the episode's layout differs from the training layout.
 
 `learned_gap` adds up learned log odds of the pairs seen together, `overdue_gap` grows as the goal fails to appear where
 the training layout would show it, and `evidence_gap` is a z-test of the counts against layouts drawn from the prior.
@@ -15,8 +15,8 @@ class CooccurrenceEvidence(NamedTuple):
     """Evidence that pairs of categories seen together carry about the layout; learned before training.
 
     Attributes:
-      log_odds: float32 [..., K, K], 0 on and below the diagonal, so that each pair counts once; what a pair seen
-        together adds to the log odds of another layout than that of training.
+      log_odds: float32 [..., K, K], added to the log odds that the layout is not the training layout when a pair has
+        been seen together; 0 on and below the diagonal, so that each pair counts once.
       co_visibility: float32 [..., K, K], in [0, 1], 0 on the diagonal; P(j visible | i visible) over the
         training poses.
     """
@@ -55,9 +55,9 @@ def learned_gap(co_seen: jax.Array, log_odds: jax.Array) -> jax.Array:
 def overdue_gap(co_seen: jax.Array, co_visibility: jax.Array, goal: jax.Array | int) -> jax.Array:
     """Return the gap D as the probability that the goal would have been seen by now in the training layout.
 
-    There the views that show category i show the goal with probability q_i. The goal is missed beside all categories
-    seen so far, taken as independent, with probability prod_i (1 - q_i), so D = 1 - prod_i (1 - q_i). Once the goal has
-    been seen D is 0.
+    In the training layout, a view that shows category i also shows the goal with probability q_i. If these events are
+    independent, the goal is missed next to every category seen so far with probability prod_i (1 - q_i), so
+    D = 1 - prod_i (1 - q_i). D is 0 once the goal has been seen.
 
     Args:
       co_seen: bool [K, K], see `seen_together`; only the diagonal is read.
@@ -73,16 +73,18 @@ def overdue_gap(co_seen: jax.Array, co_visibility: jax.Array, goal: jax.Array | 
 
 
 def evidence_gap(prior: jax.Array, alpha: jax.Array) -> jax.Array:
-    """Return the gap D by the evidence of an episode: how far its co-occurrences fall short of agreeing with the prior.
+    """Return the gap D as a z-test of whether the episode's co-occurrences agree with the prior.
 
-    With the expected shares p_i = alpha*_i / a_i before and q_i = alpha_i / (a_i + n_i) after n_i counts, row i agrees
-    by p_i . q_i, the probability that one draw of each is alike. For layouts drawn from the prior that has mean p_i .
-    p_i and variance n_i v_i / ((a_i + n_i) (a_i + 1)), where v_i is the variance of p_ij, j drawn from p_i. So
+    Row i has the prior mean p_i = alpha*_i / a_i (a_i is the sum of the row) and, after n_i counts, the posterior mean
+    q_i = alpha_i / (a_i + n_i). Their agreement is p_i . q_i, the probability that one draw from each is equal. Under
+    layouts drawn from the prior, the agreement has mean p_i . p_i and variance n_i v_i / ((a_i + n_i) (a_i + 1)), where
+    v_i is the variance of p_ij for j drawn from p_i. So
 
-      z = sum_i (p_i . p_i - p_i . q_i) / sum_i sqrt(n_i v_i / ((a_i + n_i) (a_i + 1))),
+      z = sum_i (p_i . p_i - p_i . q_i) / sum_i sqrt(n_i v_i / ((a_i + n_i) (a_i + 1))).
 
-    the denominator being the standard deviation if rows are fully correlated, its upper bound, and D = erf(z / sqrt 2),
-    or 0 where z < 0: 2 P - 1, P the probability (normal approximation) that the prior's own layouts agree better.
+    The denominator adds standard deviations, an upper bound that fully correlated rows reach. The gap is
+    D = max(erf(z / sqrt 2), 0) = max(2 P - 1, 0), where P is the probability (normal approximation) that a layout drawn
+    from the prior agrees better.
 
     Args:
       prior: float32 [K, K], alpha*, 0 on the diagonal.
@@ -92,16 +94,16 @@ def evidence_gap(prior: jax.Array, alpha: jax.Array) -> jax.Array:
       float32 [], in [0, 1] (1 only by rounding); 0 where no counts were added, below 0.01 where prior rows are uniform.
     """
     counts = (alpha - prior) * (1 - jnp.eye(len(prior), dtype=jnp.float32))
-    strength = prior.sum(-1)  # a_i
+    prior_sum = prior.sum(-1)  # a_i
     num_counts = counts.sum(-1)  # n_i
-    share = prior / strength[:, None]  # p_ij
+    prior_share = prior / prior_sum[:, None]  # p_ij
 
-    # Per row: by how much the agreement is short of its mean, and its standard deviation.
-    shortfall = (share * share).sum(-1, keepdims=True) - share
-    excess = (counts * shortfall).sum(-1) / (strength + num_counts)
-    share_variance = (share * shortfall**2).sum(-1)
-    deviation = jnp.sqrt(num_counts * share_variance / ((strength + num_counts) * (strength + 1)))
+    # Per row: shortfall of the agreement, p_i . p_i - p_i . q_i, and its standard deviation.
+    entry_shortfall = (prior_share * prior_share).sum(-1, keepdims=True) - prior_share
+    row_shortfall = (counts * entry_shortfall).sum(-1) / (prior_sum + num_counts)
+    share_variance = (prior_share * entry_shortfall**2).sum(-1)
+    row_std = jnp.sqrt(num_counts * share_variance / ((prior_sum + num_counts) * (prior_sum + 1)))
 
-    # Where rows are uniform both are 0 up to rounding (1e-7), which the bound keeps out of the ratio.
-    z = excess.sum() / jnp.maximum(deviation.sum(), 1e-5)
+    # With uniform rows, numerator and denominator are 0 up to rounding (1e-7); the lower bound avoids 0 / 0.
+    z = row_shortfall.sum() / jnp.maximum(row_std.sum(), 1e-5)
     return jnp.maximum(jax.lax.erf(z * 0.5**0.5), 0)

@@ -32,12 +32,13 @@ Reduction = Literal["mean_visible", "mean", "sum"]
 
 @dataclasses.dataclass(frozen=True)
 class EstimatorConfig:
-    """How equations 3 to 6 are interpreted; a value out of range raises a ValueError.
+    """Configuration of the layout estimator (eqs. 3 to 6).
 
     The defaults equal `ESTIMATORS["calibrated"]`.
 
     Attributes:
-      rows: rows that gain counts (eq. 3): those of `visible` categories, or `all`, as the equation is printed.
+      rows: rows that gain counts (eq. 3). `visible`: rows of the visible categories; `all`: every row, as eq. 3 is
+        printed.
       reduction: over the rows' divergences in eq. 5: `mean_visible`, `mean` over all K, or `sum`.
       increment: whole number from 1 to 50, added to alpha per visible category.
       own_column: a row also counts its own category, as in the released code; in the divergence of eq. 5 this entry
@@ -46,11 +47,11 @@ class EstimatorConfig:
       gap: measure of the layout gap D, used only in evaluation. `reduction` acts on `novelty` alone, `decay` and
         `passes` on `novelty` and `clock`.
         `novelty`: how much the last view changed the belief (eq. 5).
-        `evidence`: how badly everything seen so far fits the prior (`evidence_gap`).
-        `learned`: how surely the pairs seen together are not of the training layout (`learned_gap`).
-        `overdue`: how surely the goal would have been seen by now in the training layout (`overdue_gap`).
-        `clock`: 1 when the gate opens, then decays. In `released` the sum over all rows saturates tanh, so that its
-        `novelty` comes to the same.
+        `evidence`: misfit between the counts of the episode and the prior (`evidence_gap`).
+        `learned`: probability that the layout is not the training layout, from the pairs seen together (`learned_gap`).
+        `overdue`: probability that the training layout would have shown the goal by now (`overdue_gap`).
+        `clock`: 1 when the gate opens, decays afterwards. `novelty` behaves like this under `released`, because its sum
+        over all rows saturates tanh.
         `none`: D stays 0, so that sTDE removes nothing.
       hold: the gap never falls within an episode.
       decay: the gap is multiplied by this factor in [0, 1] at each call with the gate shut.
@@ -58,7 +59,10 @@ class EstimatorConfig:
         set, so that a new gap is already decayed once.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
       uniform: share of the uniform distribution mixed into every prior row, in [0, 1].
-      form: of eq. 2 in evaluation, unless asked otherwise; see `jaxnav.causal.stde`.
+      form: form of eq. 2 that evaluations use by default, see `jaxnav.causal.stde`; no effect on the estimator.
+
+    Raises:
+      ValueError: a value is out of its range.
     """
 
     rows: Literal["visible", "all"] = "visible"
@@ -82,19 +86,19 @@ class EstimatorConfig:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: choose one of {', '.join(options)}")
 
         # Numbers must lie in the ranges that the docstring gives.
-        for name, valid, mend in (
+        for name, is_valid, requirement in (
             ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
             ("decay", 0 <= self.decay <= 1, "a number from 0 to 1"),
             ("passes", self.passes >= 1 and self.passes % 1 == 0, "a whole number of 1 or more"),
             ("strength", self.strength is None or 0 < self.strength < float("inf"), "a number above 0, or None"),
             ("uniform", 0 <= self.uniform <= 1, "a number from 0 to 1"),
         ):
-            if not valid:
-                raise ValueError(f"{name} is {getattr(self, name)!r}: give {mend}")
+            if not is_valid:
+                raise ValueError(f"{name} is {getattr(self, name)!r}: give {requirement}")
 
 
 #: `paper`: equations 3 to 6, with 0/1 visibility as the counts n. `released`: the estimator of the authors' code.
-#: `evidence`: `calibrated` with another gap; priors and weights w are the same.
+#: `evidence`: `calibrated` with `gap="evidence"`; priors and weights w are unchanged.
 ESTIMATORS = {
     "paper": EstimatorConfig(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
     "released": EstimatorConfig(
@@ -185,7 +189,7 @@ class LayoutEstimator(struct.PyTreeNode):
         resolve_estimator(self.config)  # raises on an unknown name
 
     def init(self) -> LayoutState:
-        """Return the belief at the start of an episode."""
+        """Belief at the start of an episode."""
         num_categories = self.prior.shape[-1]
         records_pairs = resolve_estimator(self.config).gap in ("learned", "overdue")
         return LayoutState(
@@ -201,10 +205,10 @@ class LayoutEstimator(struct.PyTreeNode):
         Args:
           state: the belief before the step.
           presence: bool or real [K], nonzero where a category is visible.
-          goal: int [], what is sought; only the gap `overdue` needs it.
+          goal: int [], index of the goal category; only the gap `overdue` needs it.
 
         Returns:
-          The belief after the step, with its gap.
+          The belief after the step, including the layout gap.
 
         Raises:
           ValueError: the gap needs `cooccurrence` or a goal, and there is none.
@@ -242,14 +246,16 @@ class LayoutEstimator(struct.PyTreeNode):
                 next_state = next_state.replace(co_seen=state.co_seen | seen_together(is_visible[None]))
                 gap = self._cooccurrence_gap(next_state, goal)
             case "novelty" | "clock":
+                # The released code adds 1 to a row's own category before the divergence.
                 row_alpha = state.alpha + diagonal if config.own_column else state.alpha
+                # A new gap has already decayed in the later calls of the same step.
                 new_gap = self._novelty(row_alpha, counts, visible) * config.decay ** (config.passes - 1)
                 gap = jnp.where(is_accepted, new_gap, state.gap * config.decay**config.passes)
         return next_state.replace(gap=jnp.maximum(gap, state.gap) if config.hold else gap)
 
     @staticmethod
     def expectation(state: LayoutState, goal: jax.Array | int | None = None) -> jax.Array:
-        """Return the expected co-occurrence w (eq. 6).
+        """Expected co-occurrence w (eq. 6).
 
         w_ij = p(j visible given i visible) and w_ii = 1. With `own_column` w_ii is 1 + the share of i in its own row,
         as in the released code.
@@ -268,23 +274,29 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """Return w x g of eq. 7, float32 [K]: the goal's column of w, for g is one-hot."""
+        """w x g of eq. 7, float32 [K]: the goal's column of w, because g is one-hot. Methods multiply it into Z."""
         return LayoutEstimator.expectation(state, goal)
 
     def _novelty(self, alpha: jax.Array, counts: jax.Array, visible: jax.Array) -> jax.Array:
-        """Return tanh of the mean divergence between posterior and belief (eq. 5); 1 for the gap `clock`."""
+        """Tanh of the reduced row divergences KL(posterior || belief) (eq. 5), float32 []; 1 for the gap `clock`.
+
+        Args:
+          alpha: float32 [K, K], belief before the step.
+          counts: float32 [K, K], counts of the step.
+          visible: float32 [K], 1 where a category is visible.
+        """
         config = resolve_estimator(self.config)
         if config.gap == "clock":
             return jnp.float32(1.0)
         row_kl = presence_kl(alpha, counts, config.increment)  # [K]
         match config.reduction:
             case "mean_visible":
-                mean_kl = (row_kl * visible).sum() / jnp.maximum(visible.sum(), 1)
+                reduced_kl = (row_kl * visible).sum() / jnp.maximum(visible.sum(), 1)
             case "mean":
-                mean_kl = row_kl.mean()
+                reduced_kl = row_kl.mean()
             case "sum":
-                mean_kl = row_kl.sum()
-        return jnp.tanh(mean_kl)
+                reduced_kl = row_kl.sum()
+        return jnp.tanh(reduced_kl)
 
     def _cooccurrence_gap(self, state: LayoutState, goal: jax.Array | int | None) -> jax.Array:
         """Return the gap `learned` or `overdue`, from the pairs seen so far."""

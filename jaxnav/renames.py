@@ -178,7 +178,7 @@ NAMES = {
     "training.apply.renewed": "training.ppo.reset_optimizer_if",
     "training.collect.collect": "training.ppo.collect_rollout",
     "training.collect.draw_coins": "training.ppo.sample_experience_dropout",
-    "training.collect.zero_direct": "policies.agent_loop.mask_direct_pathways",
+    "training.collect.zero_direct": "policies.pathways.mask_direct_pathways",
     "training.loss.advantages": "training.ppo.compute_advantages",
     "training.loss.replay": "training.ppo.replay_rollout",
     "viz.figure.save_figure": "viz.style.save_figure",

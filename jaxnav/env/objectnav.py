@@ -8,10 +8,12 @@ shapes share one compilation. The interface is that of gymnax 1.0:
     observation, state = env.reset(key, params)
     observation, state, reward, terminated, truncated, info = env.step(key, state, action, params)
 
-All functions handle a single episode and consist of integer arithmetic and table look-ups; batch them with `jax.vmap`.
-docs/environment.md states the rules.
+In gymnax's words `advance` is `step_env` (no auto-reset) and `observe` is `get_obs`. All functions handle a single
+episode and look their results up in tables; batch them with `jax.vmap`. docs/environment.md states the rules.
 
-Symbols in shapes: S scenes, C cells, H headings, P poses, K categories, R bytes of an observation row.
+A pose is one integer: cell, heading and camera horizon, with cells numbered over all scenes (`Rules.join_pose`).
+
+Symbols in shapes: S scenes, C cells, H headings, P = C * H * horizons poses, K categories, R bytes of a row.
 """
 
 import dataclasses
@@ -27,11 +29,11 @@ from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
-#: Index of the layout prior that all room types outside `ROOM_TYPES` share.
+#: Index of the layout prior that all room types outside `ROOM_TYPES` share; read by agents, not by the environment.
 OTHER_ROOM = len(ROOM_TYPES)
 #: Number of layout priors.
 NUM_PRIORS = OTHER_ROOM + 1
-#: Number of random cells of which an episode that starts near its goal takes the nearest.
+#: An episode that starts near its goal takes the nearest to the goal of this many random cells.
 NUM_START_CANDIDATES = 8
 
 
@@ -39,16 +41,16 @@ class SceneTables(struct.PyTreeNode):
     """Tables of all scenes on the device; see `jaxnav.scenes.tables.compile.Bank`.
 
     Attributes:
-      ahead: int32 [C, H], cell after MoveAhead.
-      rows: uint8 [P, R], observation row of each pose.
+      ahead: int32 [C, H], cell after MoveAhead; the same cell if the move is blocked.
+      rows: uint8 [P, R], packed observation of each pose, see `RowFormat`.
       success: uint8 [P, ceil(K / 8)], one bit per pose and goal, set where Done succeeds. Stored apart from the rows,
         so that no observation contains the answer.
       goal_distance: float32 [C, K], metres to the nearest object of a category.
-      first_cell: int32 [S], first cell of each scene.
-      num_cells: int32 [S].
-      goals: int32 [S, K], possible goals of each scene, of which the first `num_goals` entries are valid.
-      num_goals: int32 [S].
-      expert: uint8 [P, K], first action of a shortest path to each goal; None unless an agent imitates it.
+      first_cell: int32 [S], first cell of each scene, whose cells are consecutive.
+      num_cells: int32 [S], number of cells of each scene.
+      goals: int32 [S, K], possible goals of each scene; the first `num_goals` entries are valid.
+      num_goals: int32 [S], number of possible goals of each scene.
+      expert: uint8 [P, K], first action of a shortest path to each goal; None unless a training stage imitates it.
     """
 
     ahead: jax.Array
@@ -67,7 +69,8 @@ class EnvParams(struct.PyTreeNode):
 
     Attributes:
       tables: the scenes.
-      room: int32 [S], index of the layout prior of each scene's room type, see `prior_index`.
+      room: int32 [S], index of the layout prior of each scene's room type, see `prior_index`; read by the layout
+        estimator of agents, not by the environment.
       step_limit: int32 [S], number of actions after which an episode in a scene is truncated.
       success_reward: float32 [], reward of a successful Done.
       step_reward: float32 [], reward of every other action.
@@ -88,14 +91,14 @@ class State(struct.PyTreeNode):
       scene: int32 [], index of the scene.
       goal: int32 [], category to search for.
       time: int32 [], number of actions taken.
-      nearest: float32 [], least distance to the goal so far, metres; None without reward shaping.
+      min_goal_distance: float32 [], smallest distance to the goal so far, metres; None without reward shaping.
     """
 
     pose: jax.Array
     scene: jax.Array
     goal: jax.Array
     time: jax.Array
-    nearest: jax.Array | None = None
+    min_goal_distance: jax.Array | None = None
 
 
 class Observation(struct.PyTreeNode):
@@ -112,13 +115,14 @@ class Observation(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class ObjectNav:
-    """The environment; immutable and hashable.
+    """ObjectNav task with static rules; immutable and hashable. The scenes are in `EnvParams`.
 
     Attributes:
       task: categories, goals and rules.
-      shaping: training reward per metre by which the agent gets nearer to its goal than ever before in the episode.
-      near_starts: probability that a training episode starts near its goal, in the nearest of `NUM_START_CANDIDATES`
-        random cells.
+      shaping: reward per metre of new progress, by which the distance to the goal falls below its minimum so far in the
+        episode.
+      near_starts: probability that an episode starts near its goal, in the nearest of `NUM_START_CANDIDATES` random
+        cells.
       bundled_params: parameters made together with the environment by `jaxnav.make`.
     """
 
@@ -140,26 +144,34 @@ class ObjectNav:
         tables = params.tables
         rules = self.task.rules
 
-        # Scene and goal. One call derives the random words of all draws.
-        random_words = _random_words(key, 4 + NUM_START_CANDIDATES * bool(self.near_starts))
-        scene = _uniform_below(random_words[0], jnp.asarray(tables.num_goals.shape[0], jnp.int32))
-        goal = tables.goals[scene, _uniform_below(random_words[1], tables.num_goals[scene])]
-
-        # Start cell and heading. A share `near_starts` of the episodes starts in the nearest of several random cells.
-        cell = tables.first_cell[scene] + _uniform_below(random_words[2], tables.num_cells[scene])
-        heading = _uniform_below(random_words[3], jnp.asarray(rules.headings, jnp.int32))
+        # Random words: scene, goal, cell and heading; with near starts also the cells of the other candidates, then the
+        # draw that decides whether the episode starts near its goal.
+        num_words = 4
         if self.near_starts:
-            other_cells = tables.first_cell[scene] + _uniform_below(random_words[4:-1], tables.num_cells[scene])
+            num_words += (NUM_START_CANDIDATES - 1) + 1
+        random_words = _random_words(key, num_words)
+
+        # Scene, goal, cell and heading.
+        num_scenes = tables.num_goals.shape[0]
+        scene = _uniform_below(random_words[0], num_scenes)
+        goal = tables.goals[scene, _uniform_below(random_words[1], tables.num_goals[scene])]
+        cell = tables.first_cell[scene] + _uniform_below(random_words[2], tables.num_cells[scene])
+        heading = _uniform_below(random_words[3], rules.headings)
+
+        # A share `near_starts` of the episodes starts in the nearest of several random cells.
+        if self.near_starts:
+            candidate_words = random_words[4:-1]
+            other_cells = tables.first_cell[scene] + _uniform_below(candidate_words, tables.num_cells[scene])
             candidate_cells = jnp.concatenate([cell[None], other_cells])
             nearest_cell = candidate_cells[tables.goal_distance[candidate_cells, goal].argmin()]
             # The upper 24 bits of a word are exact in float32.
             starts_near = (random_words[-1] >> jnp.uint32(8)).astype(jnp.float32) < self.near_starts * 2.0**24
             cell = jnp.where(starts_near, nearest_cell, cell)
 
-        # Horizon 0, the first of the rules, looks straight ahead.
-        pose = (cell * rules.headings + heading) * len(rules.horizons)
-        nearest_distance = tables.goal_distance[cell, goal] if self.shaping else None
-        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose), nearest=nearest_distance)
+        # The camera looks straight ahead: horizon 0.
+        pose = rules.join_pose(cell, heading, 0)
+        goal_distance = tables.goal_distance[cell, goal] if self.shaping else None
+        state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose), min_goal_distance=goal_distance)
         return self.observe(state, params), state
 
     def step(
@@ -170,7 +182,7 @@ class ObjectNav:
         Args:
           key: PRNG key of the reset, consumed; without effect unless the episode ends.
           state: current state.
-          action: int [], 0 to 5.
+          action: int [], index into `jaxnav.ACTIONS`.
           params: scenes, limits and rewards.
 
         Returns:
@@ -197,11 +209,11 @@ class ObjectNav:
     def advance(
         self, state: State, action: jax.Array | int, params: EnvParams
     ) -> tuple[State, jax.Array, jax.Array, jax.Array]:
-        """Take an action, without auto-reset.
+        """Take an action, without auto-reset. A Done that fails ends the episode with `step_reward`.
 
         Args:
           state: current state.
-          action: int [], 0 to 5.
+          action: int [], index into `jaxnav.ACTIONS`.
           params: scenes, limits and rewards.
 
         Returns:
@@ -219,41 +231,42 @@ class ObjectNav:
         success = terminated & self.done_succeeds(state, params)
         reward = jnp.where(success, params.success_reward, params.step_reward)
 
-        # Reward shaping: pay for each metre by which the distance to the goal falls below its least value so far.
-        nearest_distance = state.nearest
-        if state.nearest is not None:
+        # Reward shaping: pay for each metre by which the distance to the goal falls below its minimum so far.
+        min_goal_distance = state.min_goal_distance
+        if state.min_goal_distance is not None:
             goal_distance = params.tables.goal_distance[self.cell_of_pose(pose), state.goal]
-            nearest_distance = jnp.minimum(state.nearest, goal_distance)
-            reward += self.shaping * (state.nearest - nearest_distance)
+            min_goal_distance = jnp.minimum(state.min_goal_distance, goal_distance)
+            reward += self.shaping * (state.min_goal_distance - min_goal_distance)
 
-        return state.replace(pose=pose, time=next_time, nearest=nearest_distance), reward, terminated, truncated
+        next_state = state.replace(pose=pose, time=next_time, min_goal_distance=min_goal_distance)
+        return next_state, reward, terminated, truncated
 
     def observe(self, state: State, params: EnvParams) -> Observation:
-        """Return the observation of a state."""
+        """Observation of a state."""
         return Observation(row=params.tables.rows[state.pose], goal=state.goal)
 
     def next_pose(self, pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
-        """Return the pose after an action, both int32 []."""
+        """Pose int32 [] after an action; pose and action are int32 []."""
         # The pose as three indices, int32 [] each.
         num_headings = self.task.rules.headings
         num_horizons = len(self.task.rules.horizons)
         cell, heading, horizon = self.task.rules.split_pose(pose)
 
-        def indicator(action_kind: int) -> jax.Array:
-            return (action == action_kind).astype(jnp.int32)
+        def is_action(candidate: int) -> jax.Array:
+            return (action == candidate).astype(jnp.int32)
 
-        # A blocked MoveAhead stays in its cell; the horizon is clipped to its range.
+        # The table maps a blocked MoveAhead to its own cell; the horizon is clipped to its range.
         cell = jnp.where(action == MOVE_AHEAD, params.tables.ahead[cell, heading], cell)
-        heading = (heading + indicator(ROTATE_RIGHT) + (num_headings - 1) * indicator(ROTATE_LEFT)) % num_headings
-        horizon = jnp.clip(horizon + indicator(LOOK_DOWN) - indicator(LOOK_UP), 0, num_horizons - 1)
-        return (cell * num_headings + heading) * num_horizons + horizon
+        heading = (heading + is_action(ROTATE_RIGHT) + (num_headings - 1) * is_action(ROTATE_LEFT)) % num_headings
+        horizon = jnp.clip(horizon + is_action(LOOK_DOWN) - is_action(LOOK_UP), 0, num_horizons - 1)
+        return self.task.rules.join_pose(cell, heading, horizon)
 
     def cell_of_pose(self, pose: jax.Array) -> jax.Array:
-        """Return the cell of a pose, int32 [], numbered over all scenes."""
+        """Cell of a pose, int32 [], numbered over all scenes."""
         return self.task.rules.split_pose(pose)[0]
 
     def done_succeeds(self, state: State, params: EnvParams) -> jax.Array:
-        """Return True where Done would succeed, bool [].
+        """True where Done would succeed, bool [].
 
         Rewards and metrics use the answer; agents never observe it.
         """
@@ -299,7 +312,7 @@ class ObjectNav:
           ValueError: the environment was not made by `jaxnav.make`.
         """
         if self.bundled_params is None:
-            raise ValueError("default_params: this environment was built by hand; jaxnav.make returns both")
+            raise ValueError("default_params: this ObjectNav has no bundled parameters; jaxnav.make returns both")
         return self.bundled_params
 
 
@@ -308,16 +321,16 @@ def prior_index(room_type: str) -> int:
     return ROOM_TYPES.index(room_type) if room_type in ROOM_TYPES else OTHER_ROOM
 
 
-def _uniform_below(random_word: jax.Array, count: jax.Array) -> jax.Array:
-    """Map random uint32 words to int32 below a count; the bias of the modulo is under count / 2**32."""
-    return (random_word % count.astype(jnp.uint32)).astype(jnp.int32)
+def _uniform_below(random_word: jax.Array, count: jax.Array | int) -> jax.Array:
+    """Map random uint32 words [...] to int32 [...] below a count; the bias of the modulo is under count / 2**32."""
+    return (random_word % jnp.asarray(count, jnp.uint32)).astype(jnp.int32)
 
 
 def _random_words(key: jax.Array, count: int) -> jax.Array:
     """Derive random words from a key by Murmur3's finaliser (Appleby, 2011), uint32 [count].
 
-    A split key is random already. A stronger generator would dominate the time of a step, although most steps have no
-    use for the reset.
+    Hashing replaces `jax.random` here, because same-step auto-reset draws at every step and threefry would dominate the
+    time of a step. The keys themselves are random already.
     """
     # Counters, spread over all bits by the golden ratio, so that the words of one key differ.
     key_words = jax.random.key_data(key)

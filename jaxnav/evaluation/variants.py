@@ -1,6 +1,6 @@
-"""The rows of the paper's tables as cells of an evaluation grid.
+"""The rows of the paper's tables as entries of an evaluation grid.
 
-`table_rows` lists the rows of an evaluation; `inference_grid` turns rows and training seeds into the cells that
+`table_rows` lists the rows of an evaluation; `inference_grid` turns rows and training seeds into the entries that
 `jaxnav.evaluation.grid` evaluates in one compiled call.
 """
 
@@ -89,15 +89,15 @@ def inference_grid(rows: Sequence[EvaluationRow], arms: Sequence[str], num_seeds
       num_seeds: S.
     """
     # Row by row, with all seeds of a row next to each other.
-    cells = []
+    entries = []
     for row in rows:
         for seed in range(num_seeds):
-            cells.append(_inference_cell(row, arms, seed, num_seeds))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cells)
+            entries.append(_grid_entry(row, arms, seed, num_seeds))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *entries)
 
 
-def _inference_cell(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: int) -> InferenceConfig:
-    """Make the cell of one row and seed, leaves []; the controls of sTDE are off."""
+def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: int) -> InferenceConfig:
+    """Grid entry of one row and seed, leaves []; the controls of sTDE are off."""
     # Random gets the policies of the first arm, which it ignores. An infinite epsilon never removes anything.
     arm_index = 0 if row.arm is None else arms.index(row.arm)
     return InferenceConfig(

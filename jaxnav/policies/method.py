@@ -70,27 +70,27 @@ class Tracker(Protocol):
     """
 
     def init(self, knowledge: Knowledge, /) -> Tree:
-        """Return the state before the first view."""
+        """State before the first view."""
         ...
 
     def update(self, state: Tree, knowledge: Knowledge, percept: Percept, /) -> Tree:
-        """Take in one step."""
+        """State after one step: the next view, and the action that led to it."""
         ...
 
     def read(self, state: Tree, knowledge: Knowledge, goal: jax.Array, /) -> Tree:
-        """Return what the network reads; rollouts store it."""
+        """Input of the network from the tracker (the reading), leaves without a batch axis; rollouts store it."""
         ...
 
 
 class Experience(nnx.Module):
-    """Module that makes the mediator Z of what is seen and sought.
+    """Network module that computes the mediator Z from detections and goal.
 
     Subclasses take `(spec, rngs)` and set `width`.
 
     Attributes:
-      sizes: the method's own whole-number sizes and their defaults, beside those that all methods share.
+      sizes: the method's own integer sizes with their defaults, in addition to `Sizes`.
       width: Z, the size of the experience.
-      recurrent: whether `attend` reads the memory; training then unrolls the policy step by step.
+      reads_memory: whether `attend` reads the memory; training then unrolls the policy step by step.
       num_scene_inputs: number of inputs that the reading adds to the direct pathway of the scene, see `scene_inputs`.
     """
 
@@ -103,20 +103,20 @@ class Experience(nnx.Module):
         raise NotImplementedError
 
     def size(self, spec: "PolicySpec", name: str) -> int:
-        """Return one of the method's own sizes."""
+        """One of the method's own sizes."""
         return dict(spec.method_sizes).get(name, self.sizes[name])
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Tree) -> Tree:
-        """Encode without memory, in parallel over time.
+        """Encode without memory, in parallel over time. The method applies eq. 7 here.
 
         Args:
-          features: what is seen and sought, leaves [..., K, ...].
+          features: detections and goal, leaves [..., K, ...].
           appearance: float32 [K, d], an embedding per category.
-          weights: float32 [..., K], w x g of eq. 7; ones leave the layout out.
-          reading: what the method's tracker read, leaves [...]; None without a tracker.
+          weights: float32 [..., K], w x g of eq. 7; ones disable the layout.
+          reading: output of the method's tracker, leaves [...]; None without a tracker.
 
         Returns:
-          float32 [..., Z], or any pytree with leaves [...] that `attend` turns into that.
+          float32 [..., Z], or a pytree with leaves [...] that `attend` maps to float32 [..., Z].
         """
         raise NotImplementedError
 
@@ -129,7 +129,7 @@ class Experience(nnx.Module):
         raise NotImplementedError
 
     def attend(self, encoded: Tree, memory: "PolicyState") -> jax.Array:
-        """Return the experience float32 [..., Z], given the memory."""
+        """Experience float32 [..., Z], given the memory."""
         del memory
         return encoded
 
@@ -148,14 +148,14 @@ class Control(Protocol):
         ...
 
     def is_decision_step(self, state: Tree, /) -> jax.Array | None:
-        """True where the choice has an effect now, bool [...]; None where every choice has.
+        """True where the next choice takes effect, bool [...]; None if every choice does.
 
-        At other times the choice is ignored, and not learned from. The tracker state has leaves [..., ...].
+        At other steps the choice is ignored and excluded from the loss. The tracker state has leaves [..., ...].
         """
         ...
 
     def act(self, choice: jax.Array, state: Tree, knowledge: Any, /) -> tuple[jax.Array, Tree]:
-        """Return the action int32 [] of a choice int32 [], and the tracker state; one episode, callers `vmap`."""
+        """Action int32 [] of a choice int32 [], and the next tracker state; one episode, callers `vmap`."""
         ...
 
 
@@ -184,9 +184,9 @@ class Adaptation(Protocol):
         ...
 
     def decide(self, policy: "Policy", pathways: "Pathways", memory: "PolicyState", /) -> "Decision":
-        """Decide with the fast weights `memory.fast`; the decision holds the next ones.
+        """Decide with the fast weights `memory.fast`; the returned decision carries the updated ones.
 
-        `policy.decide_with_changes` is the decision without them.
+        `policy.decide_with_changes` decides with given changes of the layers, or with none.
         """
         ...
 
@@ -196,13 +196,12 @@ class Stage:
     """One part of a method's training.
 
     Attributes:
-      share: of all updates, above 0; the shares of a method add up to 1.
-      loss: in place of PPO's, with the arguments and results of `jaxnav.training.ppo.ppo_loss`.
-      lr_scale_by_path: factor on the learning rate of the parameter at a path of names, 0 for one that is frozen; None
-        for 1.
+      share: share of all updates, above 0; the shares of a method add up to 1.
+      loss: loss in place of PPO's, with the arguments and results of `jaxnav.training.ppo.ppo_loss`.
+      lr_scale_by_path: learning-rate factor by parameter path; 0 freezes a parameter. None for 1 everywhere.
       uses_expert: whether the loss reads the actions of shortest paths, `SceneTables.expert`, which are compiled only
         then.
-      direct_stream_only: whether the direct stream acts without that of experience, where there are streams.
+      direct_stream_only: whether only the direct stream acts and learns, for policies with streams.
       lr_scale: factor on the learning rate of all parameters.
       adapts_online: whether the method's adaptation changes the policy while it acts and learns; if not, fast weights
         stay as they are.
@@ -223,17 +222,18 @@ class Method:
 
     Attributes:
       experience: module that makes Z, built with `(spec, rngs)`.
-      perceive: map from the features to those that the networks see; None for all. The number of categories may change.
+      perceive: map from all features to the features that the networks read; None for all. It may change the number of
+        categories.
       tracker: memory of an episode without parameters.
-      learn: from the banks of training scenes and counts float32 [rooms, K, K] (poses of exploration at which two
-        categories were detected together) to `Knowledge.method`, a nested dict of arrays.
-      stages: of training, in order; among the policies of the last stage the best is kept.
+      learn: function that computes `Knowledge.method`, a nested dict of arrays, from the banks of training scenes and
+        co-occurrence counts float32 [rooms, K, K] (number of exploration poses that detect both categories).
+      stages: stages of training, in order; the best policy of the last stage is kept.
       auxiliary: further term of the loss, from a `jaxnav.training.ppo.Replay` to a loss float32 [] and named parts.
       adaptation: change of the policy within an episode.
       control: map from choices to actions.
-      check: from knowledge and a bank to an `InputError` if the method cannot act in these scenes.
-      hosts_layout: whether the layout's weights can enter; if not, only the arm without the layout is trained.
-      name: by which `find_method` finds the method again.
+      check: function of knowledge and a bank that raises an `InputError` if the method cannot act in these scenes.
+      hosts_layout: whether the layout's weights can enter; if not, only the agent without the layout is trained.
+      name: name by which `find_method` finds the method again.
     """
 
     experience: type[Experience]

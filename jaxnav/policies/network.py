@@ -34,10 +34,10 @@ from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 Params = dict[str, Any]
 
-#: Initial bias of Done's logit: without the Done gate Done is then chosen about once in 60 steps. An agent that gives
-#: up at once never learns what it might have found.
+#: Initial bias of Done's logit: without the Done gate, a new policy chooses Done about once in 60 steps. A policy that
+#: often chooses Done ends its episodes too early to find goals.
 INITIAL_DONE_LOGIT = -2.5
-#: Factor of the Done gate, times the confidence of the goal's detection.
+#: The Done gate is this factor times the confidence of the goal's detection.
 DONE_GATE = 0.58
 
 #: Additive changes of layer outputs by an adaptation: layer name (`fuse`, `input_gates`, `hidden_gates` or `actor`) ->
@@ -72,9 +72,10 @@ def _graph(spec: PolicySpec) -> "nnx.GraphDef[Policy]":
 
 
 class Stream(nnx.Module):
-    """A recurrent core with what enters it (`fuse`) and the heads on it (`actor`, `critic`).
+    """A recurrent core with its input layer (`fuse`) and its heads (`actor`, `critic`).
 
-    The parts of a step are methods of their own, so that training can compute each for whole rollouts at once:
+    Each part of a step is a method of its own, so that training can compute it for whole rollouts at once
+    (`training.ppo`):
 
         mediated_input + direct input -> input_gates -+
                                                       +-> GRU -> apply_heads
@@ -92,11 +93,11 @@ class Stream(nnx.Module):
         """Create the layers.
 
         Args:
-          widths: of all inputs; the last two are those of experience and previous action.
-          num_choices: A.
-          spec: of the policy.
-          rngs: of the parameters.
-          done_logit: first bias of Done's logit, where choices are actions.
+          widths: input widths, in the order of the kernel rows of `fuse`; experience and previous action come last.
+          num_choices: A, size of the actor's output.
+          spec: specification of the policy.
+          rngs: random number generators of the parameters.
+          done_logit: initial bias of Done's logit, if choices are actions.
         """
         self.widths = widths
         self.hidden = spec.sizes.hidden
@@ -104,16 +105,16 @@ class Stream(nnx.Module):
         self.fuse = Linear(sum(widths), self.hidden, rngs=rngs)
         self.core = nnx.GRUCell(self.hidden, self.hidden, rngs=rngs)
 
-        # Small first logits: the first policy is close to uniform but for Done.
+        # Small initial logits: a new policy is close to uniform except for Done.
         small_kernel = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
-        first_logits = np.zeros(num_choices, np.float32)
+        initial_logits = np.zeros(num_choices, np.float32)
         if num_choices == NUM_ACTIONS:
-            first_logits[DONE] = done_logit
+            initial_logits[DONE] = done_logit
         self.actor = Linear(
             self.hidden,
             num_choices,
             kernel_init=small_kernel,
-            bias_init=lambda *_: jnp.asarray(first_logits),
+            bias_init=lambda *_: jnp.asarray(initial_logits),
             rngs=rngs,
         )
         self.critic = Linear(self.hidden, 1, rngs=rngs)
@@ -124,7 +125,8 @@ class Stream(nnx.Module):
         Args:
           pathways: leaves [..., ...].
           action: int32 [...], the previous action.
-          changes: of the layers. A change of `fuse`, which reads all pathways, is added here.
+          changes: changes of the layers. The change of `fuse` depends on scene and goal too; it is added here, because
+            one place must add it.
         """
         # The kernel of `fuse` is a sum over its inputs, so the direct ones can be added separately.
         *_, experience_kernel, action_kernel = self.fuse_kernels
@@ -150,7 +152,7 @@ class Stream(nnx.Module):
         return gates + changes["hidden_gates"](hidden) if "hidden_gates" in changes else gates
 
     def apply_heads(self, hidden: jax.Array, pathways: Pathways, changes: LayerChanges = NO_CHANGES) -> Decision:
-        """Compute logits and value from a hidden state float32 [..., H]."""
+        """Compute logits [..., A] and value [...] from a hidden state float32 [..., H]."""
         logits = self.actor(hidden)
         if "actor" in changes:
             logits = logits + changes["actor"](append_one(hidden))
@@ -159,7 +161,7 @@ class Stream(nnx.Module):
         return Decision(logits=self.gate_done(logits, pathways), value=value, hidden=hidden)
 
     def gate_done(self, logits: jax.Array, pathways: Pathways) -> jax.Array:
-        """Multiply the logit of Done by the gate, where there is one."""
+        """Multiply the logit of Done, in logits [..., A], by the gate [..., 1] if `done_gate` is set."""
         if not self.done_gate:
             return logits
         return jnp.concatenate([logits[..., :DONE], pathways.gate * logits[..., DONE:]], axis=-1)
@@ -197,7 +199,7 @@ def append_one(values: jax.Array) -> jax.Array:
 class Policy(Stream):
     """Three pathways, fused before one recurrent core; works on single observations and batches."""
 
-    num_views: ClassVar[int] = 1  # embeddings of the view
+    num_views: ClassVar[int] = 1  # the scene layer embeds the view once per stream
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         method = spec.method
@@ -274,16 +276,16 @@ class Policy(Stream):
         return Pathways(scene=scene, goal=goal_embedding, experience=experience, gate=gate, reading=inputs.reading)
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
-        """Let the experience of `encode` attend with the memory."""
+        """Compute the experience from the encoded inputs and the memory."""
         return encoded._replace(experience=self.method.attend(encoded.experience, memory))
 
     def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
         """Return action logits and value.
 
-        Where a factual and a counterfactual decision stand in one compiled function, what they share (the products of
-        experience and of memory) is computed once.
+        If a factual and a counterfactual decision are traced in one jitted function, XLA computes their common products
+        (experience, memory) once.
         """
-        # Some training episodes are without experience, so that the direct stream learns to act alone.
+        # Experience dropout: in some training episodes Z = 0, so that the direct stream learns to act alone.
         pathways = mask_experience(pathways, memory.use_experience)
         if self.adaptation is None:
             decision = self.decide_with_changes(pathways, memory)
@@ -294,9 +296,9 @@ class Policy(Stream):
     def decide_with_changes(
         self, pathways: Pathways, memory: PolicyState, changes: LayerChanges = NO_CHANGES
     ) -> Decision:
-        """Decide without the method's adaptation, which may call this with changes of the layers.
+        """Decide with given changes of the layers; an adaptation calls this with its own changes.
 
-        With streams these are the layers of the direct stream.
+        With streams, the changes apply to the direct stream.
         """
         # Fuse the pathways and the previous action, [..., H], or [..., 2 H] with streams.
         fused = self.direct_input(pathways) + self.mediated_input(pathways, memory.action, changes)
@@ -348,19 +350,19 @@ class Policy(Stream):
         return jax.eval_shape(self.perceive, features).visible.shape[-1]
 
     def _embed_goal(self, features: Features, appearance: jax.Array) -> jax.Array:
-        """Embed detections and the category that is sought, without experience.
+        """Embed detections and the goal, without experience.
 
-        With `goal_row` the goal's detection enters twice: in the row of its category and in a row of its own. When to
-        say Done is then learned for all goals at once.
+        With `goal_row` the goal's detection enters twice: among all categories, and through the same perceptron in a
+        row of its own, so that Done is learned jointly for all goals.
         """
-        # Rows [..., K, h]; the setting of `direct` decides which of them enter.
+        # Rows [..., K, h]; `direct` masks rows.
         rows = self.detections.project_detections(features, appearance)
         if self.direct == "goal":
             rows = rows * features.goal[..., None]
         elif self.direct == "none":
             rows = rows * jnp.zeros_like(features.goal)[..., None]
 
-        # All categories first, then the row of the goal, then which goal is sought.
+        # All categories first, then the row of the goal, then the embedding of the goal.
         embeddings = [self.detections.finish(rows)]
         if self.goal_row:
             goal_row = (rows * features.goal[..., None]).sum(axis=-2, keepdims=True)
@@ -375,20 +377,23 @@ class Policy(Stream):
 class StreamsPolicy(Policy):
     """Two streams, whose logits and values are added.
 
-    The direct stream reads scene and goal; the stream of experience reads all of `Pathways.experience`, which
-    includes a view of its own. Scene and experience end with a 1, a factor on the stream: setting the pathway to 0
-    removes the stream. The direct stream learns where it acts alone; the stream of experience learns what to add to it.
+    The direct stream reads scene and goal. The experience stream reads all of `Pathways.experience`, which includes a
+    view embedding of its own. Scene and experience end with a 1, the factor of the stream: setting the pathway to 0
+    removes the stream. The direct stream learns in steps without experience; the experience stream learns a residual.
+
+    This object itself is the direct stream: `fuse`, `core`, `actor`, `critic`, and every `super()` call below. Its
+    counterpart is `experience_stream`.
     """
 
     num_views = 2
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)
-        # Its inputs: experience with a view of its own and the factor 1, and the previous action.
+        # The experience stream reads experience, a view embedding, the factor 1 and the previous action.
         experience_widths = self.method.width + spec.sizes.view_outputs + 1, NUM_ACTIONS
         num_choices = self.actor.out_features
         self.experience_stream = Stream(experience_widths, num_choices, spec, rngs, done_logit=0.0)
-        # Embeddings of its own, so that experience shares none with the direct stream.
+        # Category embeddings of the experience stream, which shares none with the direct stream.
         self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
 
     def encode(self, inputs: PolicyInputs) -> Pathways:
@@ -401,7 +406,7 @@ class StreamsPolicy(Policy):
         return encoded if self.method.reads_memory else _join_experience(encoded)
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
-        """Let the experience of `encode` attend with the memory of its stream."""
+        """Compute the experience from the encoded inputs and the memory of its stream."""
         if not self.method.reads_memory:
             return encoded
         experience, experience_view = encoded.experience
@@ -444,7 +449,7 @@ class StreamsPolicy(Policy):
         direct = super().apply_heads(direct_hidden, pathways, changes)
         experience = self.experience_stream.apply_heads(experience_hidden, pathways)
 
-        # Where experience takes part, the direct stream is fixed and experience learns what to add.
+        # While experience is on, stop gradients into the direct stream, so that experience learns a residual.
         direct_factor = pathways.scene[..., -1:]
         experience_factor = pathways.experience[..., -1:]
         direct = _stop_gradient_where(direct, experience_factor != 0)
@@ -486,7 +491,6 @@ class StreamsPolicy(Policy):
 
 def _stop_gradient_where(decision: Decision, condition: jax.Array) -> Decision:
     """Stop the gradient of logits and value where the condition, bool [..., 1], holds."""
-    # The hidden state keeps its gradient.
     fixed = jax.lax.stop_gradient(decision)
     return decision._replace(
         logits=jnp.where(condition, fixed.logits, decision.logits),

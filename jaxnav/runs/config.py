@@ -19,7 +19,7 @@ from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.training.config import CounterfactualTraining, PPOConfig, PPOScalars, stage_index_at
+from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_index_at
 from jaxnav.training.devices import Devices
 
 Arm = Literal["baseline", "layout"]
@@ -203,19 +203,19 @@ class RunConfig:
         The stages are those of the method, with shares rescaled to `imitation` where it is given. With streams, the
         last stage that does not imitate is split in two, so that the direct stream learns alone first.
         """
-        # Shares of imitation, by the method or by the configuration.
+        # Stages of the method, with `imitation` as their share of imitation if it is set.
         stages = list(find_method(self.method).stages)
         if self.imitation is not None:
             stages = _rescale_imitation(stages, self.imitation)
 
         # With streams, the direct stream learns alone in the first part of the last learning stage.
-        learning_stages = []
+        last_learning_index = None
         for index, stage in enumerate(stages):
             if not stage.uses_expert:
-                learning_stages.append(index)
-        if self.decision == "streams" and self.ppo.alone and learning_stages:
-            last_index = learning_stages[-1]
-            stages[last_index : last_index + 1] = _split_by_stream(stages[last_index], self.ppo)
+                last_learning_index = index
+        if self.decision == "streams" and self.ppo.alone and last_learning_index is not None:
+            split_stages = _split_by_stream(stages[last_learning_index], self.ppo)
+            stages[last_learning_index : last_learning_index + 1] = split_stages
         return tuple(stages)
 
     @property
@@ -223,17 +223,6 @@ class RunConfig:
         """Index of the training stage of every chunk, in order."""
         num_chunks = self.total_updates // self.chunk
         return [stage_index_at(self.stages, chunk / num_chunks) for chunk in range(num_chunks)]
-
-    @property
-    def stage_scalars(self) -> list[PPOScalars]:
-        """Traced settings of PPO, one entry for each training stage."""
-        stage_by_chunk = self.stage_by_chunk
-        scalars_by_stage = []
-        for index, stage in enumerate(self.stages):
-            first_update = self.chunk * stage_by_chunk.index(index)
-            num_updates = self.chunk * stage_by_chunk.count(index)
-            scalars_by_stage.append(self.ppo.scalars(num_updates, first_update, stage.lr_scale))
-        return scalars_by_stage
 
     @property
     def steps_by_purpose(self) -> dict[str, int]:
@@ -272,16 +261,17 @@ class RunConfig:
 
 def _rescale_imitation(stages: Sequence[Stage], imitation: float) -> list[Stage]:
     """Rescale shares so that the stages that imitate take `imitation` of training, and the rest the remainder."""
-    # Shares of both kinds of stages, by whether they imitate: wanted, and as the method has them.
-    target_share = {True: imitation, False: 1.0 - imitation}
-    method_share = {True: 0.0, False: 0.0}
-    for stage in stages:
-        method_share[stage.uses_expert] += stage.share
+    # Total share of either kind of stages, as the method has them.
+    imitation_share = sum(stage.share for stage in stages if stage.uses_expert)
+    learning_share = sum(stage.share for stage in stages if not stage.uses_expert)
 
     # Keep the proportions among the stages of a kind.
     rescaled_stages = []
     for stage in stages:
-        stage_share = stage.share * target_share[stage.uses_expert] / method_share[stage.uses_expert]
+        if stage.uses_expert:
+            stage_share = stage.share * imitation / imitation_share
+        else:
+            stage_share = stage.share * (1.0 - imitation) / learning_share
         rescaled_stages.append(dataclasses.replace(stage, share=stage_share))
     return rescaled_stages
 

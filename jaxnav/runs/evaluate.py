@@ -124,14 +124,14 @@ def evaluate(
     config = run.config
     policies = run.policies().with_estimator(setting, hold).with_inner_steps(inner_steps)
 
-    # Rows of the table.
+    # Rows of the table: variants, thresholds and forms, with best and with sampled actions.
     removal_forms = form
     if removal_forms is None:
         removal_forms = () if policies.estimator_config is None else (policies.estimator_config.form,)
     thresholds = np.asarray(epsilon, float).tolist()
     rows = table_rows(thresholds, removal_forms, policies.arms)
 
-    # Run all rows, and the oracle on the same episodes.
+    # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world)
     episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed)
     env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
@@ -184,7 +184,7 @@ def evaluate_rows(
     Returns:
       The episodes of each bank, the outcomes with leaves [R, S, E], and the number of compilations.
     """
-    # Banks are read ahead, while the episodes of the previous one run.
+    # While one bank is evaluated, a thread reads the next.
     episode_lists = draw_episode_lists(world, num_episodes, seed)
     env_params = prefetch_env_params(world, range(len(world.banks)))
     evaluator = Evaluator(policies.make_agent_loop(world))

@@ -7,6 +7,7 @@ A run resumes from its last checkpoint, and a signal ends it after the current c
 """
 
 import dataclasses
+import functools
 import json
 import signal
 import threading
@@ -17,6 +18,7 @@ from types import FrameType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
@@ -63,10 +65,13 @@ from jaxnav.training.devices import (
 from jaxnav.training.ppo import Learner, LearnerState
 from jaxnav.training.trainer import SeedMetrics, ShardedTrainer, Trainer, TrainerStates
 
-# Purposes of keys that are folded into the seed of the run. The arms use 0, 1, ...
+# Constants folded into the run's key; the arms use 0, 1, ... (`ARM_KEY_PURPOSES`).
 _EXPLORE = 2**31 - 1
 _CALIBRATE = 2**31 - 2
 _COOCCURRENCE = 2**31 - 3
+
+#: Random walks of the co-occurrence evidence, as a multiple of those of the prior.
+_EVIDENCE_WALK_FACTOR = 4
 
 #: Signals that end a run after the current chunk: Ctrl-C, and SIGTERM as schedulers send it.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -119,14 +124,16 @@ def _train_in_run_dir(
     console: Console,
 ) -> None:
     """Train in a run directory whose lock is held; see `train`."""
-    # Learn what is known before training: layout prior, estimator, and the method's own knowledge.
+    # Prepare the knowledge from before training: layout prior, estimator, and the method's own statistics.
     warn_if_rollout_too_short(config, console)
-    explored = explore_world(config, world)
-    console.print(f"layout prior from {int(explored.steps):,} random steps, {int(explored.poses):,} distinct poses")
-    estimator_config = calibrate_estimator(config, world, explored, console)
-    knowledge = learn_knowledge(config, world, explored, estimator_config)
+    exploration = explore_world(config, world)
+    console.print(
+        f"layout prior from {int(exploration.steps):,} random steps, {int(exploration.poses):,} distinct poses"
+    )
+    estimator_config = calibrate_estimator(config, world, exploration, console)
+    knowledge = learn_knowledge(config, world, exploration, estimator_config)
 
-    # Decide in which bank of scenes each chunk trains.
+    # Draw the bank of scenes in which each chunk trains.
     trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
     bank_order = draw_bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
@@ -134,8 +141,8 @@ def _train_in_run_dir(
         console.print(f"one shard after the other: {len(bank_order)} turns in {num_used} of {len(world.banks)} shards")
 
     # Resume from the last checkpoint. A finished run needs no validator.
-    first_params = world.make_env_params(bank_order[0])
-    states, update = _restore_or_init(config, trainer, first_params, manifest, console)
+    env_params = world.make_env_params(bank_order[0])
+    states, update = _restore_or_init(config, trainer, env_params, manifest, console)
     stopwatch = stopwatch.resume(config.run_dir / TIMES_FILE)
     is_finished = update == config.total_updates and (config.run_dir / REACH_FILE).exists()
     validator = None if is_finished else _make_validator(config, trainer, knowledge, world, console)
@@ -147,7 +154,7 @@ def _train_in_run_dir(
     policies = {}
     for arm, seed_states in trainer.unpack(states).items():
         policies[arm] = [_best_params(state) for state in seed_states]
-    run_on_first_process(lambda: _export_policies(config, policies, estimator_config, knowledge, explored))
+    run_on_first_process(lambda: _export_policies(config, policies, estimator_config, knowledge, exploration))
     if validator is not None:
         success_by_budget = validator.success_by_budget(policies)
         run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
@@ -172,8 +179,7 @@ def _check_config_and_method(config: RunConfig) -> RunConfig:
 
 
 def connect_devices(config: RunConfig) -> Mesh | None:
-    """Join the other processes of the run, and return the mesh of devices; None where one device is enough."""
-    # An unset or single device needs no mesh.
+    """Join the other processes of the run, and return the mesh of its devices; None if `devices` is not set."""
     devices = None if config.devices is None else Devices.parse(str(config.devices))
     if devices is None:
         return None
@@ -182,14 +188,14 @@ def connect_devices(config: RunConfig) -> Mesh | None:
 
 
 def warn_if_rollout_too_short(config: RunConfig, console: Console) -> None:
-    """Warn where rollouts are shorter than the interval between two choices of the method."""
+    """Warn if rollouts are shorter than the interval between two choices of the method."""
     # Methods such as `semexp` choose once in several actions.
     choice_interval = find_method(config.method).control.interval
     rollout = config.ppo.rollout
     if rollout < choice_interval:
         console.print(
-            f"{config.method} chooses every {choice_interval} actions: in rollouts of {rollout} it learns little of "
-            f"what a choice leads to; give --ppo.rollout {2 * choice_interval} or more, and fewer --ppo.num-envs"
+            f"{config.method} chooses every {choice_interval} actions, so rollouts of {rollout} steps rarely contain "
+            f"the outcome of a choice; give --ppo.rollout {2 * choice_interval} or more, and fewer --ppo.num-envs"
         )
 
 
@@ -208,17 +214,17 @@ def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
     for bank_index, params in enumerate(prefetch_env_params(world, range(num_banks))):
         bank_key = jax.random.fold_in(key, bank_index)
         explorations.append(explore_bank(world.env, params, bank_key, walks_per_bank, config.layout.steps))
-    explored = jax.tree.map(lambda *parts: sum(parts), *explorations)
+    exploration = jax.tree.map(lambda *bank_leaves: sum(bank_leaves), *explorations)
 
     # A pooled prior gives every room type the counts of all rooms.
     if config.layout.prior == "room":
-        return explored
-    pooled_counts = explored.counts.sum(axis=0)
-    return explored._replace(counts=jax.numpy.broadcast_to(pooled_counts, explored.counts.shape))
+        return exploration
+    pooled_counts = exploration.counts.sum(axis=0)
+    return exploration._replace(counts=jnp.broadcast_to(pooled_counts, exploration.counts.shape))
 
 
 def calibrate_estimator(
-    config: RunConfig, world: CompiledWorld, explored: Exploration, console: Console
+    config: RunConfig, world: CompiledWorld, exploration: Exploration, console: Console
 ) -> EstimatorConfig:
     """Configuration of the layout estimator, with strength and reduction.
 
@@ -226,16 +232,16 @@ def calibrate_estimator(
     """
     estimator_config = ESTIMATORS[config.layout.setting]
     if estimator_config.strength is None:
-        return estimator_config  # rows of the prior keep the sums of the counts
+        return estimator_config  # `paper` and `released` keep the sums of the counts, so nothing is calibrated
 
-    # Only values that are not set are searched.
+    # Search both values, or use the value that the configuration sets.
     candidate_strengths = STRENGTHS if config.layout.strength is None else (config.layout.strength,)
     candidate_reductions = REDUCTIONS if config.layout.reduction is None else (config.layout.reduction,)
     key = jax.random.fold_in(jax.random.key(config.seed), _CALIBRATE)
     calibration = calibrate(
         world.env,
         world.make_env_params(0),
-        explored.counts,
+        exploration.counts,
         estimator_config,
         key,
         candidate_strengths,
@@ -251,28 +257,28 @@ def calibrate_estimator(
 
 
 def learn_knowledge(
-    config: RunConfig, world: CompiledWorld, explored: Exploration, estimator_config: EstimatorConfig
+    config: RunConfig, world: CompiledWorld, exploration: Exploration, estimator_config: EstimatorConfig
 ) -> Knowledge:
     """Knowledge from before training: layout priors, the method's own, and evidence from co-occurrence.
 
     The evidence is learned in the training scenes of the first bank, and only where policies use the layout.
     """
-    layout = layout_priors(explored.counts, estimator_config)
+    layout = layout_priors(exploration.counts, estimator_config)
 
     # The method's own knowledge, from the tables of all banks.
     learn = find_method(config.method).learn
     method_knowledge = {}
     if learn is not None:
-        method_knowledge = jax.tree.map(jax.numpy.asarray, learn(world.banks, np.asarray(explored.counts)))
+        method_knowledge = jax.tree.map(jnp.asarray, learn(world.banks, np.asarray(exploration.counts)))
     if "layout" not in config.arms:
         return Knowledge(layout, method_knowledge)
 
-    # Evidence that pairs of categories give for another layout.
+    # Log odds that a pair of categories seen together indicates a shifted layout.
     key = jax.random.fold_in(jax.random.key(config.seed), _COOCCURRENCE)
-    num_walks = 4 * config.layout.walks
+    num_walks = _EVIDENCE_WALK_FACTOR * config.layout.walks
     is_pooled = config.layout.prior == "pooled"
     learn_evidence = jax.jit(fit_shift_classifier, static_argnums=(0, 4, 5))
-    cooccurrence = learn_evidence(world.env, world.make_env_params(0), explored.counts, key, num_walks, is_pooled)
+    cooccurrence = learn_evidence(world.env, world.make_env_params(0), exploration.counts, key, num_walks, is_pooled)
     return Knowledge(layout, method_knowledge, cooccurrence)
 
 
@@ -299,23 +305,28 @@ def make_trainer(
         agent_loop = AgentLoop(env, policy_spec, arm_estimators[arm])
         learners[arm] = Learner(agent_loop, config.ppo, config.counterfactual)
 
-    stages = list(zip(config.stages, config.stage_scalars, strict=True))
-    key = jax.random.key(config.seed)
     # With a mesh, seeds and environments are sharded over its devices.
-    arguments = (learners, stages, knowledge, key, config.seeds, config.chunk)
-    if mesh is None:
-        return Trainer(*arguments)
-    return ShardedTrainer(*arguments, mesh=mesh)
+    trainer_class = Trainer if mesh is None else functools.partial(ShardedTrainer, mesh=mesh)
+    return trainer_class(
+        learners,
+        stages=config.stages,
+        stage_scalars=config.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk),
+        knowledge=knowledge,
+        key=jax.random.key(config.seed),
+        num_seeds=config.seeds,
+        chunk_size=config.chunk,
+    )
 
 
 def _restore_or_init(
-    config: RunConfig, trainer: Trainer, params: EnvParams, manifest: dict[str, Any], console: Console
+    config: RunConfig, trainer: Trainer, env_params: EnvParams, manifest: dict[str, Any], console: Console
 ) -> tuple[TrainerStates, int]:
-    """Training states of the last checkpoint, or of the start, and the number of updates in them.
+    """Training states of the last checkpoint or of the start, and the number of updates done in them.
 
-    Damaged later checkpoints and later log rows leave the run directory, because training writes them again.
+    Checkpoints and log rows after the restored update are moved away or dropped, because training will write them
+    again.
     """
-    checkpoint = restore_checkpoint(config.run_dir, trainer.abstract_states(params), manifest)
+    checkpoint = restore_checkpoint(config.run_dir, trainer.abstract_states(env_params), manifest)
     update = 0
     if checkpoint is not None:
         update = checkpoint.step
@@ -325,7 +336,7 @@ def _restore_or_init(
     run_on_first_process(lambda: RunLogs(config).rewind(update))
 
     if checkpoint is None:
-        return trainer.init(params), 0
+        return trainer.init(env_params), 0
     console.print(f"resumed after update {update} of {config.total_updates}")
     return trainer.pack(checkpoint.state), update
 
@@ -336,7 +347,9 @@ def _make_validator(
     """Validator of the policies; None without validations or val scenes."""
     if not config.validations:
         return None
-    agent_loop = trainer.learners[config.arms[-1]].agent_loop
+    # The loop with the estimator serves both arms; rows of the baseline set the layout weights to ones.
+    arm = "layout" if "layout" in config.arms else "baseline"
+    agent_loop = trainer.learners[arm].agent_loop
     try:
         return Validator(config, agent_loop, knowledge, world, console)
     except MissingSplitError as error:
@@ -372,35 +385,40 @@ class TrainingSession:
 
 
 def run_updates(session: TrainingSession, states: TrainerStates, update: int) -> TrainerStates:
-    """Train chunk by chunk, from an update to the end of the run.
+    """Train chunk by chunk, from `update` updates to the end of the run.
 
     Raises:
       Interrupted: a signal asked for an end. The current chunk is saved.
     """
-    # Chunks that are still to do, and the environment's parameters for each.
+    # The remaining chunks, and the environment's parameters for each.
     config = session.config
     trainer = session.trainer
     bank_order = session.bank_order
     stage_by_chunk = config.stage_by_chunk
+    validation_updates = config.validation_updates
     remaining_chunks = range(update // config.chunk, len(bank_order))
-    env_params = prefetch_env_params(session.world, [bank_order[chunk] for chunk in remaining_chunks])
+    params_by_chunk = prefetch_env_params(session.world, [bank_order[chunk] for chunk in remaining_chunks])
 
     with ProgressDisplay(config, update, session.console) as progress, Interrupts() as interrupts:
-        for chunk, params in zip(remaining_chunks, env_params, strict=True):
-            # Episodes start anew where the scenes change.
-            stage_index = stage_by_chunk[chunk]
-            if chunk and bank_order[chunk] != bank_order[chunk - 1]:
-                states = trainer.restart(states, params, stage_index)
+        for chunk_index, env_params in zip(remaining_chunks, params_by_chunk, strict=True):
+            # A new bank of scenes invalidates the running episodes, so restart them.
+            stage_index = stage_by_chunk[chunk_index]
+            if chunk_index and bank_order[chunk_index] != bank_order[chunk_index - 1]:
+                states = trainer.restart(states, env_params, stage_index)
 
-            states, metrics = trainer.train(states, params, stage_index)
+            # Train, and validate if due.
+            states, metrics = trainer.train(states, env_params, stage_index)
             update += config.chunk
             progress.stop_timing()
-            if session.validator is not None and update in config.validation_updates:
+            if session.validator is not None and update in validation_updates:
                 states, metrics = _validate(session, session.validator, states, metrics, stage_index)
 
-            # All processes agree on a signal, before the first of them writes.
+            # All processes agree on a signal before the first of them writes. Stop if the run directory is gone or
+            # another process has taken it.
             signal_number = interrupts.pending_signal()
             run_on_first_process(session.lock.check)
+
+            # Write the log, and the checkpoint if due.
             if is_first_process():
                 time_row = {"step": update} | session.stopwatch.read()
                 RunLogs(config).append(_log_rows(config, metrics, update), time_row)
@@ -410,12 +428,12 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
 
             progress.show_chunk(metrics, update)
             if signal_number:
-                raise _interrupted(config, signal_number, update)
+                raise _make_interrupted(config, signal_number, update)
 
         # A signal may also come during the last save.
         signal_number = interrupts.pending_signal()
         if signal_number:
-            raise _interrupted(config, signal_number, update)
+            raise _make_interrupted(config, signal_number, update)
     return states
 
 
@@ -430,12 +448,12 @@ def _validate(
     config = session.config
     trainer = session.trainer
     # Score the current parameters, with adaptation as in this stage.
-    policies = {}
+    params_by_arm = {}
     for arm, seed_states in trainer.unpack(states).items():
-        policies[arm] = [state.params for state in seed_states]
-    scores_by_arm = validator.measure(policies, config.stages[stage_index].adapts_online)
+        params_by_arm[arm] = [state.params for state in seed_states]
+    scores_by_arm = validator.measure(params_by_arm, config.stages[stage_index].adapts_online)
 
-    # Before the last stage, part of the policy has not learned, so no policy is kept.
+    # Only policies of the last stage compete: earlier stages leave parts of the policy untrained.
     if stage_index == config.stage_by_chunk[-1]:
         val_success = {}
         for arm, arm_scores in scores_by_arm.items():
@@ -444,28 +462,30 @@ def _validate(
 
     # Scores become further columns of the log.
     scored_metrics: SeedMetrics = {}
-    for arm, seeds in metrics.items():
-        scored_metrics[arm] = [row | seed_score for row, seed_score in zip(seeds, scores_by_arm[arm], strict=True)]
+    for arm, seed_metrics in metrics.items():
+        seed_scores = scores_by_arm[arm]
+        scored_metrics[arm] = [row | scores for row, scores in zip(seed_metrics, seed_scores, strict=True)]
     return states, scored_metrics
 
 
 def _log_rows(config: RunConfig, metrics: SeedMetrics, update: int) -> list[LogRow]:
     """Rows of one chunk in the training log, one for each arm and seed."""
     log_rows: list[LogRow] = []
-    for arm, seeds in metrics.items():
-        for seed, seed_metrics in enumerate(seeds):
-            row_place = {"step": update, "arm": arm, "seed": seed, "env_steps": update * config.steps_per_update}
-            log_rows.append(row_place | seed_metrics)
+    for arm, metrics_by_seed in metrics.items():
+        for seed, seed_metrics in enumerate(metrics_by_seed):
+            row_labels = {"step": update, "arm": arm, "seed": seed, "env_steps": update * config.steps_per_update}
+            log_rows.append(row_labels | seed_metrics)
     return log_rows
 
 
-def _interrupted(config: RunConfig, signal_number: int, update: int) -> Interrupted:
+def _make_interrupted(config: RunConfig, signal_number: int, update: int) -> Interrupted:
     stop_message = f"{config.run_dir}: stopped after update {update} of {config.total_updates} and saved"
     return Interrupted(signal_number, stop_message)
 
 
 def _best_params(state: LearnerState) -> Params:
     """Parameters of a seed's best policy in validation, or of its last one without validation."""
+    # The score is -1 before the first validation.
     params = state.best.params if state.best.score >= 0 else state.params
     return jax.device_get(params)
 
@@ -475,7 +495,7 @@ def _export_policies(
     policies: Mapping[str, Sequence[Params]],
     estimator_config: EstimatorConfig,
     knowledge: Knowledge,
-    explored: Exploration,
+    exploration: Exploration,
 ) -> None:
     """Export the policy of every arm and seed."""
     for arm, seeds in policies.items():
@@ -483,7 +503,7 @@ def _export_policies(
         arm_estimator = estimator_config if arm == "layout" else None
         for seed, params in enumerate(seeds):
             export_folder = config.run_dir / POLICIES_DIR / f"{arm}-{seed}"
-            export_policy(export_folder, config, params, knowledge, arm_estimator, explored)
+            export_policy(export_folder, config, params, knowledge, arm_estimator, exploration)
 
 
 @dataclasses.dataclass(frozen=True)

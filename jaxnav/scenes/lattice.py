@@ -82,7 +82,7 @@ def pose_successors(ahead: np.ndarray, rules: Rules) -> np.ndarray:
     next_cell = np.broadcast_to(ahead[..., None], cell.shape)
 
     def pose_index(cell: np.ndarray, heading: np.ndarray, horizon: np.ndarray) -> np.ndarray:
-        return (cell * rules.headings + heading % rules.headings) * len(rules.horizons) + horizon
+        return rules.join_pose(cell, heading % rules.headings, horizon)
 
     # One entry per action, in the order of `ACTIONS`.
     next_poses = [

@@ -57,8 +57,12 @@ class Rules:
         """
         return self.headings * len(self.horizons)
 
+    def join_pose(self, cell: Any, heading: Any, horizon: Any) -> Any:
+        """Pose with a cell, a heading and a horizon: indices of one type and shape, ints or arrays of ints."""
+        return (cell * self.headings + heading) * len(self.horizons) + horizon
+
     def split_pose(self, pose: Any) -> tuple[Any, Any, Any]:
-        """Return cell, heading and horizon of poses.
+        """Cell, heading and horizon of poses, the inverse of `join_pose`.
 
         Each is an index of the type and the shape of `pose`: an int or an array of ints.
         """

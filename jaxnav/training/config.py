@@ -5,6 +5,7 @@ compilation. `stage_index_at` tells which stage of a method a part of training b
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import jax
@@ -66,8 +67,25 @@ class PPOConfig:
         """Number of updates in `total_steps` environment steps of a seed, rounded up."""
         return -(-total_steps // (self.num_envs * self.rollout))
 
+    def stage_scalars(
+        self, stages: Sequence[Stage], stage_by_chunk: Sequence[int], chunk_size: int
+    ) -> list["PPOScalars"]:
+        """Traced settings of every training stage.
+
+        Args:
+          stages: stages of training, in order.
+          stage_by_chunk: index of the stage of every chunk, in order.
+          chunk_size: updates in a chunk.
+        """
+        scalars_by_stage = []
+        for index, stage in enumerate(stages):
+            first_update = chunk_size * stage_by_chunk.index(index)
+            num_updates = chunk_size * stage_by_chunk.count(index)
+            scalars_by_stage.append(self.scalars(num_updates, first_update, stage.lr_scale))
+        return scalars_by_stage
+
     def scalars(self, num_updates: int, first_update: int = 0, lr_scale: float = 1.0) -> "PPOScalars":
-        """Traced settings of a training stage.
+        """Traced settings of one training stage.
 
         Args:
           num_updates: updates in the stage.

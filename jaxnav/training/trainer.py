@@ -48,7 +48,8 @@ class Trainer:
     def __init__(
         self,
         learners: Mapping[str, Learner],
-        stages: Sequence[tuple[Stage, PPOScalars]],
+        stages: Sequence[Stage],
+        stage_scalars: Sequence[PPOScalars],
         knowledge: Knowledge,
         key: jax.Array,
         num_seeds: int,
@@ -58,15 +59,16 @@ class Trainer:
 
         Args:
           learners: learner of each arm, named as in `ARM_KEY_PURPOSES`.
-          stages: stages of training, each with its traced settings of PPO.
-          knowledge: learned before training.
+          stages: stages of training, in order.
+          stage_scalars: traced settings of PPO of each stage.
+          knowledge: layout priors and statistics from before training.
           key: typed PRNG key [] of all arms and seeds.
           num_seeds: S, seeds of each arm.
           chunk_size: updates in one call of `train`.
         """
         self.learners = dict(learners)
-        self._stages = [stage for stage, _ in stages]
-        self._scalars = [scalars for _, scalars in stages]
+        self._stages = list(stages)
+        self._stage_scalars = list(stage_scalars)
         self._knowledge = knowledge
         self._key = key
         self._num_seeds = num_seeds
@@ -139,7 +141,9 @@ class Trainer:
 
         def train_seed(job: tuple[str, int]) -> Any:
             arm, seed = job
-            result = train_functions[arm](states[arm][seed], self._scalars[stage_index], env_params, self._knowledge)
+            result = train_functions[arm](
+                states[arm][seed], self._stage_scalars[stage_index], env_params, self._knowledge
+            )
             return jax.block_until_ready(result)
 
         # Seeds of all arms run in threads, as many as there are cores.
@@ -181,7 +185,7 @@ class Trainer:
         """Compiled chunk of updates of an arm in a stage, for arguments like these."""
         if (arm, stage_index) not in self._compiled:
             learner = self._stage_learner(arm, stage_index)
-            arguments = (state, self._scalars[stage_index], env_params, self._knowledge)
+            arguments = (state, self._stage_scalars[stage_index], env_params, self._knowledge)
             self._compiled[arm, stage_index] = self._compile_train(learner, arguments)
         return self._compiled[arm, stage_index]
 
@@ -277,7 +281,7 @@ class ShardedTrainer(Trainer):
         metrics: SeedMetrics = {}
         for arm in self.learners:
             train = self._compiled_train(arm, stage_index, states[arm], env_params)
-            new_states[arm], values = train(states[arm], self._scalars[stage_index], env_params, self._knowledge)
+            new_states[arm], values = train(states[arm], self._stage_scalars[stage_index], env_params, self._knowledge)
 
             # Metrics come as one array [S] for each name.
             arm_metrics = {name: value.tolist() for name, value in jax.device_get(values).items()}

@@ -28,7 +28,7 @@ def searched(bank, pose, goal=BOOK, limit=100):
 
 
 def pose(cell, heading, rules=ROOMS):
-    return (cell * rules.headings + heading) * len(rules.horizons)
+    return rules.join_pose(cell, heading, 0)
 
 
 def outcome(bank, count=60, limit=200):

@@ -106,13 +106,13 @@ def test_shaping_rewards_metres_nearer_than_before(rules, ahead):
     # Away pays nothing, nor does the way back to where it was nearer.
     for state, action, metres in [(start, MOVE_AHEAD, 0.25), (turned, MOVE_AHEAD, 0.0), (start, LOOK_UP, 0.0)]:
         for nearest, gained in [(here, metres), (here - 0.25, 0.0), (here - 0.125, max(metres - 0.125, 0.0))]:
-            given = state.replace(nearest=jnp.float32(nearest))
+            given = state.replace(min_goal_distance=jnp.float32(nearest))
             after, reward, _, _ = shaped.advance(given, jnp.int32(action), params)
             np.testing.assert_allclose(reward, -0.01 + 2.0 * gained, atol=1e-6)
-            assert after.nearest == pytest.approx(nearest - gained, abs=1e-6)
+            assert after.min_goal_distance == pytest.approx(nearest - gained, abs=1e-6)
     _, begun = shaped.reset(jax.random.key(0), params)
-    assert begun.nearest == pytest.approx(bank.goal_distance[shaped.cell_of_pose(begun.pose), BOOK])
-    done = start.replace(pose=jnp.int32(7 * per_cell), nearest=jnp.float32(ahead))
+    assert begun.min_goal_distance == pytest.approx(bank.goal_distance[shaped.cell_of_pose(begun.pose), BOOK])
+    done = start.replace(pose=jnp.int32(7 * per_cell), min_goal_distance=jnp.float32(ahead))
     np.testing.assert_allclose(bank.goal_distance[7, BOOK], ahead)  # z = 1.75
     assert shaped.advance(done, jnp.int32(DONE), params)[1] == 5.0
     assert make("rooms")[0].shaping == 0.0

@@ -134,7 +134,12 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended(seeds, first):
     assert metrics["episodes"] == ended.sum() > 20
     # A successful episode's last action earns 5, every other one costs 0.01.
     returns = np.where(t.success, 5 + 0.01, 0) - 0.01 * t.episode_length
-    for name, values in {"success": t.success, "length": t.episode_length, "truncated": t.truncated, "return": returns}.items():
+    for name, values in {
+        "success": t.success,
+        "length": t.episode_length,
+        "truncated": t.truncated,
+        "return": returns,
+    }.items():
         assert metrics[name] == pytest.approx(values[ended].mean(), rel=1e-5), name
 
 

@@ -31,6 +31,10 @@ def acting_with(method):
     return AgentLoop(ENV, spec_of(method), tiny.SETTING)
 
 
+def scalars_of(config):
+    return config.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk)
+
+
 def learner_with(method, **settings):
     config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4, **settings)
     return Learner(acting_with(method), config, "none")
@@ -135,7 +139,8 @@ def test_the_direct_stream_is_alone_first():
     assert config.stage_by_chunk == [0, 1]
     trainer = Trainer(
         {"layout": learner_with("org", experience=SHARE)},
-        list(zip(config.stages, config.stage_scalars, strict=True)),
+        config.stages,
+        scalars_of(config),
         KNOWLEDGE,
         jax.random.key(0),
         num_seeds=1,
@@ -174,15 +179,15 @@ def test_the_rate_runs_its_course_in_every_stage():
     config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
     assert config.stage_by_chunk == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert [stage.direct_stream_only for stage in config.stages] == [False, True, False]
-    assert [(float(scalars.first_update), float(scalars.num_updates)) for scalars in config.stage_scalars] == [
+    assert [(float(scalars.first_update), float(scalars.num_updates)) for scalars in scalars_of(config)] == [
         (0, 4),
         (4, 8),
         (12, 8),
     ]
-    assert [float(scalars.learning_rate) for scalars in config.stage_scalars] == pytest.approx([4e-3, 4e-3, 2e-3])
+    assert [float(scalars.learning_rate) for scalars in scalars_of(config)] == pytest.approx([4e-3, 4e-3, 2e-3])
     assert config.steps_by_purpose["imitation"] == 2 * 2 * 3840
     fused = dataclasses.replace(config, method="org", decision="fused")
-    assert [(float(scalars.first_update), float(scalars.num_updates)) for scalars in fused.stage_scalars] == [(0, 20)]
+    assert [(float(scalars.first_update), float(scalars.num_updates)) for scalars in scalars_of(fused)] == [(0, 20)]
 
 
 # Replay
