@@ -157,6 +157,6 @@ def test_an_environment_that_was_made_knows_its_parameters(tmp_path):
 
 
 def test_an_environment_that_was_built_by_hand_has_no_parameters():
-    with pytest.raises(ValueError, match=r"built by hand; jaxnav\.make returns both"):
+    with pytest.raises(ValueError, match=r"no bundled parameters; jaxnav\.make returns both"):
         _ = ENV.default_params
     np.testing.assert_array_equal(PARAMS.step_limit, tiny.LIMITS)

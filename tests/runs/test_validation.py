@@ -11,7 +11,7 @@ import jaxnav
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import evaluate_rows
-from jaxnav.runs.train import train
+from jaxnav.runs.train import _make_validator, make_trainer, train
 from jaxnav.runs.validation import DECODINGS, Validator
 from jaxnav.runs.worlds import compile_evaluation_world, compile_training_world
 from jaxnav.scenes.files.scene_file import write_scenes
@@ -97,6 +97,24 @@ def test_the_exported_policy_is_the_one_that_succeeded_most(config, tmp_path):
             differ.append(not same)
     assert run.success_by_budget() is not None
     assert last.success_by_budget() is None
+
+
+@pytest.mark.slow
+def test_layout_policies_are_validated_with_the_layout_in_any_order_of_the_arms(validated):
+    config, policies, validator, held = validated
+    training = compile_training_world(config, QUIET)
+    reversed_config = dataclasses.replace(config, arms=("layout", "baseline"), validations=1)
+    trainer = make_trainer(reversed_config, training.env, policies.estimator_config, policies.knowledge)
+    reversed_validator = _make_validator(reversed_config, trainer, policies.knowledge, training, QUIET)
+    expected = validator.measure(held)
+    measured = reversed_validator.measure({arm: held[arm] for arm in reversed_config.arms})
+    for seed in range(policies.num_seeds):
+        for name in ("val_success", "val_timeout", "val_wrong_done"):  # of best actions, so no draws enter
+            assert measured["layout"][seed][name] == expected["layout"][seed][name]
+    # The weights matter: without them the same policies end other episodes.
+    plain = trainer.learners["baseline"].agent_loop
+    unweighted = Validator(config, plain, policies.knowledge, training, QUIET).measure(held)
+    assert unweighted["layout"] != expected["layout"]
 
 
 @pytest.mark.slow
