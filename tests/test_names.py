@@ -36,6 +36,7 @@ BANNED = frozenset(
         "kept",
         "every",
         "beforehand",
+        "across",
     ]
 )
 

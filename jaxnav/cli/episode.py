@@ -71,14 +71,14 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
 
     episodes = play_episode(
         config.source,
-        config.split,
-        config.index,
-        config.variant,
-        config.epsilon,
-        config.setting,
-        config.scenes,
-        config.shift or (None,),
-        console,
+        split=config.split,
+        index=config.index,
+        variant=config.variant,
+        epsilon=config.epsilon,
+        estimator=config.setting,
+        scenes=config.scenes,
+        shifts=config.shift or (None,),
+        console=console,
     )
     num_steps = max(len(episode.trace.pose) for episode in episodes)
     if config.map:

@@ -13,19 +13,18 @@ from rich.console import Console
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
 from jaxnav.runs.policies import POLICIES_DIR
-from jaxnav.runs.policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, load_policy, write_model_card
+from jaxnav.runs.policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, format_model_card, load_policy
 from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.task import ACTIONS
+from jaxnav.store.export import PARAMS_FILE, POLICY_FILE
 from jaxnav.store.files import write_atomic
 
-# Files of an export.
+# Files of an export, besides those of the policy itself.
 CARD_FILE = "README.md"
 PROGRAM_FILE = "step.stablehlo"
 NAMES_FILE = "step.json"
-PARAMS_FILE = "params.safetensors"
-POLICY_FILE = "policy.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,28 +70,29 @@ class Export(NamedTuple):
 
 def _export(config: ExportConfig, console: Console) -> None:
     """Write the files of an export, the card last."""
-    # Find the policy among those of the run.
+    # Find the policy in the run.
     run = Run.open(config.run)
     policy_names = [f"{arm}-{seed}" for arm in run.config.arms for seed in range(run.config.seeds)]
-    name = config.policy or f"{run.config.arms[-1]}-0"
-    if name not in policy_names:
-        raise InputError(f"--policy {name}: {config.run} has {', '.join(policy_names)}")
-    source = config.run / POLICIES_DIR / name
+    policy_name = config.policy or f"{run.config.arms[-1]}-0"
+    if policy_name not in policy_names:
+        raise InputError(f"--policy {policy_name}: {config.run} has {', '.join(policy_names)}")
+    source = config.run / POLICIES_DIR / policy_name
     policy = load_policy(source)
-    out = config.out or config.run / "exports" / f"{name}-{config.format}"
+    out = config.out or config.run / "exports" / f"{policy_name}-{config.format}"
     if not _is_replaceable(out):
         raise InputError(f"{out}: is there and holds no export; give another --out")
 
+    # Contents of the files, and the card that describes them.
     is_program = config.format == "stablehlo"
     export = _make_program_export(policy, run) if is_program else _make_parameter_export(source)
-    card = write_model_card(run, name, policy, export.descriptions, export.usage)
+    card = format_model_card(run, policy_name, policy, export.descriptions, export.usage)
 
     # The card marks a complete export: it is removed first and written last.
     try:
-        for file in (CARD_FILE, PROGRAM_FILE, NAMES_FILE, PARAMS_FILE, POLICY_FILE):
-            (out / file).unlink(missing_ok=True)
-        for file, data in export.files.items():
-            write_atomic(out / file, data)
+        for file_name in (CARD_FILE, PROGRAM_FILE, NAMES_FILE, PARAMS_FILE, POLICY_FILE):
+            (out / file_name).unlink(missing_ok=True)
+        for file_name, file_bytes in export.files.items():
+            write_atomic(out / file_name, file_bytes)
         write_atomic(out / CARD_FILE, card.encode())
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
@@ -108,30 +108,37 @@ def _is_replaceable(out: Path) -> bool:
 
 
 def _make_parameter_export(source: Path) -> Export:
-    """Return the parameters as the run stores them."""
-    descriptions = {PARAMS_FILE: "parameters and what was learned before", POLICY_FILE: "what they are built into"}
-    files = {name: (source / name).read_bytes() for name in descriptions}
+    """Return the files of the policy as the run stores them."""
+    descriptions = {
+        PARAMS_FILE: "parameters, priors and method knowledge",
+        POLICY_FILE: "specification of the network, task and layout estimator",
+    }
+    files = {file_name: (source / file_name).read_bytes() for file_name in descriptions}
     return Export(files, descriptions, _code_block(_LOADING_CODE))
 
 
 def _make_program_export(policy: LoadedPolicy, run: Run) -> Export:
     """Return the step as a program, and the names of its inputs' categories, actions and rooms."""
+    # The program, and the names that its indices stand for.
     program = export_program(policy)
-    contents = {
+    names_by_kind = {
         "categories": run.config.task.categories,
         "actions": ACTIONS,
         "rooms": [*ROOM_TYPES, "any other"],
         "jax": jax.__version__,
         "sha256": hashlib.sha256(program).hexdigest(),
     }
-    files = {PROGRAM_FILE: program, NAMES_FILE: (json.dumps(contents, indent=2) + "\n").encode()}
+    files = {PROGRAM_FILE: program, NAMES_FILE: (json.dumps(names_by_kind, indent=2) + "\n").encode()}
+
+    # Descriptions for the model card, and the use of the program.
     descriptions = {
         PROGRAM_FILE: f"the step, for CPU, CUDA and TPU; written by JAX {jax.__version__}, "
         "runs with JAX and flatbuffers",
         NAMES_FILE: "names by index, and the digest",
     }
-    inputs = _INPUTS_TEXT.format(choices=policy.spec.method.control.num_choices)
-    return Export(files, descriptions, (*_code_block(_CALLING_CODE), *inputs.rstrip().split("\n")))
+    inputs_text = _INPUTS_TEXT.format(choices=policy.spec.method.control.num_choices)
+    usage = (*_code_block(_CALLING_CODE), *inputs_text.rstrip().split("\n"))
+    return Export(files, descriptions, usage)
 
 
 def _code_block(text: str) -> tuple[str, ...]:
@@ -157,7 +164,7 @@ program = Path("step.stablehlo").read_bytes()
 assert hashlib.sha256(program).hexdigest() == json.loads(Path("step.json").read_text())["sha256"]
 step = jax.export.deserialize(bytearray(program))
 (shapes, _), _ = jax.tree.unflatten(step.in_tree, step.in_avals)
-inputs = jax.tree.map(lambda each: np.zeros((8, *each.shape[1:]), each.dtype), shapes)  # eight episodes
+inputs = jax.tree.map(lambda leaf: np.zeros((8, *leaf.shape[1:]), leaf.dtype), shapes)  # eight episodes
 inputs["first"][:] = True  # they begin
 outputs = step.call(inputs, np.float32(0.5))  # epsilon
 inputs |= {"memory": outputs["memory"], "action": outputs["action"], "first": np.zeros(8, bool)}
@@ -170,12 +177,12 @@ Inputs, a row for each episode:
   ahead x {AHEAD_SCALE:g}, metres to the right x {RIGHT_SCALE:g} + 128, apparent size x {SIZE_SCALE:g}
 * `view` uint8 [V, V]: cells of 0.25 m before the agent, 0 unknown, 1 free, 2 blocked; row 0 is nearest, column 0
   leftmost
-* `goal`, `action`, `heading`, `horizon`, `room` int32: what is sought, the action taken last, compass heading, the
-  camera's horizon, the type of the room (it picks the layout prior)
-* `moved` bool: whether the last action changed the cell; `first` bool: whether an episode begins
-* `memory`: what the step before returned; not read where an episode begins
+* `goal`, `action`, `heading`, `horizon`, `room` int32: category of the goal, previous action, compass heading, horizon
+  of the camera, type of the room (which selects the layout prior)
+* `moved` bool: true where the previous action changed the cell; `first` bool: true where an episode begins
+* `memory`: output `memory` of the previous step; not read where an episode begins
 
-Outputs: `action` int32, the best one (where `logits` are of actions, you may sample one and give it as the next
+Outputs: `action` int32, the best action (where `logits` are of actions, you may sample one and give it as the next
 `action`); `logits`, `factual` and, where the policy uses the layout, `counterfactual` float32 [{{choices}}]; there also
 the layout gap `gap` and the weights `weights` [K] of eq. 7; `memory`.
 """

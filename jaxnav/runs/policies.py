@@ -60,7 +60,7 @@ class Policies(NamedTuple):
       prior_steps: random steps in which the counts were collected.
       task: task of the training.
       inner_steps: limit of adaptation steps in an episode; None for the method's default.
-      handover_spec: specification of the policies that take over when experience is removed; None without handover.
+      fallback_spec: specification of the policies that decide once experience is removed; None without handover.
     """
 
     params: dict[str, Any]
@@ -72,7 +72,7 @@ class Policies(NamedTuple):
     prior_steps: int
     task: Task
     inner_steps: int | None = None
-    handover_spec: PolicySpec | None = None
+    fallback_spec: PolicySpec | None = None
 
     @property
     def num_seeds(self) -> int:
@@ -137,28 +137,30 @@ class Policies(NamedTuple):
         limit_inner_steps(method.adaptation, inner_steps)  # raises for an impossible number
         return self._replace(inner_steps=inner_steps)
 
-    def with_handover_to(self, successors: "Policies") -> "Policies":
-        """Pairs of policies in which `successors` decide once experience is removed.
+    def with_handover_to(self, fallback_policies: "Policies") -> "Policies":
+        """Policies that hand over to fallback policies once experience is removed.
 
         Args:
-          successors: equally many policies without experience, trained for the same task.
+          fallback_policies: equally many policies without experience, trained for the same task.
 
         Returns:
           Policies with parameters {"agent": ..., "without": ...}.
 
         Raises:
-          InputError: the successors track, choose or remember in ways that the agents of `anonymous` do not.
+          InputError: the fallback policies have a tracker, another number of choices or another spatial memory.
         """
+        # Both policies share choices and spatial memory, and no tracker runs for the fallback policy.
         method = self.spec.method
-        other_method = successors.spec.method
-        if other_method.tracker is not None or method.control.num_choices != other_method.control.num_choices:
+        fallback_method = fallback_policies.spec.method
+        if fallback_method.tracker is not None or method.control.num_choices != fallback_method.control.num_choices:
             raise InputError(
-                f"handing over: {method.name!r} cannot hand over to {other_method.name!r}; train a run with "
+                f"handing over: {method.name!r} cannot hand over to {fallback_method.name!r}; train a run with "
                 "--method anonymous, and let a method that chooses actions hand over to it"
             )
-        if self.spec.spatial_memory != successors.spec.spatial_memory:
+        if self.spec.spatial_memory != fallback_policies.spec.spatial_memory:
             raise InputError("handing over: one of the runs has no spatial memory; train both alike")
-        return self._replace(params={"agent": self.params, "without": successors.params}, handover_spec=successors.spec)
+        paired_params = {"agent": self.params, "without": fallback_policies.params}
+        return self._replace(params=paired_params, fallback_spec=fallback_policies.spec)
 
     def make_agent_loop(self, world: CompiledWorld) -> AgentLoop:
         """Agent loop of these policies in the scenes of a world.
@@ -168,7 +170,7 @@ class Policies(NamedTuple):
         """
         # Some methods refuse scenes, such as those that are larger than their map.
         world.check_method(self.spec.method, self.knowledge)
-        return AgentLoop(world.env, self.spec, self.estimator_config, self.inner_steps, self.handover_spec)
+        return AgentLoop(world.env, self.spec, self.estimator_config, self.inner_steps, self.fallback_spec)
 
 
 def estimators_by_gap(estimator_config: EstimatorConfig) -> dict[GapName, EstimatorConfig]:
@@ -202,7 +204,7 @@ def export_policy(
       estimator_config: layout estimator; None without the layout.
       explored: random walks behind the priors.
     """
-    # Settings, as JSON.
+    # Fields, as JSON.
     policy_spec = config.policy_spec(len(config.task.categories))
     fields = policy_spec.to_json() | {
         "categories": list(config.task.categories),
@@ -213,17 +215,17 @@ def export_policy(
     }
 
     # Arrays, by group.
-    tensors = {
+    arrays = {
         "policy": jax.device_get(params),
         "layout": {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.counts)},
     }
     if knowledge.method:
-        tensors["knowledge"] = jax.device_get(knowledge.method)
+        arrays["knowledge"] = jax.device_get(knowledge.method)
     if knowledge.cooccurrence is not None:
         log_odds, co_visibility = jax.device_get(knowledge.cooccurrence)
-        tensors["signs"] = {"odds": log_odds, "chance": co_visibility}
+        arrays["signs"] = {"odds": log_odds, "chance": co_visibility}
 
-    export_params(folder, tensors, fields)
+    export_params(folder, arrays, fields)
 
 
 def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Policies:
@@ -259,8 +261,8 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
 
     # Every policy must agree with the reference, except that baselines have no layout estimator.
     parsed_policies = []
-    for (arm, folder), (tensors, fields) in zip(export_folders, loaded_exports, strict=True):
-        parsed_policies.append(_parse_export(folder, tensors, fields))
+    for (arm, folder), (arrays, fields) in zip(export_folders, loaded_exports, strict=True):
+        parsed_policies.append(_parse_export(folder, arrays, fields))
         if arm != reference_arm:
             fields = fields | {"layout": reference_fields["layout"]}
         field_differences = list_differences(fields, reference_fields)
@@ -277,7 +279,7 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
             f"{'; '.join(field_differences)}; use the version that trained the run"
         )
 
-    # Leaves [S, ...], the seeds of one arm after those of the other.
+    # Leaves [A S, ...], arm by arm.
     params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(policies.params for policies in parsed_policies))
     return parsed_policies[reference_index]._replace(params=params, arms=arms)
 
@@ -291,38 +293,41 @@ def read_exported_policy(folder: Path) -> Policies:
     return _parse_export(folder, *load_params(folder))
 
 
-def _parse_export(folder: Path, tensors: dict[str, Any], fields: dict[str, Any]) -> Policies:
+def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) -> Policies:
     """Build policies from the contents of one export; see `read_exported_policy`."""
     try:
         # The specification decides which arrays there must be.
         method = find_method(fields["method"])
-        if method.learn is not None and "knowledge" not in tensors:
+        if method.learn is not None and "knowledge" not in arrays:
             raise InputError(f"what method {fields['method']!r} learns before training is missing; train the run anew")
         policy_spec = PolicySpec.from_json(fields, method, len(fields["categories"]))
-        check_arrays(folder, tensors, policy_spec)
+        check_arrays(folder, arrays, policy_spec)
 
-        # Arrays, on the device.
-        params = jax.tree.map(jnp.asarray, tensors["policy"])
+        # Network parameters, on the device.
+        params = jax.tree.map(jnp.asarray, arrays["policy"])
+
+        # Knowledge from before training; exports of baselines have no co-occurrence evidence.
         cooccurrence = None
-        if "signs" in tensors:
-            evidence_arrays = tensors["signs"]
+        if "signs" in arrays:
+            evidence_arrays = arrays["signs"]
             cooccurrence = CooccurrenceEvidence(
                 jnp.asarray(evidence_arrays["odds"]), jnp.asarray(evidence_arrays["chance"])
             )
         knowledge = Knowledge(
-            layout=jnp.asarray(tensors["layout"]["prior"]),
-            method=jax.tree.map(jnp.asarray, tensors.get("knowledge", {})),
+            layout=jnp.asarray(arrays["layout"]["prior"]),
+            method=jax.tree.map(jnp.asarray, arrays.get("knowledge", {})),
             cooccurrence=cooccurrence,
         )
         if knowledge.method:
             check_knowledge(params, policy_spec, knowledge)
 
+        # A single policy has no arms.
         estimator_fields = fields["layout"]
         return Policies(
             params=params,
             arms=(),
             knowledge=knowledge,
-            prior_counts=jnp.asarray(tensors["layout"]["counts"]),
+            prior_counts=jnp.asarray(arrays["layout"]["counts"]),
             spec=policy_spec,
             estimator_config=None if estimator_fields is None else EstimatorConfig(**estimator_fields),
             prior_steps=fields["prior_steps"],
@@ -336,12 +341,12 @@ def _parse_export(folder: Path, tensors: dict[str, Any], fields: dict[str, Any])
         ) from error
 
 
-def check_arrays(folder: Path, tensors: Mapping[str, Any], spec: PolicySpec) -> None:
+def check_arrays(folder: Path, arrays: Mapping[str, Any], spec: PolicySpec) -> None:
     """Refuse arrays of the wrong shape or dtype, or with numbers that are not finite.
 
     Args:
       folder: folder of the export, for messages.
-      tensors: arrays of the export, as `load_params` returns them.
+      arrays: arrays of the export, as `load_params` returns them.
       spec: specification of the policy.
 
     Raises:
@@ -349,9 +354,9 @@ def check_arrays(folder: Path, tensors: Mapping[str, Any], spec: PolicySpec) -> 
     """
     # Shapes and dtypes. Exports of baselines, and of older versions, have no group `signs`.
     expected_arrays = dict(_expected_arrays(spec))
-    if "signs" not in tensors:
+    if "signs" not in arrays:
         del expected_arrays["signs"]
-    present_arrays = {name: tensors.get(name, {}) for name in expected_arrays}
+    present_arrays = {name: arrays.get(name, {}) for name in expected_arrays}
     field_differences = list_differences(describe_arrays(present_arrays), describe_arrays(expected_arrays))
     if field_differences:
         raise InputError(
@@ -359,11 +364,11 @@ def check_arrays(folder: Path, tensors: Mapping[str, Any], spec: PolicySpec) -> 
             "train the run anew"
         )
 
-    # Values.
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tensors):
+    # Refuse NaN and infinities.
+    for path, leaf in jax.tree_util.tree_leaves_with_path(arrays):
         if not np.isfinite(leaf).all():
-            name = jax.tree_util.keystr(path, simple=True, separator="/")
-            raise InputError(f"{folder}: {name} holds numbers that are not finite; train the run anew")
+            array_name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise InputError(f"{folder}: {array_name} holds numbers that are not finite; train the run anew")
 
 
 @functools.lru_cache(maxsize=16)

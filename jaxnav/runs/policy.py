@@ -2,7 +2,7 @@
 
 `load_policy` reads an exported policy as a `LoadedPolicy`. Call `LoadedPolicy.init` at the start of an episode and
 `LoadedPolicy.act` at every step; `decide` and `apply_choice` are the two halves of `act`. `export_program` compiles the
-step with `jax.export`, for programs that run without this package, and `write_model_card` describes an export.
+step with `jax.export`, for programs that run without this package, and `format_model_card` describes an export.
 """
 
 import dataclasses
@@ -126,7 +126,7 @@ class LoadedPolicy(struct.PyTreeNode):
     ) -> tuple[jax.Array, EpisodeMemory]:
         """Choose an action for one observation.
 
-        Where the policy uses the layout, experience is removed by sTDE (eq. 2).
+        A policy that uses the layout removes experience by sTDE (eq. 2).
 
         Args:
           observation: observation of one episode.
@@ -144,9 +144,9 @@ class LoadedPolicy(struct.PyTreeNode):
           InputError: heading, moved or horizon is needed and missing.
         """
         # Best action, or one sampled from the logits.
-        decision = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
-        choice = jnp.argmax(decision.logits) if key is None else jax.random.categorical(key, decision.logits)
-        return self.apply_choice(decision, choice.astype(jnp.int32), memory.room)
+        output = self.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
+        choice = jnp.argmax(output.logits) if key is None else jax.random.categorical(key, output.logits)
+        return self.apply_choice(output, choice.astype(jnp.int32), memory.room)
 
     def decide(
         self,
@@ -237,14 +237,14 @@ def load_policy(
 
     Raises:
       InputError: the export is missing or damaged, its method cannot be found, the setting is impossible, or the policy
-        was trained with other categories or rules than those of `env`.
+        was trained with other categories or rules than `env` has.
     """
-    # The layout estimator may differ from that of the export.
+    # The layout estimator may replace the one in the export.
     policies = read_exported_policy(find_policy_folder(path)).with_estimator(setting, hold)
     estimator_config = policies.estimator_config
     if estimator_config is not None and form is not None:
         estimator_config = dataclasses.replace(estimator_config, form=form)
-    # Categories and rules must be those of training.
+    # Categories and rules must equal the trained ones.
     if env is not None:
         _check_task(path, policies.task, env.task)
     return LoadedPolicy(policies.params, policies.knowledge, policies.spec, estimator_config, policies.task)
@@ -303,7 +303,7 @@ def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Ar
     row_format = RowFormat(policy.spec.num_categories)
     observation = Observation(row_format.pack(inputs["detections"], inputs["view"]), inputs["goal"])
 
-    # The memory: new in the first step of an episode, else that of the previous step with the action that was taken.
+    # Memory of the first step of an episode, or memory of the previous step with its action.
     initial_memory = policy.begin(inputs["room"])
     previous_memory = _memory_from_names(inputs["memory"], initial_memory)
     policy_state = previous_memory.policy_state._replace(action=inputs["action"])
@@ -311,7 +311,7 @@ def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Ar
     memory = jax.tree.map(functools.partial(jnp.where, inputs["first"]), initial_memory, previous_memory)
 
     # Decide on the best action.
-    decision = policy.decide(
+    output = policy.decide(
         observation,
         memory,
         epsilon,
@@ -319,21 +319,21 @@ def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Ar
         moved=inputs["moved"] & ~inputs["first"],
         horizon=inputs["horizon"],
     )
-    choice = jnp.argmax(decision.logits).astype(jnp.int32)
-    action, memory = policy.apply_choice(decision, choice, memory.room)
+    choice = jnp.argmax(output.logits).astype(jnp.int32)
+    action, memory = policy.apply_choice(output, choice, memory.room)
 
     # Counterfactual outputs exist only with the layout.
     step_outputs = {
         "action": action,
-        "logits": decision.logits,
-        "factual": decision.factual,
+        "logits": output.logits,
+        "factual": output.factual,
         "memory": _memory_by_name(memory),
     }
-    if decision.counterfactual is not None:
+    if output.counterfactual is not None:
         step_outputs |= {
-            "counterfactual": decision.counterfactual,
-            "gap": decision.gap,
-            "weights": decision.weights,
+            "counterfactual": output.counterfactual,
+            "gap": output.gap,
+            "weights": output.weights,
         }
     return step_outputs
 
@@ -419,23 +419,25 @@ Success was measured in the scenes by which the run chose its policies; it is no
 """
 
 
-def write_model_card(run: Run, name: str, policy: LoadedPolicy, files: Mapping[str, str], use: Iterable[str]) -> str:
-    """Write the model card of a policy of a run.
+def format_model_card(
+    run: Run, policy_name: str, policy: LoadedPolicy, file_descriptions: Mapping[str, str], usage_lines: Iterable[str]
+) -> str:
+    """Format the model card of a policy of a run.
 
     Args:
       run: the run that trained the policy.
-      name: name of the policy in the run, such as `layout-0`.
+      policy_name: name of the policy in the run, such as `layout-0`.
       policy: the policy.
-      files: description of each file of the export, by name.
-      use: lines of Markdown on the use of the export.
+      file_descriptions: description of each file of the export, by name.
+      usage_lines: lines of Markdown that show how to use the export.
 
     Returns:
       The card, as Markdown.
     """
     config = run.config
-    arm, _, seed = name.rpartition("-")
+    arm, _, seed = policy_name.rpartition("-")
 
-    # Parts of the facts.
+    # Scenes, environment steps and size, in words.
     num_categories = len(config.task.categories)
     scene_text = f"scenes of `{config.scenes.name}`" if config.scenes else "generated scenes"
     step_texts = []
@@ -444,7 +446,7 @@ def write_model_card(run: Run, name: str, policy: LoadedPolicy, files: Mapping[s
             step_texts.append(f"{num_steps:,} of {purpose}")
     num_parameters = sum(leaf.size for leaf in jax.tree.leaves(policy.params))
 
-    # What the policy is, how it was trained, and what it looks for.
+    # Method, training and goals of the policy.
     card_facts = {
         "Method": f"`{config.method}`, decision `{config.decision}`, {_ARM_DESCRIPTIONS[arm]}",
         "Trained in": f"{scene_text}, rules of `{config.world}`, {num_categories} categories, training seed {seed}",
@@ -459,15 +461,15 @@ def write_model_card(run: Run, name: str, policy: LoadedPolicy, files: Mapping[s
     for fact_name, fact_text in card_facts.items():
         fact_lines.append(f"* **{fact_name}**: {fact_text}")
     file_lines = []
-    for file_name, file_description in files.items():
+    for file_name, file_description in file_descriptions.items():
         file_lines.append(f"* `{file_name}`: {file_description}")
 
     return _MODEL_CARD.format(
-        title=f"{name} of {config.run_dir.name}",
+        title=f"{policy_name} of {config.run_dir.name}",
         signature=MODEL_CARD_SIGNATURE,
         facts="\n".join(fact_lines),
         files="\n".join(file_lines),
-        usage="\n".join(use),
+        usage="\n".join(usage_lines),
     )
 
 
@@ -475,7 +477,7 @@ def _describe_success(success_by_budget: dict[str, Any] | None, arm: str) -> str
     """Success of an arm's policies within the longest budget."""
     if success_by_budget is None:
         return "not measured"
-    # The last budget is the longest step limit, so its success is that of whole episodes.
+    # The last budget is the longest step limit, so it has the success of whole episodes.
     success_curves = success_by_budget["val"][arm]
     best_success = 100.0 * success_curves["argmax"][-1]
     sampled_success = 100.0 * success_curves["sample"][-1]

@@ -1,9 +1,9 @@
-"""Checkpoints: the resumable state of a run, one atomic Orbax commit per step, of which the latest two are kept.
+"""Checkpoints: the resumable state of a run, with one atomic Orbax commit per step; the latest two steps are kept.
 
-`save_checkpoint` commits the arrays, a digest of each array and the manifest together, so that none of them exists
-without the others. A process killed at any moment leaves the earlier commits intact; the next save ignores and clears
-an unfinished one. `restore_checkpoint` returns the latest undamaged state. A list of the files of a commit, with their
-digests, is added after the commit, so that damage is found before Orbax reads any of these files.
+`save_checkpoint` commits the arrays, a digest of each array and the manifest together, so that a checkpoint always
+holds all three. A process killed at any moment leaves the earlier commits intact; the next save clears an unfinished
+commit. `restore_checkpoint` returns the latest undamaged state. A list of the files of a commit, with their digests, is
+added after the commit, so that damage is reported before Orbax reads any of these files.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ class RestoredState(NamedTuple, Generic[State]):
     """State from a checkpoint.
 
     Attributes:
-      state: as it was saved.
+      state: the saved state.
       step: step of the checkpoint.
       damaged: messages about later checkpoints that cannot be used.
     """
@@ -56,13 +56,13 @@ class RestoredState(NamedTuple, Generic[State]):
 
 
 class _DamageError(InputError):
-    """Error about a checkpoint whose content differs from what was saved."""
+    """Error about a checkpoint whose content differs from the saved content."""
 
 
 def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str, Any]) -> None:
     """Save the state of a run at a step.
 
-    State and manifest are committed when the function returns; all but the latest two steps are deleted.
+    State and manifest are committed when the function returns. Only the latest two steps are kept.
 
     Args:
       run_dir: folder of the run; checkpoints go to `run_dir/checkpoints/<step>`.
@@ -71,8 +71,8 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
       manifest: from `make_manifest`.
 
     Raises:
-      InputError: the run has this step or a later one already.
-      TypeError: a leaf is no array, or an empty one.
+      InputError: the run already has this step or a later step.
+      TypeError: a leaf is no array, or an empty array.
     """
     # Orbax commits the metadata together with the arrays.
     _check_leaves(state)
@@ -80,8 +80,8 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
         {"manifest": dict(manifest), "leaves": describe_arrays(state), "digests": array_digests(state)}
     )
 
-    # Steps only increase: an earlier one belongs to another run in this folder.
-    with _quiet_libraries(), _open_checkpointer(run_dir, cleanup_tmp_directories=True) as checkpointer:
+    # Steps only increase: a smaller step belongs to another run in this folder.
+    with _silence_libraries(), _open_checkpointer(run_dir, cleanup_tmp_directories=True) as checkpointer:
         latest_checkpoint = checkpointer.latest
         if latest_checkpoint is not None and latest_checkpoint.step >= step:
             raise InputError(
@@ -110,12 +110,14 @@ def restore_checkpoint(
     Raises:
       InputError: the checkpoint has another format version, config or state structure, or all are damaged.
     """
+    # A run without the folder has not saved yet.
     folder = _checkpoints_folder(run_dir)
     if not folder.is_dir():
         return None
+
+    # Try the checkpoints from the latest to the earliest, until one is undamaged.
     damage_messages: list[str] = []
-    with _quiet_libraries(), _open_checkpointer(run_dir) as checkpointer:
-        # From the latest to the earliest, until one is undamaged.
+    with _silence_libraries(), _open_checkpointer(run_dir) as checkpointer:
         for step in sorted((saved.step for saved in checkpointer.checkpoints), reverse=True):
             try:
                 state = _load_step(checkpointer, folder / str(step), step, abstract_state, expected_manifest)
@@ -124,6 +126,8 @@ def restore_checkpoint(
             else:
                 return RestoredState(state, step, tuple(damage_messages))
             gc.collect()  # asyncio logs the error of a task when it is collected
+
+    # Without any checkpoint the run starts anew; with damaged ones alone it must not.
     if damage_messages:
         raise InputError(
             f"{'; '.join(damage_messages)}: no checkpoint is left; restore one or choose another run directory"
@@ -152,18 +156,18 @@ def _load_step(
     """Load and verify the state of one step.
 
     Raises:
-      _DamageError: a file is broken, or its content differs from what was saved.
+      _DamageError: a file is broken, or its content differs from the saved content.
       InputError: another format version, config or state structure.
     """
     # Verify the files and the metadata before Orbax reads the arrays.
-    with _damage_reported(folder):
+    with _report_damage(folder):
         _check_files(folder)
         metadata = checkpointer.metadata(step).custom_metadata
         saved = verify_digest(folder, metadata if isinstance(metadata, dict) else {}, _REMEDY)
         if not {"manifest", "leaves"} <= saved.keys():
             raise ValueError("it holds no manifest")
 
-    # Orbax would cast another dtype silently, and names no leaf when a shape or the structure differs.
+    # Compare shapes and dtypes here: Orbax would cast another dtype silently, and its errors name no leaf.
     check_manifest(folder, saved["manifest"], expected_manifest)
     mismatches = list_differences(saved["leaves"], describe_arrays(abstract_state))
     if mismatches:
@@ -172,9 +176,9 @@ def _load_step(
             f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
         )
 
-    # Intact files are no proof: compare the arrays that Orbax made of them, too.
-    with _damage_reported(folder):
-        state = checkpointer.load(step, abstract_state=_with_shardings(abstract_state))
+    # Compare the loaded arrays, too, in case Orbax reads intact files wrongly.
+    with _report_damage(folder):
+        state = checkpointer.load(step, abstract_state=_add_shardings(abstract_state))
         if "digests" in saved:  # checkpoints of jaxnav 0.2.0 have none
             mismatches = list_differences(saved["digests"], array_digests(state))
             if mismatches:
@@ -190,12 +194,14 @@ def _check_files(folder: Path) -> None:
       InputError: the file list is damaged.
       ValueError: a file is missing or has another digest.
     """
-    if not (folder / FILE_LIST).exists():  # the process may have ended before it was written
+    # The process may have ended before the list was written.
+    if not (folder / FILE_LIST).exists():
         return
+
     # Files that the list does not name are harmless.
     saved_digests = read_json_with_digest(folder / FILE_LIST, _REMEDY)["files"]
     file_digests = _file_digests(folder)
-    damaged_files = [name for name, digest in saved_digests.items() if file_digests.get(name) != digest]
+    damaged_files = [file_name for file_name, digest in saved_digests.items() if file_digests.get(file_name) != digest]
     if damaged_files:
         raise ValueError(f"missing or other than saved: {', '.join(damaged_files)}")
 
@@ -235,30 +241,30 @@ def array_digests(state: Any) -> dict[str, str]:
 
 
 def _array_bytes(leaf: jax.Array) -> bytes:
-    array_data = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-    if array_data.is_fully_replicated:  # also over processes: no exchange
-        return np.asarray(array_data).tobytes()
-    if not array_data.is_fully_addressable:
+    """Return the bytes of a leaf, gathered from all processes where they hold different parts."""
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    array_data = jax.random.key_data(leaf) if is_key else leaf
+    if not array_data.is_fully_replicated and not array_data.is_fully_addressable:
         array_data = multihost_utils.process_allgather(array_data, tiled=True)
     return np.asarray(array_data).tobytes()
 
 
 def _check_leaves(state: Any) -> None:
-    """Refuse a state that could be saved, but not restored from an abstract one."""
+    """Refuse a state that could be saved, but not restored from an abstract state."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) or leaf.size == 0:
             leaf_path = jax.tree_util.keystr(path)
             raise TypeError(f"state{leaf_path} is {leaf!r}; every leaf must be a non-empty jax.Array")
 
 
-def _with_shardings(abstract_state: State) -> State:
-    """Return an abstract state with a sharding on every leaf, so that Orbax ignores the shardings on disk."""
+def _add_shardings(abstract_state: State) -> State:
+    """Add a sharding to every leaf of an abstract state, so that Orbax ignores the shardings on disk."""
     default_sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
-    def with_sharding(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    def add_sharding(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding or default_sharding)
 
-    return jax.tree.map(with_sharding, abstract_state)
+    return jax.tree.map(add_sharding, abstract_state)
 
 
 # Orbax
@@ -269,19 +275,19 @@ def _checkpoints_folder(run_dir: Path) -> Path:
 
 
 def _open_checkpointer(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.Checkpointer:
-    latest_only = ocp.training.preservation_policies.LatestN(_NUM_KEPT_CHECKPOINTS)
+    keep_latest = ocp.training.preservation_policies.LatestN(_NUM_KEPT_CHECKPOINTS)
     return ocp.training.Checkpointer(
         str(_checkpoints_folder(run_dir)),
-        preservation_policy=latest_only,  # pyright: ignore[reportArgumentType]  (Orbax's own policy, typed too narrowly)
+        preservation_policy=keep_latest,  # pyright: ignore[reportArgumentType]  (Orbax's own policy, typed too narrowly)
         cleanup_tmp_directories=cleanup_tmp_directories,
     )
 
 
 @contextlib.contextmanager
-def _quiet_libraries() -> Iterator[None]:
+def _silence_libraries() -> Iterator[None]:
     """Keep Orbax from logging pages about errors that are reported in one line."""
     # A level above the highest silences a logger.
-    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    loggers = [logging.getLogger(logger_name) for logger_name in ("absl", "asyncio")]
     saved_levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
@@ -293,12 +299,12 @@ def _quiet_libraries() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _damage_reported(folder: Path) -> Iterator[None]:
-    """Turn the errors of Orbax and TensorStore over missing or broken files into a `_DamageError`."""
+def _report_damage(folder: Path) -> Iterator[None]:
+    """Turn the errors of Orbax and TensorStore about missing or broken files into a `_DamageError`."""
     try:
         yield
     except (ValueError, KeyError, OSError) as error:
-        # Orbax wraps every error while it loads in a KeyError: only errors of files are damage.
+        # Orbax wraps every error of loading in a KeyError, so the root error decides if a file is damaged.
         root_error: BaseException = error
         while root_error.__cause__ is not None:
             root_error = root_error.__cause__

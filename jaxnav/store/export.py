@@ -18,37 +18,38 @@ from jaxnav.store.files import verify_digest, write_atomic, write_json_with_dige
 #: Version of the format of the two files.
 POLICY_FORMAT_VERSION = 3
 
+#: File with all arrays of the policy: network parameters, layout priors and method knowledge.
+PARAMS_FILE = "params.safetensors"
 #: File that describes the policy; it is written last.
 POLICY_FILE = "policy.json"
-
-_PARAMS_FILE = "params.safetensors"
 
 
 class _OtherVersionError(InputError):
     """Error about an export of another format version."""
 
 
-def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
-    """Write parameters and the specification of their policy.
+def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, Any]) -> None:
+    """Write the arrays of a policy and the fields that describe it.
 
-    `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, `spec`, the SHA-256 of the
-    parameters and a digest of its own. Because `policy.json` is written last, `load_params` refuses an export that was
-    cut short. An identical export stays, a damaged one is replaced, and a different one is refused.
+    `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, the fields as `spec`, the
+    SHA-256 of the arrays and a digest of its own. Because `policy.json` is written last, `load_params` refuses an
+    export that was cut short. An identical export stays, a damaged one is replaced, and a different one is refused.
 
     Args:
       folder: created if missing.
-      params: nested dict of arrays; names are strings without `/`.
-      spec: JSON values.
+      arrays: nested dict of arrays; names are strings without `/`.
+      fields: JSON values by name, such as the specification of the network.
 
     Raises:
       InputError: the folder holds another export, or one of another format version.
-      TypeError: a name in `params` is no string or contains `/`.
+      TypeError: a name in `arrays` is no string or contains `/`.
     """
-    tensor_bytes = safetensors.numpy.save(_flatten(params))
+    # The description has the digest of the arrays, so that both files are known to belong together.
+    array_bytes = safetensors.numpy.save(_flatten(arrays))
     policy = {
         "format_version": POLICY_FORMAT_VERSION,
-        "params_sha256": hashlib.sha256(tensor_bytes).hexdigest(),
-        "spec": spec,
+        "params_sha256": hashlib.sha256(array_bytes).hexdigest(),
+        "spec": fields,
     }
 
     # An intact export is never overwritten.
@@ -57,7 +58,7 @@ def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, An
     except _OtherVersionError:
         raise
     except InputError:  # no export there, or a damaged one
-        write_atomic(folder / _PARAMS_FILE, tensor_bytes)
+        write_atomic(folder / PARAMS_FILE, array_bytes)
         write_json_with_digest(folder / POLICY_FILE, policy)
         return
 
@@ -67,28 +68,28 @@ def export_params(folder: Path, params: Mapping[str, Any], spec: Mapping[str, An
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Load the parameters, a nested dict of NumPy arrays, and the specification of an export.
+    """Load the arrays of an export, a nested dict of NumPy arrays, and its fields.
 
     Raises:
       InputError: no export there, another format version, or files that are damaged or do not belong together.
     """
     policy = _read_policy(folder)
     try:
-        params = _unflatten(safetensors.numpy.load_file(folder / _PARAMS_FILE))
+        arrays = _unflatten(safetensors.numpy.load_file(folder / PARAMS_FILE))
     except Exception as error:  # safetensors and NumPy raise errors of many types
-        raise InputError(f"{folder / _PARAMS_FILE}: holds no arrays ({error}); export the policy again") from error
-    return params, policy["spec"]
+        raise InputError(f"{folder / PARAMS_FILE}: holds no arrays ({error}); export the policy again") from error
+    return arrays, policy["spec"]
 
 
 def _read_policy(folder: Path) -> dict[str, Any]:
-    """Read `policy.json` and verify that the parameters belong to it.
+    """Read `policy.json` and verify that the arrays belong to it.
 
     Raises:
       InputError: as `load_params`.
     """
-    # Read the description and the digest of the parameters.
+    # Read the description, and compute the digest of the arrays.
     policy_path = folder / POLICY_FILE
-    params_path = folder / _PARAMS_FILE
+    params_path = folder / PARAMS_FILE
     try:
         policy = json.loads(policy_path.read_bytes())
         with params_path.open("rb") as params_file:
@@ -116,27 +117,27 @@ def _read_policy(folder: Path) -> dict[str, Any]:
     return policy
 
 
-def _flatten(params: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
-    """Return nested parameters by flat names, `a/b/kernel`."""
-    flat_params = {}
-    for name, value in params.items():
+def _flatten(arrays: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+    """Return nested arrays by flat names, `a/b/kernel`."""
+    flat_arrays = {}
+    for name, value in arrays.items():
         if not isinstance(name, str) or "/" in name:
             raise TypeError(f"parameter name {name!r} under {prefix!r} must be a string without '/'")
         if isinstance(value, Mapping):
-            flat_params |= _flatten(value, f"{prefix}{name}/")
+            flat_arrays |= _flatten(value, f"{prefix}{name}/")
         else:
-            flat_params[f"{prefix}{name}"] = np.asarray(value, order="C")
-    return flat_params
+            flat_arrays[f"{prefix}{name}"] = np.asarray(value, order="C")
+    return flat_arrays
 
 
-def _unflatten(flat_params: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return flat parameters as nested dicts."""
-    params: dict[str, Any] = {}
-    for flat_name, value in flat_params.items():
+def _unflatten(flat_arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return arrays with flat names as nested dicts."""
+    arrays: dict[str, Any] = {}
+    for flat_name, array in flat_arrays.items():
         # Create the missing dicts on the way to the leaf.
         *parent_names, leaf_name = flat_name.split("/")
-        parent_node = params
+        parent_node = arrays
         for parent_name in parent_names:
             parent_node = parent_node.setdefault(parent_name, {})
-        parent_node[leaf_name] = value
-    return params
+        parent_node[leaf_name] = array
+    return arrays

@@ -2,11 +2,11 @@
 
 `write_atomic` replaces a file in one step. `write_json_with_digest` and `read_json_with_digest` store a JSON object
 together with a digest of its content, so that corruption is reported when the file is read. `append_log_rows` and
-`read_log_rows` do the same for every line of a run's `metrics.jsonl`. `FolderLock` allows only one writer per folder,
+`read_log_rows` store a digest in every line of a run's `metrics.jsonl`. `FolderLock` allows only one writer per folder,
 and `make_manifest` and `check_manifest` refuse a checkpoint that was saved under another configuration.
 
-Log rows reach the disk before the checkpoint that covers them is saved. A checkpoint therefore never knows more than
-the log; on resume the rows after the restored step are dropped and written again.
+Log rows reach the disk before the checkpoint of their step is saved, so the log always has all rows up to a
+checkpoint. On resume, the rows after the restored step are dropped and written again.
 """
 
 import hashlib
@@ -36,14 +36,14 @@ def write_atomic(path: Path, data: bytes) -> None:
     Raises:
       OSError: the file cannot be written; `path` is unchanged.
     """
+    # The temporary file is in the same folder, because a rename is atomic only within one file system.
     path.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder, since a rename is atomic only within one file system.
     temporary_path = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary_path.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())  # the content is on the disk before the name points to it
+        with temporary_path.open("wb") as temporary_file:
+            temporary_file.write(data)
+            temporary_file.flush()
+            os.fsync(temporary_file.fileno())  # the content is on the disk before the name points to it
         os.replace(temporary_path, path)
     finally:
         temporary_path.unlink(missing_ok=True)
@@ -51,7 +51,7 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 # JSON records with a digest
 
-#: Key of the digest in a record. It guards against damage, not against forgery.
+#: Key of the digest in a record. The digest guards against damage, not against forgery.
 DIGEST_KEY = "digest"
 
 
@@ -68,7 +68,7 @@ def verify_digest(source: object, record: Mapping[str, Any], remedy: str) -> dic
 
     Args:
       source: name of the record, for the message.
-      record: as read from a file.
+      record: content of a file.
       remedy: advice for the message, in case the record is damaged.
 
     Raises:
@@ -128,7 +128,7 @@ LOCK_FILE = ".lock"
 class FolderLock:
     """Exclusive lock on a folder, so that no other process writes to it.
 
-    The operating system releases the lock when the process ends, however it ends: a lock file left behind locks
+    The operating system releases the lock when the process ends, even if it is killed, so a leftover lock file locks
     nothing. On file systems without locks, nothing is locked.
     """
 
@@ -144,26 +144,28 @@ class FolderLock:
           InputError: another process, or another lock of this process, holds the folder.
           OSError: the folder is missing or cannot be written.
         """
+        # Lock the file without waiting.
         descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             if fcntl is not None:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            holder = os.read(descriptor, 200).decode(errors="replace") or "another process"
+            holder_name = os.read(descriptor, 200).decode(errors="replace") or "another process"
             os.close(descriptor)
             raise InputError(
-                f"{self._path.parent}: {holder} writes to it; wait for that, end it, or choose another run directory"
+                f"{self._path.parent}: {holder_name} writes to it; wait for that, end it, or choose another run "
+                "directory"
             ) from error
         except OSError:  # a file system without locks
             pass
 
-        # The holder signs the file, for the message of those who come too late.
+        # The holder writes its name to the file, for the error message of later processes.
         self._descriptor = descriptor
         os.truncate(descriptor, 0)
         os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
 
     def check(self) -> None:
-        """Check that the locked folder is still the one on disk.
+        """Check that the locked folder has not been removed or replaced on disk.
 
         Raises:
           InputError: the folder or its lock file was removed or replaced.
@@ -197,10 +199,10 @@ def append_log_rows(path: Path, rows: Sequence[LogRow]) -> None:
 
     A row has an int `step`. NaN and infinities are written as null, since JSON cannot express them.
     """
-    with path.open("ab") as file:
-        file.write(_encode_rows(rows))
-        file.flush()
-        os.fsync(file.fileno())
+    with path.open("ab") as log_file:
+        log_file.write(_encode_rows(rows))
+        log_file.flush()
+        os.fsync(log_file.fileno())
 
 
 def read_log_rows(path: Path) -> list[dict[str, Any]]:
@@ -214,7 +216,7 @@ def read_log_rows(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
 
-    # A crash can cut short the last line only, so that it may be broken.
+    # A crash can cut short only the last line, so only the last line may be broken.
     log_lines = path.read_bytes().splitlines()
     rows: list[dict[str, Any]] = []
     has_digest: list[bool] = []
@@ -227,7 +229,7 @@ def read_log_rows(path: Path) -> list[dict[str, Any]]:
         elif line_number < len(log_lines):
             raise InputError(f"{source}: not a JSON object with a whole number `step`; remove the line")
 
-    # All rows have a digest, or none has: a single row without one was damaged or added by hand.
+    # Either all rows or no rows have a digest: a single row without a digest was damaged or added by hand.
     if any(has_digest) and not all(has_digest):
         line_number = has_digest.index(False) + 1
         raise InputError(
@@ -274,7 +276,7 @@ def _parse_row(line: bytes) -> dict[str, Any] | None:
 
 # The manifest of a checkpoint
 
-#: Raised whenever the stored state changes in a way that older code cannot read.
+#: Increased whenever the stored state changes in a way that older code cannot read.
 CHECKPOINT_FORMAT_VERSION = 2
 
 _PACKAGES = ("jaxnav", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -327,7 +329,7 @@ def list_differences(first: Mapping[str, Any], second: Mapping[str, Any], prefix
     Returns:
       A line `"train.lr: 0.1 != 0.2"` for each dotted key, with `(absent)` for a missing value.
     """
-    # Keys of both, of which either may lack some.
+    # Keys of either mapping; a missing value differs from every value.
     difference_lines = []
     for key in sorted(first.keys() | second.keys()):
         first_value = first.get(key, _ABSENT)

@@ -33,7 +33,7 @@ class TensorBoardSink:
     def __init__(self, run_dir: Path, series: str, project: str, settings: Mapping[str, Any]) -> None:
         events_folder = run_dir / "tensorboard" / series
         writer_class = _import_library("tensorboardX", "tensorboard").SummaryWriter
-        # TensorBoard would draw a second curve over that of an earlier call.
+        # Remove the events of an earlier call, which TensorBoard would draw as a second curve.
         for old_events in events_folder.glob("events.out.tfevents.*"):
             old_events.unlink()
         self._writer = writer_class(logdir=str(events_folder))

@@ -87,6 +87,20 @@ class PlayedEpisode(NamedTuple):
 # Playing an episode
 
 
+class ShiftedEpisodes(NamedTuple):
+    """Episodes of an evaluation in scenes with one layout shift.
+
+    Attributes:
+      world: compiled scenes.
+      episodes: E episodes with the lengths of shortest paths in these scenes.
+      shift: layout shift of the scenes, from 0 to 1.
+    """
+
+    world: CompiledWorld
+    episodes: EpisodeList
+    shift: float
+
+
 def play_episode(
     source: str | Path,
     split: str = "val",
@@ -101,7 +115,7 @@ def play_episode(
     """Play one episode of an evaluation at every layout shift.
 
     Room, goal and start are equal at every shift. The first seed acts, with the best action at every step. With several
-    shifts all episodes of the list are played, and the console reports how many goals are found at each shift.
+    shifts all episodes of the list are played, and the console reports the number of successes at each shift.
 
     Args:
       source: directory of a finished run, folder of an exported policy, or name of a policy of the package.
@@ -119,49 +133,41 @@ def play_episode(
         impossible epsilon.
     """
     console = console or Console(quiet=True)
+
     # The arm without layout weights acts in the variant `baseline`.
-    config, policies = _load_source(source, "baseline" if variant == "baseline" else "layout")
+    config, policies = _load_source(source, arm="baseline" if variant == "baseline" else "layout")
     policies = policies.with_estimator(estimator)
 
-    # The episodes are drawn at the first shift; at the others only the shortest paths differ.
-    worlds = []
-    for shift in shifts:
-        worlds.append(compile_evaluation_world(config, split, scenes, shift, console))
-    episodes = draw_episodes(worlds[0].banks[0])
-    if not 0 <= index < len(episodes.goal):
-        raise InputError(f"--index {index}: give a number from 0 to {len(episodes.goal) - 1}")
-    episode_lists = [_with_shortest_paths(episodes, world) for world in worlds]
-    best_lengths = np.stack([episode_list.best_length for episode_list in episode_lists])  # [shifts, E]
-    is_reachable = best_lengths.min(axis=0) > 0
-    if not is_reachable[index]:
-        raise InputError(f"--index {index}: at some --shift the goal cannot be reached; give another")
-
-    # Play the episode alone or, to compare shifts, all episodes.
+    # Play the episode alone or, to compare shifts, all episodes whose goal can be reached at every shift.
+    episodes_by_shift = _draw_shifted_episodes(config, split, scenes, shifts, console)
+    is_reachable = _check_index(index, episodes_by_shift)
     played_indices = np.flatnonzero(is_reachable) if len(shifts) > 1 else np.array([index])
+
+    # Replay the episodes with best actions.
     gap_form = None if policies.estimator_config is None else policies.estimator_config.form
     evaluation_row = table_row(variant, epsilon if variant == "stde" else None, gap_form, "argmax")
     traces_by_shift = []
-    for world, episode_list in zip(worlds, episode_lists, strict=True):
-        traces_by_shift.append(replay_episodes(policies, world, episode_list.take(played_indices), evaluation_row))
-    applied_shifts = [evaluation_shift(config, scenes, shift) for shift in shifts]
+    for shifted in episodes_by_shift:
+        played_episodes = shifted.episodes.take(played_indices)
+        traces_by_shift.append(replay_episodes(policies, shifted.world, played_episodes, evaluation_row))
     if len(shifts) > 1:
-        success_by_shift = []
-        for traces in traces_by_shift:
-            success_by_shift.append([trace.success for trace in traces])
-        _report_success(np.array(success_by_shift), applied_shifts, console)
+        _report_success(traces_by_shift, [shifted.shift for shifted in episodes_by_shift], console)
 
-    # Of these, return the episode that was asked for.
-    played_position = int(np.searchsorted(played_indices, index))
-    name_suffixes = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
-    agent_name = f"{policies.spec.method.name.upper()}{name_suffixes[variant]}"
-    threshold = np.inf if evaluation_row.epsilon is None else epsilon
-    played_episodes = []
-    for traces, world, episode_list, shift in zip(traces_by_shift, worlds, episode_lists, applied_shifts, strict=True):
-        trace = traces[played_position]
-        played_episodes.append(
-            _make_played_episode(trace, world, episode_list, index, threshold, agent_name, shift, policies)
+    # Return the requested episode at every shift.
+    trace_index = int(np.searchsorted(played_indices, index))
+    agent_name = _describe_agent(policies, variant, epsilon)
+    requested_episodes = []
+    for traces, shifted in zip(traces_by_shift, episodes_by_shift, strict=True):
+        requested_episode = _make_played_episode(
+            trace=traces[trace_index],
+            shifted=shifted,
+            index=index,
+            epsilon=np.inf if evaluation_row.epsilon is None else epsilon,
+            agent_name=agent_name,
+            policies=policies,
         )
-    return played_episodes
+        requested_episodes.append(requested_episode)
+    return requested_episodes
 
 
 def _load_source(source: str | Path, arm: str) -> tuple[RunConfig, Policies]:
@@ -175,34 +181,81 @@ def _load_source(source: str | Path, arm: str) -> tuple[RunConfig, Policies]:
     return config, policies
 
 
-def _with_shortest_paths(episodes: EpisodeList, world: CompiledWorld) -> EpisodeList:
-    """Return the episodes with the lengths L* of a world in which objects may lie elsewhere."""
-    return episodes._replace(best_length=world.banks[0].best_length[episodes.pose, episodes.goal])
+def _draw_shifted_episodes(
+    config: RunConfig, split: str, scenes: Path | None, shifts: Sequence[float | None], console: Console
+) -> list[ShiftedEpisodes]:
+    """Compile the scenes at every shift, and draw the episodes of the first shift for all of them."""
+    worlds = []
+    for shift in shifts:
+        worlds.append(compile_evaluation_world(config, split, scenes, shift, console))
+    episodes = draw_episodes(worlds[0].banks[0])
+
+    # Objects lie at other places at other shifts, so the shortest paths differ.
+    episodes_by_shift = []
+    for world, shift in zip(worlds, shifts, strict=True):
+        best_length = world.banks[0].best_length[episodes.pose, episodes.goal]
+        applied_shift = evaluation_shift(config, scenes, shift)
+        episodes_by_shift.append(ShiftedEpisodes(world, episodes._replace(best_length=best_length), applied_shift))
+    return episodes_by_shift
 
 
-def _report_success(success: np.ndarray, shifts: Sequence[float], console: Console) -> None:
-    """Print how many of the episodes, bool [shifts, E], succeed at each shift, and at this shift alone."""
+def _check_index(index: int, episodes_by_shift: Sequence[ShiftedEpisodes]) -> np.ndarray:
+    """Check that an episode exists, and that its goal can be reached at every shift.
+
+    Returns:
+      bool [E], True for episodes whose goal can be reached at every shift.
+
+    Raises:
+      InputError: no such episode, or an unreachable goal.
+    """
+    num_episodes = len(episodes_by_shift[0].episodes.goal)
+    if not 0 <= index < num_episodes:
+        raise InputError(f"--index {index}: give a number from 0 to {num_episodes - 1}")
+
+    best_lengths = np.stack([shifted.episodes.best_length for shifted in episodes_by_shift])  # [shifts, E]
+    is_reachable = best_lengths.min(axis=0) > 0
+    if not is_reachable[index]:
+        raise InputError(f"--index {index}: at some --shift the goal cannot be reached; give another")
+    return is_reachable
+
+
+def _report_success(
+    traces_by_shift: Sequence[Sequence[EpisodeTrace]], shifts: Sequence[float], console: Console
+) -> None:
+    """Print the number of successful episodes at each shift, and the number that succeeds at no other shift."""
+    # Success of each episode, bool [shifts, E].
+    success_by_shift = []
+    for traces in traces_by_shift:
+        success_by_shift.append([trace.success for trace in traces])
+    success = np.array(success_by_shift)
+
     for i, shift in enumerate(shifts):
         success_elsewhere = np.delete(success, i, axis=0).any(axis=0)
         only_here = success[i] & ~success_elsewhere
         console.print(f"shift {shift:g}: {success[i].sum()} of {success.shape[1]} found, {only_here.sum()} only there")
 
 
+def _describe_agent(policies: Policies, variant: PlayedVariant, epsilon: float) -> str:
+    """Return method and variant of the agent, for a title."""
+    name_suffixes = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
+    return f"{policies.spec.method.name.upper()}{name_suffixes[variant]}"
+
+
 def _make_played_episode(
+    *,
     trace: EpisodeTrace,
-    world: CompiledWorld,
-    episodes: EpisodeList,
+    shifted: ShiftedEpisodes,
     index: int,
     epsilon: float,
     agent_name: str,
-    shift: float,
     policies: Policies,
 ) -> PlayedEpisode:
     """Combine a trace with the scene and the tables of its episode."""
-    # The cell of each pose, counted from the first one of the scene, [T].
-    bank = world.banks[0]
+    # The cell of each pose, counted from the first cell of the scene, [T].
+    bank = shifted.world.banks[0]
+    episodes = shifted.episodes
     scene_index = episodes.scene[index]
-    scene = find_scene(world, bank.names[scene_index])
+    scene = find_scene(shifted.world, bank.names[scene_index])
     visited_cells = trace.pose // bank.task.rules.poses_per_cell - bank.first_cell[scene_index]
     return PlayedEpisode(
         trace=trace,
@@ -215,7 +268,7 @@ def _make_played_episode(
         epsilon=epsilon,
         title=f"{agent_name}  ·  {scene.name}",
         policies=policies,
-        shift=shift,
+        shift=shifted.shift,
     )
 
 
@@ -225,9 +278,9 @@ def _make_played_episode(
 def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
     """Write the picture of an episode, with a panel for each layout shift.
 
-    All panels show one step at a time; a panel whose episode has ended keeps its end. Hollow stars mark where the goal
-    is in the first panel. A path that ends in .gif gets a frame per step, evenly spaced ones of an episode with more
-    than 60 steps; another path gets the last frame.
+    All panels show one step at a time; a panel whose episode has ended keeps its last step. Hollow stars mark the goals
+    of the first panel in the other panels. A path that ends in .gif gets a frame per step, or evenly spaced frames of
+    an episode with more than 60 steps; another path gets the last frame.
 
     Args:
       episodes: at least one; equal room, goal and start at several layout shifts.
@@ -249,7 +302,7 @@ def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
     for number, episode in enumerate(episodes):
         panels.append(EpisodePanel(figure, width * number, width, episode, gap_steps=max(2, max_steps)))
     for panel in panels[1:]:
-        panel.mark_goal_of(first_episode)
+        panel.mark_goal(first_episode)
 
     # One frame for each step, or the last one alone.
     last_step = max_steps - 1
@@ -323,11 +376,12 @@ class EpisodePanel:
         self._status = figure.text(panel_left + 0.98 * panel_width, 0.9, "", fontsize=10.5, ha="right")
         draw_plan(self._plan_axes, episode.scene, episode.task.categories, episode.goal)
 
-    def mark_goal_of(self, other: PlayedEpisode) -> None:
-        """Mark where the goal is in the scene of another episode."""
-        # A hollow star for each object of the goal's category there.
-        object_categories = np.array(category_ids(other.scene.types, other.task.categories))
-        places = other.scene.boxes[object_categories == other.goal][:, [0, 2]]
+    def mark_goal(self, other_episode: PlayedEpisode) -> None:
+        """Mark the places of the goal in the scene of another episode by hollow stars."""
+        # A star for each object of the goal's category.
+        scene = other_episode.scene
+        object_categories = np.array(category_ids(scene.types, other_episode.task.categories))
+        places = scene.boxes[object_categories == other_episode.goal][:, [0, 2]]
         self._plan_axes.plot(*places.T, "*", color="none", markeredgecolor=GOAL_COLOR, markersize=13, zorder=5)
 
     def draw_step(self, step: int) -> None:
@@ -368,27 +422,28 @@ def _draw_agent_and_path(axes: Axes, episode: PlayedEpisode, step: int) -> list[
     start_style = {"color": "white", "markeredgecolor": AGENT_COLOR, "markersize": 6, "zorder": 4}
     start_ring = axes.plot(*episode.places[0], "o", **start_style)
 
-    # Rings stand where the detector reports objects, not where they are.
-    detections = _detections_at(episode, step)
-    detected = np.flatnonzero(detections[:, 0])
-    reported_points = detected_positions(detections[detected], place, rules.heading_directions()[heading])
-    colors = [_color_of(int(category), episode) for category in detected]
+    # Rings mark the positions that the detector reports, which may differ from the objects' positions.
+    detections = _read_detections(episode, step)
+    detected_categories = np.flatnonzero(detections[:, 0])
+    forward = rules.heading_directions()[heading]
+    reported_points = detected_positions(detections[detected_categories], place, forward)
+    colors = [_category_color(int(category), episode) for category in detected_categories]
     rings = axes.scatter(*reported_points.T, s=110, facecolor="none", edgecolor=colors, lw=1.6, zorder=6)
     return [*agent, *path, *start_ring, rings]
 
 
 def _draw_detections(axes: Axes, episode: PlayedEpisode, step: int) -> None:
     """Draw bars of confidence, the greatest on top."""
-    # The categories with the highest confidence, of those that are detected.
+    # The detected categories with the highest confidence.
     axes.clear()
-    confidence = _detections_at(episode, step)[:, 0] / 255.0
+    confidence = _read_detections(episode, step)[:, 0] / 255.0
     by_confidence = np.argsort(-confidence)[:_MAX_DETECTIONS]
     most_confident = by_confidence[confidence[by_confidence] > 0]
     bar_labels = []
     bar_colors = []
     for category in most_confident:
         bar_labels.append(episode.task.categories[category])
-        bar_colors.append(_color_of(int(category), episode))
+        bar_colors.append(_category_color(int(category), episode))
 
     # The axis has room for as many bars at every step.
     axes.barh(range(len(most_confident)), confidence[most_confident], 0.6, color=bar_colors)
@@ -398,11 +453,11 @@ def _draw_detections(axes: Axes, episode: PlayedEpisode, step: int) -> None:
     style_axes(axes, label_size=8.5)
 
 
-def _detections_at(episode: PlayedEpisode, step: int) -> np.ndarray:
+def _read_detections(episode: PlayedEpisode, step: int) -> np.ndarray:
     return RowFormat(len(episode.task.categories)).detections(episode.rows[step])
 
 
-def _color_of(category: int, episode: PlayedEpisode) -> str:
+def _category_color(category: int, episode: PlayedEpisode) -> str:
     return GOAL_COLOR if category == episode.goal else SEEN_COLOR
 
 

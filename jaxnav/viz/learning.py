@@ -19,7 +19,9 @@ _SAMPLED_STYLE: dict[str, Any] = _LINE | {"ls": "--", "marker": "s"}
 _TRAINING_STYLE: dict[str, Any] = _LINE | {"ls": ":"}
 
 
-def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] | None, title: str) -> Figure:
+def learning_figure(
+    rows: Sequence[Mapping[str, Any]], success_by_budget: Mapping[str, Any] | None, title: str
+) -> Figure:
     """Draw success during training, and within numbers of actions.
 
     The left panel shows the mean over seeds against environment steps: of training episodes, and of val episodes with
@@ -28,11 +30,11 @@ def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] 
 
     Args:
       rows: the training log.
-      reach: success within budgets, see `Validator.reach`; None for no right panel.
+      success_by_budget: success within each budget, see `Run.success_by_budget`; None for no right panel.
       title: title of the figure.
     """
     # The right panel has the budgets, if they were measured.
-    figure, panels = make_panels(1, 1 if reach is None else 2, height=3.2, sharey=True)
+    figure, panels = make_panels(1, 1 if success_by_budget is None else 2, height=3.2, sharey=True)
     logged_arms = {row["arm"] for row in rows}
     arms = [arm for arm in _ARM_COLORS if arm in logged_arms]
 
@@ -47,28 +49,30 @@ def learning_figure(rows: Sequence[Mapping[str, Any]], reach: Mapping[str, Any] 
     set_panel_title(log_axes, title, "while training")
 
     # Curves of the exported policies.
-    if reach is not None:
-        reach_axes = panels[0, 1]
-        budgets = reach["budgets"]
+    if success_by_budget is not None:
+        budget_axes = panels[0, 1]
+        budgets = success_by_budget["budgets"]
         for arm in arms:
             color = _ARM_COLORS[arm]
-            reach_axes.plot(budgets, _percent(reach["val"][arm]["argmax"]), color=color, **_BEST_STYLE)
-            reach_axes.plot(budgets, _percent(reach["val"][arm]["sample"]), color=color, **_SAMPLED_STYLE)
-            reach_axes.plot(budgets, _percent(reach["train"][arm]["argmax"]), color=color, **_TRAINING_STYLE)
-        reach_axes.set(xlabel="Actions")
-        set_panel_title(reach_axes, "exported policies", "success within a number of actions")
+            val_success = success_by_budget["val"][arm]
+            training_success = success_by_budget["train"][arm]
+            budget_axes.plot(budgets, _percent(val_success["argmax"]), color=color, **_BEST_STYLE)
+            budget_axes.plot(budgets, _percent(val_success["sample"]), color=color, **_SAMPLED_STYLE)
+            budget_axes.plot(budgets, _percent(training_success["argmax"]), color=color, **_TRAINING_STYLE)
+        budget_axes.set(xlabel="Actions")
+        set_panel_title(budget_axes, "exported policies", "success within a number of actions")
 
     _add_legend(figure, arms)
     return freeze_axes_positions(figure)
 
 
-def _mean_curve(rows: Sequence[Mapping[str, Any]], arm: str, name: str) -> tuple[list[float], list[float]]:
+def _mean_curve(rows: Sequence[Mapping[str, Any]], arm: str, metric_name: str) -> tuple[list[float], list[float]]:
     """Return millions of steps, and the mean over seeds in percent."""
     # The log has a row for each seed and step; a metric may be missing in some.
     values_by_step: dict[int, list[float]] = {}
     for row in rows:
-        if row["arm"] == arm and row.get(name) is not None:
-            values_by_step.setdefault(row["env_steps"], []).append(row[name])
+        if row["arm"] == arm and row.get(metric_name) is not None:
+            values_by_step.setdefault(row["env_steps"], []).append(row[metric_name])
 
     # One point for each step, in the order of the log.
     million_steps = []

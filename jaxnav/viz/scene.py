@@ -88,7 +88,7 @@ def draw_scene(scene: Scene, task: Task, path: Path, pose: tuple[float, float, f
 
     Args:
       scene: scene to draw.
-      task: categories and rules; the view is that of a detector without errors.
+      task: categories and rules; the view has the detections of a detector without errors.
       path: file to write.
       pose: x and z in metres and heading in degrees of the level camera; None for the pose that detects most
         categories.
@@ -128,8 +128,8 @@ def scene_figure(scene: Scene, task: Task, view: PoseView) -> Figure:
     _draw_scale(axes)
 
     # The name above the plan, and the texts of the panel; places are in inches from the upper left corner.
-    def write(x: float, down: float, text: str, size: float, **style) -> None:
-        position = (x / width, 1 - down / height)
+    def write(x: float, y: float, text: str, size: float, **style) -> None:
+        position = (x / width, 1 - y / height)
         figure.text(*position, text, fontsize=size, color=TEXT_COLOR, va="top", parse_math=False, **style)
 
     panel_left = width - _PANEL_WIDTH
@@ -166,7 +166,7 @@ def _draw_cells(axes: Axes, scene: Scene) -> list[Artist]:
     if is_unreachable.any():
         crosses = cell_centres(scene, np.argwhere(is_unreachable)).T
         artist_style = {"s": 12, "color": GOAL_COLOR, "marker": "x", "lw": 0.9, "zorder": 3}
-        cell_marks.append(axes.scatter(*crosses, label="cut off from those", **artist_style))
+        cell_marks.append(axes.scatter(*crosses, label="unreachable cell", **artist_style))
     return cell_marks
 
 
@@ -187,11 +187,12 @@ def _draw_view(axes: Axes, scene: Scene, rules: Rules, view: PoseView) -> list[A
 
 def _draw_scale(axes: Axes) -> None:
     """Draw a bar of one metre below the plan."""
+    # x is in metres, y a share of the height of the axes.
     bar_start = axes.get_xlim()[0]
-    down = -0.15 * axes.figure.dpi / axes.bbox.height
+    bar_y = -0.15 * axes.figure.dpi / axes.bbox.height
     artist_style = {"transform": axes.get_xaxis_transform(), "clip_on": False, "color": TEXT_COLOR}
-    axes.plot([bar_start, bar_start + 1.0], [down, down], lw=2, solid_capstyle="butt", **artist_style)
-    axes.text(bar_start + 1.0, down, "  1 m", fontsize=8.5, va="center", **artist_style)
+    axes.plot([bar_start, bar_start + 1.0], [bar_y, bar_y], lw=2, solid_capstyle="butt", **artist_style)
+    axes.text(bar_start + 1.0, bar_y, "  1 m", fontsize=8.5, va="center", **artist_style)
 
 
 def _draw_height_scale(figure: Figure, box: tuple[float, float, float, float]) -> None:
@@ -205,11 +206,12 @@ def _draw_height_scale(figure: Figure, box: tuple[float, float, float, float]) -
 
 def _describe_scene(scene: Scene, task: Task) -> str:
     """Return name of the world, size, cells and objects of a scene, a line each."""
+    # Size and cells.
     width, depth = scene_size(scene)
     num_standable = len(standable_cells(scene.reach))
     num_free = scene.reach.sum()
 
-    # Of the objects, those that have a category.
+    # Categories of the objects that have one.
     object_categories = np.array(category_ids(scene.types, task.categories), int)
     object_categories = object_categories[object_categories >= 0]
 
@@ -268,7 +270,7 @@ def view_from_pose(scene: Scene, task: Task, pose: tuple[float, float, float] | 
     detections = row_format.detections(rows[level_pose])
     reported_places = detected_positions(detections, place, rules.heading_directions()[heading])
 
-    # A detection is rounded to bytes: the object is the one nearest to where it points.
+    # A detection is rounded to bytes, so its object is the nearest to the reported place.
     object_categories = np.array(category_ids(scene.types, task.categories))
     object_places = scene.boxes[:, [0, 2]]
     detection_list: list[tuple[float, str, np.ndarray]] = []
@@ -324,6 +326,7 @@ def draw_plan_background(axes: Axes, scene: Scene, alpha: float = 0.3) -> None:
       scene: scene to draw.
       alpha: opacity.
     """
+    # Floor and walls are an image of the cells, under the boxes of the furniture.
     low_corner, high_corner = scene_extent(scene)
     nz, nx = scene.reach.shape
     corner = np.asarray(scene.origin) - CELL_SIZE / 2
@@ -331,6 +334,7 @@ def draw_plan_background(axes: Axes, scene: Scene, alpha: float = 0.3) -> None:
     axes.imshow(_floor_colors(scene), origin="lower", extent=sides, interpolation="nearest", alpha=alpha)
     _draw_boxes(axes, scene, alpha)
 
+    # Limits of the plan, without ticks and spines.
     low_corner = low_corner - _PLAN_MARGIN
     high_corner = high_corner + _PLAN_MARGIN
     axes.set(
@@ -372,7 +376,7 @@ def view_cone(scene: Scene, rules: Rules, place: np.ndarray, yaw: float) -> np.n
     ray_directions = np.stack([np.sin(ray_angles), np.cos(ray_angles)], axis=-1)
     points = place + ray_distances[:, None] * ray_directions[:, None]
 
-    # Mark the points in walls; those outside the grid are free.
+    # Mark the points in walls; points outside the grid are free.
     cells = np.rint((points - scene.origin) / CELL_SIZE).astype(int)[..., ::-1]
     last_cell = np.array(scene.walls.shape) - 1
     iz, ix = np.moveaxis(np.clip(cells, 0, last_cell), -1, 0)
@@ -417,42 +421,44 @@ def _draw_boxes(axes: Axes, scene: Scene, alpha: float) -> None:
 
 
 def _draw_objects(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: int | None) -> "LabelPlacer":
-    """Mark and name the objects of categories, those of `goal` first."""
+    """Mark and name the objects of categories, the objects of `goal` first."""
+    # Indices of the objects with a category.
     object_categories = category_ids(scene.types, categories)
     places = scene.boxes[:, [0, 2]]
     objects = np.flatnonzero(np.array(object_categories, int) >= 0).tolist()
-    objects.sort(key=lambda number: object_categories[number] != goal)
+    objects.sort(key=lambda object_index: object_categories[object_index] != goal)
 
     # Labels avoid the dots and the walls.
     corner = np.asarray(scene.origin) - CELL_SIZE / 2
     walls = corner + CELL_SIZE * cover_with_rectangles(scene.walls)[:, [[1, 0], [3, 2]]]
     labels = LabelPlacer(axes, places[objects], walls, halo=BACKGROUND_COLOR)
 
+    # A mark for each object, and a label for each group of objects.
     labelled_places: dict[int, list[np.ndarray]] = {}
-    for number in objects:
-        is_goal = object_categories[number] == goal
+    for object_index in objects:
+        is_goal = object_categories[object_index] == goal
         marker, size, color = ("*", 15, GOAL_COLOR) if is_goal else ("o", 4, TEXT_COLOR)
         artist_style = {"markeredgecolor": "white", "markeredgewidth": 0.7, "zorder": 6 if is_goal else 5}
-        axes.plot(places[number, 0], places[number, 1], marker, color=color, markersize=size, **artist_style)
+        axes.plot(*places[object_index], marker, color=color, markersize=size, **artist_style)
 
         # Objects of one category that stand together share a label.
-        same_category_places = labelled_places.setdefault(object_categories[number], [])
-        if not _is_any_near(places[number], same_category_places):
-            same_category_places.append(places[number])
-            labels.label_point(categories[object_categories[number]], places[number], color)
+        same_category_places = labelled_places.setdefault(object_categories[object_index], [])
+        if not _is_any_near(places[object_index], same_category_places):
+            same_category_places.append(places[object_index])
+            labels.label_point(categories[object_categories[object_index]], places[object_index], color)
     return labels
 
 
 def _is_any_near(place: np.ndarray, other_places: Sequence[np.ndarray]) -> bool:
     """Return True if any other place [2] is so near that one label serves both."""
-    return any(np.linalg.norm(place - other) < _SHARED_LABEL_DISTANCE for other in other_places)
+    return any(np.linalg.norm(place - other_place) < _SHARED_LABEL_DISTANCE for other_place in other_places)
 
 
 class LabelPlacer:
     """Writes names on a plan where they cover the least.
 
-    Names, dots and walls drawn so far count as covered, walls half as much as the others. Of equally good positions
-    the first is used.
+    Covering an earlier name, a dot or a wall has a cost for each pixel, which is half as large for walls. The first of
+    equally good positions is used.
     """
 
     def __init__(self, axes: Axes, dots: np.ndarray, walls: np.ndarray, halo: str) -> None:

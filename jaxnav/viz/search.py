@@ -127,7 +127,7 @@ def predict_path(control: LocalPolicy, search_state: SearchState, choice: jax.Ar
 def _percepts(episode: PlayedEpisode) -> Percept:
     """Return the inputs of the tracker in an episode, leaves [T, ...]."""
     _, heading, horizon = episode.task.rules.split_pose(episode.trace.pose)
-    # A percept holds the action before it; the first one has none.
+    # A percept holds the previous action; the first percept has none.
     has_moved = (np.diff(episode.places, axis=0) != 0).any(axis=1)
     earlier_actions = jnp.asarray(episode.trace.action[:-1], jnp.int32)
     return Percept(
@@ -166,7 +166,7 @@ class MapProjection:
         return self._start + CELL_SIZE * from_start[..., ::-1]
 
     def path_to_world(self, cells: np.ndarray) -> np.ndarray:
-        """Return the world (x, z) of consecutive cells [L, 2], each the shorter way from the one before.
+        """Return the world (x, z) of consecutive cells [L, 2], with the shorter way around the map between neighbours.
 
         A path may lead beyond the edge of the map.
         """
@@ -259,15 +259,16 @@ def _draw_block(axes: Axes, search_state: SearchState, projection: MapProjection
 
 
 def _draw_marks(axes: Axes, episode: PlayedEpisode, snapshot: SearchSnapshot, projection: MapProjection) -> None:
-    """Draw and name the cells in which categories were seen."""
-    # Places of each category on the map, the goal's first.
+    """Draw and name the cells that hold categories on the map."""
+    # Places of each category on the map.
     categories = episode.task.categories
     places_by_category = []
     for category in range(len(categories)):
         marked_cells = np.argwhere(snapshot.search_state.cells & np.uint32(1 << category))
         places_by_category.append(projection.to_world(marked_cells))
-    goal_first = sorted(range(len(categories)), key=lambda category: category != episode.goal)
 
+    # Mark the goal first, so that its label gets the best place.
+    goal_first = sorted(range(len(categories)), key=lambda category: category != episode.goal)
     no_walls = np.zeros((0, 2, 2))
     label_placer = LabelPlacer(axes, np.concatenate(places_by_category), no_walls, halo=BACKGROUND_COLOR)
     style = {"markeredgecolor": "white", "markeredgewidth": 0.5, "zorder": 6}
@@ -277,7 +278,8 @@ def _draw_marks(axes: Axes, episode: PlayedEpisode, snapshot: SearchSnapshot, pr
         for place in places_by_category[category]:
             axes.plot(*place, marker, color=color, markersize=size, **style)
             # Marks of one category that are near each other share a label.
-            is_labelled = any(np.linalg.norm(place - other) < _SHARED_LABEL_DISTANCE for other in earlier_places)
+            distances = [np.linalg.norm(place - earlier_place) for earlier_place in earlier_places]
+            is_labelled = bool(distances) and min(distances) < _SHARED_LABEL_DISTANCE
             if not is_labelled:
                 label_placer.label_point(categories[category], place, color)
             earlier_places.append(place)
@@ -285,8 +287,8 @@ def _draw_marks(axes: Axes, episode: PlayedEpisode, snapshot: SearchSnapshot, pr
 
 def _legend_handles(goal_name: str, is_searching: bool) -> list[Patch | Line2D]:
     """Return the entries of the legend."""
-    block_handles = [Patch(fill=False, edgecolor=BLOCK_COLOR, lw=2, label="block chosen to search in")]
     # The target block is drawn during the search only.
+    block_handles = [Patch(fill=False, edgecolor=BLOCK_COLOR, lw=2, label="block chosen to search in")]
     return [
         Patch(color=NEAR_COLOR, label="floor seen from nearby"),
         Patch(color=FAR_COLOR, label="floor seen from afar"),

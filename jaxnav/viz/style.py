@@ -41,7 +41,7 @@ def make_panels(rows: int, columns: int, *, height: float, **sharing: Any) -> tu
 
 
 def style_axes(axes: Axes, label_size: float) -> None:
-    """Remove the upper and right border, and mute the others."""
+    """Remove the upper and right border, and mute the remaining ones."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED_COLOR)
     axes.tick_params(labelcolor=TEXT_COLOR, labelsize=label_size, color=MUTED_COLOR)

@@ -101,7 +101,7 @@ def policies(spec, params):
 def test_parameters_stand_side_by_side():
     one, other = (jax.tree.map(lambda leaf: leaf[None], tree) for tree in (AGENT, WITHOUT))
     pair = policies(tiny.SPEC, one).with_handover_to(policies(ANONYMOUS, other))
-    assert pair.handover_spec == ANONYMOUS
+    assert pair.fallback_spec == ANONYMOUS
     assert pair.num_seeds == 1
     chex.assert_trees_all_equal(pair.params, {"agent": one, "without": other})
 

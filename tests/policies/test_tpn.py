@@ -22,8 +22,8 @@ from jaxnav.policies.methods.tpn import (
     NUM_TRIALS,
     TentativePolicy,
     UniformTentativePolicy,
-    actor_changes,
     learn_motion,
+    make_layer_changes,
 )
 from jaxnav.policies.network import NO_CHANGES, bind
 from jaxnav.policies.pathways import PolicyInputs, PolicyState
@@ -116,7 +116,7 @@ def test_the_step_descends_the_cross_entropy_at_repeated_poses(options):
     best = decision.fast.predicted_logits.argmax(axis=-1)
 
     def cross_entropy(change):
-        log_pi = jax.nn.log_softmax(policy.decide_with_changes(pathways, memory, actor_changes(change)).logits)
+        log_pi = jax.nn.log_softmax(policy.decide_with_changes(pathways, memory, make_layer_changes(change)).logits)
         return -jnp.take_along_axis(log_pi, best[:, None], axis=-1).sum()
 
     gradient = jax.grad(cross_entropy)(memory.fast.actor_change)
@@ -132,7 +132,7 @@ def test_the_actor_is_renewed():
         policy, pathways, memory = given(SPEC, decisions)
         decision = policy.decide(pathways, memory)
         expected = policy.decide_with_changes(
-            pathways, memory, actor_changes(memory.fast.actor_change) if is_kept else NO_CHANGES
+            pathways, memory, make_layer_changes(memory.fast.actor_change) if is_kept else NO_CHANGES
         )
         np.testing.assert_allclose(decision.logits, expected.logits, rtol=1e-5, atol=1e-5)
         unrepeated = ~np.asarray(pathways.reading)

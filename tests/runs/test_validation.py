@@ -106,6 +106,7 @@ def test_layout_policies_are_validated_with_the_layout_in_any_order_of_the_arms(
     reversed_config = dataclasses.replace(config, arms=("layout", "baseline"), validations=1)
     trainer = make_trainer(reversed_config, training.env, policies.estimator_config, policies.knowledge)
     reversed_validator = _make_validator(reversed_config, trainer, policies.knowledge, training, QUIET)
+    assert reversed_validator is not None
     expected = validator.measure(held)
     measured = reversed_validator.measure({arm: held[arm] for arm in reversed_config.arms})
     for seed in range(policies.num_seeds):

@@ -60,7 +60,7 @@ def test_what_is_on_the_picture():
     bar = np.asarray(plan.lines[-1].get_xdata())
     assert bar[1] - bar[0] == 1.0
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend == ["standable cell", "cut off from those", "wall", "in view", "detected"]
+    assert legend == ["standable cell", "unreachable cell", "wall", "in view", "detected"]
     text = "\n".join(text.get_text() for text in figure.texts)
     # Without the wall x goes from the chair's -0.3 (the book's side) to 0.875, z from -1.25 to 2.525.
     for part in (

@@ -20,47 +20,55 @@ class MultiHeadAttention(nnx.Module):
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(
-        self, values: jax.Array, query: jax.Array, key: jax.Array, memory: jax.Array, present: jax.Array | None = None
+        self,
+        residual: jax.Array,
+        query_inputs: jax.Array,
+        key_inputs: jax.Array,
+        value_inputs: jax.Array,
+        is_present: jax.Array | None = None,
     ) -> jax.Array:
-        """Add to the values what their queries read, and normalise.
+        """Attend from the queries to the entries, add the residual, and normalise.
 
         Args:
-          values: float32 [..., Q, d], the residual.
-          query: float32 [..., Q, d], inputs of the queries.
-          key: float32 [..., N, d], inputs of the keys.
-          memory: float32 [..., N, d], inputs of the values that are read.
-          present: bool [..., N], True where there is an entry to attend to, at least once; None for all.
+          residual: float32 [..., Q, d], added to the answers.
+          query_inputs: float32 [..., Q, d], projected to the queries.
+          key_inputs: float32 [..., N, d], projected to the keys of the entries.
+          value_inputs: float32 [..., N, d], projected to the values of the entries.
+          is_present: bool [..., N], True for entries to attend to, at least one; None for all entries.
+
+        Returns:
+          float32 [..., Q, d].
         """
         # Project the inputs and divide them among the heads, [..., h, Q or N, d / h].
-        queries = self._split_heads(self.query(query))
-        keys = self._split_heads(self.key(key))
-        head_values = self._split_heads(self.value(memory))
+        queries = self._split_heads(self.query(query_inputs))
+        keys = self._split_heads(self.key(key_inputs))
+        values = self._split_heads(self.value(value_inputs))
 
-        # Attention weights [..., h, Q, N].
+        # Attention weights [..., h, Q, N], which are 0 for absent entries.
         scores = self.scores(queries, keys)
-        if present is not None:
-            scores = jnp.where(present[..., None, None, :], scores, -jnp.inf)
-        answers = jax.nn.softmax(scores) @ head_values
+        if is_present is not None:
+            scores = jnp.where(is_present[..., None, None, :], scores, -jnp.inf)
+        answers = jax.nn.softmax(scores) @ values
 
         # Join the heads, [..., Q, d].
-        joined_answers = jnp.swapaxes(answers, -2, -3).reshape(values.shape)
-        return self.norm(values + self.out(joined_answers))
+        joined_answers = jnp.swapaxes(answers, -2, -3).reshape(residual.shape)
+        return self.norm(residual + self.out(joined_answers))
 
-    def scores(self, query: jax.Array, key: jax.Array) -> jax.Array:
+    def scores(self, queries: jax.Array, keys: jax.Array) -> jax.Array:
         """Return attention scores, [..., h, Q, N]."""
-        return query @ jnp.swapaxes(key, -1, -2) / np.float32(np.sqrt(query.shape[-1]))
+        return queries @ jnp.swapaxes(keys, -1, -2) / np.float32(np.sqrt(queries.shape[-1]))
 
-    def _split_heads(self, values: jax.Array) -> jax.Array:
+    def _split_heads(self, projected: jax.Array) -> jax.Array:
         """Divide [..., N, d] among the heads, [..., h, N, d / h]."""
-        return jnp.swapaxes(values.reshape(*values.shape[:-1], self.heads, -1), -2, -3)
+        return jnp.swapaxes(projected.reshape(*projected.shape[:-1], self.heads, -1), -2, -3)
 
 
 class UniformMultiHeadAttention(MultiHeadAttention):
     """Attention with equal weights, for ablations."""
 
-    def scores(self, query: jax.Array, key: jax.Array) -> jax.Array:
+    def scores(self, queries: jax.Array, keys: jax.Array) -> jax.Array:
         """Return zeros, [..., h, Q, N]."""
-        return jnp.zeros_like(super().scores(query, key))
+        return jnp.zeros_like(super().scores(queries, keys))
 
 
 class FeedForward(nnx.Module):
@@ -71,6 +79,6 @@ class FeedForward(nnx.Module):
         self.outer = Linear(hidden, width, rngs=rngs)
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
-    def __call__(self, values: jax.Array) -> jax.Array:
+    def __call__(self, rows: jax.Array) -> jax.Array:
         """Return rows [..., N, d] for rows [..., N, d]."""
-        return self.norm(values + self.outer(nnx.relu(self.inner(values))))
+        return self.norm(rows + self.outer(nnx.relu(self.inner(rows))))

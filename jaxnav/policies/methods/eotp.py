@@ -3,11 +3,11 @@
 Source: B. Mayo, T. Hazan and A. Tal, *Visual Navigation with Spatial Attention*, CVPR 2021, and its released code; a
 host of L-sTDE in the paper.
 
-Kept: entries, goal, previous action and memory are embedded at length 1; the score of an entry is a mixture of its
+Kept: entries, goal, previous action and memory are embedded with length 1; the score of an entry is a mixture of its
 cosines to goal, action and memory, with shares that the memory sets; attention is the softmax of the scores and
 multiplies the embeddings before their normalisation. Changed: the entries are the detected categories and the goal, not
 49 places of an image, the previous action is one-hot, and one more layer reads the attended entries. The released agent
-also adapts by a learned loss, which `ADAPTED` does and `EOTP` does not.
+also adapts by a learned loss, as `ADAPTED` does; `EOTP` does not adapt.
 """
 
 from typing import Any, NamedTuple
@@ -47,9 +47,9 @@ class AttentionEntries(NamedTuple):
 class SpatialAttention(Experience):
     """Attention to the detected categories and the goal.
 
-    Attention and the layout weights multiply the embeddings of the rows. The weights cannot enter before: cosines only
-    know the directions of the embeddings, so a factor would be normalised away. The layer that reads an embedding is
-    linear, so both factors multiply its output instead, which is equivalent.
+    Attention and the layout weights multiply the embeddings of the rows. The weights cannot enter earlier, because
+    cosines only depend on the directions of the embeddings and would normalise a factor away. The layer that reads an
+    embedding is linear, so both factors multiply its output instead, which is equivalent.
     """
 
     reads_memory = True
@@ -68,10 +68,12 @@ class SpatialAttention(Experience):
         # Rows [..., K, h] are the keys and, after the second layer of the maps, the values [..., K, m].
         rows = add_bias(self.maps.project_detections(features, appearance), self.maps.inner)
         values = weights[..., None] * matmul_rows(nnx.relu(rows), self.maps.outer.kernel[...])
-        goal = self.goal(features.goal @ appearance)
+
+        # Keys and goal have length 1, so that their products are cosines.
+        goal_embedding = self.goal(features.goal @ appearance)
         return AttentionEntries(
             keys=_normalize(rows),
-            goal=_normalize(goal),
+            goal=_normalize(goal_embedding),
             can_attend=features.visible + features.goal > 0,
             values=values,
         )
@@ -84,7 +86,7 @@ class SpatialAttention(Experience):
     def attention_weights(self, encoded: AttentionEntries, memory: PolicyState) -> jax.Array:
         """Return the attention to each category, float32 [..., K].
 
-        The weights sum to 1 and are 0 for categories that are neither detected nor sought.
+        The weights sum to 1 and are 0 for categories that are neither detected nor the goal.
         """
         # Three queries [..., 3, h]: goal, previous action and memory.
         action_one_hot = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
@@ -103,7 +105,7 @@ class UniformAttention(SpatialAttention):
     """Equal attention to the detected categories and the goal."""
 
     def attention_weights(self, encoded: AttentionEntries, memory: PolicyState) -> jax.Array:
-        """Return equal attention to what is detected or sought."""
+        """Return equal attention to the detected categories and the goal."""
         can_attend = encoded.can_attend.astype(jnp.float32)
         return can_attend / can_attend.sum(axis=-1, keepdims=True)
 

@@ -3,11 +3,12 @@
 Source: S. Zhang et al., *Hierarchical Object-to-Zone Graph for Object Navigation*, ICCV 2021, and its released code; a
 host of L-sTDE in the paper.
 
-Kept: the poses of every training scene are clustered into zones by what is detected, and the zones of all scenes of a
-room type are merged. In an episode, the zone of the view, the goal's zone and the next zone on the best path between
-them are embedded by one layer of graph convolution, and the view pulls the node of its zone. Changed: poses adjoin if
-one action leads from one to the other, the embeddings are columns of ORG's category table, and the room type is
-predicted by naive Bayes from what has been detected, in place of a classifier that only reinforcement trains.
+Kept: the poses of every training scene are clustered into zones by their detected categories, and the zones of all
+scenes of a room type are merged. In an episode, the zone of the view, the goal's zone and the next zone on the best
+path between them are embedded by one layer of graph convolution, and the view pulls the node of its zone. Changed: two
+poses adjoin if one action leads from one pose to the other, the embeddings are columns of ORG's category table, and
+naive Bayes predicts the room type from the categories detected so far, in place of a classifier that only
+reinforcement trains.
 
 The file has two parts: `learn_zones` builds the graphs before training; `ZoneTracker` and `ZoneRelations` use them.
 """
@@ -42,7 +43,8 @@ NUM_ZONES = 8
 UNIFORM_SHARE = 0.05
 
 _KMEANS_ITERATIONS = 30
-_NUM_READ_ZONES = 3  # current zone, next zone, goal's zone
+#: Number of zones that the network reads: current zone, next zone and goal's zone.
+_NUM_READ_ZONES = 3
 
 
 # Learning the zones before training
@@ -71,24 +73,23 @@ def learn_zones(banks: Iterable[Bank], counts: np.ndarray, num_zones: int = NUM_
     """Learn the zones of each room type.
 
     Args:
-      banks: of the training scenes.
-      counts: [rooms, K, K]; only the number of categories is used.
-      num_zones: Z, zones of a room type.
+      banks: banks of the training scenes.
+      counts: [rooms, K, K], co-occurrence counts, of which only the number of categories is used.
+      num_zones: Z, number of zones of a room type.
 
     Returns:
       `nodes` float32 [rooms, Z, K], in 0 to 1, the share of a zone's poses at which a category is detected; -1 in an
       empty zone, which is therefore nearest to no view.
       `mixing` float32 [rooms, Z, Z], the edges with loops, symmetrically normalised for a graph convolution.
       `next_zone` int32 [rooms, Z, Z], the first zone on the best path from one zone to another.
-      `detected` float32 [rooms, K], log shares of the categories in what is detected in a room type.
-      `frequency` float32 [rooms], log shares of the room types among the scenes; -87 for one without any.
+      `detected` float32 [rooms, K], log shares of the categories among the detections in a room type.
+      `frequency` float32 [rooms], log shares of the room types among the scenes; -87 for a room type without scenes.
 
     Raises:
       InputError: a scene has fewer poses than zones.
     """
-    graphs, scene_counts = build_room_graphs(banks, counts.shape[-1], num_zones)
-
     # Edges relative to the strongest edge of the room type: otherwise hardly any best path would be indirect.
+    graphs, scene_counts = build_room_graphs(banks, counts.shape[-1], num_zones)
     adjacency = compute_adjacency(graphs)
     strongest_edge = adjacency.max(axis=(-2, -1), keepdims=True)
     edges = adjacency / np.maximum(strongest_edge, np.finfo(float).tiny)
@@ -99,6 +100,7 @@ def learn_zones(banks: Iterable[Bank], counts: np.ndarray, num_zones: int = NUM_
     mixed_shares = (1.0 - UNIFORM_SHARE) * detection_shares + UNIFORM_SHARE / detection_shares.shape[-1]
     room_shares = np.maximum(scene_counts / scene_counts.sum(), np.finfo(np.float32).tiny)
 
+    # Empty zones get nodes that are far from every view.
     nodes = np.where(graphs.pose_counts[..., None] > 0, graphs.category_shares, -1.0)
     return {
         "nodes": nodes.astype(np.float32),
@@ -112,12 +114,13 @@ def learn_zones(banks: Iterable[Bank], counts: np.ndarray, num_zones: int = NUM_
 def learn_permuted_zones(
     banks: Iterable[Bank], counts: np.ndarray, num_zones: int = NUM_ZONES
 ) -> dict[str, np.ndarray]:
-    """Learn the zones and permute their relations, for an ablation: each zone gets edges and paths of another."""
+    """Learn the zones and permute their relations, for an ablation: each zone gets edges and paths of another zone."""
+    # Permute both sides of the edges.
     learned = learn_zones(banks, counts, num_zones)
     permutation = np.roll(np.arange(num_zones), 1)
     mixing = learned["mixing"][:, permutation][:, :, permutation]
 
-    # `next_zone` also holds indices of zones as values, which are renamed by the inverse permutation.
+    # The values of `next_zone` are zones too, so the inverse permutation renames them.
     renamed_zones = np.argsort(permutation)[learned["next_zone"]]
     next_zone = renamed_zones[:, permutation][:, :, permutation].astype(np.int32)
     return learned | {"mixing": mixing, "next_zone": next_zone}
@@ -126,11 +129,12 @@ def learn_permuted_zones(
 def build_room_graphs(banks: Iterable[Bank], num_categories: int, num_zones: int) -> tuple[ZoneGraph, np.ndarray]:
     """Merge the graphs of the scenes of each room type, one scene after another.
 
-    Zones of a scene are matched one to one with the zones merged so far, so that their category shares differ least.
+    Zones of a scene are matched one to one with the zones merged so far, such that their category shares differ least.
 
     Returns:
       Graphs with leaves [rooms, ...], and the number of scenes, int [rooms].
     """
+    # Start with empty graphs of all room types.
     empty_graph = ZoneGraph(
         category_counts=np.zeros((num_zones, num_categories)),
         pose_counts=np.zeros(num_zones),
@@ -139,6 +143,7 @@ def build_room_graphs(banks: Iterable[Bank], num_categories: int, num_zones: int
     graphs = [empty_graph] * NUM_PRIORS
     scene_counts = np.zeros(NUM_PRIORS, int)
 
+    # Add scene by scene to the graph of its room type.
     for bank in banks:
         for scene, room_type in enumerate(bank.room_types):
             room = prior_index(room_type)
@@ -151,6 +156,7 @@ def build_room_graphs(banks: Iterable[Bank], num_categories: int, num_zones: int
                 differences = np.zeros_like(differences)
             _, partners = linear_sum_assignment(differences)
 
+            # Sum the counts of matched zones.
             graphs[room] = ZoneGraph(
                 merged.category_counts + graph.category_counts[partners],
                 merged.pose_counts + graph.pose_counts[partners],
@@ -161,36 +167,38 @@ def build_room_graphs(banks: Iterable[Bank], num_categories: int, num_zones: int
 
 
 def build_scene_graph(bank: Bank, scene: int, num_zones: int) -> ZoneGraph:
-    """Cluster the poses of a scene by which categories are detected.
+    """Cluster the poses of a scene by their detected categories.
 
-    Where there are fewer different views than zones, the last zones are empty.
+    In a scene with fewer different views than zones, the last zones are empty.
 
     Raises:
       InputError: there are fewer poses than zones.
     """
+    # Rows of all poses of the scene, [P, R].
     rules = bank.task.rules
     num_categories = len(bank.task.categories)
-
-    # Rows of all poses of the scene, [P, R].
     first_cell = bank.first_cell[scene]
     end_cell = first_cell + bank.num_cells[scene]
     rows = bank.rows[first_cell * rules.poses_per_cell : end_cell * rules.poses_per_cell]
     num_poses = len(rows)
     if num_zones > num_poses:
-        name = bank.names[scene]
-        raise InputError(f"scene {name!r}: has {num_poses} poses for {num_zones} zones; give at most {num_poses} zones")
+        raise InputError(
+            f"scene {bank.names[scene]!r}: has {num_poses} poses for {num_zones} zones; give at most {num_poses} zones"
+        )
 
-    # Cluster; a cluster may lose all its poses, of which SciPy would warn.
+    # Cluster the poses; SciPy would warn of a cluster that loses all its poses.
     presence = RowFormat(num_categories).presence(rows).astype(float)
     num_clusters = min(num_zones, len(np.unique(presence, axis=0)))
     generator = np.random.default_rng(scene)
     with warnings.catch_warnings(action="ignore"):
         _, zone_of_pose = kmeans2(presence, num_clusters, iter=_KMEANS_ITERATIONS, minit="++", rng=generator)
 
-    # Count detections, poses, and the actions that change the pose.
+    # Count detections and poses by zone.
     category_counts = np.zeros((num_zones, num_categories))
     np.add.at(category_counts, zone_of_pose, presence)
     pose_counts = np.bincount(zone_of_pose, minlength=num_zones).astype(float)
+
+    # Count the actions that change the pose, by the zones of start and end.
     successors = pose_successors(bank.ahead[first_cell:end_cell] - first_cell, rules)
     start_pose, action = np.nonzero(successors != np.arange(num_poses)[:, None])
     end_pose = successors[start_pose, action]
@@ -200,7 +208,7 @@ def build_scene_graph(bank: Bank, scene: int, num_zones: int) -> ZoneGraph:
 
 
 def compute_adjacency(graph: ZoneGraph) -> np.ndarray:
-    """Return the share of pairs of poses, one in each of two zones, that are one action apart in either direction.
+    """Return the edges between zones: the share of their pose pairs that one action connects, in either direction.
 
     Returns:
       float64 [..., Z, Z], in 0 to 1, symmetric, 0 on the diagonal.
@@ -217,16 +225,18 @@ def find_next_zones(edges: np.ndarray) -> np.ndarray:
     The best path has the largest product of edges; among equal paths the direct one is chosen.
 
     Args:
-      edges: float64 [..., Z, Z], in 0 to 1; 0 where there is none.
+      edges: float64 [..., Z, Z], in 0 to 1; 0 for no edge.
 
     Returns:
-      int32 [..., Z, Z], from one zone to another; the other itself where it is next, or where no path leads there.
+      int32 [..., Z, Z], by start and target zone; the target itself if it is the next zone or no path leads there.
     """
+    # Costs of direct paths: the largest product of edges has the smallest sum of costs.
     zones = np.arange(edges.shape[-1])
     with np.errstate(divide="ignore"):
         path_costs = -np.log(edges + np.eye(len(zones)))
     next_zone = np.broadcast_to(zones, edges.shape).astype(np.int32)
 
+    # Allow one more intermediate zone at a time.
     for middle_zone in zones:
         costs_through = path_costs[..., :, middle_zone, None] + path_costs[..., middle_zone, None, :]
         is_better = costs_through < path_costs - 1e-9
@@ -236,16 +246,16 @@ def find_next_zones(edges: np.ndarray) -> np.ndarray:
 
 
 def measure_indirect_paths(nodes: np.ndarray, next_zone: np.ndarray, is_goal: np.ndarray) -> tuple[float, float]:
-    """Return how often the best path leads through another zone.
+    """Measure how often the best path leads through an intermediate zone.
 
     Args:
-      nodes: as `learn_zones` returns them.
-      next_zone: as `learn_zones` returns it.
+      nodes: float32 [rooms, Z, K], from `learn_zones`.
+      next_zone: int32 [rooms, Z, Z], from `learn_zones`.
       is_goal: bool [K], True for categories that can be goals.
 
     Returns:
-      The share of indirect paths among pairs of different zones, and among pairs of a zone and a goal whose zone is
-      another one; 0 without any.
+      The share of indirect paths among pairs of different zones, and among pairs of a zone and a goal in a different
+      zone; 0 without such pairs.
     """
     # Pairs [rooms, Z, Z] of different zones that are not empty.
     zones = np.arange(nodes.shape[-2])
@@ -259,6 +269,7 @@ def measure_indirect_paths(nodes: np.ndarray, next_zone: np.ndarray, is_goal: np
     num_goal_pairs = pairs[rooms, :, goal_zones].sum()
     num_indirect_goal_pairs = indirect_pairs[rooms, :, goal_zones].sum()
 
+    # Shares among both kinds of pairs.
     zone_share = float(indirect_pairs.sum() / max(pairs.sum(), 1))
     goal_share = float(num_indirect_goal_pairs / max(num_goal_pairs, 1))
     return zone_share, goal_share
@@ -288,8 +299,8 @@ class ZoneReading(NamedTuple):
 
     Attributes:
       room_probs: float32 [..., R], the probabilities of the room types.
-      zone_rows: float32 [..., 3, K], nodes of the current zone, the next one and the goal's, each mixed with those of
-        the adjoining zones.
+      zone_rows: float32 [..., 3, K], nodes of the current zone, the next zone and the goal's zone, each mixed with the
+        nodes of adjoining zones.
     """
 
     room_probs: jax.Array
@@ -330,7 +341,8 @@ class ZoneTracker:
         return ZoneState(seen_categories, room_type, zone, nodes)
 
     def read(self, state: ZoneState, knowledge: Knowledge, goal: jax.Array) -> ZoneReading:
-        """Return the current zone, the next one on the best path to the goal, and the goal's."""
+        """Return the current zone, the next zone on the best path to the goal, and the goal's zone."""
+        # The goal's zone has the largest share of poses that show the goal.
         graph = knowledge.method
         goal_zone = state.nodes[:, goal].argmax()
         next_zone = graph["next_zone"][state.room_type, state.zone, goal_zone]
@@ -353,8 +365,8 @@ def _room_logits(seen_categories: jax.Array, graph: dict[str, jax.Array]) -> jax
 class ZoneRelations(ObjectRelations):
     """Relations between the detected categories, the goal and the zones.
 
-    The row of each category in ORG's table also gets its entries in the embeddings of three zones. The layout weights
-    multiply the whole row.
+    The row of each category in ORG's table also holds the category's entries in the embeddings of three zones. The
+    layout weights multiply the whole row.
     """
 
     columns = ObjectRelations.columns + _NUM_READ_ZONES

@@ -1,7 +1,8 @@
 """Imitation of shortest paths, for stages of training that use an expert.
 
-A stage with `uses_expert` has `SceneTables.expert`, the first action of a shortest path from every pose to every goal.
-`expert_actions` looks it up along a rollout and `imitation_loss` is the cross-entropy to it.
+In a stage with `uses_expert` the scene tables have `SceneTables.expert`, the first action of a shortest path from every
+pose to every goal. `expert_actions` looks up these actions along a rollout, and `imitation_loss` is the cross-entropy
+to them.
 """
 
 from typing import Any
@@ -10,14 +11,14 @@ import jax
 import jax.numpy as jnp
 
 
-def expert_actions(replayed: Any) -> jax.Array:
+def expert_actions(replay: Any) -> jax.Array:
     """Return the first action of a shortest path at every step of a rollout, int32 [T, B].
 
     Args:
-      replayed: a `jaxnav.training.ppo.Replay`, in a stage that uses an expert.
+      replay: a `jaxnav.training.ppo.Replay`, in a stage that uses an expert.
     """
-    transitions = replayed.transitions
-    return replayed.env_params.tables.expert[transitions.pose, transitions.goal].astype(jnp.int32)
+    transitions = replay.transitions
+    return replay.env_params.tables.expert[transitions.pose, transitions.goal].astype(jnp.int32)
 
 
 def imitation_loss(logits: jax.Array, expert: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -25,7 +26,8 @@ def imitation_loss(logits: jax.Array, expert: jax.Array) -> tuple[jax.Array, dic
 
     Args:
       logits: float32 [..., A].
-      expert: int32 [...]; `NUM_ACTIONS`, where no path leads to the goal, adds nothing to the loss.
+      expert: int32 [...], actions of the expert; `NUM_ACTIONS`, which stands for no path to the goal, adds nothing to
+        the loss.
 
     Returns:
       The loss float32 [], and by name the loss and the share of steps at which the likeliest action is the expert's.

@@ -1,8 +1,8 @@
 """Tracker of SemExp: the semantic map of an episode, and the state of the search on it.
 
-`SemanticMap` draws views on a toroidal map by compass and odometry, one 32-bit word per cell. `MapTracker` keeps the
-map and the rest of `SearchState`, which `jaxnav.policies.methods.local_policy` turns into actions, and reads the map
-block by block for the network.
+`SemanticMap` draws views on a toroidal map by compass and odometry, one 32-bit word per cell. `MapTracker` updates the
+`SearchState`, which holds the map and from which `jaxnav.policies.methods.local_policy` plans actions, and reads the
+map block by block for the network.
 """
 
 import dataclasses
@@ -18,37 +18,47 @@ from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.wavefront import WORD_BITS
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.observation_row import (
-    AHEAD_SCALE,
     MIN_RANGE,
-    RIGHT_SCALE,
     SIZE_SCALE,
     VIEW_BLOCKED,
     VIEW_FREE,
     RowFormat,
+    relative_position,
 )
 from jaxnav.scenes.task import MOVE_AHEAD, Rules
 
-#: Categories that a cell can hold, in its lowest bits.
+#: Number of categories that a cell can hold, one in each of its lowest bits.
 MAX_CATEGORIES = 27
+#: The bits of all categories.
 CATEGORY_BITS = np.uint32((1 << MAX_CATEGORIES) - 1)
-#: Flags of a cell in its highest bits: seen from nearby, standable, not standable, visited by the agent, and tried as a
-#: viewpoint of the goal without success.
-EXPLORED_BIT, FREE_BIT, WALL_BIT, VISITED_BIT, TRIED_BIT = (np.uint32(1 << bit) for bit in range(27, 32))
+#: Flag of cells that were seen from nearby.
+EXPLORED_BIT = np.uint32(1 << 27)
+#: Flag of standable cells.
+FREE_BIT = np.uint32(1 << 28)
+#: Flag of cells where the agent cannot stand: walls and furniture.
+WALL_BIT = np.uint32(1 << 29)
+#: Flag of cells that the agent has visited.
+VISITED_BIT = np.uint32(1 << 30)
+#: Flag of cells that were tried as viewpoints of the goal without success.
+TRIED_BIT = np.uint32(1 << 31)
+#: Word without any bit.
+NO_BITS = np.uint32(0)
 
 #: Number of blocks along each side of the map; the policy chooses one of them.
 BLOCKS_PER_SIDE = 8
-#: Values of `SearchState.goal_sight`: the goal is not in view or too far; near enough for Done; and near enough at a
-#: place where an earlier view showed it too.
-GOAL_FAR, GOAL_NEAR, GOAL_CONFIRMED = range(3)
-
-_NO_BITS = np.uint32(0)
+#: Value of `SearchState.goal_sight`: the goal is not in view, or too far for Done.
+GOAL_FAR = 0
+#: Value of `SearchState.goal_sight`: the goal is near enough for Done.
+GOAL_NEAR = 1
+#: Value of `SearchState.goal_sight`: the goal is near enough for Done, and an earlier view has shown it there too.
+GOAL_CONFIRMED = 2
 
 
 # The map
 
 
 class PlacedView(NamedTuple):
-    """A view and the pose that it was seen from.
+    """A view and the pose of the camera.
 
     Attributes:
       row: uint8 [R], the observation row.
@@ -65,7 +75,8 @@ class PlacedView(NamedTuple):
 class SemanticMap:
     """Functions on the map uint32 [N, N] of one episode; hashable.
 
-    The map is toroidal, so a home fits on it wherever the agent starts. All functions take one episode; callers `vmap`.
+    The map is toroidal, so a home fits on it for every start of the agent. All functions take one episode; callers
+    `vmap`.
 
     Attributes:
       size: N, cells along each side, a multiple of 32.
@@ -82,65 +93,63 @@ class SemanticMap:
         return jnp.zeros((self.size, self.size), jnp.uint32)
 
     def advance(self, position: jax.Array, moved: jax.Array, step: jax.Array) -> jax.Array:
-        """Return the position int32 [2] after a step (dz, dx), which only counts where the agent moved."""
+        """Return the position int32 [2] after a step (dz, dx), unchanged where the agent did not move."""
         return (position + jnp.where(moved, step, 0)) % self.size
 
-    def update(self, cells: jax.Array, look: PlacedView, row_format: RowFormat, headings: int) -> jax.Array:
+    def update(self, cells: jax.Array, placed_view: PlacedView, row_format: RowFormat, headings: int) -> jax.Array:
         """Draw a view.
 
-        Categories that are not detected are cleared where the view shows a cell nearby: the detector would have
-        reported them.
+        Nearby cells lose the categories that the detector does not report, because it would have detected them.
 
         Args:
           cells: uint32 [N, N], the map before the view.
-          look: the view.
-          row_format: format of its row.
-          headings: H of the task.
+          placed_view: the view and its pose.
+          row_format: format of the observation row.
+          headings: H, number of headings of the task.
         """
-        # Cells [V V] of the view on the map. Two cells of the view may be one of the map; both then get the same state.
+        # Map cells [V V] of the view. Two cells of the view may share a map cell, whose state they then share.
         offset_table, twin_table = _view_tables(headings, row_format.view)
         near_table = CELL_SIZE * np.hypot(*np.moveaxis(offset_table, -1, 0)) <= MIN_RANGE
-        offsets = jnp.asarray(offset_table)[look.heading]
-        twins = jnp.asarray(twin_table)[look.heading]
-        is_near = jnp.asarray(near_table)[look.heading]
-        rows, columns = ((look.position[None] + offsets) % self.size).T
-        view = row_format.view_cells(look.row)
+        offsets = jnp.asarray(offset_table)[placed_view.heading]
+        twins = jnp.asarray(twin_table)[placed_view.heading]
+        is_near = jnp.asarray(near_table)[placed_view.heading]
+        rows, columns = ((placed_view.position[None] + offsets) % self.size).T
+        view = row_format.view_cells(placed_view.row)
         view = jnp.maximum(view, view[twins])
 
-        # Floor and walls: cells of the view replace their flags, unseen ones stay.
+        # Floor and walls: seen cells get new flags, unseen cells keep theirs.
         is_free = view == VIEW_FREE
         is_seen = is_free | (view == VIEW_BLOCKED)
-        new_bits = jnp.where(is_free, FREE_BIT, WALL_BIT) | jnp.where(is_near, EXPLORED_BIT, _NO_BITS)
-        undetected_bits = CATEGORY_BITS & ~self.detected_bits(look.row, row_format)
-        cleared_bits = jnp.where(is_near, undetected_bits, _NO_BITS) | jnp.where(is_free, WALL_BIT, FREE_BIT)
+        new_bits = jnp.where(is_free, FREE_BIT, WALL_BIT) | jnp.where(is_near, EXPLORED_BIT, NO_BITS)
+        undetected_bits = CATEGORY_BITS & ~self.detected_bits(placed_view.row, row_format)
+        cleared_bits = jnp.where(is_near, undetected_bits, NO_BITS) | jnp.where(is_free, WALL_BIT, FREE_BIT)
         words = cells[rows, columns]
         cells = cells.at[rows, columns].set(jnp.where(is_seen, words & ~cleared_bits | new_bits, words))
 
-        # The agent's own cell is free whatever the view says.
-        row, column = look.position
+        # The agent's own cell is always free, visited and explored.
+        row, column = placed_view.position
         own_word = cells[row, column] & ~WALL_BIT | VISITED_BIT | FREE_BIT | EXPLORED_BIT
         cells = cells.at[row, column].set(own_word)
 
         # Detected categories [K]. Each has a bit of its own, so adding missing bits is a bitwise or.
-        rows, columns = self.detection_cells(look, row_format, headings).T
-        detected_bits = jnp.where(row_format.presence(look.row), _category_bits(row_format), _NO_BITS)
+        rows, columns = self.detection_cells(placed_view, row_format, headings).T
+        detected_bits = jnp.where(row_format.presence(placed_view.row), _category_bits(row_format), NO_BITS)
         return cells.at[rows, columns].add(detected_bits & ~cells[rows, columns])
 
-    def detection_cells(self, look: PlacedView, row_format: RowFormat, headings: int) -> jax.Array:
-        """Return the cells int32 [K, 2] in which categories are detected."""
+    def detection_cells(self, placed_view: PlacedView, row_format: RowFormat, headings: int) -> jax.Array:
+        """Return the map cell int32 [K, 2] of each category's detection; without a detection it is meaningless."""
         # Metres ahead and to the right of the agent, [K].
-        detections = row_format.detections(look.row).astype(jnp.float32)
-        ahead = detections[:, 1] / AHEAD_SCALE
-        right = (detections[:, 2] - 128.0) / RIGHT_SCALE
+        detections = row_format.detections(placed_view.row).astype(jnp.float32)
+        ahead, right = relative_position(detections)
 
-        # Turn them by the heading; directions are (z, x).
-        forward = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[look.heading][::-1]
+        # Turn the offsets by the heading; directions are (z, x).
+        forward = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[placed_view.heading][::-1]
         rightward = jnp.stack([-forward[1], forward[0]])
         offsets = (ahead[:, None] * forward[None] + right[:, None] * rightward[None]) / CELL_SIZE
-        return (look.position[None] + jnp.rint(offsets).astype(jnp.int32)) % self.size
+        return (placed_view.position[None] + jnp.rint(offsets).astype(jnp.int32)) % self.size
 
     def neighbourhood(self, position: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return lines and columns, int32 [9] each, of a cell int32 [2] and its neighbours."""
+        """Return rows and columns, int32 [9] each, of a cell int32 [2] and its eight neighbours."""
         offsets = np.moveaxis(np.indices((3, 3)), 0, -1).reshape(-1, 2).astype(np.int32) - 1
         rows, columns = ((position[None] + offsets) % self.size).T
         return rows, columns
@@ -148,16 +157,16 @@ class SemanticMap:
     @staticmethod
     def detected_bits(row: jax.Array, row_format: RowFormat) -> jax.Array:
         """Return the word uint32 [] with the bits of all detected categories."""
-        return jnp.where(row_format.presence(row), _category_bits(row_format), _NO_BITS).sum(dtype=jnp.uint32)
+        return jnp.where(row_format.presence(row), _category_bits(row_format), NO_BITS).sum(dtype=jnp.uint32)
 
     def mark_collision(self, cells: jax.Array, ahead: jax.Array, action: jax.Array, moved: jax.Array) -> jax.Array:
         """Mark the cell ahead of the agent as explored, and as a wall where the agent ran into it.
 
         Args:
           cells: uint32 [N, N].
-          ahead: int32 [2], the cell ahead; it may lie beyond an edge.
-          action: int32 [], the last action.
-          moved: bool [], True where it changed the cell.
+          ahead: int32 [2], the cell ahead, which may lie beyond an edge.
+          action: int32 [], the previous action.
+          moved: bool [], True where the previous action changed the cell.
         """
         row, column = ahead % self.size
         is_wall = (action == MOVE_AHEAD) & ~moved
@@ -183,19 +192,19 @@ def _category_bits(row_format: RowFormat) -> np.ndarray:
 
 @functools.lru_cache
 def _view_tables(headings: int, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the cells of a view lie on the map, by heading.
+    """Return the map offsets of the cells of a view, by heading, and which cells of the view share a map cell.
 
-    A view turned by less than a right angle may have two of its cells in one cell of the map.
+    A view turned by less than a right angle may have two of its cells in one map cell.
 
     Returns:
-      int32 [H, V V, 2], (dz, dx) from the agent, and int32 [H, V V], the other cell of the view in the same cell of the
-      map; the cell itself where there is no other.
+      Offsets (dz, dx) from the agent, int32 [H, V V, 2]; and for each cell of the view its twin in the same map cell,
+      int32 [H, V V], which is the cell itself if it has none.
     """
     offsets = Rules(headings=headings).view_offsets(view).reshape(headings, -1, 2).astype(np.int32)
     is_same_cell = (offsets[:, :, None] == offsets[:, None]).all(axis=-1)
     num_cells = is_same_cell.shape[-1]
 
-    # Of the at most two cells, the twin of the first is the last, and vice versa.
+    # At most two cells of the view share a map cell: the twin of the first is the last, and vice versa.
     first_twin = is_same_cell.argmax(axis=-1)
     last_twin = num_cells - 1 - is_same_cell[..., ::-1].argmax(axis=-1)
     twins = np.where(first_twin == np.arange(num_cells), last_twin, first_twin)
@@ -213,14 +222,14 @@ class SearchState(NamedTuple):
       position: int32 [2], (z, x) of the agent's cell.
       heading: int32 [], compass heading.
       horizon: int32 [], index of the camera's horizon.
-      goal: int32 [], the category that is sought.
+      goal: int32 [], category of the goal.
       goal_sight: int32 [], `GOAL_FAR`, `GOAL_NEAR` or `GOAL_CONFIRMED`.
       success_distance: float32 [], metres to the goal's centre within which Done succeeds.
       block_start: int32 [2], first cell of the block to search in.
-      actions_left: int32 [], actions until the policy chooses another block, which it does at 0 unless the goal is on
-        the map.
-      search_horizon: int32 [], index of the horizon to search with, the lowest first; -1 before the first view.
-      failed_views: int32 [], viewpoints from which the goal was not seen since it was last near.
+      actions_left: int32 [], actions until the policy chooses another block; at 0 it chooses, unless the goal is on the
+        map.
+      search_horizon: int32 [], index of the horizon to search with, at first the lowest; -1 before the first view.
+      failed_views: int32 [], number of viewpoints that did not show the goal since it was last near.
     """
 
     cells: jax.Array
@@ -240,8 +249,8 @@ class MapReading(NamedTuple):
     """Network inputs from the map.
 
     Attributes:
-      blocks: uint32 [..., M], the bits of all cells in each block around the agent, line by line; `EXPLORED_BIT` is
-        inverted and says that some cell is unexplored.
+      blocks: uint32 [..., M], the joined bits of all cells in each block around the agent, row by row; `EXPLORED_BIT`
+        is inverted, so it marks blocks with unexplored cells.
       compass: float32 [..., 2], sine and cosine of the heading.
     """
 
@@ -256,13 +265,16 @@ def goal_on_map(state: SearchState) -> jax.Array:
 
 @dataclasses.dataclass(frozen=True)
 class MapTracker:
-    """Tracker of the map; the method's knowledge is that of `learn_search_setup`."""
+    """Tracker of the map; `learn_search_setup` provides the method's knowledge."""
 
     def init(self, knowledge: Knowledge) -> SearchState:
         """Return an empty map with the agent at its centre."""
+        # The knowledge has an entry for each row of the map.
         semantic_map = SemanticMap(len(knowledge.method["lines"]))
         centre = jnp.full(2, semantic_map.size // 2, jnp.int32)
         zero = jnp.int32(0)
+
+        # Without actions left, the policy chooses a block at the first step.
         return SearchState(
             cells=semantic_map.init(),
             position=centre,
@@ -279,23 +291,25 @@ class MapTracker:
 
     def update(self, state: SearchState, knowledge: Knowledge, percept: Percept) -> SearchState:
         """Draw a view on the map and update the state of the search."""
+        # Follow the agent by compass and odometry.
         strides = knowledge.method["steps"]
         row_format = RowFormat(knowledge.layout.shape[-1])
         semantic_map = SemanticMap(len(state.cells))
         stride = strides[percept.heading]
-
-        # A collision leaves the view as it is, so it cannot confirm the goal.
         position = semantic_map.advance(state.position, percept.moved, stride)
-        look = PlacedView(percept.row, position, percept.heading)
-        goal_sight, success_distance = self._sight(state, look, percept.goal, knowledge)
+        placed_view = PlacedView(percept.row, position, percept.heading)
+
+        # Only a new view can confirm the goal: after a collision the view is the previous one.
+        goal_sight, success_distance = self._judge_goal_sight(state, placed_view, percept.goal, knowledge)
         is_new_view = (percept.action != MOVE_AHEAD) | percept.moved
         confirmed_sight = jnp.where(is_new_view, goal_sight, jnp.minimum(goal_sight, state.goal_sight))
 
-        # Draw.
-        cells = semantic_map.update(state.cells, look, row_format, len(strides))
+        # Draw the view, the collision and a cleared goal on the map.
+        cells = semantic_map.update(state.cells, placed_view, row_format, len(strides))
         cells = semantic_map.mark_collision(cells, position + stride, percept.action, percept.moved)
         cells = _clear_goal_once(state.cells, cells, position, percept.goal)
 
+        # The search starts with the lowest horizon; a goal nearby resets the failed views.
         lowest_horizon = knowledge.method["horizons"] - 1
         return state._replace(
             cells=cells,
@@ -320,31 +334,35 @@ class MapTracker:
         # Put the agent at the centre, and join the bits of the cells in each of the 8 x 8 blocks.
         centred_cells = jnp.roll(state.cells ^ EXPLORED_BIT, size // 2 - state.position, axis=(0, 1))
         blocks = centred_cells.reshape(BLOCKS_PER_SIDE, block_size, BLOCKS_PER_SIDE, block_size)
-        joined_bits = jax.lax.reduce(blocks, _NO_BITS, jax.lax.bitwise_or, (1, 3))
+        joined_bits = jax.lax.reduce(blocks, NO_BITS, jax.lax.bitwise_or, (1, 3))
 
         compass = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[state.heading]
         return MapReading(joined_bits.reshape(-1), compass)
 
-    def _sight(
-        self, state: SearchState, look: PlacedView, goal: jax.Array, knowledge: Knowledge
+    def _judge_goal_sight(
+        self, state: SearchState, placed_view: PlacedView, goal: jax.Array, knowledge: Knowledge
     ) -> tuple[jax.Array, jax.Array]:
-        """Return how near the goal is seen, and the distance within which Done succeeds.
+        """Judge if the view shows the goal near enough for Done.
 
-        Where success is measured on foot, the walk ends at the goal's edge, so a share of its size is added.
+        The distance to the goal's centre within which Done succeeds grows with the goal's size in tasks that measure
+        the walk to the goal's edge.
+
+        Returns:
+          int32 [], the new `SearchState.goal_sight`, and float32 [], the new `SearchState.success_distance`.
         """
         setup = knowledge.method
         row_format = RowFormat(knowledge.layout.shape[-1])
         semantic_map = SemanticMap(len(state.cells))
 
-        # Distance of the detection, and its size as seen from there.
-        detection = row_format.detections(look.row)[goal].astype(jnp.float32)
+        # Distance of the detected goal, and how much its size adds to the distance of success.
+        detection = row_format.detections(placed_view.row)[goal].astype(jnp.float32)
         is_detected = detection[0] > 0
-        distance = jnp.hypot(detection[1] / AHEAD_SCALE, (detection[2] - 128.0) / RIGHT_SCALE)
+        distance = jnp.hypot(*relative_position(detection))
         size_bonus = setup["edge"] * detection[3] / SIZE_SCALE * jnp.maximum(distance, CELL_SIZE)
         success_distance = setup["enough"] + size_bonus
 
-        # Confirmed where an earlier view marked the goal in the same or a neighbouring cell.
-        goal_position = semantic_map.detection_cells(look, row_format, len(setup["steps"]))[goal]
+        # An earlier view confirms the goal if it marked the goal in this cell or in a neighbouring cell.
+        goal_position = semantic_map.detection_cells(placed_view, row_format, len(setup["steps"]))[goal]
         rows, columns = semantic_map.neighbourhood(goal_position)
         is_confirmed = has_category(state.cells[rows, columns], goal).any()
 
@@ -356,13 +374,13 @@ class MapTracker:
 def _clear_goal_once(cells_before: jax.Array, cells: jax.Array, position: jax.Array, goal: jax.Array) -> jax.Array:
     """Let views from one cell clear the goal from the map only once.
 
-    Where the goal is detected at one heading and missed at the next, the agent would otherwise turn to and fro.
+    Otherwise the agent would turn to and fro at a cell that shows the goal at one heading and misses it at the next.
     """
     row, column = position
     own_word = cells[row, column]
     cleared_bits = cells_before & ~cells & category_bit(goal)
 
     # Restore the goal if this cell has cleared it before; mark the cell if it has cleared it now.
-    cells = cells | jnp.where(own_word & TRIED_BIT > 0, cleared_bits, _NO_BITS)
-    tried_bit = jnp.where((cleared_bits > 0).any(), TRIED_BIT, _NO_BITS)
+    cells = cells | jnp.where(own_word & TRIED_BIT > 0, cleared_bits, NO_BITS)
+    tried_bit = jnp.where((cleared_bits > 0).any(), TRIED_BIT, NO_BITS)
     return cells.at[row, column].set(own_word | tried_bit)

@@ -3,9 +3,9 @@
 Source: H. Du, X. Yu and L. Zheng, *Learning Object Relation Graph and Tentative Policy for Visual Navigation*, ECCV
 2020; a host of L-sTDE in the paper. (`jaxnav.policies.methods.tpn` adds its tentative policy.)
 
-Kept: relations R between categories are computed from their boxes and the goal, and mix the appearances of what is
-detected. Changed: appearances are learned embeddings of the categories, and a perceptron shared by all categories reads
-each row.
+Kept: relations R between categories are computed from their boxes and the goal, and mix the appearances of the detected
+categories. Changed: appearances are learned embeddings of the categories, and a perceptron shared by all categories
+reads each row.
 """
 
 from collections.abc import Mapping
@@ -24,9 +24,9 @@ from jaxnav.policies.spec import PolicySpec
 class ObjectRelations(Experience):
     """Relations between the detected categories and the goal.
 
-    The table [R^T X | T | g] of K rows, with the appearance X and the boxes T of the detected categories, is the
-    experience that the layout weights multiply (eq. 7), before the perceptron that reads it. The first layer of the
-    perceptron is linear, so the weights multiply its output instead, which is equivalent.
+    The layout weights multiply (eq. 7) the table [R^T X | T | g] of K rows, with the appearance X and the boxes T of
+    the detected categories and the goal g, before a perceptron reads each row. The first layer of the perceptron is
+    linear, so the weights multiply its output instead, which is equivalent.
 
     Attributes:
       columns: number of columns of T and g; a subclass may add columns of its own.
@@ -36,6 +36,7 @@ class ObjectRelations(Experience):
     sizes: ClassVar[Mapping[str, int]] = {"relation_layers": 1}
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
+        # Relations from the boxes and the goal.
         num_categories = spec.num_categories
         self.edges = Linear(NUM_FEATURES, num_categories, rngs=rngs)
 
@@ -44,6 +45,7 @@ class ObjectRelations(Experience):
         init_kernels = nnx.initializers.lecun_normal(batch_axis=0)
         self.mix = nnx.Param(init_kernels(rngs.params(), kernel_shape))
 
+        # The perceptron that reads each row.
         self.maps = CategoryMaps(spec.sizes.appearance + self.columns, spec, rngs)
         self.width = self.maps.width
 
@@ -58,7 +60,7 @@ class ObjectRelations(Experience):
         for kernel in self.mix[...]:
             relations = nnx.relu(matmul_rows(relations, kernel))
 
-        # R^T X, where X = visible * appearance; the appearance has already passed the first layer of the maps.
+        # R^T X with X = visible * appearance; the appearance has already passed the first layer of the maps.
         visible_relations = relations * features.visible[..., None, :]
         aggregated = matmul_rows(visible_relations, self.maps.project_appearance(appearance))
         return self.maps.finish(weights[..., None] * (aggregated + self.maps.project_rows(table)))

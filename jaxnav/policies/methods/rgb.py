@@ -5,9 +5,8 @@ Source: the baseline *RGB+RL* of Zhang et al., *Layout-based Causal Inference fo
 Kept: detections and view reach the policy directly and Z is empty. Changed: the view is a plan of the floor seen ahead,
 as depth would give it, and the learner is PPO in place of A3C.
 
-`anonymous` has no counterpart in the paper. Its networks receive the view and the goal's own detection as that of a
-single category without a name, so it cannot learn any layout: the gain of a method over `anonymous` is the value of
-experience.
+`anonymous` has no counterpart in the paper. Its networks receive the view and the goal's detection, as the detection of
+one nameless category, so it cannot learn any layout: the gain of a method over `anonymous` is the value of experience.
 """
 
 from typing import Any
@@ -35,8 +34,8 @@ class NoExperience(Experience):
 def keep_goal_detection(features: Features) -> Features:
     """Keep the view and the detection of the goal.
 
-    The detection becomes that of a single nameless category, K = 1. Which goal is sought, all other detections and with
-    them every co-occurrence are removed.
+    The features have a single nameless category, K = 1. The goal's name and all detections of other categories, and
+    with them every co-occurrence, are removed.
     """
     goal_row = (features.goal[..., None] * features.table).sum(axis=-2, keepdims=True)
     return Features(

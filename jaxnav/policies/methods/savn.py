@@ -3,9 +3,9 @@
 Source: M. Wortsman et al., *Learning to Learn How to Learn: Self-Adaptive Visual Navigation Using Meta-Learning*, CVPR
 2019, and its released code. The steps and the loss are in `jaxnav.policies.adaptation`.
 
-Kept: the policy is that of `rgb`, takes a step of gradient descent on a learned loss every six decisions of an episode,
-and training differentiates the loss of PPO through these steps. Changed: only the fusing layer, the recurrent core and
-the actor adapt, at a rate of 0.01, and training unrolls the steps of a rollout, not of a whole episode.
+Kept: the policy has the network of `rgb` and takes a step of gradient descent on a learned loss every six decisions of
+an episode; training differentiates the loss of PPO through these steps. Changed: only the fusing layer, the recurrent
+core and the actor adapt, at a rate of 0.01, and training unrolls the steps of a rollout, not of a whole episode.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxnav.policies.spec import PolicySpec
 
 
 class LearnedLossExperience(Experience):
-    """Mixin that adds a learned loss to another experience; inherit from it first."""
+    """Mixin that adds a learned loss to another experience; it must be the first base class."""
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)
@@ -31,7 +31,7 @@ class LearnedInteraction(LearnedLossExperience, NoExperience):
 
 
 SAVN = Method(LearnedInteraction, adaptation=LearnedLossAdaptation(), hosts_layout=False, name="savn")
-#: Ablation: the same network without adaptation.
+#: Ablation: SAVN without adaptation.
 UNADAPTED = dataclasses.replace(SAVN, adaptation=None)
 #: First-order variant: training does not differentiate the inner gradient, except by the learned loss.
 FIRST_ORDER = dataclasses.replace(SAVN, adaptation=LearnedLossAdaptation(second_order=False))

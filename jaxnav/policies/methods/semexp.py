@@ -4,12 +4,12 @@ Source: D. S. Chaplot et al., *Object Goal Navigation using Goal-Oriented Semant
 released code; a host of L-sTDE in the paper (Table 3).
 
 Kept: the agent maps free, blocked, visited and explored cells and the categories in them; the policy chooses a
-long-term goal every 25 actions and is trained on these macro-steps; a planner without parameters walks there, or to the
-goal once it is on the map, where Done follows from the map. Changed: the long-term goal is one of 8 x 8 blocks around
-the agent, because equation 2 needs logits, and breadth-first search replaces fast marching.
+long-term goal every 25 actions and is trained on these macro-steps; a planner without parameters walks to the long-term
+goal, or to the goal category once the map shows it, and the map decides on Done. Changed: the long-term goal is one of
+8 x 8 blocks around the agent, because equation 2 needs logits, and breadth-first search replaces fast marching.
 
 `MappedCategories` is the network. The tracker is in `map_tracker`, the planner in `local_policy`; `learn_search_setup`
-returns what they need to know of the task, and `check_map_size` refuses scenes that do not fit on the map.
+returns the parameters of the task for both, and `check_map_size` refuses scenes that do not fit on the map.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ _SCENE_FLAGS = (EXPLORED_BIT, FREE_BIT, WALL_BIT, VISITED_BIT)
 class MappedCategories(Experience):
     """Relations between the categories in each block of the map and the goal.
 
-    Flags of floor and walls, and the compass, enter by the scene's direct pathway.
+    Flags of floor and walls, and the compass, enter through the scene's direct pathway.
     """
 
     sizes: ClassVar[Mapping[str, int]] = {"block_outputs": 8}
@@ -70,7 +70,9 @@ class MappedCategories(Experience):
     @staticmethod
     def scene_inputs(reading: MapReading) -> jax.Array:
         """Return the flags of each block, and the compass."""
-        block_flags = [(reading.blocks & flag > 0).astype(jnp.float32) for flag in _SCENE_FLAGS]
+        block_flags = []
+        for flag in _SCENE_FLAGS:
+            block_flags.append((reading.blocks & flag > 0).astype(jnp.float32))
         return jnp.concatenate([*block_flags, reading.compass], axis=-1)
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: MapReading) -> jax.Array:
@@ -93,20 +95,21 @@ class MappedCategories(Experience):
 
 
 def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarray]:
-    """Return how the agent of the task moves and succeeds, and the size of the map.
+    """Return the motion of the agent, the distance of success and the size of the map.
 
     Args:
-      banks: of training scenes, which all have the task of the first one.
-      counts: of exploration, unused.
+      banks: banks of training scenes, which share one task.
+      counts: co-occurrence counts of exploration, unused.
 
     Returns:
       The values of `learn_motion`, and by name `enough`, float32 [], metres within which Done succeeds; `edge`, float32
-      [], the share of a goal's apparent size that is added to them; `lines`, int32 [N], the indices of the lines of a
+      [], the share of a goal's apparent size that is added to these metres; `lines`, int32 [N], the row indices of a
       map that holds the largest home.
 
     Raises:
       InputError: the map has no bit for a category, or the agent cannot walk to all eight neighbours.
     """
+    # Refuse tasks for which the map or the planner does not work.
     banks = list(banks)
     task = banks[0].task
     rules = task.rules
@@ -123,6 +126,7 @@ def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, n
         required_size = max(required_size, *required_map_sizes(bank).values())
     map_size = -(-required_size // WORD_BITS) * WORD_BITS
 
+    # The success distance is measured to the goal's centre, or on foot to its edge.
     setup = {
         "enough": np.array(rules.success_distance - DISTANCE_SLACK, np.float32),
         "edge": np.array(0.25 if rules.success == "near" else 0.0, np.float32),
@@ -138,32 +142,36 @@ def check_map_size(knowledge: Knowledge, bank: Bank) -> None:
       InputError: a scene is too large.
     """
     map_size = len(knowledge.method["lines"])
-    for name, required_size in required_map_sizes(bank).items():
+    for scene_name, required_size in required_map_sizes(bank).items():
         if required_size > map_size:
-            problem = (
-                f"scene {name} needs a map of {required_size} cells, and that of the training homes has {map_size}"
+            raise InputError(
+                f"method semexp: scene {scene_name} needs a map of {required_size} cells, and that of the training "
+                f"homes has {map_size}; train in homes as large"
             )
-            raise InputError(f"method semexp: {problem}; train in homes as large")
 
 
 def required_map_sizes(bank: Bank) -> dict[str, int]:
-    """Return the side in cells of the map that each scene needs, by name: its extent, and a view beyond."""
+    """Return the side in cells of the map that each scene needs, by name: the extent of the scene plus one view."""
+    # Cells of a scene are consecutive.
     positions = cell_positions(bank.ahead, bank.task.rules.move_steps())
     view_size = RowFormat(0).view
     map_sizes: dict[str, int] = {}
-    for name, first_cell, num_cells in zip(bank.names, bank.first_cell, bank.num_cells, strict=True):
+    for scene_name, first_cell, num_cells in zip(bank.names, bank.first_cell, bank.num_cells, strict=True):
         scene_positions = positions[first_cell : first_cell + num_cells]
         extent = int(np.ptp(scene_positions, axis=0).max()) + 1
-        map_sizes[name] = extent + view_size
+        map_sizes[scene_name] = extent + view_size
     return map_sizes
 
 
 def cell_positions(ahead: np.ndarray, strides: np.ndarray) -> np.ndarray:
-    """Return positions of cells, int [C, 2], (z, x) relative to the first cell of their scene.
+    """Return the positions of cells relative to the first cell of their scene.
 
     Args:
       ahead: int [C, H], cell after MoveAhead.
-      strides: int [H, 2], the displacement of a step ahead by heading.
+      strides: int [H, 2], the displacement (dz, dx) of a step ahead by heading.
+
+    Returns:
+      int [C, 2], (z, x).
     """
     num_headings = len(strides)
     positions = np.zeros((len(ahead), 2), int)
@@ -173,6 +181,8 @@ def cell_positions(ahead: np.ndarray, strides: np.ndarray) -> np.ndarray:
     for first_cell in range(len(ahead)):
         if is_reached[first_cell]:
             continue
+
+        # Step from the frontier in every heading; cells that are reached for the first time are the next frontier.
         is_reached[first_cell] = True
         frontier = np.array([first_cell])
         while len(frontier):

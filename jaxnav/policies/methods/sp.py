@@ -3,9 +3,9 @@
 Source: W. Yang et al., *Visual Semantic Navigation using Scene Priors*, ICLR 2019, in the form of SAVN's released code.
 
 Kept: three layers of graph convolution with symmetric normalisation and loops, without biases, over a graph that is
-known before training; they leave one number per category. Changed: nodes get the detection of their category in place
-of the scores of an image classifier, edges have weights, the graph is learned from exploration (or read from a file)
-and stays fixed, and the last layer is linear.
+fixed before training; their output is one number per category. Changed: nodes get the detection of their category in
+place of the scores of an image classifier, edges have weights, the graph is learned from exploration or read from a
+file, and the last layer is linear.
 """
 
 import dataclasses
@@ -32,8 +32,8 @@ from jaxnav.scenes.tables.compile import Bank
 def learn_graph(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarray]:
     """Learn the co-occurrence graph of the categories.
 
-    The edge of two categories is the number of poses that show both, over the geometric mean of the numbers of poses
-    that show either.
+    The edge of two categories is the number of poses that show both categories, divided by the geometric mean of the
+    numbers of poses that show each category.
 
     Args:
       banks: not used.
@@ -51,7 +51,7 @@ def learn_graph(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarr
 
 
 def learn_permuted_graph(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarray]:
-    """Learn the graph and permute its categories, for an ablation: each gets the edges of another."""
+    """Learn the graph and permute its categories, for an ablation: each category gets the edges of another."""
     mixing = learn_graph(banks, counts)["mixing"]
     return {"mixing": np.roll(mixing, 1, axis=(0, 1))}
 
@@ -62,32 +62,33 @@ def graph_from_file(path: str | Path, banks: Iterable[Bank], counts: np.ndarray)
     A line is `Book,Desk` or `Book,Desk,0.5`: two categories and a weight above 0 and at most 1, which is 1 if omitted.
     A # starts a comment. Edges have no direction.
 
-    The configuration of a run does not include the file, which is read again when a run continues: do not change it
-    until the run has ended.
+    The configuration of a run does not include the file. A run that continues reads the file again, so do not change
+    the file until the run has ended.
 
     Args:
-      path: of the file.
-      banks: of the training scenes; only the names of their categories are used.
+      path: file of edges.
+      banks: banks of the training scenes, of which only the names of the categories are used.
       counts: not used.
 
     Returns:
-      As `learn_graph`.
+      `mixing`, as from `learn_graph`.
 
     Raises:
-      InputError: the file cannot be read, a line is no edge of the scenes' categories, or there is none.
+      InputError: the file cannot be read, a line is no edge of the scenes' categories, or the file has no edges.
     """
+    # Every line but comments and empty ones is an edge, entered in both directions.
     categories = next(iter(banks)).task.categories
     edges = np.zeros((len(categories), len(categories)))
-    # Every line but comments and empty ones is an edge, entered in both directions.
     lines = read_bytes(Path(path)).decode(errors="replace").splitlines()
     for line_number, line in enumerate(lines, 1):
         edge_text = line.partition("#")[0].strip()
         if not edge_text:
             continue
-        first, second, weight = _parse_edge(f"{path}:{line_number}", edge_text, categories)
-        edges[first, second] = weight
-        edges[second, first] = weight
+        first_category, second_category, weight = _parse_edge(f"{path}:{line_number}", edge_text, categories)
+        edges[first_category, second_category] = weight
+        edges[second_category, first_category] = weight
 
+    # A file without any edge is probably the wrong file.
     if not edges.any():
         raise InputError(f"{path}: has no edges; write one a line, such as {','.join(categories[:2])}")
     return {"mixing": normalize_adjacency(edges).astype(np.float32)}
@@ -100,49 +101,52 @@ def normalize_adjacency(edges: np.ndarray) -> np.ndarray:
 
     Args:
       edges: A, float64 [..., N, N], at least 0, symmetric, 0 on the diagonal.
+
+    Returns:
+      float64 [..., N, N], the normalised adjacency.
     """
     with_loops = edges + np.eye(edges.shape[-1])
     degrees = with_loops.sum(axis=-1)
     return with_loops / np.sqrt(degrees[..., :, None] * degrees[..., None, :])
 
 
-def _parse_edge(source: str, text: str, categories: tuple[str, ...]) -> tuple[int, int, float]:
+def _parse_edge(source: str, edge_text: str, categories: tuple[str, ...]) -> tuple[int, int, float]:
     """Return the indices of two categories and the weight of their edge.
 
     Args:
       source: file and line, for error messages.
-      text: the line without its comment.
+      edge_text: the line without its comment.
       categories: names of the categories.
     """
     # Two different names, and perhaps a weight.
-    fields = [field.strip() for field in text.split(",")]
+    fields = [field.strip() for field in edge_text.split(",")]
     names = tuple(fields[:2])
     if len(fields) not in (2, 3) or names[0] == names[-1]:
-        raise InputError(f"{source}: {text!r} is no edge; name two categories, such as {','.join(categories[:2])}")
+        raise InputError(f"{source}: {edge_text!r} is no edge; name two categories, such as {','.join(categories[:2])}")
 
     # Unknown categories have a negative index.
-    first, second = category_ids(names, categories)
-    for name, index in zip(names, (first, second), strict=True):
-        if index < 0:
+    first_category, second_category = category_ids(names, categories)
+    for name, category in zip(names, (first_category, second_category), strict=True):
+        if category < 0:
             close_matches = difflib.get_close_matches(name, categories, n=1)
             hint = f"choose of {', '.join(categories)}, or take the line out"
             if close_matches:
                 hint = f"did you mean {close_matches[0]!r}?"
             raise InputError(f"{source}: category {name!r} is unknown; {hint}")
 
+    # An omitted weight is 1; a text that is no number fails the check of the range.
     try:
-        # An omitted weight is 1; a text that is no number fails the check of the range.
         weight = float(fields[2]) if len(fields) == 3 else 1.0
     except ValueError:
         weight = np.nan
     if not 0.0 < weight <= 1.0:
         raise InputError(f"{source}: weight {fields[2]!r} is not above 0 and at most 1; mend it or leave it out")
-    return first, second, weight
+    return first_category, second_category, weight
 
 
 @dataclasses.dataclass(frozen=True)
 class GraphTracker:
-    """Tracker that remembers nothing and passes the graph to the network."""
+    """Tracker without a state, which passes the graph to the network."""
 
     def init(self, knowledge: Knowledge) -> Any:
         """Return the empty tracker state."""
@@ -158,11 +162,11 @@ class GraphTracker:
 
 
 class GraphConvolution(Experience):
-    """Graph convolution over what is detected and sought.
+    """Graph convolution over the detections and the goal.
 
     A node holds the embedding of its category, detected or not, its detection and the goal flag. Three layers without
-    biases leave one number per category, which the layout weights multiply (eq. 7). The last layer is linear: a ReLU on
-    a single output may be 0 everywhere from the start, and could then not learn.
+    biases compute one number per category, which the layout weights multiply (eq. 7). The last layer is linear: a ReLU
+    on a single output may be 0 everywhere from the start, and could then not learn.
     """
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
@@ -175,13 +179,13 @@ class GraphConvolution(Experience):
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: jax.Array) -> jax.Array:
         """Return experience, each category weighted by the layout."""
+        # First layer, in two parts: detections [..., K, h] and appearances [K, h], which the batch shares.
         graph = reading
-
-        # First layer, in two parts: detections [..., K, h] and appearances [K, h], which are shared by the batch.
         detections = self.seen(features.table)
         appearances = jnp.broadcast_to(self.named(appearance), detections.shape)
         nodes = nnx.relu(graph @ (detections + appearances))
 
+        # Two more layers leave one number per category, [..., K].
         nodes = nnx.relu(graph @ self.second(nodes))
         return weights * (graph @ self.third(nodes))[..., 0]
 

@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from jaxnav.policies.network import Policy
     from jaxnav.policies.pathways import Decision, Pathways, PolicyState
 
-#: Trials of an episode that are remembered, and those of them that a decision attends to.
-NUM_TRIALS, NUM_ATTENDED = 100, 10
+#: Number of trials of an episode that are remembered.
+NUM_TRIALS = 100
+#: Number of remembered trials that a decision attends to.
+NUM_ATTENDED = 10
 
 #: Share of all updates in which the tentative policy learns to imitate.
 _IMITATION_SHARE = 0.2
@@ -51,7 +53,7 @@ class PoseHistory(NamedTuple):
     Attributes:
       poses: int32 [N], numbers of the last poses, the present one at the end.
       position: int32 [2], (dz, dx) in cells from the start of the episode.
-      is_repeated: bool [], True where the present pose is one of the earlier ones.
+      is_repeated: bool [], True where the present pose repeats an earlier pose.
     """
 
     poses: jax.Array
@@ -63,7 +65,7 @@ class PoseHistory(NamedTuple):
 class PoseTracker:
     """Tracker that recognises repeated poses by compass, odometry and horizon.
 
-    A pose is cell, heading and horizon. The method's knowledge is that of `learn_motion`.
+    A pose is cell, heading and horizon. `learn_motion` provides the method's knowledge.
 
     Attributes:
       length: N, number of poses that are remembered.
@@ -78,11 +80,12 @@ class PoseTracker:
 
     def update(self, state: PoseHistory, knowledge: Knowledge, percept: Percept) -> PoseHistory:
         """Append the present pose."""
+        # Follow the agent by odometry.
         strides = knowledge.method["steps"]
         num_horizons = knowledge.method["horizons"]
         position = state.position + jnp.where(percept.moved, strides[percept.heading], 0)
 
-        # One number per pose.
+        # One number per pose: mixed radix of row, column, heading and horizon.
         cell = position[0] * _CELLS_PER_LINE + position[1]
         pose = (cell * len(strides) + percept.heading) * num_horizons + percept.horizon
         poses = jnp.concatenate([state.poses[1:], pose[None]])
@@ -94,11 +97,11 @@ class PoseTracker:
 
 
 def learn_motion(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarray]:
-    """Return how the agent of the task moves.
+    """Return the displacements and the number of horizons of the task.
 
     Args:
-      banks: of training scenes, which all have the task of the first one.
-      counts: of exploration, unused.
+      banks: banks of training scenes, which share one task.
+      counts: co-occurrence counts of exploration, unused.
 
     Returns:
       By name `steps`, int32 [H, 2], the displacement (dz, dx) of a step ahead by heading, and `horizons`, int32 [], the
@@ -148,7 +151,7 @@ class TentativePolicy(nnx.Module):
           trials: float32 [..., N, H + A], the latest at the end.
           count: int32 [...], number of trials so far, at least 1.
         """
-        # Read from the trials in similar states, and predict from both.
+        # Attend to the trials in similar states, and predict the action from the state and the attended trial.
         state = self.state(hidden)
         attention = self.attention(state, trials, count)
         attended_trial = (attention[..., None, :] @ trials)[..., 0, :]
@@ -165,12 +168,12 @@ class TentativePolicy(nnx.Module):
         ages = jnp.arange(trials.shape[-2], 0, -1).reshape((1,) * count.ndim + (-1,))
         scores = jnp.where(ages <= count[..., None], self.scores(state, trials), -jnp.inf)
 
-        # Mask all but the best ones.
+        # Keep the NUM_ATTENDED highest scores and their ties: equal scores attend to all trials, as the ablation needs.
         lowest_attended = jax.lax.top_k(scores, NUM_ATTENDED)[0][..., -1:]
         return jax.nn.softmax(jnp.where(scores >= lowest_attended, scores, -jnp.inf))
 
     def scores(self, state: jax.Array, trials: jax.Array) -> jax.Array:
-        """Return the scaled dot products of the state and those of the trials, [..., N]."""
+        """Return the scaled dot products of the state with the states of the trials, [..., N]."""
         width = state.shape[-1]
         return (trials[..., :width] @ state[..., None])[..., 0] / np.float32(np.sqrt(width))
 
@@ -224,10 +227,10 @@ class TentativeAdaptation:
     """Gradient descent towards the tentative policy at repeated poses.
 
     After a decision at a repeated pose, the actor takes a step on the cross-entropy to the action that the tentative
-    policy considers best. With streams it is the actor of the direct stream.
+    policy considers best. With streams, the actor of the direct stream adapts.
 
     Attributes:
-      learning_rate: of the step.
+      learning_rate: learning rate of the step.
       reset_interval: number of decisions after which the actor is reset to its trained state.
     """
 
@@ -253,9 +256,9 @@ class TentativeAdaptation:
         # Decide, with a reset actor every `reset_interval` decisions.
         is_reset = num_decisions % self.reset_interval == 0
         actor_change = jnp.where(is_reset[..., None, None], 0.0, actor_change)
-        output = policy.decide_with_changes(pathways, memory, actor_changes(actor_change))
+        output = policy.decide_with_changes(pathways, memory, make_layer_changes(actor_change))
 
-        # Hidden states, with streams those of the direct stream; the tentative policy does not train the policy.
+        # Hidden states, with streams of the direct stream alone; no gradient of the tentative policy passes them.
         hidden_before = jax.lax.stop_gradient(memory.hidden[..., : policy.hidden])
         hidden_now = jax.lax.stop_gradient(output.hidden[..., : policy.hidden])
 
@@ -273,23 +276,23 @@ class TentativeAdaptation:
         return output._replace(fast=TentativeState(trials, num_decisions + 1, actor_change, predicted_logits))
 
 
-def actor_changes(actor_change: jax.Array) -> LayerChanges:
-    """Return the layer changes for a change of the actor's kernel and bias, [..., H + 1, A]."""
+def make_layer_changes(actor_change: jax.Array) -> LayerChanges:
+    """Make the layer changes for a change of the actor's kernel and bias, [..., H + 1, A]."""
     return {"actor": lambda inputs: (inputs[..., None] * actor_change).sum(axis=-2)}
 
 
-def tentative_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+def tentative_loss(replay: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Return the imitation loss of the tentative policy at repeated poses.
 
     No gradient reaches the policy itself.
 
     Args:
-      replayed: a `jaxnav.training.ppo.Replay`.
+      replay: a `jaxnav.training.ppo.Replay`.
     """
     # Steps at other poses get the label NUM_ACTIONS, which adds nothing to the loss.
-    is_repeated = replayed.transitions.reading
-    expert = jnp.where(is_repeated, expert_actions(replayed), NUM_ACTIONS)
-    loss, metrics = imitation_loss(replayed.factual.fast.predicted_logits, expert)
+    is_repeated = replay.transitions.reading
+    expert = jnp.where(is_repeated, expert_actions(replay), NUM_ACTIONS)
+    loss, metrics = imitation_loss(replay.factual.fast.predicted_logits, expert)
     return loss, metrics | {"repeated": is_repeated.astype(jnp.float32).mean()}
 
 

@@ -3,8 +3,8 @@
 Source: H. Du, X. Yu and L. Zheng, *VTNet: Visual Transformer Network for Object Goal Navigation*, ICLR 2021, and its
 released code; a host of L-sTDE in the paper.
 
-Kept: each detection is a token, a post-norm encoder relates the tokens, and a decoder reads them from queries, which
-are squares of the view with a fixed sine code of their position. A head of its own imitates shortest paths before the
+Kept: each detection is a token, a post-norm encoder relates the tokens, and decoder queries, which are squares of the
+view with a fixed sine code of their position, attend to the tokens. A separate head imitates shortest paths before the
 rest of the policy is trained. Changed: only the goal and the detected categories are tokens, queries are 5 x 5 squares
 of the plan of the floor, the networks are smaller, there is no dropout, and all parameters have one learning rate.
 """
@@ -36,8 +36,8 @@ class Transformer(Experience):
     """Transformer from the detected categories to squares of the view.
 
     An encoder relates the detected categories and the goal; each token embeds a category and its detection. The layout
-    weights multiply the output of the encoder (eq. 7): before its last normalisation they would be undone. A decoder
-    then attends to this output from queries, which are squares of the view in front of the agent.
+    weights multiply the output of the encoder (eq. 7), because its last normalisation would undo earlier weights. A
+    decoder then attends to this output from queries, which are squares of the view in front of the agent.
     """
 
     attention: ClassVar[type[MultiHeadAttention]] = MultiHeadAttention
@@ -72,27 +72,30 @@ class Transformer(Experience):
         def build_layer(*attention_names: str) -> nnx.Dict:
             """Build attention modules by name, and the perceptron after them."""
             modules: dict[str, nnx.Module] = {}
-            for name in attention_names:
-                modules[name] = self.attention(token_width, num_heads, rngs)
+            for attention_name in attention_names:
+                modules[attention_name] = self.attention(token_width, num_heads, rngs)
             modules["forward"] = FeedForward(token_width, self.size(spec, "feedforward"), rngs)
             return nnx.Dict(modules)
 
+        # Encoder: a token for each category, and layers in which the tokens attend to each other.
         self.token = Linear(spec.sizes.appearance + NUM_FEATURES, token_width, rngs=rngs)
         encoder_layers: dict[str, nnx.Dict] = {}
         for i in range(self.size(spec, "encoder_layers")):
             encoder_layers[str(i)] = build_layer("tokens")
         self.encoder = nnx.Dict(encoder_layers)
 
-        # The first decoder layer does not attend to the answers of the queries, which are still zero.
+        # Decoder: the first layer does not attend to the answers of the queries, which are still zero.
         self.query = Linear(view_squares(self.view, self.side).shape[1], token_width, rngs=rngs)
         decoder_layers: dict[str, nnx.Dict] = {}
         for i in range(self.size(spec, "decoder_layers")):
-            decoder_layers[str(i)] = build_layer("tokens") if i == 0 else build_layer("answers", "tokens")
+            attention_names = ("tokens",) if i == 0 else ("answers", "tokens")
+            decoder_layers[str(i)] = build_layer(*attention_names)
         self.decoder = nnx.Dict(decoder_layers)
 
+        # Outputs for each query; the expert head serves the imitation only.
         self.maps = Linear(token_width, query_outputs, rngs=rngs)
         self.width = self.side**2 * query_outputs
-        self.expert = Linear(self.width, NUM_ACTIONS, rngs=rngs)  # only for imitation
+        self.expert = Linear(self.width, NUM_ACTIONS, rngs=rngs)
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Any) -> jax.Array:
         """Return experience, each encoded category weighted by the layout."""
@@ -105,12 +108,12 @@ class Transformer(Experience):
         tokens = add_bias(detections + appearances, self.token)
 
         # Encode the tokens, then weight them by the layout.
-        present = slots.any(axis=-1)
+        is_present = slots.any(axis=-1)
         for layer in self.encoder.values():
-            tokens = layer.forward(layer.tokens(tokens, tokens, tokens, tokens, present))
+            tokens = layer.forward(layer.tokens(tokens, tokens, tokens, tokens, is_present))
         weighted_tokens = slots @ weights[..., None] * tokens
 
-        # Queries [..., side^2, d]: what is seen of each square of the view, and where it is.
+        # Queries [..., side^2, d]: floor and walls in each square of the view, and the position of the square.
         squares = features.view[..., view_squares(self.view, self.side)]
         query = nnx.relu(self.query(squares))
         query = query + jnp.broadcast_to(position_codes(self.side, query.shape[-1]), query.shape)
@@ -120,19 +123,20 @@ class Transformer(Experience):
         for layer in self.decoder.values():
             if "answers" in layer:
                 answers = layer.answers(answers, answers + query, answers + query, answers)
-            answers = layer.forward(layer.tokens(answers, answers + query, weighted_tokens, weighted_tokens, present))
+            attended = layer.tokens(answers, answers + query, weighted_tokens, weighted_tokens, is_present)
+            answers = layer.forward(attended)
         maps = nnx.relu(self.maps(answers))
         return maps.reshape(*maps.shape[:-2], -1)
 
     def _slots(self, features: Features) -> jax.Array:
         """Return the category of each token.
 
-        The first token is the goal, detected or not; the other detected categories follow in their order.
+        The first token is the goal, detected or not; further detected categories follow in their order.
 
         Returns:
           float32 [..., N, K], one-hot, or zero where there are fewer categories than tokens.
         """
-        # Ranks [..., K] of the categories among the tokens, -1 for those without one.
+        # Rank [..., K] of each category among the tokens, -1 for categories without a token.
         other_visible = features.visible * (1.0 - features.goal)
         other_rank = jnp.where(other_visible > 0, jnp.cumsum(other_visible, axis=-1), -1.0)
         rank = jnp.where(features.goal > 0, 0.0, other_rank)
@@ -158,12 +162,13 @@ def view_squares(view: int, side: int) -> np.ndarray:
     Returns:
       int [side^2, 2 cells], indices into `Features.view`, whose two halves are free and blocked cells.
     """
+    # Starts of the squares along one side, and cells within a square.
     stride = view // side
     square_size = view - stride * (side - 1)
     starts = stride * np.arange(side)
     offsets = np.arange(square_size)
 
-    # [square row, square column, cell row, cell column]
+    # Indices of free cells, [square row, square column, cell row, cell column] -> [side^2, cells].
     line_starts = (starts[:, None, None, None] + offsets[:, None]) * view
     free_cells = (line_starts + starts[:, None, None] + offsets).reshape(side**2, -1)
     blocked_cells = view**2 + free_cells
@@ -176,7 +181,7 @@ def position_codes(side: int, width: int) -> np.ndarray:
     Returns:
       float32 [side^2, width].
     """
-    # A quarter of the width for each of sine and cosine, of row and column.
+    # Sine and cosine of row and of column get a quarter of the width each.
     frequencies = np.pi / side / 2.0 ** np.arange(width // 4)
     angles = np.arange(side)[:, None] * frequencies
     line_codes = np.concatenate([np.sin(angles), np.cos(angles)], axis=1)
@@ -186,18 +191,18 @@ def position_codes(side: int, width: int) -> np.ndarray:
     return np.concatenate([row_codes, column_codes], axis=1).astype(np.float32)
 
 
-def experience_imitation_loss(replayed: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+def experience_imitation_loss(replay: Any, *_: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Return the imitation loss of a linear head on experience.
 
     Only this loss reads the head; the policy itself just explores in this stage.
 
     Args:
-      replayed: a `jaxnav.training.ppo.Replay`.
+      replay: a `jaxnav.training.ppo.Replay`.
     """
     # With streams the view follows the experience of the method.
-    transformer = replayed.policy.method
-    experience = replayed.pathways.experience[..., : transformer.width]
-    return imitation_loss(transformer.expert(experience), expert_actions(replayed))
+    transformer = replay.policy.method
+    experience = replay.pathways.experience[..., : transformer.width]
+    return imitation_loss(transformer.expert(experience), expert_actions(replay))
 
 
 _IMITATION = Stage(

@@ -45,7 +45,7 @@ FURNISHED_HOUSE_CELLS = (250, 1500)  # range of the standable cells
 MIN_ROOM_SIDE = 9  # cells
 ROOM_CELLS = (235.0, 0.25)  # median floor of a room, and the standard deviation of its logarithm
 CORRIDOR_WIDTHS = (5, 6)  # cells
-DOOR_WIDTHS = (4, 6, 8, 8)  # cells; bathrooms have the first
+DOOR_WIDTHS = (4, 6, 8, 8)  # cells; doors of bathrooms have the first width
 EXTRA_DOOR_PROBABILITY = 0.2  # of a door between rooms that are already connected
 #: Probability of each number of rooms.
 ROOM_COUNT_PROBABILITIES = {4: 0.18, 5: 0.24, 6: 0.18, 7: 0.14, 8: 0.16, 10: 0.1}
@@ -105,21 +105,23 @@ def generate_apartment(split: str, index: int, seed: int) -> Scene:
     Raises:
       InputError: unknown split, or a negative index or seed.
     """
+    # The plan of the apartment, which all its furnishings share.
     check_scene_arguments("generate_apartment", split, index, seed)
     plan_index, furnishing = divmod(index, FURNISHINGS_PER_PLAN)
     apartment_key = (seed, SPLITS.index(split))
     plan = sample_apartment_plan(np.random.default_rng((*apartment_key, plan_index, _PLAN_STREAM)))
     builder = HomeBuilder(plan, home_rules("apartments"), _APARTMENT_RANGE)
 
+    # Furnish the plan until the apartment is accepted.
     rng = np.random.default_rng((*apartment_key, index, _APARTMENT_STREAM))
-    name = f"{split}-apartment-{plan_index:02d}-{furnishing}"
+    scene_name = f"{split}-apartment-{plan_index:02d}-{furnishing}"
     while True:
         rooms = builder.furnish_rooms(rng)
         if rooms is None or not _has_cells(builder, rooms, FURNISHED_APARTMENT_CELLS):
             continue
 
         # Accept the apartment if an agent succeeds for every goal from some pose.
-        scene = builder.build_scene(name, "apartments", "apartment", split, rooms)
+        scene = builder.build_scene(scene_name, "apartments", "apartment", split, rooms)
         best_length = compile_scene(scene, APARTMENTS).best_length  # [P, K]
         if best_length[:, APARTMENTS.is_goal()].any(axis=0).all():
             return scene
@@ -144,6 +146,8 @@ def generate_house(split: str, index: int, seed: int) -> Scene:
     check_scene_arguments("generate_house", split, index, seed)
     rules = home_rules("houses")
     rng = np.random.default_rng((seed, SPLITS.index(split), index, _HOUSE_STREAM))
+
+    # Sample and furnish plans until a house has a realistic size.
     while True:
         builder = HomeBuilder(sample_house_plan(rng), rules, _HOUSE_RANGE)
         rooms = builder.furnish_rooms(rng)
@@ -154,8 +158,8 @@ def generate_house(split: str, index: int, seed: int) -> Scene:
 
 def _has_cells(builder: "HomeBuilder", rooms: list[FurnishedRoom], cell_range: tuple[int, int]) -> bool:
     """Return True if the number of standable cells is in a range."""
-    low, high = cell_range
-    return bool(low <= builder.standable_mask(rooms).sum() <= high)
+    min_cells, max_cells = cell_range
+    return bool(min_cells <= builder.standable_mask(rooms).sum() <= max_cells)
 
 
 # Floor plans.
@@ -167,7 +171,7 @@ class FloorPlan(NamedTuple):
     Attributes:
       walls: bool [nz, nx], with a ring of walls around.
       rooms: the floors of the rooms.
-      types: their room types.
+      types: room type of each room.
       doors: openings in the walls between rooms.
       partitions: walls that stand in a room.
     """
@@ -189,11 +193,14 @@ def sample_apartment_plan(rng: np.random.Generator) -> FloorPlan:
     while True:
         # One partition in each half of the apartment, or one in the whole of it.
         middle = int(rng.integers(num_x // 3, 2 * num_x // 3))
-        spans = [(0, middle), (middle, num_x)] if rng.random() < 0.7 else [(0, num_x)]
+        column_ranges = [(0, num_x)]
+        if rng.random() < 0.7:
+            column_ranges = [(0, middle), (middle, num_x)]
         partitions = []
-        for low, high in spans:
-            partitions += _sample_partition(low, high, rng)
+        for first_column, end_column in column_ranges:
+            partitions += _sample_partition(first_column, end_column, rng)
 
+        # Outer walls and partitions.
         walls = np.ones((num_z + 2, num_x + 2), bool)
         walls[1:-1, 1:-1] = False
         for wall in partitions:
@@ -206,19 +213,20 @@ def sample_apartment_plan(rng: np.random.Generator) -> FloorPlan:
             return FloorPlan(walls, (floor,), ("apartment",), partitions=tuple(partitions))
 
 
-def _sample_partition(low: int, high: int, rng: np.random.Generator) -> list[CellRectangle]:
+def _sample_partition(first_column: int, end_column: int, rng: np.random.Generator) -> list[CellRectangle]:
     """Sample some sides of a rectangle as walls.
 
-    The rectangle lies between the columns `low` and `high` of the floor; one side may extend to the outer wall.
+    The rectangle lies in the columns [first_column, end_column) of the floor; one side may extend to the outer wall.
     """
+    # Columns for the rectangle, with a passage before the outer wall.
     num_z, num_x = APARTMENT_SHAPE
-    first = low + 1 + (PASSAGE_CELLS if low == 0 else 1)
-    last = high + 1 - (PASSAGE_CELLS if high == num_x else 1)
+    min_x = first_column + 1 + (PASSAGE_CELLS if first_column == 0 else 1)
+    max_x = end_column + 1 - (PASSAGE_CELLS if end_column == num_x else 1)
 
     # The rectangle and its four sides, each one cell thick.
-    width = int(rng.integers(6, min(18, last - first) + 1))
+    width = int(rng.integers(6, min(18, max_x - min_x) + 1))
     depth = int(rng.integers(5, 9))
-    x0 = int(rng.integers(first, last - width + 1))
+    x0 = int(rng.integers(min_x, max_x - width + 1))
     z0 = 1 + int(rng.integers(PASSAGE_CELLS, num_z - PASSAGE_CELLS - depth + 1))
     x1 = x0 + width
     z1 = z0 + depth
@@ -234,14 +242,14 @@ def _sample_partition(low: int, high: int, rng: np.random.Generator) -> list[Cel
     num_sides = rng.choice([1, 2, 3], p=[0.2, 0.45, 0.35])
     walls = [sides[i] for i in side_order[:num_sides]]
 
-    # Sometimes the last wall extends to the outer wall: along z to either end, along x to the nearer one.
+    # Sometimes the last wall extends to the outer wall: along z to either end, along x to the nearer end.
     if rng.random() < 0.4:
         wall = walls.pop()
         if wall.z1 - wall.z0 > 1:
-            wall = wall._replace(z0=1) if rng.random() < 0.5 else wall._replace(z1=num_z + 1)
+            extended_wall = wall._replace(z0=1) if rng.random() < 0.5 else wall._replace(z1=num_z + 1)
         else:
-            wall = wall._replace(x0=1) if low == 0 else wall._replace(x1=num_x + 1)
-        walls.append(wall)
+            extended_wall = wall._replace(x0=1) if first_column == 0 else wall._replace(x1=num_x + 1)
+        walls.append(extended_wall)
     return walls
 
 
@@ -257,9 +265,10 @@ def sample_house_plan(rng: np.random.Generator) -> FloorPlan:
         area = num_rooms * median_cells * np.exp(log_std * rng.standard_normal())
         stretch = np.sqrt(rng.uniform(1.0, 1.8))
         sides = np.round(rng.permutation([stretch, 1.0 / stretch]) * np.sqrt(area))
-        num_z, num_x = int(sides[0]), int(sides[1])
+        num_z = int(sides[0])
+        num_x = int(sides[1])
 
-        # Divide the house, or the two parts beside its corridor, into rooms.
+        # Divide the house into rooms; half of the houses have a corridor and are divided on both sides of it.
         corridors: list[CellRectangle] = []
         parts = [CellRectangle(1, 1, num_z + 1, num_x + 1)]
         if rng.random() < 0.5:
@@ -268,7 +277,7 @@ def sample_house_plan(rng: np.random.Generator) -> FloorPlan:
         if rooms is None:
             continue
 
-        # Room types go by size; corridors come last.
+        # Room types depend on the order by size; corridors are the last rooms.
         rooms.sort(key=lambda room: -room.area)
         types = _sample_room_types(num_rooms, rng) + ["corridor"] * len(corridors)
         rooms += corridors
@@ -276,6 +285,7 @@ def sample_house_plan(rng: np.random.Generator) -> FloorPlan:
         if doors is None:
             continue
 
+        # Everything but rooms and doors is wall.
         walls = np.ones((num_z + 2, num_x + 2), bool)
         for opening in (*rooms, *doors):
             walls[opening.cells] = False
@@ -288,19 +298,22 @@ def _sample_corridor(
     """Sample a corridor along the longer side.
 
     Returns:
-      The corridor alone, and the two parts of the house beside it.
+      The corridor as a list of one, and the two parts of the house on its sides.
     """
     width = int(rng.choice(CORRIDOR_WIDTHS))
-    breadth = min(num_z, num_x)
-    low = 1 + int(np.round((breadth - width) * rng.uniform(0.4, 0.6)))
+    house_breadth = min(num_z, num_x)
+    corridor_start = 1 + int(np.round((house_breadth - width) * rng.uniform(0.4, 0.6)))
+    corridor_end = corridor_start + width
 
-    # Ranges across the corridor, with a wall of one cell between them.
-    band_ranges = [(low, low + width), (1, low - 1), (low + width + 1, breadth + 1)]
-    if num_z <= num_x:
-        corridor, *sides = (CellRectangle(z0, 1, z1, num_x + 1) for z0, z1 in band_ranges)
-    else:
-        corridor, *sides = (CellRectangle(1, x0, num_z + 1, x1) for x0, x1 in band_ranges)
-    return [corridor], sides
+    # Ranges across the corridor: of the corridor and of both parts, with walls of one cell between them.
+    band_ranges = [(corridor_start, corridor_end), (1, corridor_start - 1), (corridor_end + 1, house_breadth + 1)]
+    bands = []
+    for band_start, band_end in band_ranges:
+        if num_z <= num_x:
+            bands.append(CellRectangle(band_start, 1, band_end, num_x + 1))
+        else:
+            bands.append(CellRectangle(1, band_start, num_z + 1, band_end))
+    return bands[:1], bands[1:]
 
 
 def _divide_into_rooms(
@@ -313,8 +326,8 @@ def _divide_into_rooms(
     """
     rooms = list(parts)
     while len(rooms) < num_rooms:
-        largest_room = int(np.argmax([room.area for room in rooms]))
-        z0, x0, z1, x1 = rooms.pop(largest_room)
+        largest_index = int(np.argmax([room.area for room in rooms]))
+        z0, x0, z1, x1 = rooms.pop(largest_index)
 
         # A wall of one cell across the longer side.
         length = max(z1 - z0, x1 - x0)
@@ -324,6 +337,7 @@ def _divide_into_rooms(
         else:
             rooms += [CellRectangle(z0, x0, z1, x0 + wall), CellRectangle(z0, x0 + wall + 1, z1, x1)]
 
+    # Refuse narrow rooms.
     shortest_side = min(min(z1 - z0, x1 - x0) for z0, x0, z1, x1 in rooms)
     return rooms if shortest_side >= MIN_ROOM_SIDE else None
 
@@ -333,39 +347,53 @@ def _sample_room_types(num_rooms: int, rng: np.random.Generator) -> list[str]:
     num_living = LIVING_ROOM_COUNTS[num_rooms]
     num_baths = BATHROOM_COUNTS[num_rooms]
     medium_rooms = ["kitchen"] + ["bedroom"] * (num_rooms - num_living - num_baths - 1)
-    medium_types = [str(name) for name in rng.permutation(medium_rooms)]
+    medium_types = [str(room_type) for room_type in rng.permutation(medium_rooms)]
     return ["living_room"] * num_living + medium_types + ["bathroom"] * num_baths
 
 
 def _sample_doors(rooms: list[CellRectangle], types: list[str], rng: np.random.Generator) -> list[CellRectangle] | None:
-    """Sample doors that connect all rooms, and some more.
+    """Sample doors that connect all rooms, and some extra doors.
 
-    Connections through corridors and living rooms are preferred to those through bathrooms.
+    Connections through corridors and living rooms are preferred to connections through bathrooms.
 
     Returns:
       The doors, or None if they cannot connect all rooms.
     """
-    # All pairs of rooms with a wall that has space for a door, the preferred ones first.
-    pairs = []
-    for b in range(len(rooms)):
-        for a in range(b):
-            wall = _shared_wall(rooms[a], rooms[b])
+    # All pairs of rooms with a wall that has space for a door.
+    room_pairs = []
+    for second_room in range(len(rooms)):
+        for first_room in range(second_room):
+            wall = _shared_wall(rooms[first_room], rooms[second_room])
             if wall is not None:
-                pairs.append((a, b, wall))
-    pairs.sort(key=lambda pair: PASSAGE_RANK[types[pair[0]]] + PASSAGE_RANK[types[pair[1]]] + rng.random())
+                room_pairs.append((first_room, second_room, wall))
 
-    # Kruskal's spanning tree, with some extra doors; `component` numbers the connected rooms.
+    # Preferred pairs come first; pairs of equal rank are shuffled.
+    def sample_pair_rank(room_pair: tuple[int, int, CellRectangle]) -> float:
+        first_room, second_room, _ = room_pair
+        return PASSAGE_RANK[types[first_room]] + PASSAGE_RANK[types[second_room]] + rng.random()
+
+    room_pairs.sort(key=sample_pair_rank)
+
+    # Kruskal's spanning tree with some extra doors; connected rooms have equal numbers in `component`.
     component = list(range(len(rooms)))
     doors = []
-    for a, b, wall in pairs:
-        has_bathroom = "bathroom" in (types[a], types[b])
-        if component[a] == component[b] and (has_bathroom or rng.random() > EXTRA_DOOR_PROBABILITY):
+    for first_room, second_room, wall in room_pairs:
+        has_bathroom = "bathroom" in (types[first_room], types[second_room])
+        is_connected = component[first_room] == component[second_room]
+        if is_connected and (has_bathroom or rng.random() > EXTRA_DOOR_PROBABILITY):
             continue
-        old_component = component[b]
-        component = [component[a] if number == old_component else number for number in component]
+        _merge_components(component, first_room, second_room)
         width = DOOR_WIDTHS[0] if has_bathroom else int(rng.choice(DOOR_WIDTHS))
         doors.append(_sample_door(wall, width, rng))
     return doors if len(set(component)) == 1 else None
+
+
+def _merge_components(component: list[int], first_room: int, second_room: int) -> None:
+    """Give all rooms connected with the second room the number of the first room's component."""
+    old_number = component[second_room]
+    for room_index, number in enumerate(component):
+        if number == old_number:
+            component[room_index] = component[first_room]
 
 
 def _sample_door(wall: CellRectangle, max_width: int, rng: np.random.Generator) -> CellRectangle:
@@ -378,17 +406,17 @@ def _sample_door(wall: CellRectangle, max_width: int, rng: np.random.Generator) 
     return wall._replace(x0=wall.x0 + offset, x1=wall.x0 + offset + width)
 
 
-def _shared_wall(a: CellRectangle, b: CellRectangle) -> CellRectangle | None:
+def _shared_wall(first_room: CellRectangle, second_room: CellRectangle) -> CellRectangle | None:
     """Return the cells for a door between two rooms.
 
     Returns:
-      Their common wall without a cell at each end, or None if it is too short.
+      The common wall of the rooms without a cell at each end, or None if the wall is too short for a door.
     """
-    # The ranges that the rooms have in common; a range of length -1 is the wall between them.
-    z_low = max(a.z0, b.z0)
-    z_high = min(a.z1, b.z1)
-    x_low = max(a.x0, b.x0)
-    x_high = min(a.x1, b.x1)
+    # The ranges that the rooms have in common; a range of length -1 is the wall between the rooms.
+    z_low = max(first_room.z0, second_room.z0)
+    z_high = min(first_room.z1, second_room.z1)
+    x_low = max(first_room.x0, second_room.x0)
+    x_high = min(first_room.x1, second_room.x1)
     if z_high - z_low - 2 >= DOOR_WIDTHS[0] and x_low - x_high == 1:
         return CellRectangle(z_low + 1, x_high, z_high - 1, x_low)
     if x_high - x_low - 2 >= DOOR_WIDTHS[0] and z_low - z_high == 1:
@@ -405,24 +433,32 @@ def room_shape_from_walls(walls: np.ndarray) -> RoomShape:
       walls: bool [nz, nx], of the room and of the ring of cells around it; a cell of the ring that is no wall is a
         door.
     """
+    # Walls of each direction, seen by an object that stands with its back to the wall.
     floor = ~walls[1:-1, 1:-1]
     num_z, num_x = floor.shape
-    wall_starts, wall_turns, wall_lengths = [], [], []
-    for turn, ((x, z), right) in enumerate(zip(FORWARD_XZ, RIGHT_XZ, strict=True)):
-        # Floor cells with a wall right behind an object that faces this way, one lattice line per row.
-        has_wall_behind = floor & walls[1 - z : 1 - z + num_z, 1 - x : 1 - x + num_x]
-        wall_lines = has_wall_behind if z else has_wall_behind.T
+    wall_starts = []
+    wall_turns = []
+    wall_lengths = []
+    for turn, ((forward_x, forward_z), right_xz) in enumerate(zip(FORWARD_XZ, RIGHT_XZ, strict=True)):
+        # Floor cells with a wall right behind the object, one lattice line per row.
+        cells_behind = walls[1 - forward_z : 1 - forward_z + num_z, 1 - forward_x : 1 - forward_x + num_x]
+        has_wall_behind = floor & cells_behind
+        wall_lines = has_wall_behind if forward_z else has_wall_behind.T
 
-        # Each run of such cells is a wall; it runs to the right, which is towards lower indices for two turns.
+        # Each run of such cells is a wall.
         edges = np.diff(np.pad(wall_lines.astype(int), ((0, 0), (1, 1))), axis=1)
-        line, first = np.nonzero(edges == 1)
-        _, span_end = np.nonzero(edges == -1)
-        along = first if right.sum() > 0 else span_end
-        across = line + (0 if x + z > 0 else 1)
-        wall_starts.append(CELL_SIZE * np.stack([along, across] if z else [across, along], axis=-1))
-        wall_turns.append(np.full(len(line), turn))
-        wall_lengths.append(CELL_SIZE * (span_end - first))
+        line, run_start = np.nonzero(edges == 1)
+        _, run_end = np.nonzero(edges == -1)
 
+        # A wall extends to the right of the object, which is towards lower indices for two turns.
+        position_along = run_start if right_xz.sum() > 0 else run_end
+        position_across = line + (0 if forward_x + forward_z > 0 else 1)
+        start_xz = [position_along, position_across] if forward_z else [position_across, position_along]
+        wall_starts.append(CELL_SIZE * np.stack(start_xz, axis=-1))
+        wall_turns.append(np.full(len(line), turn))
+        wall_lengths.append(CELL_SIZE * (run_end - run_start))
+
+    # A rectangular room has no notch.
     size = CELL_SIZE * np.array([num_x, num_z])
     no_notch = np.zeros((2, 2))
     return RoomShape(
@@ -442,7 +478,7 @@ class HomeBuilder:
     def __init__(self, plan: FloorPlan, rules: Mapping[str, Mapping[str, ObjectSpec]], goal_range: GoalRange):
         self.plan = plan
         self.goal_range = goal_range
-        self.away_from_walls = cells_away_from_walls(plan.walls)
+        self.bare_free_cells = cells_away_from_walls(plan.walls)
         self.room_specs = [rules[room_type] for room_type in plan.types]
         self.bare_rooms = [self._make_bare_room(floor) for floor in plan.rooms]
 
@@ -465,8 +501,9 @@ class HomeBuilder:
 
         All doors and nearly all free cells must be connected, with a standable cell near every goal.
         """
+        # Free cells of the room and of the ring around its floor.
         floor = self.plan.rooms[room_index]
-        free_cells = cells_away_from_boxes(self.away_from_walls[floor.with_ring.cells], _furniture_boxes(room))
+        free_cells = cells_away_from_boxes(self.bare_free_cells[floor.with_ring.cells], _furniture_boxes(room))
         reach = largest_connected_part(free_cells)
 
         # Free cells in the ring around the floor are doors.
@@ -477,12 +514,15 @@ class HomeBuilder:
         if not reach[1:-1, 1:-1].any():
             return False
 
-        # Distances from C standable cells to G goals, [C, G].
+        # Low and high corners [G, 2] of the goals' footprints; a goal without an extent is a point, its centre.
         goal_footprints = room.boxes_of_types(self.goal_range.goals)[:, :, [0, 2]]
         if self.goal_range.to_footprint:
             low, high = goal_footprints.swapaxes(0, 1)
         else:
-            low = high = goal_footprints.mean(axis=1)
+            low = goal_footprints.mean(axis=1)
+            high = low
+
+        # Distances from C standable cells to G goals, [C, G].
         cell_centres = CELL_SIZE * (np.argwhere(reach)[:, None, ::-1] - 0.5)
         offsets = np.maximum(np.maximum(low - cell_centres, cell_centres - high), 0.0)
         distances = np.linalg.norm(offsets, axis=-1)
@@ -490,7 +530,8 @@ class HomeBuilder:
 
     def standable_mask(self, rooms: list[FurnishedRoom]) -> np.ndarray:
         """Return the standable cells of the home, bool [nz, nx]."""
-        return largest_connected_part(cells_away_from_boxes(self.away_from_walls, self._merge_rooms(rooms).boxes))
+        furniture_boxes = self._merge_rooms(rooms).boxes
+        return largest_connected_part(cells_away_from_boxes(self.bare_free_cells, furniture_boxes))
 
     def scene_rooms(self) -> tuple[Room, ...]:
         """Return the types and floors of the rooms."""
@@ -518,35 +559,41 @@ class HomeBuilder:
         return None
 
     def _make_bare_room(self, floor: CellRectangle) -> FurnishedRoom:
-        """Return a room with its partitions and doors alone.
+        """Return a room that holds only its partitions and doors.
 
-        Nothing can be placed in them or right in front of a door.
+        Furniture cannot overlap them or stand right in front of a door.
         """
+        # Partitions.
         room = FurnishedRoom(room_shape_from_walls(self.plan.walls[floor.with_ring.cells]))
         for wall in self.plan.partitions:
             low, high = wall.to_box(floor, _FIXTURE_HEIGHT)
             room.add_object(PARTITION, low, high, 0, -1, _PARTITION_SPEC, in_middle=False)
 
+        # Doors in the walls of the room: the box of a door is flat, in the plane of the wall, and faces the room.
         for door in self.plan.doors:
             if not door.is_inside(floor.with_ring):
                 continue
-            # The box of a door is flat, in the plane of the wall, and faces the room.
             is_at_side = [door.z1 == floor.z0, door.x1 == floor.x0, door.z0 == floor.z1, door.x0 == floor.x1]
+            turn = is_at_side.index(True)
             low, high = door.to_box(floor, _FIXTURE_HEIGHT)
-            room.add_object(DOORWAY, low, high, is_at_side.index(True), -1, _DOORWAY_SPEC, in_middle=False)
+            room.add_object(DOORWAY, low, high, turn, -1, _DOORWAY_SPEC, in_middle=False)
         return room
 
     def _merge_rooms(self, rooms: list[FurnishedRoom]) -> FurnishedRoom:
         """Return the furniture of all rooms in the frame of the home."""
         home = FurnishedRoom(self.bare_rooms[0].shape)
         for floor, room in zip(self.plan.rooms, rooms, strict=True):
-            # Fixtures are the first objects of a room.
-            num_fixtures = sum(name in _FIXTURES for name in room.types)
+            # Fixtures are the first objects of a room; they are left out.
+            num_fixtures = sum(object_type in _FIXTURES for object_type in room.types)
             index_shift = len(home.types) - num_fixtures
+
+            # Parents are indices of objects, which change in the home; -1 stands for no parent.
             for parent_index in room.parents[num_fixtures:]:
                 home.parents.append(parent_index if parent_index < 0 else parent_index + index_shift)
             home.types += room.types[num_fixtures:]
             home.turns += room.turns[num_fixtures:]
+
+            # Boxes are relative to the low corner of the room's floor.
             corner = CELL_SIZE * np.array([floor.x0 - 1, 0.0, floor.z0 - 1])
             home.boxes = np.concatenate([home.boxes, room.boxes[num_fixtures:] + corner])
         return home
@@ -554,4 +601,4 @@ class HomeBuilder:
 
 def _furniture_boxes(room: FurnishedRoom) -> np.ndarray:
     """Return the boxes of the furniture without fixtures, [N, 2, 3]."""
-    return room.boxes[[name not in _FIXTURES for name in room.types]]
+    return room.boxes[[object_type not in _FIXTURES for object_type in room.types]]

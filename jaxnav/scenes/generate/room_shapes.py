@@ -21,9 +21,9 @@ def check_scene_arguments(function: str, split: str, index: int, seed: int) -> N
     """
     if split not in SPLITS:
         raise InputError(f"{function}: split is {split!r}; choose one of {', '.join(SPLITS)}")
-    for name, number in {"index": index, "seed": seed}.items():
+    for argument_name, number in {"index": index, "seed": seed}.items():
         if number < 0:
-            raise InputError(f"{function}: {name} is {number}; give a number of at least 0")
+            raise InputError(f"{function}: {argument_name} is {number}; give a number of at least 0")
 
 
 class CellRectangle(NamedTuple):
@@ -58,7 +58,7 @@ class CellRectangle(NamedTuple):
 
         Args:
           frame: rectangle to which the box is clipped; its low corner is the origin.
-          height: of the box, metres.
+          height: height of the box, metres.
 
         Returns:
           float64 [2, 3], low and high corner (x, y, z), metres.
@@ -97,11 +97,12 @@ def sample_room_shape(
     Args:
       num_cells: target number of standable cells.
       fill: standable share of the rectangle around the standable cells.
-      margin: how much wider (and deeper) the room is than that rectangle, metres.
-      aspect: the longest possible side of that rectangle, relative to the other.
+      margin: how much wider and deeper the room is than this rectangle, metres.
+      aspect: the longest possible side of this rectangle, relative to the shorter side.
       has_notch: True for an L-shaped room.
       rng: source of randomness.
     """
+    # Area of the rectangle around the room, with a notch that takes up a share of each side.
     notch_share = rng.uniform(0.3, 0.45, 2) if has_notch else np.zeros(2)
     area = num_cells * CELL_SIZE**2 / fill / (1.0 - notch_share.prod())
 
@@ -156,7 +157,7 @@ def is_inside_room(shape: RoomShape, low: np.ndarray, high: np.ndarray) -> np.nd
     """Return where rectangles lie within the room, bool [K].
 
     Args:
-      shape: of the room.
+      shape: shape of the room.
       low: float [K, 2], low corners (x, z) of the rectangles.
       high: float [K, 2], high corners.
     """

@@ -45,10 +45,10 @@ class CompiledScene(NamedTuple):
       room_type: its room type.
       ahead: int32 [C, H], cell after MoveAhead.
       rows: uint8 [P, R], observation row of each pose, see `RowFormat`.
-      best_length: uint16 [P, K], length L* of a shortest path, Done included; 0 where a goal cannot be reached, or
-        where a category is no goal.
-      goal_distance: float32 [C, K], metres to the nearest object of a category, inf without one. The distance is the
-        horizontal one to the object's centre if success means seeing the object, else the walk to its footprint.
+      best_length: uint16 [P, K], length L* of a shortest path, Done included; 0 for an unreachable goal and for a
+        category that is no goal.
+      goal_distance: float32 [C, K], metres to the nearest object of a category, inf without an object. If success means
+        seeing the object, this is the horizontal distance to its centre, else the length of the walk to its footprint.
     """
 
     name: str
@@ -120,25 +120,23 @@ def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
 
 def compile_scene(scene: Scene, task: Task) -> CompiledScene:
     """Compile one scene by the rules of docs/environment.md."""
+    # Standable cells, and the moves between them.
     rules = task.rules
-    row_format = RowFormat(len(task.categories))
-    num_categories = len(task.categories)
-
-    # Where the agent can stand and move.
     cells = standable_cells(scene.reach)  # [C, 2]
     centres = cell_centres(scene, cells)
     ahead = cells_ahead(cells, rules)
     num_poses = len(cells) * rules.poses_per_cell
 
-    # Which objects are in view, up to the distance at which they can be detected or count as found.
+    # Objects in view, up to the distance at which they can be detected or Done can succeed.
     targets = _find_targets(scene, task, centres)
     detection_ranges = detection_range(object_size(scene.boxes[targets.objects]))
     distance_limits = np.maximum(detection_ranges, rules.success_distance)
     sightings = find_sightings(scene, rules, centres, targets, distance_limits)
 
-    # Where Done succeeds, and how far the goals are.
+    # Poses at which Done succeeds, and distances to the goals.
+    num_categories = len(task.categories)
     if rules.success == "seen":
-        success = sightings.within(rules.success_distance, (num_poses, num_categories))
+        success = sightings.visible_within(rules.success_distance, (num_poses, num_categories))
         goal_distance = np.full((len(cells), num_categories), np.inf)
         np.minimum.at(goal_distance.T, targets.category, targets.distance.T)
     else:
@@ -146,7 +144,9 @@ def compile_scene(scene: Scene, task: Task) -> CompiledScene:
         success = np.repeat(goal_distance <= rules.success_distance + TOLERANCE, rules.poses_per_cell, axis=0)
     success &= task.is_goal()
 
+    # Observation rows and shortest paths.
     detections = detect_objects(scene, task, sightings, num_poses)
+    row_format = RowFormat(num_categories)
     views = ego_views(scene, rules, cells, row_format.view)
     return CompiledScene(
         name=scene.name,
@@ -161,17 +161,20 @@ def compile_scene(scene: Scene, task: Task) -> CompiledScene:
 def categories_in_view(scene: Scene, task: Task) -> np.ndarray:
     """Return True for the categories in view from every pose.
 
-    A category is in view where a perfect detector with range `MAX_RANGE` for objects of all sizes would detect it.
+    A category is in view if a perfect detector with range `MAX_RANGE` for objects of all sizes would detect it.
 
     Returns:
       bool [P, K], poses in the order of `CompiledScene.rows`.
     """
+    # Sightings of all objects within the range.
     cells = standable_cells(scene.reach)
     centres = cell_centres(scene, cells)
     targets = _find_targets(scene, task, centres)
     distance_limits = np.full(len(targets.objects), MAX_RANGE)
     sightings = find_sightings(scene, task.rules, centres, targets, distance_limits)
-    return sightings.within(MAX_RANGE, (len(cells) * task.rules.poses_per_cell, len(task.categories)))
+
+    num_poses = len(cells) * task.rules.poses_per_cell
+    return sightings.visible_within(MAX_RANGE, (num_poses, len(task.categories)))
 
 
 def join_scenes(compiled_scenes: Sequence[CompiledScene], task: Task) -> Bank:
@@ -179,7 +182,7 @@ def join_scenes(compiled_scenes: Sequence[CompiledScene], task: Task) -> Bank:
     banks = []
     skipped = []
     for compiled in compiled_scenes:
-        # A category is a possible goal where some pose has a path to it.
+        # A category is a possible goal if some pose has a path to it.
         goals = np.flatnonzero((compiled.best_length > 0).any(axis=0))
         if len(goals):
             banks.append(_single_scene_bank(compiled, goals, task))
@@ -192,17 +195,18 @@ def join_scenes(compiled_scenes: Sequence[CompiledScene], task: Task) -> Bank:
 
 def concatenate_banks(banks: Sequence[Bank]) -> Bank:
     """Concatenate banks of one task, and number their cells anew."""
-    # Cells are numbered over all banks, so those of a bank begin after the earlier ones.
+    # Cells are numbered over all banks, so the cells of a bank begin after the cells of earlier banks.
     cell_offsets = np.cumsum([0] + [len(bank.ahead) for bank in banks[:-1]], dtype=np.int32)
     renumbered_banks = []
     for bank, cell_offset in zip(banks, cell_offsets, strict=True):
         renumbered_banks.append(bank._replace(ahead=bank.ahead + cell_offset, first_cell=bank.first_cell + cell_offset))
 
+    # Concatenate the arrays and the tuples of names; all banks have one task.
     fields: dict[str, Any] = {}
-    for name in Bank._fields[1:]:
-        field_parts = [getattr(bank, name) for bank in renumbered_banks]
+    for field_name in Bank._fields[1:]:
+        field_parts = [getattr(bank, field_name) for bank in renumbered_banks]
         is_array = isinstance(field_parts[0], np.ndarray)
-        fields[name] = np.concatenate(field_parts) if is_array else tuple(itertools.chain(*field_parts))
+        fields[field_name] = np.concatenate(field_parts) if is_array else tuple(itertools.chain(*field_parts))
     return Bank(task=banks[0].task, **fields)
 
 
@@ -215,7 +219,7 @@ def no_goal_error(num_scenes: int, task: Task) -> InputError:
 
 
 def bank_checksum(bank: Bank) -> int:
-    """Return the CRC-32 of everything in a bank."""
+    """Return the CRC-32 of all fields of a bank."""
     crc = 0
     for field_value in bank:
         content_bytes = field_value.tobytes() if isinstance(field_value, np.ndarray) else repr(field_value).encode()
@@ -255,16 +259,15 @@ def _find_targets(scene: Scene, task: Task, centres: np.ndarray) -> Targets:
 def _walks_to_goals(scene: Scene, task: Task, centres: np.ndarray, ahead: np.ndarray, targets: Targets) -> np.ndarray:
     """Return the length of the walk from each cell to each goal category.
 
-    A walk ends at the footprint of the nearest object. Its last part is straight, crosses no wall and is no longer than
-    the success distance.
+    A walk ends at the footprint of the nearest object. The last part of a walk is straight, crosses no wall and is no
+    longer than the success distance.
 
     Returns:
       float64 [C, K], metres.
     """
+    # Nearest point of each footprint, as seen from each cell.
     rules = task.rules
     is_goal = task.is_goal()
-
-    # Nearest point of each footprint, as seen from each cell.
     boxes = scene.boxes[targets.objects]
     half_size = boxes[:, [3, 5]] / 2
     low_corner = boxes[:, [0, 2]] - half_size
@@ -272,7 +275,7 @@ def _walks_to_goals(scene: Scene, task: Task, centres: np.ndarray, ahead: np.nda
     nearest_point = np.clip(centres[:, None], low_corner, high_corner)  # [C, N, 2]
     distance = np.linalg.norm(nearest_point - centres[:, None], axis=-1)
 
-    # Straight last parts that cross no wall.
+    # Straight last parts that cross no wall, [C, K].
     is_candidate = (distance <= rules.success_distance + TOLERANCE) & is_goal[targets.category]
     cell, target = np.nonzero(is_candidate)
     is_clear = clear_of_walls(scene, centres[cell], nearest_point[cell, target], boxes[target][:, [0, 2]])
@@ -281,6 +284,7 @@ def _walks_to_goals(scene: Scene, task: Task, centres: np.ndarray, ahead: np.nda
     straight_lengths = np.full((len(centres), len(is_goal)), np.inf)
     np.minimum.at(straight_lengths, (cell, targets.category[target]), distance[cell, target])
 
+    # Walk to a cell with a straight last part.
     walk_lengths = straight_lengths
     walk_lengths[:, is_goal] = walking_distances(ahead, rules, straight_lengths[:, is_goal])
     return walk_lengths

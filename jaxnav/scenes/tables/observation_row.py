@@ -1,9 +1,10 @@
 """Observation rows: the packed bytes that an agent perceives at one pose, and the simulated detector behind them.
 
 A row holds the detection of each category and an ego-centric view of the floor. `RowFormat` packs and unpacks rows, on
-NumPy and on JAX arrays. `Detector` simulates an object detector, whose errors are drawn once per pose.
+NumPy and on JAX arrays. `Detector` simulates an object detector, whose errors are sampled once per pose.
 
-Detections are four bytes: confidence, metres ahead, metres to the right and apparent size, all 0 without a detection.
+A detection has four bytes: confidence, metres ahead, metres to the right and apparent size, all 0 for an undetected
+category. `relative_position` converts the bytes of the position to metres.
 """
 
 import dataclasses
@@ -12,15 +13,29 @@ from typing import Any
 
 import numpy as np
 
-#: Cells of the ego-centric view.
-VIEW_UNKNOWN, VIEW_FREE, VIEW_BLOCKED = range(3)
-#: Bytes per metre ahead, per metre to the right (0 m is byte 128) and per unit of apparent size.
-AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE = 51.0, 25.4, 127.5
+#: Cell of the ego-centric view that is hidden or beyond the view cone.
+VIEW_UNKNOWN = 0
+#: Visible standable cell of the ego-centric view.
+VIEW_FREE = 1
+#: Visible cell of the ego-centric view on which the agent cannot stand.
+VIEW_BLOCKED = 2
 
-#: Least and greatest detection range, metres.
-MIN_RANGE, MAX_RANGE = 1.5, 5.0
-FALSE_ALARM_SIZE = 0.3  # metres
-MIN_APPARENT_SIZE = 0.12  # about 15 pixels of a 300 x 300 picture with a field of view of 100 degrees
+#: Byte steps per metre ahead.
+AHEAD_SCALE = 51.0
+#: Byte steps per metre to the right; 0 m is byte 128.
+RIGHT_SCALE = 25.4
+#: Byte steps per unit of apparent size.
+SIZE_SCALE = 127.5
+
+#: Detection range of the smallest objects, metres.
+MIN_RANGE = 1.5
+#: Detection range of the largest objects, metres.
+MAX_RANGE = 5.0
+#: Size of the objects that false alarms report, metres.
+FALSE_ALARM_SIZE = 0.3
+#: Apparent size of an object at the end of its detection range: about 15 pixels of a 300 x 300 picture with a field of
+#: view of 100 degrees.
+MIN_APPARENT_SIZE = 0.12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,16 +75,16 @@ class RowFormat:
         Returns:
           uint8 [..., num_bytes].
         """
+        # Four cells of the view share a byte.
         xp = view.__array_namespace__()
         batch_shape = view.shape[:-2]
         num_cells = self.view * self.view
-
-        # Four cells of the view share a byte.
         cell_padding = xp.zeros((*batch_shape, 4 * self._view_bytes - num_cells), dtype=np.uint8)
         cells = xp.concat([view.reshape(*batch_shape, num_cells), cell_padding], axis=-1)
         cell_groups = cells.reshape(*batch_shape, self._view_bytes, 4)
         packed_view = xp.sum(cell_groups << _cell_shifts(cell_groups.ndim), axis=-1, dtype=np.uint8)
 
+        # Detections, view and padding, one after another.
         row_padding = xp.zeros((*batch_shape, self.num_bytes - self._view_start - self._view_bytes), dtype=np.uint8)
         return xp.concat([detections.reshape(*batch_shape, self._view_start), packed_view, row_padding], axis=-1)
 
@@ -96,14 +111,14 @@ def _cell_shifts(rank: int) -> np.ndarray:
     return np.array([0, 2, 4, 6], np.uint8).reshape((1,) * (rank - 1) + (4,))
 
 
-def relative_position(detections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def relative_position(detections: Any) -> tuple[Any, Any]:
     """Return metres ahead and metres to the right of detections.
 
     Args:
-      detections: uint8 [..., 4].
+      detections: uint8 [..., 4] of NumPy, or the bytes as a float32 array of JAX.
 
     Returns:
-      float64 [...] each.
+      float [...] each; float64 for bytes, else of the type of the array.
     """
     return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - 128.0) / RIGHT_SCALE
 
@@ -142,8 +157,8 @@ class Detector:
 
     def detect(
         self,
-        name: str,
-        half_view: float,
+        scene_name: str,
+        half_view_tangent: float,
         visible: np.ndarray,
         ahead: np.ndarray,
         right: np.ndarray,
@@ -153,15 +168,19 @@ class Detector:
         """Sample the detections of one scene, with errors.
 
         Args:
-          name: name of the scene, so that errors do not depend on the other scenes of a bank.
-          half_view: tangent of half the horizontal field of view.
+          scene_name: name of the scene, which seeds the errors, so that they do not depend on the bank of the scene.
+          half_view_tangent: tangent of half the horizontal field of view.
           visible: bool [P, K], True where a perfect detector detects a category.
-          ahead, right, distance, size: float [P, K], metres, of the nearest visible object.
+          ahead: float [P, K], metres ahead to the nearest visible object.
+          right: float [P, K], metres to the right to the nearest visible object.
+          distance: float [P, K], distance of the nearest visible object, metres.
+          size: float [P, K], size of the nearest visible object, metres.
 
         Returns:
           uint8 [P, K, 4].
         """
-        rng = np.random.default_rng([self.seed, zlib.crc32(name.encode())])
+        # Independent errors for each pose and category, seeded by the scene.
+        rng = np.random.default_rng([self.seed, zlib.crc32(scene_name.encode())])
         error_draw, noise, range_draw, bearing_draw = rng.random((4, *visible.shape), dtype=np.float32)
 
         # Misses become more likely with distance; false alarms only occur without a visible object.
@@ -174,12 +193,13 @@ class Detector:
 
         # A false alarm lies uniformly in the part of the view cone where an object of its size could be detected.
         alarm_distance = detection_range(FALSE_ALARM_SIZE) * np.sqrt(range_draw)
-        alarm_angle = np.arctan(half_view) * (2.0 * bearing_draw - 1.0)
+        alarm_angle = np.arctan(half_view_tangent) * (2.0 * bearing_draw - 1.0)
         ahead = np.where(false_alarm, alarm_distance * np.cos(alarm_angle), ahead)
         right = np.where(false_alarm, alarm_distance * np.sin(alarm_angle), right)
         size = np.where(false_alarm, FALSE_ALARM_SIZE, size)
         apparent_size = size / np.maximum(np.hypot(ahead, right), 0.25)
 
+        # Bytes are 0 for undetected categories.
         is_detected = (visible & ~is_missed) | false_alarm
         detection_bytes = _scale_to_bytes(confidence, ahead, right, apparent_size)
         return np.where(is_detected[..., None], detection_bytes, 0.0).astype(np.uint8)
@@ -199,10 +219,10 @@ def detection_range(size: np.ndarray | float) -> np.ndarray:
     """Return the greatest distance at which objects are detected.
 
     Args:
-      size: sizes of the objects, metres, see `object_size`.
+      size: float [...], sizes of the objects, metres, see `object_size`.
 
     Returns:
-      Distances, metres, in the shape of `size`.
+      float [...], metres.
     """
     return np.clip(size / MIN_APPARENT_SIZE, MIN_RANGE, MAX_RANGE)
 

@@ -1,8 +1,8 @@
 """Banks of scenes on disk, compiled once, verified when opened, and memory-mapped.
 
 `compile_shards` compiles scenes in one or several processes, into one folder per shard, and returns `Shards`: a
-sequence of banks whose arrays are read from disk where they are used. Shards are cached. The name of their folder
-depends on everything they are computed from, the code included.
+sequence of banks whose arrays are read from disk on use. Shards are cached in a folder whose name is a hash of the
+scenes, the task and the code.
 """
 
 import dataclasses
@@ -32,11 +32,12 @@ if TYPE_CHECKING:
     from jaxnav.scenes.worlds import Scenes
 
 
-#: Fields of a `Bank` that a shard stores as JSON, and fields that it stores as arrays.
+#: Fields of a `Bank` that a shard stores as JSON.
 TEXT_FIELDS = ("names", "room_types", "skipped")
+#: Fields of a `Bank` that a shard stores as arrays.
 ARRAY_FIELDS = tuple(field for field in Bank._fields if field not in ("task", *TEXT_FIELDS))
 
-#: The code that determines shards, below `_SOURCE`. Importers are not part of it: scene files have their own checksums.
+#: The code that determines shards, below `_SOURCE`. Importers are left out, because scene files have checksums.
 _CODE = (
     *("categories.py", "lattice.py", "layout_shift.py", "scene.py", "task.py", "worlds.py"),
     *("generate/*.py", "generate/*.yaml", "tables/*.py"),
@@ -58,7 +59,7 @@ class Shards:
       num_cells: greatest number of cells of any shard.
       num_scenes: greatest number of scenes of any shard.
       skipped: names of the scenes without a possible goal, which are in no shard.
-      checksum: CRC-32 of everything in the shards.
+      checksum: CRC-32 of the checksums of all shards.
     """
 
     folder: Path
@@ -83,11 +84,14 @@ class Shards:
           IndexError: no shard has this index.
           InputError: a file of the shard is missing or damaged.
         """
-        # Texts are read, arrays are only mapped.
+        # Texts are read at once, arrays are only mapped.
         path = self.paths[index]
         metadata = _read_metadata(path)
-        fields: dict[str, Any] = {field: tuple(metadata[field]) for field in TEXT_FIELDS}
-        fields |= {field: _map_array(path / f"{field}.npy") for field in ARRAY_FIELDS}
+        fields: dict[str, Any] = {}
+        for field_name in TEXT_FIELDS:
+            fields[field_name] = tuple(metadata[field_name])
+        for field_name in ARRAY_FIELDS:
+            fields[field_name] = _map_array(path / f"{field_name}.npy")
         return Bank(task=self.task, **fields)
 
 
@@ -96,8 +100,8 @@ def compile_shards(
     task: Task,
     shard_scenes: int,
     cache: Path,
-    report: Callable[[int, int], None],
-    workers: int | None = None,
+    report_progress: Callable[[int, int], None],
+    num_workers: int | None = None,
 ) -> Shards:
     """Compile scenes into shards, or open the shards of an earlier call.
 
@@ -107,17 +111,18 @@ def compile_shards(
     several workers the calling script needs its `if __name__ == "__main__"`.
 
     Args:
-      scenes: sent to every worker once; each scene is made where it is compiled.
+      scenes: scenes to compile; every worker receives a copy and makes the scenes that it compiles.
       task: the task for which the scenes are compiled.
       shard_scenes: greatest number of scenes per shard, at least 1.
       cache: parent of the folder, created if necessary.
-      report: called after each shard with the number of finished shards and the number of all shards.
-      workers: number of processes that compile one shard at a time each; None for one per core. A single worker runs in
-        the calling process.
+      report_progress: called after each shard with the number of finished shards and the number of all shards.
+      num_workers: number of processes, each of which compiles one shard at a time; None for one per core. A single
+        worker runs in the calling process.
 
     Raises:
       InputError: no scene has a reachable goal, a scene cannot be made, or a cached shard is damaged.
     """
+    # Folder of these scenes, and a subfolder for each shard.
     if shard_scenes < 1:
         raise InputError(f"shard_scenes is {shard_scenes}; give a number of at least 1")
     folder = cache / _cache_key(scenes, task, shard_scenes)
@@ -125,15 +130,20 @@ def compile_shards(
     num_shards = -(-len(scenes) // shard_scenes)
     job = ShardJob(scenes, task, tuple(folder / f"{index:05d}" for index in range(num_shards)))
 
-    # Compile the missing shards; cached ones are reported first.
-    missing = []
-    for index, path in enumerate(job.paths):
-        if not path.exists():
-            missing.append(index)
+    # Count the finished shards for the reports.
     finished_count = itertools.count(1)
-    for _ in range(num_shards - len(missing)):
-        report(next(finished_count), num_shards)
-    compile_missing(job, missing, workers or os.cpu_count() or 1, lambda: report(next(finished_count), num_shards))
+
+    def report_finished_shard() -> None:
+        report_progress(next(finished_count), num_shards)
+
+    # Report the cached shards, then compile the missing ones.
+    missing_shards = []
+    for index, path in enumerate(job.paths):
+        if path.exists():
+            report_finished_shard()
+        else:
+            missing_shards.append(index)
+    compile_missing(job, missing_shards, num_workers or os.cpu_count() or 1, report_finished_shard)
 
     # Remove the unfinished shards of processes that were killed.
     for unfinished_folder in folder.glob(".*.tmp"):
@@ -162,12 +172,13 @@ class ShardJob:
         end_scene = len(self.scenes) * (index + 1) // len(self.paths)
         compiled_scenes = [compile_scene(self.scenes[scene], self.task) for scene in range(first_scene, end_scene)]
 
+        # Join the scenes with a reachable goal, if there are any.
         metadata: dict[str, Any]
         if any(compiled.best_length.any() for compiled in compiled_scenes):
             bank = join_scenes(compiled_scenes, self.task)
-            metadata = {field: getattr(bank, field) for field in TEXT_FIELDS}
+            metadata = {field_name: getattr(bank, field_name) for field_name in TEXT_FIELDS}
             metadata |= {"cells": len(bank.ahead), "checksum": bank_checksum(bank)}
-            arrays = {field: getattr(bank, field) for field in ARRAY_FIELDS}
+            arrays = {field_name: getattr(bank, field_name) for field_name in ARRAY_FIELDS}
         else:
             skipped = [compiled.name for compiled in compiled_scenes]
             metadata = {"names": (), "room_types": (), "skipped": skipped, "cells": 0}
@@ -175,14 +186,17 @@ class ShardJob:
         _write_shard(self.paths[index], metadata, arrays)
 
 
-def compile_missing(job: ShardJob, missing: Sequence[int], workers: int, on_finished: Callable[[], None]) -> None:
-    """Compile shards by index, and call `on_finished` after each.
+def compile_missing(
+    job: ShardJob, missing_shards: Sequence[int], num_workers: int, on_finished: Callable[[], None]
+) -> None:
+    """Compile shards by index, and call `on_finished` after each shard.
 
-    Several workers are separate processes, which end with the calling process, however that one ends.
+    Several workers are separate processes, which end with the calling process even if it is killed.
     """
-    workers = min(workers, len(missing))
-    if workers <= 1:
-        for index in missing:
+    # A single worker runs in this process.
+    num_workers = min(num_workers, len(missing_shards))
+    if num_workers <= 1:
+        for index in missing_shards:
             job.compile(index)
             on_finished()
         return
@@ -190,8 +204,9 @@ def compile_missing(job: ShardJob, missing: Sequence[int], workers: int, on_fini
     # Workers watch one end of a pipe. The other end closes when this process leaves the block or dies.
     spawn_context = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
     parent_alive, parent_end = spawn_context.Pipe(duplex=False)
-    with ProcessPoolExecutor(workers, spawn_context, _start_worker, (job, parent_alive)) as pool, parent_end:
-        for shard_future in as_completed([pool.submit(_compile_in_worker, index) for index in missing]):
+    with ProcessPoolExecutor(num_workers, spawn_context, _start_worker, (job, parent_alive)) as pool, parent_end:
+        shard_futures = [pool.submit(_compile_in_worker, index) for index in missing_shards]
+        for shard_future in as_completed(shard_futures):
             shard_future.result()
             on_finished()
 
@@ -219,16 +234,17 @@ def _compile_in_worker(index: int) -> None:
 
 
 def _write_shard(path: Path, metadata: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Write a complete shard or nothing; an existing shard is left alone."""
+    """Write a shard atomically; an existing shard stays."""
+    # Write to a temporary folder, and rename it when all files are complete.
     unfinished_folder = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         unfinished_folder.mkdir()
-        for field, array in arrays.items():
+        for field_name, array in arrays.items():
             # Arrays must be on the disk before the folder gets its final name.
-            with (unfinished_folder / f"{field}.npy").open("wb") as file:
-                np.save(file, array)
-                file.flush()
-                os.fsync(file.fileno())
+            with (unfinished_folder / f"{field_name}.npy").open("wb") as array_file:
+                np.save(array_file, array)
+                array_file.flush()
+                os.fsync(array_file.fileno())
         write_json_with_digest(unfinished_folder / "shard.json", metadata)
         unfinished_folder.rename(path)  # fails if the shard exists
     except OSError:
@@ -264,6 +280,7 @@ def _open_shards(folder: Path, job: ShardJob) -> Shards:
     if not paths:
         raise no_goal_error(len(job.scenes), job.task)
 
+    # The checksum of all shards covers the checksum of each.
     shards = Shards(
         folder=folder,
         task=job.task,
@@ -275,7 +292,7 @@ def _open_shards(folder: Path, job: ShardJob) -> Shards:
         checksum=zlib.crc32(repr(checksums).encode()),
     )
 
-    # Verify that the arrays are those that were written.
+    # Compare the arrays on disk with the checksums of the written arrays.
     for bank, path, metadata in zip(shards, paths, usable_metadata, strict=True):
         if (len(bank.ahead), bank_checksum(bank)) != (metadata["cells"], metadata["checksum"]):
             raise InputError(f"{path}: is damaged (its checksum is another); {_REPAIR_HINT.format(path)}")
@@ -283,7 +300,7 @@ def _open_shards(folder: Path, job: ShardJob) -> Shards:
 
 
 def _cache_key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
-    """Return a hash of everything that determines the shards."""
+    """Return a hash of the scenes, the task and the code that determine the shards."""
     # Scenes and settings first, then the path and content of each file of the code.
     code_digest = hashlib.sha256(repr((scenes.identity, task, shard_scenes, np.__version__)).encode())
     code_files = set()

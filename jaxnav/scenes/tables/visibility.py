@@ -1,8 +1,8 @@
-"""Visibility in a scene: which objects and which floor cells can be seen from every pose.
+"""Visibility in a scene: the objects and the floor cells that are visible from every pose.
 
 `find_sightings` pairs objects with the cells that have a clear line of sight to them, `detect_objects` turns sightings
-into the detector's reports, and `ego_views` computes the views of the floor. The geometry follows below: walls as
-rectangles, segments against boxes, and offsets relative to the camera.
+into the detector's reports, and `ego_views` computes the views of the floor. The geometry follows: walls as rectangles,
+intersections of segments and boxes, and offsets relative to the camera.
 
 Symbols in shapes: C cells, H headings, T horizons, P = C H T poses, K categories, N objects, M pairs.
 """
@@ -16,12 +16,17 @@ from jaxnav.scenes.scene import CELL_SIZE, Scene
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, detection_range, object_size
 from jaxnav.scenes.task import Rules, Task
 
-SIGHT_MARGIN = 0.3  # metres before the target's centre at which a line of sight ends
-GRAZE = 1e-6  # metres; touching a surface by less than this does not block
-TOLERANCE = 1e-9  # metres; added to limits, so that rounding errors do not decide
+#: Distance from the target's centre at which a line of sight ends, metres.
+SIGHT_MARGIN = 0.3
+#: Depth to which a line of sight may touch a surface without being blocked, metres.
+GRAZE = 1e-6
+#: Metres added to limits, so that rounding errors do not decide.
+TOLERANCE = 1e-9
 
-#: Bulky furniture on the floor is opaque. Metres: least thickness, greatest height of the bottom, least of the top.
-_OPAQUE_THICKNESS, _OPAQUE_BOTTOM, _OPAQUE_TOP = 0.3, 0.3, 0.85
+# Bulky furniture on the floor is opaque.
+_MIN_OPAQUE_THICKNESS = 0.3  # metres
+_MAX_OPAQUE_BOTTOM = 0.3  # height of the underside, metres
+_MIN_OPAQUE_TOP = 0.85  # height of the top, metres
 
 
 class Targets(NamedTuple):
@@ -41,13 +46,13 @@ class Targets(NamedTuple):
 class Sightings(NamedTuple):
     """The M pairs of a cell and an object with a clear line of sight between them.
 
-    Pairs are sorted by falling distance: the nearest object (of equally near ones the first in the scene) comes last.
+    Pairs are sorted by falling distance: the nearest object comes last, and equally near objects in reverse order.
 
     Attributes:
       cell: int [M].
-      category: int [M], of the object.
+      category: int [M], category of the object.
       distance: float64 [M], horizontal metres from the cell to the object's centre.
-      size: float64 [M], metres, see `object_size`.
+      size: float64 [M], size of the object, metres, see `object_size`.
       ahead: float64 [M, H], metres ahead to the object's centre, by heading.
       right: float64 [M, H], metres to the right, by heading.
       in_view: bool [M, H, T], True where the object is in the camera's view, by heading and horizon.
@@ -61,33 +66,33 @@ class Sightings(NamedTuple):
     right: np.ndarray
     in_view: np.ndarray
 
-    def expand(self, selected: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def expand(self, is_selected: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the poses at which selected pairs are in view.
 
         Args:
-          selected: bool [M].
+          is_selected: bool [M], True for the selected pairs.
 
         Returns:
           Pair, heading and pose, int [...] each, in the order of the pairs.
         """
         _, num_headings, num_horizons = self.in_view.shape
-        pair, heading, horizon = np.nonzero(self.in_view & selected[:, None, None])
+        pair, heading, horizon = np.nonzero(self.in_view & is_selected[:, None, None])
         return pair, heading, (self.cell[pair] * num_headings + heading) * num_horizons + horizon
 
-    def within(self, distance: float, shape: tuple[int, int]) -> np.ndarray:
+    def visible_within(self, max_distance: float, table_shape: tuple[int, int]) -> np.ndarray:
         """Return True where a category is in view within a distance.
 
         Args:
-          distance: horizontal metres.
-          shape: (P, K).
+          max_distance: horizontal metres.
+          table_shape: numbers of poses and categories, (P, K).
 
         Returns:
           bool [P, K].
         """
-        pair, _, pose = self.expand(self.distance <= distance + TOLERANCE)
-        table = np.zeros(shape, bool)
-        table[pose, self.category[pair]] = True
-        return table
+        pair, _, pose = self.expand(self.distance <= max_distance + TOLERANCE)
+        is_visible = np.zeros(table_shape, bool)
+        is_visible[pose, self.category[pair]] = True
+        return is_visible
 
 
 def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Targets, limits: np.ndarray) -> Sightings:
@@ -107,11 +112,12 @@ def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Tar
     cell = cell[is_clear]
     target = target[is_clear]
 
-    # The nearest object comes last.
+    # Sort by falling distance, so that the nearest object comes last.
     order = np.lexsort((-target, -targets.distance[cell, target]))
     cell = cell[order]
     target = target[order]
 
+    # Offsets and field of view at every heading and horizon.
     ahead, right, in_view = offsets_in_view(rules, centres[cell], scene.boxes[targets.objects[target], :3])
     return Sightings(
         cell=cell,
@@ -126,18 +132,19 @@ def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Tar
 
 def detect_objects(scene: Scene, task: Task, sightings: Sightings, num_poses: int) -> np.ndarray:
     """Return the detections at every pose, uint8 [P, K, 4], see `Detector.detect`."""
-    shape = (num_poses, len(task.categories))
+    # Categories with an object within its detection range, [P, K].
+    table_shape = (num_poses, len(task.categories))
     is_in_range = sightings.distance <= detection_range(sightings.size) + TOLERANCE
     pair, heading, pose = sightings.expand(is_in_range)
     category = sightings.category[pair]
-    visible = np.zeros(shape, bool)
+    visible = np.zeros(table_shape, bool)
     visible[pose, category] = True
 
-    # The nearest of several objects of a category counts: where indices repeat, the last value stays.
-    ahead = np.zeros(shape)
-    right = np.zeros(shape)
-    distance = np.zeros(shape)
-    size = np.zeros(shape)
+    # The nearest of several objects of a category counts: assignments to equal indices keep the last value.
+    ahead = np.zeros(table_shape)
+    right = np.zeros(table_shape)
+    distance = np.zeros(table_shape)
+    size = np.zeros(table_shape)
     ahead[pose, category] = sightings.ahead[pair, heading]
     right[pose, category] = sightings.right[pair, heading]
     distance[pose, category] = sightings.distance[pair]
@@ -180,7 +187,7 @@ def ego_views(scene: Scene, rules: Rules, cells: np.ndarray, view: int) -> np.nd
 
 
 def _floor_in_sight(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return True for the floor cells around each cell that can be seen.
+    """Return True for the visible floor cells around each cell.
 
     Walls and opaque boxes at least as high as the camera hide the cells behind them.
 
@@ -203,6 +210,7 @@ def _floor_in_sight(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.n
     num_shifted = flat_clear.size - 2 * margin
     cell_index = (cells + radius) @ (stride, 1) - margin
 
+    # A floor cell is visible if all cells on the line to it are clear.
     in_sight = np.ones((len(offsets), len(cells)), bool)
     lattice_in_sight = np.empty(num_shifted, bool)
     for cells_in_sight, offset in zip(in_sight, offsets.tolist(), strict=True):
@@ -216,21 +224,24 @@ def _floor_in_sight(scene: Scene, rules: Rules, cells: np.ndarray, offsets: np.n
 
 def _tall_box_cells(scene: Scene, rules: Rules) -> np.ndarray:
     """Return True for the cells under opaque boxes as high as the camera, bool [nz, nx]."""
+    # Footprints of the opaque boxes at least as high as the camera.
     x, y, z, size_x, size_y, size_z = scene.boxes[is_opaque(scene.boxes)].T
     is_tall = y + size_y / 2 >= rules.camera - TOLERANCE
     box_centres = np.stack([x, z], axis=-1)[is_tall]
     half_sizes = np.stack([size_x, size_z], axis=-1)[is_tall] / 2
 
+    # Cells whose centre lies in a footprint, [cells, N].
     centres = cell_centres(scene, np.argwhere(np.ones_like(scene.walls)))
-    distance = np.abs(centres[:, None] - box_centres)  # [cells, N, 2]
-    is_under_box = (distance <= half_sizes + TOLERANCE).all(axis=-1)
+    centre_offsets = np.abs(centres[:, None] - box_centres)  # [cells, N, 2]
+    is_under_box = (centre_offsets <= half_sizes + TOLERANCE).all(axis=-1)
     return np.any(is_under_box, axis=-1).reshape(scene.walls.shape)
 
 
 @functools.lru_cache(maxsize=4096)
 def _cells_between(dz: int, dx: int, radius: int) -> list[tuple[int, int]]:
     """Return the cells strictly between (0, 0) and (dz, dx)."""
-    half_steps = np.arange(1, 2 * radius)  # half-cell steps along the longest line
+    # Points at half-cell steps along the longest line, rounded to cells.
+    half_steps = np.arange(1, 2 * radius)
     # Rounding is symmetric about 0, so that a mirrored room has a mirrored view.
     z = np.rint(dz * half_steps / (2 * radius)).astype(int).tolist()
     x = np.rint(dx * half_steps / (2 * radius)).astype(int).tolist()
@@ -252,11 +263,12 @@ def cell_centres(scene: Scene, cells: np.ndarray) -> np.ndarray:
 
 
 def is_opaque(boxes: np.ndarray) -> np.ndarray:
-    """Return True for the boxes [N, 6] that block the sight: bulky furniture on the floor. bool [N]."""
+    """Return True for the boxes [N, 6] that block the sight, bulky furniture on the floor, bool [N]."""
+    # A box is opaque if all its margins are at least 0.
     _, y, _, size_x, size_y, size_z = boxes.T
-    thickness_margin = np.minimum(size_x, size_z) - _OPAQUE_THICKNESS
-    bottom_margin = _OPAQUE_BOTTOM - (y - size_y / 2)
-    top_margin = y + size_y / 2 - _OPAQUE_TOP
+    thickness_margin = np.minimum(size_x, size_z) - _MIN_OPAQUE_THICKNESS
+    bottom_margin = _MAX_OPAQUE_BOTTOM - (y - size_y / 2)
+    top_margin = y + size_y / 2 - _MIN_OPAQUE_TOP
     return np.minimum(np.minimum(thickness_margin, bottom_margin), top_margin) >= -TOLERANCE
 
 
@@ -275,7 +287,7 @@ def cover_with_rectangles(mask: np.ndarray) -> np.ndarray:
         run_ends = np.flatnonzero(edges == -1).tolist()
         runs = list(zip(run_starts, run_ends, strict=True))
 
-        # A run that does not continue unchanged in this row closes its rectangle.
+        # A run that ends or changes in this row closes its rectangle.
         for (x0, x1), z0 in open_runs.items():
             if (x0, x1) not in runs:
                 rectangles.append((z0, x0, z, x1))
@@ -290,12 +302,12 @@ def clear_of_walls(scene: Scene, start: np.ndarray, end: np.ndarray, target: np.
       scene: the scene.
       start: float64 [M, 2], world (x, z).
       end: float64 [M, 2], world (x, z).
-      target: float64 [M, 2]; wall cells that contain `start` or `target` do not count.
+      target: float64 [M, 2], world (x, z); wall cells that contain `start` or `target` are exempt and do not count.
 
     Returns:
       bool [M].
     """
-    # Segments are grouped by the wall cells that do not count for them; most segments have none.
+    # Segments are grouped by their exempt wall cells; most segments have none.
     exempt = np.concatenate([_wall_cells_at(scene, start), _wall_cells_at(scene, target)], axis=1)
     has_exempt = (exempt >= 0).any(axis=1)
     segment_groups: list[tuple[np.ndarray, np.ndarray]] = [(np.flatnonzero(~has_exempt), np.zeros(0, int))]
@@ -320,7 +332,7 @@ def _wall_cells_at(scene: Scene, points: np.ndarray) -> np.ndarray:
     """Return the wall cells that contain points [M, 2].
 
     Returns:
-      int [M, 4], flat indices, up to four for each point, -1 for none.
+      int [M, 4], flat indices of up to four cells for each point, padded with -1.
     """
     # A point on the border of cells belongs to all of them.
     cell_position = (points - scene.origin) / CELL_SIZE
@@ -329,6 +341,7 @@ def _wall_cells_at(scene: Scene, points: np.ndarray) -> np.ndarray:
     columns, rows = np.moveaxis(corners, -1, 0)  # [2, M] each
     row_index, column_index = np.stack([rows[[0, 0, 1, 1]], columns[[0, 1, 0, 1]]]).swapaxes(1, 2)  # [M, 4] each
 
+    # Cells outside the lattice are no walls.
     num_rows, num_columns = scene.walls.shape
     is_inside = (row_index >= 0) & (row_index < num_rows) & (column_index >= 0) & (column_index < num_columns)
     cell = np.where(is_inside, row_index * num_columns + column_index, 0)
@@ -337,13 +350,13 @@ def _wall_cells_at(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 def _enters_any_box(start: np.ndarray, end: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Return True for segments [M, D] that enter a box [R, 2, D] shrunk by `GRAZE`, bool [M]."""
-    # A segment is tested against one box at a time, until a box blocks it.
+    # Test all unblocked segments against one box at a time.
     direction = end - start
     segment_low = np.minimum(start, end)
     segment_high = np.maximum(start, end)
     is_blocked = np.zeros(len(start), bool)
     for low, high in zip(boxes[:, 0] + GRAZE, boxes[:, 1] - GRAZE, strict=True):
-        # The exact test is only needed where the bounding boxes overlap.
+        # Only segments whose bounding box overlaps the box need the exact test.
         boxes_overlap = (segment_low < high).all(axis=1) & (segment_high > low).all(axis=1)
         candidate_segments = np.flatnonzero(~is_blocked & boxes_overlap)
         is_blocked[candidate_segments] = _enters_box(
@@ -371,7 +384,7 @@ def _enters_box(start: np.ndarray, direction: np.ndarray, low: np.ndarray, high:
 
 
 def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return True where a camera has a clear line of sight to its target object.
+    """Return True for cameras with a clear line of sight to their target object.
 
     Args:
       scene: the scene, whose walls and opaque boxes block the sight.
@@ -389,8 +402,10 @@ def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.n
     line_length = np.linalg.norm(sight_line, axis=-1, keepdims=True)
     end = start + sight_line * np.maximum(1.0 - SIGHT_MARGIN / np.maximum(line_length, SIGHT_MARGIN), 0.0)
 
+    # Walls hide the target.
     is_clear = clear_of_walls(scene, cameras, end[:, [0, 2]], centres[:, [0, 2]])
-    # Opaque boxes between camera and target hide it.
+
+    # Opaque boxes between camera and target hide it, too.
     floor_low = np.minimum(cameras, end[:, [0, 2]])
     floor_high = np.maximum(cameras, end[:, [0, 2]])
     for blocker in np.flatnonzero(is_opaque(scene.boxes)):
@@ -399,7 +414,7 @@ def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.n
         low = box_centre - half_size
         high = box_centre + half_size
 
-        # The exact test is only needed where the bounding boxes overlap on the floor.
+        # Only segments whose bounding box overlaps the box on the floor need the exact test.
         boxes_overlap = (floor_low < high[[0, 2]]).all(axis=1) & (floor_high > low[[0, 2]]).all(axis=1)
         near_segments = np.flatnonzero(is_clear & boxes_overlap)
 
@@ -416,15 +431,16 @@ def line_of_sight(scene: Scene, rules: Rules, cameras: np.ndarray, targets: np.n
 
 
 def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the offsets of points from cameras, and where the points are in view.
+    """Return the offsets of points from cameras, and the views that show the points.
 
     Args:
       rules: headings, horizons and camera.
       cameras: float64 [M, 2], world (x, z).
-      points: float64 [M, 3].
+      points: float64 [M, 3], world (x, y, z).
 
     Returns:
-      ahead, right: float64 [M, H], metres; in_view: bool [M, H, T], by heading and horizon.
+      Metres ahead and metres to the right, float64 [M, H] each, by heading; and True where a point is in view, bool
+      [M, H, T], by heading and horizon.
     """
     # Offsets on the floor, by heading.
     directions = rules.heading_directions()  # [H, 2]
@@ -438,6 +454,7 @@ def offsets_in_view(rules: Rules, cameras: np.ndarray, points: np.ndarray) -> tu
     depth = ahead[..., None] * np.cos(pitch) - height_offset * np.sin(pitch)
     vertical_offset = ahead[..., None] * np.sin(pitch) + height_offset * np.cos(pitch)
 
+    # A point is in view if it lies in front of the camera, within both fields of view.
     tan_horizontal, tan_vertical = rules.half_view_tangents
     is_in_width = np.abs(right)[..., None] <= tan_horizontal * depth
     is_in_height = np.abs(vertical_offset) <= tan_vertical * depth

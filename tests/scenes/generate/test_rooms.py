@@ -12,7 +12,8 @@ from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.generate.rooms import (
     AGENT_RADIUS,
     MAX_TARGET_DISTANCE,
-    free_cells,
+    cells_away_from_boxes,
+    cells_away_from_walls,
     generate_room,
     generate_rooms,
     room_statistics,
@@ -99,9 +100,9 @@ def test_the_agent_fits_and_every_target_is_within_reach(rooms: list[Scene]):
 def test_free_cells_of_a_room_with_one_box():
     # 4 x 3 floor cells within walls; cells next to a wall are out, which leaves [2, 2] and [2, 3] with centres
     # x = 0.375 and 0.625, z = 0.375. A box that begins at x = 0.8 is 0.175 m from the second: too near for 0.2 m.
-    walls = np.pad(np.zeros((3, 4), bool), 1, constant_values=True)
-    assert np.argwhere(free_cells(walls, np.zeros((0, 2, 3)))).tolist() == [[2, 2], [2, 3]]
+    free_cells = cells_away_from_walls(np.pad(np.zeros((3, 4), bool), 1, constant_values=True))
+    assert np.argwhere(cells_away_from_boxes(free_cells, np.zeros((0, 2, 3)))).tolist() == [[2, 2], [2, 3]]
     box = np.array([[[0.8, 0.0, 0.0], [1.0, 1.0, 0.75]]])
-    assert np.argwhere(free_cells(walls, box)).tolist() == [[2, 2]]
+    assert np.argwhere(cells_away_from_boxes(free_cells, box)).tolist() == [[2, 2]]
     overhead = box + np.array([0.0, 1.7, 0.0])  # begins at 1.7 m: not in the way
-    assert np.argwhere(free_cells(walls, overhead)).tolist() == [[2, 2], [2, 3]]
+    assert np.argwhere(cells_away_from_boxes(free_cells, overhead)).tolist() == [[2, 2], [2, 3]]
