@@ -51,9 +51,9 @@ class _Step(NamedTuple):
 
 
 def play_episodes(
-    cell: InferenceConfig,
-    weights: Params,
-    start: State,
+    config: InferenceConfig,
+    policy_params: Params,
+    initial_states: State,
     agent_loop: AgentLoop,
     env_params: EnvParams,
     knowledge: Knowledge,
@@ -61,23 +61,25 @@ def play_episodes(
     """Play episodes to their ends, step by step.
 
     Args:
-      cell: how to infer, leaves []; `cell.policy_index` is not used.
-      weights: parameters of the policy.
-      start: initial states of the episodes, leaves [E].
+      config: configuration of the inference, leaves []; `policy_index` is not used.
+      policy_params: parameters of the policy.
+      initial_states: initial states of the episodes, leaves [E].
       agent_loop: environment, policy and layout estimator.
       env_params: parameters of the environment.
-      knowledge: learned before training.
+      knowledge: layout priors and statistics from before training.
     """
     # A fixed key per episode, so that a replay is the same every time.
-    num_episodes = len(start.pose)
+    num_episodes = len(initial_states.pose)
     episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(num_episodes))
-    agent = _begin(weights, start, agent_loop, env_params, knowledge)
+    agent = _begin(policy_params, initial_states, agent_loop, env_params, knowledge)
     running = jnp.ones(num_episodes, bool)
 
     # All episodes are stepped together until the longest has ended. Steps [E, ...] move to the host one by one.
     host_steps = []
     while running.any():
-        agent, running, step = _step(cell, weights, agent, running, episode_keys, agent_loop, env_params, knowledge)
+        agent, running, step = _step(
+            config, policy_params, agent, running, episode_keys, agent_loop, env_params, knowledge
+        )
         host_steps.append(jax.tree.map(np.asarray, step))
 
     # Stack the steps along a time axis, and cut out the steps of each episode.
@@ -96,15 +98,17 @@ def _episode_trace(all_steps: _Step, episode: int) -> EpisodeTrace:
 
 
 @functools.partial(jax.jit, static_argnames="agent_loop")
-def _begin(weights: Params, start: State, agent_loop: AgentLoop, env_params: EnvParams, knowledge: Knowledge) -> Agent:
-    initial_memory = agent_loop.bind(weights).initial_memory(start.pose.shape)
-    return agent_loop.start_from(start, initial_memory, knowledge, env_params)
+def _begin(
+    policy_params: Params, initial_states: State, agent_loop: AgentLoop, env_params: EnvParams, knowledge: Knowledge
+) -> Agent:
+    initial_memory = agent_loop.bind(policy_params).initial_memory(initial_states.pose.shape)
+    return agent_loop.start_from(initial_states, initial_memory, knowledge, env_params)
 
 
 @functools.partial(jax.jit, static_argnames="agent_loop")
 def _step(
-    cell: InferenceConfig,
-    weights: Params,
+    config: InferenceConfig,
+    policy_params: Params,
     agent: Agent,
     running: jax.Array,
     episode_keys: jax.Array,
@@ -118,9 +122,9 @@ def _step(
       The agents after the step, which episodes still run, and the step.
     """
     # Act in all episodes, including those that have ended: shapes stay fixed.
-    policy = agent_loop.bind(weights)
+    policy = agent_loop.bind(policy_params)
     next_agent, step_result, inferred = infer_and_act(
-        cell,
+        config,
         policy,
         agent,
         running,

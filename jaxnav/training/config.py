@@ -96,12 +96,12 @@ class PPOConfig:
             learning_rate=jnp.float32(self.learning_rate) * lr_scale,
             gamma=jnp.float32(self.gamma),
             gae_lambda=jnp.float32(self.gae_lambda),
-            clip=jnp.float32(self.clip),
-            entropy=jnp.float32(self.entropy),
-            final_entropy=jnp.float32(self.final_entropy),
-            value=jnp.float32(self.value),
-            distil=jnp.float32(self.distil),
-            experience=jnp.float32(self.experience),
+            clip_range=jnp.float32(self.clip),
+            entropy_weight=jnp.float32(self.entropy),
+            final_entropy_weight=jnp.float32(self.final_entropy),
+            value_weight=jnp.float32(self.value),
+            distil_weight=jnp.float32(self.distil),
+            experience_prob=jnp.float32(self.experience),
             first_update=jnp.float32(first_update),
             num_updates=jnp.float32(num_updates),
         )
@@ -110,7 +110,7 @@ class PPOConfig:
 class PPOScalars(struct.PyTreeNode):
     """Settings that may change without a new compilation, float32 [] each.
 
-    The settings are those of `PPOConfig`; the schedule of a stage is given by two more.
+    All fields but the last two hold the setting of `PPOConfig` with the same first word.
 
     Attributes:
       first_update: updates before the stage.
@@ -120,12 +120,12 @@ class PPOScalars(struct.PyTreeNode):
     learning_rate: jax.Array
     gamma: jax.Array
     gae_lambda: jax.Array
-    clip: jax.Array
-    entropy: jax.Array
-    final_entropy: jax.Array
-    value: jax.Array
-    distil: jax.Array
-    experience: jax.Array
+    clip_range: jax.Array
+    entropy_weight: jax.Array
+    final_entropy_weight: jax.Array
+    value_weight: jax.Array
+    distil_weight: jax.Array
+    experience_prob: jax.Array
     first_update: jax.Array
     num_updates: jax.Array
 

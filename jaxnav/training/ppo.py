@@ -494,7 +494,7 @@ def ppo_loss(
     advantage_mean, advantage_std = mean_and_std(advantages, is_decision_step)
     normalised_advantages = (advantages - advantage_mean) / (advantage_std + 1e-8)
     ratio = jnp.exp(log_prob - transitions.log_prob)
-    clipped_ratio = jnp.clip(ratio, 1.0 - scalars.clip, 1.0 + scalars.clip)
+    clipped_ratio = jnp.clip(ratio, 1.0 - scalars.clip_range, 1.0 + scalars.clip_range)
     surrogate = jnp.minimum(ratio * normalised_advantages, clipped_ratio * normalised_advantages)
     policy_loss = -masked_mean(surrogate, is_decision_step)
 
@@ -502,13 +502,13 @@ def ppo_loss(
     value_target = advantages + transitions.value
     value_loss = 0.5 * jnp.square(replay.factual.value - value_target).mean()
     entropy = -masked_mean((jnp.exp(log_probs) * log_probs).sum(axis=-1), is_decision_step)
-    loss = policy_loss + scalars.value * value_loss - scalars.entropy * entropy
+    loss = policy_loss + scalars.value_weight * value_loss - scalars.entropy_weight * entropy
     loss_terms = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
 
     # Distillation of the counterfactual branch.
     if use_distillation:
         distil_loss = _distillation_loss(log_probs, replay.counterfactual.logits, is_decision_step)
-        loss = loss + scalars.distil * distil_loss
+        loss = loss + scalars.distil_weight * distil_loss
         loss_terms["distil_loss"] = distil_loss
 
     # Auxiliary loss of the method.
@@ -770,7 +770,7 @@ class Learner:
             knowledge,
             num_steps=self.config.rollout,
             use_coin=self.counterfactual == "coin",
-            experience_prob=self._experience_prob(scalars.experience),
+            experience_prob=self._experience_prob(scalars.experience_prob),
             redraw_every_step=self.config.experience_drawn == "step",
         )
         if not self.stage.adapts_online:
@@ -813,11 +813,11 @@ class Learner:
         """Take a gradient step for every minibatch of every epoch."""
         config = self.config
 
-        # Schedules: both are linear within the stage. From here on `scalars.entropy` is the scheduled weight.
+        # Schedules: both are linear within the stage. From here on `scalars.entropy_weight` is the scheduled weight.
         progress = (state.update.astype(jnp.float32) - scalars.first_update) / scalars.num_updates
         learning_rate = scalars.learning_rate * (1.0 - progress)
-        entropy_weight = scalars.entropy + progress * (scalars.final_entropy - scalars.entropy)
-        scalars = scalars.replace(entropy=entropy_weight)
+        entropy_change = scalars.final_entropy_weight - scalars.entropy_weight
+        scalars = scalars.replace(entropy_weight=scalars.entropy_weight + progress * entropy_change)
 
         # Each device computes loss and gradient on its share of the environments; their means over the devices are
         # those of the minibatch. The specs follow the arguments of `_minibatch_loss`.

@@ -39,7 +39,7 @@ MISTAKES = (
     Mistake("policies/spatial_memory.py", "stride: int = 2", "stride: int = 1", INFERENCE),
     Mistake("training/ppo.py", "policy_loss = -masked_mean(", "policy_loss = masked_mean(", PROBES),
     Mistake("training/ppo.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES),
-    Mistake("training/ppo.py", "scalars.value * value_loss", "0.0 * value_loss", PROBES),
+    Mistake("training/ppo.py", "scalars.value_weight * value_loss", "0.0 * value_loss", PROBES),
     Mistake("causal.py", "jnp.where(s == 0, logits, effect)", "effect", "test_causal.py"),
     Mistake("causal.py", "gap - epsilon)", "gap - float(epsilon))", "test_causal.py"),
     Mistake("evaluation/grid.py", "success * best_length / length", "success * length / best_length",

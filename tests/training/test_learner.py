@@ -155,7 +155,9 @@ def test_no_episode_that_ends_counts_as_none(seeds):
 def test_chunks_and_other_scalars_do_not_trace_again(first):
     before = len(traces)
     states, _ = one_update(first[0], SCALARS, PARAMS, KNOWLEDGE)
-    one_update(states, SCALARS.replace(learning_rate=jnp.float32(0.1), entropy=jnp.float32(0.5)), PARAMS, KNOWLEDGE)
+    one_update(
+        states, SCALARS.replace(learning_rate=jnp.float32(0.1), entropy_weight=jnp.float32(0.5)), PARAMS, KNOWLEDGE
+    )
     one_update(states, SCALARS, PARAMS.replace(success_reward=jnp.float32(1)), Knowledge(2 * KNOWLEDGE.layout))
     assert len(traces) == before
 

@@ -197,7 +197,11 @@ def test_a_term_of_the_method_is_added():
 
 # The counterfactual branch
 
-DISTIL_ONLY = {"entropy": jnp.float32(0), "value": jnp.float32(0), "distil": jnp.float32(1)}
+DISTIL_ONLY = {
+    "entropy_weight": jnp.float32(0),
+    "value_weight": jnp.float32(0),
+    "distil_weight": jnp.float32(1),
+}
 
 
 def test_distillation_reaches_only_what_the_counterfactual_branch_uses():
