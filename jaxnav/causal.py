@@ -7,8 +7,8 @@ the paper's *experience*: features of what tends to stand near what, learned in 
     G ---------> A
     S, G -> Z -> A
 
-With the logits a of the factual decision, the logits a_bar under do(S = 0, G = 0) with the factual experience Z, the
-layout gap D and its threshold epsilon:
+Let a be the logits of the factual decision, a_bar the logits under do(S = 0, G = 0) with the factual experience Z and
+the factual memory (hidden state, previous action), D the layout gap, and epsilon its threshold:
 
     counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
     tde(logits, counterfactual)                    # eq. 1: a - a_bar

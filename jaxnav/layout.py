@@ -54,9 +54,9 @@ class EstimatorConfig:
         over all rows saturates tanh.
         `none`: D stays 0, so that sTDE removes nothing.
       hold: the gap never falls within an episode.
-      decay: the gap is multiplied by this factor in [0, 1] at each call with the gate shut.
-      passes: estimator calls per step, >= 1. The released code calls the estimator twice; the second call sees the same
-        set, so that a new gap is already decayed once.
+      decay: the gap is multiplied by this factor in [0, 1] in each pass with the gate shut.
+      passes: passes over one view that a single `update` reproduces, >= 1. The released code makes two per step; the
+        second sees the same set and finds the gate shut, so that a new gap is already decayed once.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
       uniform: share of the uniform distribution mixed into every prior row, in [0, 1].
       form: form of eq. 2 that evaluations use by default, see `jaxnav.causal.stde`; no effect on the estimator.
@@ -248,7 +248,7 @@ class LayoutEstimator(struct.PyTreeNode):
             case "novelty" | "clock":
                 # The released code adds 1 to a row's own category before the divergence.
                 row_alpha = state.alpha + diagonal if config.own_column else state.alpha
-                # A new gap has already decayed in the later calls of the same step.
+                # A new gap has already decayed in the later passes over this view.
                 new_gap = self._novelty(row_alpha, counts, visible) * config.decay ** (config.passes - 1)
                 gap = jnp.where(is_accepted, new_gap, state.gap * config.decay**config.passes)
         return next_state.replace(gap=jnp.maximum(gap, state.gap) if config.hold else gap)
@@ -257,8 +257,8 @@ class LayoutEstimator(struct.PyTreeNode):
     def expectation(state: LayoutState, goal: jax.Array | int | None = None) -> jax.Array:
         """Expected co-occurrence w (eq. 6).
 
-        w_ij = p(j visible given i visible) and w_ii = 1. With `own_column` w_ii is 1 + the share of i in its own row,
-        as in the released code.
+        w_ij = alpha_ij / sum_k alpha_ik, the mean of row i: the probability that a category seen with i is j. The
+        diagonal w_ii is 1; with `own_column` it is 1 + the share of i in its own row, as in the released code.
 
         Args:
           state: the belief.
@@ -274,7 +274,10 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """w x g of eq. 7, float32 [K]: the goal's column of w, because g is one-hot. Methods multiply it into Z."""
+        """w x g of eq. 7, float32 [K]: the goal's column of w, because g is one-hot.
+
+        A method multiplies what Z holds of category i by entry i, see `Experience.encode`.
+        """
         return LayoutEstimator.expectation(state, goal)
 
     def _novelty(self, alpha: jax.Array, counts: jax.Array, visible: jax.Array) -> jax.Array:

@@ -168,7 +168,7 @@ class ObjectNav:
             starts_near = (random_words[-1] >> jnp.uint32(8)).astype(jnp.float32) < self.near_starts * 2.0**24
             cell = jnp.where(starts_near, nearest_cell, cell)
 
-        # The camera looks straight ahead: horizon 0.
+        # Horizon index 0 is the first camera pitch, straight ahead; higher indices look further down.
         pose = rules.join_pose(cell, heading, 0)
         goal_distance = tables.goal_distance[cell, goal] if self.shaping else None
         state = State(pose=pose, scene=scene, goal=goal, time=jnp.zeros_like(pose), min_goal_distance=goal_distance)

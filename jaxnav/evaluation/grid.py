@@ -1,10 +1,11 @@
-"""The evaluation grid: every variant, epsilon and seed over every episode, in one compiled call.
+"""The evaluation grid: every variant, epsilon and seed over every episode, in one compiled call per bank of scenes.
 
-A grid is an `InferenceConfig` with leaves [C]. `Evaluator` runs its C entries one after the other (`lax.map`). For each
-entry it steps all E episodes of a list as one batch until every episode has ended (`_run_episodes`). One step is
-`infer_and_act`: decide, remove experience, choose, act. The policy's *choice* is the action itself, except for methods
-with macro-actions, where one choice lasts several steps. `episode_metrics` turns the outcomes into success rate (SR),
-success weighted by path length (SPL), success weighted by action efficiency (SAE) and distance to success (DTS).
+A grid is an `InferenceConfig` with leaves [C], such as one entry for each table row and training seed. For each bank,
+`Evaluator` runs the C entries one after the other (`lax.map`). For each entry it steps all E episodes of the bank as
+one batch until every episode has ended (`_run_episodes`). One step is `infer_and_act`: decide, remove experience,
+choose, act. The policy's *choice* is the action itself, except for methods with macro-actions, where one choice lasts
+several steps. `episode_metrics` turns the outcomes into success rate (SR), success weighted by path length (SPL),
+success weighted by action efficiency (SAE) and distance to success (DTS).
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,7 +29,7 @@ Tree = TypeVar("Tree")
 
 #: Metres that DTS subtracts from the distance to the goal.
 GOAL_RADIUS = 1.0
-#: Batch sizes, as divisors of E: most episodes are short, so the batch shrinks once so few episodes still run.
+#: Batch sizes, as divisors of E: once at most E / divisor episodes still run, the batch shrinks to that size.
 _BATCH_DIVISORS = (2, 4, 16)
 
 
@@ -222,7 +223,7 @@ def _run_episodes(
             knowledge=knowledge,
             can_remove=can_remove,
         )
-        # The executed action differs from the choice while a macro-action runs.
+        # The memory holds the executed action, which differs from the choice where the method has macro-actions.
         action = policy_memory(result.agent).action
         is_decision_step = agent_loop.is_decision_step(batch.agent)  # of the state before the step
         outcome = batch.outcome.add_step(batch.running, action, result, trace.removal_weight, is_decision_step)
@@ -246,7 +247,7 @@ def _run_episodes(
         episode_keys=episode_keys,
     )
     batch_ids = jnp.arange(num_episodes)
-    episode_table = batch.outcome, initial_states  # outcomes and final states of all episodes
+    episode_table = batch.outcome, initial_states  # outcomes and states of all episodes; overwritten with final ones
 
     # Carry on with ever smaller batches: whenever enough episodes have ended, keep only those that still run. The loop
     # is unrolled, one `while_loop` for each static batch size.
@@ -254,7 +255,7 @@ def _run_episodes(
     for next_size in (*smaller_sizes, 0):
         batch = run_until(batch, max_running=next_size)
         episode_table = _write_rows(episode_table, batch_ids, (batch.outcome, batch.agent.state))
-        kept_rows = jnp.argsort(~batch.running)[:next_size]  # running episodes first
+        kept_rows = jnp.argsort(~batch.running)[:next_size]  # running episodes first; ended ones may fill the rest
         batch_ids = batch_ids[kept_rows]
         batch = _take_rows(batch, kept_rows)
 

@@ -1,6 +1,6 @@
 """Removal of experience from a decision: sTDE (eq. 2), TDE (eq. 1), and the controls that they are compared with.
 
-Both subtract the counterfactual logits, to which only experience contributes (scene and goal are set to zero).
+sTDE and TDE subtract the counterfactual logits, to which only experience contributes (scene and goal are set to zero).
 
 An `InferenceConfig` says how one entry of an evaluation grid turns a decision into logits to act by. At every step
 `logits_to_remove` decides without the direct pathways, `select_gap` picks the layout gap, and `apply_removal` combines
@@ -135,7 +135,7 @@ def logits_to_remove(
         return jax.vmap(lambda key: sampler(key, row_shape))(row_keys)
 
     def intervention_value(tag: int, pathway: jax.Array) -> jax.Array:
-        """Zeros, or the uniform noise of the control; `cond` skips the noise for all other rows of a table."""
+        """Zeros, or the uniform noise of the control. Entries run one by one, so `cond` samples only if needed."""
         return jax.lax.cond(
             config.intervention > 0,
             lambda: config.intervention * sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform),
@@ -184,24 +184,24 @@ def select_gap(
 
 
 def apply_removal(
-    config: InferenceConfig, logits: jax.Array, counterfactual: jax.Array, gap: jax.Array
+    config: InferenceConfig, logits: jax.Array, removed_logits: jax.Array, gap: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Remove experience from logits by equation 1 or 2.
 
     Args:
       config: configuration of the grid entry.
       logits: float32 [E, A], factual logits.
-      counterfactual: float32 [E, A], logits to remove.
+      removed_logits: float32 [E, A], logits to remove.
       gap: float32 [E], layout gaps.
 
     Returns:
       Logits float32 [E, A], and the weight float32 [E] of the removed ones.
     """
     # The form is a traced index: compute every form, then pick one.
-    soft_logits = jnp.stack([stde(logits, counterfactual, gap, config.epsilon, form) for form in FORMS])[config.form]
+    soft_logits = jnp.stack([stde(logits, removed_logits, gap, config.epsilon, form) for form in FORMS])[config.form]
     soft_weight = jnp.stack([removal_weight(gap, config.epsilon, form) for form in FORMS])[config.form]
 
-    corrected_logits = jnp.where(config.use_tde, tde(logits, counterfactual), soft_logits)
+    corrected_logits = jnp.where(config.use_tde, tde(logits, removed_logits), soft_logits)
     weight = jnp.where(config.use_tde, 1.0, soft_weight)
     return corrected_logits, weight
 

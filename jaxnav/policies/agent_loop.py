@@ -1,8 +1,9 @@
 """The agent loop: perceive, decide, act, for every episode in training, evaluation and replays.
 
 `Perception` turns the views of one episode into beliefs that need no trained parameters: the layout belief, the spatial
-map and the state of the method's tracker. `decide` runs a policy on such a view. `AgentLoop` ties both to an
-environment: it starts B parallel episodes, and steps them with or without auto-reset.
+map and the state of the method's tracker. `policy_inputs` joins them with the observation, and `decide` runs a policy
+on these inputs. `AgentLoop` ties both to an environment: it starts B parallel episodes, and steps them with or without
+auto-reset.
 
     loop = AgentLoop(env, spec, estimator_config)
     agent = loop.start(start_key, num_envs, policy.initial_memory((num_envs,)), knowledge, env_params)

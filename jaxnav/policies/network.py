@@ -37,7 +37,8 @@ Params = dict[str, Any]
 #: Initial bias of Done's logit: without the Done gate, a new policy chooses Done about once in 60 steps. A policy that
 #: often chooses Done ends its episodes too early to find goals.
 INITIAL_DONE_LOGIT = -2.5
-#: The Done gate is this factor times the confidence of the goal's detection.
+#: The Done gate is this factor times the confidence of the goal's detection. A gate of 0 makes the logit of Done 0, so
+#: Done stays possible; at first it is then even likelier than with the bias above.
 DONE_GATE = 0.58
 
 #: Additive changes of layer outputs by an adaptation: layer name (`fuse`, `input_gates`, `hidden_gates` or `actor`) ->
@@ -77,9 +78,11 @@ class Stream(nnx.Module):
     Each part of a step is a method of its own, so that training can compute it for whole rollouts at once
     (`training.ppo`):
 
-        mediated_input + direct input -> input_gates -+
+        direct_input + mediated_input -> input_gates -+
                                                       +-> GRU -> apply_heads
         hidden state                 -> hidden_gates -+
+
+    `direct_input` is a method of `Policy`; the experience stream of `StreamsPolicy` has none.
     """
 
     def __init__(
@@ -219,7 +222,8 @@ class Policy(Stream):
         self.appearance = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
         self.view = Linear(num_scene_inputs, self.num_views * sizes.view_outputs, rngs=rngs)
 
-        # Goal G: detections and the category that is sought. Experience Z: the method's own module.
+        # Goal G: detections and the category of the goal. Experience Z: the method's own module; `self.method` is this
+        # `Experience` (the attribute is a checkpoint path), the local `method` is the `Method`.
         self.detections = CategoryMaps.for_detections(perceived_spec, rngs)
         self.sought = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
         self.method = method.experience(perceived_spec, rngs)
@@ -399,10 +403,11 @@ class StreamsPolicy(Policy):
     def encode(self, inputs: PolicyInputs) -> Pathways:
         """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
         encoded = super().encode(inputs)
-        # The layer of the view embeds it twice, once per stream; the appended 1 is the factor of the stream.
+        # The view layer embeds the view twice, once per stream; the appended 1 is the factor of the stream.
         direct_view, experience_view = jnp.split(encoded.scene, 2, axis=-1)
-        experience = encoded.experience, append_one(experience_view)
-        encoded = encoded._replace(scene=append_one(direct_view), experience=experience)
+        # The experience stays a pair until `_join_experience`: `attend`, if needed, computes only its first part.
+        experience_parts = (encoded.experience, append_one(experience_view))
+        encoded = encoded._replace(scene=append_one(direct_view), experience=experience_parts)
         return encoded if self.method.reads_memory else _join_experience(encoded)
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:

@@ -1,8 +1,8 @@
 """The paper's causal graph as types.
 
-    S (what is seen) ---------> A
-    G (what is sought) -------> A
-    S, G --> Z (experience) --> A
+    S (surroundings without objects) --> A
+    G (detections and goal) -----------> A
+    S, G --> Z (experience) -----------> A
 
 `Pathways` holds the three embeddings that lead to the action A, `Decision` what the policy makes of them, and
 `PolicyState` what it carries from step to step.
@@ -40,8 +40,8 @@ class PolicyInputs(NamedTuple):
 class Pathways(NamedTuple):
     """Embeddings on the three pathways into the action.
 
-    With streams, scene and experience end with a 1, the factor of a stream: scene = 0 silences the whole direct stream,
-    that of the goal included, experience = 0 the stream of experience.
+    In `StreamsPolicy`, scene and experience end with a 1, a factor on a stream's outputs: scene = 0 silences the whole
+    direct stream, which also reads the goal, and experience = 0 silences the experience stream.
 
     Attributes:
       scene: float32 [..., S], the direct pathway S -> A: the surroundings without objects.

@@ -358,8 +358,8 @@ def sweep(
     if not len(epsilon):
         raise InputError("epsilon: give at least one number")
 
-    # Random numbers depend on the position of the parameters. Repeated for every arm, they have the same positions as
-    # in `evaluate`, and so both functions sample the same actions.
+    # Random numbers depend on `policy_index`. Repeating the layout parameters for every arm gives them the same index
+    # as in `evaluate`, and so both functions sample the same actions.
     arm_names = run.config.arms
     params = policies.params if params is None else params
     repeated_params = jax.tree.map(lambda leaf: jnp.concatenate([jnp.asarray(leaf)] * len(arm_names)), params)

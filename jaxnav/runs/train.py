@@ -1,9 +1,11 @@
 """Training of a run, from the layout prior to the exported policies.
 
 `train` is the entry point. Before training, `explore_world`, `calibrate_estimator` and `learn_knowledge` collect the
-layout prior and everything else that is known from the training scenes. `make_trainer` builds the trainer of all arms
-and seeds, and `run_updates` trains chunk by chunk: between chunks the run validates, logs and saves its policies.
-A run resumes from its last checkpoint, and a signal ends it after the current chunk (`Interrupts`).
+layout prior and everything else that is known from the training scenes. `make_trainer` builds the trainer of all seeds
+of both arms (`baseline`: policies without the layout estimator, `layout`: with it), and `run_updates` trains chunk by
+chunk. A chunk is one compiled call of several updates in one bank of scenes (a shard, where scenes are streamed).
+Between chunks the run validates, logs and saves its policies. A run resumes from its last checkpoint, and a signal
+ends it after the current chunk (`Interrupts`).
 """
 
 import dataclasses
@@ -294,8 +296,8 @@ def make_trainer(
       knowledge: knowledge from before training.
       mesh: mesh of devices; None for one device.
     """
-    # Training episodes may start near their goals.
     policy_spec = config.policy_spec(len(env.categories))
+    # Training episodes may start near their goals.
     env = dataclasses.replace(env, near_starts=config.near_starts)
 
     # Arms differ only in the estimator.
@@ -401,8 +403,8 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
 
     with ProgressDisplay(config, update, session.console) as progress, Interrupts() as interrupts:
         for chunk_index, env_params in zip(remaining_chunks, params_by_chunk, strict=True):
-            # A new bank of scenes invalidates the running episodes, so restart them.
             stage_index = stage_by_chunk[chunk_index]
+            # A new bank of scenes invalidates the running episodes, so restart them.
             if chunk_index and bank_order[chunk_index] != bank_order[chunk_index - 1]:
                 states = trainer.restart(states, env_params, stage_index)
 
@@ -413,8 +415,8 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
             if session.validator is not None and update in validation_updates:
                 states, metrics = _validate(session, session.validator, states, metrics, stage_index)
 
-            # All processes agree on a signal before the first of them writes. Stop if the run directory is gone or
-            # another process has taken it.
+            # All processes agree on a signal before process 0 writes. The check of the lock stops the run if its
+            # directory was removed or replaced.
             signal_number = interrupts.pending_signal()
             run_on_first_process(session.lock.check)
 

@@ -10,14 +10,15 @@
             gradient = grad(ppo_loss(replay, ...))
             apply_gradient(...)
 
-The recurrent state at the start of a rollout is the stored one. There is no value clipping.
+Replay starts from the stored memory (`PolicyState`: recurrent state, previous action, ...) of the rollout's first step,
+and unrolls it anew under the current parameters. There is no value clipping.
 
 Extensions of plain PPO:
 
-* *Pathways*: a policy has three inputs to the action, the scene and the goal (*direct*), and the method's *experience*
-  features (the mediator). The *counterfactual branch* is the same network at the same memory with both direct pathways
-  zero. `CounterfactualTraining` says how this branch is trained: not at all, by zeroing the direct pathways at random
-  while acting (a coin), or by distillation.
+* *Pathways*: the action depends on three inputs: scene and goal (the *direct* pathways), and the method's *experience*
+  features (the mediator; *experience* never means collected transitions here). The *counterfactual branch* is the same
+  network at the same memory with both direct pathways zero. `CounterfactualTraining` says how this branch is trained:
+  not at all, by zeroing the direct pathways at random while acting (a coin), or by distillation.
 * *Experience dropout*: policies with `decision: streams` may act without experience, for whole episodes or single
   steps.
 * *Macro-actions*: a choice of the policy may last for several actions. Choices sampled meanwhile are ignored
@@ -66,8 +67,8 @@ TrainCarry = tuple[Params, Any]
 _INIT, _START, _UPDATES = range(3)
 _ROLLOUT, _SHUFFLE, _RESTART = range(3)
 _DIRECT_MASK, _ACTION, _ENV, _EXPERIENCE_DROPOUT = range(4)
-#: Tag of the experience dropout at a start. `AgentLoop.start` splits the same key into one key per environment, and
-#: split keys equal folded ones, so this tag must exceed every environment index.
+#: Tag for drawing experience dropout when all episodes are started. `AgentLoop.start` splits the same key, and
+#: `split(key, B)[i]` equals `fold_in(key, i)`, so this tag must exceed every environment index.
 _START_DROPOUT = 2**31 - 1
 
 
@@ -81,7 +82,7 @@ class Transition(NamedTuple):
 
     Attributes:
       pose, goal: int32 [B].
-      layout_weights: float32 [B, K], the layout's weights for the goal (eq. 7).
+      layout_weights: float32 [B, K], the layout's weights for the goal (w x g, eq. 7).
       reading: output of the method's tracker, leaves [B, ...]; None without one.
       surroundings: uint8 [B, M], map cells around the agent; None without a spatial memory.
       use_direct: bool [B], False where the coin zeroed both direct pathways; None without a coin.
@@ -169,7 +170,7 @@ def collect_rollout(
     Args:
       agent_loop: runs policy and environment.
       policy: policy with bound parameters.
-      agent: B running episodes.
+      agent: B running episodes: environment states, perception and policy memories.
       key: PRNG key [].
       env_params: parameters of the environment.
       knowledge: layout priors and statistics from before training.
@@ -226,6 +227,7 @@ def collect_rollout(
             use_experience=decision.use_experience,
             is_decision_step=agent_loop.is_decision_step(agent),
             choice=choice,
+            # The action sent to the environment, as the memory keeps it; equals `choice` if choices are actions.
             action=policy_memory(result.agent).action,
             log_prob=log_prob,
             value=decision.value,
@@ -393,8 +395,8 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
     )
     pathways = policy.encode(inputs)
 
-    # A recurrent core alone is unrolled on precomputed inputs. If the experience or an adaptation reads the memory, the
-    # whole policy is scanned over time.
+    # If only the GRU depends on the memory, everything else runs in parallel over time. If the experience or an
+    # adaptation reads the memory too, the whole policy is scanned over time.
     replay_decisions = _replay_step_by_step if policy.needs_stepwise_replay else _replay_in_parallel
     factual_decision, counterfactual_decision = replay_decisions(policy, pathways, transitions, memory)
     return Replay(
@@ -430,8 +432,8 @@ def _replay_in_parallel(
     unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
     factual_decision = policy.apply_heads(unrolled_core.hidden_after, factual_pathways)
 
-    # Counterfactual: one GRU step at each time, from the factual hidden state before it (no gradient enters that state)
-    # and with the mediated input only.
+    # Counterfactual: one GRU step at each time with the mediated input only, from the factual hidden state before it.
+    # `unroll_gru` treats that state as a constant, so no gradient enters it.
     counterfactual_gates = policy.input_gates(mediated_input)
     counterfactual_hidden = gru_step(counterfactual_gates, unrolled_core.hidden_gates, unrolled_core.hidden_before)
     return factual_decision, policy.apply_heads(counterfactual_hidden, counterfactual_pathways)
@@ -580,7 +582,7 @@ def apply_gradient(
         param_updates, opt_state = make_optimizer(config).update(gradient, opt_state, policy_params)
 
     # Scale Adam's step, not the gradient: Adam is invariant to the scale of gradients, and momentum would still move
-    # frozen parameters.
+    # frozen parameters. The chain has no negative learning rate, so the step is subtracted.
     if lr_scale_by_path is not None:
         param_updates = _scale_by_path(param_updates, lr_scale_by_path)
     policy_params = jax.tree.map(lambda param, step: param - learning_rate * step, policy_params, param_updates)
@@ -656,7 +658,7 @@ class LearnerState(struct.PyTreeNode):
       params: parameters of the policy.
       best: the policy with the best validation, which is exported.
       opt_state: state of the optimizer.
-      agent: agents in B environments.
+      agent: B running episodes, including the environment states.
       key: typed PRNG key []; update u uses `fold_in(key, u)`.
       update: int32 [], number of updates done.
     """
@@ -813,14 +815,17 @@ class Learner:
         """Take a gradient step for every minibatch of every epoch."""
         config = self.config
 
-        # Schedules: both are linear within the stage. From here on `scalars.entropy_weight` is the scheduled weight.
+        # Schedules, linear within the stage: the learning rate falls to 0, the entropy weight goes to its final value.
+        # `scalars.num_updates` counts the updates of the stage; one call of `train` may run fewer. From here on
+        # `scalars.entropy_weight` is the scheduled weight.
         progress = (state.update.astype(jnp.float32) - scalars.first_update) / scalars.num_updates
         learning_rate = scalars.learning_rate * (1.0 - progress)
         entropy_change = scalars.final_entropy_weight - scalars.entropy_weight
         scalars = scalars.replace(entropy_weight=scalars.entropy_weight + progress * entropy_change)
 
         # Each device computes loss and gradient on its share of the environments; their means over the devices are
-        # those of the minibatch. The specs follow the arguments of `_minibatch_loss`.
+        # those of the minibatch, also under masks (see `masked_mean`). The specs follow the arguments of
+        # `_minibatch_loss`.
         replicated = PartitionSpec()
         split_over_envs = PartitionSpec(None, ENV_AXIS)  # [T, B, ...]
         minibatch_specs = split_over_envs, PartitionSpec(ENV_AXIS), split_over_envs

@@ -220,8 +220,8 @@ class ShardedTrainer(Trainer):
         self._seed_sharding = state_sharding(mesh)
         self._stacked_sharding = state_sharding(mesh, stacked=True)
         super().__init__(*arguments, **keywords)
-        shared_arrays = (self._key, self._scalars, self._knowledge)
-        self._key, self._scalars, self._knowledge = replicate_on_devices(mesh, shared_arrays)
+        shared_arrays = (self._key, self._stage_scalars, self._knowledge)
+        self._key, self._stage_scalars, self._knowledge = replicate_on_devices(mesh, shared_arrays)
         self._local_env_params: EnvParams | None = None
 
         def stack(arm_states: list[LearnerState]) -> LearnerState:
