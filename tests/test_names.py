@@ -11,6 +11,9 @@ SOURCES = [
     *sorted(ROOT.glob("jaxnav/**/*.py")),
     *sorted(ROOT.glob("benchmarks/*.py")),
     *sorted(ROOT.glob("examples/*.py")),
+    *sorted(ROOT.glob("tests/**/*.py")),
+    ROOT / "train.py",
+    ROOT / "eval.py",
 ]
 BANNED = frozenset(
     [

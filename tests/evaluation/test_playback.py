@@ -68,9 +68,9 @@ def test_panels_are_in_step_and_keep_their_ends(tmp_path):
             gif.seek(number)
             frames.append(np.asarray(gif.convert("RGB")))
             durations.append(gif.info["duration"])
-    left, right = ([frame[:, half] for frame in frames] for half in (slice(0, 515), slice(525, None)))
-    assert [(a != b).any() for a, b in itertools.pairwise(left)] == [True, True, False, False, False]
-    assert all((a != b).any() for a, b in itertools.pairwise(right))
+    left_half, right_half = ([frame[:, half] for frame in frames] for half in (slice(0, 515), slice(525, None)))
+    assert [(a != b).any() for a, b in itertools.pairwise(left_half)] == [True, True, False, False, False]
+    assert all((a != b).any() for a, b in itertools.pairwise(right_half))
     assert durations[-1] >= 1000 > max(durations[:-1])
 
 

@@ -109,5 +109,5 @@ def test_a_cell_spreads_to_its_eight_neighbours(z, x):
 
 def test_turns_take_the_shorter_way():
     turns = [int(turn_towards(jnp.int32(wanted), jnp.int32(1), 8)) for wanted in range(8)]
-    right, left = ROTATE_RIGHT, ROTATE_LEFT
-    assert turns == [left, MOVE_AHEAD, right, right, right, right, left, left]
+    turn_right, turn_left = ROTATE_RIGHT, ROTATE_LEFT
+    assert turns == [turn_left, MOVE_AHEAD, turn_right, turn_right, turn_right, turn_right, turn_left, turn_left]

@@ -25,12 +25,12 @@ def lines(axes):
 
 def test_curves_are_means_over_seeds_in_percent(tmp_path):
     figure = learning_figure(ROWS, REACH, "ORG")
-    left, right = figure.axes
-    training, best, sampled = lines(left)
+    curve_axes, budget_axes = figure.axes
+    training, best, sampled = lines(curve_axes)
     np.testing.assert_allclose(training, ([1, 2], [30, 70]))  # (20 + 40) / 2 and (60 + 80) / 2
     np.testing.assert_allclose(best, ([2], [35]))
     np.testing.assert_allclose(sampled, ([2], [17.5]))
-    np.testing.assert_allclose(lines(right), [([10, 100], course) for course in ([10, 50], [20, 60], [30, 70])])
+    np.testing.assert_allclose(lines(budget_axes), [([10, 100], course) for course in ([10, 50], [20, 60], [30, 70])])
     save_figure(figure, tmp_path / "learning.png")
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
 

@@ -88,14 +88,14 @@ def test_a_scene_without_objects():
 
 
 def test_rooms_are_tinted_and_named():
-    left, right = np.zeros((9, 5), bool), np.zeros((9, 5), bool)
-    left[:, 0], right[:, 3] = True, True
-    home = dataclasses.replace(HALL, rooms=(Room("living_room", left), Room("bedroom", right)))
+    left_room, right_room = np.zeros((9, 5), bool), np.zeros((9, 5), bool)
+    left_room[:, 0], right_room[:, 3] = True, True
+    home = dataclasses.replace(HALL, rooms=(Room("living_room", left_room), Room("bedroom", right_room)))
     plan = scene_figure(home, TASK, view_from_pose(home, TASK, None)).axes[0]
     assert {"living room", "bedroom"} < set(names(plan))
     untinted = scene_figure(HALL, TASK, view_from_pose(HALL, TASK, None)).axes[0]
     colours, plain = (np.asarray(axes.images[0].get_array()) for axes in (plan, untinted))
-    assert (colours != plain).any(axis=-1).tolist() == (left | right).tolist()
+    assert (colours != plain).any(axis=-1).tolist() == (left_room | right_room).tolist()
     assert not np.array_equal(colours[0, 0], colours[0, 3])
 
 

@@ -95,8 +95,8 @@ def test_the_map_lies_over_the_home(walked):
         projection.to_world(np.array([note.position for note in notes])), episode.places, atol=1e-9
     )
     visited = np.argwhere(projection.unroll(np.asarray(notes[-1].cells)) & VISITED_BIT)
-    left, _, bottom, top = projection.borders
-    centres = np.array([left, bottom]) + (top - bottom) / SIZE * (visited[:, ::-1] + 0.5)
+    left_border, _, bottom, top = projection.borders
+    centres = np.array([left_border, bottom]) + (top - bottom) / SIZE * (visited[:, ::-1] + 0.5)
     np.testing.assert_allclose(centres, np.unique(episode.places, axis=0), atol=1e-9)
     # Beyond an edge it goes on: from line N - 1 to line 1 are two lines, not N - 2.
     ways = np.diff(projection.path_to_world(np.array([[SIZE - 1, 3], [1, 3]])), axis=0)
