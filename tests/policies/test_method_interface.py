@@ -165,7 +165,7 @@ def test_experience_attends_with_the_memory():
     experience = jax.jit(lambda memory: policy.pathways(view, memory).experience)
     first, other = experience(before.memory), experience(before.memory._replace(hidden=-before.memory.hidden))
     assert np.abs(first - other).max() > 1e-3
-    with pytest.raises(ValueError, match="attends with its memory"):
+    with pytest.raises(ValueError, match="reads the memory"):
         policy.pathways(view)
 
 
@@ -177,7 +177,7 @@ def test_a_tracker_takes_in_every_view_once():
         np.testing.assert_array_equal(agent.perception.tracker_state["views"], agent.state.time + 1)
     t = rollout.transitions
     # What the network read at each step is the note of that step: views, moves, goal.
-    np.testing.assert_allclose(t.reading[..., 0] * 10, t.length, rtol=1e-6)  # the length counts this step's action
+    np.testing.assert_allclose(t.reading[..., 0] * 10, t.episode_length, rtol=1e-6)  # the length counts this step's action
     np.testing.assert_allclose(t.reading[..., 2] * 10, t.goal, rtol=1e-6)
     cell = t.pose // tiny.POSES_PER_CELL
     stayed = ~np.asarray(t.ended[:-1])

@@ -78,7 +78,7 @@ def test_the_coin_is_constant_within_an_episode():
     for before, after in itertools.pairwise(rollouts):
         goes_on = ~before.transitions.ended[-1]
         np.testing.assert_array_equal(
-            after.memory.use_experience[goes_on], before.transitions.use_experience[-1][goes_on]
+            after.initial_memory.use_experience[goes_on], before.transitions.use_experience[-1][goes_on]
         )
 
 
