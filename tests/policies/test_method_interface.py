@@ -177,7 +177,8 @@ def test_a_tracker_takes_in_every_view_once():
         np.testing.assert_array_equal(agent.perception.tracker_state["views"], agent.state.time + 1)
     t = rollout.transitions
     # What the network read at each step is the note of that step: views, moves, goal.
-    np.testing.assert_allclose(t.reading[..., 0] * 10, t.episode_length, rtol=1e-6)  # the length counts this step's action
+    # The length counts the action of this step.
+    np.testing.assert_allclose(t.reading[..., 0] * 10, t.episode_length, rtol=1e-6)
     np.testing.assert_allclose(t.reading[..., 2] * 10, t.goal, rtol=1e-6)
     cell = t.pose // tiny.POSES_PER_CELL
     stayed = ~np.asarray(t.ended[:-1])
