@@ -134,7 +134,7 @@ def _find_views(
 
     # Every horizon sees the same sites, but its looks count separately.
     horizon = np.arange(len(rules.horizons))[:, None]
-    pose = (cell[pair] * rules.headings + heading) * len(horizon) + horizon  # [T, pairs]
+    pose = rules.join_pose(cell[pair], heading, horizon)  # [T, pairs]
     distance_bin = (distance[cell, site][pair] / SITE_SPACING).astype(np.int16)
     look = distance_bin + (horizon * NUM_DISTANCE_BINS).astype(np.int16)
     pose_site = np.broadcast_to(site[pair], pose.shape)

@@ -58,7 +58,7 @@ class Rules:
         return self.headings * len(self.horizons)
 
     def join_pose(self, cell: Any, heading: Any, horizon: Any) -> Any:
-        """Pose with a cell, a heading and a horizon: indices of one type and shape, ints or arrays of ints."""
+        """Pose with a cell, a heading and a horizon: indices, ints or arrays of ints of shapes that broadcast."""
         return (cell * self.headings + heading) * len(self.horizons) + horizon
 
     def split_pose(self, pose: Any) -> tuple[Any, Any, Any]:
