@@ -12,7 +12,7 @@ from jaxnav.env.testing import check_environment
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.files.scene_file import write_scenes
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
@@ -56,7 +56,7 @@ def test_make_generates_a_world():
 
 def test_make_from_a_scene_file_with_another_task(tmp_path):
     path = tmp_path / "rooms.jsonl.gz"
-    scenes = generate_rooms(4, 4, 0)
+    scenes = [generate_room(split, i, 0) for split in ("train", "val") for i in range(4)]
     write_scenes(path, scenes)
     assert tuple(scene.room_type for scene in scenes[4:]) == ROOM_TYPES
     task = Task(("Television", "Sink"), rules=HOUSES)
@@ -69,7 +69,7 @@ def test_make_refuses_what_it_does_not_know(tmp_path):
     with pytest.raises(InputError, match=r"world 'romms': choose one of rooms, apartments, houses"):
         make("romms")
     path = tmp_path / "train.jsonl.gz"
-    write_scenes(path, generate_rooms(1, 0, 0))
+    write_scenes(path, [generate_room("train", 0, 0)])
     with pytest.raises(InputError, match=r"split 'valid': choose one of train, val, test"):
         make("rooms", "valid", path)
     with pytest.raises(InputError, match=r"train\.jsonl\.gz: holds no scene of split 'test'; it holds train"):

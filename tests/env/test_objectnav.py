@@ -12,11 +12,11 @@ from support.scenes import BOOK, CATEGORIES, CHAIR, HOUSES, ROOMS, SMALL, draw
 
 from jaxnav.env.make import build_environment, make
 from jaxnav.env.objectnav import NUM_START_CANDIDATES, State
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, Task
 
-BANK = compile_bank(generate_rooms(4, 0, 0), Task())  # one of each type
+BANK = compile_bank([generate_room("train", i, 0) for i in range(4)], Task())  # one of each type
 # One cell: Done succeeds for the book at headings 7, 0 and 1, for the chair from behind.
 ONE_CELL = compile_bank([draw(["."], ("Book", 0, 1.5, 1, *SMALL), ("Chair", 0, 1.5, -1, *SMALL))], Task(CATEGORIES))
 

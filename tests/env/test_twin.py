@@ -21,7 +21,7 @@ from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.files.scene_file import read_scenes
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.lattice import pose_successors, standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import Bank, compile_bank, compile_scene
@@ -47,7 +47,7 @@ def scenes_of(source: str) -> list[Scene]:
     if source == "maze":
         return [maze_scene(seed) for seed in range(6)]
     if source == "rooms":
-        return generate_rooms(4, 0, 0)
+        return [generate_room("train", i, 0) for i in range(4)]
     scenes = [scene for scene in read_scenes(require(ITHOR)) if scene.split == "val"]
     return [next(scene for scene in scenes if scene.room_type == room) for room in ROOM_TYPES]
 

@@ -13,7 +13,7 @@ from jaxnav.env.make import build_environment
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes, joint_clusters
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics, start_states
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, Rules, Task
 
@@ -30,7 +30,8 @@ def test_episodes_are_possible_and_know_their_best_length():
 
 
 def test_episodes_are_equally_many_per_room_type_and_scene():
-    bank = compile_bank(generate_rooms(0, 6, 0, seed=1), Task())  # two kitchens and living rooms, one of the others
+    # Two kitchens and living rooms, one of the others.
+    bank = compile_bank([generate_room("val", i, 1) for i in range(6)], Task())
     assert len(bank.names) == 6
     episodes = draw_episodes(bank, 42)
     assert episodes.rooms == ("bathroom", "bedroom", "kitchen", "living_room")
@@ -108,7 +109,7 @@ def test_a_floor_plan_is_left_out_of_all_lists_at_once():
 @pytest.mark.parametrize("rules", [Rules(), Rules(headings=12, horizons=(0.0,), success="near", success_distance=1.0)])
 def test_an_oracle_has_full_marks(rules):
     """It goes down the table of best lengths: SR 1 and SPL 1, exactly."""
-    bank = compile_bank(generate_rooms(0, 4, 0, seed=5), Task(rules=rules))
+    bank = compile_bank([generate_room("val", i, 5) for i in range(4)], Task(rules=rules))
     env, params = build_environment(bank, {}, 100)
     episodes = draw_episodes(bank, 200)
     actions = oracle_actions(bank, episodes)

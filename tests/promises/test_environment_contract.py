@@ -8,11 +8,11 @@ from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import ObjectNav
 from jaxnav.env.testing import check_environment
 from jaxnav.scenes.files.scene_file import read_scenes
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
 
-BANK = compile_bank(generate_rooms(4, 0, 0), Task())  # one of each type
+BANK = compile_bank([generate_room("train", i, 0) for i in range(4)], Task())  # one of each type
 
 
 def test_contract_on_generated_rooms():

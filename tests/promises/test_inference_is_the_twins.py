@@ -32,7 +32,7 @@ from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import DONE, Task
 
@@ -62,7 +62,7 @@ FEWER = {"savn": 100}
 @functools.cache
 def world() -> tuple[Any, Any, Any, Any]:
     """Return a bank of four rooms, their environment, and poses at which categories are seen together [R, K, K]."""
-    bank = compile_bank(generate_rooms(4, 0, 0), Task())
+    bank = compile_bank([generate_room("train", i, 0) for i in range(4)], Task())
     env, params = build_environment(bank, {}, LIMIT)
     seen = env.row_format.presence(bank.rows).astype(np.float32)
     counts = np.ones((NUM_PRIORS, len(env.categories), len(env.categories)), np.float32)

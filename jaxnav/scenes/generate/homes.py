@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.scenes.categories import GIBSON_GOALS, ROBOTHOR_GOALS
-from jaxnav.scenes.generate.room_shapes import CellRectangle, RoomShape, check_scene_arguments
+from jaxnav.scenes.generate.room_shapes import CellRectangle, RoomShape
 from jaxnav.scenes.generate.rooms import (
     FORWARD_XZ,
     MIN_CONNECTED_SHARE,
     RIGHT_XZ,
     FurnishedRoom,
+    GoalRange,
     ObjectSpec,
     PlacementRule,
     cells_away_from_boxes,
@@ -70,21 +71,6 @@ _PLAN_STREAM = 2
 _APARTMENT_STREAM = 3
 _HOUSE_STREAM = 4
 
-
-class GoalRange(NamedTuple):
-    """Requirement that a standable cell is near every goal.
-
-    Attributes:
-      goals: the goal categories.
-      max_distance: from the goal to the nearest standable cell, metres.
-      to_footprint: True if the distance is to the nearest point of the object, False if it is to its centre.
-    """
-
-    goals: tuple[str, ...]
-    max_distance: float
-    to_footprint: bool
-
-
 _APARTMENT_RANGE = GoalRange(ROBOTHOR_GOALS, 0.85, to_footprint=False)
 _HOUSE_RANGE = GoalRange(GIBSON_GOALS, 0.6, to_footprint=True)
 
@@ -101,12 +87,8 @@ def generate_apartment(split: str, index: int, seed: int) -> Scene:
 
     Returns:
       The scene, named like `train-apartment-03-2`; it depends on the arguments alone.
-
-    Raises:
-      InputError: unknown split, or a negative index or seed.
     """
     # The plan of the apartment, which all its furnishings share.
-    check_scene_arguments("generate_apartment", split, index, seed)
     plan_index, furnishing = divmod(index, FURNISHINGS_PER_PLAN)
     apartment_key = (seed, SPLITS.index(split))
     plan = sample_apartment_plan(np.random.default_rng((*apartment_key, plan_index, _PLAN_STREAM)))
@@ -115,13 +97,13 @@ def generate_apartment(split: str, index: int, seed: int) -> Scene:
     # Furnish the plan until the apartment is accepted.
     rng = np.random.default_rng((*apartment_key, index, _APARTMENT_STREAM))
     scene_name = f"{split}-apartment-{plan_index:02d}-{furnishing}"
+    min_cells, max_cells = FURNISHED_APARTMENT_CELLS
     while True:
-        rooms = builder.furnish_rooms(rng)
-        if rooms is None or not _has_cells(builder, rooms, FURNISHED_APARTMENT_CELLS):
+        scene = builder.sample_scene(scene_name, "apartments", "apartment", split, rng)
+        if scene is None or not min_cells <= scene.reach.sum() <= max_cells:
             continue
 
         # Accept the apartment if an agent succeeds for every goal from some pose.
-        scene = builder.build_scene(scene_name, "apartments", "apartment", split, rooms)
         best_length = compile_scene(scene, APARTMENTS).best_length  # [P, K]
         if best_length[:, APARTMENTS.is_goal()].any(axis=0).all():
             return scene
@@ -139,27 +121,17 @@ def generate_house(split: str, index: int, seed: int) -> Scene:
 
     Returns:
       The scene, named like `train-house-00017`; it depends on the arguments alone.
-
-    Raises:
-      InputError: unknown split, or a negative index or seed.
     """
-    check_scene_arguments("generate_house", split, index, seed)
     rules = home_rules("houses")
     rng = np.random.default_rng((seed, SPLITS.index(split), index, _HOUSE_STREAM))
+    min_cells, max_cells = FURNISHED_HOUSE_CELLS
 
     # Sample and furnish plans until a house has a realistic size.
     while True:
         builder = HomeBuilder(sample_house_plan(rng), rules, _HOUSE_RANGE)
-        rooms = builder.furnish_rooms(rng)
-        if rooms is not None and _has_cells(builder, rooms, FURNISHED_HOUSE_CELLS):
-            scene = builder.build_scene(f"{split}-house-{index:05d}", "houses", "house", split, rooms)
+        scene = builder.sample_scene(f"{split}-house-{index:05d}", "houses", "house", split, rng)
+        if scene is not None and min_cells <= scene.reach.sum() <= max_cells:
             return dataclasses.replace(scene, rooms=builder.scene_rooms())
-
-
-def _has_cells(builder: "HomeBuilder", rooms: list[FurnishedRoom], cell_range: tuple[int, int]) -> bool:
-    """Return True if the number of standable cells is in a range."""
-    min_cells, max_cells = cell_range
-    return bool(min_cells <= builder.standable_mask(rooms).sum() <= max_cells)
 
 
 # Floor plans.
@@ -482,11 +454,11 @@ class HomeBuilder:
         self.room_specs = [rules[room_type] for room_type in plan.types]
         self.bare_rooms = [self._make_bare_room(floor) for floor in plan.rooms]
 
-    def furnish_rooms(self, rng: np.random.Generator) -> list[FurnishedRoom] | None:
+    def sample_scene(self, name: str, world: str, room_type: str, split: str, rng: np.random.Generator) -> Scene | None:
         """Furnish the rooms by the rules of their types.
 
         Returns:
-          The rooms, or None if one has no space for its furniture.
+          The scene, or None if a room has no space for its furniture.
         """
         rooms = []
         for room_index in range(len(self.bare_rooms)):
@@ -494,7 +466,10 @@ class HomeBuilder:
             if room is None:
                 return None
             rooms.append(room)
-        return rooms
+
+        home = self._merge_rooms(rooms)
+        reach = largest_connected_part(cells_away_from_boxes(self.bare_free_cells, home.boxes))
+        return make_scene(name, world, room_type, split, self.plan.walls, reach, home)
 
     def is_usable(self, room_index: int, room: FurnishedRoom) -> bool:
         """Return True if an agent can walk through the room.
@@ -503,7 +478,8 @@ class HomeBuilder:
         """
         # Free cells of the room and of the ring around its floor.
         floor = self.plan.rooms[room_index]
-        free_cells = cells_away_from_boxes(self.bare_free_cells[floor.with_ring.cells], _furniture_boxes(room))
+        furniture_boxes = room.boxes[[object_type not in _FIXTURES for object_type in room.types]]
+        free_cells = cells_away_from_boxes(self.bare_free_cells[floor.with_ring.cells], furniture_boxes)
         reach = largest_connected_part(free_cells)
 
         # Free cells in the ring around the floor are doors.
@@ -511,27 +487,7 @@ class HomeBuilder:
         door_cells[1:-1, 1:-1] = False
         if (door_cells & ~reach).any() or reach.sum() < MIN_CONNECTED_SHARE * free_cells.sum():
             return False
-        if not reach[1:-1, 1:-1].any():
-            return False
-
-        # Low and high corners [G, 2] of the goals' footprints; a goal without an extent is a point, its centre.
-        goal_footprints = room.boxes_of_types(self.goal_range.goals)[:, :, [0, 2]]
-        if self.goal_range.to_footprint:
-            low, high = goal_footprints.swapaxes(0, 1)
-        else:
-            low = goal_footprints.mean(axis=1)
-            high = low
-
-        # Distances from C standable cells to G goals, [C, G].
-        cell_centres = CELL_SIZE * (np.argwhere(reach)[:, None, ::-1] - 0.5)
-        offsets = np.maximum(np.maximum(low - cell_centres, cell_centres - high), 0.0)
-        distances = np.linalg.norm(offsets, axis=-1)
-        return bool((distances.min(axis=0, initial=np.inf) <= self.goal_range.max_distance).all())
-
-    def standable_mask(self, rooms: list[FurnishedRoom]) -> np.ndarray:
-        """Return the standable cells of the home, bool [nz, nx]."""
-        furniture_boxes = self._merge_rooms(rooms).boxes
-        return largest_connected_part(cells_away_from_boxes(self.bare_free_cells, furniture_boxes))
+        return bool(reach[1:-1, 1:-1].any()) and room.has_goals_in_range(reach, self.goal_range)
 
     def scene_rooms(self) -> tuple[Room, ...]:
         """Return the types and floors of the rooms."""
@@ -541,11 +497,6 @@ class HomeBuilder:
             cells[floor.cells] = True
             rooms.append(Room(room_type, cells))
         return tuple(rooms)
-
-    def build_scene(self, name: str, world: str, room_type: str, split: str, rooms: list[FurnishedRoom]) -> Scene:
-        """Return the scene of the furnished rooms."""
-        reach = self.standable_mask(rooms)
-        return make_scene(name, world, room_type, split, self.plan.walls, reach, self._merge_rooms(rooms))
 
     def _furnish_room(self, room_index: int, rng: np.random.Generator) -> FurnishedRoom | None:
         """Return a usable furnished room, or None if all attempts fail."""
@@ -597,8 +548,3 @@ class HomeBuilder:
             corner = CELL_SIZE * np.array([floor.x0 - 1, 0.0, floor.z0 - 1])
             home.boxes = np.concatenate([home.boxes, room.boxes[num_fixtures:] + corner])
         return home
-
-
-def _furniture_boxes(room: FurnishedRoom) -> np.ndarray:
-    """Return the boxes of the furniture without fixtures, [N, 2, 3]."""
-    return room.boxes[[object_type not in _FIXTURES for object_type in room.types]]

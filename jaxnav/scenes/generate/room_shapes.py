@@ -1,29 +1,14 @@
 """Outlines of generated rooms: rectangles of lattice cells, and rectangular or L-shaped rooms with their walls.
 
 `sample_room_shape` samples the outline of a single room and `wall_mask` rasterizes an outline; `CellRectangle` is the
-building block of the floor plans of homes. `check_scene_arguments` validates the arguments that all scene generators
-share.
+building block of the floor plans of homes.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxnav.errors import InputError
-from jaxnav.scenes.scene import CELL_SIZE, SPLITS
-
-
-def check_scene_arguments(function: str, split: str, index: int, seed: int) -> None:
-    """Check the arguments of a generator.
-
-    Raises:
-      InputError: unknown split, or a negative index or seed.
-    """
-    if split not in SPLITS:
-        raise InputError(f"{function}: split is {split!r}; choose one of {', '.join(SPLITS)}")
-    for argument_name, number in {"index": index, "seed": seed}.items():
-        if number < 0:
-            raise InputError(f"{function}: {argument_name} is {number}; give a number of at least 0")
+from jaxnav.scenes.scene import CELL_SIZE
 
 
 class CellRectangle(NamedTuple):

@@ -2,10 +2,10 @@
 
 import pytest
 
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.scene import Scene
 
 
 @pytest.fixture(scope="session")
 def rooms() -> list[Scene]:
-    return generate_rooms(num_train=200, num_val=0, num_test=0, seed=0)
+    return [generate_room("train", i, 0) for i in range(200)]

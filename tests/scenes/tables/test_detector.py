@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binomtest, kstest
 from support.scenes import APARTMENTS, HOUSES, ROOMS
 
-from jaxnav.scenes.generate.rooms import generate_rooms
+from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, Detector, RowFormat, detection_range
 from jaxnav.scenes.task import Task
@@ -70,7 +70,7 @@ def test_false_alarms_keep_to_a_narrower_view():
 
 
 def test_errors_are_frozen_and_belong_to_the_scene():
-    scenes, task = generate_rooms(3, 0, 0), Task()
+    scenes, task = [generate_room("train", i, 0) for i in range(3)], Task()
     together, again, alone = compile_bank(scenes, task), compile_bank(scenes, task), compile_bank(scenes[1:2], task)
     np.testing.assert_array_equal(together.rows, again.rows)
     first = together.first_cell[1] * task.rules.poses_per_cell
@@ -82,7 +82,8 @@ def test_errors_are_frozen_and_belong_to_the_scene():
 
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
 def test_success_is_never_noisy(rules):
-    scenes, row_format, blind = generate_rooms(2, 0, 0), RowFormat(22), Detector(miss_near=1.0, miss_far=1.0)
+    scenes = [generate_room("train", i, 0) for i in range(2)]
+    row_format, blind = RowFormat(22), Detector(miss_near=1.0, miss_far=1.0)
     blind, perfect = (compile_bank(scenes, Task(rules=rules, detector=d)) for d in (blind, PERFECT_DETECTOR))
     np.testing.assert_array_equal(blind.best_length, perfect.best_length)
     assert row_format.presence(blind.rows).sum() < 0.1 * row_format.presence(perfect.rows).sum()
