@@ -1,24 +1,30 @@
-"""Game loop: plays an episode with named keys from any source.
+"""Episodes played by hand: `prepare_game` chooses one, `play_game` plays it with named keys from any source."""
 
-`play_game` does not depend on a terminal: it reads names of keys from an iterable and hands each view to a function.
-"""
-
-import functools
+import dataclasses
 from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rich.console import Console
 
-from jaxnav.baselines.shortest_path import oracle_actions
-from jaxnav.env.objectnav import EnvParams
+from jaxnav.env.objectnav import Observation
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import start_states
-from jaxnav.game.episode import Game, GameResult, GameView
-from jaxnav.policies.agent_loop import Agent, AgentLoop
-from jaxnav.policies.method import Knowledge
-from jaxnav.runs.policy import EpisodeMemory
-from jaxnav.scenes.tables.observation_row import relative_position
-from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT
+from jaxnav.layout import EstimatorConfig
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import ActionControl, Knowledge
+from jaxnav.runs.config import RunConfig, WorldConfig
+from jaxnav.runs.policies import config_for_policy
+from jaxnav.runs.policy import LoadedPolicy, load_policy
+from jaxnav.runs.train import calibrate_estimator, explore_world
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, compile_training_world
+from jaxnav.scenes.tables.compile import Bank
+from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
+from jaxnav.training.calibration import layout_priors
 
 #: Actions by the names of keys; other keys do nothing.
 KEY_ACTIONS = {
@@ -35,6 +41,161 @@ KEY_ACTIONS = {
 QUIT_KEY = "q"
 
 
+@dataclasses.dataclass(frozen=True)
+class PlayConfig:
+    """Look for an object yourself, with what an agent perceives.
+
+    Attributes:
+      world: generated scenes and rules.
+      scenes: scene file to read instead of the world's scenes.
+      split: scenes to play in.
+      goal: category to look for; default: any.
+      seed: of the scenes and of the episode.
+      shift: layout shift of the scenes, from 0 to 1.
+      policy: folder of an exported policy, or one of the package (`rooms-org`): its advice and its belief are shown.
+        Without, the belief begins with what random walks in training scenes see together.
+      epsilon: threshold of sTDE in its advice.
+    """
+
+    world: Literal["rooms", "apartments", "houses"] = "rooms"
+    scenes: Path | None = None
+    split: Literal["train", "val", "test"] = "val"
+    goal: str | None = None
+    seed: int = 0
+    shift: float = 0.0
+    policy: str | None = None
+    epsilon: float = 0.5
+
+
+class Game(NamedTuple):
+    """Episode to be played by hand, with the agent whose belief is displayed.
+
+    Attributes:
+      world: compiled scenes; the game takes place in the first bank.
+      episode: list of one episode.
+      knowledge: layout priors.
+      estimator_config: configuration of the layout estimator.
+      policy: policy that gives advice; None for no advice.
+      epsilon: threshold of sTDE in the advice.
+    """
+
+    world: CompiledWorld
+    episode: EpisodeList
+    knowledge: Knowledge
+    estimator_config: EstimatorConfig
+    policy: LoadedPolicy | None = None
+    epsilon: float = 0.5
+
+    @property
+    def bank(self) -> Bank:
+        """Tables of the scenes."""
+        return self.world.banks[0]
+
+    @property
+    def goal(self) -> str:
+        """Name of the category to search for."""
+        return self.bank.task.categories[int(self.episode.goal[0])]
+
+
+class GameView(NamedTuple):
+    """State of a game at one step, for K categories and A actions.
+
+    Attributes:
+      pose: index of the pose in the bank, whose row holds the observation.
+      time: number of actions so far.
+      step_limit: largest number of actions.
+      layout_weights: float32 [K], w x g of eq. 7.
+      layout_gap: layout gap D.
+      advice: float32 [A], the policy's probability of each action; None without a policy.
+    """
+
+    pose: int
+    time: int
+    step_limit: int
+    layout_weights: np.ndarray
+    layout_gap: float
+    advice: np.ndarray | None
+
+
+class GameResult(NamedTuple):
+    """Result of a game that ended after T actions.
+
+    Attributes:
+      poses: int [T + 1], indices of the poses in the bank, from the start on.
+      ending: how the game ended, to be followed by the number of actions.
+    """
+
+    poses: list[int]
+    ending: Literal["found in", "wrong Done after", "out of time after", "left after"]
+
+
+def prepare_game(config: PlayConfig, console: Console) -> Game:
+    """Prepare a game.
+
+    Args:
+      config: settings of the game.
+      console: receives messages.
+
+    Raises:
+      InputError: no such scenes, goal or policy, or a policy of another world or without actions to advise.
+    """
+    # Check the policy first, since compiling scenes takes longer.
+    adviser = None if config.policy is None else _load_adviser(config.policy, config.world)
+
+    # The game takes one episode of the list that an evaluation with this seed would play.
+    run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed))
+    world = compile_evaluation_world(run_config, config.split, config.scenes, config.shift, console)
+    episode = choose_episode(world.banks[0], config.goal, config.seed)
+
+    # Without a policy that estimates the layout, the belief starts from random walks in training scenes.
+    if adviser is not None and adviser.estimator_config is not None:
+        knowledge = adviser.knowledge
+        estimator_config = adviser.estimator_config
+    else:
+        training_world = compile_training_world(run_config, console)
+        exploration = explore_world(run_config, training_world)
+        estimator_config = calibrate_estimator(run_config, training_world, exploration, console)
+        knowledge = Knowledge(layout_priors(exploration.counts, estimator_config))
+    return Game(world, episode, knowledge, estimator_config, adviser, config.epsilon)
+
+
+def _load_adviser(policy: str, world: str) -> LoadedPolicy:
+    """Load a policy that can give advice in a world.
+
+    Raises:
+      InputError: no such policy, or one of another world or without actions to advise.
+    """
+    policy_world = config_for_policy(policy).world
+    adviser = load_policy(policy)
+    if policy_world != world:
+        raise InputError(f"--policy {policy}: was trained for {policy_world}; play with --world {policy_world}")
+    if not isinstance(adviser.spec.method.control, ActionControl):
+        raise InputError(
+            f"--policy {policy}: method {adviser.spec.method.name!r} chooses no single actions; take another"
+        )
+    return adviser
+
+
+def choose_episode(bank: Bank, goal: str | None, seed: int) -> EpisodeList:
+    """Draw one of the episodes of an evaluation, as a list of one.
+
+    Raises:
+      InputError: no episode has this goal, or the seed is negative.
+    """
+    if seed < 0:
+        raise InputError(f"--seed {seed}: give a number of at least 0")
+
+    # Of the episodes in a random order, take the first one with this goal.
+    episodes = draw_episodes(bank, seed=seed)
+    goal_names = np.array(bank.task.categories)[episodes.goal]
+    candidate_indices = np.random.default_rng(seed).permutation(len(goal_names))
+    if goal is not None:
+        candidate_indices = candidate_indices[goal_names[candidate_indices] == goal]
+    if not len(candidate_indices):
+        raise InputError(f"--goal {goal}: choose one of {', '.join(sorted(set(goal_names)))}")
+    return episodes.take(candidate_indices[:1])
+
+
 def play_game(game: Game, keys: Iterable[str], show: Callable[[GameView], None]) -> GameResult:
     """Play until Done, the step limit, the key to quit or the last key.
 
@@ -43,127 +204,58 @@ def play_game(game: Game, keys: Iterable[str], show: Callable[[GameView], None])
       keys: names of keys, read one at a time.
       show: receives the view at the start and after each action but the last.
     """
-    # The agent is a batch of one, steered by the keys; an adviser, if any, observes the same episode.
+    # The agent is a batch of one, steered by the keys.
     agent_loop = AgentLoop(game.world.env, None, game.estimator_config)
     params = game.world.make_env_params(0)
     agent = _begin(agent_loop, start_states(game.episode), None, game.knowledge, params)
-    memory = None if game.policy is None else game.policy.begin(params.room[agent.state.scene[0]])
-    moved = jnp.zeros(1, bool)
-
-    # The player sees the start before the first key.
     poses = [int(agent.state.pose[0])]
-    shortest_poses = _shortest_poses(game)
-    advice, next_memories = _advise(game, agent_loop, agent, memory, moved, params)
-    show(_make_view(game, agent, agent_loop, params, advice))
+    scene = int(game.episode.scene[0])
 
-    for key in keys:
+    # An adviser, if any, observes the same episode.
+    policy = game.policy
+    memory = None if policy is None else policy.begin(params.room[scene])
+    output = None
+    moved = jnp.bool_(False)
+
+    remaining_keys = iter(keys)
+    while True:
+        # The view from the present pose, with the advice and the belief.
+        if policy is not None and memory is not None:
+            observation = Observation(jnp.asarray(game.bank.rows[poses[-1]]), jnp.asarray(game.episode.goal[0]))
+            _, heading, horizon = game.bank.task.rules.split_pose(poses[-1])
+            output = _decide(policy, observation, memory, game.epsilon, heading=heading, moved=moved, horizon=horizon)
+        view = GameView(
+            pose=poses[-1],
+            time=len(poses) - 1,
+            step_limit=int(params.step_limit[scene]),
+            layout_weights=np.asarray(_read_inputs(agent_loop, agent, game.knowledge, params).layout_weights[0]),
+            layout_gap=float(agent_loop.layout_gap(agent)[0]),
+            advice=None if output is None else np.asarray(jax.nn.softmax(output.logits)),
+        )
+        show(view)
+
+        # Wait for a key that has a meaning.
+        key = next((key for key in remaining_keys if key in KEY_ACTIONS or key == QUIT_KEY), QUIT_KEY)
         if key == QUIT_KEY:
-            break
-        if key not in KEY_ACTIONS:
-            continue
+            return GameResult(poses, "left after")
 
         # Act, and end the game with the episode.
         action = KEY_ACTIONS[key]
         agent, step_result = _step(agent_loop, agent, jnp.array([action], jnp.int32), game.knowledge, params)
         poses.append(int(agent.state.pose[0]))
+        if step_result.success[0]:
+            return GameResult(poses, "found in")
         if step_result.ended[0]:
-            success = bool(step_result.success[0])
-            return GameResult(poses, shortest_poses, success, said_done=action == DONE, has_quit=False)
+            return GameResult(poses, "wrong Done after" if action == DONE else "out of time after")
 
         # The adviser remembers the action of the player, not the one that it would have chosen.
-        memory = _memory_after(next_memories, action)
-        moved = step_result.moved
-        advice, next_memories = _advise(game, agent_loop, agent, memory, moved, params)
-        show(_make_view(game, agent, agent_loop, params, advice))
-    return GameResult(poses, shortest_poses, success=False, said_done=False, has_quit=True)
+        if policy is not None and output is not None:
+            _, memory = _apply_choice(policy, output, jnp.int32(action), params.room[scene])
+        moved = step_result.moved[0]
 
 
 _begin = jax.jit(AgentLoop.start_from, static_argnums=0)
 _step = jax.jit(AgentLoop.step, static_argnums=0)
-
-
-def _advise(
-    game: Game, agent_loop: AgentLoop, agent: Agent, memory: EpisodeMemory | None, moved: jax.Array, params: EnvParams
-) -> tuple[np.ndarray | None, EpisodeMemory | None]:
-    """Return the policy's probabilities [A], and its memory after each action, leaves [A, ...].
-
-    Both are None without a policy.
-    """
-    if game.policy is None or memory is None:
-        return None, None
-
-    # The policy decides for one episode, without the axis of the batch.
-    env_state = jax.tree.map(lambda leaf: leaf[0], agent.state)
-    _, heading, horizon = agent_loop.env.task.rules.split_pose(env_state.pose)
-    observation = agent_loop.env.observe(env_state, params)
-    advice, next_memories = _decide(game.policy, observation, memory, game.epsilon, heading, moved[0], horizon)
-    return np.asarray(advice), next_memories
-
-
-@jax.jit
-def _decide(policy, observation, memory, epsilon, heading, moved, horizon):
-    decision = policy.decide(observation, memory, epsilon, heading=heading, moved=moved, horizon=horizon)
-
-    # Only the next key shows which action the memory has to record, so that all are tried.
-    apply_each_action = jax.vmap(policy.apply_choice, (None, 0, None))
-    _, next_memories = apply_each_action(decision, jnp.arange(NUM_ACTIONS), memory.room)
-    return jax.nn.softmax(decision.logits), next_memories
-
-
-def _memory_after(next_memories: EpisodeMemory | None, action: int) -> EpisodeMemory | None:
-    """Return the memory after one action; None stays None."""
-    return jax.tree.map(lambda leaf: leaf[action], next_memories)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _read_belief(
-    agent_loop: AgentLoop, agent: Agent, knowledge: Knowledge, params: EnvParams
-) -> tuple[jax.Array, jax.Array]:
-    """Return w x g of eq. 7 [1, K], and the layout gap [1]."""
-    return agent_loop.policy_inputs(agent, knowledge, params).layout_weights, agent_loop.layout_gap(agent)
-
-
-def _make_view(
-    game: Game, agent: Agent, agent_loop: AgentLoop, params: EnvParams, advice: np.ndarray | None
-) -> GameView:
-    """Return the information for the player at the present pose."""
-    # The tables of the scenes have the observation of each pose.
-    rules = game.bank.task.rules
-    row_format = agent_loop.env.row_format
-    pose = int(agent.state.pose[0])
-    observation_row = game.bank.rows[pose]
-    _, heading, horizon = rules.split_pose(pose)
-
-    # List the detected categories, the nearest first.
-    detections = row_format.detections(observation_row)
-    ahead, right = relative_position(detections)
-    detected_categories = np.flatnonzero(detections[:, 0])
-    nearest_first = sorted(detected_categories, key=lambda category: np.hypot(ahead[category], right[category]))
-    detection_list = []
-    for category in nearest_first:
-        category_name = game.bank.task.categories[category]
-        confidence_share = float(detections[category, 0]) / 255
-        detection_list.append((category_name, float(ahead[category]), float(right[category]), confidence_share))
-
-    # Add the belief of the agent about the layout.
-    goal_weights, layout_gap = _read_belief(agent_loop, agent, game.knowledge, params)
-    return GameView(
-        time=int(agent.state.time[0]),
-        step_limit=int(params.step_limit[agent.state.scene[0]]),
-        heading=360.0 / rules.headings * heading,
-        horizon=rules.horizons[horizon],
-        view_cells=row_format.view_cells(observation_row).reshape(row_format.view, row_format.view),
-        detections=detection_list,
-        goal_weights=np.asarray(goal_weights[0]),
-        gap=float(layout_gap[0]),
-        advice=advice,
-    )
-
-
-def _shortest_poses(game: Game) -> list[int]:
-    """Return the poses of a shortest path."""
-    # The oracle lists actions, [L*, 1]; the tables lead from pose to pose.
-    poses = [int(game.episode.pose[0])]
-    for action in oracle_actions(game.bank, game.episode)[:, 0]:
-        poses.append(int(game.bank.successor[poses[-1], action]))
-    return poses
+_read_inputs = jax.jit(AgentLoop.policy_inputs, static_argnums=0)
+_decide = jax.jit(LoadedPolicy.decide)
+_apply_choice = jax.jit(LoadedPolicy.apply_choice)
