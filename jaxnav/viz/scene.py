@@ -33,7 +33,7 @@ from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent, scene_size
 from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.tables.observation_row import MAX_RANGE, PERFECT_DETECTOR, RowFormat, detected_positions
-from jaxnav.scenes.tables.visibility import cell_centres, cover_with_rectangles, is_opaque
+from jaxnav.scenes.tables.visibility import cell_centres, is_opaque, wall_boxes
 from jaxnav.scenes.task import Rules, Task
 from jaxnav.store.files import write_atomic
 from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR
@@ -429,9 +429,7 @@ def _draw_objects(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: i
     objects.sort(key=lambda object_index: object_categories[object_index] != goal)
 
     # Labels avoid the dots and the walls.
-    corner = np.asarray(scene.origin) - CELL_SIZE / 2
-    walls = corner + CELL_SIZE * cover_with_rectangles(scene.walls)[:, [[1, 0], [3, 2]]]
-    labels = LabelPlacer(axes, places[objects], walls, halo=BACKGROUND_COLOR)
+    labels = LabelPlacer(axes, places[objects], wall_boxes(scene, scene.walls), halo=BACKGROUND_COLOR)
 
     # A mark for each object, and a label for each group of objects.
     labelled_places: dict[int, list[np.ndarray]] = {}

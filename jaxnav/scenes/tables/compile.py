@@ -37,39 +37,21 @@ from jaxnav.scenes.tables.visibility import (
 from jaxnav.scenes.task import Task
 
 
-class CompiledScene(NamedTuple):
-    """Tables of one scene; pose = (cell * H + heading) * T + horizon.
+class Bank(NamedTuple):
+    """Tables of S scenes end to end; poses and cells are numbered over all scenes.
+
+    In a single scene, pose = (cell * H + heading) * T + horizon.
 
     Attributes:
-      name: name of the scene.
-      room_type: its room type.
+      task: the task for which the scenes are compiled.
+      names: [S] scene names.
+      room_types: [S] room type names.
       ahead: int32 [C, H], cell after MoveAhead.
       rows: uint8 [P, R], observation row of each pose, see `RowFormat`.
       best_length: uint16 [P, K], length L* of a shortest path, Done included; 0 for an unreachable goal and for a
         category that is no goal.
       goal_distance: float32 [C, K], metres to the nearest object of a category, inf without an object. If success means
         seeing the object, this is the horizontal distance to its centre, else the length of the walk to its footprint.
-    """
-
-    name: str
-    room_type: str
-    ahead: np.ndarray
-    rows: np.ndarray
-    best_length: np.ndarray
-    goal_distance: np.ndarray
-
-
-class Bank(NamedTuple):
-    """Tables of S scenes end to end; poses and cells are numbered over all scenes.
-
-    Attributes:
-      task: the task for which the scenes are compiled.
-      names: [S] scene names.
-      room_types: [S] room type names.
-      ahead: int32 [C, H].
-      rows: uint8 [P, R].
-      best_length: uint16 [P, K].
-      goal_distance: float32 [C, K].
       first_cell: int32 [S], first cell of each scene.
       num_cells: int32 [S].
       goals: int32 [S, K], possible goals of each scene, of which the first `num_goals` entries are valid.
@@ -118,8 +100,8 @@ def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
     return join_scenes([compile_scene(scene, task) for scene in scenes], task)
 
 
-def compile_scene(scene: Scene, task: Task) -> CompiledScene:
-    """Compile one scene by the rules of docs/environment.md."""
+def compile_scene(scene: Scene, task: Task) -> Bank:
+    """Compile one scene by the rules of docs/environment.md; the scene may be without a reachable goal."""
     # Standable cells, and the moves between them.
     rules = task.rules
     cells = standable_cells(scene.reach)  # [C, 2]
@@ -148,13 +130,23 @@ def compile_scene(scene: Scene, task: Task) -> CompiledScene:
     detections = detect_objects(scene, task, sightings, num_poses)
     row_format = RowFormat(num_categories)
     views = ego_views(scene, rules, cells, row_format.view)
-    return CompiledScene(
-        name=scene.name,
-        room_type=scene.room_type,
+    best_length = best_lengths(pose_successors(ahead, rules), success)
+
+    # A category is a possible goal if some pose has a path to it; padded to K entries, so that scenes can be joined.
+    goals = np.flatnonzero(best_length.any(axis=0)).astype(np.int32)
+    return Bank(
+        task=task,
+        names=(scene.name,),
+        room_types=(scene.room_type,),
         ahead=ahead,
         rows=row_format.pack(detections, views),
-        best_length=best_lengths(pose_successors(ahead, rules), success),
+        best_length=best_length,
         goal_distance=goal_distance.astype(np.float32),
+        first_cell=np.zeros(1, np.int32),
+        num_cells=np.array([len(cells)], np.int32),
+        goals=np.pad(goals, (0, num_categories - len(goals)))[None],
+        num_goals=np.array([len(goals)], np.int32),
+        skipped=(),
     )
 
 
@@ -164,7 +156,7 @@ def categories_in_view(scene: Scene, task: Task) -> np.ndarray:
     A category is in view if a perfect detector with range `MAX_RANGE` for objects of all sizes would detect it.
 
     Returns:
-      bool [P, K], poses in the order of `CompiledScene.rows`.
+      bool [P, K], poses in the order of `Bank.rows`.
     """
     # Sightings of all objects within the range.
     cells = standable_cells(scene.reach)
@@ -177,20 +169,13 @@ def categories_in_view(scene: Scene, task: Task) -> np.ndarray:
     return sightings.visible_within(MAX_RANGE, (num_poses, len(task.categories)))
 
 
-def join_scenes(compiled_scenes: Sequence[CompiledScene], task: Task) -> Bank:
-    """Join compiled scenes end to end; see `compile_bank`."""
-    banks = []
-    skipped = []
-    for compiled in compiled_scenes:
-        # A category is a possible goal if some pose has a path to it.
-        goals = np.flatnonzero((compiled.best_length > 0).any(axis=0))
-        if len(goals):
-            banks.append(_single_scene_bank(compiled, goals, task))
-        else:
-            skipped.append(compiled.name)
-    if not banks:
-        raise no_goal_error(len(compiled_scenes), task)
-    return concatenate_banks(banks)._replace(skipped=tuple(skipped))
+def join_scenes(scene_banks: Sequence[Bank], task: Task) -> Bank:
+    """Join banks of one scene each end to end; see `compile_bank`."""
+    usable_banks = [bank for bank in scene_banks if bank.num_goals[0] > 0]
+    if not usable_banks:
+        raise no_goal_error(len(scene_banks), task)
+    skipped = tuple(bank.names[0] for bank in scene_banks if bank.num_goals[0] == 0)
+    return concatenate_banks(usable_banks)._replace(skipped=skipped)
 
 
 def concatenate_banks(banks: Sequence[Bank]) -> Bank:
@@ -225,27 +210,6 @@ def bank_checksum(bank: Bank) -> int:
         content_bytes = field_value.tobytes() if isinstance(field_value, np.ndarray) else repr(field_value).encode()
         crc = zlib.crc32(content_bytes, crc)
     return crc
-
-
-def _single_scene_bank(compiled: CompiledScene, goals: np.ndarray, task: Task) -> Bank:
-    """Return the bank of one scene with its possible goals."""
-    # Goals are padded to K entries, so that scenes can be joined.
-    padded_goals = np.zeros((1, len(task.categories)), np.int32)
-    padded_goals[0, : len(goals)] = goals
-    return Bank(
-        task=task,
-        names=(compiled.name,),
-        room_types=(compiled.room_type,),
-        ahead=compiled.ahead,
-        rows=compiled.rows,
-        best_length=compiled.best_length,
-        goal_distance=compiled.goal_distance,
-        first_cell=np.zeros(1, np.int32),
-        num_cells=np.array([len(compiled.ahead)], np.int32),
-        goals=padded_goals,
-        num_goals=np.array([len(goals)], np.int32),
-        skipped=(),
-    )
 
 
 def _find_targets(scene: Scene, task: Task, centres: np.ndarray) -> Targets:

@@ -123,8 +123,6 @@ def compile_shards(
       InputError: no scene has a reachable goal, a scene cannot be made, or a cached shard is damaged.
     """
     # Folder of these scenes, and a subfolder for each shard.
-    if shard_scenes < 1:
-        raise InputError(f"shard_scenes is {shard_scenes}; give a number of at least 1")
     folder = cache / _cache_key(scenes, task, shard_scenes)
     folder.mkdir(parents=True, exist_ok=True)
     num_shards = -(-len(scenes) // shard_scenes)
@@ -170,17 +168,17 @@ class ShardJob:
         # Scenes of this shard; shards differ by at most one scene.
         first_scene = len(self.scenes) * index // len(self.paths)
         end_scene = len(self.scenes) * (index + 1) // len(self.paths)
-        compiled_scenes = [compile_scene(self.scenes[scene], self.task) for scene in range(first_scene, end_scene)]
+        scene_banks = [compile_scene(self.scenes[scene], self.task) for scene in range(first_scene, end_scene)]
 
         # Join the scenes with a reachable goal, if there are any.
         metadata: dict[str, Any]
-        if any(compiled.best_length.any() for compiled in compiled_scenes):
-            bank = join_scenes(compiled_scenes, self.task)
+        if any(bank.num_goals[0] > 0 for bank in scene_banks):
+            bank = join_scenes(scene_banks, self.task)
             metadata = {field_name: getattr(bank, field_name) for field_name in TEXT_FIELDS}
             metadata |= {"cells": len(bank.ahead), "checksum": bank_checksum(bank)}
             arrays = {field_name: getattr(bank, field_name) for field_name in ARRAY_FIELDS}
         else:
-            skipped = [compiled.name for compiled in compiled_scenes]
+            skipped = [bank.names[0] for bank in scene_banks]
             metadata = {"names": (), "room_types": (), "skipped": skipped, "cells": 0}
             arrays = {}
         _write_shard(self.paths[index], metadata, arrays)
@@ -262,38 +260,32 @@ def _open_shards(folder: Path, job: ShardJob) -> Shards:
       InputError: no scene has a reachable goal, or a shard is damaged.
     """
     # Shards without a reachable goal only contribute the names of their scenes.
-    paths = []
-    usable_metadata = []
-    scene_counts = []
-    cell_counts = []
-    checksums = []
+    usable_metadata = {}
     skipped = []
     for path in job.paths:
         metadata = _read_metadata(path)
-        skipped.extend(metadata["skipped"])
+        skipped += metadata["skipped"]
         if metadata["names"]:
-            paths.append(path)
-            usable_metadata.append(metadata)
-            scene_counts.append(len(metadata["names"]))
-            cell_counts.append(metadata["cells"])
-            checksums.append(metadata["checksum"])
-    if not paths:
+            usable_metadata[path] = metadata
+    if not usable_metadata:
         raise no_goal_error(len(job.scenes), job.task)
 
     # The checksum of all shards covers the checksum of each.
+    scene_counts = [len(metadata["names"]) for metadata in usable_metadata.values()]
+    checksums = [metadata["checksum"] for metadata in usable_metadata.values()]
     shards = Shards(
         folder=folder,
         task=job.task,
-        paths=tuple(paths),
+        paths=tuple(usable_metadata),
         counts=tuple(scene_counts),
-        num_cells=max(cell_counts),
+        num_cells=max(metadata["cells"] for metadata in usable_metadata.values()),
         num_scenes=max(scene_counts),
         skipped=tuple(skipped),
         checksum=zlib.crc32(repr(checksums).encode()),
     )
 
     # Compare the arrays on disk with the checksums of the written arrays.
-    for bank, path, metadata in zip(shards, paths, usable_metadata, strict=True):
+    for bank, (path, metadata) in zip(shards, usable_metadata.items(), strict=True):
         if (len(bank.ahead), bank_checksum(bank)) != (metadata["cells"], metadata["checksum"]):
             raise InputError(f"{path}: is damaged (its checksum is another); {_REPAIR_HINT.format(path)}")
     return shards

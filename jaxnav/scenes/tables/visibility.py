@@ -295,6 +295,12 @@ def cover_with_rectangles(mask: np.ndarray) -> np.ndarray:
     return np.array(rectangles, int).reshape(-1, 4)
 
 
+def wall_boxes(scene: Scene, walls: np.ndarray) -> np.ndarray:
+    """Return boxes that cover wall cells [nz, nx] of a scene, float64 [R, 2, 2], low and high corner (x, z)."""
+    map_corner = np.asarray(scene.origin) - CELL_SIZE / 2
+    return map_corner + CELL_SIZE * cover_with_rectangles(walls)[:, [[1, 0], [3, 2]]]
+
+
 def clear_of_walls(scene: Scene, start: np.ndarray, end: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return True for segments that cross no wall cell.
 
@@ -319,12 +325,10 @@ def clear_of_walls(scene: Scene, start: np.ndarray, end: np.ndarray, target: np.
 
     # Test each group against the rectangles of the walls without its exempt cells.
     is_clear = np.ones(len(start), bool)
-    map_corner = np.asarray(scene.origin) - CELL_SIZE / 2
     for segments, exempt_cells in segment_groups:
         walls = scene.walls.copy()
         walls.flat[exempt_cells] = False
-        boxes = map_corner + CELL_SIZE * cover_with_rectangles(walls)[:, [[1, 0], [3, 2]]]  # [R, 2, (x, z)]
-        is_clear[segments] = ~_enters_any_box(start[segments], end[segments], boxes)
+        is_clear[segments] = ~_enters_any_box(start[segments], end[segments], wall_boxes(scene, walls))
     return is_clear
 
 

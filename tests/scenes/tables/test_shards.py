@@ -87,8 +87,6 @@ def test_a_shard_without_a_goal_is_left_out_and_a_bank_without_one_refused(tmp_p
     assert [shard.names[0] for shard in shards] == ["corridor-0", "corridor-4"]
     with pytest.raises(InputError, match=r"none of the 3 scenes has a reachable goal: .* Book, Chair, Fridge"):
         build(tmp_path, Corridors(count=3, without=(0, 1, 2), identity="bare"))
-    with pytest.raises(InputError, match="shard_scenes is 0; give a number of at least 1"):
-        build(tmp_path, shard_scenes=0)
 
 
 # Where they are
