@@ -10,6 +10,7 @@ import tyro
 from jaxnav.cli.console import escape_control_chars, parse_arguments, run_command
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import REPORT_FORMAT, markdown_table
+from jaxnav.store.files import WRITTEN_BY_0_1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,9 @@ def _read_report(path: Path) -> dict:
         raise InputError(
             f"{path}: no evaluation can be read from it ({error}); give a file that an evaluation wrote"
         ) from error
-    if not isinstance(report, dict) or report.get("format") != REPORT_FORMAT:
+    if not isinstance(report, dict) or report.get("format") != REPORT_FORMAT or "compilations" not in report:
         raise InputError(f"{path}: is no evaluation of format {REPORT_FORMAT}; give a file that an evaluation wrote")
+    # Reports have notes since version 0.2.
+    if "notes" not in report:
+        raise InputError(f"{path}: {WRITTEN_BY_0_1}")
     return report

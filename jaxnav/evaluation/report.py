@@ -299,8 +299,7 @@ def markdown_table(report: dict[str, Any]) -> str:
     text_parts = []
     for cells in table_lines:
         text_parts.append(f"| {' | '.join(cells)} |\n")
-    # Reports of version 0.1 have no notes.
-    for note in report.get("notes", ()):
+    for note in report["notes"]:
         text_parts.append(f"\n{note}\n")
     return "".join(text_parts)
 
@@ -312,15 +311,12 @@ def _metric_titles() -> list[str]:
 
 def _column_titles(report: dict[str, Any]) -> list[str]:
     """Titles of all columns after the first."""
-    titles = _metric_titles()
-    budgets = _action_budgets(report)
-    if budgets:
-        titles.append(f"SR within {', '.join(map(str, budgets))} (%)")
-    return [*titles, *_FAILURE_COLUMNS.values()]
+    budgets = ", ".join(map(str, _action_budgets(report)))
+    return [*_metric_titles(), f"SR within {budgets} (%)", *_FAILURE_COLUMNS.values()]
 
 
 def _action_budgets(report: dict[str, Any]) -> list[int]:
-    """Action budgets N of the metrics `sr@N`; none before version 0.2."""
+    """Action budgets N of the metrics `sr@N`."""
     # All rows of a report have the same budgets.
     budgets = []
     for name in _budget_metric_names(report["rows"][0]):
@@ -342,11 +338,10 @@ def _lines_by_heading(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]
         cells = [row_label(row)]
         for metric, (_, digits) in METRIC_COLUMNS.items():
             cells.append(f"{Interval.from_json(row[metric]):.{digits}f}")
-        if budgets:
-            budget_cells = [f"{row[f'sr@{budget}']['mean']:.1f}" for budget in budgets]
-            cells.append(", ".join(budget_cells))
-        for metric in _FAILURE_COLUMNS:  # absent before version 0.3
-            cells.append(f"{row[metric]['mean']:.1f}" if metric in row else "")
+        budget_cells = [f"{row[f'sr@{budget}']['mean']:.1f}" for budget in budgets]
+        cells.append(", ".join(budget_cells))
+        for metric in _FAILURE_COLUMNS:
+            cells.append(f"{row[metric]['mean']:.1f}")
 
         # Rows are compared within one world, split and decoding only.
         heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"

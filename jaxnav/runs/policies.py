@@ -352,7 +352,7 @@ def check_arrays(folder: Path, arrays: Mapping[str, Any], spec: PolicySpec) -> N
     Raises:
       InputError: names the arrays.
     """
-    # Shapes and dtypes. Exports of baselines, and of older versions, have no group `signs`.
+    # Shapes and dtypes. Exports of runs without the layout have no group `signs`.
     expected_arrays = dict(_expected_arrays(spec))
     if "signs" not in arrays:
         del expected_arrays["signs"]

@@ -163,9 +163,9 @@ def _load_step(
     with _report_damage(folder):
         _check_files(folder)
         metadata = checkpointer.metadata(step).custom_metadata
-        saved = verify_digest(folder, metadata if isinstance(metadata, dict) else {}, _REMEDY)
-        if not {"manifest", "leaves"} <= saved.keys():
+        if not isinstance(metadata, dict):
             raise ValueError("it holds no manifest")
+        saved = verify_digest(folder, metadata, _REMEDY)
 
     # Compare shapes and dtypes here: Orbax would cast another dtype silently, and its errors name no leaf.
     check_manifest(folder, saved["manifest"], expected_manifest)
@@ -179,11 +179,10 @@ def _load_step(
     # Compare the loaded arrays, too, in case Orbax reads intact files wrongly.
     with _report_damage(folder):
         state = checkpointer.load(step, abstract_state=_add_shardings(abstract_state))
-        if "digests" in saved:  # checkpoints of jaxnav 0.2.0 have none
-            mismatches = list_differences(saved["digests"], array_digests(state))
-            if mismatches:
-                leaf_paths = [mismatch.split(":")[0] for mismatch in mismatches]
-                raise ValueError(f"digests differ of {', '.join(leaf_paths)}")
+        mismatches = list_differences(saved["digests"], array_digests(state))
+        if mismatches:
+            leaf_paths = [mismatch.split(":")[0] for mismatch in mismatches]
+            raise ValueError(f"digests differ of {', '.join(leaf_paths)}")
     return state
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import safetensors.numpy
 
 from jaxnav.errors import InputError
-from jaxnav.store.files import verify_digest, write_atomic, write_json_with_digest
+from jaxnav.store.files import WRITTEN_BY_0_1, verify_digest, write_atomic, write_json_with_digest
 
 #: Version of the format of the two files.
 POLICY_FORMAT_VERSION = 3
+_FORMAT_VERSION_OF_0_1 = 2
 
 #: File with all arrays of the policy: network parameters, layout priors and method knowledge.
 PARAMS_FILE = "params.safetensors"
@@ -102,6 +103,8 @@ def _read_policy(folder: Path) -> dict[str, Any]:
     # Check the version before the digest: another version may compute it differently.
     if not isinstance(policy, dict) or not {"format_version", "params_sha256", "spec"} <= policy.keys():
         raise InputError(f"{policy_path}: lacks format_version, params_sha256 or spec; export the policy again")
+    if policy["format_version"] == _FORMAT_VERSION_OF_0_1:
+        raise _OtherVersionError(f"{policy_path}: {WRITTEN_BY_0_1}")
     if policy["format_version"] != POLICY_FORMAT_VERSION:
         raise _OtherVersionError(
             f"{policy_path}: has format version {policy['format_version']!r}, this code reads version "

@@ -27,6 +27,10 @@ except ImportError:  # not a POSIX system: nothing is locked there
     fcntl = None
 
 
+#: Refusal of a file of version 0.1, which only that version reads.
+WRITTEN_BY_0_1 = "written by jaxnav 0.1; train again, or read it with jaxnav 0.1"
+
+
 def write_atomic(path: Path, data: bytes) -> None:
     """Replace a file in one step.
 
@@ -64,18 +68,18 @@ def add_digest(record: Mapping[str, Any]) -> dict[str, Any]:
 def verify_digest(source: object, record: Mapping[str, Any], remedy: str) -> dict[str, Any]:
     """Check a record against its digest and return the record without it.
 
-    A record without a digest was written by jaxnav 0.2.0 or earlier and is accepted unchecked.
-
     Args:
       source: name of the record, for the message.
       record: content of a file.
       remedy: advice for the message, in case the record is damaged.
 
     Raises:
-      InputError: the digest does not match the content.
+      InputError: the digest does not match the content, or is missing, as in records of jaxnav 0.1.
     """
+    if DIGEST_KEY not in record:
+        raise InputError(f"{source}: has no digest, so it is damaged ({remedy}) or {WRITTEN_BY_0_1}")
     plain_record = {name: value for name, value in record.items() if name != DIGEST_KEY}
-    if DIGEST_KEY in record and record[DIGEST_KEY] != _record_digest(plain_record):
+    if record[DIGEST_KEY] != _record_digest(plain_record):
         raise InputError(f"{source}: is damaged or was changed by hand (its digest is another); {remedy}")
     return plain_record
 
@@ -219,22 +223,13 @@ def read_log_rows(path: Path) -> list[dict[str, Any]]:
     # A crash can cut short only the last line, so only the last line may be broken.
     log_lines = path.read_bytes().splitlines()
     rows: list[dict[str, Any]] = []
-    has_digest: list[bool] = []
     for line_number, line in enumerate(log_lines, start=1):
         source = f"{path}, line {line_number}"
         row = _parse_row(line)
         if row is not None:
             rows.append(verify_digest(source, row, "restore the file, or remove the line"))
-            has_digest.append(DIGEST_KEY in row)
         elif line_number < len(log_lines):
             raise InputError(f"{source}: not a JSON object with a whole number `step`; remove the line")
-
-    # Either all rows or no rows have a digest: a single row without a digest was damaged or added by hand.
-    if any(has_digest) and not all(has_digest):
-        line_number = has_digest.index(False) + 1
-        raise InputError(
-            f"{path}, line {line_number}: has no digest, unlike others; restore the file, or remove the line"
-        )
     return rows
 
 
@@ -292,7 +287,7 @@ def make_manifest(config: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(manifest))
 
 
-def check_manifest(source: object, saved: Any, expected: Mapping[str, Any]) -> None:
+def check_manifest(source: object, saved: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """Refuse a checkpoint of another format version or another config.
 
     Package versions may differ.
@@ -303,15 +298,13 @@ def check_manifest(source: object, saved: Any, expected: Mapping[str, Any]) -> N
       expected: manifest of the run that resumes from the checkpoint.
 
     Raises:
-      InputError: another format version, no manifest at all, or another config; names the keys and both values.
+      InputError: another format version, or another config; names the keys and both values.
     """
     # Another format may store the config in another way: check the version first.
-    if not isinstance(saved, dict) or "format_version" not in saved:
-        raise InputError(f"{source}: holds no manifest, so it is no jaxnav checkpoint; choose another run directory")
     if saved["format_version"] != expected["format_version"]:
         raise InputError(
             f"{source}: has format version {saved['format_version']!r}, this code reads version "
-            f"{expected['format_version']!r}; use the jaxnav that wrote it ({saved.get('versions', {}).get('jaxnav')})"
+            f"{expected['format_version']!r}; use the jaxnav that wrote it ({saved['versions'].get('jaxnav')})"
         )
 
     # The message names every value that differs, with the saved one first.

@@ -1,7 +1,7 @@
-"""What earlier versions wrote is read, or refused by name and left as it is.
+"""What version 0.2 wrote is read, or refused by name; what 0.1 wrote is refused; both are left as they are.
 
-`tests/data` holds a run of version 0.1.0 and one of 0.2.0: two chunks of a tiny policy, its checkpoint and its exports,
-as `train.py` of that version left them; that of 0.2.0 with an evaluation.
+`tests/data` holds what is refused of a run of version 0.1.0 (settings, log, a policy without its arrays), and a run of
+0.2.0 with an evaluation: two chunks of a tiny policy, as `train.py` of that version left them.
 """
 
 import json
@@ -14,13 +14,14 @@ import pytest
 from support.commands import CONFIG, contents, evaluate, refusal, train, write_config
 
 import jaxnav
+from jaxnav.cli import log as log_command
+from jaxnav.cli import table as table_command
 from jaxnav.errors import InputError
-from jaxnav.evaluation.statistics import Interval
 from jaxnav.store import checkpoint
-from jaxnav.store.export import POLICY_FORMAT_VERSION
 from jaxnav.store.files import make_manifest, read_log_rows
 
 DATA = Path(__file__).parents[1] / "data"
+REFUSED = "written by jaxnav 0.1; train again, or read it with jaxnav 0.1"
 
 
 def extract_run(version: str, folder: Path) -> Path:
@@ -31,7 +32,7 @@ def extract_run(version: str, folder: Path) -> Path:
 
 
 @pytest.fixture
-def old(tmp_path) -> Path:
+def run_of_0_1(tmp_path) -> Path:
     """The run of version 0.1.0."""
     return extract_run("0_1", tmp_path / "old")
 
@@ -42,45 +43,61 @@ def run_of_0_2(tmp_path) -> Path:
     return extract_run("0_2", tmp_path / "old")
 
 
-def test_its_policies_are_refused_by_their_version(old):
-    folder = old / "policies" / "layout-0"
-    message = (
-        rf"policy\.json: has format version 2, this code reads version {POLICY_FORMAT_VERSION}; export the policy again"
-    )
-    with pytest.raises(InputError, match=message):
+# Version 0.1
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        lambda run, file: train(file, run),
+        lambda run, file: evaluate(run),
+        lambda run, file: log_command.main([str(run), "--to", "tensorboard"]),
+    ],
+)
+def test_commands_refuse_a_run_of_0_1_and_leave_it_as_it_is(run_of_0_1, tmp_path, capsys, command):
+    before = contents(run_of_0_1)
+    assert command(run_of_0_1, write_config(tmp_path)) == 2
+    message = refusal(capsys)
+    assert message.startswith(f"error: {run_of_0_1}/config.json: has no digest")
+    assert message.endswith(REFUSED)
+    assert contents(run_of_0_1) == before
+
+
+def test_table_refuses_a_report_of_0_1(run_of_0_2, tmp_path, capsys):
+    report = json.loads((run_of_0_2 / "eval-val.json").read_text())
+    del report["notes"]
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps(report))
+    assert table_command.main([str(path)]) == 2
+    assert refusal(capsys) == f"error: {path}: {REFUSED}"
+
+
+def test_policies_of_0_1_are_refused(run_of_0_1):
+    folder = run_of_0_1 / "policies" / "layout-0"
+    with pytest.raises(InputError) as refused:
         jaxnav.load_policy(folder)
-    # It is the version that is refused: called by the present one, it fails by what the old one did not write.
-    policy = json.loads((folder / "policy.json").read_text())
-    (folder / "policy.json").write_text(json.dumps(policy | {"format_version": POLICY_FORMAT_VERSION}))
-    with pytest.raises(InputError, match="layout-0") as refused:
-        jaxnav.load_policy(folder)
-    assert "format version" not in str(refused.value)
+    assert str(refused.value) == f"{folder}/policy.json: {REFUSED}"
 
 
-@pytest.mark.parametrize("manifest", [False, True])
-def test_its_checkpoint_is_refused_by_settings_or_arrays(old, manifest):
-    """Asked for with other settings, or with its own and another state."""
-    config = json.loads((old / "config.json").read_text()) if manifest else {"method": "org"}
-    abstract = jax.eval_shape(lambda: {"params": jnp.zeros(3)})
-    with pytest.raises(InputError, match=r"checkpoints/2") as refused:
-        checkpoint.restore_checkpoint(old, abstract, make_manifest(config))
-    assert str(refused.value).isprintable()
+def test_logs_of_0_1_are_refused(run_of_0_1):
+    path = run_of_0_1 / "metrics.jsonl"
+    with pytest.raises(InputError) as refused:
+        read_log_rows(path)
+    assert str(refused.value).startswith(f"{path}, line 1: has no digest")
+    assert str(refused.value).endswith(REFUSED)
 
 
-@pytest.mark.parametrize("command", [lambda run, file: train(file, run), lambda run, file: evaluate(run)])
-def test_commands_refuse_the_run_and_leave_it_as_it_is(old, tmp_path, capsys, command):
-    before = contents(old)
-    assert command(old, write_config(tmp_path)) == 2
-    assert f"{old}/config.json: " in refusal(capsys)
-    files = contents(old)
-    assert {name: files[name] for name in before} == before
+def test_checkpoints_of_0_1_are_refused(tmp_path, monkeypatch):
+    """Their metadata has no digest."""
+    manifest = make_manifest({})
+    state = {"step": jnp.int32(1)}
+    monkeypatch.setattr(checkpoint, "add_digest", lambda metadata: metadata)
+    checkpoint.save_checkpoint(tmp_path, 1, state, manifest)
+    with pytest.raises(InputError, match=r"checkpoints/1: has no digest.*" + REFUSED):
+        checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(lambda: state), manifest)
 
 
-def test_its_log_and_its_intervals_are_read(old):
-    rows = read_log_rows(old / "metrics.jsonl")
-    assert [row["step"] for row in rows if row["arm"] == "layout"] == [1, 2]
-    interval = Interval.from_json({"mean": 1.0, "ci95": [0.5, 1.5]})
-    assert (interval.mean, interval.low, interval.high, interval.seeds) == (1.0, 0.5, 1.5, ())
+# Version 0.2
 
 
 def test_a_run_of_0_2_is_evaluated_as_by_that_version(run_of_0_2, tmp_path):
@@ -96,9 +113,11 @@ def test_a_run_of_0_2_is_evaluated_as_by_that_version(run_of_0_2, tmp_path):
         assert row_after["sr"]["mean"] == pytest.approx(row_before["sr"]["mean"], abs=100 * 3 / 24)
 
 
-def test_policies_and_logs_of_0_2_are_read(run_of_0_2):
+def test_policies_logs_and_reports_of_0_2_are_read(run_of_0_2, capsys):
     assert jaxnav.load_policy(run_of_0_2 / "policies" / "layout-0").spec.method.name == "org"
     assert [row["step"] for row in read_log_rows(run_of_0_2 / "metrics.jsonl") if row["arm"] == "layout"] == [2, 4]
+    assert table_command.main([str(run_of_0_2 / "eval-val.json")]) == 0
+    assert "| + w (layout) |" in capsys.readouterr().out
 
 
 def test_a_checkpoint_of_0_2_is_refused_by_its_version(run_of_0_2, tmp_path, capsys):

@@ -218,15 +218,6 @@ def test_a_run_without_a_whole_checkpoint_does_not_begin_anew(tmp_path):
         checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(state, 0), MANIFEST)
 
 
-def test_a_checkpoint_without_digests_is_restored(tmp_path, monkeypatch):
-    """Those of version 0.2.0 are."""
-    monkeypatch.setattr(
-        checkpoint, "add_digest", lambda record: {name: record[name] for name in ("manifest", "leaves")}
-    )
-    save_two(tmp_path)
-    assert restored(tmp_path) == 2
-
-
 @pytest.mark.parametrize("lost", [0, 3, 7])
 def test_a_log_without_a_row_is_refused_where_the_run_goes_on(tmp_path, lost):
     log_rows(tmp_path)

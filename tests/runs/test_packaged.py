@@ -1,12 +1,12 @@
 """An exported policy has the world of its task, and acts in it at several layout shifts."""
 
 import io
-import json
 import shutil
 
 import numpy as np
 import pytest
 from rich.console import Console
+from support.records import resigned
 
 import jaxnav
 from jaxnav.errors import InputError
@@ -28,9 +28,8 @@ def test_the_world_is_the_one_of_the_task(drawn_run, tmp_path):
     baseline = config_for_policy(drawn_run.config.run_dir / POLICIES_DIR / "baseline-0")
     assert (baseline.world, baseline.arms) == ("rooms", ("baseline",))
     export = shutil.copytree(PACKAGED_POLICIES / "rooms-org", tmp_path / "mine")
-    policy = json.loads((export / "policy.json").read_text())
-    policy["spec"]["task"]["rules"]["headings"] = 12
-    (export / "policy.json").write_text(json.dumps(policy))
+    with resigned(export / "policy.json") as policy:
+        policy["spec"]["task"]["rules"]["headings"] = 12
     with pytest.raises(InputError, match=r"no generated world has; give the run that it comes from$"):
         config_for_policy(export)
 

@@ -103,8 +103,8 @@ def test_an_export_killed_between_its_files_is_refused_not_mixed(tmp_path, monke
 def test_an_export_of_another_format_version_is_not_overwritten(tmp_path):
     export_params(tmp_path, PARAMS, SPEC)
     policy = tmp_path / "policy.json"
-    policy.write_text(policy.read_text().replace(f'"format_version": {POLICY_FORMAT_VERSION}', '"format_version": 2'))
+    policy.write_text(policy.read_text().replace(f'"format_version": {POLICY_FORMAT_VERSION}', '"format_version": 9'))
     before = policy.read_bytes()
-    with pytest.raises(InputError, match="has format version 2, this code reads"):
+    with pytest.raises(InputError, match="has format version 9, this code reads"):
         export_params(tmp_path, PARAMS, SPEC)
     assert policy.read_bytes() == before

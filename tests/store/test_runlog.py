@@ -28,12 +28,12 @@ def test_rows_are_one_json_object_per_line_with_its_digest(log):
     assert read_log_rows(log)[-1] == {"step": 40, "loss": None, "spl": None, "note": None}
 
 
-def test_a_log_of_an_earlier_version_is_read_and_signed_when_it_is_resumed(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n')
-    assert read_log_rows(path) == [{"step": 1}, {"step": 2}, {"step": 3}]
-    truncate_log_after(path, 2)
-    assert [list(json.loads(line)) for line in path.read_text().splitlines()] == [["step", "digest"]] * 2
+def test_a_row_without_a_digest_is_refused(log):
+    log.write_text(log.read_text() + '{"step": 40}\n')
+    before = log.read_bytes()
+    with pytest.raises(InputError, match=r"metrics.jsonl, line 4: has no digest, so it is damaged \(restore the file"):
+        truncate_log_after(log, 20)
+    assert log.read_bytes() == before
 
 
 @pytest.mark.parametrize(("step", "remaining"), [(0, 0), (10, 1), (25, 2), (30, 3), (99, 3)])
@@ -55,7 +55,8 @@ def test_a_torn_last_line_is_dropped(log, lost):
 
 
 def test_a_bad_line_in_the_middle_is_refused_and_kept(log):
-    log.write_text('{"step": 1}\n{"loss": 2}\n{"step": 3}\n')
+    first, _, last = log.read_text().splitlines(keepends=True)
+    log.write_text(first + '{"loss": 2}\n' + last)
     before = log.read_bytes()
     with pytest.raises(InputError, match=r"metrics.jsonl, line 2: not a JSON object with a whole number `step`"):
         truncate_log_after(log, 1)

@@ -21,6 +21,7 @@ from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.policies import PACKAGED_POLICIES
 from jaxnav.runs.policy import load_policy
 from jaxnav.scenes.files.scene_file import write_scenes
+from jaxnav.store.files import DIGEST_KEY, add_digest
 from support import fuzz_importers
 from support.fuzz_importers import NASTY, damaged, mutated
 from support.tiny_world import BEDROOM, KITCHEN
@@ -48,8 +49,14 @@ def _export(folder: Path, draw: random.Random) -> int:
         file = draw.choice([export / "params.safetensors", export / "policy.json"])
         file.write_bytes(damaged(file.read_bytes(), draw))
     else:
-        policy = export / "policy.json"
-        policy.write_text(json.dumps(mutated(json.loads(policy.read_text()), draw)))
+        path = export / "policy.json"
+        policy = json.loads(path.read_text())
+        del policy[DIGEST_KEY]
+        policy = mutated(policy, draw)
+        # Signed again, so that the mutation itself is read; NaN cannot be signed.
+        with contextlib.suppress(ValueError):
+            policy = add_digest(policy) if isinstance(policy, dict) else policy
+        path.write_text(json.dumps(policy))
     return run_command(lambda _: load_policy(export))
 
 
