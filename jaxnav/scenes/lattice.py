@@ -2,13 +2,15 @@
 
 `standable_cells` finds the cells that an agent can occupy, `cells_ahead` and `pose_successors` tabulate the actions on
 them, and `best_lengths` computes the shortest action sequence from every pose to every goal at once. Arrays use
-C standable cells, H headings, K categories and P = C * H * horizons poses.
+C standable cells, H headings, K categories and P = C * H * horizons poses. `cells_near_boxes` and
+`cells_touching_boxes` find the cells around the footprints of objects and walls.
 """
 
 import numpy as np
 from scipy import ndimage
 
 from jaxnav.scenes.scene import CELL_SIZE
+from jaxnav.scenes.tables.visibility import TOLERANCE
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
 
 
@@ -182,3 +184,46 @@ def walking_distances(ahead: np.ndarray, rules: Rules, direct: np.ndarray) -> np
         if np.array_equal(next_distance, distance):
             return distance
         distance = next_distance
+
+
+# Boxes on the lattice
+
+
+def interval_distances(positions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the distances of positions from the intervals [low, high]; 0 inside."""
+    return np.maximum(np.maximum(low - positions, positions - high), 0.0)
+
+
+def cells_touching_boxes(footprints: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return the cells that any box touches, bool [nz, nx].
+
+    A cell is a closed square of 0.25 m.
+
+    Args:
+      footprints: float64 [N, 2, 2], low and high corner (x, z), metres.
+      x, z: float64 [nx] and [nz], centres of the cells.
+    """
+    cell_mask = np.zeros((len(z), len(x)), bool)
+    for low, high in footprints:
+        touches_row = interval_distances(z, low[1], high[1]) <= CELL_SIZE / 2 + TOLERANCE
+        touches_column = interval_distances(x, low[0], high[0]) <= CELL_SIZE / 2 + TOLERANCE
+        cell_mask[np.ix_(touches_row, touches_column)] = True
+    return cell_mask
+
+
+def cells_near_boxes(footprints: np.ndarray, x: np.ndarray, z: np.ndarray, distance: float) -> np.ndarray:
+    """Return the cells whose centre is nearer than `distance` metres to any box, bool [nz, nx].
+
+    Args:
+      footprints: float64 [N, 2, 2], low and high corner (x, z), metres.
+      x, z: float64 [nx] and [nz], centres of the cells.
+      distance: metres.
+    """
+    cell_mask = np.zeros((len(z), len(x)), bool)
+    for low, high in footprints:
+        distance_x = interval_distances(x, low[0], high[0])
+        distance_z = interval_distances(z, low[1], high[1])
+        # Only rows and columns near the box are measured.
+        rows, columns = np.ix_(distance_z < distance, distance_x < distance)
+        cell_mask[rows, columns] |= np.hypot(distance_z[rows], distance_x[columns]) < distance
+    return cell_mask

@@ -85,6 +85,13 @@ def floor_plan_name(name: str) -> str:
     return name
 
 
+def box_footprints(boxes: np.ndarray) -> np.ndarray:
+    """Return low and high corner (x, z), float64 [N, 2, 2], of boxes [N, 6] with centre and full size."""
+    centres = boxes[:, [0, 2]]
+    half_sizes = boxes[:, [3, 5]] / 2
+    return np.stack([centres - half_sizes, centres + half_sizes], axis=1)
+
+
 def scene_extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest (x, z) of a scene's cells and objects.
 
@@ -102,13 +109,10 @@ def scene_extent(scene: Scene, cells: np.ndarray | None = None) -> tuple[np.ndar
     row, column = np.nonzero(cells)
     cell_centres = np.asarray(scene.origin) + CELL_SIZE * np.stack([column, row], axis=-1)
 
-    # Footprints of the objects, [N, 2] each.
-    box_centres = scene.boxes[:, [0, 2]]
-    half_sizes = scene.boxes[:, [3, 5]] / 2
-
     # The cells are squares around their centres. A scene without objects has the extent of its cells.
-    low = np.minimum(cell_centres.min(axis=0) - CELL_SIZE / 2, (box_centres - half_sizes).min(axis=0, initial=np.inf))
-    high = np.maximum(cell_centres.max(axis=0) + CELL_SIZE / 2, (box_centres + half_sizes).max(axis=0, initial=-np.inf))
+    footprints = box_footprints(scene.boxes)
+    low = np.minimum(cell_centres.min(axis=0) - CELL_SIZE / 2, footprints.min(axis=(0, 1), initial=np.inf))
+    high = np.maximum(cell_centres.max(axis=0) + CELL_SIZE / 2, footprints.max(axis=(0, 1), initial=-np.inf))
     return low, high
 
 

@@ -21,7 +21,8 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.generate.sizes import typical_box
-from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, SPLITS, Room, Scene
+from jaxnav.scenes.lattice import cells_near_boxes
+from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, SPLITS, Room, Scene, box_footprints
 from jaxnav.store.files import write_atomic
 
 #: Distance in metres that a position in a file may lie off the lattice.
@@ -151,9 +152,9 @@ class JsonRecord:
         """Return a required member that is an object."""
         return self.check_record(field, self.get(field))
 
-    def get_vector(self, field: str, axes: str = "xyz") -> list[float]:
-        """Return the numbers `axes` of a required member such as {"x": 0, "y": 0, "z": 0}."""
-        return self.check_vector(field, self.get(field), axes)
+    def get_numbers(self, fields: Iterable[str] = "xyz") -> list[float]:
+        """Return required members that are finite numbers, such as those of the position {"x": 0, "y": 0, "z": 0}."""
+        return [self.check_number(field, self.get(field)) for field in fields]
 
     def check_text(self, field: str, value: Any) -> str:
         """Return a value that must be a text, not empty."""
@@ -185,14 +186,6 @@ class JsonRecord:
             raise self.error(field, f"is {reprlib.repr(value)}; give an object")
         return JsonRecord(f"{self.location}: {field}", value)
 
-    def check_vector(self, field: str, value: Any, axes: str = "xyz") -> list[float]:
-        """Return the numbers `axes` of a value such as {"x": 0, "y": 0, "z": 0}."""
-        vector = self.check_record(field, value)
-        components: list[float] = []
-        for axis in axes:
-            components.append(vector.check_number(axis, vector.get(axis)))
-        return components
-
     def check_numbers(self, field: str, values: Iterable[Any]) -> list[float]:
         """Return values that must be finite numbers."""
         return [self.check_number(field, value) for value in values]
@@ -201,13 +194,6 @@ class JsonRecord:
         """Yield the items of a list of objects, named `field[0]`, `field[1]`, ... in their errors."""
         for index, value in enumerate(self.check_list(field, values)):
             yield self.check_record(f"{field}[{index}]", value)
-
-    def check_vectors(self, field: str, values: Sequence[Any], axes: str = "xyz") -> list[list[float]]:
-        """Return the numbers `axes` of each item of a list."""
-        vectors: list[list[float]] = []
-        for index, value in enumerate(values):
-            vectors.append(self.check_vector(f"{field}[{index}]", value, axes))
-        return vectors
 
 
 def read_bytes(path: Path) -> bytes:
@@ -432,15 +418,10 @@ def derive_walls(reach: np.ndarray, origin: tuple[float, float], boxes: np.ndarr
     reach_windows = np.lib.stride_tricks.sliding_window_view(np.pad(reach, radius), window_shape)
     wall_mask = np.logical_not(reach_windows.any(axis=(2, 3)))
 
-    # Without the cells near boxes; only rows and columns near a box are measured.
+    # Without the cells near boxes.
     column_x = origin[0] + CELL_SIZE * np.arange(reach.shape[1])
     row_z = origin[1] + CELL_SIZE * np.arange(reach.shape[0])
-    for box in boxes:
-        distance_x = np.maximum(np.abs(column_x - box[0]) - box[3] / 2, 0.0)
-        distance_z = np.maximum(np.abs(row_z - box[2]) - box[5] / 2, 0.0)
-        near_cells = np.ix_(distance_z <= _BOX_DISTANCE, distance_x <= _BOX_DISTANCE)
-        wall_mask[near_cells] &= np.hypot(distance_z[near_cells[0]], distance_x[near_cells[1]]) > _BOX_DISTANCE
-    return wall_mask
+    return wall_mask & ~cells_near_boxes(box_footprints(boxes), column_x, row_z, _BOX_DISTANCE)
 
 
 # From scenes to JSON

@@ -17,7 +17,7 @@ import yaml
 
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.generate.room_shapes import RoomShape, is_inside_room, sample_room_shape, wall_mask
-from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.lattice import interval_distances, standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, SPLITS, Scene
 
 AGENT_RADIUS = 0.2  # metres
@@ -665,7 +665,7 @@ def footprint_distances(cells: np.ndarray, footprints: np.ndarray) -> np.ndarray
       float64 [C, N], metres.
     """
     centres = CELL_SIZE * (cells[:, None, ::-1] - 0.5)
-    offsets = np.maximum(np.maximum(footprints[:, 0] - centres, centres - footprints[:, 1]), 0.0)
+    offsets = interval_distances(centres, footprints[:, 0], footprints[:, 1])
     return np.linalg.norm(offsets, axis=-1)
 
 

@@ -23,7 +23,7 @@ from jaxnav.scenes.lattice import (
     standable_cells,
     walking_distances,
 )
-from jaxnav.scenes.scene import Scene
+from jaxnav.scenes.scene import Scene, box_footprints
 from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, detection_range, object_size
 from jaxnav.scenes.tables.visibility import (
     TOLERANCE,
@@ -233,10 +233,8 @@ def _walks_to_goals(scene: Scene, task: Task, centres: np.ndarray, ahead: np.nda
     rules = task.rules
     is_goal = task.is_goal()
     boxes = scene.boxes[targets.objects]
-    half_size = boxes[:, [3, 5]] / 2
-    low_corner = boxes[:, [0, 2]] - half_size
-    high_corner = boxes[:, [0, 2]] + half_size
-    nearest_point = np.clip(centres[:, None], low_corner, high_corner)  # [C, N, 2]
+    footprints = box_footprints(boxes)
+    nearest_point = np.clip(centres[:, None], footprints[:, 0], footprints[:, 1])  # [C, N, 2]
     distance = np.linalg.norm(nearest_point - centres[:, None], axis=-1)
 
     # Straight last parts that cross no wall, [C, K].

@@ -174,7 +174,8 @@ def parse_agent_positions(record: JsonRecord, field: str, positions: Sequence[An
       reaches far below the ground in many rooms.
     """
     # Positions of the body, [N, 3]; the floor is below them.
-    body_positions = np.array(record.check_vectors(field, positions)).reshape(-1, 3)
+    position_records = record.iterate_records(field, positions)
+    body_positions = np.array([position.get_numbers() for position in position_records]).reshape(-1, 3)
     cells = lattice_cells(record, field, body_positions[:, [0, 2]].tolist())
     return cells, float(np.median(body_positions[:, 1])) - AGENT_HEIGHT
 
@@ -207,7 +208,7 @@ def _parse_objects(record: JsonRecord, floor_height: float) -> list[SceneObject]
     # Parents are indices into the same rows.
     scene_objects: list[SceneObject] = []
     for object_index, object_row in enumerate(object_rows):
-        (yaw,) = object_row.get_vector("rotation", "y")
+        (yaw,) = object_row.get_record("rotation").get_numbers("y")
         parent_index = _smallest_receptacle(object_row, object_index, index_by_id, box_volumes)
         scene_objects.append(
             SceneObject(object_row.get_text("objectType"), object_boxes[object_index], yaw, parent_index)
@@ -222,8 +223,8 @@ def _parse_box(object_row: JsonRecord, floor_height: float) -> list[float]:
     box_field = "axisAlignedBoundingBox"
     if object_row.fields.get(box_field) is not None:
         bounding_box = object_row.get_record(box_field)
-        box_centre = bounding_box.get_vector("center")
-        box_size = bounding_box.get_vector("size")
+        box_centre = bounding_box.get_record("center").get_numbers()
+        box_size = bounding_box.get_record("size").get_numbers()
     elif object_row.fields.get("bounds3D") is not None:
         # Older releases give the low and the high corner.
         box_field = "bounds3D"
@@ -235,7 +236,7 @@ def _parse_box(object_row: JsonRecord, floor_height: float) -> list[float]:
     if min(box_size) < 0:
         raise object_row.error(box_field, f"has the size {box_size}; a size is at least 0")
     if max(box_size) == 0:  # the object has no renderer
-        x, y, z = object_row.get_vector("position")
+        x, y, z = object_row.get_record("position").get_numbers()
         return box_at_pivot(object_row.get_text("objectType"), x, y - floor_height, z)
     return [box_centre[0], box_centre[1] - floor_height, box_centre[2], *box_size]
 

@@ -1,20 +1,19 @@
-"""Building blocks of the importers: scenes from standable points and objects, and polygons and boxes on the lattice.
+"""Building blocks of the importers: scenes from standable points and objects, and polygons and walls on the lattice.
 
 An importer describes objects as `SceneObject`s. Those that know standable points turn them to cells with
 `lattice_cells`, and `build_scene_from_cells` lays out the arrays and derives the walls; importers that know the walls
-call `build_scene`. The functions on polygons and boxes find the cells of rooms, walls and obstacles.
+call `build_scene`. The functions on polygons and walls find the cells of rooms and the pieces between doors.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, ParamSpec
 
 import numpy as np
+from scipy import ndimage
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, derive_walls
-from jaxnav.scenes.lattice import connected_parts
 from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene
-from jaxnav.scenes.tables.visibility import TOLERANCE
 
 Arguments = ParamSpec("Arguments")
 
@@ -145,7 +144,7 @@ def object_boxes(objects: Sequence[SceneObject]) -> np.ndarray:
     return np.array([scene_object.box for scene_object in objects], np.float64).reshape(-1, 6)
 
 
-# Polygons and boxes on the lattice
+# Polygons and walls on the lattice
 
 
 def is_simple_polygon(corners: np.ndarray) -> bool:
@@ -232,40 +231,6 @@ def subtract_openings(wall_line: np.ndarray, openings: Sequence[np.ndarray]) -> 
     return wall_pieces
 
 
-def cells_touching_boxes(boxes: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return the cells that any box touches, bool [nz, nx].
-
-    A cell is a closed square of 0.25 m.
-
-    Args:
-      boxes: float64 [M, 2, 2], low and high corner (x, z), metres.
-      x, z: float64 [nx] and [nz], centres of the cells.
-    """
-    cell_mask = np.zeros((len(z), len(x)), bool)
-    for _, window in _iterate_windows(boxes, x, z, CELL_SIZE / 2 + TOLERANCE):
-        cell_mask[window] = True
-    return cell_mask
-
-
-def cells_near_boxes(boxes: np.ndarray, x: np.ndarray, z: np.ndarray, distance: float) -> np.ndarray:
-    """Return the cells nearer than `distance` to any box.
-
-    Args:
-      boxes: float64 [M, 2, 2], low and high corner (x, z), metres.
-      x, z: float64 [nx] and [nz], centres of the cells.
-      distance: of a cell's centre, metres.
-
-    Returns:
-      bool [nz, nx].
-    """
-    cell_mask = np.zeros((len(z), len(x)), bool)
-    for (box_low, box_high), (row_slice, column_slice) in _iterate_windows(boxes, x, z, distance):
-        distance_x = np.maximum(np.maximum(box_low[0] - x[column_slice], x[column_slice] - box_high[0]), 0.0)
-        distance_z = np.maximum(np.maximum(box_low[1] - z[row_slice], z[row_slice] - box_high[1]), 0.0)
-        cell_mask[row_slice, column_slice] |= np.hypot(distance_z[:, None], distance_x[None]) < distance - TOLERANCE
-    return cell_mask
-
-
 def component_containing(free: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return the 8-connected component of a cell, bool [nz, nx].
 
@@ -273,31 +238,9 @@ def component_containing(free: np.ndarray, start: np.ndarray) -> np.ndarray:
       free: bool [nz, nx].
       start: int [2], (iz, ix), a cell of `free`.
     """
-    cell_mask = np.zeros_like(free)
-    for part_cells in connected_parts(free):
-        # The parts are disjoint, so exactly one of them holds the cell.
-        if (part_cells == start).all(axis=1).any():
-            cell_mask[tuple(part_cells.T)] = True
-            break
-    return cell_mask
+    part_labels, _ = ndimage.label(free, np.ones((3, 3)))
+    return part_labels == part_labels[tuple(start)]
 
 
 def _cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _iterate_windows(
-    boxes: np.ndarray, x: np.ndarray, z: np.ndarray, margin: float
-) -> Iterator[tuple[np.ndarray, tuple[slice, slice]]]:
-    """Yield each box with the rows and columns of cells that are at most `margin` from it in z and in x."""
-    # The coordinates are ascending, so two searches give the range of cells of every box.
-    low_corners = boxes[:, 0] - margin
-    high_corners = boxes[:, 1] + margin
-    column_ranges = zip(
-        np.searchsorted(x, low_corners[:, 0]), np.searchsorted(x, high_corners[:, 0], "right"), strict=True
-    )
-    row_ranges = zip(
-        np.searchsorted(z, low_corners[:, 1]), np.searchsorted(z, high_corners[:, 1], "right"), strict=True
-    )
-    for box, row_range, column_range in zip(boxes, row_ranges, column_ranges, strict=True):
-        yield box, (slice(*row_range), slice(*column_range))

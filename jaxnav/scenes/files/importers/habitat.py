@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES
-from jaxnav.scenes.files.importers.assemble import SceneObject, build_scene_from_cells, lattice_cells
+from jaxnav.scenes.files.importers.assemble import SceneObject, build_scene_from_cells, lattice_cells, scene_or_error
 from jaxnav.scenes.files.importers.pickled_arrays import PickledArray, read_pickle
 from jaxnav.scenes.files.scene_file import JsonRecord, parse_json, read_bytes
 from jaxnav.scenes.generate.sizes import typical_box
@@ -257,18 +257,14 @@ def _floors_without_map(scene: SceneEpisodes, split: str) -> Iterator[Scene | In
             if floor_number == floor_index and y - floor_height <= _STOREY_HEIGHT:
                 floor_objects.append(SceneObject(object_type, (x, y - floor_height, z, *typical_box(object_type)[:3])))
         on_floor = np.abs(standable_points[:, 1] - floor_height) <= _FLOOR_TOLERANCE
-        try:
-            floor_scene = _build_scene_from_points(
-                floor_record,
-                f"{scene.name}_floor{floor_index}",
-                split,
-                standable_points[on_floor][:, ::2],
-                floor_objects,
-            )
-        except InputError as error:
-            yield error
-        else:
-            yield floor_scene
+        yield scene_or_error(
+            _build_scene_from_points,
+            floor_record,
+            f"{scene.name}_floor{floor_index}",
+            split,
+            standable_points[on_floor][:, ::2],
+            floor_objects,
+        )
 
 
 def _find_floor_heights(start_heights: np.ndarray) -> list[float]:

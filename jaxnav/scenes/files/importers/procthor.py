@@ -22,8 +22,6 @@ from jaxnav.scenes.files.importers.assemble import (
     ImportNote,
     SceneObject,
     build_scene,
-    cells_near_boxes,
-    cells_touching_boxes,
     component_containing,
     is_simple_polygon,
     lattice_cells,
@@ -34,7 +32,9 @@ from jaxnav.scenes.files.importers.assemble import (
 from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, parse_json, read_bytes
 from jaxnav.scenes.generate.rooms import AGENT_RADIUS, OBSTACLE_HEIGHTS
 from jaxnav.scenes.generate.sizes import typical_box, typical_types
-from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene
+from jaxnav.scenes.lattice import cells_near_boxes, cells_touching_boxes
+from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene, box_footprints
+from jaxnav.scenes.tables.visibility import TOLERANCE
 
 #: Where the types and sizes of ProcTHOR's assets are.
 _ASSET_DATABASE = "procthor/databases/asset-database.json of github.com/allenai/procthor"
@@ -220,15 +220,15 @@ def _build_house(house: JsonRecord, name: str, split: str, objects: Sequence[Sce
     wall_boxes = read_walls(house, {room_floor.id for room_floor in room_floors})
 
     # Obstacles are the objects at the height of the agent's body.
-    box_centres, box_sizes = np.split(object_boxes(objects), 2, axis=1)
-    box_bottoms = box_centres[:, 1] - box_sizes[:, 1] / 2
-    box_tops = box_centres[:, 1] + box_sizes[:, 1] / 2
-    footprints = np.stack([box_centres - box_sizes / 2, box_centres + box_sizes / 2], axis=1)[:, :, [0, 2]]  # [N, 2, 2]
-    obstacle_boxes = footprints[(box_bottoms < OBSTACLE_HEIGHTS[1]) & (box_tops > OBSTACLE_HEIGHTS[0])]
+    boxes = object_boxes(objects)
+    box_bottoms = boxes[:, 1] - boxes[:, 4] / 2
+    box_tops = boxes[:, 1] + boxes[:, 4] / 2
+    is_obstacle = (box_bottoms < OBSTACLE_HEIGHTS[1]) & (box_tops > OBSTACLE_HEIGHTS[0])
+    barriers = np.concatenate([wall_boxes, box_footprints(boxes[is_obstacle])])
 
     # The agent's body must fit between walls and obstacles.
     indoor_cells = np.any([room.cells for room in rooms], axis=0)
-    free_cells = indoor_cells & ~cells_near_boxes(np.concatenate([wall_boxes, obstacle_boxes]), x, z, AGENT_RADIUS)
+    free_cells = indoor_cells & ~cells_near_boxes(barriers, x, z, AGENT_RADIUS - TOLERANCE)
     if not free_cells.any():
         raise house.error("rooms", f"have no floor {AGENT_RADIUS} m from walls and objects; leave the house out")
     return build_scene(
@@ -249,7 +249,7 @@ def _build_house(house: JsonRecord, name: str, split: str, objects: Sequence[Sce
 def _cells_of_agent(house: JsonRecord, scene: Scene) -> tuple[np.ndarray, bool]:
     """Return the cells connected with the agent's place, bool [nz, nx], and True where it had to be moved."""
     agent = house.get_record("metadata").get_record("agent")
-    agent_position = agent.get_vector("position", "xz")
+    agent_position = agent.get_record("position").get_numbers("xz")
     first_cell = np.rint(np.divide(scene.origin[::-1], CELL_SIZE)).astype(int)
     agent_cell = lattice_cells(agent, "position", [agent_position])[0] - first_cell
 
@@ -275,7 +275,8 @@ def read_rooms(house: JsonRecord) -> list[FloorPolygon]:
         polygon_points = room.get_list("floorPolygon")
         if not 3 <= len(polygon_points) <= _MAX_CORNERS:
             raise room.error("floorPolygon", f"has {len(polygon_points)} corners; give 3 to {_MAX_CORNERS}")
-        polygon_corners = np.round(room.check_vectors("floorPolygon", polygon_points, "xz"), _DECIMALS)
+        corner_records = room.iterate_records("floorPolygon", polygon_points)
+        polygon_corners = np.round([corner.get_numbers("xz") for corner in corner_records], _DECIMALS)
         if not is_simple_polygon(polygon_corners):
             raise room.error("floorPolygon", "crosses or touches itself; give the corners once around the room")
         # LivingRoom becomes living_room.
@@ -325,8 +326,8 @@ def _wall_line(wall: JsonRecord) -> np.ndarray:
 
     Copies for the outside list the ceiling first, other walls the floor.
     """
-    wall_polygon = wall.get_list("polygon", 4)
-    wall_corners = np.round(wall.check_vectors("polygon", wall_polygon, "xz"), _DECIMALS)
+    corner_records = wall.iterate_records("polygon", wall.get_list("polygon", 4))
+    wall_corners = np.round([corner.get_numbers("xz") for corner in corner_records], _DECIMALS)
     wall_ends = list(dict.fromkeys(map(tuple, wall_corners.tolist())))
     if len(wall_ends) != 2 or np.ptp(wall_ends, axis=0).min() > SNAP_TOLERANCE:
         raise wall.error("polygon", f"has the corners {wall_ends} (x, z); give an upright rectangle along x or z")
@@ -351,8 +352,8 @@ def _passable_opening(door: JsonRecord, room_ids: set[str], wall_lines: dict[str
             raise door.error(field, f"is {reference!r}, which the house does not have; give the id of one it has")
 
     # The hole is measured along its wall.
-    hole_polygon = door.get_list("holePolygon", 2)
-    hole_x = np.array(door.check_vectors("holePolygon", hole_polygon, "x"))  # [2, 1]
+    corner_records = door.iterate_records("holePolygon", door.get_list("holePolygon", 2))
+    hole_x = np.array([corner.get_numbers("x") for corner in corner_records])  # [2, 1]
     wall_start, wall_end = wall_lines[wall0]
     wall_length = np.linalg.norm(wall_end - wall_start)
     if not -SNAP_TOLERANCE <= hole_x[0, 0] < hole_x[1, 0] <= wall_length + SNAP_TOLERANCE:
@@ -390,7 +391,7 @@ def read_assets(path: Path) -> dict[str, AssetInfo]:
                 type_name = asset.check_text("objectType", type_name)
             asset_size = asset.fields.get("boundingBox")
             if asset_size is not None:
-                asset_size = asset.check_vector("boundingBox", asset_size)
+                asset_size = asset.check_record("boundingBox", asset_size).get_numbers()
             if asset_size and min(asset_size) < 0:
                 raise asset.error("boundingBox", f"is {asset_size}; a size is at least 0")
             asset_by_id[asset.check_text("assetId", asset_id)] = AssetInfo(type_name, asset_size)
@@ -448,8 +449,8 @@ def _object_parts(
 
     Further parts rest on the first, whose index is `index`.
     """
-    item_position = item.get_vector("position")
-    (yaw,) = item.get_vector("rotation", "y")
+    item_position = item.get_record("position").get_numbers()
+    (yaw,) = item.get_record("rotation").get_numbers("y")
     if size is None:
         # Typical sizes are of boxes in the world, at any yaw.
         return [SceneObject(object_type, (*item_position, *typical_box(object_type)[:3]), yaw, parent)]
