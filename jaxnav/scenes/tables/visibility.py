@@ -141,15 +141,10 @@ def detect_objects(scene: Scene, task: Task, sightings: Sightings, num_poses: in
     visible[pose, category] = True
 
     # The nearest of several objects of a category counts: assignments to equal indices keep the last value.
-    ahead = np.zeros(table_shape)
-    right = np.zeros(table_shape)
-    distance = np.zeros(table_shape)
-    size = np.zeros(table_shape)
-    ahead[pose, category] = sightings.ahead[pair, heading]
-    right[pose, category] = sightings.right[pair, heading]
-    distance[pose, category] = sightings.distance[pair]
-    size[pose, category] = sightings.size[pair]
-    return task.detector.detect(scene.name, task.rules.half_view_tangents[0], visible, ahead, right, distance, size)
+    offsets = (sightings.ahead[pair, heading], sightings.right[pair, heading])
+    nearest = np.zeros((4, *table_shape))
+    nearest[:, pose, category] = np.stack([*offsets, sightings.distance[pair], sightings.size[pair]])
+    return task.detector.detect(scene.name, task.rules.half_view_tangents[0], visible, *nearest)
 
 
 def ego_views(scene: Scene, rules: Rules, cells: np.ndarray, view: int) -> np.ndarray:

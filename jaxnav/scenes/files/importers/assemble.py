@@ -238,7 +238,8 @@ def component_containing(free: np.ndarray, start: np.ndarray) -> np.ndarray:
       free: bool [nz, nx].
       start: int [2], (iz, ix), a cell of `free`.
     """
-    part_labels, _ = ndimage.label(free, np.ones((3, 3)))
+    part_labels = np.zeros(free.shape, np.int32)
+    ndimage.label(free, np.ones((3, 3)), output=part_labels)
     return part_labels == part_labels[tuple(start)]
 
 
