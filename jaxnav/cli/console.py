@@ -78,6 +78,15 @@ def run_command(command: Callable[[Console], object]) -> int:
     return 0
 
 
+@contextlib.contextmanager
+def refuse_unwritable(path: object, remedy: str) -> Iterator[None]:
+    """Turn an `OSError` of writing to a path into an `InputError` with a remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); give another {remedy}") from error
+
+
 def _user_message(error: Exception) -> str | None:
     """Return the message for an error that the user can fix, or None for a bug of the program."""
     match error:

@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from jaxnav.causal import Form
-from jaxnav.cli.console import make_result_console, parse_arguments, run_command
+from jaxnav.cli.console import make_result_console, parse_arguments, refuse_unwritable, run_command
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import difference_table, results_table
 from jaxnav.runs.evaluate import evaluate
@@ -88,10 +88,8 @@ def _print_evaluation(config: EvalConfig, console: Console, result_console: Cons
     for note in results.report["notes"]:
         result_console.print(note)
 
-    try:
+    with refuse_unwritable(target, "--json"):
         results.write(target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror}); give another --json") from error
     compilations = results.report["compilations"]
     console.print(f"{len(results.episodes.goal)} episodes, {compilations} compilation; written to {target}")
 

@@ -10,7 +10,7 @@ import jax
 import tyro
 from rich.console import Console
 
-from jaxnav.cli.console import parse_arguments, run_command
+from jaxnav.cli.console import parse_arguments, refuse_unwritable, run_command
 from jaxnav.errors import InputError
 from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.runs.policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, format_model_card, load_policy
@@ -88,14 +88,12 @@ def _export(config: ExportConfig, console: Console) -> None:
     card = format_model_card(run, policy_name, policy, export.descriptions, export.usage)
 
     # The card marks a complete export: it is removed first and written last.
-    try:
+    with refuse_unwritable(out, "--out"):
         for file_name in (CARD_FILE, PROGRAM_FILE, NAMES_FILE, PARAMS_FILE, POLICY_FILE):
             (out / file_name).unlink(missing_ok=True)
         for file_name, file_bytes in export.files.items():
             write_atomic(out / file_name, file_bytes)
         write_atomic(out / CARD_FILE, card.encode())
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
     console.print(f"written to {out}")
 
 

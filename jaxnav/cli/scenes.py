@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from jaxnav.cli.console import escape_parser_output, make_result_console, run_command
+from jaxnav.cli.console import escape_parser_output, make_result_console, refuse_unwritable, run_command
 from jaxnav.errors import InputError
 from jaxnav.evaluation.scene_statistics import compute_scene_statistics
 from jaxnav.runs.policies import load_policies
@@ -178,10 +178,8 @@ def _show(config: ShowConfig, console: Console) -> None:
     path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + ".png")
     if path.suffix != ".png":
         raise InputError(f"--out {path}: give a name that ends in .png")
-    try:
+    with refuse_unwritable(f"--out {path}", "name"):
         draw_scene(scene, config.task, path, config.pose)
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror}); give another name") from error
     console.print(f"{scene.name} drawn by the rules of {config.world_name}")
     console.print(f"written to {path}")
 
