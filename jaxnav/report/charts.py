@@ -12,10 +12,8 @@ from jaxnav.causal import Form
 from jaxnav.evaluation.report import ExperienceLead, difference_label
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.report.page import Chart
-from jaxnav.runs.run import Run
-from jaxnav.study.figures import effects_figure, epsilon_figure, gap_figure, similarity_figure
-from jaxnav.study.records import GapCurves, StudyMetric, SuccessBySimilarity
-from jaxnav.viz.learning import learning_figure
+from jaxnav.study.figures import effects_figure, epsilon_figure
+from jaxnav.study.records import StudyMetric
 
 #: Variables of the page's style sheet, by the colors of the figures.
 _PAGE_COLORS = {
@@ -38,12 +36,6 @@ class _ReportRow(NamedTuple):
     def metric(self, name: StudyMetric) -> Interval:
         """Return one of the metrics."""
         return Interval.from_json(self.fields[name])
-
-
-def learning_chart(run: Run) -> Chart:
-    """Draw success during training, in training and val scenes."""
-    figure = learning_figure(run.log(), run.success_by_budget(), run.config.method.upper())
-    return Chart(to_svg(figure), "Learning curves: success while training and within a number of actions.")
 
 
 def thresholds_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
@@ -93,16 +85,6 @@ def differences_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
                 differences[difference_label(entry)] = Interval.from_json(entry)
         differences_by_shift[f"Shift {shift:g}"] = differences
     return Chart(to_svg(effects_figure(differences_by_shift)), "Paired differences in success, best actions.")
-
-
-def gap_chart(curves: GapCurves) -> Chart:
-    """Draw the mean layout gap by step."""
-    return Chart(to_svg(gap_figure(curves)), "Mean layout gap by step.")
-
-
-def similarity_chart(by_shift: Mapping[float, SuccessBySimilarity]) -> Chart:
-    """Draw success against layout similarity."""
-    return Chart(to_svg(similarity_figure(by_shift)), "Success against layout similarity.")
 
 
 def to_svg(figure: Figure) -> str:

@@ -11,19 +11,15 @@ from rich.console import Console
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import accounting_table, difference_table, results_table, row_label
-from jaxnav.report.charts import (
-    differences_chart,
-    gap_chart,
-    leads_chart,
-    learning_chart,
-    similarity_chart,
-    thresholds_chart,
-)
-from jaxnav.report.measure import ReportOptions, ShiftMeasurements, measure_shift
-from jaxnav.report.page import Section, render_page, to_text_table
+from jaxnav.report.charts import differences_chart, leads_chart, thresholds_chart, to_svg
+from jaxnav.report.config import ReportConfig
+from jaxnav.report.measure import ShiftMeasurements, measure_shift
+from jaxnav.report.page import Chart, Section, render_page, to_text_table
 from jaxnav.runs.run import Run
+from jaxnav.study.figures import gap_figure, similarity_figure
 from jaxnav.study.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
 from jaxnav.study.records import GapCurves, GapLine, GapPanel
+from jaxnav.viz.learning import learning_figure
 
 #: Report of an evaluation, as in JSON.
 _Report = dict[str, Any]
@@ -53,23 +49,23 @@ _SIMILARITY_TEXT = (
 )
 
 
-def make_report(run: Run, reference_run: Run | None, options: ReportOptions, console: Console) -> str:
+def make_report(run: Run, reference_run: Run | None, config: ReportConfig, console: Console) -> str:
     """Measure a run and return its page as HTML.
 
     Args:
       run: a finished run.
       reference_run: a finished run of agents that cannot know any layout, in the same world; None for none.
-      options: options of the measurements.
+      config: options of the measurements.
       console: receives messages about the progress.
 
     Raises:
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
     # Measure at each shift once, in the order given.
-    _check(run, reference_run, options)
+    _check(run, reference_run, config)
     by_shift: dict[float, ShiftMeasurements] = {}
-    for shift in dict.fromkeys(options.shift):
-        by_shift[shift] = measure_shift(run, reference_run, shift, options, console)
+    for shift in dict.fromkeys(config.shift):
+        by_shift[shift] = measure_shift(run, reference_run, shift, config, console)
 
     # The header states facts that are equal at all shifts, so that the first report serves.
     report = next(iter(by_shift.values())).results.report
@@ -78,7 +74,7 @@ def make_report(run: Run, reference_run: Run | None, options: ReportOptions, con
         "Run": run.config.run_dir.name,
         "Method": run.config.method,
         "Decision": run.config.decision,
-        "World": f"{first_row['world']}, {options.split}",
+        "World": f"{first_row['world']}, {config.split}",
         "Training runs": f"{run.config.seeds} of each arm",
         "Steps": f"{report['run']['steps_per_policy']:,} a policy",
         "Episodes": f"{first_row['episodes']:,} at each shift",
@@ -87,17 +83,17 @@ def make_report(run: Run, reference_run: Run | None, options: ReportOptions, con
 
     # The sections compare the shifts; the replays, one player for each shift, follow the first section.
     page_title = f"{run.config.method.upper()} in {first_row['world']}"
-    sections = make_sections(run, by_shift, options.threshold)
+    sections = make_sections(run, by_shift, config.threshold)
     replays_by_shift = [measurements.replays for measurements in by_shift.values()]
     return render_page(page_title, run_facts, sections, replays_by_shift)
 
 
-def _check(run: Run, reference_run: Run | None, options: ReportOptions) -> None:
+def _check(run: Run, reference_run: Run | None, config: ReportConfig) -> None:
     """Refuse within a second options and runs that would fail after minutes."""
-    if not options.shift:
+    if not config.shift:
         raise InputError("--shift: give at least one number")
-    if options.replays < len(options.shift):
-        raise InputError(f"--replays {options.replays}: give at least {len(options.shift)}, one for each shift")
+    if config.replays < len(config.shift):
+        raise InputError(f"--replays {config.replays}: give at least {len(config.shift)}, one for each shift")
 
     # Loading the policies fails for unfinished runs.
     run.policies()
@@ -183,7 +179,12 @@ def _account_section(by_shift: Mapping[float, ShiftMeasurements], threshold: flo
 
 
 def _learning_section(run: Run) -> Section | None:
-    return Section("Learning", _LEARNING_TEXT, (learning_chart(run),)) if run.log() else None
+    log_rows = run.log()
+    if not log_rows:
+        return None
+    figure = learning_figure(log_rows, run.success_by_budget(), run.config.method.upper())
+    chart = Chart(to_svg(figure), "Learning curves: success while training and within a number of actions.")
+    return Section("Learning", _LEARNING_TEXT, (chart,))
 
 
 def _thresholds_section(reports: Mapping[float, _Report]) -> Section | None:
@@ -218,7 +219,7 @@ def _gap_section(run: Run, by_shift: Mapping[float, ShiftMeasurements]) -> Secti
         running_shares.append(gap_traces.running.mean(axis=(0, 1)))
     running = np.stack(running_shares)
     curves = GapCurves(tuple(range(running.shape[1])), running, (gap_panel,), ())
-    return Section("The gap", _GAP_TEXT, (gap_chart(curves),))
+    return Section("The gap", _GAP_TEXT, (Chart(to_svg(gap_figure(curves)), "Mean layout gap by step."),))
 
 
 def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:
@@ -233,4 +234,5 @@ def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section 
     # The text names the row that the chart shows.
     first_report = next(iter(by_shift.values())).results.report
     section_text = _SIMILARITY_TEXT.format(row=row_label(first_report["rows"][0]))
-    return Section("Success and similarity", section_text, (similarity_chart(similarity_by_shift),))
+    chart = Chart(to_svg(similarity_figure(similarity_by_shift)), "Success against layout similarity.")
+    return Section("Success and similarity", section_text, (chart,))

@@ -1,9 +1,5 @@
-"""Measurements for the report: evaluates finished runs at one layout shift and replays some of their episodes.
+"""Measurements for the report: evaluates finished runs at one layout shift and replays some of their episodes."""
 
-`measure_shift` is the entry point; `ReportOptions` configures it.
-"""
-
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -13,6 +9,7 @@ from rich.console import Console
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.report import ExperienceLead, row_label
 from jaxnav.evaluation.similarity import cooccurrence_counts
+from jaxnav.report.config import ReportConfig
 from jaxnav.report.replays import ReplayAgent, Replays, make_replays
 from jaxnav.runs.evaluate import Results, evaluate, measure_leads
 from jaxnav.runs.policies import Policies
@@ -25,42 +22,6 @@ from jaxnav.training.calibration import layout_priors
 
 #: Length of the curves of the gap, steps.
 GAP_STEPS = 40
-
-
-@dataclasses.dataclass(frozen=True)
-class ReportOptions:
-    """Options of the measurements for a report.
-
-    Attributes:
-      split: scenes to evaluate on.
-      shift: layout shifts, from 0 to 1.
-      episodes: number of episodes in the fixed list, at each shift.
-      epsilon: thresholds of sTDE.
-      threshold: threshold of the tables and of the replays; added to `epsilon`.
-      replays: number of episodes to replay, in all.
-      seed: seed of the episode list and the sampled actions.
-    """
-
-    split: str
-    shift: tuple[float, ...]
-    episodes: int
-    epsilon: tuple[float, ...]
-    threshold: float
-    replays: int
-    seed: int
-
-    def evaluate_run(self, run: Run, shift: float, world: CompiledWorld, console: Console) -> Results:
-        """Evaluate a run at a shift, as `jaxnav eval` does."""
-        return evaluate(
-            run,
-            split=self.split,
-            shift=shift,
-            episodes=self.episodes,
-            epsilon=sorted({*self.epsilon, self.threshold}),
-            seed=self.seed,
-            compiled=world,
-            console=console,
-        )
 
 
 class ShiftMeasurements(NamedTuple):
@@ -82,7 +43,7 @@ class ShiftMeasurements(NamedTuple):
 
 
 def measure_shift(
-    run: Run, reference_run: Run | None, shift: float, options: ReportOptions, console: Console
+    run: Run, reference_run: Run | None, shift: float, config: ReportConfig, console: Console
 ) -> ShiftMeasurements:
     """Measure a run at one layout shift.
 
@@ -90,29 +51,29 @@ def measure_shift(
       run: a finished run.
       reference_run: a finished run of agents that cannot know any layout, in the same world; None for none.
       shift: layout shift.
-      options: options of the measurements.
+      config: options of the measurements.
       console: receives messages about the progress.
 
     Raises:
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
     # Evaluate the run.
-    world = compile_evaluation_world(run.config, options.split, None, shift, console)
-    results = options.evaluate_run(run, shift, world, console)
+    world = compile_evaluation_world(run.config, config.split, None, shift, console)
+    results = _evaluate(run, shift, world, config, console)
     policies = run.policies()
-    agents = _select_agents(results, policies, world, options.threshold)
+    agents = _select_agents(results, policies, world, config.threshold)
 
     # Compare with agents without experience, and replay the best of them, too.
     account = None
     if reference_run is not None:
         quiet_console = Console(quiet=True)
-        reference_world = compile_evaluation_world(reference_run.config, options.split, None, shift, quiet_console)
-        reference_results = options.evaluate_run(reference_run, shift, reference_world, quiet_console)
+        reference_world = compile_evaluation_world(reference_run.config, config.split, None, shift, quiet_console)
+        reference_results = _evaluate(reference_run, shift, reference_world, config, quiet_console)
         account = measure_leads(results, reference_results)
 
         # Among the replays these agents have a role of their own.
         reference_policies = reference_run.policies()
-        for agent in _select_agents(reference_results, reference_policies, reference_world, options.threshold):
+        for agent in _select_agents(reference_results, reference_policies, reference_world, config.threshold):
             if agent.role == "baseline":
                 agents.append(agent._replace(role="without"))
 
@@ -122,12 +83,36 @@ def measure_shift(
     similarity = _measure_similarity(results, policies, world) if has_one_bank else None
     gap_traces = None
     if has_one_bank and policies.estimator_config is not None:
-        gap_traces = _measure_gaps(episodes, policies, world, options.seed)
+        gap_traces = trace_gaps(
+            policies.arm_params("layout"),
+            episodes,
+            world.make_env_params(0),
+            policies.make_agent_loop(world),
+            policies.knowledge,
+            [policies.estimator_config],
+            layout_priors(policies.prior_counts, policies.estimator_config)[None],
+            GAP_STEPS,
+            jax.random.key(config.seed),
+        )
 
     # The number of replays is that of the whole page.
-    replays_per_shift = options.replays // len(set(options.shift))
-    replays = make_replays(agents, episodes, replays_per_shift, shift, options.split)
+    replays_per_shift = config.replays // len(set(config.shift))
+    replays = make_replays(agents, episodes, replays_per_shift, shift, config.split)
     return ShiftMeasurements(results, account, similarity, gap_traces, replays)
+
+
+def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig, console: Console) -> Results:
+    """Evaluate a run at a shift, as `jaxnav eval` does."""
+    return evaluate(
+        run,
+        split=config.split,
+        shift=shift,
+        episodes=config.episodes,
+        epsilon=sorted({*config.epsilon, config.threshold}),
+        seed=config.seed,
+        compiled=world,
+        console=console,
+    )
 
 
 def _select_agents(results: Results, policies: Policies, world: CompiledWorld, threshold: float) -> list[ReplayAgent]:
@@ -162,19 +147,3 @@ def _measure_similarity(results: Results, policies: Policies, world: CompiledWor
     # One point for each scene and goal, with the success of the episodes that belong to it.
     similarity_points = compute_similarity_points(results.episodes, cooccurrence_counts(bank), prior_counts)
     return relate_success_to_similarity(similarity_points, np.asarray(results.outcome.success)[0])
-
-
-def _measure_gaps(episodes: EpisodeList, policies: Policies, world: CompiledWorld, seed: int) -> GapTraces:
-    """Trace the layout gap of the layout arm along the episodes."""
-    assert policies.estimator_config is not None
-    return trace_gaps(
-        policies.arm_params("layout"),
-        episodes,
-        world.make_env_params(0),
-        policies.make_agent_loop(world),
-        policies.knowledge,
-        [policies.estimator_config],
-        layout_priors(policies.prior_counts, policies.estimator_config)[None],
-        GAP_STEPS,
-        jax.random.key(seed),
-    )

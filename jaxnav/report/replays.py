@@ -25,10 +25,10 @@ from jaxnav.runs.policies import Policies
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
-from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent
+from jaxnav.scenes.scene import Scene, scene_extent
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, detected_positions
-from jaxnav.scenes.tables.visibility import cell_centres, cover_with_rectangles
+from jaxnav.scenes.tables.visibility import cell_centres, wall_boxes
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.viz.scene import FULL_SHADE_HEIGHT, view_cone
 
@@ -419,11 +419,8 @@ def pack_shares(shares: np.ndarray) -> str:
 
 def _to_rectangles(scene: Scene, mask: np.ndarray) -> list[Rectangle]:
     """Return cells bool [nz, nx] as rectangles."""
-    # The origin is the centre of the first cell, hence the half.
-    z_low, x_low, z_high, x_high = cover_with_rectangles(mask).T
-    low_corner = np.asarray(scene.origin) + CELL_SIZE * (np.stack([x_low, z_low], axis=-1) - 0.5)
-    rectangle_size = CELL_SIZE * np.stack([x_high - x_low, z_high - z_low], axis=-1)
-    boxes = _to_centimetres(np.concatenate([low_corner, rectangle_size], axis=-1))
+    low_corners, high_corners = wall_boxes(scene, mask).swapaxes(0, 1)
+    boxes = _to_centimetres(np.concatenate([low_corners, high_corners - low_corners], axis=-1))
     return list(map(tuple, boxes.tolist()))
 
 

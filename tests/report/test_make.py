@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,16 @@ from support.drawn_run import draw_run, tiny_config
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import accounting_table, results_table
+from jaxnav.report.config import ReportConfig
 from jaxnav.report.make import make_report, make_sections
-from jaxnav.report.measure import ReportOptions, measure_shift
+from jaxnav.report.measure import measure_shift
 from jaxnav.report.replays import ReplayAgent, select_episodes
 from jaxnav.runs.evaluate import account
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS
 
 QUIET = Console(quiet=True)
-OPTIONS = ReportOptions("val", (1.0,), 24, (0.0,), 0.2, 10, 0)
+OPTIONS = ReportConfig(Path("run"), shift=(1.0,), episodes=24, epsilon=(0.0,), threshold=0.2, replays=10)
 EVALUATION = {"shift": 1.0, "episodes": 24, "epsilon": (0.0, 0.2)}
 
 
