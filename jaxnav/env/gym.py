@@ -20,18 +20,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from jaxnav.env.make import make
-from jaxnav.env.objectnav import EnvParams, ObjectNav, State
+from jaxnav.env.objectnav import DETECTION_ORIGIN, DETECTION_SCALE, EnvParams, ObjectNav, State, unpack_detections
 from jaxnav.numerics.trees import tree_where
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import WORLDS
 
 #: Observations or infos by name.
 NamedValues = dict[str, Any]
-
-#: A detection is (byte - origin) / scale: confidence, metres ahead, metres to the right, apparent size.
-_DETECTION_SCALE = np.array([255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE], np.float32)
-_DETECTION_ORIGIN = np.array([0.0, 0.0, 128.0, 0.0], np.float32)
 
 
 class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
@@ -170,8 +165,8 @@ def observation_space(env: ObjectNav) -> spaces.Dict:
     task_rules = env.task.rules
 
     # A detection has four bytes, each from 0 to 255; the bounds are these bytes in units of the observation.
-    detection_low = (np.zeros(4, np.float32) - _DETECTION_ORIGIN) / _DETECTION_SCALE
-    detection_high = (np.full(4, 255.0, np.float32) - _DETECTION_ORIGIN) / _DETECTION_SCALE
+    detection_low = (np.zeros(4, np.float32) - DETECTION_ORIGIN) / DETECTION_SCALE
+    detection_high = (np.full(4, 255.0, np.float32) - DETECTION_ORIGIN) / DETECTION_SCALE
     detections_shape = (row_format.num_categories, 4)
     return spaces.Dict(
         {
@@ -262,15 +257,11 @@ class _BatchedEnv:
         observation_row = env.observe(episode.state, self._params).row
         _, heading, horizon = env.task.rules.split_pose(episode.state.pose)
 
-        # Detections in metres and apparent size, from bytes; zeros without a detection.
-        detections = env.row_format.detections(observation_row)  # [K, 4]
-        detection_values = (detections.astype(jnp.float32) - _DETECTION_ORIGIN[None]) / _DETECTION_SCALE[None]
-
         # The view is square, [V V] -> [V, V].
         view_side = env.row_format.view
         return {
             "view": env.row_format.view_cells(observation_row).reshape(view_side, view_side),
-            "detections": jnp.where(detections[:, :1] > 0, detection_values, 0.0),
+            "detections": unpack_detections(env.row_format.detections(observation_row)),
             "goal": episode.state.goal,
             "heading": heading,
             "horizon": horizon,

@@ -6,17 +6,15 @@
 Reset, step and same-step auto-reset are those of `ObjectNav`.
 """
 
-import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from gymnax.environments import spaces
 
 from jaxnav.env import make as env_make
-from jaxnav.env.objectnav import EnvParams, ObjectNav, State
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, VIEW_BLOCKED, VIEW_FREE
+from jaxnav.env.objectnav import EnvParams, ObjectNav, State, unpack_detections
+from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE
 
 #: Bound of all entries of an observation: above every distance (metres), confidence and apparent size.
 OBSERVATION_BOUND = 6.0
@@ -43,12 +41,7 @@ class FlatObjectNav(ObjectNav):
         """Return the observation of a state, float32 [5 K + 2 V V]."""
         observation = super().observe(state, params)
 
-        # Detections in metres and apparent size, from bytes.
-        detections = self.row_format.detections(observation.row)  # [K, 4]
-        detection_origin = np.array([[0, 0, 128, 0]]).astype(np.float32)
-        detection_scale = np.array([[255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE]]).astype(np.float32)
-        detection_values = (detections.astype(jnp.float32) - detection_origin) / detection_scale
-        detection_values = jnp.where(detections[:, :1] > 0, detection_values, 0.0)
+        detection_values = unpack_detections(self.row_format.detections(observation.row))  # [K, 4]
 
         # Goal and floor cells as indicators.
         one_hot_goal = jax.nn.one_hot(observation.goal, len(self.categories))
@@ -69,9 +62,5 @@ def make(world: str = "rooms", **options: Any) -> tuple[FlatObjectNav, EnvParams
       InputError: see `jaxnav.make`.
     """
     env, params = env_make.make(world, **options)
-
     # The subclass differs only in its observations, so it takes over every attribute.
-    env_fields = {}
-    for dataclass_field in dataclasses.fields(env):
-        env_fields[dataclass_field.name] = getattr(env, dataclass_field.name)
-    return FlatObjectNav(**env_fields), params
+    return FlatObjectNav(**vars(env)), params

@@ -21,18 +21,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxnav.env.spaces import Box, Dict, Discrete
 from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
 #: Index of the layout prior that all room types outside `ROOM_TYPES` share; read by agents, not by the environment.
 OTHER_ROOM = len(ROOM_TYPES)
 #: Number of layout priors.
 NUM_PRIORS = OTHER_ROOM + 1
+#: A detection is (byte - origin) / scale: confidence, metres ahead, metres to the right, apparent size.
+DETECTION_SCALE = np.array([255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE], np.float32)
+DETECTION_ORIGIN = np.array([0.0, 0.0, 128.0, 0.0], np.float32)
 #: An episode that starts near its goal takes the nearest to the goal of this many random cells.
 NUM_START_CANDIDATES = 8
 
@@ -314,6 +318,12 @@ class ObjectNav:
         if self.bundled_params is None:
             raise ValueError("default_params: this ObjectNav has no bundled parameters; jaxnav.make returns both")
         return self.bundled_params
+
+
+def unpack_detections(detections: jax.Array) -> jax.Array:
+    """Convert bytes of detections [K, 4] to confidence, metres and apparent size, float32; zeros if not detected."""
+    detection_values = (detections.astype(jnp.float32) - DETECTION_ORIGIN[None]) / DETECTION_SCALE[None]
+    return jnp.where(detections[:, :1] > 0, detection_values, 0.0)
 
 
 def prior_index(room_type: str) -> int:
