@@ -52,7 +52,7 @@ HEIGHT_COLORMAP = LinearSegmentedColormap.from_list("height", ["#ddd5c5", "#7f75
 
 _ARROW = Outline([(0, 1), (-0.75, -0.9), (0, -0.45), (0.75, -0.9), (0, 1)], closed=True)
 _PLAN_MARGIN = 0.05  # metres around the plan
-_SHARED_LABEL_DISTANCE = 1.0  # metres within which objects of one category share a label, such as burners of a stove
+_SHARED_LABEL_DISTANCE = 1.0  # metres within which marks of one category share a label, such as burners of a stove
 
 # Composition of the picture of a scene, in inches. The plan is as large as fits, the panel stands on its right.
 _LARGEST_PLAN = np.array([9.0, 8.0])
@@ -174,12 +174,9 @@ def _draw_view(axes: Axes, scene: Scene, rules: Rules, view: PoseView) -> list[A
     """Draw the view cone, the agent and detected objects."""
     cone, _ = draw_agent(axes, scene, rules, view.place, view.yaw)
     cone.set_label("in view")
-    object_places = []
-    for _, _, object_place in view.detections:
-        object_places.append(object_place)
 
     # A view without detections has places of shape [0, 2].
-    points = np.reshape(object_places, (-1, 2))
+    points = np.reshape([object_place for _, _, object_place in view.detections], (-1, 2))
     artist_style = {"s": 90, "facecolor": "none", "edgecolor": SEEN_COLOR, "lw": 1.6, "zorder": 6}
     rings = axes.scatter(*points.T, label="detected", **artist_style)
     return [cone, rings]
@@ -338,9 +335,13 @@ def draw_plan_background(axes: Axes, scene: Scene, alpha: float = 0.3) -> None:
     low_corner = low_corner - _PLAN_MARGIN
     high_corner = high_corner + _PLAN_MARGIN
     axes.set(
-        xlim=(low_corner[0], high_corner[0]), ylim=(low_corner[1], high_corner[1]), aspect="equal", xticks=[], yticks=[]
+        xlim=(low_corner[0], high_corner[0]),
+        ylim=(low_corner[1], high_corner[1]),
+        aspect="equal",
+        xticks=[],
+        yticks=[],
+        facecolor=BACKGROUND_COLOR,
     )
-    axes.set(facecolor=BACKGROUND_COLOR)
     axes.spines[:].set_visible(False)
     axes.apply_aspect()
 
@@ -441,13 +442,13 @@ def _draw_objects(axes: Axes, scene: Scene, categories: tuple[str, ...], goal: i
 
         # Objects of one category that stand together share a label.
         same_category_places = labelled_places.setdefault(object_categories[object_index], [])
-        if not _is_any_near(places[object_index], same_category_places):
+        if not is_any_near(places[object_index], same_category_places):
             same_category_places.append(places[object_index])
             labels.label_point(categories[object_categories[object_index]], places[object_index], color)
     return labels
 
 
-def _is_any_near(place: np.ndarray, other_places: Sequence[np.ndarray]) -> bool:
+def is_any_near(place: np.ndarray, other_places: Sequence[np.ndarray]) -> bool:
     """Return True if any other place [2] is so near that one label serves both."""
     return any(np.linalg.norm(place - other_place) < _SHARED_LABEL_DISTANCE for other_place in other_places)
 

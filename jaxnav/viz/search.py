@@ -32,7 +32,7 @@ from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.scene import CELL_SIZE, scene_extent
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 from jaxnav.viz.episode import PlayedEpisode, describe_step
-from jaxnav.viz.scene import BACKGROUND_COLOR, LabelPlacer, draw_agent, draw_plan_background
+from jaxnav.viz.scene import BACKGROUND_COLOR, LabelPlacer, draw_agent, draw_plan_background, is_any_near
 from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR
 
 MAX_PREDICTED_ACTIONS = 80
@@ -41,8 +41,6 @@ NEAR_COLOR = "#bcd9ea"
 FAR_COLOR = "#e6f0f6"
 OBSTACLE_COLOR = "#55524d"
 BLOCK_COLOR = "#CC79A7"
-
-_SHARED_LABEL_DISTANCE = 1.0  # metres within which marks of one category share a label
 
 
 class SearchSnapshot(NamedTuple):
@@ -188,7 +186,7 @@ class MapProjection:
 def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, path: Path) -> None:
     """Write the picture of the search at a step as a PNG."""
     figure = Figure(figsize=(9.6, 5.4), dpi=100)
-    canvas = FigureCanvasAgg(figure)
+    FigureCanvasAgg(figure)
     axes = figure.add_axes((0.015, 0.03, 0.7, 0.85))
     projection = MapProjection(episode, snapshot)
 
@@ -208,7 +206,6 @@ def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, pat
     # The legend stands to the right of the plan.
     legend_handles = _legend_handles(goal_name, snapshot.is_searching)
     figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
-    canvas.draw()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
@@ -278,9 +275,7 @@ def _draw_marks(axes: Axes, episode: PlayedEpisode, snapshot: SearchSnapshot, pr
         for place in places_by_category[category]:
             axes.plot(*place, marker, color=color, markersize=size, **style)
             # Marks of one category that are near each other share a label.
-            distances = [np.linalg.norm(place - earlier_place) for earlier_place in earlier_places]
-            is_labelled = bool(distances) and min(distances) < _SHARED_LABEL_DISTANCE
-            if not is_labelled:
+            if not is_any_near(place, earlier_places):
                 label_placer.label_point(categories[category], place, color)
             earlier_places.append(place)
 
