@@ -121,29 +121,16 @@ def join_episode_lists(lists: Sequence[EpisodeList]) -> EpisodeList:
 
     # Scenes are numbered on from list to list, rooms are renumbered by name.
     scene_names: list[str] = []
-    scene_parts = []
-    goal_parts = []
-    pose_parts = []
-    length_parts = []
-    room_parts = []
+    list_columns = []
     for episodes in lists:
-        scene_parts.append(episodes.scene + len(scene_names))
+        joined_scene = episodes.scene + len(scene_names)
+        joined_room = np.array(list(map(rooms.index, episodes.rooms)))[episodes.room]
+        list_columns.append([joined_scene, episodes.goal, episodes.pose, episodes.best_length, joined_room])
         scene_names.extend(episodes.scenes)
-        goal_parts.append(episodes.goal)
-        pose_parts.append(episodes.pose)
-        length_parts.append(episodes.best_length)
-        joined_room = np.array(list(map(rooms.index, episodes.rooms)))
-        room_parts.append(joined_room[episodes.room])
 
-    return EpisodeList(
-        scene=np.concatenate(scene_parts).astype(np.int32),
-        goal=np.concatenate(goal_parts).astype(np.int32),
-        pose=np.concatenate(pose_parts).astype(np.int32),
-        best_length=np.concatenate(length_parts).astype(np.int32),
-        room=np.concatenate(room_parts).astype(np.int32),
-        rooms=rooms,
-        scenes=tuple(scene_names),
-    )
+    # From [5, E] of every list to one array per field.
+    scene, goal, pose, best_length, room = np.concatenate(list_columns, axis=1).astype(np.int32)
+    return EpisodeList(scene, goal, pose, best_length, room, rooms, tuple(scene_names))
 
 
 def joint_clusters(lists: Sequence[EpisodeList]) -> list[Clusters]:

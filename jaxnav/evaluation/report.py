@@ -9,11 +9,9 @@ the difference of their results. If the layout matches training, the lead is the
 shift, a negative lead is its cost. `remaining_share` is the part of the lead that remains after a removal.
 """
 
-import importlib.metadata
 import json
 import platform
-import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -33,17 +31,14 @@ from jaxnav.evaluation.statistics import (
     run_clusters,
     scene_clusters,
 )
-from jaxnav.store.files import write_atomic
+from jaxnav.store.files import installed_versions, write_atomic
 
 #: Version of the JSON layout.
 REPORT_FORMAT = 1
 
-Metric = Literal["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
 Decoding = Literal["argmax", "sample"]
 
-#: Metrics of every row, in percent except `dts` in metres. A row may add `sr@N`, success within N actions.
-_METRICS: tuple[Metric, ...] = typing.get_args(Metric)
 #: Variants without training, whose seeds are repetitions.
 UNTRAINED_VARIANTS: tuple[Variant, ...] = ("oracle", "random")
 #: Smallest L* of the episodes in each bucket.
@@ -79,27 +74,11 @@ def build_row(
       episodes: the E episodes.
 
     Raises:
-      InputError: metrics missing, of unequal or wrong shape, not finite or out of range, or an L* below 1.
+      InputError: results not finite or out of range.
     """
-    # Check the metrics: names, range, then shape.
-    budget_metrics = _budget_metric_names(metrics)
-    if set(metrics) - set(budget_metrics) != set(_METRICS):
-        raise InputError(f"metrics are {sorted(metrics)}; give exactly {sorted(_METRICS)}, and any sr@N")
     scaled_metrics = {}
-    for metric_name in (*_METRICS, *budget_metrics):
-        scaled_metrics[metric_name] = _to_report_units(metric_name, metrics[metric_name])
-    result_shape = scaled_metrics["sr"].shape
-    metric_shapes = {metric_values.shape for metric_values in scaled_metrics.values()}
-    if len(result_shape) != 2 or metric_shapes != {result_shape}:
-        raise InputError("metrics differ in shape; give each as [seeds, episodes]")
-
-    # The lengths L* decide the bucket of each episode.
-    if episodes.best_length.shape != result_shape[1:]:
-        raise InputError(
-            f"metrics have {result_shape[1]} episodes, and the list {len(episodes.best_length)}; give as many"
-        )
-    if (episodes.best_length < 1).any():
-        raise InputError("best_length holds values below 1; drop episodes whose goal no pose can see")
+    for metric_name, metric_values in metrics.items():
+        scaled_metrics[metric_name] = _to_report_units(metric_name, metric_values)
 
     # Each metric with its interval, bucket by bucket.
     buckets: dict[str, dict[str, Any]] = {}
@@ -122,14 +101,14 @@ def build_row(
         "epsilon": epsilon,
         "decoding": decoding,
         "form": form,
-        "seeds": result_shape[0],
+        "seeds": len(metrics["sr"]),
         **buckets["L>=1"],
         "buckets": buckets,
     }
 
 
 def build_difference(
-    metric: Metric,
+    metric: str,
     reference: tuple[str, np.ndarray],
     compared: tuple[str, np.ndarray],
     *,
@@ -152,7 +131,7 @@ def build_difference(
       same_runs: True if equal seed indices are the same network (see `paired_difference`).
 
     Raises:
-      InputError: results of unequal or wrong shape, not finite or out of range.
+      InputError: results not finite or out of range.
     """
     reference_name, reference_results = reference
     compared_name, compared_results = compared
@@ -203,22 +182,8 @@ def build_report(
 
 
 def package_versions() -> dict[str, str]:
-    """Look up the versions of Python and packages that influence results.
-
-    `jaxnav` is `source` when it runs uninstalled.
-    """
-    # A checkout has no metadata of its own, while its dependencies are always installed.
-    try:
-        jaxnav_version = importlib.metadata.version("jaxnav")
-    except importlib.metadata.PackageNotFoundError:
-        jaxnav_version = "source"
-    return {
-        "jaxnav": jaxnav_version,
-        "jax": importlib.metadata.version("jax"),
-        "flax": importlib.metadata.version("flax"),
-        "numpy": importlib.metadata.version("numpy"),
-        "python": platform.python_version(),
-    }
+    """Look up the versions of Python and packages that influence results."""
+    return installed_versions(("jaxnav", "jax", "flax", "numpy")) | {"python": platform.python_version()}
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
@@ -319,14 +284,10 @@ def _action_budgets(report: dict[str, Any]) -> list[int]:
     """Action budgets N of the metrics `sr@N`."""
     # All rows of a report have the same budgets.
     budgets = []
-    for name in _budget_metric_names(report["rows"][0]):
-        budgets.append(int(name.removeprefix("sr@")))
+    for name in report["rows"][0]:
+        if name.startswith("sr@"):
+            budgets.append(int(name.removeprefix("sr@")))
     return sorted(budgets)
-
-
-def _budget_metric_names(names: Iterable[str]) -> list[str]:
-    """Select the names of the metrics `sr@N`."""
-    return [name for name in names if name.startswith("sr@")]
 
 
 def _lines_by_heading(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]]:

@@ -18,7 +18,7 @@ import yaml
 
 from jaxnav.errors import InputError
 
-Config = TypeVar("Config")
+Config = TypeVar("Config", bound=Any)
 
 #: Configurations that come with jaxnav, by name.
 CONFIGS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))}
@@ -47,16 +47,7 @@ def apply_yaml(default: Config, source: str | Path) -> Config:
     """
     path = CONFIGS.get(str(source), Path(source))
     values = _load_yaml(path)
-    return default if values is None else _apply_mapping(default, values, path, "")
-
-
-def apply_values(default: Config, values: dict[str, Any], source: Path) -> Config:
-    """Apply values that were read from the file `source` to a dataclass; see `apply_yaml`.
-
-    Raises:
-      InputError: see `apply_yaml`.
-    """
-    return _apply_mapping(default, values, source, "")
+    return default if values is None else apply_values(default, values, path)
 
 
 def parse_setting(text: str, annotation: Any) -> Any:
@@ -96,8 +87,18 @@ def _load_yaml(path: Path) -> Any:
         raise InputError(f"{path}: not valid YAML ({error}); mend the file") from error
 
 
-def _apply_mapping(default: Any, values: Any, path: Path, prefix: str) -> Any:
-    """Apply a mapping to a dataclass; `prefix` is the dotted key of the dataclass, with a final dot."""
+def apply_values(default: Config, values: Any, path: Path, prefix: str = "") -> Config:
+    """Apply values that were read from a file to a dataclass; see `apply_yaml`.
+
+    Args:
+      default: instance of a frozen dataclass.
+      values: mapping of names to values.
+      path: file that the values come from, for messages.
+      prefix: dotted key of the dataclass in the file, with a final dot.
+
+    Raises:
+      InputError: see `apply_yaml`.
+    """
     if not isinstance(values, dict):
         mapping_name = f"{prefix.rstrip('.')} " if prefix else ""
         raise InputError(f"{path}: {mapping_name}holds {_describe_value(values)}; give a mapping of names to values")
@@ -112,7 +113,7 @@ def _apply_mapping(default: Any, values: Any, path: Path, prefix: str) -> Any:
         # Nested dataclasses are changed field by field.
         current_value = getattr(default, name)
         if dataclasses.is_dataclass(current_value):
-            changed_fields[name] = _apply_mapping(current_value, value, path, f"{key}.")
+            changed_fields[name] = apply_values(current_value, value, path, f"{key}.")
             continue
         try:
             changed_fields[name] = _convert(value, field_types[name])

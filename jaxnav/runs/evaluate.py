@@ -353,8 +353,7 @@ def sweep(
     check_seed(seed)
     policies = run.policies(("layout",))
     estimator_config = policies.estimator_config
-    if estimator_config is None:
-        raise InputError(f"{run.config.run_dir}: its layout arm has no layout setting; train the run anew")
+    assert estimator_config is not None  # policies of the arm `layout` have an estimator
     if not len(epsilon):
         raise InputError("epsilon: give at least one number")
 

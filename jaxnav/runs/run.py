@@ -63,14 +63,14 @@ class Run:
 
     def log(self) -> list[dict[str, Any]]:
         """Training log, a row for each chunk, arm and seed."""
-        return RunLogs(self.config).metrics()
+        return RunLogs(self.config).read(LOG_FILE)
 
     def times(self) -> list[dict[str, Any]]:
         """Seconds that training took, a row for each chunk.
 
         `wall_s` and `cpu_s` count from the start, and include compilation, validation and earlier, interrupted calls.
         """
-        return RunLogs(self.config).times()
+        return RunLogs(self.config).read(TIMES_FILE)
 
     def success_by_budget(self) -> dict[str, Any] | None:
         """Success within budgets of actions, see `Validator.success_by_budget`; None for a run without val scenes."""
@@ -177,21 +177,18 @@ class RunLogs:
 
     config: RunConfig
 
-    def metrics(self) -> list[dict[str, Any]]:
-        """Rows of the training metrics; empty without the file.
+    def read(self, name: str) -> list[dict[str, Any]]:
+        """Rows of `metrics.jsonl` or `times.jsonl`; empty without the file.
 
         Raises:
           InputError: a row is damaged or missing.
         """
-        return self._read(LOG_FILE)
+        rows = read_log_rows(self.config.run_dir / name)
 
-    def times(self) -> list[dict[str, Any]]:
-        """Rows of seconds; empty without the file.
-
-        Raises:
-          InputError: a row is damaged or missing.
-        """
-        return self._read(TIMES_FILE)
+        # The logs of a finished run must be complete.
+        is_finished = bool(rows) and (self.config.run_dir / POLICIES_DIR).exists()
+        self._check_rows(name, rows, self.config.total_updates if is_finished else 0)
+        return rows
 
     def append(self, metrics: Sequence[LogRow], times: LogRow) -> None:
         """Append the rows of one chunk."""
@@ -208,14 +205,6 @@ class RunLogs:
             path = self.config.run_dir / name
             truncate_log_after(path, update)
             self._check_rows(name, read_log_rows(path), update)
-
-    def _read(self, name: str) -> list[dict[str, Any]]:
-        rows = read_log_rows(self.config.run_dir / name)
-
-        # The logs of a finished run must be complete.
-        is_finished = bool(rows) and (self.config.run_dir / POLICIES_DIR).exists()
-        self._check_rows(name, rows, self.config.total_updates if is_finished else 0)
-        return rows
 
     def _check_rows(self, name: str, rows: Sequence[dict[str, Any]], last_update: int) -> None:
         """Refuse rows that are out of order or incomplete up to `last_update`."""

@@ -1,7 +1,7 @@
 """Forwarding of a run's training log to TensorBoard and Weights & Biases."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from jaxnav.errors import InputError
@@ -14,13 +14,7 @@ POLL_S = 5.0
 _PLACE_COLUMNS = ("step", "arm", "seed", "env_steps")
 
 
-def send_log(
-    run: Run,
-    to: Sequence[str],
-    follow: bool = False,
-    project: str = "jaxnav",
-    wait: Callable[[float], object] = time.sleep,
-) -> int:
+def send_log(run: Run, to: Sequence[str], follow: bool = False, project: str = "jaxnav") -> int:
     """Send the training log of a run to sinks, as one series per arm and seed.
 
     Steps of a series are environment steps. Every row is sent once: rows that an interrupted run writes again hold the
@@ -31,7 +25,6 @@ def send_log(
       to: names of sinks: `tensorboard`, `wandb`.
       follow: continue until the run is finished.
       project: project in Weights & Biases.
-      wait: function that waits for the seconds between two reads of the log.
 
     Returns:
       The number of rows.
@@ -46,7 +39,7 @@ def send_log(
     sinks_by_series: dict[str, list[Sink]] = {}
     num_rows = 0
     try:
-        for row in _new_rows(run, follow, wait):
+        for row in _new_rows(run, follow):
             # Sinks of a series open with its first row.
             series_name = f"{row['arm']}-{row['seed']}"
             if series_name not in sinks_by_series:
@@ -70,7 +63,7 @@ def send_log(
     return num_rows
 
 
-def _new_rows(run: Run, follow: bool, wait: Callable[[float], object]) -> Iterator[dict[str, Any]]:
+def _new_rows(run: Run, follow: bool) -> Iterator[dict[str, Any]]:
     """Yield each row of the log once, and wait for new ones with `follow`."""
     num_series = len(run.config.arms) * run.config.seeds
     last_step: dict[tuple[str, int], int] = {}
@@ -87,4 +80,4 @@ def _new_rows(run: Run, follow: bool, wait: Callable[[float], object]) -> Iterat
         is_finished = has_all_series and min(last_step.values()) >= run.config.total_updates
         if is_finished or not follow:
             return
-        wait(POLL_S)
+        time.sleep(POLL_S)

@@ -25,6 +25,9 @@ from jaxnav.scenes.tables.compile import Bank, bank_checksum, compile_bank, conc
 from jaxnav.scenes.tables.shards import Shards, compile_shards
 from jaxnav.scenes.worlds import WORLDS, Scenes, load_scenes, make_generated_scenes, shift_scenes
 
+#: Scenes in which a method of another package is checked.
+_NUM_SAMPLE_SCENES = 4
+
 
 @dataclasses.dataclass(frozen=True)
 class CompiledWorld:
@@ -85,11 +88,11 @@ def compile_training_world(config: RunConfig, console: Console) -> CompiledWorld
     return dataclasses.replace(world, has_expert=any(stage.uses_expert for stage in config.stages))
 
 
-def compile_sample_bank(config: RunConfig, count: int = 4) -> Bank:
+def compile_sample_bank(config: RunConfig) -> Bank:
     """Compile the first few training scenes of a run."""
     scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, Console(quiet=True))
     # A scene file may hold fewer scenes.
-    num_scenes = min(count, len(scenes))
+    num_scenes = min(_NUM_SAMPLE_SCENES, len(scenes))
     return compile_bank((scenes[index] for index in range(num_scenes)), config.task)
 
 
@@ -247,13 +250,9 @@ def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
         raise InputError("scenes fill more than one shard; give more --shard-scenes, or fewer scenes")
     # Banks in memory are joined; settings are those of the first world.
     bank = concatenate_banks([world.banks[0] for world in worlds])
-    first_world = worlds[0]
-    return CompiledWorld(
-        first_world.scenes,
-        first_world.env,
-        (bank,),
-        first_world.step_limits,
-        first_world.step_limit,
+    return dataclasses.replace(
+        worlds[0],
+        banks=(bank,),
         num_cells=len(bank.ahead),
         num_scenes=len(bank.names),
         fingerprint="-".join(world.fingerprint for world in worlds),

@@ -75,11 +75,7 @@ def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
       InputError: no export there, another format version, or files that are damaged or do not belong together.
     """
     policy = _read_policy(folder)
-    try:
-        arrays = _unflatten(safetensors.numpy.load_file(folder / PARAMS_FILE))
-    except Exception as error:  # safetensors and NumPy raise errors of many types
-        raise InputError(f"{folder / PARAMS_FILE}: holds no arrays ({error}); export the policy again") from error
-    return arrays, policy["spec"]
+    return _unflatten(safetensors.numpy.load_file(folder / PARAMS_FILE)), policy["spec"]
 
 
 def _read_policy(folder: Path) -> dict[str, Any]:
@@ -113,8 +109,6 @@ def _read_policy(folder: Path) -> dict[str, Any]:
 
     # Both files must be intact and belong together.
     policy = verify_digest(policy_path, policy, "export the policy again")
-    if not isinstance(policy["spec"], dict):
-        raise InputError(f"{policy_path}: spec is no JSON object; export the policy again")
     if params_sha256 != policy["params_sha256"]:
         raise InputError(f"{params_path}: does not belong to {POLICY_FILE} or is damaged; export the policy again")
     return policy

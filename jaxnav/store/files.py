@@ -274,6 +274,7 @@ def _parse_row(line: bytes) -> dict[str, Any] | None:
 #: Increased whenever the stored state changes in a way that older code cannot read.
 CHECKPOINT_FORMAT_VERSION = 2
 
+#: Packages that shape the stored state.
 _PACKAGES = ("jaxnav", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -283,7 +284,11 @@ def make_manifest(config: Mapping[str, Any]) -> dict[str, Any]:
     Args:
       config: nested mapping of JSON values; tuples become lists.
     """
-    manifest = {"format_version": CHECKPOINT_FORMAT_VERSION, "config": config, "versions": _package_versions()}
+    manifest = {
+        "format_version": CHECKPOINT_FORMAT_VERSION,
+        "config": config,
+        "versions": installed_versions(_PACKAGES),
+    }
     return json.loads(json.dumps(manifest))
 
 
@@ -344,12 +349,13 @@ class _Absent:
 _ABSENT = _Absent()
 
 
-def _package_versions() -> dict[str, str]:
-    """Return the installed versions of jaxnav and of the packages that shape its state."""
-    package_versions = {}
-    for package_name in _PACKAGES:
+def installed_versions(package_names: Sequence[str]) -> dict[str, str]:
+    """Look up the versions of packages; jaxnav is `source` when it runs uninstalled."""
+    # A source tree has no metadata of its own, while its dependencies are always installed.
+    versions = {}
+    for package_name in package_names:
         try:
-            package_versions[package_name] = metadata.version(package_name)
+            versions[package_name] = metadata.version(package_name)
         except metadata.PackageNotFoundError:
-            package_versions[package_name] = "not installed"  # run from a source tree
-    return package_versions
+            versions[package_name] = "source"
+    return versions

@@ -20,11 +20,9 @@ class Sink(Protocol):
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Write the numbers of a step; steps increase."""
-        ...
 
     def close(self) -> None:
         """Finish writing."""
-        ...
 
 
 class TensorBoardSink:

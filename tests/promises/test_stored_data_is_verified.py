@@ -24,7 +24,7 @@ from support.drawn_run import tiny_config
 from jaxnav.errors import InputError
 from jaxnav.runs.policies import PACKAGED_POLICIES
 from jaxnav.runs.policy import load_policy
-from jaxnav.runs.run import CONFIG_FILE, REACH_FILE, Run, RunLogs, claim_run_dir, run_settings
+from jaxnav.runs.run import CONFIG_FILE, LOG_FILE, REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, run_settings
 from jaxnav.store import checkpoint
 from jaxnav.store.export import export_params, load_params
 from jaxnav.store.files import make_manifest, write_json_with_digest
@@ -82,7 +82,7 @@ def log_rows(folder):
 def resumed_logs(folder):
     logs = RunLogs(in_run(folder))
     logs.rewind(2 * CHUNKS)
-    return logs.metrics(), logs.times()
+    return logs.read(LOG_FILE), logs.read(TIMES_FILE)
 
 
 def arrays() -> dict[str, Any]:
@@ -177,7 +177,7 @@ def test_another_digit_in_a_log_is_told(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(path.read_bytes().replace(b"0.57", b"0.67"))  # success of 4 / 7
     with pytest.raises(InputError, match=r"metrics.jsonl, line 3: is damaged or was changed by hand"):
-        RunLogs(in_run(tmp_path)).metrics()
+        RunLogs(in_run(tmp_path)).read(LOG_FILE)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_a_log_without_a_row_is_refused_where_the_run_goes_on(tmp_path, lost):
         RunLogs(in_run(tmp_path)).rewind(2 * CHUNKS)
     path.write_bytes(b"".join(lines + lines[lost : lost + 1]))
     with pytest.raises(InputError, match=r"metrics.jsonl, line 9: rows are missing or out of order"):
-        RunLogs(in_run(tmp_path)).metrics()
+        RunLogs(in_run(tmp_path)).read(LOG_FILE)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from support.drawn_run import tiny_config
 
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
+from jaxnav.runs import tracking
 from jaxnav.runs.run import LOG_FILE, Run, claim_run_dir
 from jaxnav.runs.tracking import send_log
 from jaxnav.store.files import append_log_rows, truncate_log_after
@@ -78,7 +79,7 @@ def test_every_row_goes_to_its_series(run, sent):
     assert sorted(closed) == [(library, f"layout-{seed}") for library in sorted(MODULES) for seed in (0, 1)]
 
 
-def test_a_run_that_goes_on_is_followed_to_its_end(run, sent):
+def test_a_run_that_goes_on_is_followed_to_its_end(run, sent, monkeypatch):
     """Killed after update 2 of 4 and resumed: the row after the checkpoint is dropped and written again, the same."""
     numbers, closed = sent
     log(run, row(1, loss=1.0), row(1, seed=1, loss=1.0), row(2, loss=2.0))
@@ -92,21 +93,23 @@ def test_a_run_that_goes_on_is_followed_to_its_end(run, sent):
             lambda: log(run, row(4, loss=4.0), row(4, seed=1, loss=4.5)),
         ]
     )
-    assert send_log(run, ("tensorboard",), follow=True, wait=lambda _: next(parts)()) == 8
+    monkeypatch.setattr(tracking, "time", types.SimpleNamespace(sleep=lambda _: next(parts)()))
+    assert send_log(run, ("tensorboard",), follow=True) == 8
     assert next(parts, None) is None
     by_seed = {seed: [value for key, value in numbers.items() if key[1] == f"layout-{seed}"] for seed in (0, 1)}
     assert by_seed == {0: [1.0, 2.0, 3.0, 4.0], 1: [1.0, 2.5, 3.5, 4.5]}
     assert len(closed) == 2
 
 
-def test_sinks_are_closed_where_the_log_is_damaged(run, sent):
+def test_sinks_are_closed_where_the_log_is_damaged(run, sent, monkeypatch):
     log(run, row(1, loss=0.5))
 
     def damage(_):
         (run.config.run_dir / LOG_FILE).write_text("nothing\n\n")
 
+    monkeypatch.setattr(tracking, "time", types.SimpleNamespace(sleep=damage))
     with pytest.raises(InputError, match=r"metrics\.jsonl, line 1: not a JSON object"):
-        send_log(run, ("wandb",), follow=True, wait=damage)
+        send_log(run, ("wandb",), follow=True)
     assert sent[1] == [("wandb", "layout-0")]
 
 
