@@ -6,40 +6,43 @@ import pytest
 from jaxnav.evaluation.report import remaining_share
 from jaxnav.evaluation.statistics import scene_clusters
 
-SCENES, EPISODES, SEEDS = 12, 10, 4
-PLANS = np.repeat(np.arange(SCENES), EPISODES)
-CLUSTERS = scene_clusters(PLANS, np.zeros(len(PLANS), int))
+SCENES, NUM_EPISODES, SEEDS = 12, 10, 4
+FLOOR_PLANS = np.repeat(np.arange(SCENES), NUM_EPISODES)
+CLUSTERS = scene_clusters(FLOOR_PLANS, np.zeros(len(FLOOR_PLANS), int))
 
 
-def results(generator, success, spread=0.05):
+def draw_results(generator, success, spread=0.05):
     """Success of 4 policies in 120 episodes, with seeds and scenes that differ."""
-    of_seed, of_scene = generator.normal(0, spread, (SEEDS, 1)), generator.normal(0, spread, SCENES)[PLANS]
-    return success + of_seed + of_scene + generator.normal(0, 0.1, (SEEDS, len(PLANS)))
+    seed_effects, scene_effects = (
+        generator.normal(0, spread, (SEEDS, 1)),
+        generator.normal(0, spread, SCENES)[FLOOR_PLANS],
+    )
+    return success + seed_effects + scene_effects + generator.normal(0, 0.1, (SEEDS, len(FLOOR_PLANS)))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0, 1.5])
-def test_a_removal_that_leaves_a_fixed_share_has_it_exactly(share):
+def test_remaining_share_of_a_fixed_share_is_exact(share):
     generator = np.random.default_rng(0)
-    agent = results(generator, 0.9)
+    agent = draw_results(generator, 0.9)
     without = np.broadcast_to(
-        results(generator, 0.6)[:1], agent.shape
+        draw_results(generator, 0.6)[:1], agent.shape
     )  # equal seeds, so that leaving one out is no change
     interval = remaining_share(without, agent, without + share * (agent - without), CLUSTERS)
     # (w + s (a - w) - w) / (a - w) = s under all weights, so nothing varies.
     np.testing.assert_allclose((interval.mean, interval.low, interval.high), 100 * share, atol=1e-9)
 
 
-def test_the_interval_holds_the_true_share():
-    generator, held = np.random.default_rng(1), 0
+def test_remaining_share_interval_covers_the_true_share():
+    generator, num_covered = np.random.default_rng(1), 0
     for _ in range(200):
         # A cost: -0.3 with experience, -0.1 with removal; a third of it is left.
-        without, agent, removed = (results(generator, success) for success in (0.9, 0.6, 0.8))
+        without, agent, removed = (draw_results(generator, success) for success in (0.9, 0.6, 0.8))
         interval = remaining_share(without, agent, removed, CLUSTERS)
-        held += interval.low <= 100 / 3 <= interval.high
-    assert held >= 184  # 92 % of 200; the 95 % interval of 95 % is 184 to 195
+        num_covered += interval.low <= 100 / 3 <= interval.high
+    assert num_covered >= 184  # 92 % of 200; the 95 % interval of 95 % is 184 to 195
 
 
-def test_there_is_no_share_of_a_lead_that_is_not_clear():
+def test_remaining_share_of_an_unclear_lead_is_nan():
     generator = np.random.default_rng(2)
-    without, agent = results(generator, 0.6), results(generator, 0.6)
+    without, agent = draw_results(generator, 0.6), draw_results(generator, 0.6)
     assert np.isnan(remaining_share(without, agent, agent, CLUSTERS).mean)

@@ -20,16 +20,16 @@ from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, Rules, Task
 EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
 
 
-def test_episodes_are_possible_and_know_their_best_length():
-    for scene, goal, pose, best in zip(*EPISODES[:4], strict=True):
+def test_drawn_episodes_are_possible_and_have_their_best_length():
+    for scene, goal, pose, best_length in zip(*EPISODES[:4], strict=True):
         assert goal in tiny.BANK.goals[scene, : tiny.BANK.num_goals[scene]]
-        first = tiny.BANK.first_cell[scene] * tiny.POSES_PER_CELL
-        assert first <= pose < first + tiny.BANK.num_cells[scene] * tiny.POSES_PER_CELL
-        assert best == tiny.BANK.best_length[pose, goal] >= 1
+        first_pose = tiny.BANK.first_cell[scene] * tiny.POSES_PER_CELL
+        assert first_pose <= pose < first_pose + tiny.BANK.num_cells[scene] * tiny.POSES_PER_CELL
+        assert best_length == tiny.BANK.best_length[pose, goal] >= 1
     assert len(set(EPISODES.pose.tolist())) > 12  # all over the rooms
 
 
-def test_episodes_are_equally_many_per_room_type_and_scene():
+def test_drawn_episodes_are_balanced_over_room_types_and_scenes():
     # Two kitchens and living rooms, one of the others.
     bank = compile_bank([generate_room("val", i, 1) for i in range(6)], Task())
     assert len(bank.names) == 6
@@ -48,13 +48,13 @@ def test_episodes_are_equally_many_per_room_type_and_scene():
     assert (episodes.best_length >= 1).all()
 
 
-def test_episodes_are_fixed_by_bank_and_seed():
+def test_drawn_episodes_depend_on_bank_and_seed_alone():
     chex.assert_trees_all_equal(draw_episodes(tiny.BANK, 24, seed=1)[:5], EPISODES[:5])
     assert not np.array_equal(draw_episodes(tiny.BANK, 24, seed=2).pose, EPISODES.pose)
 
 
-def test_no_episodes_are_refused():
-    with pytest.raises(InputError, match="--episodes 0: give at least 1"):
+def test_zero_episodes_are_refused():
+    with pytest.raises(InputError, match="--episodes 0"):
         draw_episodes(tiny.BANK, 0)
 
 
@@ -79,35 +79,35 @@ def test_scenes_of_a_floor_plan_are_left_out_together():
         ([0, 0, 1, 1, 1], ("a", "a-replaced-1", "b", "c", "d"), 4 - 1),  # nor do two of one floor plan
     ],
 )
-def test_room_types_are_strata_where_each_has_two_floor_plans(room, names, degrees):
+def test_room_types_with_two_floor_plans_each_are_strata(room, names, degrees):
     clusters = episodes_in(range(5), room=room, names=names).clusters()
     assert clusters.degrees_of_freedom == degrees
     # A stratum keeps its weight.
     room = np.array(room) if degrees == 3 and names is None else np.zeros(5, int)
-    for kind in set(room):
-        np.testing.assert_allclose(clusters.weights[room == kind].sum(axis=0), (room == kind).sum())
+    for room_type in set(room):
+        np.testing.assert_allclose(clusters.weights[room == room_type].sum(axis=0), (room == room_type).sum())
 
 
-def test_a_floor_plan_is_left_out_of_all_lists_at_once():
-    here = episodes_in([0, 1, 1, 2, 3], room=[0, 0, 1, 1], names=("a", "b", "c", "d"))
-    replaced = episodes_in([0, 0, 1, 2], room=[1, 0, 1], names=("c", "a-replaced-1", "d"))
-    one, other = joint_clusters([here, replaced])
-    assert one.degrees_of_freedom == other.degrees_of_freedom == 4 - 2
-    np.testing.assert_array_equal(one.scale, other.scale)
+def test_joint_clusters_leave_a_floor_plan_out_of_all_lists():
+    own_episodes = episodes_in([0, 1, 1, 2, 3], room=[0, 0, 1, 1], names=("a", "b", "c", "d"))
+    replaced_episodes = episodes_in([0, 0, 1, 2], room=[1, 0, 1], names=("c", "a-replaced-1", "d"))
+    own_clusters, replaced_clusters = joint_clusters([own_episodes, replaced_episodes])
+    assert own_clusters.degrees_of_freedom == replaced_clusters.degrees_of_freedom == 4 - 2
+    np.testing.assert_array_equal(own_clusters.scale, replaced_clusters.scale)
     # Bedrooms a (1 here, 1 there) and b (2 here): without one the other two count double. Kitchens c (1 and 2) and d (1
     # and 1): without c the weight of five is d's two, without d it is c's three. The other room type counts as before.
     a, b, c, d = [0, 2, 1, 1], [2, 0, 1, 1], [1, 1, 0, 5 / 3], [1, 1, 5 / 2, 0]
-    np.testing.assert_allclose(one.weights[:, 1:], [a, b, b, c, d])
-    np.testing.assert_allclose(other.weights[:, 1:], [c, c, a, d])
+    np.testing.assert_allclose(own_clusters.weights[:, 1:], [a, b, b, c, d])
+    np.testing.assert_allclose(replaced_clusters.weights[:, 1:], [c, c, a, d])
     # By themselves they would not be: each list has its own scenes.
-    assert replaced.clusters().weights.shape == (4, 1 + 3)
+    assert replaced_episodes.clusters().weights.shape == (4, 1 + 3)
 
 
 # The shortest way in generated rooms
 
 
 @pytest.mark.parametrize("rules", [Rules(), Rules(headings=12, horizons=(0.0,), success="near", success_distance=1.0)])
-def test_an_oracle_has_full_marks(rules):
+def test_oracle_has_sr_and_spl_of_one(rules):
     """It goes down the table of best lengths: SR 1 and SPL 1, exactly."""
     bank = compile_bank([generate_room("val", i, 5) for i in range(4)], Task(rules=rules))
     env, params = build_environment(bank, {}, 100)
@@ -124,18 +124,18 @@ def test_an_oracle_has_full_marks(rules):
     assert np.median(outcome.length) > 3
 
     # Nothing is taken for granted: other actions fail, and a step limit stops the oracle too.
-    astray = replay_actions(
+    wrong_outcome = replay_actions(
         np.where(actions == LOOK_DOWN, LOOK_UP, (actions + 1) % 3), start_states(episodes), params, env
     )
-    assert not astray.success.any()
-    stopped = replay_actions(actions, start_states(episodes), build_environment(bank, {}, 3)[1], env)
-    np.testing.assert_array_equal(stopped.success, episodes.best_length <= 3)
+    assert not wrong_outcome.success.any()
+    stopped_outcome = replay_actions(actions, start_states(episodes), build_environment(bank, {}, 3)[1], env)
+    np.testing.assert_array_equal(stopped_outcome.success, episodes.best_length <= 3)
 
 
 # Metrics
 
 
-def test_metrics_by_hand():
+def test_episode_metrics_follow_worked_arithmetic():
     leaves = EpisodeOutcome(
         done=jnp.array([True, True, False, True]),
         success=jnp.array([True, True, False, True]),
@@ -161,7 +161,7 @@ def test_metrics_by_hand():
     np.testing.assert_array_equal(metrics["sr@9"], [0, 1, 0, 1])
 
 
-def test_an_episode_fails_by_a_time_out_or_a_wrong_done():
+def test_failed_episodes_are_time_outs_or_wrong_dones():
     zeros, ones = jnp.zeros(3), jnp.ones(3, jnp.int32)
     done, success = jnp.array([True, True, False]), jnp.array([True, False, False])
     outcome = EpisodeOutcome(done, success, ones, jnp.zeros(3, jnp.int32), zeros, ones, zeros)

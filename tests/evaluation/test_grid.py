@@ -1,6 +1,5 @@
 """The evaluation grid against plain loops and against itself, cell by cell."""
 
-import logging
 from typing import Any
 
 import chex
@@ -9,23 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
+from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_step
 
 from jaxnav.causal import stde
 from jaxnav.evaluation.episodes import draw_episodes, join_episode_lists
-from jaxnav.evaluation.grid import Evaluator, infer_and_act, start_states
+from jaxnav.evaluation.grid import Evaluator, start_states
 from jaxnav.evaluation.playback import play_episodes
 from jaxnav.evaluation.removal import GapSource, RemovedLogits
 from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
-from jaxnav.policies.agent_loop import AgentLoop
-from jaxnav.policies.method import Knowledge
 from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.scenes.task import DONE, MOVE_AHEAD
 
 SEEDS, LIMITS = 2, (12, 16)
-ENV, PARAMS = tiny.world()
-PARAMS = PARAMS.replace(step_limit=jnp.array(LIMITS, jnp.int32))
-KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)  # a belief that gives way at once: large gaps
+PARAMS = tiny.world()[1].replace(step_limit=jnp.array(LIMITS, jnp.int32))
 EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
 ARMS = ("baseline", "layout")
 ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"], ARMS)
@@ -33,7 +29,7 @@ ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"], ARMS)
 WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) for seed in (5, 9, 6, 11)))
 
 
-def control(epsilon, form, decoding, **changes):
+def control_cells(epsilon, form, decoding, **changes):
     """The cells of sTDE with something changed."""
     cells = inference_grid([table_row("stde", epsilon, form, decoding)], ARMS, SEEDS)
     return cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
@@ -41,43 +37,23 @@ def control(epsilon, form, decoding, **changes):
 
 #: Controls whose gaps or logits are of other episodes or drawn by key.
 CONTROLS = [
-    control(0.0, "paper", "argmax", gap_source=GapSource.OTHER),
-    control(0.2, "residual", "sample", gap_source=GapSource.MEAN),
-    control(0.2, "residual", "sample", gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=5),
-    control(0.0, "paper", "argmax", removed=RemovedLogits.NOISE),
-    control(0.0, "paper", "sample", intervention=1.0),
+    control_cells(0.0, "paper", "argmax", gap_source=GapSource.OTHER),
+    control_cells(0.2, "residual", "sample", gap_source=GapSource.MEAN),
+    control_cells(0.2, "residual", "sample", gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=5),
+    control_cells(0.0, "paper", "argmax", removed=RemovedLogits.NOISE),
+    control_cells(0.0, "paper", "sample", intervention=1.0),
 ]
 CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, ARMS, SEEDS), *CONTROLS)
-ACTING, KEY = AgentLoop(ENV, tiny.SPEC, tiny.SETTING), jax.random.key(3)
-
-
-class Compilations(logging.Handler):
-    """The compilations of the grid that JAX reports."""
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-
-    def emit(self, record):
-        self.count += record.getMessage().startswith("Compiling jit(_run_grid)")
+KEY = jax.random.key(3)
 
 
 @pytest.fixture(scope="module")
 def evaluated():
-    """All rows and trials [R + T, S, E], the compilations that were counted and the number that was told."""
-    handler, logger = Compilations(), logging.getLogger("jax")
-    logger.addHandler(handler)
-    try:
-        with jax.log_compiles():
-            evaluator = Evaluator(ACTING)
-            outcome = evaluator(CELLS, WEIGHTS, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
-    finally:
-        logger.removeHandler(handler)
-    return (
-        jax.tree.map(lambda leaf: leaf.reshape(-1, SEEDS, len(EPISODES.goal)), outcome),
-        handler.count,
-        evaluator.compilations,
-    )
+    """All rows and controls [R + C, S, E], and the number of compilations that the evaluator reports."""
+    evaluator = Evaluator(AGENT_LOOP)
+    outcome = evaluator(CELLS, WEIGHTS, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+    reshaped_outcome = jax.tree.map(lambda leaf: leaf.reshape(-1, SEEDS, len(EPISODES.goal)), outcome)
+    return reshaped_outcome, evaluator.compilations
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +61,7 @@ def outcome(evaluated):
     return evaluated[0]
 
 
-def pick(outcome, variant, epsilon=None, form=None, decoding: Decoding = "argmax"):
+def row_outcome(outcome, variant, epsilon=None, form=None, decoding: Decoding = "argmax"):
     """The outcome [S, E] of one row."""
     return tiny.leaves_at(outcome, ROWS.index(EvaluationRow(variant, epsilon, form, decoding)))
 
@@ -94,76 +70,78 @@ def pick(outcome, variant, epsilon=None, form=None, decoding: Decoding = "argmax
 
 
 def test_the_whole_grid_is_one_compilation(evaluated):
-    _, counted, events = evaluated
-    assert counted == events == 1
+    _, compilations = evaluated
+    assert compilations == 1
     # Of each decoding: baseline, layout, TDE, and two forms of three sTDE. And Random.
     assert len(ROWS) == 2 * (3 + 6) + 1
 
 
 @pytest.mark.parametrize("decoding", ["argmax", "sample"])
 @pytest.mark.parametrize("form", ["residual", "paper"])
-def test_at_epsilon_one_nothing_is_taken_out_bit_for_bit(outcome, form, decoding):
-    layout = pick(outcome, "layout", decoding=decoding)
-    chex.assert_trees_all_equal(pick(outcome, "stde", 1.0, form, decoding), layout)
+def test_stde_at_epsilon_one_is_bit_identical_to_the_layout_row(outcome, form, decoding):
+    layout = row_outcome(outcome, "layout", decoding=decoding)
+    chex.assert_trees_all_equal(row_outcome(outcome, "stde", 1.0, form, decoding), layout)
     assert not layout.mean_weight.any()
     # At epsilon 0 something is taken out, and it matters.
-    stde = pick(outcome, "stde", 0.0, form, decoding)
+    stde = row_outcome(outcome, "stde", 0.0, form, decoding)
     assert 0.1 < stde.mean_weight.max() < 1
     assert not np.array_equal(stde.length, layout.length)
 
 
-def test_hard_tde_takes_all_experience_out(outcome):
-    np.testing.assert_array_equal(pick(outcome, "tde", form="paper").mean_weight, np.ones((SEEDS, 24)))
-    assert not np.array_equal(pick(outcome, "tde", form="paper").length, pick(outcome, "layout").length)
+def test_tde_removes_all_experience(outcome):
+    np.testing.assert_array_equal(row_outcome(outcome, "tde", form="paper").mean_weight, np.ones((SEEDS, 24)))
+    assert not np.array_equal(row_outcome(outcome, "tde", form="paper").length, row_outcome(outcome, "layout").length)
 
 
-def test_the_weight_falls_as_epsilon_rises(outcome):
+def test_removal_weight_falls_as_epsilon_rises(outcome):
     # The first step is the same for all, so that its gap is; afterwards they part.
-    means = [pick(outcome, "stde", epsilon, "residual").mean_weight.mean() for epsilon in (0.0, 0.2, 1.0)]
+    means = [row_outcome(outcome, "stde", epsilon, "residual").mean_weight.mean() for epsilon in (0.0, 0.2, 1.0)]
     assert means[0] > means[1] > means[2] == 0
 
 
-def test_random_is_another_for_every_seed_and_knows_no_policy(outcome):
-    random = pick(outcome, "random", decoding="sample")
+def test_random_row_differs_between_seeds(outcome):
+    random = row_outcome(outcome, "random", decoding="sample")
     assert not np.array_equal(random.length[0], random.length[1])
     # Done is one of six actions: of all last actions a sixth would be right at best.
     assert 2 < random.length.mean() < 9
 
 
-def part(episodes):
+def select_episodes(indices):
     """Those of the episodes, and all scenes."""
-    return EPISODES._replace(**{name: getattr(EPISODES, name)[episodes] for name in EPISODES._fields[:5]})
+    return EPISODES._replace(**{name: getattr(EPISODES, name)[indices] for name in EPISODES._fields[:5]})
 
 
 @pytest.mark.slow
-def test_parts_share_a_compilation_and_neither_cells_nor_episodes_depend_on_others(outcome):
+def test_parts_share_a_compilation_and_cells_and_episodes_are_independent(outcome):
     """Two parts of few episodes, in another order and by some of the cells in another order."""
-    parts = [np.array([0, 1, 2, 3, 20, 11]), np.array([12, 5, 4, 23, 8, 17])]
-    cells = np.arange(len(ROWS))[::-3]
-    grid = inference_grid([ROWS[i] for i in cells], ARMS, SEEDS)
-    lists = [part(episodes) for episodes in parts]
-    evaluator = Evaluator(ACTING)
-    result = evaluator(grid, WEIGHTS, [(episodes, PARAMS) for episodes in lists], KNOWLEDGE, KEY)
+    part_indices = [np.array([0, 1, 2, 3, 20, 11]), np.array([12, 5, 4, 23, 8, 17])]
+    row_indices = np.arange(len(ROWS))[::-3]
+    grid = inference_grid([ROWS[row] for row in row_indices], ARMS, SEEDS)
+    lists = [select_episodes(indices) for indices in part_indices]
+    evaluator = Evaluator(AGENT_LOOP)
+    result = evaluator(grid, WEIGHTS, [(indices, PARAMS) for indices in lists], KNOWLEDGE, KEY)
     assert evaluator.compilations == 1
-    result = jax.tree.map(lambda leaf: leaf.reshape(len(cells), SEEDS, -1), result)
-    expected = jax.tree.map(lambda leaf: leaf[cells][..., np.concatenate(parts)], outcome)
-    best = np.array([ROWS[i].decoding == "argmax" for i in cells])
-    chex.assert_trees_all_equal(tiny.leaves_at(result, best), tiny.leaves_at(expected, best))
+    result = jax.tree.map(lambda leaf: leaf.reshape(len(row_indices), SEEDS, -1), result)
+    expected = jax.tree.map(lambda leaf: leaf[row_indices][..., np.concatenate(part_indices)], outcome)
+    is_argmax = np.array([ROWS[row].decoding == "argmax" for row in row_indices])
+    chex.assert_trees_all_equal(tiny.leaves_at(result, is_argmax), tiny.leaves_at(expected, is_argmax))
     # Sampled actions follow the number of the episode in its part, which the first four keep.
     chex.assert_trees_all_equal(tiny.leaves_at(result, ..., slice(4)), tiny.leaves_at(expected, ..., slice(4)))
-    assert not np.array_equal(result.length[~best], expected.length[~best])
-    merged = join_episode_lists(lists)
-    assert merged.scenes == 2 * EPISODES.scenes
-    assert [merged.scenes[i] for i in merged.scene] == [
-        EPISODES.scenes[i] for i in EPISODES.scene[np.concatenate(parts)]
+    assert not np.array_equal(result.length[~is_argmax], expected.length[~is_argmax])
+    merged_episodes = join_episode_lists(lists)
+    assert merged_episodes.scenes == 2 * EPISODES.scenes
+    assert [merged_episodes.scenes[row] for row in merged_episodes.scene] == [
+        EPISODES.scenes[row] for row in EPISODES.scene[np.concatenate(part_indices)]
     ]
     for name in ("goal", "pose", "best_length", "room"):
-        np.testing.assert_array_equal(getattr(merged, name), getattr(EPISODES, name)[np.concatenate(parts)])
+        np.testing.assert_array_equal(
+            getattr(merged_episodes, name), getattr(EPISODES, name)[np.concatenate(part_indices)]
+        )
 
 
-def test_a_single_episode():
+def test_evaluator_takes_a_single_episode():
     grid = tiny.leaves_at(CELLS, slice(1))
-    result = Evaluator(ACTING)(grid, WEIGHTS, [(part(np.array([3])), PARAMS)], KNOWLEDGE, KEY)
+    result = Evaluator(AGENT_LOOP)(grid, WEIGHTS, [(select_episodes(np.array([3])), PARAMS)], KNOWLEDGE, KEY)
     assert result.length.shape == (1, 1)
     assert 1 <= result.length[0, 0] <= max(LIMITS)
 
@@ -171,21 +149,21 @@ def test_a_single_episode():
 # Against a plain loop
 
 
-def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
+def run_plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
     """One episode, best actions, by single calls."""
     scene, goal, pose = (int(getattr(EPISODES, name)[episode]) for name in ("scene", "goal", "pose"))
     prior, weights, belief = KNOWLEDGE.layout[PARAMS.room[scene]], tiny.leaves_at(WEIGHTS, seed), None
     memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
-    length, action, total, moves = 0, None, 0.0, 0
+    length, action, total_weight, moves = 0, None, 0.0, 0
     while length < LIMITS[scene] and action != DONE:
         row = tiny.BANK.rows[pose]
         belief = tiny.believe(prior, belief, row)
         relevance = tiny.goal_weights(belief, goal) if layout else jnp.ones(3)
         factual, counterfactual = tiny.decide(weights, row, goal, relevance, memory)
-        weight = jnp.maximum(belief.gap - epsilon, 0)
+        removal_weight = jnp.maximum(belief.gap - epsilon, 0)
         logits = stde(factual.logits, counterfactual.logits, belief.gap, epsilon, form)
         action = int(np.argmax(logits))
-        length, moves, total = length + 1, moves + (action == MOVE_AHEAD), total + float(weight)
+        length, moves, total_weight = length + 1, moves + (action == MOVE_AHEAD), total_weight + float(removal_weight)
         memory = PolicyState(factual.hidden, jnp.int32(action))  # what is carried on is factual
         pose = int(tiny.BANK.successor[pose, action])
     return {
@@ -193,7 +171,7 @@ def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
         "length": length,
         "moves": moves,
         "distance": tiny.BANK.goal_distance[pose // tiny.POSES_PER_CELL, goal],
-        "mean_weight": total / length,
+        "mean_weight": total_weight / length,
     }
 
 
@@ -201,57 +179,45 @@ def plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
     ("variant", "epsilon", "form"),
     [("baseline", None, None), ("layout", None, None), ("stde", 0.0, "paper"), ("stde", 0.2, "residual")],
 )
-def test_outcomes_are_those_of_a_plain_loop(outcome, variant, epsilon, form):
-    result = pick(outcome, variant, epsilon, form)
+def test_grid_outcomes_equal_a_plain_loop(outcome, variant, epsilon, form):
+    result = row_outcome(outcome, variant, epsilon, form)
     layout, threshold = variant != "baseline", jnp.float32(np.inf if epsilon is None else epsilon)
     for seed in range(SEEDS):
         for episode in range(0, 24, 3):
-            expected = plain_loop(seed + SEEDS * layout, episode, layout, threshold, form or "residual")
+            expected = run_plain_loop(seed + SEEDS * layout, episode, layout, threshold, form or "residual")
             for name, value in expected.items():
                 assert getattr(result, name)[seed, episode] == pytest.approx(value, rel=1e-4, abs=1e-6), (name, episode)
 
 
-@jax.jit
-def begin(weights):
-    memory = ACTING.bind(weights).initial_memory(EPISODES.goal.shape)
-    return ACTING.start_from(start_states(EPISODES), memory, KNOWLEDGE, PARAMS)
-
-
-@jax.jit
-def take(cell, weights, agent, running, keys):
-    policy = ACTING.bind(weights)
-    return infer_and_act(cell, policy, agent, running, keys, agent_loop=ACTING, env_params=PARAMS, knowledge=KNOWLEDGE)
-
-
 @pytest.mark.parametrize("number", range(len(CONTROLS)))
-def test_controls_are_those_of_all_episodes_carried_on_to_the_end(outcome, number):
+def test_control_outcomes_equal_a_loop_that_keeps_ended_episodes(outcome, number):
     """Leaving ended episodes out changes no one's next running episode and no one's noise."""
     for seed in range(SEEDS):
         cell = tiny.leaves_at(CELLS, (len(ROWS) + number) * SEEDS + seed)
         weights = tiny.leaves_at(WEIGHTS, int(cell.policy_index))
         # Folded with the part, the parameters and the episode.
-        folded = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.policy_index)
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(folded, jnp.arange(len(EPISODES.goal)))
-        agent = begin(weights)
+        policy_key = jax.random.fold_in(jax.random.fold_in(KEY, 0), cell.policy_index)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(policy_key, jnp.arange(len(EPISODES.goal)))
+        agent = start_agent(weights, start_states(EPISODES), PARAMS)
         running = np.ones(len(EPISODES.goal), bool)
-        success, length, total = ~running, np.zeros(len(running), int), np.zeros(len(running))
+        success, length, total_weight = ~running, np.zeros(len(running), int), np.zeros(len(running))
         while running.any():
-            agent, step_result, inferred = take(cell, weights, agent, running, keys)
+            agent, step_result, inferred = take_step(cell, weights, agent, running, keys, PARAMS)
             success |= running & np.asarray(step_result.success)
             length += running
-            total += np.where(running, inferred.removal_weight, 0.0)
+            total_weight += np.where(running, inferred.removal_weight, 0.0)
             running &= ~np.asarray(step_result.ended)
         result = tiny.leaves_at(outcome, len(ROWS) + number, seed)
         np.testing.assert_array_equal(result.success, success)
         np.testing.assert_array_equal(result.length, length)
-        np.testing.assert_allclose(result.mean_weight, total / length, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(result.mean_weight, total_weight / length, rtol=1e-5, atol=1e-7)
 
 
-def test_playing_an_episode_agrees_with_the_grid(outcome):
+def test_played_episodes_agree_with_the_grid(outcome):
     row = ROWS.index(EvaluationRow("stde", 0.2, "residual", "argmax"))
     cell = tiny.leaves_at(CELLS, row * SEEDS + 1)
     traces = play_episodes(
-        cell, tiny.leaves_at(WEIGHTS, int(cell.policy_index)), start_states(EPISODES), ACTING, PARAMS, KNOWLEDGE
+        cell, tiny.leaves_at(WEIGHTS, int(cell.policy_index)), start_states(EPISODES), AGENT_LOOP, PARAMS, KNOWLEDGE
     )
     for episode, trace in enumerate(traces):
         result = tiny.leaves_at(outcome, row, 1, episode)
@@ -259,16 +225,16 @@ def test_playing_an_episode_agrees_with_the_grid(outcome):
         assert trace.pose[0] == EPISODES.pose[episode]
         assert not (trace.action[:-1] == DONE).any()
         assert np.maximum(trace.gap - 0.2, 0).mean() == pytest.approx(result.mean_weight, abs=1e-6)
-        how, weight = trace.inferred, np.maximum(trace.gap - 0.2, 0)[:, None]
-        np.testing.assert_allclose(how.removal_weight, weight[:, 0], atol=1e-7)
+        inferred, weight = trace.inferred, np.maximum(trace.gap - 0.2, 0)[:, None]
+        np.testing.assert_allclose(inferred.removal_weight, weight[:, 0], atol=1e-7)
         # Equation 2 in its residual form, and the best action of what it gives.
-        expected = (1 + weight) * how.factual_logits - weight * how.removed_logits
-        np.testing.assert_allclose(how.action_logits, expected, rtol=1e-5, atol=1e-5)
-        np.testing.assert_array_equal(trace.action, how.action_logits.argmax(axis=1))
-        assert how.layout_weights.shape == (len(trace.pose), len(tiny.CATEGORIES))
+        expected = (1 + weight) * inferred.factual_logits - weight * inferred.removed_logits
+        np.testing.assert_allclose(inferred.action_logits, expected, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(trace.action, inferred.action_logits.argmax(axis=1))
+        assert inferred.layout_weights.shape == (len(trace.pose), len(tiny.CATEGORIES))
 
 
-def test_episodes_end_once(outcome):
+def test_episodes_end_at_done_or_at_their_step_limit(outcome):
     """There is no second episode after Done or after the limit of the scene."""
     limits = np.array(LIMITS)[EPISODES.scene]
     assert (outcome.length >= 1).all()

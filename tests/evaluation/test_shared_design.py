@@ -18,13 +18,13 @@ EQUAL = np.full(SCENES, EPISODES)
 MEANS = arrays(float, (SEEDS, SCENES), elements=st.integers(-20, 20).map(float))
 
 
-def mean_of(means: np.ndarray, weights=EQUAL, names: Sequence[str] = NAMES, rooms: Sequence[str] = KITCHENS):
+def mean_interval_of(means: np.ndarray, weights=EQUAL, names: Sequence[str] = NAMES, rooms: Sequence[str] = KITCHENS):
     """Return the interval of one condition, from means by scene."""
     design = SharedDesign.from_conditions([(names, rooms)], len(means))
     return design.interval(design.jackknife_means(means * weights, np.array(weights), names))
 
 
-def growth(first: np.ndarray, last: np.ndarray, names: Sequence[str] = NAMES) -> Interval:
+def growth_interval(first: np.ndarray, last: np.ndarray, names: Sequence[str] = NAMES) -> Interval:
     """Return how much the mean grows; `names` are those at the end."""
     design = SharedDesign.from_conditions([(NAMES, KITCHENS), (names, KITCHENS)], SEEDS)
     start, end = (
@@ -35,30 +35,30 @@ def growth(first: np.ndarray, last: np.ndarray, names: Sequence[str] = NAMES) ->
 
 
 @given(MEANS)
-def test_where_all_is_balanced_it_is_the_analysis_of_variance(means):
+def test_balanced_mean_interval_is_the_analysis_of_variance(means):
     # Mean squares of scenes, runs and the rest; the mean's variance is (scenes + runs - rest) / (S N), at least that of
     # scenes or of runs alone.
     by_scene, by_run, whole = means.mean(axis=0), means.mean(axis=1), means.mean()
-    rest = means - by_scene - by_run[:, None] + whole
+    residuals = means - by_scene - by_run[:, None] + whole
     degrees = np.array([SCENES - 1, SEEDS - 1, (SCENES - 1) * (SEEDS - 1)])
-    squares = SEEDS * ((by_scene - whole) ** 2).sum(), SCENES * ((by_run - whole) ** 2).sum(), (rest**2).sum()
-    parts = squares / degrees / (SEEDS * SCENES)
-    variance = max(parts[0] + parts[1] - parts[2], parts[0], parts[1])
-    spread = (parts**2 / degrees).sum()
-    freedom = np.clip(variance**2 / spread, 2, 4 + 2) if spread > 1e-18 else 4 + 2
-    assert bounds(mean_of(means)) == pytest.approx(around(whole, variance, freedom), abs=1e-6)
+    squares = SEEDS * ((by_scene - whole) ** 2).sum(), SCENES * ((by_run - whole) ** 2).sum(), (residuals**2).sum()
+    mean_squares = squares / degrees / (SEEDS * SCENES)
+    variance = max(mean_squares[0] + mean_squares[1] - mean_squares[2], mean_squares[0], mean_squares[1])
+    squared_spread = (mean_squares**2 / degrees).sum()
+    satterthwaite_degrees = np.clip(variance**2 / squared_spread, 2, 4 + 2) if squared_spread > 1e-18 else 4 + 2
+    assert bounds(mean_interval_of(means)) == pytest.approx(around(whole, variance, satterthwaite_degrees), abs=1e-6)
 
 
 @given(MEANS, MEANS)
-def test_growth_over_the_same_scenes_and_runs_is_that_of_their_differences(first, last):
-    assert bounds(growth(first, last)) == pytest.approx(bounds(mean_of(last - first)), abs=1e-6)
+def test_growth_over_shared_scenes_is_the_interval_of_differences(first, last):
+    assert bounds(growth_interval(first, last)) == pytest.approx(bounds(mean_interval_of(last - first)), abs=1e-6)
 
 
-def test_growth_over_shared_scenes_is_told_more_finely_than_over_others():
+def test_growth_over_shared_scenes_has_a_narrower_interval():
     # Scenes of unlike difficulty, all of which gain 2 points or 4, alike in all runs.
     first = np.tile([10.0, 20, 30, 40, 50], (SEEDS, 1))
     last = first + np.array([2.0, 4, 2, 4, 3])
-    shared, apart = growth(first, last), growth(first, last, OTHERS)
+    shared, apart = growth_interval(first, last), growth_interval(first, last, OTHERS)
     assert shared.mean == apart.mean == pytest.approx(3.0)
     # Gains have squares 1 + 1 + 1 + 1 + 0: variance 4 / 4 of one, / 5 of the mean.
     assert bounds(shared) == pytest.approx(around(3, 1 / 5, 4))
@@ -68,54 +68,56 @@ def test_growth_over_shared_scenes_is_told_more_finely_than_over_others():
     assert shared.low > 0 > apart.low
 
 
-def test_names_tell_which_scenes_are_the_same_not_their_order():
-    draw = np.random.default_rng(0)
-    first, last = draw.random((2, SEEDS, SCENES))
+def test_growth_matches_scenes_by_name_not_by_order():
+    generator = np.random.default_rng(0)
+    first, last = generator.random((2, SEEDS, SCENES))
     order = [3, 0, 4, 1, 2]
-    shuffled = growth(first, last[:, order], [NAMES[i] for i in order])
-    assert bounds(shuffled) == pytest.approx(bounds(growth(first, last)))
+    shuffled = growth_interval(first, last[:, order], [NAMES[i] for i in order])
+    assert bounds(shuffled) == pytest.approx(bounds(growth_interval(first, last)))
 
 
-def test_a_run_is_left_out_of_all_conditions_at_once():
+def test_growth_leaves_a_run_out_of_all_conditions():
     # Runs are unlike, by as much at both shifts: their growth is equal. With their order changed it is not.
     first = np.arange(SCENES) + 10.0 * np.arange(SEEDS)[:, None]
-    assert bounds(growth(first, first + 1.0)) == pytest.approx((1.0, 1.0, 1.0))
-    assert growth(first, first[::-1] + 1.0).low < 0
+    assert bounds(growth_interval(first, first + 1.0)) == pytest.approx((1.0, 1.0, 1.0))
+    assert growth_interval(first, first[::-1] + 1.0).low < 0
 
 
-def test_unequal_scenes_weigh_as_many_as_their_episodes():
-    draw, weights = np.random.default_rng(1), np.array([1.0, 5, 2, 3, 9])
-    means = draw.random((SEEDS, SCENES))
+def test_scenes_are_weighted_by_their_episodes():
+    generator, weights = np.random.default_rng(1), np.array([1.0, 5, 2, 3, 9])
+    means = generator.random((SEEDS, SCENES))
 
     def mean(scene: int | None, run: int | None) -> float:
         has_scene, has_run = (np.arange(n) != out for n, out in ((SCENES, scene), (SEEDS, run)))
         return float(np.average(means[has_run].mean(axis=0)[has_scene], weights=weights[has_scene]))
 
-    assert bounds(mean_of(means, weights)) == pytest.approx(left_out(mean, SCENES, SEEDS))
+    assert bounds(mean_interval_of(means, weights)) == pytest.approx(left_out(mean, SCENES, SEEDS))
 
 
-def test_room_types_keep_their_shares():
+def test_room_types_are_strata_of_the_mean():
     # Kitchens are at 0 and 10, bedrooms at 70, 80 and 90, alike in all runs: variance 50 of a kitchen and 100 of a
     # bedroom, so (2 / 5)^2 50 / 2 + (3 / 5)^2 100 / 3 = 16 of the mean.
     means = np.tile([0.0, 10, 70, 80, 90], (SEEDS, 1))
-    result = mean_of(means, rooms=("kitchen", "kitchen", "bedroom", "bedroom", "bedroom"))
+    result = mean_interval_of(means, rooms=("kitchen", "kitchen", "bedroom", "bedroom", "bedroom"))
     assert bounds(result) == pytest.approx(around(50, 16, 1 + 2))
     # One stratum is wider: the types differ.
-    assert mean_of(means).low < result.low - 10
+    assert mean_interval_of(means).low < result.low - 10
     # An only kitchen shows no variance of kitchens: all are one stratum.
-    assert bounds(mean_of(means, rooms=("kitchen", *("bedroom",) * 4))) == pytest.approx(bounds(mean_of(means)))
+    assert bounds(mean_interval_of(means, rooms=("kitchen", *("bedroom",) * 4))) == pytest.approx(
+        bounds(mean_interval_of(means))
+    )
 
 
-def test_scenes_of_a_floor_plan_are_left_out_together():
+def test_scenes_of_a_floor_plan_are_one_cluster():
     # Plan 0 is at 10, 20 and 30, plan 1 at 50 twice, plan 2 at 80, by equally many episodes: those of plans.
     names = [f"val-apartment-{plan:02}-{i}" for plan, i in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))]
     means = np.tile([10.0, 20, 30, 50, 50, 80], (SEEDS, 1))
-    result = mean_of(means, np.full(6, EPISODES), names, ("apartment",) * 6)
+    result = mean_interval_of(means, np.full(6, EPISODES), names, ("apartment",) * 6)
     # Mean 40; without plan 0 it is 60, without 1 35, without 2 32: 2 / 3 of the squares 400 + 25 + 64.
     assert bounds(result) == pytest.approx(around(40, 2 / 3 * 489, 2))
 
 
-def test_what_is_untrained_varies_with_scenes_alone():
+def test_untrained_means_vary_with_scenes_alone():
     means = np.array([[10.0, 20, 30, 40, 50]])
     design = SharedDesign.from_conditions([(NAMES, KITCHENS)], SEEDS)
     replicates = design.jackknife_means(means * EQUAL, EQUAL, NAMES, trained=False)
@@ -123,14 +125,14 @@ def test_what_is_untrained_varies_with_scenes_alone():
     assert bounds(design.interval(replicates)) == pytest.approx(around(30, 250 / 5, SCENES - 1))
 
 
-def test_scenes_without_episodes_say_nothing():
+def test_scenes_without_episodes_are_ignored():
     means, rooms = np.tile([50.0, 50, 7, 90, 90], (SEEDS, 1)), ("kitchen",) * 3 + ("bedroom",) * 2
     # Each room type is at one level, so scenes of these types tell nothing apart; the third was not drawn.
-    result = mean_of(means, np.array([4, 4, 0, 4, 4]), rooms=rooms)
+    result = mean_interval_of(means, np.array([4, 4, 0, 4, 4]), rooms=rooms)
     assert bounds(result) == pytest.approx((70.0, 70.0, 70.0))
 
 
-def test_a_mean_of_one_scene_is_undefined_without_it():
-    result = mean_of(np.ones((SEEDS, SCENES)), np.array([4, 0, 0, 0, 0]))
+def test_mean_of_a_single_scene_has_no_bounds():
+    result = mean_interval_of(np.ones((SEEDS, SCENES)), np.array([4, 0, 0, 0, 0]))
     assert result.mean == 1.0
     assert not result.has_bounds

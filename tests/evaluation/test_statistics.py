@@ -33,7 +33,7 @@ def scenes_of(count: int, episodes: int = 1):
 # What is left out
 
 
-def test_the_others_of_a_stratum_take_over_its_weight():
+def test_left_out_clusters_give_their_weight_to_their_stratum():
     # Stratum 0 holds clusters a (2 items) and b (1), stratum 1 holds c and d. Without a, b alone has the weight of 3.
     clusters = leave_one_out(np.array(list("aabcd")), np.array([0, 0, 0, 1, 1]))
     expected = {"a": [0, 0, 3, 1, 1], "b": [1.5, 1.5, 0, 1, 1], "c": [1, 1, 1, 0, 2], "d": [1, 1, 1, 2, 0]}
@@ -43,7 +43,7 @@ def test_the_others_of_a_stratum_take_over_its_weight():
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2)), min_size=2, max_size=20))
-def test_strata_keep_their_weight(pairs):
+def test_leave_one_out_keeps_the_weight_of_strata(pairs):
     label, stratum = np.array(pairs).T
     clusters = leave_one_out(10 * stratum + label, stratum)
     for number in np.unique(stratum):
@@ -52,7 +52,7 @@ def test_strata_keep_their_weight(pairs):
             np.testing.assert_allclose(clusters.weights[inside].sum(axis=0), inside.sum())
 
 
-def test_a_room_type_of_one_floor_plan_joins_the_others():
+def test_room_type_of_one_floor_plan_joins_the_other_strata():
     plans, rooms = np.array(list("aabbcc")), np.array([0, 0, 0, 0, 1, 1])
     assert scene_clusters(plans, rooms).degrees_of_freedom == 3 - 1
     assert scene_clusters(plans, np.array([0, 0, 0, 0, 0, 0])).degrees_of_freedom == 3 - 1
@@ -63,14 +63,14 @@ def test_a_room_type_of_one_floor_plan_joins_the_others():
 # Closed forms
 
 
-def test_the_mean_of_scenes_has_students_interval():
+def test_scene_means_have_students_interval():
     # Five scenes of one episode: mean 3, variance of the mean 2.5 / 5 = 0.5, 4 degrees of freedom.
     interval = mean_interval(np.array([[1.0, 2, 3, 4, 5]]), scenes_of(5), trained=False)
     assert interval.mean == 3
     assert half_width(interval) == pytest.approx(t.ppf(0.975, 4) * math.sqrt(0.5))
 
 
-def test_episodes_of_a_scene_count_as_one():
+def test_interval_counts_the_episodes_of_a_scene_as_one():
     # Twenty episodes in each scene, all alike, say no more than one. Treated as independent they would give a fifth.
     values = np.repeat([[1.0, 2, 3, 4, 5]], 20, axis=1)
     clustered = mean_interval(values, scenes_of(5, 20), trained=False)
@@ -79,7 +79,7 @@ def test_episodes_of_a_scene_count_as_one():
     assert half_width(apart) < 0.4 * half_width(clustered)
 
 
-def test_room_types_take_out_the_variance_between_them():
+def test_strata_remove_the_variance_between_room_types():
     # Types with scenes 0, 1 and 10, 11: the variance of each type's mean is 0.5 / 2, of the whole (0.25 + 0.25) / 4.
     values, rooms = np.array([[0.0, 1, 10, 11]]), np.array([0, 0, 1, 1])
     within = mean_interval(values, scene_clusters(np.arange(4), rooms), trained=False)
@@ -87,7 +87,7 @@ def test_room_types_take_out_the_variance_between_them():
     assert half_width(mean_interval(values, scenes_of(4), trained=False)) > 3 * half_width(within)
 
 
-def test_seeds_alone_have_students_interval():
+def test_seed_means_have_students_interval():
     # All scenes alike: seed means 1, 2 and 6 have mean 3 and variance 7, so 7 / 3 with 2 degrees of freedom.
     values = np.repeat([[1.0], [2.0], [6.0]], 12, axis=1)
     interval = mean_interval(values, scenes_of(12))
@@ -96,19 +96,19 @@ def test_seeds_alone_have_students_interval():
     assert half_width(interval) == pytest.approx(t.ppf(0.975, 2) * math.sqrt(7 / 3))
 
 
-def anova(values: np.ndarray) -> tuple[float, float]:
+def analyse_variance(values: np.ndarray) -> tuple[float, float]:
     """Return variance of the mean and its degrees of freedom.
 
     One result for each run and scene [S, C]: mean squares of runs, scenes and what is left, (A + B - AB) / (S C).
     """
     runs, scenes = values.shape
     by_run, by_scene = values.mean(axis=1), values.mean(axis=0)
-    rest = values - by_run[:, None] - by_scene + values.mean()
+    residuals = values - by_run[:, None] - by_scene + values.mean()
     squares = np.array(
         [
             scenes * by_run.var(ddof=1),
             runs * by_scene.var(ddof=1),
-            (rest**2).sum() / ((runs - 1) * (scenes - 1)),
+            (residuals**2).sum() / ((runs - 1) * (scenes - 1)),
         ]
     )
     signed = squares * [1, 1, -1]
@@ -117,14 +117,14 @@ def anova(values: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_crossed_means_follow_the_analysis_of_variance(seed):
+def test_mean_interval_follows_the_analysis_of_variance(seed):
     draw = np.random.default_rng(seed)
     values = draw.normal(size=(4, 1)) + draw.normal(size=(1, 9)) + 0.5 * draw.normal(size=(4, 9))
-    variance, degrees = anova(values)
+    variance, degrees = analyse_variance(values)
     assert half_width(mean_interval(values, scenes_of(9))) == pytest.approx(t.ppf(0.975, degrees) * math.sqrt(variance))
 
 
-def test_a_variance_is_never_below_one_of_its_parts():
+def test_mean_variance_is_at_least_that_of_scenes_or_runs():
     # Scenes -1 and +1 in seed 0, +1 and -1 in seed 1: neither scenes nor seeds differ, the rest would be subtracted.
     interval = mean_interval(np.array([[-1.0, 1, 0], [1, -1, 0]]), scenes_of(3))
     assert (interval.low, interval.high) == pytest.approx((0, 0))
@@ -133,7 +133,7 @@ def test_a_variance_is_never_below_one_of_its_parts():
 # Differences
 
 
-def test_pairing_cancels_what_scenes_share():
+def test_paired_difference_cancels_scene_effects():
     # Scenes differ by up to 10; the second variant gains exactly 1 in each.
     values = np.array([[0.0, 3, 10, 4], [1, 2, 9, 5]])
     gain = paired_difference(values, values + 1, scenes_of(4), same_runs=True)
@@ -142,34 +142,37 @@ def test_pairing_cancels_what_scenes_share():
     assert gain.seeds == pytest.approx((1, 1))
 
 
-def test_runs_trained_apart_vary_apart():
+def test_difference_of_separate_runs_adds_their_variances():
     # Scenes alike; seed means 0, 2 and 1, 5: variances 2 / 2 and 8 / 2 add up, with 2 degrees of freedom.
-    a, b = (np.repeat([[low], [high]], 6, axis=1) for low, high in ((0.0, 2.0), (1.0, 5.0)))
-    gain = paired_difference(a, b, scenes_of(6))
+    first_values, last_values = (np.repeat([[low], [high]], 6, axis=1) for low, high in ((0.0, 2.0), (1.0, 5.0)))
+    gain = paired_difference(first_values, last_values, scenes_of(6))
     assert gain.mean == pytest.approx(2)
     assert gain.std == pytest.approx(math.sqrt(2 + 8))
     assert gain.seeds == ()
     assert half_width(gain) == pytest.approx(t.ppf(0.975, 2) * math.sqrt(2 / 2 + 8 / 2))
     # The same networks: gains 1 and 3, variance 2 / 2, 1 degree of freedom.
-    same = paired_difference(a, b, scenes_of(6), same_runs=True)
-    assert half_width(same) == pytest.approx(t.ppf(0.975, 1) * math.sqrt(2 / 2))
+    same_run_gain = paired_difference(first_values, last_values, scenes_of(6), same_runs=True)
+    assert half_width(same_run_gain) == pytest.approx(t.ppf(0.975, 1) * math.sqrt(2 / 2))
 
 
 @settings(max_examples=30)
 @given(st.lists(st.booleans(), min_size=24, max_size=24), st.booleans())
-def test_a_difference_turned_round_changes_sign(outcomes, same_runs):
+def test_swapping_arms_negates_the_difference(outcomes, same_runs):
     values = np.reshape(outcomes, (2, 12))
-    a, b, scenes = values, values[::-1], leave_one_out(np.arange(12) % 4)
-    forth, back = (paired_difference(*pair, scenes, same_runs=same_runs) for pair in ((a, b), (b, a)))
-    assert (back.mean, back.low, back.high) == pytest.approx((-forth.mean, -forth.high, -forth.low))
+    first_values, last_values, scenes = values, values[::-1], leave_one_out(np.arange(12) % 4)
+    forward, backward = (
+        paired_difference(*value_pair, scenes, same_runs=same_runs)
+        for value_pair in ((first_values, last_values), (last_values, first_values))
+    )
+    assert (backward.mean, backward.low, backward.high) == pytest.approx((-forward.mean, -forward.high, -forward.low))
 
 
 @settings(max_examples=30)
 @given(st.lists(st.integers(-50, 50), min_size=24, max_size=24), st.floats(0.1, 100), st.floats(-10, 10))
-def test_an_interval_follows_a_change_of_units(cells, scale, shift):
+def test_mean_interval_scales_and_shifts_with_its_values(cells, scale, shift):
     values, scenes = np.reshape(cells, (3, 8)) / 10, scenes_of(8)
     before, after = mean_interval(values, scenes), mean_interval(values * scale + shift, scenes)
-    expected = [scale * x + shift for x in (before.mean, before.low, before.high)]
+    expected = [scale * bound + shift for bound in (before.mean, before.low, before.high)]
     assert (after.mean, after.low, after.high) == pytest.approx(expected, abs=1e-9)
     assert after.std == pytest.approx(before.std * scale, abs=1e-9)
 
@@ -178,7 +181,7 @@ def test_an_interval_follows_a_change_of_units(cells, scale, shift):
 
 
 @pytest.mark.parametrize(("runs", "scenes", "bounded"), [(2, 3, True), (2, 2, False), (1, 20, False), (3, 1, False)])
-def test_too_few_scenes_or_runs_have_no_bounds(runs, scenes, bounded):
+def test_mean_interval_needs_enough_scenes_and_runs(runs, scenes, bounded):
     values = np.random.default_rng(0).random((runs, 2 * scenes))
     interval = mean_interval(values, scenes_of(scenes, 2))
     assert interval.mean == pytest.approx(values.mean())
@@ -186,7 +189,7 @@ def test_too_few_scenes_or_runs_have_no_bounds(runs, scenes, bounded):
     assert math.isnan(interval.std) == (runs == 1)
 
 
-def test_a_statistic_that_a_scene_decides_has_no_bounds():
+def test_jackknife_with_an_undefined_replicate_has_no_bounds():
     replicates = np.array([0.5, math.nan, 0.4, 0.6])
     assert not jackknife_interval(replicates, scenes_of(3)).has_bounds
     assert jackknife_interval(np.array([0.5, 0.5, 0.4, 0.6]), scenes_of(3)).has_bounds
@@ -198,19 +201,19 @@ def test_a_statistic_that_a_scene_decides_has_no_bounds():
         (np.array([[0.0, np.nan]]), "NaN"),
         (np.array([[0.0, np.inf]]), "infinite"),
         (np.zeros(2), r"\[runs, episodes\]"),
-        (np.zeros((0, 2)), "at least one"),
-        (np.zeros((3, 4)), "4 episodes and scenes 2"),
+        (np.zeros((0, 2)), "one"),
+        (np.zeros((3, 4)), "4 episodes.*2"),
     ],
 )
-def test_bad_input_is_refused(values, message):
+def test_intervals_refuse_bad_values(values, message):
     with pytest.raises(InputError, match=message):
         mean_interval(values, scenes_of(2))
     with pytest.raises(InputError, match=message):
         paired_difference(values, values, scenes_of(2))
 
 
-def test_arms_of_unequal_shape_are_refused():
-    with pytest.raises(InputError, match="differ in shape"):
+def test_paired_difference_refuses_unequal_shapes():
+    with pytest.raises(InputError, match="shape"):
         paired_difference(np.zeros((2, 4)), np.zeros((3, 4)), scenes_of(4))
 
 
@@ -218,16 +221,16 @@ def test_arms_of_unequal_shape_are_refused():
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_an_interval_covers_the_truth_as_often_as_it_says(size):
+def test_jackknife_interval_has_its_nominal_coverage(size):
     # 95 % of 300 draws are 285 +- 3.8; 90 % is six standard errors below.
     assert coverage(jackknifed, size, draws=300) >= 0.90
 
 
-def test_episodes_taken_for_independent_cover_far_less():
+def test_episode_bootstrap_has_too_low_coverage():
     assert coverage(episode_bootstrap, (20, 3), draws=60) < 0.85
 
 
-def test_runs_of_both_arms_are_left_out_within_their_arm():
+def test_run_clusters_leave_runs_out_within_their_arm():
     runs = run_clusters(2, 3)
     assert runs.degrees_of_freedom == 4
     np.testing.assert_allclose(runs.weights[:, 1], [0, 1.5, 1.5, 1, 1, 1])

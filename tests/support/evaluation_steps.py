@@ -1,0 +1,34 @@
+"""Evaluation episodes of the small world, step by step, with large layout gaps."""
+
+import jax
+
+from jaxnav.evaluation.grid import infer_and_act
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.method import Knowledge
+from support import tiny_world as tiny
+
+#: A weak prior: the belief follows the first views, so gaps are large.
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
+AGENT_LOOP = AgentLoop(tiny.world()[0], tiny.SPEC, tiny.SETTING)
+
+
+@jax.jit
+def start_agent(weights, states, env_params):
+    """Return the agent of all episodes after their first view."""
+    memory = AGENT_LOOP.bind(weights).initial_memory(states.pose.shape)
+    return AGENT_LOOP.start_from(states, memory, KNOWLEDGE, env_params)
+
+
+@jax.jit
+def take_step(cell, weights, agent, running, keys, env_params):
+    """Take one step by a cell of the evaluation grid."""
+    return infer_and_act(
+        cell,
+        AGENT_LOOP.bind(weights),
+        agent,
+        running,
+        keys,
+        agent_loop=AGENT_LOOP,
+        env_params=env_params,
+        knowledge=KNOWLEDGE,
+    )
