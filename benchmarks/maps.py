@@ -1,7 +1,7 @@
 """Cost of SemExp's map and planner, and their success without learning.
 
-`python benchmarks/maps.py [WORLD ...] [--scenes 8] [--episodes 300]` times a map update and a plan at 64 x 64, and
-searches in generated val scenes (all three worlds without arguments) with the agent's own body and no learned policy:
+`python benchmarks/maps.py [WORLD ...]` times a map update and a plan at 64 x 64, and searches in generated val scenes
+(all three worlds without arguments) with the agent's own body and no learned policy:
 
   nearest     the nearest frontier
   random      a random block every 25 actions
@@ -12,7 +12,7 @@ searches in generated val scenes (all three worlds without arguments) with the a
 Rates are percent. The result goes to stdout as JSON.
 """
 
-import argparse
+import sys
 from typing import Any
 
 import jax
@@ -27,7 +27,7 @@ from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import find_method
-from jaxnav.policies.methods.map_tracker import FREE_BIT, WALL_BIT, PlacedView, SemanticMap
+from jaxnav.policies.methods.map_tracker import FREE_BIT, WALL_BIT, draw_view
 from jaxnav.policies.methods.semexp import SEMEXP, cell_positions, learn_search_setup
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.policies.wavefront import find_path, pack_board
@@ -41,16 +41,13 @@ from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 #: Updates or plans in a timed call.
 REPEATS = 1000
 TURNS = 7
+NUM_SCENES = 8
+NUM_EPISODES = 300
 NEAREST = "jaxnav.policies.methods.semexp:NEAREST"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("worlds", nargs="*", default=list(WORLDS))
-    parser.add_argument("--scenes", type=int, default=8)
-    parser.add_argument("--episodes", type=int, default=300)
-    options = parser.parse_args()
-    results = {world: run_searches(world, options.scenes, options.episodes) for world in options.worlds}
+def main(world_names: list[str]) -> None:
+    results = {name: run_searches(name) for name in world_names or WORLDS}
     print_report({"microseconds": measure_costs(), "found": results})
 
 
@@ -59,21 +56,19 @@ def measure_costs(size: int = 64) -> dict[str, Any]:
     # Random observations and a random map.
     rng = np.random.default_rng(0)
     row_format = RowFormat(22)
-    semantic_map = SemanticMap(size)
     row = jnp.asarray(rng.integers(0, 256, row_format.num_bytes, np.uint8))
     passable = pack_board(jnp.asarray(rng.random((size, size)) < 0.7))
     target = pack_board(jnp.zeros((size, size), bool).at[3, 3].set(True))
 
     # Positions change from call to call, so that the loop cannot be simplified.
     def update_map(i: jax.Array, cells: jax.Array) -> jax.Array:
-        view = PlacedView(row, jnp.array([30, 30]) + i % 5, i % 12)
-        return semantic_map.update(cells, view, row_format, 12)
+        return draw_view(cells, row, jnp.array([30, 30]) + i % 5, i % 12, row_format, 12)
 
     def plan(i: jax.Array, total_length: jax.Array) -> jax.Array:
         return total_length + find_path(target, passable, jnp.array([20, 20]) + i % 20).length
 
     loops = {
-        "update": jax.jit(lambda: jax.lax.fori_loop(0, REPEATS, update_map, semantic_map.init())),
+        "update": jax.jit(lambda: jax.lax.fori_loop(0, REPEATS, update_map, jnp.zeros((size, size), jnp.uint32))),
         "plan": jax.jit(lambda: jax.lax.fori_loop(0, REPEATS, plan, jnp.int32(0))),
     }
     mean_length = int(loops["plan"]()) / REPEATS
@@ -84,14 +79,14 @@ def measure_costs(size: int = 64) -> dict[str, Any]:
     return costs | {"steps_of_a_plan": mean_length}
 
 
-def run_searches(world_name: str, num_scenes: int, num_episodes: int) -> dict[str, dict[str, float]]:
+def run_searches(world_name: str) -> dict[str, dict[str, float]]:
     """Return the results of every search in val scenes of a world."""
     world = WORLDS[world_name]
-    split = make_generated_scenes(world_name, "val", num_scenes)
-    scenes = [split[index] for index in range(num_scenes)]
+    split = make_generated_scenes(world_name, "val", NUM_SCENES)
+    scenes = [split[index] for index in range(NUM_SCENES)]
     bank = compile_bank(scenes, world.task)
     env, params = build_environment(bank, {"living_room": world.large_step_limit}, world.step_limit)
-    episodes = draw_episodes(bank, num_episodes, seed=0)
+    episodes = draw_episodes(bank, NUM_EPISODES, seed=0)
     search_setup = learn_search_setup([bank], np.zeros(0))
 
     # Method of each search, and its changes to the search setup.
@@ -199,4 +194,4 @@ def draw_true_maps(scenes: list[Scene], bank: Bank, episodes: EpisodeList, map_s
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -30,7 +30,6 @@ from jaxnav.policies.methods.hoz import (
     find_next_zones,
     learn_permuted_zones,
     learn_zones,
-    measure_indirect_paths,
 )
 from jaxnav.scenes.lattice import best_actions
 from jaxnav.scenes.tables.compile import Bank, compile_bank
@@ -99,6 +98,36 @@ def shuffle_edges(adjacency: np.ndarray) -> Iterator[np.ndarray]:
         edges = np.zeros_like(adjacency)
         edges[:, rows, columns] = rng.permuted(relative_strength[:, rows, columns], axis=1)
         yield find_next_zones(edges + np.swapaxes(edges, 1, 2))
+
+
+def measure_indirect_paths(nodes: np.ndarray, next_zone: np.ndarray, is_goal: np.ndarray) -> tuple[float, float]:
+    """Measure how often the best path leads through an intermediate zone.
+
+    Args:
+      nodes: float32 [rooms, Z, K], from `learn_zones`.
+      next_zone: int32 [rooms, Z, Z], from `learn_zones`.
+      is_goal: bool [K], True for categories that can be goals.
+
+    Returns:
+      The share of indirect paths among pairs of different zones, and among pairs of a zone and a goal in a different
+      zone; 0 without such pairs.
+    """
+    # Pairs [rooms, Z, Z] of different zones that are not empty.
+    zones = np.arange(nodes.shape[-2])
+    has_poses = nodes.max(axis=-1) >= 0
+    pairs = has_poses[:, :, None] & has_poses[:, None, :] & (zones[:, None] != zones)
+    indirect_pairs = pairs & (next_zone != zones)
+
+    # Pairs of a zone and a goal that occurs in the room type.
+    rooms, goals = np.nonzero(is_goal & (nodes.max(axis=-2) > 0))
+    goal_zones = nodes.argmax(axis=-2)[rooms, goals]
+    num_goal_pairs = pairs[rooms, :, goal_zones].sum()
+    num_indirect_goal_pairs = indirect_pairs[rooms, :, goal_zones].sum()
+
+    # Shares among both kinds of pairs.
+    zone_share = float(indirect_pairs.sum() / max(pairs.sum(), 1))
+    goal_share = float(num_indirect_goal_pairs / max(num_goal_pairs, 1))
+    return zone_share, goal_share
 
 
 def room_type_of_poses(bank: Bank) -> np.ndarray:

@@ -12,7 +12,6 @@ from support.scenes import BOOK, CHAIR, FRIDGE
 from support.zones import (
     BEDROOM,
     EAST,
-    EVERY,
     KITCHEN,
     KITCHENS,
     NOTHING,
@@ -22,6 +21,7 @@ from support.zones import (
     K,
     corridor,
     holding,
+    indirect_share,
     learned,
 )
 
@@ -34,7 +34,6 @@ from jaxnav.policies.methods.hoz import (
     ZoneTracker,
     learn_permuted_zones,
     learn_zones,
-    measure_indirect_paths,
 )
 from jaxnav.policies.network import bind, init_params
 from jaxnav.policies.pathways import NO_ACTION
@@ -88,7 +87,7 @@ def test_zones_without_poses_are_never_entered():
     assert held.sum() == 3
     assert (zones["nodes"][KITCHEN][~held] == -1).all()
     assert (zones["nodes"][BEDROOM] == -1).all()
-    assert measure_indirect_paths(zones["nodes"], zones["next_zone"], EVERY) == (2 / 6, 2 / 6)
+    assert indirect_share(zones, zones["next_zone"]) == 2 / 6
     assert all(np.isfinite(zones[name]).all() for name in ("nodes", "mixing", "detected"))
     knowledge = Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, zones))
     note = ZoneTracker().init(knowledge)
@@ -165,7 +164,7 @@ def test_permuted_relations_change_the_experience_and_nothing_else_of_the_graph(
     zones, permuted = learn_zones(bank, NOTHING, 3), learn_permuted_zones(bank, NOTHING, 3)
     for name in ("nodes", "detected", "frequency"):
         np.testing.assert_array_equal(zones[name], permuted[name])
-    assert measure_indirect_paths(zones["nodes"], permuted["next_zone"], EVERY) == (2 / 6, 2 / 6)
+    assert indirect_share(zones, permuted["next_zone"]) == 2 / 6
     # Each zone got the place of the one before it, loop and all: the graph is the same under other names.
     loops, moved = (np.diagonal(graph["mixing"][KITCHEN]) for graph in (zones, permuted))
     np.testing.assert_array_equal(moved, np.roll(loops, 1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.scenes import BOOK, CHAIR, FRIDGE
-from support.zones import BEDROOM, EVERY, KITCHEN, KITCHENS, NOTHING, PATH, TASK, K, corridor, holding, learned
+from support.zones import BEDROOM, KITCHEN, KITCHENS, NOTHING, PATH, TASK, K, corridor, holding, indirect_share, learned
 
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
@@ -15,7 +15,6 @@ from jaxnav.policies.methods.hoz import (
     compute_adjacency,
     find_next_zones,
     learn_zones,
-    measure_indirect_paths,
 )
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
@@ -43,10 +42,7 @@ def test_the_graph_of_a_corridor_is_the_one_by_hand():
     assert following[book, chair] == chair
     assert following[chair, fridge] == fridge
     assert [following[zone, zone] for zone in range(3)] == [0, 1, 2]
-    # 2 of the 6 pairs of zones, and the same of zones and goals, for each category has a zone of its own.
-    assert measure_indirect_paths(zones["nodes"], zones["next_zone"], EVERY) == (2 / 6, 2 / 6)
-    # Chair alone is next to both: of its two pairs with another zone, none is indirect.
-    assert measure_indirect_paths(zones["nodes"], zones["next_zone"], np.arange(K) == CHAIR) == (2 / 6, 0.0)
+    assert indirect_share(zones, zones["next_zone"]) == 2 / 6
 
 
 def test_next_zones_are_those_of_the_best_of_all_paths():
@@ -114,8 +110,6 @@ def test_indirect_paths_exist_where_edges_are_relative_and_not_where_they_are_ab
     bank = compile_bank((train_scenes[i] for i in range(scenes)), task)
     nothing = np.zeros((NUM_PRIORS, *2 * [len(task.categories)]))
     zones = learn_zones([bank], nothing)
-    assert min(measure_indirect_paths(zones["nodes"], zones["next_zone"], task.is_goal())) > 0.2
+    assert indirect_share(zones, zones["next_zone"]) > 0.2
     graphs, _ = build_room_graphs([bank], len(task.categories), 8)
-    assert (
-        max(measure_indirect_paths(zones["nodes"], find_next_zones(compute_adjacency(graphs)), task.is_goal())) < 0.02
-    )
+    assert indirect_share(zones, find_next_zones(compute_adjacency(graphs))) < 0.02

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
 
-from jaxnav.errors import InputError
-from jaxnav.policies.methods.map_tracker import EXPLORED_BIT, FREE_BIT, VISITED_BIT, WALL_BIT, PlacedView, SemanticMap
+from jaxnav.policies.methods.map_tracker import EXPLORED_BIT, FREE_BIT, VISITED_BIT, WALL_BIT, draw_view, mark_collision
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE
@@ -18,8 +17,8 @@ from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, VIEW_BLOCKED,
 from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_RIGHT, Task
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
-MAP, ROWS, HEADINGS = SemanticMap(32), RowFormat(len(CATEGORIES)), 8
-update = jax.jit(functools.partial(MAP.update, row_format=ROWS, headings=HEADINGS))
+EMPTY, ROWS, HEADINGS = jnp.zeros((32, 32), jnp.uint32), RowFormat(len(CATEGORIES)), 8
+update = jax.jit(functools.partial(draw_view, row_format=ROWS, headings=HEADINGS))
 START = 16
 
 
@@ -35,7 +34,7 @@ def row(view, detections=()):
 
 
 def look(cells, place, heading, *what):
-    return update(cells, PlacedView(row(*what), jnp.array(place, jnp.int32), jnp.int32(heading)))
+    return update(cells, row(*what), jnp.array(place, jnp.int32), jnp.int32(heading))
 
 
 def drawn(cells, rows, z, x):
@@ -62,7 +61,7 @@ def test_a_known_walk_is_the_map_that_was_drawn_by_hand():
     North is +z, lines further down. Cells up to 1.5 m away (6 cells) are explored.
     """
     north = [(1, 0, VIEW_FREE), (6, 0, VIEW_FREE), (7, 0, VIEW_BLOCKED), (7, 1, VIEW_FREE)]
-    cells = look(MAP.init(), (START, START), 0, north, [(BOOK, 1.75, 0.0)])
+    cells = look(EMPTY, (START, START), 0, north, [(BOOK, 1.75, 0.0)])
     drawn(cells, ["v.", "F.", "..", "..", "..", "..", "F.", "bf"], START, START)
     # East is +x; its right is south. The chair is a cell ahead and a cell to the right.
     east = [(1, 0, VIEW_FREE), (1, 1, VIEW_FREE), (2, -1, VIEW_BLOCKED)]
@@ -73,14 +72,14 @@ def test_a_known_walk_is_the_map_that_was_drawn_by_hand():
 
 
 def test_the_map_goes_on_at_the_opposite_edge():
-    cells = look(MAP.init(), (31, 0), 0, [(1, -1, VIEW_FREE)], [(BOOK, 0.5, 0.0)])
+    cells = look(EMPTY, (31, 0), 0, [(1, -1, VIEW_FREE)], [(BOOK, 0.5, 0.0)])
     detections = {tuple(map(int, cell)) for cell in np.argwhere(np.asarray(cells))}
     assert detections == {(31, 0), (0, 31), (1, 0)}
 
 
 def test_later_looks_clear_false_alarms_nearby_and_nothing_else():
     ahead = [(3, 0, VIEW_FREE), (7, 0, VIEW_FREE)]
-    alarmed = look(MAP.init(), (START, START), 0, ahead, [(BOOK, 0.75, 0.0), (CHAIR, 1.75, 0.0), (FRIDGE, 0.0, 1.0)])
+    alarmed = look(EMPTY, (START, START), 0, ahead, [(BOOK, 0.75, 0.0), (CHAIR, 1.75, 0.0), (FRIDGE, 0.0, 1.0)])
     cleared = look(alarmed, (START, START), 0, ahead)
     marks = {category: np.argwhere(np.asarray(cleared) >> category & 1).tolist() for category in (BOOK, CHAIR, FRIDGE)}
     # Too far to be sure, and not in view.
@@ -90,8 +89,8 @@ def test_later_looks_clear_false_alarms_nearby_and_nothing_else():
 
 
 def test_what_the_agent_runs_into_is_a_wall():
-    bump = jax.jit(MAP.mark_collision)
-    free = look(MAP.init(), (START, START), 0, [(1, 0, VIEW_FREE)])
+    bump = jax.jit(mark_collision)
+    free = look(EMPTY, (START, START), 0, [(1, 0, VIEW_FREE)])
     ahead = jnp.array([START + 1, START], jnp.int32)
     cells = bump(free, ahead, jnp.int32(MOVE_AHEAD), jnp.bool_(False))
     assert int(cells[START + 1, START]) == WALL_BIT | EXPLORED_BIT
@@ -105,15 +104,15 @@ def test_maps_of_random_walks_agree_with_the_home(world):
     task = WORLDS[world].task
     scene = make_generated_scenes(world, "train", 1)[0]
     bank = compile_bank([scene], Task(task.categories, task.goals, task.rules, PERFECT_DETECTOR))
-    rules, rows, around = task.rules, RowFormat(len(task.categories)), SemanticMap(96)
-    take_in = jax.jit(lambda cells, seen: around.update(cells, seen, rows, rules.headings))
+    rules, rows = task.rules, RowFormat(len(task.categories))
+    take_in = jax.jit(functools.partial(draw_view, row_format=rows, headings=rules.headings))
     places, generator = standable_cells(scene.reach), np.random.default_rng(0)
-    pose, cells, been = len(bank.rows) // 2, around.init(), set()
+    pose, cells, been = len(bank.rows) // 2, jnp.zeros((96, 96), jnp.uint32), set()
     for _ in range(400):
         cell, heading = divmod(pose // len(rules.horizons), rules.headings)
         been.add(tuple(places[cell] % 96))
         place = jnp.asarray(places[cell], jnp.int32)
-        cells = take_in(cells, PlacedView(jnp.asarray(bank.rows[pose]), place, jnp.int32(heading)))
+        cells = take_in(cells, jnp.asarray(bank.rows[pose]), place, jnp.int32(heading))
         pose = bank.successor[pose, generator.choice(5, p=[0.5, 0.15, 0.15, 0.1, 0.1])]
     cells, inside = np.asarray(cells), set(map(tuple, places % 96))
     kinds = {flag: set(map(tuple, np.argwhere(cells & flag))) for flag in (FREE_BIT, WALL_BIT, VISITED_BIT)}
@@ -130,9 +129,3 @@ def test_maps_of_random_walks_agree_with_the_home(world):
         away = np.abs((centres[object_categories == category] - mark + 48) % 96 - 48).max(axis=1)
         assert away.min() <= 1.0  # half a cell of rounding, and bytes
     assert len(marks) > 1
-
-
-def test_a_size_that_is_no_multiple_of_a_word_is_refused():
-    for size in (0, 40):
-        with pytest.raises(InputError, match=f"size is {size}; give a multiple of 32"):
-            SemanticMap(size)

@@ -18,7 +18,6 @@ EAST, WEST = 2, 6  # headings
 ROOMS = [prior_index(room) for room in ("kitchen", "bedroom")]
 KITCHEN, BEDROOM = ROOMS
 NOTHING = np.zeros((NUM_PRIORS, K, K))
-EVERY = np.ones(K, bool)
 
 
 def corridor(*shown, room_type="kitchen"):
@@ -69,6 +68,14 @@ def learned(*banks_of, zones=3):
 
 
 KITCHENS = (((BOOK, CHAIR, FRIDGE), "kitchen"),)
+
+
+def indirect_share(zones, next_zone):
+    """Share of the pairs of different zones with poses whose best path leads through another zone."""
+    zone = np.arange(zones["nodes"].shape[-2])
+    held = zones["nodes"].max(axis=-1) >= 0
+    pairs = held[:, :, None] & held[:, None, :] & (zone[:, None] != zone)
+    return (pairs & (next_zone != zone)).sum() / pairs.sum()
 
 
 def holding(zones, category, room=KITCHEN):

@@ -20,10 +20,10 @@ from jaxnav.policies.methods.map_tracker import (
     TRIED_BIT,
     WALL_BIT,
     SearchState,
-    SemanticMap,
     category_bit,
     goal_on_map,
     has_category,
+    neighbourhood,
 )
 from jaxnav.policies.wavefront import PathField, find_path, follow_path, pack_board, turn_towards
 from jaxnav.scenes.scene import CELL_SIZE
@@ -214,7 +214,7 @@ def _record_failed_view(state: SearchState, goal_location: GoalLocation, is_fail
     failed_views = state.failed_views + is_failed_view.astype(jnp.int32)
     is_given_up = failed_views >= PATIENCE
     cleared_bit = jnp.where(is_given_up, category_bit(state.goal), NO_BITS)
-    rows, columns = SemanticMap(len(cells)).neighbourhood(goal_location.position)
+    rows, columns = neighbourhood(goal_location.position, len(cells))
     cells = cells.at[rows, columns].set(cells[rows, columns] & ~cleared_bit)
     return state._replace(cells=cells, failed_views=jnp.where(is_given_up, 0, failed_views))
 

@@ -1,6 +1,6 @@
 """Tracker of SemExp: the semantic map of an episode, and the state of the search on it.
 
-`SemanticMap` draws views on a toroidal map by compass and odometry, one 32-bit word per cell. `MapTracker` updates the
+`draw_view` draws views on a toroidal map by compass and odometry, one 32-bit word per cell. `MapTracker` updates the
 `SearchState`, which holds the map and from which `jaxnav.policies.methods.local_policy` plans actions, and reads the
 map block by block for the network.
 """
@@ -13,9 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.errors import InputError
 from jaxnav.policies.method import Knowledge, Percept
-from jaxnav.policies.wavefront import WORD_BITS
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.observation_row import (
     MIN_RANGE,
@@ -57,122 +55,97 @@ GOAL_CONFIRMED = 2
 # The map
 
 
-class PlacedView(NamedTuple):
-    """A view and the pose of the camera.
+def draw_view(
+    cells: jax.Array, row: jax.Array, position: jax.Array, heading: jax.Array, row_format: RowFormat, headings: int
+) -> jax.Array:
+    """Draw a view on the map of one episode, and return the map uint32 [N, N].
 
-    Attributes:
+    The map is toroidal, so a home fits on it for every start of the agent. Nearby cells lose the categories that the
+    detector does not report, because it would have detected them.
+
+    Args:
+      cells: uint32 [N, N], the map before the view; N is a multiple of 32.
       row: uint8 [R], the observation row.
       position: int32 [2], (z, x) of the agent's cell.
       heading: int32 [], compass heading.
+      row_format: format of the observation row.
+      headings: H, number of headings of the task.
     """
+    # Map cells [V V] of the view. Two cells of the view may share a map cell, whose state they then share.
+    size = len(cells)
+    offset_table, twin_table = _view_tables(headings, row_format.view)
+    near_table = CELL_SIZE * np.hypot(*np.moveaxis(offset_table, -1, 0)) <= MIN_RANGE
+    offsets = jnp.asarray(offset_table)[heading]
+    twins = jnp.asarray(twin_table)[heading]
+    is_near = jnp.asarray(near_table)[heading]
+    rows, columns = ((position[None] + offsets) % size).T
+    view = row_format.view_cells(row)
+    view = jnp.maximum(view, view[twins])
 
-    row: jax.Array
-    position: jax.Array
-    heading: jax.Array
+    # Detected categories [K], each with a bit of its own.
+    category_bits = np.uint32(1) << np.arange(row_format.num_categories, dtype=np.uint32)
+    detected_bits = jnp.where(row_format.presence(row), category_bits, NO_BITS)
+
+    # Floor and walls: seen cells get new flags, unseen cells keep theirs.
+    is_free = view == VIEW_FREE
+    is_seen = is_free | (view == VIEW_BLOCKED)
+    new_bits = jnp.where(is_free, FREE_BIT, WALL_BIT) | jnp.where(is_near, EXPLORED_BIT, NO_BITS)
+    undetected_bits = CATEGORY_BITS & ~detected_bits.sum(dtype=jnp.uint32)
+    cleared_bits = jnp.where(is_near, undetected_bits, NO_BITS) | jnp.where(is_free, WALL_BIT, FREE_BIT)
+    words = cells[rows, columns]
+    cells = cells.at[rows, columns].set(jnp.where(is_seen, words & ~cleared_bits | new_bits, words))
+
+    # The agent's own cell is always free, visited and explored.
+    own_row, own_column = position
+    own_word = cells[own_row, own_column] & ~WALL_BIT | VISITED_BIT | FREE_BIT | EXPLORED_BIT
+    cells = cells.at[own_row, own_column].set(own_word)
+
+    # Adding the missing bits is a bitwise or.
+    rows, columns = detection_cells(row, position, heading, row_format, headings, size).T
+    return cells.at[rows, columns].add(detected_bits & ~cells[rows, columns])
 
 
-@dataclasses.dataclass(frozen=True)
-class SemanticMap:
-    """Functions on the map uint32 [N, N] of one episode; hashable.
+def detection_cells(
+    row: jax.Array, position: jax.Array, heading: jax.Array, row_format: RowFormat, headings: int, size: int
+) -> jax.Array:
+    """Return the map cell int32 [K, 2] of each category's detection; without a detection it is meaningless.
 
-    The map is toroidal, so a home fits on it for every start of the agent. All functions take one episode; callers
-    `vmap`.
-
-    Attributes:
-      size: N, cells along each side, a multiple of 32.
+    Args:
+      row, position, heading, row_format, headings: as in `draw_view`.
+      size: N, cells along each side of the map.
     """
+    # Metres ahead and to the right of the agent, [K].
+    detections = row_format.detections(row).astype(jnp.float32)
+    ahead, right = relative_position(detections)
 
-    size: int = 64
+    # Turn the offsets by the heading; directions are (z, x).
+    forward = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[heading][::-1]
+    rightward = jnp.stack([-forward[1], forward[0]])
+    offsets = (ahead[:, None] * forward[None] + right[:, None] * rightward[None]) / CELL_SIZE
+    return (position[None] + jnp.rint(offsets).astype(jnp.int32)) % size
 
-    def __post_init__(self) -> None:
-        if self.size < WORD_BITS or self.size % WORD_BITS:
-            raise InputError(f"SemanticMap: size is {self.size}; give a multiple of {WORD_BITS}, {WORD_BITS} or more")
 
-    def init(self) -> jax.Array:
-        """Return an empty map."""
-        return jnp.zeros((self.size, self.size), jnp.uint32)
+def neighbourhood(position: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
+    """Return rows and columns, int32 [9] each, of a cell int32 [2] and its eight neighbours on a map of N cells."""
+    offsets = np.moveaxis(np.indices((3, 3)), 0, -1).reshape(-1, 2).astype(np.int32) - 1
+    rows, columns = ((position[None] + offsets) % size).T
+    return rows, columns
 
-    def advance(self, position: jax.Array, moved: jax.Array, step: jax.Array) -> jax.Array:
-        """Return the position int32 [2] after a step (dz, dx), unchanged where the agent did not move."""
-        return (position + jnp.where(moved, step, 0)) % self.size
 
-    def update(self, cells: jax.Array, placed_view: PlacedView, row_format: RowFormat, headings: int) -> jax.Array:
-        """Draw a view.
+def mark_collision(cells: jax.Array, ahead: jax.Array, action: jax.Array, moved: jax.Array) -> jax.Array:
+    """Mark the cell ahead of the agent as explored, and as a wall where the agent ran into it.
 
-        Nearby cells lose the categories that the detector does not report, because it would have detected them.
-
-        Args:
-          cells: uint32 [N, N], the map before the view.
-          placed_view: the view and its pose.
-          row_format: format of the observation row.
-          headings: H, number of headings of the task.
-        """
-        # Map cells [V V] of the view. Two cells of the view may share a map cell, whose state they then share.
-        offset_table, twin_table = _view_tables(headings, row_format.view)
-        near_table = CELL_SIZE * np.hypot(*np.moveaxis(offset_table, -1, 0)) <= MIN_RANGE
-        offsets = jnp.asarray(offset_table)[placed_view.heading]
-        twins = jnp.asarray(twin_table)[placed_view.heading]
-        is_near = jnp.asarray(near_table)[placed_view.heading]
-        rows, columns = ((placed_view.position[None] + offsets) % self.size).T
-        view = row_format.view_cells(placed_view.row)
-        view = jnp.maximum(view, view[twins])
-
-        # Floor and walls: seen cells get new flags, unseen cells keep theirs.
-        is_free = view == VIEW_FREE
-        is_seen = is_free | (view == VIEW_BLOCKED)
-        new_bits = jnp.where(is_free, FREE_BIT, WALL_BIT) | jnp.where(is_near, EXPLORED_BIT, NO_BITS)
-        undetected_bits = CATEGORY_BITS & ~self.detected_bits(placed_view.row, row_format)
-        cleared_bits = jnp.where(is_near, undetected_bits, NO_BITS) | jnp.where(is_free, WALL_BIT, FREE_BIT)
-        words = cells[rows, columns]
-        cells = cells.at[rows, columns].set(jnp.where(is_seen, words & ~cleared_bits | new_bits, words))
-
-        # The agent's own cell is always free, visited and explored.
-        row, column = placed_view.position
-        own_word = cells[row, column] & ~WALL_BIT | VISITED_BIT | FREE_BIT | EXPLORED_BIT
-        cells = cells.at[row, column].set(own_word)
-
-        # Detected categories [K]. Each has a bit of its own, so adding missing bits is a bitwise or.
-        rows, columns = self.detection_cells(placed_view, row_format, headings).T
-        detected_bits = jnp.where(row_format.presence(placed_view.row), _category_bits(row_format), NO_BITS)
-        return cells.at[rows, columns].add(detected_bits & ~cells[rows, columns])
-
-    def detection_cells(self, placed_view: PlacedView, row_format: RowFormat, headings: int) -> jax.Array:
-        """Return the map cell int32 [K, 2] of each category's detection; without a detection it is meaningless."""
-        # Metres ahead and to the right of the agent, [K].
-        detections = row_format.detections(placed_view.row).astype(jnp.float32)
-        ahead, right = relative_position(detections)
-
-        # Turn the offsets by the heading; directions are (z, x).
-        forward = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[placed_view.heading][::-1]
-        rightward = jnp.stack([-forward[1], forward[0]])
-        offsets = (ahead[:, None] * forward[None] + right[:, None] * rightward[None]) / CELL_SIZE
-        return (placed_view.position[None] + jnp.rint(offsets).astype(jnp.int32)) % self.size
-
-    def neighbourhood(self, position: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return rows and columns, int32 [9] each, of a cell int32 [2] and its eight neighbours."""
-        offsets = np.moveaxis(np.indices((3, 3)), 0, -1).reshape(-1, 2).astype(np.int32) - 1
-        rows, columns = ((position[None] + offsets) % self.size).T
-        return rows, columns
-
-    @staticmethod
-    def detected_bits(row: jax.Array, row_format: RowFormat) -> jax.Array:
-        """Return the word uint32 [] with the bits of all detected categories."""
-        return jnp.where(row_format.presence(row), _category_bits(row_format), NO_BITS).sum(dtype=jnp.uint32)
-
-    def mark_collision(self, cells: jax.Array, ahead: jax.Array, action: jax.Array, moved: jax.Array) -> jax.Array:
-        """Mark the cell ahead of the agent as explored, and as a wall where the agent ran into it.
-
-        Args:
-          cells: uint32 [N, N].
-          ahead: int32 [2], the cell ahead, which may lie beyond an edge.
-          action: int32 [], the previous action.
-          moved: bool [], True where the previous action changed the cell.
-        """
-        row, column = ahead % self.size
-        is_wall = (action == MOVE_AHEAD) & ~moved
-        word = cells[row, column]
-        marked_word = jnp.where(is_wall, word & ~FREE_BIT | WALL_BIT, word) | EXPLORED_BIT
-        return cells.at[row, column].set(marked_word)
+    Args:
+      cells: uint32 [N, N].
+      ahead: int32 [2], the cell ahead, which may lie beyond an edge.
+      action: int32 [], the previous action.
+      moved: bool [], True where the previous action changed the cell.
+    """
+    row, column = ahead % len(cells)
+    is_wall = (action == MOVE_AHEAD) & ~moved
+    word = cells[row, column]
+    marked_word = jnp.where(is_wall, word & ~FREE_BIT | WALL_BIT, word) | EXPLORED_BIT
+    return cells.at[row, column].set(marked_word)
 
 
 def has_category(cells: jax.Array, category: jax.Array) -> jax.Array:
@@ -183,11 +156,6 @@ def has_category(cells: jax.Array, category: jax.Array) -> jax.Array:
 def category_bit(category: jax.Array) -> jax.Array:
     """Return the bit uint32 [] of a category int32 []."""
     return jnp.uint32(1) << category.astype(jnp.uint32)
-
-
-def _category_bits(row_format: RowFormat) -> np.ndarray:
-    """Return the bits of all categories, uint32 [K]."""
-    return np.uint32(1) << np.arange(row_format.num_categories, dtype=np.uint32)
 
 
 @functools.lru_cache
@@ -218,7 +186,7 @@ class SearchState(NamedTuple):
     """Map of an episode and state of the search.
 
     Attributes:
-      cells: uint32 [N, N], see `SemanticMap`.
+      cells: uint32 [N, N], the map, see `draw_view`.
       position: int32 [2], (z, x) of the agent's cell.
       heading: int32 [], compass heading.
       horizon: int32 [], index of the camera's horizon.
@@ -270,13 +238,13 @@ class MapTracker:
     def init(self, knowledge: Knowledge) -> SearchState:
         """Return an empty map with the agent at its centre."""
         # The knowledge has an entry for each row of the map.
-        semantic_map = SemanticMap(len(knowledge.method["lines"]))
-        centre = jnp.full(2, semantic_map.size // 2, jnp.int32)
+        size = len(knowledge.method["lines"])
+        centre = jnp.full(2, size // 2, jnp.int32)
         zero = jnp.int32(0)
 
         # Without actions left, the policy chooses a block at the first step.
         return SearchState(
-            cells=semantic_map.init(),
+            cells=jnp.zeros((size, size), jnp.uint32),
             position=centre,
             heading=zero,
             horizon=zero,
@@ -294,19 +262,17 @@ class MapTracker:
         # Follow the agent by compass and odometry.
         strides = knowledge.method["steps"]
         row_format = RowFormat(knowledge.layout.shape[-1])
-        semantic_map = SemanticMap(len(state.cells))
         stride = strides[percept.heading]
-        position = semantic_map.advance(state.position, percept.moved, stride)
-        placed_view = PlacedView(percept.row, position, percept.heading)
+        position = (state.position + jnp.where(percept.moved, stride, 0)) % len(state.cells)
 
         # Only a new view can confirm the goal: after a collision the view is the previous one.
-        goal_sight, success_distance = self._judge_goal_sight(state, placed_view, percept.goal, knowledge)
+        goal_sight, success_distance = self._judge_goal_sight(state, percept, position, knowledge)
         is_new_view = (percept.action != MOVE_AHEAD) | percept.moved
         confirmed_sight = jnp.where(is_new_view, goal_sight, jnp.minimum(goal_sight, state.goal_sight))
 
         # Draw the view, the collision and a cleared goal on the map.
-        cells = semantic_map.update(state.cells, placed_view, row_format, len(strides))
-        cells = semantic_map.mark_collision(cells, position + stride, percept.action, percept.moved)
+        cells = draw_view(state.cells, percept.row, position, percept.heading, row_format, len(strides))
+        cells = mark_collision(cells, position + stride, percept.action, percept.moved)
         cells = _clear_goal_once(state.cells, cells, position, percept.goal)
 
         # The search starts with the lowest horizon; a goal nearby resets the failed views.
@@ -326,7 +292,6 @@ class MapTracker:
 
     def read(self, state: SearchState, knowledge: Knowledge, goal: jax.Array) -> MapReading:
         """Return the map around the agent, block by block, and the compass."""
-        del goal
         size = len(state.cells)
         block_size = size // BLOCKS_PER_SIDE
         headings = len(knowledge.method["steps"])
@@ -340,7 +305,7 @@ class MapTracker:
         return MapReading(joined_bits.reshape(-1), compass)
 
     def _judge_goal_sight(
-        self, state: SearchState, placed_view: PlacedView, goal: jax.Array, knowledge: Knowledge
+        self, state: SearchState, percept: Percept, position: jax.Array, knowledge: Knowledge
     ) -> tuple[jax.Array, jax.Array]:
         """Judge if the view shows the goal near enough for Done.
 
@@ -352,18 +317,20 @@ class MapTracker:
         """
         setup = knowledge.method
         row_format = RowFormat(knowledge.layout.shape[-1])
-        semantic_map = SemanticMap(len(state.cells))
+        goal = percept.goal
+        size = len(state.cells)
 
         # Distance of the detected goal, and how much its size adds to the distance of success.
-        detection = row_format.detections(placed_view.row)[goal].astype(jnp.float32)
+        detection = row_format.detections(percept.row)[goal].astype(jnp.float32)
         is_detected = detection[0] > 0
         distance = jnp.hypot(*relative_position(detection))
         size_bonus = setup["edge"] * detection[3] / SIZE_SCALE * jnp.maximum(distance, CELL_SIZE)
         success_distance = setup["enough"] + size_bonus
 
         # An earlier view confirms the goal if it marked the goal in this cell or in a neighbouring cell.
-        goal_position = semantic_map.detection_cells(placed_view, row_format, len(setup["steps"]))[goal]
-        rows, columns = semantic_map.neighbourhood(goal_position)
+        headings = len(setup["steps"])
+        positions = detection_cells(percept.row, position, percept.heading, row_format, headings, size)
+        rows, columns = neighbourhood(positions[goal], size)
         is_confirmed = has_category(state.cells[rows, columns], goal).any()
 
         near_sight = jnp.where(is_confirmed, GOAL_CONFIRMED, GOAL_NEAR)
