@@ -10,16 +10,12 @@ from jaxnav import __version__
 COMMANDS = {
     "train": "train a method with and without the layout estimator",
     "eval": "evaluate a run: tables of variants, epsilons and seeds",
-    "account": "say what experience is worth, beside a run of agents without any",
-    "mixture": "remove experience where half of the scenes are shifted: what is kept, recovered, known",
     "report": "show a run on one page: tables, curves and replays side by side",
     "log": "show a training log in TensorBoard or Weights & Biases, also while training goes on",
     "export": "export a policy with its model card, also as a program that runs without jaxnav",
     "episode": "draw one evaluation episode, at one or several layout shifts",
     "play": "look for an object yourself, in the terminal, with what an agent perceives",
-    "instrument": "prove that the layout shift leaves the difficulty and costs the baseline",
-    "study": "put the claims of the paper to the test: runs, results, figures, a document",
-    "compare": "compare methods without and with the layout: Table 2 of the paper, ablations",
+    "study": "run an experiment: the paper's claims, tables and ablations, or what the experience of a run is worth",
     "scenes": "import scenes, show one as a picture, tell what a file of them holds",
     "table": "print an evaluation as a Markdown table",
 }
@@ -30,8 +26,13 @@ Each has its own --help; --version prints the version.
 Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. The environment variable
 JAX_COMPILATION_CACHE_DIR names another folder; with JAX_ENABLE_COMPILATION_CACHE=0 none are kept."""
 
-#: Modules of `jaxnav.cli` for the commands that share one; there the entry point of NAME is `NAME_main`.
-_SHARED_MODULES = {"compare": "study", "instrument": "study", "mixture": "study"}
+#: Commands that became experiments, with what replaces them.
+_FORMER_COMMANDS = {
+    "account": "study account --run RUN --without RUN",
+    "mixture": "study mixture --run RUN --without RUN",
+    "instrument": "study instrument --run RUN",
+    "compare": "study table2",
+}
 
 #: Exit code if the reader of the output has gone: 128 plus SIGPIPE, as of other programs.
 _BROKEN_PIPE = 141
@@ -60,6 +61,9 @@ def _dispatch(arguments: list[str] | None) -> int:
     if name == "--version":
         print(f"jaxnav {__version__}")
         return 0
+    if name in _FORMER_COMMANDS:
+        print(f"error: jaxnav {name} is jaxnav {_FORMER_COMMANDS[name]} now", file=sys.stderr)
+        return 2
     if name not in COMMANDS:
         matches = difflib.get_close_matches(name, COMMANDS, n=1)
         advice = f"did you mean {matches[0]!r}?" if matches else f"choose one of {', '.join(COMMANDS)}"
@@ -69,9 +73,8 @@ def _dispatch(arguments: list[str] | None) -> int:
     # Find methods in the working directory, as `python -m jaxnav` does.
     if "" not in sys.path:
         sys.path.insert(0, "")
-    module = importlib.import_module(f"jaxnav.cli.{_SHARED_MODULES.get(name, name)}")
-    entry_point = getattr(module, f"{name}_main" if name in _SHARED_MODULES else "main")
-    return entry_point(command_arguments)
+    module = importlib.import_module(f"jaxnav.cli.{name}")
+    return module.main(command_arguments)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import signal
 import sys
 import typing
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -168,6 +168,7 @@ def parse_config(
     prog: str,
     description: str,
     check: Callable[[Config], Config] = lambda config: config,
+    configs: Mapping[str, Path] = CONFIGS,
 ) -> Config:
     """Return the settings of a command that has the option `--config`.
 
@@ -179,6 +180,7 @@ def parse_config(
       prog: name of the command in its help.
       description: of the command, for its help.
       check: validates the settings, and may complete them.
+      configs: packaged configurations by name.
 
     Raises:
       InputError: bad configuration, or an option that has been renamed; names the configuration.
@@ -190,20 +192,13 @@ def parse_config(
     namespace, other_arguments = config_parser.parse_known_args(arguments)
     _refuse_renamed(other_arguments)
     if namespace.config is not None:
-        default = apply_yaml(default, namespace.config)
+        default = apply_yaml(default, namespace.config, configs)
 
-    config = parse_options(type(default), other_arguments, prog, description, default)
+    config = parse_options(type(default), other_arguments, prog, description, default, configs)
     try:
         return check(config)
     except InputError as error:
         raise InputError(f"{namespace.config}: {error}" if namespace.config else str(error)) from error
-
-
-_CONFIG_OPTION = tyro.conf.arg(
-    metavar="NAME|FILE.yaml",
-    help=f"settings to lay over the defaults: a packaged configuration ({', '.join(CONFIGS)}) or a YAML file; "
-    "the other options override them.",
-)
 
 
 def parse_options(
@@ -212,6 +207,7 @@ def parse_options(
     prog: str,
     description: str,
     default: Config | None = None,
+    configs: Mapping[str, Path] = CONFIGS,
 ) -> Config:
     """Parse the options of a command, with `--config` in its help.
 
@@ -221,9 +217,15 @@ def parse_options(
       prog: name of the command in its help.
       description: of the command, for its help.
       default: settings without any option; None for those of the dataclass.
+      configs: packaged configurations by name, for the help.
     """
     # Wrap the settings beside a field for `--config`, so that the help lists both.
-    config_field = ("config", Annotated[str | None, _CONFIG_OPTION], None)
+    config_option = tyro.conf.arg(
+        metavar="NAME|FILE.yaml",
+        help=f"settings to lay over the defaults: a packaged configuration ({', '.join(configs)}) or a YAML file; "
+        "the other options override them.",
+    )
+    config_field = ("config", Annotated[str | None, config_option], None)
     settings_field = ("settings", Annotated[kind, tyro.conf.arg(name="")])
     fields = [settings_field, config_field] if default is None else [config_field, (*settings_field, default)]
     options_class = dataclasses.make_dataclass("Options", fields)

@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 from jaxnav.causal import Form
 from jaxnav.evaluation.report import ExperienceLead, difference_label
 from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments.figures import effects_figure, epsilon_figure
 from jaxnav.report.page import Chart
-from jaxnav.study.figures import effects_figure, epsilon_figure
-from jaxnav.study.records import StudyMetric
 
 #: Variables of the page's style sheet, by the colors of the figures.
 _PAGE_COLORS = {
@@ -28,29 +27,20 @@ _PAGE_COLORS = {
 }
 
 
-class _ReportRow(NamedTuple):
-    """Row of an evaluation's report, with the interface that `epsilon_figure` expects."""
-
-    fields: Mapping[str, Any]
-
-    def metric(self, name: StudyMetric) -> Interval:
-        """Return one of the metrics."""
-        return Interval.from_json(self.fields[name])
-
-
 def thresholds_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
     """Draw the metrics over the threshold of sTDE.
 
     Args:
       reports: reports of evaluations, by shift.
     """
-    # Rows of sTDE with best actions, by shift and form of the gap, then by threshold.
-    rows_by_form: dict[tuple[float, Form], dict[float, _ReportRow]] = {}
+    # Metrics of sTDE with best actions, by shift and form of the gap, then by threshold.
+    sweeps: dict[tuple[float, Form], dict[float, dict[str, Interval]]] = {}
     for shift, report in reports.items():
         for report_row in report["rows"]:
             if (report_row["variant"], report_row["decoding"]) == ("stde", "argmax"):
-                rows_by_form.setdefault((shift, report_row["form"]), {})[report_row["epsilon"]] = _ReportRow(report_row)
-    return Chart(to_svg(epsilon_figure(rows_by_form)), "Success, path length and distance by threshold.")
+                metrics = {name: Interval.from_json(report_row[name]) for name in ("sr", "spl", "dts")}
+                sweeps.setdefault((shift, report_row["form"]), {})[report_row["epsilon"]] = metrics
+    return Chart(to_svg(epsilon_figure(sweeps)), "Success, path length and distance by threshold.")
 
 
 def leads_chart(accounts: Mapping[float, Sequence[ExperienceLead]]) -> Chart:

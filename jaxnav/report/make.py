@@ -11,14 +11,14 @@ from rich.console import Console
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import accounting_table, difference_table, results_table, row_label
+from jaxnav.experiments.figures import gap_figure, similarity_figure
+from jaxnav.experiments.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
+from jaxnav.experiments.table import Curve
 from jaxnav.report.charts import differences_chart, leads_chart, thresholds_chart, to_svg
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
 from jaxnav.report.page import Chart, Section, render_page, to_text_table
 from jaxnav.runs.run import Run
-from jaxnav.study.figures import gap_figure, similarity_figure
-from jaxnav.study.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
-from jaxnav.study.records import GapCurves, GapLine, GapPanel
 from jaxnav.viz.learning import learning_figure
 
 #: Report of an evaluation, as in JSON.
@@ -206,20 +206,14 @@ def _gap_section(run: Run, by_shift: Mapping[float, ShiftMeasurements]) -> Secti
     traces_by_shift = truncate_to_shortest(traces_by_shift)
 
     # A curve for each shift and each way of updating the belief.
-    gap_lines = []
+    curve_by_line = {}
     for shift, gap_traces in zip(by_shift, traces_by_shift, strict=True):
-        mean_gaps = mean_by_step(gap_traces)
+        gap_bounds = mean_by_step(gap_traces)[:, 0]  # mean and bounds of the run's own estimator
+        steps = np.arange(gap_bounds.shape[-1], dtype=np.float64)
         for belief, belief_index in BELIEFS.items():
-            gap_lines.append(GapLine(shift, belief, mean_gaps.select(0, belief_index)))
-    gap_panel = GapPanel(run.config.layout.setting, tuple(gap_lines))
-
-    # Share of the episodes that still run: [shifts, T].
-    running_shares = []
-    for gap_traces in traces_by_shift:
-        running_shares.append(gap_traces.running.mean(axis=(0, 1)))
-    running = np.stack(running_shares)
-    curves = GapCurves(tuple(range(running.shape[1])), running, (gap_panel,), ())
-    return Section("The gap", _GAP_TEXT, (Chart(to_svg(gap_figure(curves)), "Mean layout gap by step."),))
+            curve_by_line[shift, belief] = Curve(steps, *gap_bounds[:, belief_index])
+    figure = gap_figure({run.config.layout.setting: curve_by_line})
+    return Section("The gap", _GAP_TEXT, (Chart(to_svg(figure), "Mean layout gap by step."),))
 
 
 def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:

@@ -9,15 +9,14 @@ from rich.console import Console
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.report import ExperienceLead, row_label
 from jaxnav.evaluation.similarity import cooccurrence_counts
+from jaxnav.experiments.gap_traces import GapTraces, trace_gaps
+from jaxnav.experiments.similarity import SuccessBySimilarity, compute_similarity_points, relate_success_to_similarity
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.replays import ReplayAgent, Replays, make_replays
 from jaxnav.runs.evaluate import Results, evaluate, measure_leads
 from jaxnav.runs.policies import Policies
 from jaxnav.runs.run import Run
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
-from jaxnav.study.gap_traces import GapTraces, trace_gaps
-from jaxnav.study.records import SuccessBySimilarity
-from jaxnav.study.similarity import compute_similarity_points, relate_success_to_similarity
 from jaxnav.training.calibration import layout_priors
 
 #: Length of the curves of the gap, steps.

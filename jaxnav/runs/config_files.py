@@ -11,6 +11,7 @@ import math
 import reprlib
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
 
@@ -27,7 +28,7 @@ CONFIGS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "conf
 RENAMED_SETTINGS = {"sizes.relation_layers": "method_sizes.relation_layers"}
 
 
-def apply_yaml(default: Config, source: str | Path) -> Config:
+def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] = CONFIGS) -> Config:
     """Apply a YAML configuration to a dataclass.
 
     Only fields that the file names change, and each value is checked against the annotation of its field. Supported
@@ -36,7 +37,8 @@ def apply_yaml(default: Config, source: str | Path) -> Config:
 
     Args:
       default: instance of a frozen dataclass.
-      source: name of a packaged configuration, see `CONFIGS`, or a YAML file; an empty file changes nothing.
+      source: name of a packaged configuration, or a YAML file; an empty file changes nothing.
+      configs: packaged configurations by name.
 
     Returns:
       A copy of `default` with the values of the file.
@@ -45,8 +47,8 @@ def apply_yaml(default: Config, source: str | Path) -> Config:
       InputError: the file is missing or is no YAML mapping, has a key twice, an unknown key or a value of another type.
         The message names the file, the line or dotted key, and a remedy.
     """
-    path = CONFIGS.get(str(source), Path(source))
-    values = _load_yaml(path)
+    path = configs.get(str(source), Path(source))
+    values = _load_yaml(path, configs)
     return default if values is None else apply_values(default, values, path)
 
 
@@ -73,11 +75,11 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _load_yaml(path: Path) -> Any:
+def _load_yaml(path: Path, configs: Mapping[str, Path]) -> Any:
     try:
         return yaml.load(path.read_text(encoding="utf-8"), _UniqueKeyLoader)
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such configuration; choose from {', '.join(CONFIGS)}, or give a file") from error
+        raise InputError(f"{path}: no such configuration; choose from {', '.join(configs)}, or give a file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except yaml.MarkedYAMLError as error:

@@ -1,0 +1,145 @@
+"""The workbench of an experiment: trained runs, compiled worlds and evaluations, each made once.
+
+Measurements ask a `Bench` for what they need, and the bench trains, compiles or evaluates what is missing.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
+from jaxnav.experiments.table import ResultRow, ResultTable, read_part
+from jaxnav.runs.evaluate import evaluate
+from jaxnav.runs.policies import load_policies
+from jaxnav.runs.run import Run, load_run_config, run_settings
+from jaxnav.runs.train import train
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+
+
+class Scores(NamedTuple):
+    """Results of an evaluation, episode by episode.
+
+    Attributes:
+      metrics: by row of the evaluation, the metrics [S, E] in the units of the result table.
+      episodes: the E episodes.
+      budgets: numbers of actions within which success is counted too, as `sr@N`.
+    """
+
+    metrics: dict[EvaluationRow, Mapping[str, np.ndarray]]
+    episodes: EpisodeList
+    budgets: tuple[int, ...]
+
+
+def best_epsilon(table: ResultTable, world: str, agent: str, shift: float) -> float | None:
+    """Threshold of sTDE with the greatest SR, in the residual form and with best actions; None without any result."""
+    fields = {"world": world, "run": agent, "variant": "stde", "decoding": "argmax", "shift": shift}
+    fields |= {"gap": "novelty", "form": "residual", "control": "", "reference": "", "category": "", "metric": "sr"}
+    success = {}
+    for row in table.where(**fields).rows:
+        success[row.epsilon] = table.find(**fields, epsilon=row.epsilon).mean
+    # With equal success, the first epsilon is chosen.
+    return max(success, key=lambda epsilon: success[epsilon], default=None)
+
+
+class Bench:
+    """Trains, compiles and evaluates for the measurements of an experiment.
+
+    Args:
+      config: the experiment.
+      console: prints progress.
+    """
+
+    def __init__(self, config: ExperimentConfig, console: Console) -> None:
+        self.config = config
+        self.console = console
+        self._runs = {(run.world, run.agent): run for run in agent_runs(config)}
+        self._scores: dict[tuple[str, str, float], Scores] = {}
+
+    def find_run(self, world: str, agent: str) -> AgentRun | None:
+        """Run of an agent in a world, or None if the experiment has no such run."""
+        return self._runs.get((world, agent))
+
+    def unaware_run(self, world: str) -> AgentRun | None:
+        """Run of the agents that cannot know any layout, or None if the experiment has none."""
+        return self.find_run(world, self.config.unaware)
+
+    def chosen_epsilon(self, run: AgentRun) -> float:
+        """Look up the threshold with the greatest success on `val`, at the first shift and in the residual form.
+
+        Raises:
+          InputError: the experiment has not been done on `val`.
+        """
+        folder = self.config.results / "val"
+        rows: list[ResultRow] = []
+        for path in sorted(folder.glob(f"{run.name}-trials-*.jsonl")):
+            rows += read_part(path)
+        best = best_epsilon(ResultTable(rows), run.world, run.agent, self.config.shifts[0])
+        if best is None:
+            raise InputError(f"{folder}: has no trials of {run.name}; epsilon is chosen there: give --split val first")
+        return best
+
+    def train(self, run: AgentRun) -> None:
+        """Train a run unless it is finished with the same settings."""
+        if run.is_trained:
+            return
+
+        # Loading the policies proves that they exist; equal settings prove that they are those of this experiment.
+        try:
+            load_policies(run.config, run.config.arms)
+            is_finished = run_settings(load_run_config(run.config.run_dir)) == run_settings(run.config)
+        except InputError:
+            is_finished = False
+        if not is_finished:
+            self.console.print(f"training {run.config.run_dir}")
+            train(run.config, self.console)
+
+    def compile_world(self, run: AgentRun, shift: float) -> CompiledWorld:
+        """Compile the scenes of a run at a layout shift."""
+        return compile_evaluation_world(run.config, self.config.split, None, shift, self.console)
+
+    def draw_episodes(self, world: CompiledWorld) -> EpisodeList:
+        """Draw the episodes of the experiment in a world.
+
+        Raises:
+          InputError: the scenes fill more than one shard.
+        """
+        if len(world.banks) > 1:
+            raise InputError("takes as many scenes of a split as fit into one shard; give more worlds.shard_scenes")
+        return draw_episodes(world.banks[0], self.config.episodes, self.config.seed)
+
+    def evaluate(self, run: AgentRun, shift: float) -> Scores:
+        """Train a run if necessary, and evaluate its variants as `jaxnav eval` does."""
+        key = (run.world, run.agent, shift)
+        if key not in self._scores:
+            self.train(run)
+            self._scores[key] = self._evaluate(run, shift)
+        return self._scores[key]
+
+    def _evaluate(self, run: AgentRun, shift: float) -> Scores:
+        config = self.config
+        self.console.print(f"evaluating {run.config.run_dir} at shift {shift:g}")
+        results = evaluate(
+            Run(run.config),
+            split=config.split,
+            shift=shift,
+            episodes=config.episodes,
+            epsilon=config.epsilon,
+            form=(config.form,),
+            seed=config.seed,
+            console=self.console,
+        )
+
+        # Rates in percent, distances in metres.
+        metrics_by_row = {}
+        metrics = results.metrics()
+        for index, row in enumerate(results.rows):
+            row_metrics = {}
+            for name, values in metrics.items():
+                row_metrics[name] = values[index] * (1.0 if name == "dts" else 100.0)
+            metrics_by_row[row] = row_metrics
+        return Scores(metrics_by_row, results.episodes, results.budgets)

@@ -1,0 +1,253 @@
+"""Configuration of an experiment: which agents are trained in which worlds, and what is measured of them.
+
+An experiment is a YAML file (`EXPERIMENTS` lists those that come with jaxnav) and a page template. `agent_runs` lists
+the training runs that it implies; `part_settings` lists the settings that determine a measurement, by which results are
+recognized and reused.
+"""
+
+import dataclasses
+import fnmatch
+import hashlib
+import itertools
+import json
+import operator
+import re
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from jaxnav.causal import Form
+from jaxnav.errors import InputError
+from jaxnav.evaluation.report import Decoding
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import apply_values
+from jaxnav.runs.run import load_run_config, run_settings
+
+#: Experiments that come with jaxnav, by name.
+EXPERIMENTS = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
+
+
+@dataclasses.dataclass(frozen=True)
+class ExperimentConfig:
+    """Settings of an experiment; finished runs and results are reused.
+
+    Attributes:
+      title: title of the page.
+      results: folder of the results; those of a split are in a folder of its name.
+      runs: folder of the training runs.
+      pages: pages to write, as document: template. A template is a file, or the name of a packaged one.
+      worlds: worlds by name, with the settings that all runs in it change.
+      agents: agents by name, with the settings that their runs change. `against` lists what an agent is compared
+        with: AGENT, or one of its variants as AGENT/VARIANT; `run` names a finished run to use in place of training.
+      left_out: patterns of WORLD-AGENT that are not run.
+      only: patterns of WORLD-AGENT that are run.
+      measure: measurements by name (see `jaxnav.experiments.driver.MEASUREMENTS`), each with patterns of AGENT or
+        WORLD-AGENT that are measured.
+      groups: groups of agents whose mean is compared with an agent, or with another variant of the group.
+      unaware: agent that cannot know any layout; the reference for the value and cost of experience.
+      run: finished run to measure in place of the agents; the results are kept in its folder.
+      without: finished run of agents that cannot know any layout, next to `run`.
+      split: scenes to evaluate on.
+      shifts: layout shifts, rising; the first is the reference.
+      episodes: number of episodes in each world, or at each shift.
+      epsilon: thresholds of sTDE; the first is the one that is compared.
+      form: how sTDE combines the logits.
+      decodings: rules that turn logits into actions, of which a mixture is measured with each.
+      steps: length of the curves of the layout gap.
+      seed: seed of episode lists and sampled actions.
+      base: settings shared by all runs.
+    """
+
+    title: str = "Experiment"
+    results: Path = Path("results/experiment")
+    runs: Path = Path("runs/experiment")
+    pages: dict[str, str] = dataclasses.field(default_factory=dict)
+    worlds: dict[str, dict[str, Any]] = dataclasses.field(default_factory=lambda: {"rooms": {"world": "rooms"}})
+    agents: dict[str, dict[str, Any]] = dataclasses.field(default_factory=lambda: {"main": {}})
+    left_out: tuple[str, ...] = ()
+    only: tuple[str, ...] = ("*",)
+    measure: dict[str, Any] = dataclasses.field(default_factory=lambda: {"evaluation": ["*"]})
+    groups: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    unaware: str = "anonymous"
+    run: Path | None = None
+    without: Path | None = None
+    split: Literal["train", "val", "test"] = "val"
+    shifts: tuple[float, ...] = (0.0, 1.0)
+    episodes: int = 1000
+    epsilon: tuple[float, ...] = (0.5,)
+    form: Form = "residual"
+    decodings: tuple[Decoding, ...] = ("sample",)
+    steps: int = 80
+    seed: int = 0
+    base: RunConfig = RunConfig()
+
+
+#: Settings of the evaluation, which all results of an experiment share.
+EVALUATION_SETTINGS = ("split", "shifts", "episodes", "epsilon", "form", "decodings", "steps", "seed")
+#: Settings of an agent that are not settings of its run.
+AGENT_SETTINGS = ("against", "run")
+
+
+class AgentRun(NamedTuple):
+    """The training run of an agent in a world.
+
+    Attributes:
+      world: name of the world in the experiment.
+      agent: name of the agent.
+      config: settings of the run.
+      against: names of the agents with which it is compared.
+      is_trained: True if the run was given as a finished one, and is not trained by the experiment.
+    """
+
+    world: str
+    agent: str
+    config: RunConfig
+    against: tuple[str, ...] = ()
+    is_trained: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name of the run in its folder."""
+        return f"{self.world}-{self.agent}".replace(":", "-")
+
+
+def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
+    """Return the experiment if every setting is valid, with the agents of `run` and `without` filled in.
+
+    Raises:
+      InputError: names the first invalid setting.
+    """
+    config = _with_finished_runs(config)
+
+    # Numbers of the evaluation; the first shift is the reference of every comparison, so it must be the smallest.
+    shifts = config.shifts
+    is_rising = all(itertools.starmap(operator.lt, itertools.pairwise(shifts)))
+    if not (shifts and is_rising and shifts[0] >= 0.0 and shifts[-1] <= 1.0):
+        raise InputError(f"shifts: {shifts}: give numbers from 0 to 1, rising")
+    if not (config.epsilon and all(0.0 <= epsilon < float("inf") for epsilon in config.epsilon)):
+        raise InputError(f"epsilon: {config.epsilon}: give numbers from 0 to below infinity")
+    for name in ("steps", "episodes"):
+        if getattr(config, name) < 1:
+            raise InputError(f"{name}: {getattr(config, name)}: give at least 1")
+    if not 0 <= config.seed < 2**32:
+        raise InputError(f"seed: {config.seed}: give a whole number from 0 to 2**32 - 1")
+    if not isinstance(config.base.devices, int | None):
+        raise InputError(f"base.devices: {config.base.devices}: one process trains all runs; give a number of devices")
+
+    # Names become parts of file names, and a slash separates an agent from its variant.
+    for name in (*config.worlds, *config.agents):
+        if not re.fullmatch(r"[\w.+:-]+", name):
+            raise InputError(f"worlds and agents: {name!r}: is part of file names; give letters, digits, '-' and '_'")
+    for measurement, patterns in config.measure.items():
+        if not isinstance(patterns, list) or not all(isinstance(pattern, str) for pattern in patterns):
+            raise InputError(f"measure.{measurement}: {patterns}: give a list of agents, or ['*']")
+
+    # Listing the runs checks the settings of each.
+    runs = agent_runs(config)
+    if not runs:
+        raise InputError(f"only: {', '.join(config.only)}: selects no run; give other patterns")
+    for run in runs:
+        unknown_agents = sorted({reference.partition("/")[0] for reference in run.against} - set(config.agents))
+        if unknown_agents:
+            raise InputError(f"agents.{run.agent}.against: {unknown_agents[0]!r} is none of the agents")
+    return config
+
+
+def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
+    """Replace the agents by those of `run` and `without`, if these are given."""
+    if config.run is None:
+        if config.without is not None:
+            raise InputError(f"without: {config.without}: give the run that it is compared with, as `run`")
+        return config
+
+    # The world is that of the run; results and page are kept in the run's folder.
+    base = load_run_config(config.run)
+    agents: dict[str, dict[str, Any]] = {"main": {"run": str(config.run)}}
+    if config.without is not None:
+        agents[config.unaware] = {"run": str(config.without)}
+    return dataclasses.replace(
+        config,
+        agents=agents,
+        worlds={base.scenes.stem.partition(".")[0] if base.scenes else base.world: {}},
+        base=dataclasses.replace(base, devices=None),
+        results=config.run / "results" if config.results == ExperimentConfig().results else config.results,
+        pages={str(config.run / Path(document).name): template for document, template in config.pages.items()},
+    )
+
+
+def agent_runs(config: ExperimentConfig) -> list[AgentRun]:
+    """List the runs of an experiment, world by world.
+
+    Raises:
+      InputError: a run whose settings are unknown or impossible.
+    """
+    runs = []
+    for world, world_changes in config.worlds.items():
+        for agent in config.agents:
+            name = f"{world}-{agent}"
+            if _matches(name, config.only) and not _matches(name, config.left_out):
+                runs.append(_agent_run(config, world, world_changes, agent))
+    return runs
+
+
+def _matches(name: str, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, Any], agent: str) -> AgentRun:
+    """Settings of one run: the base, changed by the world, then by the agent."""
+    agent_settings = config.agents[agent]
+    if "run" in agent_settings:
+        return AgentRun(world, agent, load_run_config(Path(agent_settings["run"])), is_trained=True)
+
+    changes = {setting: value for setting, value in agent_settings.items() if setting not in AGENT_SETTINGS}
+    name = f"{world}-{agent}".replace(":", "-")
+
+    # The scenes of finished results need not exist any more; whoever trains reads them first.
+    world_config = apply_values(config.base, world_changes, Path(f"worlds.{world}"))
+    run_config = apply_values(world_config, changes, Path(f"agents.{agent}"))
+    scenes = run_config.scenes
+    checked_scenes = scenes if scenes is None or scenes.exists() else None
+    try:
+        run_config = check_config(dataclasses.replace(run_config, run_dir=config.runs / name, scenes=checked_scenes))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    run_config = dataclasses.replace(run_config, scenes=scenes)
+    return AgentRun(world, agent, run_config, tuple(agent_settings.get("against", ())))
+
+
+def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:
+    """List the runs of which a measurement is taken."""
+    patterns = tuple(config.measure[measurement])
+    runs = []
+    for run in agent_runs(config):
+        if _matches(run.agent, patterns) or _matches(f"{run.world}-{run.agent}", patterns):
+            runs.append(run)
+    return runs
+
+
+def evaluation_settings(config: ExperimentConfig) -> dict[str, Any]:
+    """Return the settings of the evaluation as JSON."""
+    settings = {}
+    for name in EVALUATION_SETTINGS:
+        value = getattr(config, name)
+        settings[name] = list(value) if isinstance(value, tuple) else value
+    return settings
+
+
+def part_settings(config: ExperimentConfig, run: AgentRun, references: list[AgentRun]) -> dict[str, Any]:
+    """Return the settings that determine the results of a run, as JSON.
+
+    Args:
+      config: the experiment.
+      run: the measured run.
+      references: the runs with which it is compared.
+    """
+    settings = evaluation_settings(config) | {"run": run_settings(run.config)}
+    if references:
+        settings["references"] = {reference.agent: _digest(run_settings(reference.config)) for reference in references}
+    return settings
+
+
+def _digest(settings: dict[str, Any]) -> str:
+    """Digest of settings, equal for equal settings."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,168 @@
+"""The driver of all experiments: `run_experiment` trains and measures what is missing, and writes the pages.
+
+`MEASUREMENTS` lists what an experiment can measure of an agent. Every part of a measurement (a layout shift, or a
+decoding rule) has a file of results, so that an interrupted experiment goes on with the first part that is missing.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+
+from jaxnav.errors import InputError
+from jaxnav.experiments.bench import Bench
+from jaxnav.experiments.config import AgentRun, ExperimentConfig, evaluation_settings, measured_runs, part_settings
+from jaxnav.experiments.gap_traces import measure_gaps
+from jaxnav.experiments.instrument import measure_instrument
+from jaxnav.experiments.mixture import measure_handover, measure_mixture
+from jaxnav.experiments.pages import check_page, render_page
+from jaxnav.experiments.scores import measure_account, measure_evaluation, measure_frontier, measure_groups
+from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, write_part
+from jaxnav.experiments.trials import measure_growth, measure_trials, measure_variants
+
+
+class Measurement(NamedTuple):
+    """Something that an experiment measures of an agent.
+
+    Attributes:
+      measure: called with the bench and the run, and with a shift or a decoding if `parts` names either.
+      parts: setting of the experiment whose values are measured in parts of their own.
+      has_unaware: True if the run is compared with the agents that cannot know any layout.
+    """
+
+    measure: Callable[..., Iterator[ResultRow]]
+    parts: str | None = None
+    has_unaware: bool = False
+
+
+MEASUREMENTS = {
+    "evaluation": Measurement(measure_evaluation),
+    "frontier": Measurement(measure_frontier),
+    "groups": Measurement(measure_groups),
+    "account": Measurement(measure_account, has_unaware=True),
+    "trials": Measurement(measure_trials, parts="shifts"),
+    "variants": Measurement(measure_variants, parts="shifts"),
+    "growth": Measurement(measure_growth),
+    "instrument": Measurement(measure_instrument, has_unaware=True),
+    "gaps": Measurement(measure_gaps),
+    "mixture": Measurement(measure_mixture, parts="decodings", has_unaware=True),
+    "handover": Measurement(measure_handover, parts="decodings", has_unaware=True),
+}
+
+
+class Part(NamedTuple):
+    """One file of results.
+
+    Attributes:
+      name: name of the file, without its ending.
+      settings: settings that determine the results.
+      measure: trains what is missing, and measures.
+    """
+
+    name: str
+    settings: dict
+    measure: Callable[[], Iterator[ResultRow]]
+
+
+def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
+    """Measure what is missing, and write the pages.
+
+    Finished runs and results are reused, so an interrupted experiment goes on where it stopped. The pages are rewritten
+    after every part, from the files of results alone.
+
+    Args:
+      config: the experiment; see `check_experiment`.
+      console: prints progress.
+
+    Returns:
+      The text of each page.
+
+    Raises:
+      InputError: a document is not a page of an experiment, or a run is impossible.
+    """
+    # Fail early: a page that cannot be written would waste the measurements.
+    for document, template in config.pages.items():
+        check_page(Path(document), template)
+
+    folder = config.results / config.split
+    parts = list_parts(config, Bench(config, console))
+    num_reused = 0
+    for part in parts:
+        path = folder / f"{part.name}.jsonl"
+        if has_part(path, part.settings):
+            num_reused += 1
+            continue
+        console.print(f"{path}")
+        write_part(path, part.settings, part.measure())
+        write_pages(config, parts)
+
+    if num_reused:
+        console.print(f"{num_reused} results in {folder} were there already; give another --results to measure again")
+    texts = write_pages(config, parts)
+    for document in config.pages:
+        console.print(f"written to {document}")
+    return texts
+
+
+def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
+    """List the files of results of an experiment, in the order in which they are measured.
+
+    Raises:
+      InputError: an unknown measurement.
+    """
+    unknown_names = sorted(set(config.measure) - set(MEASUREMENTS))
+    if unknown_names:
+        raise InputError(f"measure: {unknown_names[0]!r} is unknown; choose from {', '.join(MEASUREMENTS)}")
+
+    parts = []
+    for name, measurement in MEASUREMENTS.items():
+        runs = measured_runs(config, name) if name in config.measure else []
+        for run in runs:
+            settings = part_settings(config, run, _references(bench, run, measurement))
+            measure = partial(measurement.measure, bench, run)
+            if measurement.parts is None:
+                parts.append(Part(f"{run.name}-{name}", settings, measure))
+                continue
+            for value in getattr(config, measurement.parts):
+                value_name = f"{value:g}" if isinstance(value, float) else value
+                parts.append(Part(f"{run.name}-{name}-{value_name}", settings, partial(measure, value)))
+    return parts
+
+
+def _references(bench: Bench, run: AgentRun, measurement: Measurement) -> list[AgentRun]:
+    """Runs that a measurement compares a run with."""
+    agents = []
+    if measurement.measure is measure_evaluation:
+        agents = [reference.partition("/")[0] for reference in run.against]
+    if measurement.has_unaware:
+        agents.append(bench.config.unaware)
+    references = [bench.find_run(run.world, agent) for agent in agents]
+    return [reference for reference in references if reference is not None]
+
+
+def write_pages(config: ExperimentConfig, parts: list[Part]) -> list[str]:
+    """Write every page from the results that exist, and return their texts."""
+    tables = load_results(config)
+    missing = [part.name for part in parts if not (config.results / config.split / f"{part.name}.jsonl").exists()]
+    texts = []
+    for document, template in config.pages.items():
+        texts.append(render_page(Path(document), template, config, tables, missing))
+    return texts
+
+
+def load_results(config: ExperimentConfig) -> dict[str, ResultTable]:
+    """Load the results of an experiment on every split that has any.
+
+    Results of other evaluation settings are ignored. Experiments may share a folder, and then a table.
+    """
+    tables = {}
+    for split in ("train", "val", "test"):
+        settings = evaluation_settings(config) | {"split": split}
+        rows: list[ResultRow] = []
+        for path in sorted((config.results / split).glob("*.jsonl")):
+            rows += read_part(path, settings)
+        if rows:
+            tables[split] = ResultTable(rows)
+    return tables

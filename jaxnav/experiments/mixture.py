@@ -1,0 +1,428 @@
+"""Removal in a mixed population: how much value of experience it keeps, and how much of the cost it recovers.
+
+Half of the episodes are in scenes laid out as in training, half in shifted ones, and no agent knows which. A removal is
+worth its gain over the whole mixture. A gap is worth its gain over controls: the gap of another episode of the mixture,
+the mean gap of all episodes at the same time, and clocks.
+
+`measure_mixture` evaluates the removals of a run and their controls, `measure_handover` those that hand over to agents
+without experience. `PopulationMetrics` compares outcomes, at each shift and over the mixture.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxnav.causal import Form
+from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
+from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
+from jaxnav.evaluation.report import Decoding, remaining_share
+from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
+from jaxnav.experiments.bench import Bench
+from jaxnav.experiments.config import AgentRun
+from jaxnav.experiments.scores import require_unaware_run
+from jaxnav.experiments.table import ResultRow
+from jaxnav.experiments.trials import (
+    EvaluatedRun,
+    GapSchedule,
+    StdeOptions,
+    Trial,
+    TrialControl,
+    TrialRunner,
+    mean_removal_weight,
+    require_estimator_config,
+)
+from jaxnav.runs.policies import GapName, estimators_by_gap, load_policies
+from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
+from jaxnav.scenes.worlds import WORLDS
+
+#: Variants of the agents that removals are compared with.
+WITHOUT_EXPERIENCE = "without experience"
+WITHOUT_REMOVAL = "without removal"
+#: Gaps of the constant controls.
+CONSTANT_GAPS = (0.25, 0.5, 0.75)
+#: Times of the clocks, as shares of the world's second action budget: all experience is removed after, or until, that
+#: time. They are below 1, because a later removal cannot change success within the budget.
+CLOCK_TIMES = (0.1, 0.25, 0.5)
+#: Name of the removal that knows the shift: all experience is removed at every shift but the first.
+ORACLE_NAME = "told the shift"
+
+
+class RemovalRule(NamedTuple):
+    """A rule of soft removal.
+
+    Attributes:
+      gap: name of the layout gap.
+      hold: True if the gap never falls within an episode.
+      options: threshold and form of sTDE.
+    """
+
+    gap: GapName
+    hold: bool
+    options: StdeOptions
+
+    def __str__(self) -> str:
+        suffix = " held" if self.hold else ""
+        return f"{self.gap}{suffix}, {self.options.form}, eps {self.options.epsilon:g}"
+
+
+#: Soft removal by every gap, then switches that hand over for the rest of the episode.
+REMOVAL_RULES = (
+    RemovalRule("novelty", False, StdeOptions(0.5, "residual")),
+    RemovalRule("novelty", False, StdeOptions(0.0, "paper")),
+    RemovalRule("evidence", False, StdeOptions(0.0, "paper")),
+    RemovalRule("learned", False, StdeOptions(0.0, "paper")),
+    RemovalRule("overdue", False, StdeOptions(0.0, "paper")),
+    RemovalRule("evidence", True, StdeOptions(0.5, "switch")),
+    RemovalRule("overdue", True, StdeOptions(0.5, "switch")),
+    RemovalRule("learned", True, StdeOptions(0.75, "switch")),
+)
+#: Controls of each form. A mean gap is not a switch, so `course` does not apply there.
+CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
+    "residual": ("shuffled", "course"),
+    "paper": ("shuffled", "course"),
+    "switch": ("shuffled",),
+}
+
+
+def measure_mixture(
+    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
+) -> Iterator[ResultRow]:
+    """Evaluate removals and their controls, where removal leaves the run's own direct effect.
+
+    Args:
+      bench: trains the runs and compiles their worlds.
+      run: the run, with the layout arm.
+      decoding: rule that turns logits into actions.
+      rules: rules of soft removal, in addition to TDE and clocks.
+
+    Raises:
+      InputError: there are no agents without experience, or they differ in world, goals or number of seeds.
+    """
+    return _measure_removals(bench, run, decoding, rules, hand_over=False)
+
+
+def measure_handover(
+    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
+) -> Iterator[ResultRow]:
+    """Evaluate removals that hand over to the agents without experience; see `measure_mixture`."""
+    return _measure_removals(bench, run, decoding, rules, hand_over=True)
+
+
+def _measure_removals(
+    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule], *, hand_over: bool
+) -> Iterator[ResultRow]:
+    # Paired comparisons need the same episodes and as many training runs on both sides.
+    unaware_run = require_unaware_run(bench, run)
+    bench.train(run)
+    bench.train(unaware_run)
+    budgets = WORLDS[run.config.world].budgets
+    shifts = (bench.config.shifts[0], bench.config.shifts[-1])
+    runner = TrialRunner(bench.config.seed)
+
+    # Both runs meet the same episodes.
+    world, episodes, shift_index = draw_mixed_population(bench, run, shifts)
+    unaware = EvaluatedRun(load_policies(unaware_run.config, ("baseline",)), world, episodes)
+    policies = load_policies(run.config, ("layout",))
+    if hand_over:
+        policies = policies.with_handover_to(unaware.policies)
+    evaluated_run = EvaluatedRun(policies, world, episodes)
+    estimator = require_estimator_config(policies)
+
+    # References and clocks are evaluated once, for all rules.
+    baseline_trial = Trial("baseline", decoding)
+    unaware_outcome = runner.run_trials(unaware, None, [baseline_trial])[baseline_trial]
+    bench.console.print("TDE and clocks")
+    clocks = clock_trials(decoding, budgets[-1])
+    plain_trial = Trial("layout", decoding)
+    hard_trial = Trial("tde", decoding)
+    outcomes = runner.run_trials(evaluated_run, estimator, [plain_trial, hard_trial, *clocks.values()])
+    outcome_by_clock = {name: outcomes[trial] for name, trial in clocks.items()}
+
+    # Values of the agents themselves.
+    metrics = PopulationMetrics(episodes, shift_index, budgets)
+    agent_name = f"{run.agent}, handed over to {unaware_run.agent}" if hand_over else run.agent
+    report = _RemovalReport(
+        fields={"world": run.world, "run": agent_name, "decoding": decoding},
+        shifts=shifts,
+        metrics=metrics,
+        unaware=metrics.percent_metrics(unaware_outcome),
+        agent=metrics.percent_metrics(outcomes[plain_trial]),
+        num_scenes=len(episodes.scenes) // len(shifts),
+    )
+    yield from report.agent_rows()
+    plain_lengths = metrics.by_shift(np.asarray(outcomes[plain_trial].length))
+    for shift, lengths in zip(shifts, plain_lengths, strict=True):
+        yield report.row("length", Interval(float(np.median(lengths))), variant=WITHOUT_REMOVAL, shift=shift)
+
+    # Hard removal, the oracle and the clocks need no estimate of the shift from the views of an episode.
+    yield from report.removal_rows("TDE", outcomes[hard_trial])
+    yield from report.removal_rows(ORACLE_NAME, metrics.oracle_removal(outcomes[plain_trial], outcomes[hard_trial]))
+    for name, outcome in outcome_by_clock.items():
+        yield from report.removal_rows(name, outcome)
+
+    # Every rule is compared with its own controls and with the best clock.
+    best_clock = max(outcome_by_clock, key=lambda name: report.mixture_gain(outcome_by_clock[name], budgets[-1]))
+    for rule in rules:
+        bench.console.print(str(rule))
+        rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)
+        trial = Trial("stde", decoding, *rule.options)
+        control_trials = {}
+        for control in CONTROLS_BY_FORM[rule.options.form]:
+            control_trials[control] = dataclasses.replace(trial, control=control)
+        rule_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *control_trials.values()])
+        compared_outcomes = {control: rule_outcomes[control_trial] for control, control_trial in control_trials.items()}
+        compared_outcomes[best_clock] = outcome_by_clock[best_clock]
+        yield from report.removal_rows(str(rule), rule_outcomes[trial], compared_outcomes)
+
+
+def clock_trials(decoding: Decoding, budget: int) -> dict[str, Trial]:
+    """List the removals that depend on nothing in the episode, by name.
+
+    They are constant gaps, and removal of all experience after or until a time, as a share of an action budget.
+    """
+    # A constant gap removes the same share of experience at every step.
+    trials_by_name = {}
+    for constant_gap in CONSTANT_GAPS:
+        trials_by_name[f"constant {constant_gap:g}"] = Trial(
+            "stde", decoding, 0.0, "paper", "constant", weight=constant_gap
+        )
+
+    # A clock removes all experience on one side of a step.
+    for control in ("after", "until"):
+        for time_share in CLOCK_TIMES:
+            clock_step = round(time_share * budget)
+            trials_by_name[f"{control} step {clock_step}"] = Trial("stde", decoding, 0.0, "paper", control, clock_step)
+    return trials_by_name
+
+
+class MixedPopulation(NamedTuple):
+    """Episodes of several shifts in one world.
+
+    Attributes:
+      world: the scenes of all shifts, concatenated.
+      episodes: equally many episodes at each shift.
+      shift: int [E], index of each episode's shift.
+    """
+
+    world: CompiledWorld
+    episodes: EpisodeList
+    shift: np.ndarray
+
+
+def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float]) -> MixedPopulation:
+    """Draw episodes in the scenes of a run, equally many at every shift."""
+    # All worlds are compiled before any episode is drawn; each has one bank.
+    worlds = [bench.compile_world(run, shift) for shift in shifts]
+
+    # The episodes of each shift follow each other, as the poses of the concatenated bank do.
+    episode_lists = []
+    num_episodes = []
+    num_poses = []
+    for world in worlds:
+        episodes = bench.draw_episodes(world)
+        episode_lists.append(episodes)
+        num_episodes.append(len(episodes.pose))
+        num_poses.append(len(world.banks[0].rows))
+
+    return MixedPopulation(
+        world=concatenate_worlds(worlds),
+        episodes=join_end_to_end(episode_lists, num_poses),
+        shift=np.repeat(np.arange(len(shifts)), num_episodes),
+    )
+
+
+def join_end_to_end(lists: Sequence[EpisodeList], num_poses: Sequence[int]) -> EpisodeList:
+    """Join the episode lists of banks that were concatenated into one bank.
+
+    Args:
+      lists: one list per bank.
+      num_poses: number of poses of each bank.
+    """
+    # Poses of a bank follow those of the banks before it.
+    first_poses = np.cumsum([0, *num_poses[:-1]])
+    joined_poses = []
+    for episodes, first_pose in zip(lists, first_poses, strict=True):
+        joined_poses.append(episodes.pose + first_pose)
+    return join_episode_lists(lists)._replace(pose=np.concatenate(joined_poses).astype(np.int32))
+
+
+#: Results [S, E] by name of the metric.
+MetricValues = Mapping[str, np.ndarray]
+
+
+class EpisodeSubset(NamedTuple):
+    """The episodes of one shift.
+
+    Attributes:
+      mask: bool [E].
+      scenes: clusters of these episodes.
+    """
+
+    mask: np.ndarray
+    scenes: Clusters
+
+
+class PopulationMetrics:
+    """Metrics of outcomes in a mixed population, and their differences.
+
+    Args:
+      episodes: episodes of the population.
+      shift: int [E], index of each episode's shift.
+      budgets: action budgets N of the additional metrics `sr@N`.
+    """
+
+    def __init__(self, episodes: EpisodeList, shift: np.ndarray, budgets: Sequence[int]) -> None:
+        self.metric_names = ("sr", "spl", *(f"sr@{budget}" for budget in budgets))
+        self._episodes = episodes
+        self._budgets = budgets
+        self._clusters = episodes.clusters()
+
+        # Each shift has clusters of its own, and so intervals of its own.
+        self._subsets = []
+        for index in range(shift.max() + 1):
+            mask = shift == index
+            self._subsets.append(EpisodeSubset(mask, episodes.take(mask).clusters()))
+
+    def percent_metrics(self, outcome: EpisodeOutcome) -> MetricValues:
+        """Compute the metrics of an outcome in percent, [S, E]."""
+        metrics = episode_metrics(outcome, self._episodes.best_length, self._budgets)
+        return {name: 100.0 * metrics[name] for name in self.metric_names}
+
+    def oracle_removal(self, plain: EpisodeOutcome, hard: EpisodeOutcome) -> EpisodeOutcome:
+        """Combine outcomes into hard removal at all shifts but the first."""
+        is_first_shift = self._subsets[0].mask
+        return jax.tree.map(lambda plain_leaf, hard_leaf: np.where(is_first_shift, plain_leaf, hard_leaf), plain, hard)
+
+    def removal_weights(self, outcome: EpisodeOutcome) -> tuple[float, ...]:
+        """Average the weight of the removed logits at each shift."""
+        weights = []
+        for subset in self._subsets:
+            # The mean needs only the choices and their weights, both [S, E].
+            subset_outcome = outcome._replace(
+                choices=outcome.choices[:, subset.mask], mean_weight=outcome.mean_weight[:, subset.mask]
+            )
+            weights.append(mean_removal_weight(subset_outcome))
+        return tuple(weights)
+
+    def by_shift(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Split values [..., E] by shift."""
+        return tuple(values[..., subset.mask] for subset in self._subsets)
+
+    def means(self, values: MetricValues) -> dict[str, tuple[Interval, ...]]:
+        """Average each metric at each shift."""
+        return self._for_each_shift(mean_interval, values)
+
+    def differences(
+        self, reference: MetricValues, compared: MetricValues, *, same_runs: bool
+    ) -> dict[str, tuple[Interval, ...]]:
+        """Compute `compared - reference` for each metric at each shift."""
+
+        def difference(reference: np.ndarray, compared: np.ndarray, scenes: Clusters) -> Interval:
+            return paired_difference(reference, compared, scenes, same_runs=same_runs)
+
+        return self._for_each_shift(difference, reference, compared)
+
+    def remaining_shares(
+        self, unaware: MetricValues, agent: MetricValues, removed: MetricValues
+    ) -> dict[str, tuple[Interval, ...]]:
+        """Compute the share of the lead that remains after removal, for each metric at each shift."""
+        return self._for_each_shift(remaining_share, unaware, agent, removed)
+
+    def overall_differences(self, reference: MetricValues, compared: MetricValues) -> dict[str, Interval]:
+        """Compute `compared - reference` of the same policies over all episodes, for each metric."""
+        differences = {}
+        for name in self.metric_names:
+            differences[name] = paired_difference(reference[name], compared[name], self._clusters, same_runs=True)
+        return differences
+
+    def _for_each_shift(
+        self, statistic: Callable[..., Interval], *sides: MetricValues
+    ) -> dict[str, tuple[Interval, ...]]:
+        """Compute a statistic of the results [S, E] of several sides, for each metric at each shift."""
+        # Metric by metric, with the clusters of each shift.
+        intervals_by_metric = {}
+        for name in self.metric_names:
+            intervals = []
+            for subset in self._subsets:
+                side_results = [side[name][:, subset.mask] for side in sides]
+                intervals.append(statistic(*side_results, subset.scenes))
+            intervals_by_metric[name] = tuple(intervals)
+        return intervals_by_metric
+
+
+class _RemovalReport(NamedTuple):
+    """Makes the rows of a mixed population.
+
+    Attributes:
+      fields: fields of all rows.
+      shifts: layout shifts of the population.
+      metrics: computes and compares metrics.
+      unaware: results of the agent without experience.
+      agent: results of the agent with experience, without removal.
+      num_scenes: number of scenes at each shift.
+    """
+
+    fields: Mapping[str, Any]
+    shifts: tuple[float, ...]
+    metrics: PopulationMetrics
+    unaware: MetricValues
+    agent: MetricValues
+    num_scenes: int
+
+    def row(self, metric: str, value: Interval, **fields: Any) -> ResultRow:
+        """Make one row."""
+        return ResultRow(**{**self.fields, **fields}, metric=metric, value=value, scenes=self.num_scenes)
+
+    def agent_rows(self) -> Iterator[ResultRow]:
+        """Make the rows of both agents without removal, and of the lead of one over the other."""
+        lead = self.metrics.differences(self.unaware, self.agent, same_runs=False)
+        yield from self._shift_rows(self.metrics.means(self.unaware), variant=WITHOUT_EXPERIENCE)
+        yield from self._shift_rows(self.metrics.means(self.agent), variant=WITHOUT_REMOVAL)
+        yield from self._shift_rows(lead, variant=WITHOUT_REMOVAL, reference=WITHOUT_EXPERIENCE)
+
+    def removal_rows(
+        self, name: str, outcome: EpisodeOutcome, controls: Mapping[str, EpisodeOutcome] | None = None
+    ) -> Iterator[ResultRow]:
+        """Make the rows of one removal: its weight, its change at each shift and over the mixture, and what it keeps.
+
+        Args:
+          name: name of the removal.
+          outcome: its outcome.
+          controls: outcomes of its controls, by name; None for a removal that is a control itself.
+        """
+        # The removal uses the networks of the agent, so both are paired by run.
+        metrics = self.metrics
+        removed = metrics.percent_metrics(outcome)
+        fields = {"variant": name, "reference": WITHOUT_REMOVAL}
+        yield from self._weight_rows(outcome, variant=name)
+        yield from self._shift_rows(metrics.differences(self.agent, removed, same_runs=True), **fields)
+        for metric, difference in metrics.overall_differences(self.agent, removed).items():
+            yield self.row(metric, difference, **fields)
+
+        # The share of the lead that remains, of a value or a cost.
+        shares = metrics.remaining_shares(self.unaware, self.agent, removed)
+        yield from self._shift_rows({f"{metric} left": by_shift for metric, by_shift in shares.items()}, variant=name)
+
+        # The gain over each control is measured over the whole mixture.
+        for control, control_outcome in (controls or {}).items():
+            control_metrics = metrics.percent_metrics(control_outcome)
+            yield from self._weight_rows(control_outcome, variant=name, control=control)
+            for metric, gain in metrics.overall_differences(control_metrics, removed).items():
+                yield self.row(metric, gain, variant=name, control=control, reference="control")
+
+    def mixture_gain(self, outcome: EpisodeOutcome, budget: int) -> float:
+        """Gain of a removal in success within a budget, over the mixture."""
+        removed = self.metrics.percent_metrics(outcome)
+        return self.metrics.overall_differences(self.agent, removed)[f"sr@{budget}"].mean
+
+    def _weight_rows(self, outcome: EpisodeOutcome, **fields: Any) -> Iterator[ResultRow]:
+        for shift, weight in zip(self.shifts, self.metrics.removal_weights(outcome), strict=True):
+            yield self.row("weight", Interval(weight), shift=shift, **fields)
+
+    def _shift_rows(self, by_metric: Mapping[str, tuple[Interval, ...]], **fields: Any) -> Iterator[ResultRow]:
+        for metric, intervals in by_metric.items():
+            for shift, interval in zip(self.shifts, intervals, strict=True):
+                yield self.row(metric, interval, shift=shift, **fields)

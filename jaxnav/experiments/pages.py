@@ -1,0 +1,219 @@
+"""Pages of experiments: Markdown templates, filled from the result table by Jinja.
+
+A template is Markdown with expressions such as `{{ table.find(world="rooms", run="org", ...) | f(".1f") }}`.
+`render_page` gives it the experiment (`config`), the results (`table`, and `tables` by split), the agents, and the
+functions of this module. The summary of a page, between two `<!-- reading -->` marks, is written by hand and kept.
+"""
+
+import functools
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments.bench import best_epsilon
+from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
+from jaxnav.experiments.scores import chooses_actions
+from jaxnav.experiments.table import ResultTable, merge_fields
+from jaxnav.scenes.worlds import WORLDS
+from jaxnav.store.files import write_atomic
+
+PAGES = Path(__file__).parent / "pages"
+READING_MARK = "<!-- reading -->"
+
+
+def check_page(document: Path, template: str) -> None:
+    """Check that a page can be written.
+
+    Raises:
+      InputError: there is no such template, or the document exists and does not hold two reading marks.
+    """
+    _load_template(template)
+    if document.exists() and document.read_text(encoding="utf-8").count(READING_MARK) != 2:
+        raise InputError(f"{document}: exists without two lines {READING_MARK}; give another document in `pages`")
+
+
+def render_page(
+    document: Path, template: str, config: ExperimentConfig, tables: dict[str, ResultTable], missing: Sequence[str]
+) -> str:
+    """Fill a template, write the document, and return its text.
+
+    Args:
+      document: the Markdown file; its summary is kept, and its figures are in the folder `images` beside it.
+      template: name of a packaged template, or a file.
+      config: the experiment.
+      tables: results by split.
+      missing: names of the results that do not exist yet.
+
+    Raises:
+      InputError: see `check_page`, or a fault in the template.
+    """
+    check_page(document, template)
+    summary = "\n\n"
+    if document.exists():
+        summary = document.read_text(encoding="utf-8").split(READING_MARK)[1]
+
+    # Pages show `val`, unless an experiment was done on another split alone.
+    table = tables.get("val", tables.get(config.split, ResultTable([])))
+    context = {
+        "config": config,
+        "table": table,
+        "tables": tables,
+        "runs": _runs_with_results(config, table),
+        "summary": READING_MARK + summary + READING_MARK,
+        "missing": missing,
+        "figure": functools.partial(_draw_figure, document),
+    }
+    try:
+        text = _load_template(template).render(context)
+    except (jinja2.TemplateError, KeyError, TypeError) as error:
+        raise InputError(f"template {template}: {type(error).__name__}: {error}") from error
+    write_atomic(document, (text.strip() + "\n").encode())
+    return text
+
+
+def _load_template(template: str) -> jinja2.Template:
+    """Load a packaged template by its name, or a file."""
+    path = PAGES / f"{template}.md"
+    if not path.exists():
+        path = Path(template)
+    loader = jinja2.FileSystemLoader([path.parent, PAGES])
+    environment = jinja2.Environment(
+        loader=loader,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        extensions=["jinja2.ext.do", "jinja2.ext.loopcontrols"],
+    )
+    environment.filters |= {"f": format_value, "plus_minus": format_with_std}
+    environment.globals |= {
+        "line": table_line,
+        "header": table_header,
+        "verdict": verdict,
+        "best_epsilon": best_epsilon,
+        "chooses_actions": chooses_actions,
+        "requested_steps": requested_steps,
+        "total_steps": total_steps,
+        "difference_of_worlds": difference_of_worlds,
+        "effect_cells": effect_cells,
+        "merge": merge_fields,
+        "numbers": format_numbers,
+        "shift_titles": shift_titles,
+        "weights": format_weights,
+    }
+    try:
+        return environment.get_template(path.name)
+    except jinja2.TemplateNotFound as error:
+        names = ", ".join(sorted(page.stem for page in PAGES.glob("*.md")))
+        raise InputError(f"pages: {template!r} is neither a file nor one of {names}") from error
+    except jinja2.TemplateSyntaxError as error:
+        raise InputError(f"{path}, line {error.lineno}: {error.message}") from error
+
+
+def _runs_with_results(config: ExperimentConfig, table: ResultTable) -> dict[str, dict[str, AgentRun]]:
+    """Runs that have results, by world and agent."""
+    measured = {(row.world, row.run) for row in table.rows}
+    runs: dict[str, dict[str, AgentRun]] = {world: {} for world in config.worlds}
+    for run in agent_runs(config):
+        if (run.world, run.agent) in measured:
+            runs[run.world][run.agent] = run
+    return {world: world_runs for world, world_runs in runs.items() if world_runs}
+
+
+def _draw_figure(document: Path, name: str, table: ResultTable, shifts: Sequence[float], fields: dict[str, Any]) -> str:
+    """Draw a figure into the folder `images/DOCUMENT` beside a document, and return its path there."""
+    from jaxnav.experiments.figures import FIGURES
+    from jaxnav.viz.style import save_figure
+
+    image = Path("images") / document.stem / f"{name}.png"
+    (document.parent / image).parent.mkdir(parents=True, exist_ok=True)
+    save_figure(FIGURES[name](table, shifts, fields), document.parent / image)
+    return image.as_posix()
+
+
+# Functions of templates
+
+
+def format_value(value: Interval | float, spec: str) -> str:
+    """Format an interval or a number; `-` if it is undefined."""
+    if isinstance(value, float) and math.isnan(value):
+        return "-"
+    return f"{value:{spec}}"
+
+
+def format_with_std(value: Interval, digits: int = 1) -> str:
+    """Format a mean and, with several seeds, their standard deviation."""
+    mean = f"{value.mean:.{digits}f}"
+    return mean if math.isnan(value.std) else f"{mean} ± {value.std:.{digits}f}"
+
+
+def table_line(*cells: Any) -> str:
+    """Make a line of a Markdown table; a cell may be a list of cells."""
+    words: list[str] = []
+    for cell in cells:
+        words += map(str, cell) if isinstance(cell, list | tuple) else [str(cell)]
+    return f"| {' | '.join(words)} |"
+
+
+def table_header(*titles: Any) -> str:
+    """Make the two lines above a Markdown table; all columns but the first are right-aligned."""
+    title_line = table_line(*titles)
+    num_columns = title_line.count(" | ") + 1
+    return f"{title_line}\n| {' | '.join(['---'] + ['---:'] * (num_columns - 1))} |"
+
+
+def verdict(effect: Interval, min_effect: float) -> str:
+    """Verdict on a claim that an effect is above 0.
+
+    An interval below 0 refutes the claim; one below `min_effect`, the least effect that would matter, shows that the
+    effect is too small to matter, whatever its sign; one above 0 confirms the claim; all others leave it open.
+    """
+    if effect.high < 0:
+        return "refuted"
+    if effect.high < min_effect:
+        return "too small to matter"
+    return "holds" if effect.low > 0 else "cannot be told"
+
+
+def difference_of_worlds(first: Interval, second: Interval) -> Interval:
+    """Difference of effects in independent worlds; bounds are added, so the interval is wider than needed."""
+    return Interval(first.mean - second.mean, first.low - second.high, first.high - second.low)
+
+
+def format_numbers(values: Iterable[float]) -> list[str]:
+    """Format numbers without trailing zeros."""
+    return [f"{value:g}" for value in values]
+
+
+def shift_titles(shifts: Iterable[float]) -> list[str]:
+    """Titles of the columns of layout shifts."""
+    return [f"shift {shift:g}" for shift in shifts]
+
+
+def effect_cells(table: ResultTable, fields: dict[str, Any], shifts: Iterable[float]) -> list[str]:
+    """Effect on SR against the layout weights, and mean weight, one cell per shift."""
+    cells = []
+    for shift in shifts:
+        effect = table.find(**fields, shift=shift, reference="layout", metric="sr")
+        weight = table.find(**fields, shift=shift, metric="weight")
+        cells.append(f"{effect:+.1f} ({weight.mean:.2f})")
+    return cells
+
+
+def format_weights(table: ResultTable, fields: dict[str, Any], shifts: Iterable[float]) -> str:
+    """Mean weights of a removal at some shifts."""
+    return ", ".join(f"{table.find(**fields, shift=shift, metric='weight').mean:.2f}" for shift in shifts)
+
+
+def requested_steps(run: AgentRun) -> int:
+    """Environment steps that a run was asked for; whole chunks may be more."""
+    return run.config.total_steps or WORLDS[run.config.world].total_steps
+
+
+def total_steps(runs: Iterable[AgentRun]) -> int:
+    """Environment steps of the longest training among runs."""
+    return max(run.config.total_updates * run.config.steps_per_update for run in runs)

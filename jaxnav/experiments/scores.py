@@ -1,0 +1,325 @@
+"""Scores of agents and their paired differences: the measurements `evaluation`, `frontier`, `account` and `groups`.
+
+The numbers are those of `jaxnav eval`: baseline, layout weights (`layout`), hard TDE (`tde`) and sTDE (`stde`) with
+best and with sampled actions, Random and the shortest path, all on the same episodes. A row with a `reference` is the
+difference to another variant of the same run, or to the variant `AGENT/VARIANT` of another run.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxnav.baselines.frontier import run_frontier_search
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
+from jaxnav.evaluation.grid import episode_metrics
+from jaxnav.evaluation.notes import last_quarter_success
+from jaxnav.evaluation.report import UNTRAINED_VARIANTS, Decoding, remaining_share
+from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
+from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.experiments.bench import Bench, Scores
+from jaxnav.experiments.config import AgentRun
+from jaxnav.experiments.table import ResultRow
+from jaxnav.policies.method import ActionControl
+from jaxnav.policies.methods import find_method
+from jaxnav.runs.evaluate import draw_episode_lists
+from jaxnav.runs.run import Run
+
+DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
+METRICS = ("sr", "spl", "dts")
+#: Comparisons within a run: a variant and its reference.
+VARIANT_COMPARISONS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"), ("tde", "layout"))
+#: Variants that act by trained policies.
+TRAINED_VARIANTS = ("baseline", "layout", "stde", "tde")
+
+
+def measure_evaluation(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
+    """Score every variant of a run at every shift, and compare it with its references."""
+    for shift in bench.config.shifts:
+        scores = bench.evaluate(run, shift)
+        yield from value_rows(run, shift, scores)
+
+        # Every agent that the run is compared with meets the same episodes.
+        references = {}
+        for reference in run.against:
+            reference_run = bench.find_run(run.world, reference.partition("/")[0])
+            if reference_run is not None:
+                references[reference] = bench.evaluate(reference_run, shift)
+        yield from difference_rows(run, shift, scores, references)
+    yield from training_rows(run)
+
+
+def value_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRow]:
+    """Score the variants of a run."""
+    clusters = scores.episodes.clusters()
+    for row, metrics in scores.metrics.items():
+        is_trained = row.variant not in UNTRAINED_VARIANTS
+        for metric in METRICS:
+            interval = mean_interval(metrics[metric], clusters, trained=is_trained)
+            yield ResultRow(**row_fields(run, shift, row), metric=metric, value=interval, scenes=num_scenes(scores))
+
+
+def difference_rows(
+    run: AgentRun, shift: float, scores: Scores, references: Mapping[str, Scores]
+) -> Iterator[ResultRow]:
+    """Compare the variants of a run with each other, with random choices, and with those of other agents.
+
+    Args:
+      run: the run.
+      shift: layout shift.
+      scores: scores of the run.
+      references: scores of other agents. Under the name AGENT are those of an agent whose variants are compared with
+        the same variants of the run; under AGENT/VARIANT, one variant is compared with the run's last arm.
+    """
+    for decoding in DECODINGS:
+        # Within the run: the baseline was trained separately, and random choices have no networks of their own.
+        variants = variants_by_name(scores, decoding)
+        for variant, reference in VARIANT_COMPARISONS:
+            if variant in variants and reference in variants:
+                same_runs = "baseline" not in (variant, reference)
+                yield from _compare(run, shift, variants[variant], variants[reference], reference, same_runs=same_runs)
+        for variant in TRAINED_VARIANTS:
+            if variant in variants:
+                yield _compare_with_chance(run, shift, variants[variant], variants["random"])
+                if not chooses_actions(run):
+                    yield from _compare(run, shift, variants[variant], variants["random"], "random", same_runs=True)
+
+        for name, reference_scores in references.items():
+            other_variants = variants_by_name(reference_scores, decoding)
+            _, is_single, single_variant = name.partition("/")
+            if is_single:
+                pairs = [(run.config.arms[-1], single_variant)]
+            else:
+                pairs = [(variant, variant) for variant in TRAINED_VARIANTS]
+            for variant, other_variant in pairs:
+                if variant in variants and other_variant in other_variants:
+                    reference_name = name if is_single else f"{name}/{variant}"
+                    yield from _compare(run, shift, variants[variant], other_variants[other_variant], reference_name)
+
+
+class VariantScores(NamedTuple):
+    """Scores of one variant of an agent: its row of the evaluation, metrics [S, E], and the episodes."""
+
+    row: EvaluationRow
+    metrics: Mapping[str, np.ndarray]
+    episodes: EpisodeList
+
+
+def variants_by_name(scores: Scores, decoding: Decoding) -> dict[str, VariantScores]:
+    """Scores of every variant with a decoding; of sTDE, those at the first epsilon. Random has either decoding."""
+    variants: dict[str, VariantScores] = {}
+    for row, metrics in scores.metrics.items():
+        if row.decoding == decoding or row.variant in UNTRAINED_VARIANTS:
+            variants.setdefault(row.variant, VariantScores(row, metrics, scores.episodes))
+    return variants
+
+
+def chooses_actions(run: AgentRun) -> bool:
+    """True if the choices of a run's policies are the actions themselves, so that random choices are random actions."""
+    return find_method(run.config.method).control == ActionControl()
+
+
+def _compare(
+    run: AgentRun,
+    shift: float,
+    compared: VariantScores,
+    reference: VariantScores,
+    reference_name: str,
+    *,
+    same_runs: bool = False,
+) -> Iterator[ResultRow]:
+    """Compare two variants in every metric, paired on the episodes."""
+    check_same_episodes(compared.episodes, reference.episodes)
+    clusters = compared.episodes.clusters()
+    for metric in METRICS:
+        difference = paired_difference(
+            reference.metrics[metric], compared.metrics[metric], clusters, same_runs=same_runs
+        )
+        fields = row_fields(run, shift, compared.row)
+        yield ResultRow(
+            **fields, reference=reference_name, metric=metric, value=difference, scenes=len(compared.episodes.scenes)
+        )
+
+
+def _compare_with_chance(run: AgentRun, shift: float, compared: VariantScores, random: VariantScores) -> ResultRow:
+    """Compare success with that of Random in other scenes, for these training runs."""
+    clusters = compared.episodes.clusters()
+    lead = paired_difference(random.metrics["sr"], compared.metrics["sr"], clusters, trained=False)
+    fields = row_fields(run, shift, compared.row)
+    return ResultRow(**fields, reference="chance", metric="sr", value=lead)
+
+
+def row_fields(run: AgentRun, shift: float | None, row: EvaluationRow) -> dict[str, Any]:
+    """Fields of a result that a row of an evaluation determines."""
+    is_stde = row.variant == "stde"
+    return {
+        "world": run.world,
+        "run": run.agent,
+        "variant": row.variant,
+        "decoding": "" if row.variant in UNTRAINED_VARIANTS else row.decoding,
+        "shift": shift,
+        "epsilon": row.epsilon,
+        "form": row.form or "" if is_stde else "",
+    }
+
+
+def training_rows(run: AgentRun) -> Iterator[ResultRow]:
+    """Cost and convergence of a training run: environment steps by purpose, seconds, and success near its end."""
+    # Exploration counts what the run really spent, which its policies know.
+    trained_run = Run(run.config)
+    budget = run.config.steps_by_purpose | {"exploration": trained_run.policies().prior_steps}
+    values: dict[str, float] = {f"{purpose} (steps)": num_steps for purpose, num_steps in budget.items()}
+    values["training (s)"] = trained_run.times()[-1]["wall_s"]
+
+    last_quarter = last_quarter_success(trained_run.log())
+    if last_quarter is not None:
+        values["val sr before the last quarter"], values["val sr at the end"] = last_quarter
+    for metric, value in values.items():
+        yield ResultRow(world=run.world, run=run.agent, metric=metric, value=Interval(float(value)))
+
+
+def check_same_episodes(episodes: EpisodeList, other: EpisodeList) -> None:
+    """Check that two agents met the same episodes.
+
+    Raises:
+      InputError: they did not, or in other scenes.
+    """
+    for name in ("scene", "goal", "pose"):
+        if not np.array_equal(getattr(episodes, name), getattr(other, name)):
+            raise InputError("the runs do not meet the same episodes; train both in one world, with equal rules")
+    if episodes.scenes != other.scenes:
+        raise InputError("the runs meet other scenes; train both in one world")
+
+
+def num_scenes(scores: Scores) -> int:
+    """Number of scenes with episodes."""
+    return len(np.unique(scores.episodes.scene))
+
+
+# Frontier search
+
+
+def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
+    """Score frontier search, which needs no training, on the episodes of a run."""
+    for shift in bench.config.shifts:
+        world = bench.compile_world(run, shift)
+        episode_lists = draw_episode_lists(world, bench.config.episodes, bench.config.seed)
+        outcomes = []
+        for bank, bank_episodes in zip(world.banks, episode_lists, strict=True):
+            outcomes.append(run_frontier_search(bank, bank_episodes, world.scene_step_limits(bank)))
+
+        # The search is deterministic, so it counts as a single run: leaves [1, E].
+        outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves)[None], *outcomes)
+        episodes = join_episode_lists(episode_lists)
+        metrics = episode_metrics(outcome, episodes.best_length)
+        for metric in METRICS:
+            scale = 1.0 if metric == "dts" else 100.0
+            interval = mean_interval(scale * metrics[metric], episodes.clusters(), trained=False)
+            yield ResultRow(
+                world=run.world,
+                run="frontier",
+                variant="frontier",
+                shift=shift,
+                metric=metric,
+                value=interval,
+                scenes=len(np.unique(episodes.scene)),
+            )
+
+
+# Value and cost of experience
+
+
+def measure_account(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
+    """Compare every variant of a run with agents that cannot know any layout, at every shift.
+
+    The metric `sr left` is the share of the lead that remains after a removal: of a value the share kept, of a cost 100
+    minus the share recovered.
+
+    Raises:
+      InputError: the experiment has no agents without experience, or as many seeds of neither.
+    """
+    unaware_run = require_unaware_run(bench, run)
+    for shift in bench.config.shifts:
+        scores = bench.evaluate(run, shift)
+        unaware_scores = bench.evaluate(unaware_run, shift)
+        check_same_episodes(scores.episodes, unaware_scores.episodes)
+        clusters = scores.episodes.clusters()
+        metric_names = ("sr", "spl", *(f"sr@{budget}" for budget in scores.budgets))
+
+        for row, metrics in scores.metrics.items():
+            if row.arm is None:
+                continue
+
+            # The agent without experience, and the agent with all of its experience, with the same decoding.
+            unaware_metrics = unaware_scores.metrics[EvaluationRow("baseline", None, None, row.decoding)]
+            agent_metrics = scores.metrics[EvaluationRow(row.arm, None, None, row.decoding)]
+            fields = row_fields(run, shift, row) | {"reference": unaware_run.agent, "scenes": num_scenes(scores)}
+            for metric in metric_names:
+                lead = paired_difference(unaware_metrics[metric], metrics[metric], clusters)
+                yield ResultRow(**fields, metric=metric, value=lead)
+                if metrics is not agent_metrics:
+                    share = remaining_share(unaware_metrics[metric], agent_metrics[metric], metrics[metric], clusters)
+                    yield ResultRow(**fields, metric=f"{metric} left", value=share)
+
+
+def require_unaware_run(bench: Bench, run: AgentRun) -> AgentRun:
+    """Return the run of agents that cannot know any layout, in the world of a run.
+
+    Raises:
+      InputError: there is none, or it differs from the run in world, goals or number of seeds.
+    """
+    unaware_run = bench.unaware_run(run.world)
+    if unaware_run is None:
+        raise InputError(f"{run.name}: there are no agents without experience to compare with; give --without RUN")
+    for name in ("world", "scenes", "worlds", "task", "seeds"):
+        if getattr(run.config, name) != getattr(unaware_run.config, name):
+            directories = f"{run.config.run_dir} and {unaware_run.config.run_dir}"
+            raise InputError(f"{directories} differ in {name}; train both alike")
+    return unaware_run
+
+
+# Groups of agents
+
+
+def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
+    """Compare the mean of each group of agents with an agent, or with another variant of the group.
+
+    Args:
+      bench: evaluates the agents.
+      run: any run of the world.
+    """
+    shift = bench.config.shifts[0]
+    for name, group in bench.config.groups.items():
+        members = []
+        for agent in group["agents"]:
+            member_run = bench.find_run(run.world, agent)
+            if member_run is not None:
+                members.append(variants_by_name(bench.evaluate(member_run, shift), "argmax"))
+        variant, reference = group["variant"], group["against"]
+
+        # The reference is a variant of the same agents, or AGENT/VARIANT.
+        agent, _, agent_variant = reference.rpartition("/")
+        if agent:
+            reference_run = bench.find_run(run.world, agent)
+            if reference_run is None:
+                continue
+            references = [variants_by_name(bench.evaluate(reference_run, shift), "argmax")[agent_variant]]
+        else:
+            members = [member for member in members if variant in member and reference in member]
+            references = [member[reference] for member in members]
+        if not members:
+            continue
+        compared = [member[variant] for member in members]
+        clusters = compared[0].episodes.clusters()
+        has_own_networks = agent_variant not in UNTRAINED_VARIANTS
+        effect = paired_difference(_mean_sr(references), _mean_sr(compared), clusters, same_runs=not has_own_networks)
+        fields = {"world": run.world, "run": name, "variant": variant, "decoding": "argmax", "shift": shift}
+        yield ResultRow(**fields, reference=reference, metric="sr", value=effect)
+        yield ResultRow(**fields, reference=reference, metric="agents", value=Interval(float(len(members))))
+
+
+def _mean_sr(scores: Sequence[VariantScores]) -> np.ndarray:
+    """Average success over agents, run by run, [S, E]."""
+    return np.mean([variant.metrics["sr"] for variant in scores], axis=0)

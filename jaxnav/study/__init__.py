@@ -1,1 +1,0 @@
-"""The study of the paper's claims, which nothing else imports."""
