@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.study_results import episodes_in
+from support.episodes import episodes_in
 
 from jaxnav.baselines.shortest_path import oracle_actions, replay_actions, run_oracle
 from jaxnav.env.make import build_environment

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.study_results import episodes_in
+from support.episodes import episodes_in
 
 from jaxnav.evaluation.notes import convergence_note, evaluation_notes
 from jaxnav.evaluation.variants import EvaluationRow

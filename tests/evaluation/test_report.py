@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from support.episodes import episodes_in
 from support.intervals import around
-from support.study_results import episodes_in
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation import report as reports

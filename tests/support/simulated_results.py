@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import expit
 
 from jaxnav.evaluation.statistics import Interval, leave_one_out, mean_interval
-from jaxnav.study.claims import Claim
+from jaxnav.experiments.pages import verdict
 
 #: Numbers of scenes and training runs.
 SIZES = ((80, 5), (20, 3), (20, 5), (10, 3), (5, 3))
@@ -91,8 +91,8 @@ def verdict_shares(effect: float, error: float, least: float = 2.0, draws: int =
     """
     estimates = effect + error * np.random.default_rng(0).normal(size=draws)
     half = 1.96 * error
-    verdicts = [Claim("", "", Interval(x, x - half, x + half), least).verdict for x in estimates.tolist()]
-    return {verdict: verdicts.count(verdict) / draws for verdict in VERDICTS}
+    verdicts = [verdict(Interval(estimate, estimate - half, estimate + half), least) for estimate in estimates.tolist()]
+    return {name: verdicts.count(name) / draws for name in VERDICTS}
 
 
 def main() -> None:
