@@ -254,7 +254,7 @@ class LayoutEstimator(struct.PyTreeNode):
         return next_state.replace(gap=jnp.maximum(gap, state.gap) if config.hold else gap)
 
     @staticmethod
-    def expectation(state: LayoutState, goal: jax.Array | int | None = None) -> jax.Array:
+    def expectation(state: LayoutState) -> jax.Array:
         """Expected co-occurrence w (eq. 6).
 
         w_ij = alpha_ij / sum_k alpha_ik, the mean of row i: the probability that a category seen with i is j. The
@@ -262,15 +262,11 @@ class LayoutEstimator(struct.PyTreeNode):
 
         Args:
           state: the belief.
-          goal: int [], for the column w[:, goal] alone; None for all of w.
 
         Returns:
-          float32 [K, K], or [K] with a goal.
+          float32 [K, K].
         """
-        if goal is None:
-            return jax.vmap(LayoutEstimator.expectation, (None, 0), 1)(state, jnp.arange(state.alpha.shape[-1]))
-        goal_share = state.alpha[:, goal] / state.alpha.sum(-1)
-        return goal_share.at[goal].add(1)
+        return jax.vmap(LayoutEstimator.goal_weights, (None, 0), 1)(state, jnp.arange(state.alpha.shape[-1]))
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
@@ -278,7 +274,8 @@ class LayoutEstimator(struct.PyTreeNode):
 
         A method multiplies what Z holds of category i by entry i, see `Experience.encode`.
         """
-        return LayoutEstimator.expectation(state, goal)
+        goal_share = state.alpha[:, goal] / state.alpha.sum(-1)
+        return goal_share.at[goal].add(1)
 
     def _novelty(self, alpha: jax.Array, counts: jax.Array, visible: jax.Array) -> jax.Array:
         """Tanh of the reduced row divergences KL(posterior || belief) (eq. 5), float32 []; 1 for the gap `clock`.

@@ -130,7 +130,6 @@ class Experience(nnx.Module):
 
     def attend(self, encoded: Tree, memory: "PolicyState") -> jax.Array:
         """Experience float32 [..., Z], given the memory."""
-        del memory
         return encoded
 
 
@@ -168,11 +167,9 @@ class ActionControl:
 
     def is_decision_step(self, state: Tree) -> None:
         """Every choice has an effect."""
-        del state
 
     def act(self, choice: jax.Array, state: Tree, knowledge: Any) -> tuple[jax.Array, Tree]:
         """Return the choice."""
-        del knowledge
         return choice, state
 
 

@@ -81,18 +81,10 @@ def explore(
       num_walks: parallel walks.
       num_steps: steps of each walk.
     """
-    agent_loop = AgentLoop(env)
-    agent, actions = _start_walks(agent_loop, env_params, None, key, num_walks, num_steps)
-    tables = env_params.tables
-
     # Walk, and mark the poses visited in any walk.
-    def step(carry: tuple[Agent, jax.Array], action: jax.Array) -> tuple[tuple[Agent, jax.Array], None]:
-        agent, is_visited = carry
-        agent, _ = agent_loop.step(agent, action, None, env_params)
-        return (agent, is_visited.at[agent.state.pose].set(True)), None
-
-    is_visited = jnp.zeros(tables.rows.shape[0], bool).at[agent.state.pose].set(True)
-    (_, is_visited), _ = jax.lax.scan(step, (agent, is_visited), actions)
+    tables = env_params.tables
+    poses, _ = _walk(env, env_params, key, num_walks, num_steps)
+    is_visited = jnp.zeros(tables.rows.shape[0], bool).at[poses].set(True)
 
     # Detections at visited poses [P, K], and the room type of each pose [P].
     presence = (env.row_format.presence(tables.rows) & is_visited[:, None]).astype(jnp.float32)
@@ -130,6 +122,21 @@ def _start_walks(
     return agent, actions
 
 
+def _walk(
+    env: ObjectNav, env_params: EnvParams, key: jax.Array, num_walks: int, num_steps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Walk at random: the poses of each walk, int32 [W, T + 1], and its scene, int32 [W]."""
+    agent_loop = AgentLoop(env)
+    agent, actions = _start_walks(agent_loop, env_params, None, key, num_walks, num_steps)
+
+    def step(agent: Agent, action: jax.Array) -> tuple[Agent, jax.Array]:
+        next_agent, _ = agent_loop.step(agent, action, None, env_params)
+        return next_agent, next_agent.state.pose
+
+    _, next_poses = jax.lax.scan(step, agent, actions)
+    return jnp.concatenate([agent.state.pose[None], next_poses]).T, agent.state.scene
+
+
 # 2. Layout priors, and calibration of the estimator
 
 
@@ -146,11 +153,8 @@ def layout_priors(counts: jax.Array, estimator_config: str | EstimatorConfig) ->
     Returns:
       float32 [rooms, K, K].
     """
-
-    def room_prior(room_counts: jax.Array) -> jax.Array:
-        return prior_from_counts(room_counts + 1.0, estimator_config)
-
-    return jax.vmap(room_prior)(_fill_unseen_rooms(counts))
+    make_prior = partial(prior_from_counts, setting=estimator_config)
+    return jax.vmap(make_prior)(_fill_unseen_rooms(counts) + 1.0)
 
 
 def _fill_unseen_rooms(counts: jax.Array) -> jax.Array:
@@ -307,7 +311,8 @@ def fit_shift_classifier(
     scene_key = jax.random.fold_in(key, 3)
 
     # Pairs that each walk has seen together when it is cut at a random length, bool [W, K, K].
-    presence, scene = _detect_on_walks(env, env_params, walk_key, num_walks)  # [W, T + 1, K], [W]
+    poses, scene = _walk(env, env_params, walk_key, num_walks, _WALK_LENGTHS[-1])
+    presence = env.row_format.presence(env_params.tables.rows[poses])  # [W, T + 1, K]
     lengths = jax.random.choice(length_key, jnp.array(_WALK_LENGTHS), (num_walks,))
     is_before_cut = jnp.arange(presence.shape[1])[None] <= lengths[:, None]
     co_seen = jax.vmap(seen_together)(presence & is_before_cut[..., None])
@@ -318,7 +323,7 @@ def fit_shift_classifier(
     frequency = jnp.diagonal(counts, axis1=1, axis2=2)[room]
     exchange_keys = jax.random.split(exchange_key, num_walks)
     exchanges = jax.vmap(draw_category_exchange)(exchange_keys, is_present, frequency)
-    shifted_co_seen = jax.vmap(_permute_categories)(co_seen, exchanges)
+    shifted_co_seen = jax.vmap(lambda matrix, exchange: matrix[exchange][:, exchange])(co_seen, exchanges)
 
     # Examples of both layouts, bool [2 W, pairs], and the scenes that only calibrate.
     rows, columns = jnp.triu_indices(counts.shape[-1], 1)
@@ -348,22 +353,6 @@ def co_visibility_from_counts(counts: jax.Array) -> jax.Array:
     category_counts = jnp.diagonal(counts, axis1=1, axis2=2)[..., None]
     off_diagonal = 1 - jnp.eye(counts.shape[-1], dtype=counts.dtype)
     return counts / jnp.maximum(category_counts, 1) * off_diagonal[None]
-
-
-def _detect_on_walks(
-    env: ObjectNav, env_params: EnvParams, key: jax.Array, num_walks: int
-) -> tuple[jax.Array, jax.Array]:
-    """Detections on random walks, bool [W, T + 1, K], and the scene of each walk, int32 [W]."""
-    agent_loop = AgentLoop(env)
-    agent, actions = _start_walks(agent_loop, env_params, None, key, num_walks, _WALK_LENGTHS[-1])
-
-    def step(agent: Agent, action: jax.Array) -> tuple[Agent, jax.Array]:
-        next_agent, _ = agent_loop.step(agent, action, None, env_params)
-        return next_agent, next_agent.state.pose
-
-    _, next_poses = jax.lax.scan(step, agent, actions)
-    poses = jnp.concatenate([agent.state.pose[None], next_poses]).T
-    return env.row_format.presence(env_params.tables.rows[poses]), agent.state.scene
 
 
 def _find_present_categories(env: ObjectNav, env_params: EnvParams) -> jax.Array:
@@ -407,11 +396,6 @@ def draw_category_exchange(key: jax.Array, present: jax.Array, frequency: jax.Ar
     partner = jnp.where((position ^ 1) < num_present, position ^ 1, position)
     partner = jnp.where(position < num_present, partner, position)
     return jnp.zeros_like(order).at[order].set(order[partner])
-
-
-def _permute_categories(co_seen: jax.Array, permutation: jax.Array) -> jax.Array:
-    """Permute rows and columns of a matrix [K, K] over categories."""
-    return co_seen[permutation][:, permutation]
 
 
 def _fit_log_odds(pairs: jax.Array, rooms: jax.Array, is_held_out: jax.Array, num_rooms: int) -> jax.Array:

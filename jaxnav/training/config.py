@@ -10,6 +10,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxnav.policies.method import Stage
@@ -137,9 +138,5 @@ def stage_index_at(stages: tuple[Stage, ...], progress: float) -> int:
       stages: stages of a method, in order.
       progress: share of all updates that are done, in [0, 1).
     """
-    stage_end = 0.0
-    for stage_index, stage in enumerate(stages):
-        stage_end += stage.share
-        if progress < stage_end - 1e-9:  # sums of shares are rounded
-            return stage_index
-    return len(stages) - 1
+    stage_ends = np.cumsum([stage.share for stage in stages]) - 1e-9  # sums of shares are rounded
+    return min(int(np.searchsorted(stage_ends, progress, side="right")), len(stages) - 1)

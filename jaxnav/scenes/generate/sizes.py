@@ -17,16 +17,12 @@ def typical_box(name: str) -> tuple[float, float, float, float]:
     Returns:
       Width, height and depth, and the height of the centre above the floor, metres.
     """
-    boxes = _read_boxes()
+    boxes = typical_boxes()
     return boxes.get(name) or boxes.get(ALIASES.get(name, name), UNKNOWN_BOX)
 
 
-def typical_types() -> tuple[str, ...]:
-    """Return the types with a known typical size."""
-    return tuple(_read_boxes())
-
-
 @functools.cache
-def _read_boxes() -> dict[str, tuple[float, float, float, float]]:
+def typical_boxes() -> dict[str, tuple[float, float, float, float]]:
+    """Read the typical sizes by type, see `typical_box`."""
     table = yaml.safe_load(pathlib.Path(__file__).with_name("sizes.yaml").read_text())
     return {name: tuple(numbers) for name, numbers in table.items()}

@@ -31,7 +31,7 @@ from jaxnav.scenes.files.importers.assemble import (
 )
 from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, parse_json, read_bytes
 from jaxnav.scenes.generate.rooms import AGENT_RADIUS, OBSTACLE_HEIGHTS
-from jaxnav.scenes.generate.sizes import typical_box, typical_types
+from jaxnav.scenes.generate.sizes import typical_box, typical_boxes
 from jaxnav.scenes.lattice import cells_near_boxes, cells_touching_boxes
 from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene, box_footprints
 from jaxnav.scenes.tables.visibility import TOLERANCE
@@ -536,7 +536,7 @@ def _is_category(type_name: str) -> bool:
 
 @functools.cache
 def _types_by_name() -> dict[str, str]:
-    return {type_name.lower(): type_name for type_name in typical_types()} | _TYPE_ALIASES
+    return {type_name.lower(): type_name for type_name in typical_boxes()} | _TYPE_ALIASES
 
 
 def _named_type(item: JsonRecord, asset: AssetInfo) -> str | None:
