@@ -25,8 +25,8 @@ class Pathways(NamedTuple):
     experience: jax.Array
 
 
-def bits(x) -> np.ndarray:
-    return np.asarray(x, np.float32).view(np.uint32)
+def as_bits(array) -> np.ndarray:
+    return np.asarray(array, np.float32).view(np.uint32)
 
 
 def test_do_replaces_only_the_named_pathways():
@@ -45,57 +45,70 @@ def test_do_names_an_unknown_pathway():
         do(Pathways(jnp.ones(1), jnp.ones(1), jnp.ones(1)), sceen=0)
 
 
-def test_worked_arithmetic():
-    a, a_bar = jnp.array([2.0, 1.0]), jnp.array([4.0, -2.0])
-    np.testing.assert_array_equal(tde(a, a_bar), [-2.0, 3.0])
+def test_tde_and_stde_follow_worked_arithmetic():
+    factual, counterfactual = jnp.array([2.0, 1.0]), jnp.array([4.0, -2.0])
+    np.testing.assert_array_equal(tde(factual, counterfactual), [-2.0, 3.0])
     # s = 0.75 - 0.5 = 0.25. Paper: [2 - 1, 1 + 0.5]. Residual: [2.5 - 1, 1.25 + 0.5].
     gap = jnp.float32(0.75)
-    np.testing.assert_array_equal(stde(a, a_bar, gap, 0.5, "paper"), [1.0, 1.5])
-    np.testing.assert_array_equal(stde(a, a_bar, gap, 0.5, "residual"), [1.5, 1.75])
+    np.testing.assert_array_equal(stde(factual, counterfactual, gap, 0.5, "paper"), [1.0, 1.5])
+    np.testing.assert_array_equal(stde(factual, counterfactual, gap, 0.5, "residual"), [1.5, 1.75])
     # A weight of 1 is eq. 1 in the paper's form, and eq. 1 plus a in the other.
-    np.testing.assert_array_equal(stde(a, a_bar, jnp.float32(1), 0.0, "paper"), tde(a, a_bar))
-    np.testing.assert_array_equal(stde(a, a_bar, jnp.float32(1), 0.0, "residual"), a + tde(a, a_bar))
+    np.testing.assert_array_equal(
+        stde(factual, counterfactual, jnp.float32(1), 0.0, "paper"), tde(factual, counterfactual)
+    )
+    np.testing.assert_array_equal(
+        stde(factual, counterfactual, jnp.float32(1), 0.0, "residual"), factual + tde(factual, counterfactual)
+    )
 
 
-def test_unknown_form():
+def test_stde_refuses_an_unknown_form():
     with pytest.raises(ValueError, match="'papr'"):
         stde(jnp.ones(2), jnp.ones(2), jnp.float32(1), 0.0, "papr")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("form", FORMS)
 @given(LOGITS, LOGITS, hnp.arrays(np.float32, 4, elements=UNIT))
-def test_closed_gate_is_bit_identical(form, a, a_bar, gap):
-    a[0], a_bar[0] = -0.0, -1.0  # -0 - 0 * (-1) would be +0
-    a[1], a_bar[1] = 0.0, -0.0
-    result = stde(jnp.asarray(a), jnp.asarray(a_bar), jnp.asarray(gap), 1.0, form)
-    np.testing.assert_array_equal(bits(result), bits(a))
+def test_stde_with_a_closed_gate_is_bit_identical(form, factual, counterfactual, gap):
+    factual[0], counterfactual[0] = -0.0, -1.0  # -0 - 0 * (-1) would be +0
+    factual[1], counterfactual[1] = 0.0, -0.0
+    result = stde(jnp.asarray(factual), jnp.asarray(counterfactual), jnp.asarray(gap), 1.0, form)
+    np.testing.assert_array_equal(as_bits(result), as_bits(factual))
 
 
-def test_open_gate_changes_logits():
+def test_stde_with_an_open_gate_changes_logits():
     """Negative control for the test above: epsilon just below the gap is not the identity."""
-    a = jnp.ones((1, 6))
-    assert not np.array_equal(stde(a, a, jnp.ones(1), 0.9), stde(a, 2 * a, jnp.ones(1), 0.9))
+    factual = jnp.ones((1, 6))
+    assert not np.array_equal(stde(factual, factual, jnp.ones(1), 0.9), stde(factual, 2 * factual, jnp.ones(1), 0.9))
 
 
 @given(LOGITS, LOGITS, hnp.arrays(np.float32, 4, elements=UNIT), UNIT)
-def test_switch_is_eq_1_or_nothing_to_the_bit(a, a_bar, gap, epsilon):
-    a, a_bar = jnp.asarray(a), jnp.asarray(a_bar)
-    result, weight = stde(a, a_bar, jnp.asarray(gap), epsilon, "switch"), removal_weight(gap, epsilon, "switch")
+def test_switch_form_gives_tde_or_the_factual_logits(factual, counterfactual, gap, epsilon):
+    factual, counterfactual = jnp.asarray(factual), jnp.asarray(counterfactual)
+    result, weight = (
+        stde(factual, counterfactual, jnp.asarray(gap), epsilon, "switch"),
+        removal_weight(gap, epsilon, "switch"),
+    )
     np.testing.assert_array_equal(weight, gap > np.float32(epsilon))
-    np.testing.assert_array_equal(bits(result), bits(np.where(weight[:, None] == 1, tde(a, a_bar), a)))
+    np.testing.assert_array_equal(
+        as_bits(result), as_bits(np.where(weight[:, None] == 1, tde(factual, counterfactual), factual))
+    )
 
 
 @pytest.mark.parametrize("form", SOFT)
 @given(LOGITS, LOGITS, UNIT, st.floats(0, 0.9990234375, width=32, allow_subnormal=False))
-def test_continuous_in_epsilon(form, a, a_bar, gap, epsilon):
+def test_stde_is_continuous_in_epsilon(form, factual, counterfactual, gap, epsilon):
     # |d result / d epsilon| <= |a| + |a_bar| <= 60, so a step of 2^-10 moves a logit by at most 0.06 (and rounding).
-    f = jax.vmap(lambda e: stde(jnp.asarray(a), jnp.asarray(a_bar), jnp.full(4, gap), e, form))
-    low, high = f(jnp.array([epsilon, epsilon + 2**-10], jnp.float32))
+    stde_at = jax.vmap(
+        lambda epsilon_value: stde(
+            jnp.asarray(factual), jnp.asarray(counterfactual), jnp.full(4, gap), epsilon_value, form
+        )
+    )
+    low, high = stde_at(jnp.array([epsilon, epsilon + 2**-10], jnp.float32))
     assert np.abs(low - high).max() <= 60 * 2**-10 + 1e-4
 
 
 @given(UNIT, UNIT)
-def test_weight_is_at_most_one_minus_epsilon(gap, epsilon):
+def test_removal_weight_is_at_most_one_minus_epsilon(gap, epsilon):
     # With a = 0 and a_bar = -1 the paper's form returns the weight itself.
     weight = stde(jnp.zeros((1, 1)), -jnp.ones((1, 1)), jnp.full(1, gap), epsilon, "paper")
     np.testing.assert_allclose(weight, max(gap - epsilon, 0), atol=1e-6)
@@ -105,36 +118,42 @@ def test_weight_is_at_most_one_minus_epsilon(gap, epsilon):
 
 @pytest.mark.parametrize("form", FORMS)
 @given(st.permutations(range(6)), st.permutations(range(6)), st.integers(-8, 8), st.integers(-8, 8))
-def test_constant_offsets_leave_the_choice(form, a, a_bar, offset, offset_bar):
+def test_constant_offsets_do_not_change_the_choice_of_stde(
+    form, factual, counterfactual, offset, counterfactual_offset
+):
     # Small integers and s = 1/4: the arithmetic is exact, so ties stay ties.
-    a, a_bar, gap = jnp.array(a, jnp.float32), jnp.array(a_bar, jnp.float32), jnp.float32(0.75)
-    plain = stde(a, a_bar, gap, 0.5, form)
-    moved = stde(a + offset, a_bar + offset_bar, gap, 0.5, form)
-    assert plain.argmax() == moved.argmax()
+    factual, counterfactual, gap = (
+        jnp.array(factual, jnp.float32),
+        jnp.array(counterfactual, jnp.float32),
+        jnp.float32(0.75),
+    )
+    plain_logits = stde(factual, counterfactual, gap, 0.5, form)
+    moved_logits = stde(factual + offset, counterfactual + counterfactual_offset, gap, 0.5, form)
+    assert plain_logits.argmax() == moved_logits.argmax()
 
 
-def test_forms_agree_on_the_choice_at_matching_weights():
+def test_stde_forms_agree_at_matching_weights():
     # (1 + s) a - s a_bar = (1 + s) (a - s / (1 + s) a_bar).
-    a, a_bar = jax.random.normal(jax.random.key(0), (2, 50, 6))
-    s = jnp.linspace(0.01, 0.5, 50)
-    residual = stde(a, a_bar, s, 0.0, "residual")
-    paper = stde(a, a_bar, s / (1 + s), 0.0, "paper")
-    np.testing.assert_allclose(residual, (1 + s)[:, None] * paper, rtol=1e-5, atol=1e-5)
+    factual, counterfactual = jax.random.normal(jax.random.key(0), (2, 50, 6))
+    weights = jnp.linspace(0.01, 0.5, 50)
+    residual = stde(factual, counterfactual, weights, 0.0, "residual")
+    paper = stde(factual, counterfactual, weights / (1 + weights), 0.0, "paper")
+    np.testing.assert_allclose(residual, (1 + weights)[:, None] * paper, rtol=1e-5, atol=1e-5)
 
 
-def test_epsilon_is_traced():
+def test_stde_traces_epsilon():
     traces = []
 
     @jax.jit
-    def f(epsilon):
+    def first_logit(epsilon):
         traces.append(1)
         return stde(jnp.ones((3, 6)), jnp.ones((3, 6)), jnp.ones(3), epsilon)
 
-    results = [float(f(jnp.float32(e))[0, 0]) for e in (0.0, 0.5, 1.0)]
+    results = [float(first_logit(jnp.float32(epsilon))[0, 0]) for epsilon in (0.0, 0.5, 1.0)]
     np.testing.assert_allclose(results, 1.0)  # (1 + s) - s
     assert len(traces) == 1
 
 
-def test_logits_keep_their_dtype():
-    a = jnp.ones((3, 6), jnp.bfloat16)
-    assert stde(a, a, jnp.ones(3), 0.5).dtype == jnp.bfloat16
+def test_stde_keeps_the_dtype_of_logits():
+    factual = jnp.ones((3, 6), jnp.bfloat16)
+    assert stde(factual, factual, jnp.ones(3), 0.5).dtype == jnp.bfloat16

@@ -17,28 +17,28 @@ FILES = [path for path in ROOT.iterdir() if path.is_file() and not path.name.sta
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
 
 
-def build(sources, what, folder):
+def build_distribution(sources, kind, folder):
     """Build in a folder of sources, without a network, and return the path."""
-    command = [sys.executable, "-c", BUILD, f"build_{what}", folder]
-    done = subprocess.run(command, cwd=sources, capture_output=True, text=True, check=True)
-    return folder / done.stdout.splitlines()[-1]
+    command = [sys.executable, "-c", BUILD, f"build_{kind}", folder]
+    completed = subprocess.run(command, cwd=sources, capture_output=True, text=True, check=True)
+    return folder / completed.stdout.splitlines()[-1]
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
+def built_distributions(tmp_path_factory):
     """The unpacked archive of the sources, and the wheel that is built there."""
     folder = tmp_path_factory.mktemp("built")
     for name in FOLDERS:
         shutil.copytree(ROOT / name, folder / "copy" / name)
     for path in FILES:
         shutil.copy(path, folder / "copy")
-    with tarfile.open(build(folder / "copy", "sdist", folder)) as archive:
+    with tarfile.open(build_distribution(folder / "copy", "sdist", folder)) as archive:
         archive.extractall(folder / "unpacked", filter="data")
     (unpacked,) = (folder / "unpacked").iterdir()
-    return unpacked, build(unpacked, "wheel", folder)
+    return unpacked, build_distribution(unpacked, "wheel", folder)
 
 
-def files(folder):
+def list_files(folder):
     return {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")
@@ -47,24 +47,24 @@ def files(folder):
 
 
 @pytest.mark.slow
-def test_the_archive_holds_all_that_its_tests_need(built):
-    unpacked, _ = built
+def test_source_archive_contains_every_file_of_the_repository(built_distributions):
+    unpacked, _ = built_distributions
     for folder in FOLDERS:
-        assert files(ROOT / folder) == files(unpacked / folder)
-    assert {path.name for path in FILES} <= files(unpacked)
+        assert list_files(ROOT / folder) == list_files(unpacked / folder)
+    assert {path.name for path in FILES} <= list_files(unpacked)
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_the_package_and_its_data_alone(built):
-    _, wheel = built
+def test_wheel_contains_only_the_package_and_its_data(built_distributions):
+    _, wheel = built_distributions
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    assert names == {f"jaxnav/{name}" for name in files(ROOT / "jaxnav")}
+    assert names == {f"jaxnav/{name}" for name in list_files(ROOT / "jaxnav")}
     assert {"jaxnav/py.typed", "jaxnav/configs/smoke.yaml", "jaxnav/scenes/generate/rooms.yaml"} <= names
 
 
 @pytest.mark.slow
-def test_the_readme_of_the_package_leads_to_nothing_that_is_not_there(built):
-    _, wheel = built
+def test_package_description_has_no_relative_links(built_distributions):
+    _, wheel = built_distributions
     archive = zipfile.ZipFile(wheel)
     (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
     readme = Parser().parsestr(archive.read(name).decode()).get_payload()

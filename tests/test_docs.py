@@ -22,28 +22,29 @@ from jaxnav.policies.pathways import PolicyInputs
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-def test_the_numbers_of_the_concepts_are_computed():
+def test_doctests_of_concepts_pass():
     failed, tried = doctest.testfile(str(DOCS / "concepts.md"), module_relative=False)
     assert (failed, tried > 10) == (0, True)
 
 
-def test_the_worked_divergences_are_those_of_the_text():
+def test_concepts_contain_the_worked_divergences():
     """psi(n) = -gamma + 1 + 1/2 + ... + 1/(n - 1), so psi(3) - psi(9) = -(1/3 + ... + 1/8)."""
-    mug = np.log(4) - sum(1 / n for n in range(3, 9))
-    bed = np.log(2) - (1 / 3 + 1 / 4)
+    mug_divergence = np.log(4) - sum(1 / count for count in range(3, 9))
+    bed_divergence = np.log(2) - (1 / 3 + 1 / 4)
     text = (DOCS / "concepts.md").read_text()
-    for value in (mug, bed, (mug + bed) / 2, np.tanh((mug + bed) / 2)):
+    mean_divergence = (mug_divergence + bed_divergence) / 2
+    for value in (mug_divergence, bed_divergence, mean_divergence, np.tanh(mean_divergence)):
         assert f"{value:.4f}" in text
 
 
 @pytest.mark.slow
-def test_the_code_of_use_runs(tmp_path, monkeypatch, capsys):
+def test_python_blocks_of_use_run(tmp_path, monkeypatch, capsys):
     """In a folder of its own, in the order of the page, with a run of a few updates."""
     monkeypatch.chdir(tmp_path)
     small = "jaxnav.runs.config_files.apply_yaml(jaxnav.RunConfig(run_dir=Path('runs/org')), Path('tiny.yaml'))"
     write_config(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "use.md").read_text(), re.DOTALL)
-    assert len(blocks) == 3
+    assert blocks
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         for block in blocks:
             code = re.sub(r"jaxnav\.RunConfig\(.*?\)(?=\))", small.replace("\\", "\\\\"), block, flags=re.DOTALL)
@@ -58,30 +59,30 @@ BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
 @pytest.fixture
-def own_modules(tmp_path, monkeypatch):
+def page_modules(tmp_path, monkeypatch):
     """A folder with the modules of the page on methods, in the path; returns the code that follows them."""
     blocks = BLOCK.findall((DOCS / "add_a_method.md").read_text())
-    named = {name[1]: block for block in blocks if (name := re.match(r"# (\w+)\.py\n", block))}
-    assert sorted(named) == ["judged", "sectors"]
-    for name, block in named.items():
+    module_blocks = {name[1]: block for block in blocks if (name := re.match(r"# (\w+)\.py\n", block))}
+    assert sorted(module_blocks) == ["judged", "sectors"]
+    for name, block in module_blocks.items():
         (tmp_path / f"{name}.py").write_text(block)
     monkeypatch.syspath_prepend(tmp_path)
-    yield "".join(block for block in blocks if block not in named.values())
-    for name in named:
+    yield "".join(block for block in blocks if block not in module_blocks.values())
+    for name in module_blocks:
         sys.modules.pop(name, None)
     find_method.cache_clear()
 
 
-def test_the_methods_of_the_page_are_found(own_modules):
-    sectored, judged = find_method("sectors:SECTORED"), find_method("judged:JUDGED")
-    assert (sectored.control.num_choices, judged.adaptation is None) == (4, False)
-    assert 'check_method("sectors:SECTORED")' in own_modules
-    assert 'check_method("judged:JUDGED")' in own_modules
+def test_methods_of_add_a_method_are_found(page_modules):
+    sectored_method, judged_method = find_method("sectors:SECTORED"), find_method("judged:JUDGED")
+    assert (sectored_method.control.num_choices, judged_method.adaptation is None) == (4, False)
+    assert 'check_method("sectors:SECTORED")' in page_modules
+    assert 'check_method("judged:JUDGED")' in page_modules
 
 
 @pytest.mark.parametrize("decision", ["fused", "streams"])
 @pytest.mark.parametrize("name", ["sectors:SECTORED", "judged:JUDGED"])
-def test_the_methods_of_the_page_decide_in_both_ways(own_modules, name, decision):
+def test_methods_of_add_a_method_decide_fused_and_in_streams(page_modules, name, decision):
     """Shapes alone: nothing is computed."""
     spec = dataclasses.replace(tiny.SPEC, method=find_method(name), method_sizes=(), decision=decision)
     row = jax.ShapeDtypeStruct((5, tiny.BANK.rows.shape[-1]), np.uint8)
@@ -99,6 +100,6 @@ def test_the_methods_of_the_page_decide_in_both_ways(own_modules, name, decision
 
 
 @pytest.mark.slow
-def test_the_methods_of_the_page_keep_the_contract(own_modules):
+def test_methods_of_add_a_method_pass_check_method(page_modules):
     """The page's own calls, under the suite's strict rules of types and ranks."""
-    exec(own_modules, {"__name__": "page"})
+    exec(page_modules, {"__name__": "page"})

@@ -13,12 +13,12 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def output(name, tmp_path):
+def run_example(name, tmp_path):
     """What an example prints, as a user runs it: elsewhere, with warnings as errors of its own code alone."""
-    return run(EXAMPLES / f"{name}.py", tmp_path)
+    return run_script(EXAMPLES / f"{name}.py", tmp_path)
 
 
-def run(script, tmp_path):
+def run_script(script, tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     result = subprocess.run(
         [sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=250
@@ -28,10 +28,10 @@ def run(script, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_packaged_policy_finds_what_it_looks_for(tmp_path):
+def test_packaged_policy_example_finds_most_goals(tmp_path):
     """Random actions find 8 %; the policy was measured at 90 % in other rooms, with up to 200 actions."""
     matches = re.findall(
-        r"shift (\d), epsilon ([\d.]+): ([\d.]+) % of 256 episodes", output("packaged_policy", tmp_path)
+        r"shift (\d), epsilon ([\d.]+): ([\d.]+) % of 256 episodes", run_example("packaged_policy", tmp_path)
     )
     assert [row[:2] for row in matches] == [(shift, f"{e:.2f}") for shift in "01" for e in (0, 0.25, 0.5, 1)]
     rates = [float(rate) for *_, rate in matches]
@@ -41,29 +41,33 @@ def test_the_packaged_policy_finds_what_it_looks_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_drawn_room_is_walked_in(tmp_path):
+def test_drawn_room_example_reaches_the_goal(tmp_path):
     """The way on the page goes from the start to within 1.5 m, six marks, of the toaster; no way is shorter than L*."""
-    printed = output("drawn_room", tmp_path)
+    printed = run_example("drawn_room", tmp_path)
     *page, outcome, actions = printed.splitlines()
-    (matches,) = re.findall(r"found after (\d+) actions; a shortest path takes (\d+)", outcome)
-    num_actions, best = map(int, matches)
-    assert num_actions >= best > 1
+    (lengths,) = re.findall(r"found after (\d+) actions; a shortest path takes (\d+)", outcome)
+    num_actions, best_length = map(int, lengths)
+    assert num_actions >= best_length > 1
     assert sum(map(int, re.findall(r"(\d+) x", actions))) == num_actions
-    places = {mark: [(r, c) for r, row in enumerate(page) for c, m in enumerate(row) if m == mark] for mark in "@*o"}
+    places = {mark: [] for mark in "@*o"}
+    for row_index, line in enumerate(page):
+        for column, mark in enumerate(line):
+            if mark in places:
+                places[mark].append((row_index, column))
     (goal,) = places["o"]
     assert len(places["@"]) == 1
     assert min(math.dist(goal, place) for place in places["*"] + places["@"]) <= 6
 
 
 @pytest.mark.slow
-def test_the_notebook_runs_and_is_stripped(tmp_path):
+def test_notebook_runs_and_has_no_outputs(tmp_path):
     notebook = json.loads((EXAMPLES / "story.ipynb").read_text(encoding="utf-8"))
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
     script = tmp_path / "story.py"
     code = ["".join(cell["source"]) for cell in cells]
     script.write_text("\n".join(["import matplotlib\nmatplotlib.use('agg')", *code, "figure.savefig('story.png')"]))
-    printed = run(script, tmp_path)
+    printed = run_script(script, tmp_path)
     gaps = [float(gap) for gap in re.findall(r" gap ([\d.]+)", printed)]
     assert gaps[-1] > 10 * max(gaps[:-1])  # a bed beside the fridge
     assert re.search(r"^found in \d+ actions$", printed, re.MULTILINE)
@@ -71,15 +75,17 @@ def test_the_notebook_runs_and_is_stripped(tmp_path):
     assert (tmp_path / "story.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_estimator_takes_detections_of_ones_own(tmp_path):
+def test_own_detections_example_raises_the_gap_for_new_pairs(tmp_path):
     """What was never seen together moves the belief more than what was."""
-    gaps = [float(gap) for gap in re.findall(r"gap ([\d.]+)", output("own_detections", tmp_path))]
+    gaps = [float(gap) for gap in re.findall(r"gap ([\d.]+)", run_example("own_detections", tmp_path))]
     assert len(gaps) == 4
     assert gaps[3] > max(gaps[:2])
 
 
 @pytest.mark.slow
-def test_stable_baselines3_learns(tmp_path):
+def test_stable_baselines3_example_learns(tmp_path):
     pytest.importorskip("stable_baselines3")
-    learned, random = (float(rate) for rate in re.findall(r": ([\d.]+) %", output("stable_baselines3_ppo", tmp_path)))
+    learned, random = (
+        float(rate) for rate in re.findall(r": ([\d.]+) %", run_example("stable_baselines3_ppo", tmp_path))
+    )
     assert learned > 3 * random

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-ROWS, WIDTH, STEPS = 5, 7, 11
+NUM_ROWS, WIDTH, NUM_STEPS = 5, 7, 11
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def flops() -> ModuleType:
     return module
 
 
-def recurrent(weights, inputs, state):
+def recurrent_loss(weights, inputs, state):
     """Return the loss of a linear recurrence: two products a step."""
 
     def step(state, entering):
@@ -32,31 +32,31 @@ def recurrent(weights, inputs, state):
     return jax.lax.scan(step, state, inputs)[0].sum()
 
 
-ARGUMENTS = (jnp.ones((WIDTH, WIDTH)), jnp.ones((STEPS, ROWS, WIDTH)), jnp.ones((ROWS, WIDTH)))
-PRODUCT = 2 * ROWS * WIDTH * WIDTH
+ARGUMENTS = (jnp.ones((WIDTH, WIDTH)), jnp.ones((NUM_STEPS, NUM_ROWS, WIDTH)), jnp.ones((NUM_ROWS, WIDTH)))
+PRODUCT_FLOPS = 2 * NUM_ROWS * WIDTH * WIDTH
 
 
-def test_a_scan_counts_once_per_iteration(flops):
-    jaxpr = jax.make_jaxpr(jax.jit(recurrent))(*ARGUMENTS).jaxpr
-    assert flops.matmul_flops(jaxpr) == 2 * STEPS * PRODUCT
+def test_scan_counts_once_per_iteration(flops):
+    jaxpr = jax.make_jaxpr(jax.jit(recurrent_loss))(*ARGUMENTS).jaxpr
+    assert flops.matmul_flops(jaxpr) == 2 * NUM_STEPS * PRODUCT_FLOPS
 
 
-def test_a_gradient_counts_forward_and_backward(flops):
+def test_gradient_counts_forward_and_backward(flops):
     # Back: by the weights twice and by the state once per step; nobody asks for the gradient by the inputs.
-    jaxpr = jax.make_jaxpr(jax.jit(jax.grad(recurrent)))(*ARGUMENTS).jaxpr
-    assert flops.matmul_flops(jaxpr) == (2 + 3) * STEPS * PRODUCT
+    jaxpr = jax.make_jaxpr(jax.jit(jax.grad(recurrent_loss)))(*ARGUMENTS).jaxpr
+    assert flops.matmul_flops(jaxpr) == (2 + 3) * NUM_STEPS * PRODUCT_FLOPS
 
 
-def test_batched_products_count_per_entry(flops):
-    many = jnp.ones((3, ROWS, WIDTH))
-    jaxpr = jax.make_jaxpr(lambda a: jnp.einsum("bij,bkj->bik", a, a))(many).jaxpr
-    assert flops.matmul_flops(jaxpr) == 3 * 2 * ROWS * ROWS * WIDTH
+def test_batched_products_count_once_per_entry(flops):
+    matrices = jnp.ones((3, NUM_ROWS, WIDTH))
+    jaxpr = jax.make_jaxpr(lambda matrix: jnp.einsum("bij,bkj->bik", matrix, matrix))(matrices).jaxpr
+    assert flops.matmul_flops(jaxpr) == 3 * 2 * NUM_ROWS * NUM_ROWS * WIDTH
 
 
-def test_products_that_nothing_depends_on_do_not_count(flops):
+def test_unused_products_do_not_count(flops):
     @jax.jit
     def gradients(weights, inputs, state):
-        return jax.grad(recurrent, argnums=(0, 1))(weights, inputs, state)
+        return jax.grad(recurrent_loss, argnums=(0, 1))(weights, inputs, state)
 
     jaxpr = jax.make_jaxpr(lambda *arguments: gradients(*arguments)[0])(*ARGUMENTS).jaxpr
-    assert flops.matmul_flops(jaxpr) == (2 + 3) * STEPS * PRODUCT
+    assert flops.matmul_flops(jaxpr) == (2 + 3) * NUM_STEPS * PRODUCT_FLOPS

@@ -16,12 +16,12 @@ DEV = PROJECT["dependency-groups"]["dev"]
 MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|root|home|Users|tmp/venv)/")
 
 
-def _locked() -> dict[str, str]:
+def read_locked_versions() -> dict[str, str]:
     """Return the pinned versions by name, as the lock spells it."""
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
 
 
-def _files() -> list[Path]:
+def list_repository_files() -> list[Path]:
     """Return every file that git tracks or would add."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     try:
@@ -32,18 +32,18 @@ def _files() -> list[Path]:
 
 
 @pytest.mark.parametrize("line", PROJECT["project"]["dependencies"] + DEV)
-def test_lock_pins_a_version_that_satisfies(line: str) -> None:
+def test_lock_pins_a_version_within_the_requirement(line: str) -> None:
     requirement = Requirement(line)
-    assert _locked()[requirement.name] in requirement.specifier
+    assert read_locked_versions()[requirement.name] in requirement.specifier
 
 
-def test_extras_are_there_to_develop() -> None:
+def test_dev_group_contains_every_extra() -> None:
     """All but the client of a service, which brings a dozen packages; a job of its own installs that."""
     extras = {name: lines for name, lines in PROJECT["project"]["optional-dependencies"].items() if name != "wandb"}
     assert {line for lines in extras.values() for line in lines} <= set(DEV)
 
 
-def test_lock_names_packages_only() -> None:
+def test_lock_contains_only_pinned_packages() -> None:
     # Nothing but `name==version`, markers and hashes: no index, no URL, no local file.
     for line in (ROOT / "requirements.lock").read_text().splitlines():
         assert re.fullmatch(r"[a-z0-9-]+==\S+( ; [^\\]+)? \\| +--hash=sha256:[0-9a-f]{64}( \\)?", line), line
@@ -71,8 +71,8 @@ def test_machine_path_pattern(text: str, matches: bool) -> None:
     assert bool(MACHINE_PATH.search(text)) is matches
 
 
-def test_no_machine_paths() -> None:
-    for path in _files():
+def test_no_file_names_a_path_of_one_machine() -> None:
+    for path in list_repository_files():
         try:
             text = path.read_text(encoding="utf-8")
         except UnicodeDecodeError:  # an image or an archive
