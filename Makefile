@@ -3,13 +3,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-BENCHMARKS := $(filter-out _% table curves recipe success layout_value zones factors gate adaptation,$(basename $(notdir $(wildcard benchmarks/*.py))))
-RESULTS := results/performance
-DOCUMENT = $(if $(filter results/performance,$(RESULTS)),docs/performance.md,$(RESULTS)/performance.md)
-# Neither peers, whose environments hold JAX for processors alone, nor what splits this machine's cores.
-ON_GPU := environment training utilisation inference seeds sweep growth
+# Benchmarks whose report is stored in results/performance, for docs/performance.md and docs/scaling.md.
+BENCHMARKS := compile_time compiling environment estimator growth inference methods peers scaling seeds streaming sweep \
+  training training_peers utilisation
 
-.PHONY: help setup run test lint docs test-slow coverage mutants gate versions bench bench-gpu lock clean
+.PHONY: help setup run test lint docs test-slow coverage mutants gate versions bench lock clean
 
 help:
 	@echo 'make run        train on procedural rooms, then evaluate the run (runs/rooms)'
@@ -20,8 +18,7 @@ help:
 	@echo 'make gate       fails where the environment is far slower than the stored result'
 	@echo 'make versions   the fast tests on every Python, with the oldest and the newest packages'
 	@echo 'make docs       the documentation as a site, in site/'
-	@echo 'make bench      every benchmark into results/performance, then the tables of docs/performance.md'
-	@echo 'make bench-gpu  those that a GPU can run, into results/performance-gpu'
+	@echo 'make bench      every benchmark into results/performance, then the tables of the documentation'
 	@echo 'make setup      only build .venv;  make lock  pin anew;  make clean  remove what was built'
 
 setup: $(READY)
@@ -80,17 +77,12 @@ versions:
 
 # A benchmark that fails leaves its last result as it is, and the others go on.
 bench: $(READY)
-	@mkdir -p $(RESULTS); failed=; for name in $(BENCHMARKS); do \
-	  echo "== $$name"; new=$(RESULTS)/$$name.json.new; \
-	  if $(BIN)/python benchmarks/$$name.py > $$new; then mv $$new $(RESULTS)/$$name.json; \
-	  else rm -f $$new; failed="$$failed $$name"; fi; done; \
-	$(BIN)/python benchmarks/table.py $(RESULTS) $(DOCUMENT) || exit 1; \
+	@failed=; for name in $(BENCHMARKS); do \
+	  echo "== $$name"; result=results/performance/$$name.json; \
+	  if $(BIN)/python benchmarks/$$name.py > $$result.new; then mv $$result.new $$result; \
+	  else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
+	$(BIN)/python benchmarks/table.py && $(BIN)/python benchmarks/simulate.py || exit 1; \
 	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
-
-bench-gpu: $(READY)
-	@test "$$($(BIN)/python -c 'import jax; print(jax.default_backend())')" = gpu || { \
-	  echo "JAX sees no GPU: $(BIN)/python -m pip install 'jax[cuda12]' adds what it needs" >&2; exit 1; }
-	@$(MAKE) bench RESULTS=results/performance-gpu BENCHMARKS="$(ON_GPU)"
 
 # For maintainers; needs uv.
 lock:

@@ -1,4 +1,4 @@
-"""Timing calls in turns, summarizing the times, and printing the report of a benchmark."""
+"""Timing calls in turns, summarizing the times, printing the report of a benchmark, and processes of workers."""
 
 import contextlib
 import importlib.metadata
@@ -7,9 +7,12 @@ import os
 import platform
 import resource
 import statistics
+import subprocess
 import sys
 import tempfile
+import threading
 import time
+import venv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,12 +22,19 @@ import jax
 #: Median, minimum and maximum.
 Spread = dict[str, float]
 
+ROOT = Path(__file__).parents[1]
+#: Virtual environments of other packages.
+PEERS_DIR = ROOT / ".cache" / "peers"
+#: Seconds to wait for an answer of a worker.
+TIMEOUT_S = 600
 #: Makes glibc reuse large buffers instead of returning them to the system; read when a process starts.
 TUNED_ALLOCATOR = {
     "MALLOC_MMAP_THRESHOLD_": "8589934592",
     "MALLOC_TRIM_THRESHOLD_": "8589934592",
     "MALLOC_TOP_PAD_": "268435456",
 }
+
+# Timing
 
 
 def time_call(call: Callable[[], Any]) -> float:
@@ -71,6 +81,9 @@ def peak_resident_gb() -> float:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3)
 
 
+# Reports
+
+
 def describe_machine() -> dict[str, Any]:
     """Return processor, devices, settings and versions."""
     cpu_model = platform.processor()
@@ -101,3 +114,72 @@ def run_in_folder(main: Callable[[Path, Path], None]) -> None:
     context = contextlib.nullcontext(folders[0]) if folders else tempfile.TemporaryDirectory()
     with context as folder:
         main(file, Path(folder))
+
+
+# Workers
+
+
+def install(name: str, *packages: str) -> Path:
+    """Install packages into the virtual environment `.cache/peers/NAME`, and return its Python."""
+    python = PEERS_DIR / name / "bin" / "python"
+    if not python.exists():
+        venv.create(PEERS_DIR / name, with_pip=True)
+    command = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", *packages]
+    subprocess.run(command, check=True, stdout=sys.stderr)
+    return python
+
+
+class WorkerProcess:
+    """A Python script in a process of its own that answers each line of its input with a line of JSON.
+
+    The process sleeps between its answers, so that others can be timed in turns with it.
+
+    Attributes:
+      description: the first answer, which comes before any request.
+
+    Raises:
+      RuntimeError: if the process ends or is silent for `TIMEOUT_S` seconds.
+    """
+
+    def __init__(self, command: Sequence[Any], settings: Mapping[str, str] | None = None) -> None:
+        # Settings of this process must not reach the worker.
+        environment = {}
+        for name, value in os.environ.items():
+            if not name.startswith(("MALLOC_", "XLA_", "JAX_")):
+                environment[name] = value
+        environment |= {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), **(settings or {})}
+
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 (open as long as the process)
+        self._process = subprocess.Popen(
+            [str(argument) for argument in command],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+        )
+        self.description = self._read_answer()
+
+    def request(self, line: str = "") -> Any:
+        """Send one line and return the answer to it."""
+        print(line, file=self._process.stdin, flush=True)
+        return self._read_answer()
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def _read_answer(self) -> Any:
+        assert self._process.stdout
+        timer = threading.Timer(TIMEOUT_S, self._process.kill)
+        timer.start()
+        line = self._process.stdout.readline()
+        timer.cancel()
+        if line:
+            return json.loads(line)
+
+        # The process has ended: by itself, or killed by the timer.
+        was_killed = self._process.wait() < 0
+        self._errors.seek(0)
+        last_line = (self._errors.read().strip().splitlines() or ["no output"])[-1]
+        raise RuntimeError(f"no answer in {TIMEOUT_S} s" if was_killed else last_line)

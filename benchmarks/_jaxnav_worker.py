@@ -9,7 +9,7 @@ import dataclasses
 import sys
 
 from _setup import set_up_training
-from _worker import serve
+from _trainer_worker import serve
 
 from jaxnav.runs.config import RunConfig
 
@@ -26,10 +26,9 @@ def main(arm: str, epochs: int, minibatches: int, num_updates: int) -> None:
     scalars = ppo.scalars(10**9)  # so many updates that the learning rate stays constant
 
     def train(state):
-        state, metrics = learner.train(state, scalars, env_params, knowledge, num_updates)
-        return state, (metrics["episodes"], metrics["episodes"] * metrics["success"])
+        return learner.train(state, scalars, env_params, knowledge, num_updates)[0]
 
-    serve(train, state, num_updates * config.steps_per_update, state.params)
+    serve(train, state)
 
 
 if __name__ == "__main__":

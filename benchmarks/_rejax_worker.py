@@ -10,8 +10,7 @@ more floating-point work per observation than jaxnav).
 import sys
 
 import jax
-from _adapter import Adapter, Torso, count_ended, make_action_head, pack_observation, unpack_observation
-from _worker import serve
+from _trainer_worker import Adapter, Torso, make_action_head, pack_observation, serve, unpack_observation
 from flax import linen as nn
 from gymnax.environments import spaces
 from rejax import PPO
@@ -91,12 +90,9 @@ def main(critic: str, epochs: int, minibatches: int, num_updates: int) -> None:
     )
 
     def train(state):
-        next_state, _ = jax.lax.scan(lambda state, _: (trainer.train_iteration(state), None), state, None, num_updates)
-        return next_state, count_ended(state.env_state, next_state.env_state)
+        return jax.lax.fori_loop(0, num_updates, lambda _, state: trainer.train_iteration(state), state)
 
-    state = jax.jit(trainer.init_state)(jax.random.key(0))
-    num_steps = num_updates * config.num_envs * config.rollout
-    serve(train, state, num_steps, (state.actor_ts.params, state.critic_ts.params))
+    serve(train, jax.jit(trainer.init_state)(jax.random.key(0)))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
-"""Everything that a training run needs before its first update."""
+"""Everything that a training run needs before its first update, and its programs compiled."""
 
-from typing import NamedTuple
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from _flops import matmul_flops
 from jax.sharding import Mesh
 from rich.console import Console
 
@@ -72,3 +75,46 @@ def set_up_training(config: RunConfig, mesh: Mesh | None = None, explore: bool =
     trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
     env_params = world.make_env_params(0)
     return TrainingSetup(config, world, env_params, exploration, estimator_config, knowledge, trainer)
+
+
+def make_training_call(trainer: Trainer, states: Any, params: EnvParams) -> Callable[[], None]:
+    """Return a call that trains these states one more chunk."""
+
+    def train() -> None:
+        nonlocal states
+        states, _ = trainer.train(states, params)
+
+    return train
+
+
+class Program(NamedTuple):
+    """A compiled program with its arguments.
+
+    Attributes:
+      call: runs it once.
+      flops: floating-point operations of its matrix products.
+      compile_s: seconds to trace and to compile it.
+      temp_gb: temporary memory besides arguments and results; None if the device does not report it.
+    """
+
+    call: Callable[[], Any]
+    flops: int
+    compile_s: float
+    temp_gb: float | None
+
+
+def compile_program(function: Callable[..., Any], *arguments: Any) -> Program:
+    """Compile a function for these arguments."""
+    start_time = time.perf_counter()
+    traced = jax.jit(function).trace(*arguments)
+    compiled = traced.lower().compile()
+    compile_s = round(time.perf_counter() - start_time, 2)
+
+    memory = compiled.memory_analysis()
+    temp_gb = round(memory.temp_size_in_bytes / 2**30, 3) if memory else None
+    return Program(lambda: compiled(*arguments), matmul_flops(traced.jaxpr.jaxpr), compile_s, temp_gb)
+
+
+def compile_update(setup: TrainingSetup, arm: str) -> Program:
+    """Compile one update of a fresh seed: rollout and learning."""
+    return compile_program(setup.trainer.learners[arm].update, *setup.update_arguments(arm))

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import print_report, time_call
-from _setup import set_up_training
+from _setup import make_training_call, set_up_training
 
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator, start_states
@@ -33,11 +33,9 @@ from jaxnav.policies.network import init_params
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import make_trainer
 from jaxnav.training.calibration import calibrate, explore
-from jaxnav.training.trainer import Trainer
 
 NUM_EPISODES = 2048
 CHUNK = 2
-GOALS = {"train_both_arms_cold_s": 15.0}
 COMPILED_EVERY_TIME = ("calibrate", "play")
 
 
@@ -49,7 +47,6 @@ def main() -> None:
     print_report(
         {
             "episodes": NUM_EPISODES,
-            "goals": GOALS,
             "compile_s": {name: {"cold": cold[name], "cached": cached[name]} for name in cold},
         }
     )
@@ -106,8 +103,8 @@ def make_calls() -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "learner_init", partial(jax.jit(trainer.learners["layout"].init), key, params, knowledge)
     for arm in config.arms:
         arm_trainer = make_trainer(dataclasses.replace(config, arms=(arm,)), env, estimator_config, knowledge)
-        yield f"train_{arm}", make_training_call(arm_trainer, params)
-    yield "train_both_arms", make_training_call(trainer, params)
+        yield f"train_{arm}", make_training_call(arm_trainer, arm_trainer.init(params), params)
+    yield "train_both_arms", make_training_call(trainer, trainer.init(params), params)
 
     # Evaluation, of the whole grid and of one episode.
     spec = config.policy_spec(len(env.categories))
@@ -121,18 +118,6 @@ def make_calls() -> Iterator[tuple[str, Callable[[], Any]]]:
     first_weights = jax.tree.map(lambda leaf: leaf[0], weights)
     start = jax.tree.map(lambda leaf: leaf[:1], start_states(episodes))
     yield "play", lambda: play_episodes(first_cell, first_weights, start, agent_loop, params, knowledge)[0].action
-
-
-def make_training_call(trainer: Trainer, params: Any) -> Callable[[], Any]:
-    """Return a call that trains one more chunk."""
-    states = trainer.init(params)
-
-    def train() -> list[jax.Array]:
-        nonlocal states
-        states, _ = trainer.train(states, params)
-        return [arm_states[0].update for arm_states in states.values()]
-
-    return train
 
 
 if __name__ == "__main__":

@@ -69,8 +69,6 @@ def main() -> None:
         {
             "episodes": NUM_EPISODES,
             "steps": NUM_STEPS,
-            "row_bytes": env.row_format.num_bytes,
-            "table_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(params.tables)),
             "steps_per_s": {
                 name: steps_per_second(call_times, NUM_EPISODES * NUM_STEPS) for name, call_times in times.items()
             },

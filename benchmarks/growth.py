@@ -17,8 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import peak_resident_gb, print_report, summarize, time_call
-from _phases import Program, compile_program, compile_update
-from _setup import TrainingSetup, set_up_training
+from _setup import Program, TrainingSetup, compile_program, compile_update, make_training_call, set_up_training
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav
@@ -95,9 +94,9 @@ def make_config(axis: str, value: int) -> RunConfig:
 
 def train_chunks(setup: TrainingSetup, num_chunks: int) -> None:
     """Train for some chunks of updates, one after the other."""
-    states = setup.trainer.init(setup.params)
+    train = make_training_call(setup.trainer, setup.trainer.init(setup.params), setup.params)
     for _ in range(num_chunks):
-        states, _ = setup.trainer.train(states, setup.params)
+        train()
 
 
 def repeat_scenes(bank: Bank, num_scenes: int) -> Bank:
@@ -147,17 +146,13 @@ def measure_program(name: str, program: Program, num_steps: int) -> dict:
         call_times.append(time_call(program.call))
     timed_runs = call_times[1:] or call_times  # the first warms up, if time allows another
 
-    figures = {
+    return {
         f"{name}_steps_per_s": summarize([num_steps / call_time for call_time in timed_runs]),
         f"{name}_runs": len(timed_runs),
         f"{name}_compile_s": program.compile_s,
         f"{name}_temp_gb": program.temp_gb,
         f"{name}_peak_resident_gb": peak_resident_gb(),
     }
-    device_bytes = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
-    if device_bytes:
-        figures[f"{name}_peak_device_gb"] = round(device_bytes / 2**30, 3)
-    return figures
 
 
 if __name__ == "__main__":

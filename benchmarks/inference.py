@@ -14,21 +14,19 @@ one thread and with PyTorch's default, of which the faster counts. PyTorch runs 
     python -m venv .cache/peers/torch && .cache/peers/torch/bin/pip install torch numpy
 """
 
-import contextlib
 import dataclasses
 import functools
 import json
-import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import print_report, ratio_by_turn, summarize, time_in_turns
+from _common import PEERS_DIR, WorkerProcess, print_report, ratio_by_turn, summarize, time_in_turns
 from _setup import set_up_training
 
 from jaxnav.causal import do, stde
@@ -46,7 +44,6 @@ from jaxnav.training.calibration import layout_priors
 
 TURNS = 9
 EPSILON = 0.5
-GOALS = {"stde_over_factual_at_4096": 1.6, "released_sizes_over_jaxnav": 20.0}
 #: Steps of a walk, by the number of episodes.
 WALK_STEPS = {1: 64, 64: 64, 4096: 16}
 #: Walks in a timed call, by the number of episodes.
@@ -56,7 +53,7 @@ RELEASED_WALKS_PER_CALL = {"released": 1, "equal": 8}
 SPEC = PolicySpec(find_method("org"))
 SIZES = dataclasses.asdict(SPEC.sizes) | dict(SPEC.method.experience.sizes)
 WORKER = Path(__file__).with_name("_released_flow.py")
-PYTHON = Path(__file__).parents[1] / ".cache/peers/torch/bin/python"
+PYTHON = PEERS_DIR / "torch" / "bin" / "python"
 
 
 class FixedInputs(NamedTuple):
@@ -76,7 +73,6 @@ def main() -> None:
             "excluded_from_all": "the environment's step",
             "steps": WALK_STEPS,
             "turns": TURNS,
-            "goals": GOALS,
             "episodes": {num_episodes: compare_with_factual(env, inputs, num_episodes) for num_episodes in WALK_STEPS},
             "against_released_flow": compare_with_released(env, inputs, setup.exploration.counts),
         }
@@ -204,30 +200,6 @@ def measure_cpu_time(call: Callable[[], None]) -> float:
 # sTDE against the released flow
 
 
-@contextlib.contextmanager
-def start_worker(arrays: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Callable[[str, int], list[float]]]]:
-    """Run the transcription in a process of its own.
-
-    Yields a description of the process, and a call `(network, num_threads) -> gaps of the walk`.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        inputs = Path(folder, "walk.npz")
-        np.savez(inputs, **arrays)
-        command = [PYTHON, WORKER, inputs, json.dumps(SIZES)]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-            requests = process.stdin
-            answers = process.stdout
-            assert requests is not None
-            assert answers is not None
-
-            def run_network(network: str, num_threads: int) -> list[float]:
-                print(network, num_threads, RELEASED_WALKS_PER_CALL[network], file=requests, flush=True)
-                return json.loads(answers.readline())
-
-            yield json.loads(answers.readline()), run_network
-            requests.close()  # the process ends with its input
-
-
 def compare_with_released(env: ObjectNav, inputs: FixedInputs, counts: jax.Array) -> dict[str, Any]:
     """Compare sTDE at one episode with the transcription."""
     if not PYTHON.exists():
@@ -241,19 +213,28 @@ def compare_with_released(env: ObjectNav, inputs: FixedInputs, counts: jax.Array
     features = unpack_features(rows, goals, env.row_format)
     prior = layout_priors(counts, "released")[inputs.params.room[states[0].scene[0]]]
 
-    arrays = {"table": np.asarray(features.table), "view": np.asarray(features.view), "prior": np.asarray(prior)}
-    with start_worker(arrays) as (description, run_network):
-        largest_difference = np.abs(
-            np.array(run_network("equal", 1)) - compute_released_gaps(prior, features.visible)
-        ).max()
+    # The transcription runs in a process of its own, on the same walk.
+    with tempfile.TemporaryDirectory() as folder:
+        arrays_path = Path(folder, "walk.npz")
+        np.savez(arrays_path, table=np.asarray(features.table), view=np.asarray(features.view), prior=np.asarray(prior))
+        worker = WorkerProcess([PYTHON, WORKER, arrays_path, json.dumps(SIZES)])
+    description = worker.description
 
-        # Both networks with one thread and with PyTorch's default.
-        agent_loop = AgentLoop(env, SPEC, ESTIMATORS["calibrated"])
-        calls: dict[str, Callable[[], Any]] = {"jaxnav": make_walk_call(agent_loop, inputs, states, WALKS_PER_CALL[1])}
-        for network in RELEASED_WALKS_PER_CALL:
-            for num_threads in sorted({1, description["threads"]}):
-                calls[f"{network}_{num_threads}_threads"] = functools.partial(run_network, network, num_threads)
-        times = time_in_turns(calls, TURNS)
+    def run_network(network: str, num_threads: int) -> list[float]:
+        """Return the gaps of the walk."""
+        return worker.request(f"{network} {num_threads} {RELEASED_WALKS_PER_CALL[network]}")
+
+    gaps = np.array(run_network("equal", 1))
+    largest_difference = np.abs(gaps - compute_released_gaps(prior, features.visible)).max()
+
+    # Both networks with one thread and with PyTorch's default.
+    agent_loop = AgentLoop(env, SPEC, ESTIMATORS["calibrated"])
+    calls: dict[str, Callable[[], Any]] = {"jaxnav": make_walk_call(agent_loop, inputs, states, WALKS_PER_CALL[1])}
+    for network in RELEASED_WALKS_PER_CALL:
+        for num_threads in sorted({1, description["threads"]}):
+            calls[f"{network}_{num_threads}_threads"] = functools.partial(run_network, network, num_threads)
+    times = time_in_turns(calls, TURNS)
+    worker.close()
 
     decision_us = {}
     for name, call_times in times.items():

@@ -15,8 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 from _common import print_report, ratio_by_turn, steps_per_second, time_in_turns
-from _phases import compile_program
-from _setup import set_up_training
+from _setup import compile_program, set_up_training
 
 from jaxnav.policies.method import ActionControl
 from jaxnav.policies.methods import METHODS, find_method

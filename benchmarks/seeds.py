@@ -6,22 +6,16 @@ noise of the measurement.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
 
-import jax
 from _common import print_report, ratio_by_turn, steps_per_second, time_in_turns
-from _setup import set_up_training
+from _setup import make_training_call, set_up_training
 
-from jaxnav.env.objectnav import EnvParams
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import make_trainer
-from jaxnav.training.trainer import Trainer
 
 ARM = "layout"
 NUM_SEEDS = (1, 2, 4, 8)
 TURNS = 5
-GOALS = {"8_seeds_together_over_apart": 0.95}
 
 
 def main() -> None:
@@ -52,18 +46,7 @@ def main() -> None:
             "apart_steps_per_s": steps_per_second(apart_times, num_steps),
             "together_over_apart": ratio_by_turn(apart_times, together_times),
         }
-    print_report({"arm": ARM, "updates_per_call": config.chunk, "goals": GOALS, "seeds": results})
-
-
-def make_training_call(trainer: Trainer, states: Any, params: EnvParams) -> Callable[[], Any]:
-    """Return a call that trains these states one more chunk."""
-
-    def train() -> jax.Array:
-        nonlocal states
-        states, _ = trainer.train(states, params)
-        return states[ARM][0].update
-
-    return train
+    print_report({"arm": ARM, "updates_per_call": config.chunk, "seeds": results})
 
 
 if __name__ == "__main__":

@@ -1,17 +1,16 @@
 """Cost of 10^11 environment steps on many hosts.
 
-`python benchmarks/simulate.py [--document]` computes it for 1 to 1,000 hosts. From the constants that
-benchmarks/scaling.py measured (results/performance/scaling.json) and those stated in `make_networks` and `Assumptions`,
-it adds up an update, term by term, and simulates a run: noise that makes every sum over the hosts wait for the slowest
-of them, and hosts that fail, after which all start again from the last checkpoint. A host is one process on one core.
-`--document` puts the tables into docs/scaling.md instead of printing JSON.
+`python benchmarks/simulate.py` computes it for 1 to 1,000 hosts and puts the tables into docs/scaling.md, with those of
+what benchmarks/scaling.py measured (results/performance/scaling.json). From these constants and those stated in
+`NETWORKS` and `Assumptions` it adds up an update, term by term, and simulates a run: noise that makes every sum over
+the hosts wait for the slowest of them, and hosts that fail, after which all start again from the last checkpoint. A
+host is one process on one core.
 """
 
 import dataclasses
 import json
 import math
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,8 @@ import numpy as np
 from jaxnav.runs.config import RunConfig
 
 ROOT = Path(__file__).parents[1]
-MEASURED = "results/performance/scaling.json"
+MEASURED = ROOT / "results/performance/scaling.json"
+DOCUMENT = ROOT / "docs/scaling.md"
 NUM_STEPS = 10**11
 NUM_HOSTS = (1, 2, 8, 64, 1000)
 DEFAULT_CONFIG = RunConfig()
@@ -67,15 +67,8 @@ class Assumptions:
     disk_bytes_per_s: float = 1e9
 
 
-def make_networks(measured: dict) -> dict[str, Network]:
-    """Return the measured loopback of this machine, Ethernet of 25 Gb/s, and InfiniBand as between GPUs."""
-    loopback = measured["all_reduce"]["free"]
-    return {
-        "loopback, ring": Network(loopback["latency_s"] / 2, loopback["bytes_per_s"]),
-        "ethernet, ring": Network(30e-6, 2.5e9),
-        "ethernet, tree": Network(30e-6, 2.5e9, tree=True),
-        "infiniband, tree": Network(5e-6, 20e9, tree=True),
-    }
+#: Ethernet of 25 Gb/s.
+NETWORKS = {"ethernet, ring": Network(30e-6, 2.5e9), "ethernet, tree": Network(30e-6, 2.5e9, tree=True)}
 
 
 # The model
@@ -111,12 +104,9 @@ def simulate_hosts(measured: dict, network: Network, shared_batch: bool) -> list
             {
                 "hosts": num_hosts,
                 "steps_per_update": round(steps_per_update),
-                "updates": num_updates,
-                "update_s": round(update_s, 4),
                 "share_percent": {name: round(100 * part / update_s, 2) for name, part in parts.items()},
                 "failures": num_failures,
-                "days": float(f"{run_s / 86400:.3g}"),
-                "steps_per_s": round(NUM_STEPS / run_s),
+                "days": run_s / 86400,
                 "efficiency": round(single_host_s / run_s / num_hosts, 3),
             }
         )
@@ -170,18 +160,6 @@ def simulate_run(
     failure_quantiles = rng.random(num_failures) * math.expm1(-interval_s / mean_time_to_failure)
     lost_s = -mean_time_to_failure * np.log1p(failure_quantiles)
     return num_intervals * interval_s + lost_s.sum() + num_failures * restart_s, num_failures
-
-
-def compute_results() -> dict:
-    measured = json.loads((ROOT / MEASURED).read_text())
-    networks = make_networks(measured)
-    return {
-        "steps": NUM_STEPS,
-        "networks": {name: dataclasses.asdict(network) for name, network in networks.items()},
-        "assumed": dataclasses.asdict(Assumptions()),
-        "batch_grows": {name: simulate_hosts(measured, network, False) for name, network in networks.items()},
-        "batch_shared": {name: simulate_hosts(measured, network, True) for name, network in networks.items()},
-    }
 
 
 # The document
@@ -255,22 +233,21 @@ def format_measurements(measured: dict) -> str:
     )
 
 
-def fill_document(results: dict) -> None:
-    """Replace every table of docs/scaling.md that a comment names."""
-    path = ROOT / "docs/scaling.md"
-    measured = json.loads((ROOT / MEASURED).read_text())
+def main() -> None:
+    """Replace every table of the document that a comment names."""
+    measured = json.loads(MEASURED.read_text())
 
     def make_table(match: re.Match) -> str:
-        kind, _, network = match[2].partition(": ")
-        table = format_simulation(results[kind][network]) if network else format_measurements(measured)
+        kind, _, name = match[2].partition(": ")
+        if kind == "measured":
+            table = format_measurements(measured)
+        else:
+            table = format_simulation(simulate_hosts(measured, NETWORKS[name], shared_batch=kind == "batch_shared"))
         return f"{match[1]}\n{table}\n"
 
     pattern = r"(<!-- (measured|batch_\w+: .+?) -->)\n(?:\|.*\n|\n(?=\| constant))*"
-    path.write_text(re.sub(pattern, make_table, path.read_text()))
+    DOCUMENT.write_text(re.sub(pattern, make_table, DOCUMENT.read_text()))
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--document"]:
-        fill_document(compute_results())
-    else:
-        print(json.dumps(compute_results(), indent=2))
+    main()

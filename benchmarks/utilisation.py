@@ -2,28 +2,33 @@
 
 `python benchmarks/utilisation.py` prints floating-point operations of the matrix products of one default update per
 second, over the rate of a bare product of 1,024 x 1,024 matrices in the same turns: float32, and bfloat16 inputs summed
-in float32. Operations are counted in the traced program; only matrix products count.
-`learning`, the recurrent forward and backward pass over the minibatches with the optimiser, is the update less the
-rollout.
+in float32. Operations are counted in the traced program; only matrix products count. `learning`, the recurrent forward
+and backward pass over the minibatches with the optimiser, is no program of its own: its operations and seconds are
+those of the update less those of the rollout in the same turn.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from _common import print_report, ratio_by_turn, summarize, time_in_turns
-from _phases import compile_phases
-from _setup import set_up_training
+from _setup import Program, TrainingSetup, compile_program, compile_update, set_up_training
 
 from jaxnav.runs.config import RunConfig
+from jaxnav.training.ppo import collect_rollout
 
 MATRIX_SIZE = 1024
 NUM_PRODUCTS = 16
 TURNS = 31
-GOALS = {"learning_over_f32_peak": 0.45, "rollout_share_of_update": 0.35}
 
 
 def main() -> None:
     config = RunConfig()
-    programs = compile_phases(set_up_training(config))
+    setup = set_up_training(config)
+    programs = {}
+    for arm in config.arms:
+        programs[f"{arm} update"] = compile_update(setup, arm)
+        programs[f"{arm} rollout"] = compile_rollout(setup, arm)
 
     # Bare products, whose rate is the peak.
     matmul = jax.jit(lambda lhs, rhs: jnp.matmul(lhs, rhs, preferred_element_type=jnp.float32))
@@ -71,11 +76,31 @@ def main() -> None:
             "episodes": config.ppo.num_envs,
             "rollout_steps": config.ppo.rollout,
             "hidden": config.sizes.hidden,
-            "goals": GOALS,
             "product_gflop_per_s": {name: summarize(values) for name, values in peak_rates.items()},
             "parts": parts,
         }
     )
+
+
+def compile_rollout(setup: TrainingSetup, arm: str) -> Program:
+    """Compile the rollout of one update."""
+    learner = setup.trainer.learners[arm]
+    state, _, env_params, knowledge = setup.update_arguments(arm)
+
+    def act(state: Any, env_params: Any, knowledge: Any) -> Any:
+        policy = learner.agent_loop.bind(state.params)
+        return collect_rollout(
+            learner.agent_loop,
+            policy,
+            state.agent,
+            state.key,
+            env_params,
+            knowledge,
+            num_steps=learner.config.rollout,
+            use_coin=learner.counterfactual == "coin",
+        )
+
+    return compile_program(act, state, env_params, knowledge)
 
 
 if __name__ == "__main__":

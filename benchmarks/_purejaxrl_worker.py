@@ -1,8 +1,8 @@
 """Recurrent PPO in purejaxrl's style as a process.
 
-Started as `python benchmarks/_purejaxrl_style.py EPOCHS MINIBATCHES UPDATES`. The code follows purejaxrl: everything in
-one jitted function, a flax.linen cell scanned over time with resets, observations stored in the trajectory as float32
-vectors, minibatches of whole sequences. The network is jaxnav's.
+Started as `python benchmarks/_purejaxrl_worker.py EPOCHS MINIBATCHES UPDATES`. The code follows purejaxrl: everything
+in one jitted function, a flax.linen cell scanned over time with resets, observations stored in the trajectory as
+float32 vectors, minibatches of whole sequences. The network is jaxnav's.
 """
 
 import functools
@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from _adapter import Adapter, EpisodeSlot, Torso, count_ended, make_action_head, to_vector
-from _worker import serve
+from _trainer_worker import Adapter, EpisodeSlot, Torso, make_action_head, serve, to_vector
 from flax import linen as nn
 from flax.training.train_state import TrainState
 
@@ -75,7 +74,7 @@ def log_prob_of(logits: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, num_updates: int):
-    """Return a function that trains for some updates; see `_worker.Train`."""
+    """Return a function that trains for some updates."""
 
     def env_step(runner: Runner, _: None) -> tuple[Runner, Transition]:
         key, action_key, step_key = jax.random.split(runner.key, 3)
@@ -139,9 +138,8 @@ def make_train(config: PPOConfig, env: Adapter, params: Any, network: Any, num_u
         (train, key), _ = jax.lax.scan(epoch, (runner.train, runner.key), None, config.epochs)
         return runner._replace(train=train, key=key), None
 
-    def train(runner: Runner) -> tuple[Runner, tuple[jax.Array, jax.Array]]:
-        next_runner, _ = jax.lax.scan(update, runner, None, num_updates)
-        return next_runner, count_ended(runner.slots, next_runner.slots)
+    def train(runner: Runner) -> Runner:
+        return jax.lax.scan(update, runner, None, num_updates)[0]
 
     return train
 
@@ -163,8 +161,7 @@ def main(epochs: int, minibatches: int, num_updates: int) -> None:
     train = TrainState.create(apply_fn=network.apply, params=weights, tx=optimizer)
     runner = Runner(train, slots, obs, start, hidden, key)
 
-    num_steps = num_updates * config.num_envs * config.rollout
-    serve(make_train(config, adapter, params, network, num_updates), runner, num_steps, weights)
+    serve(make_train(config, adapter, params, network, num_updates), runner)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""The environment and the policy's layers for other trainers.
+"""A trainer in a process of its own, and the environment and the policy's layers for other trainers than jaxnav's.
 
 The environment has gymnax's interface with auto-reset, the layers are flax.linen modules.
 """
 
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,16 +19,31 @@ from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
+# The process
+
+
+def serve(train: Callable[[Any], Any], state: Any) -> None:
+    """Compile a trainer, then train once per line of stdin, and answer each with a line of JSON.
+
+    Args:
+      train: one training call, from a state to the state after some updates.
+      state: to begin with; donated.
+    """
+    compiled = jax.jit(train, donate_argnums=0).lower(state).compile()
+    print("null", flush=True)
+    for _ in sys.stdin:
+        state = jax.block_until_ready(compiled(state))
+        print("null", flush=True)
+
+
 # The environment
 
 
 class EpisodeSlot(NamedTuple):
-    """The episode of a slot, its last action, and the numbers of episodes and successes so far."""
+    """The episode of a slot, and its last action."""
 
     state: State
     action: jax.Array
-    episodes: jax.Array
-    successes: jax.Array
 
 
 class Adapter:
@@ -43,24 +59,16 @@ class Adapter:
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, EpisodeSlot]:
         observation, state = self.env.reset(key, params)
-        slot = EpisodeSlot(state, jnp.int32(NUM_ACTIONS), jnp.int32(0), jnp.int32(0))
+        slot = EpisodeSlot(state, jnp.int32(NUM_ACTIONS))
         return self.encode(observation, slot.action), slot
 
     def step(
         self, key: jax.Array, slot: EpisodeSlot, action: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, EpisodeSlot, jax.Array, jax.Array, dict[str, Any]]:
-        observation, state, reward, terminated, truncated, info = self.env.step(key, slot.state, action, params)
+        observation, state, reward, terminated, truncated, _ = self.env.step(key, slot.state, action, params)
         done = terminated | truncated
         previous_action = jnp.where(done, NUM_ACTIONS, action.astype(jnp.int32))
-        slot = EpisodeSlot(state, previous_action, slot.episodes + done, slot.successes + info["success"])
-        return self.encode(observation, previous_action), slot, reward, done, {}
-
-
-def count_ended(slots_before: EpisodeSlot, slots_after: EpisodeSlot) -> tuple[jax.Array, jax.Array]:
-    """Return the numbers of episodes and successes between two batches of slots."""
-    num_episodes = (slots_after.episodes - slots_before.episodes).sum()
-    num_successes = (slots_after.successes - slots_before.successes).sum()
-    return num_episodes, num_successes
+        return self.encode(observation, previous_action), EpisodeSlot(state, previous_action), reward, done, {}
 
 
 def pack_observation(observation: Observation, action: jax.Array) -> jax.Array:
