@@ -148,25 +148,17 @@ def summarize_rooms(statistics: Sequence[SceneStatistics]) -> list[RoomSummary]:
     """Summarize the scenes of each room type."""
     summaries = []
     for room_type, room_scenes in _group_by_room_type(statistics):
-        # Collect the counts of every scene of this room type.
-        split_names = []
-        cell_counts = []
-        scene_sizes = []
-        object_counts = []
-        categorized_counts = []
-        for scene_statistics in room_scenes:
-            split_names.append(scene_statistics.scene.split)
-            cell_counts.append(scene_statistics.num_cells)
-            scene_sizes.append(scene_statistics.size)
-            object_counts.append(len(scene_statistics.scene.types))
-            categorized_counts.append(scene_statistics.num_objects.sum())
+        split_names = [scene.scene.split for scene in room_scenes]
+        cell_counts = [scene.num_cells for scene in room_scenes]
+        object_counts = [len(scene.scene.types) for scene in room_scenes]
+        categorized_counts = [scene.num_objects.sum() for scene in room_scenes]
 
         # Medians and quartiles, because sizes of scenes are skewed.
         room_summary = RoomSummary(
             room_type=room_type,
             splits=tuple(map(split_names.count, SPLITS)),
             cells=np.quantile(cell_counts, np.linspace(0, 1, 5)),
-            size=np.median(scene_sizes, axis=0),
+            size=np.median([scene.size for scene in room_scenes], axis=0),
             num_objects=float(np.median(object_counts)),
             num_categorized=float(np.median(categorized_counts)),
         )
@@ -218,17 +210,11 @@ def summarize_pairs(statistics: Sequence[SceneStatistics], task: Task, count: in
       At most `count` pairs with phi > 0, the greatest first.
     """
     # Pool the poses of all scenes.
-    num_poses = 0
-    detected_counts = []
-    joint_counts = []
-    for scene_statistics in statistics:
-        num_poses += scene_statistics.num_poses
-        detected_counts.append(scene_statistics.num_detected)
-        joint_counts.append(scene_statistics.co_detections)
+    num_poses = sum(scene.num_poses for scene in statistics)
 
     # P(i) [K] and P(i, j) [K, K].
-    marginal_share = np.sum(detected_counts, axis=0) / num_poses
-    joint_share = np.sum(joint_counts, axis=0) / num_poses
+    marginal_share = np.sum([scene.num_detected for scene in statistics], axis=0) / num_poses
+    joint_share = np.sum([scene.co_detections for scene in statistics], axis=0) / num_poses
 
     # Correlation [K, K]; 0 for a category that is never, or always, detected.
     spread = np.sqrt(np.outer(marginal_share * (1 - marginal_share), marginal_share * (1 - marginal_share)))

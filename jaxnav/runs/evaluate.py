@@ -2,8 +2,8 @@
 
 `evaluate` measures every variant of the run's policies (baseline, layout weights, hard TDE, and sTDE at every epsilon)
 and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many epsilons and all seeds in one
-compiled call. `account` compares a run with agents that cannot know any layout, and `replay_episodes` plays episodes
-step by step.
+compiled call. `measure_leads` compares results with those of agents that cannot know any layout, and `replay_episodes`
+plays episodes step by step.
 """
 
 import csv
@@ -374,26 +374,6 @@ def sweep(
     return Sweep(np.asarray(epsilon, np.float64), metrics["sr"], metrics["spl"], metrics["dts"], outcome, compilations)
 
 
-def account(
-    run: Run, reference_run: Run, *, setting: EstimatorName | None = None, hold: bool = False, **options: Any
-) -> list[ExperienceLead]:
-    """Account for the experience of a run: its lead over agents without experience, on fixed episodes.
-
-    Args:
-      run: a finished run.
-      reference_run: a finished run of agents that cannot know any layout, such as those of the method `anonymous`.
-      setting, hold: layout estimator to use in place of the run's.
-      **options: further options of `evaluate`, for both runs.
-
-    Raises:
-      InputError: a run is not finished, an option is impossible, or `measure_leads` cannot compare the runs.
-    """
-    # The estimator applies only to the run with experience.
-    results = evaluate(run, setting=setting, hold=hold, **options)
-    reference = evaluate(reference_run, **options)
-    return measure_leads(results, reference)
-
-
 def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
     """Lead of every row over agents without experience.
 
@@ -431,7 +411,7 @@ def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
             lead_share = None
             if index != agent_index:
                 lead_share = remaining_share(reference_values, agent_values, row_values, scenes)
-            experience_leads.append(ExperienceLead(variant_label, row.decoding, metric, paired_lead, lead_share))
+            experience_leads.append(ExperienceLead(index, variant_label, row.decoding, metric, paired_lead, lead_share))
     return experience_leads
 
 

@@ -213,13 +213,9 @@ class RunLogs:
         # Rows of a log without gaps: every chunk in order, and in it every arm and seed.
         last_row_update = max([last_update, *(row["step"] for row in rows)])
         logged_updates = range(config.chunk, last_row_update + 1, config.chunk)
-        arm_seeds: list[tuple[str | None, int | None]] = [(None, None)]
-        if name == LOG_FILE:
-            arm_seeds = list(itertools.product(config.arms, range(config.seeds)))
-        expected_rows = []
-        for update in logged_updates:
-            for arm, seed in arm_seeds:
-                expected_rows.append((update, arm, seed))
+        arms = config.arms if name == LOG_FILE else (None,)
+        seeds = range(config.seeds) if name == LOG_FILE else (None,)
+        expected_rows = list(itertools.product(logged_updates, arms, seeds))
         actual_rows = [(row["step"], row.get("arm"), row.get("seed")) for row in rows]
 
         # The log may end early, but only after `last_update`.

@@ -430,12 +430,13 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
 
             progress.show_chunk(metrics, update)
             if signal_number:
-                raise _make_interrupted(config, signal_number, update)
+                break
 
         # A signal may also come during the last save.
         signal_number = interrupts.pending_signal()
         if signal_number:
-            raise _make_interrupted(config, signal_number, update)
+            stop_message = f"{config.run_dir}: stopped after update {update} of {config.total_updates} and saved"
+            raise Interrupted(signal_number, stop_message)
     return states
 
 
@@ -478,11 +479,6 @@ def _log_rows(config: RunConfig, metrics: SeedMetrics, update: int) -> list[LogR
             row_labels = {"step": update, "arm": arm, "seed": seed, "env_steps": update * config.steps_per_update}
             log_rows.append(row_labels | seed_metrics)
     return log_rows
-
-
-def _make_interrupted(config: RunConfig, signal_number: int, update: int) -> Interrupted:
-    stop_message = f"{config.run_dir}: stopped after update {update} of {config.total_updates} and saved"
-    return Interrupted(signal_number, stop_message)
 
 
 def _best_params(state: LearnerState) -> Params:
