@@ -140,7 +140,16 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
       InputError: no such scenes, goal or policy, or a policy of another world or without actions to advise.
     """
     # Check the policy first, since compiling scenes takes longer.
-    adviser = None if config.policy is None else _load_adviser(config.policy, config.world)
+    policy = config.policy
+    adviser = None
+    if policy is not None:
+        policy_world = config_for_policy(policy).world
+        adviser = load_policy(policy)
+        method = adviser.spec.method
+        if policy_world != config.world:
+            raise InputError(f"--policy {policy}: was trained for {policy_world}; play with --world {policy_world}")
+        if not isinstance(method.control, ActionControl):
+            raise InputError(f"--policy {policy}: method {method.name!r} chooses no single actions; take another")
 
     # The game takes one episode of the list that an evaluation with this seed would play.
     run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed))
@@ -157,23 +166,6 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
         estimator_config = calibrate_estimator(run_config, training_world, exploration, console)
         knowledge = Knowledge(layout_priors(exploration.counts, estimator_config))
     return Game(world, episode, knowledge, estimator_config, adviser, config.epsilon)
-
-
-def _load_adviser(policy: str, world: str) -> LoadedPolicy:
-    """Load a policy that can give advice in a world.
-
-    Raises:
-      InputError: no such policy, or one of another world or without actions to advise.
-    """
-    policy_world = config_for_policy(policy).world
-    adviser = load_policy(policy)
-    if policy_world != world:
-        raise InputError(f"--policy {policy}: was trained for {policy_world}; play with --world {policy_world}")
-    if not isinstance(adviser.spec.method.control, ActionControl):
-        raise InputError(
-            f"--policy {policy}: method {adviser.spec.method.name!r} chooses no single actions; take another"
-        )
-    return adviser
 
 
 def choose_episode(bank: Bank, goal: str | None, seed: int) -> EpisodeList:

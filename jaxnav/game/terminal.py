@@ -122,8 +122,8 @@ def _nearest_detections(game: Game, pose: int) -> list[_Detection]:
 
 
 def _view_text(game: Game, pose: int, detections: Sequence[_Detection]) -> Text:
-    """Return the view from above, the agent at the bottom."""
-    # Draw the floor, two characters a cell; row 0 is the agent's.
+    """Return the view from above, the agent at the bottom: the first row is the agent's."""
+    # Draw the floor, two characters a cell.
     row_format = RowFormat(len(game.bank.task.categories))
     view_size = row_format.view
     view_cells = row_format.view_cells(game.bank.rows[pose]).reshape(view_size, view_size)
@@ -140,7 +140,11 @@ def _view_text(game: Game, pose: int, detections: Sequence[_Detection]) -> Text:
             mark_rows[row_index][column_index] = (f"{letter} ", style)
     mark_rows[0][view_size // 2] = ("▲ ", AGENT_STYLE)
 
-    # The terminal's first line is farthest from the agent.
+    return _join_marks(mark_rows)
+
+
+def _join_marks(mark_rows: list[list[tuple[str, str]]]) -> Text:
+    """Return rows of texts and their styles, the last row in the terminal's first line."""
     return Text("\n").join(Text.assemble(*mark_row) for mark_row in reversed(mark_rows))
 
 
@@ -177,13 +181,7 @@ def _bar_line(name: str, printed_value: float, bar_share: float) -> Text:
 
 
 def result_screen(game: Game, result: GameResult, columns: int) -> RenderableType:
-    """Return the map with the player's path and a shortest one, and the outcome.
-
-    Args:
-      game: the game.
-      result: its result.
-      columns: width of the terminal.
-    """
+    """Return the map with the player's path and a shortest one, and the outcome, for a width in columns."""
     # The oracle lists the actions of a shortest path, [L*, 1]; the tables lead from pose to pose.
     shortest_poses = [int(game.episode.pose[0])]
     for action in oracle_actions(game.bank, game.episode)[:, 0]:
@@ -209,35 +207,29 @@ def result_screen(game: Game, result: GameResult, columns: int) -> RenderableTyp
 
 def _map_text(game: Game, poses: list[int], shortest_poses: list[int], columns: int) -> Text:
     """Return the map of the scene with both paths; +z is up."""
-    # Walls, standable cells and furniture, [nz, nx].
     scene_index = int(game.episode.scene[0])
     scene = find_scene(game.world, game.bank.names[scene_index])
-    map_characters = np.where(scene.walls, "█", np.where(scene.reach, "·", "░")).tolist()
+
+    # Walls, standable cells and furniture, [nz, nx]. Characters are about twice as high as wide: spaces keep the
+    # proportions where they fit.
+    map_characters = np.where(scene.walls, "█", np.where(scene.reach, "·", "░"))
+    separator = " " if 2 * map_characters.shape[1] <= columns else ""
     mark_rows = []
-    for character_row in map_characters:
-        mark_rows.append([(cell_character, MUTED_STYLE) for cell_character in character_row])
+    for character_row in map_characters.tolist():
+        mark_rows.append([(cell_character + separator, MUTED_STYLE) for cell_character in character_row])
 
     # Mark the objects of the goal's category.
     for name, (x, z) in zip(scene.types, scene.boxes[:, [0, 2]], strict=True):
         iz, ix = np.rint((np.array([z, x]) - np.array(scene.origin)[::-1]) / CELL_SIZE).astype(int)
         if name == game.goal and 0 <= iz < len(mark_rows) and 0 <= ix < len(mark_rows[0]):
-            mark_rows[iz][ix] = ("★", GOAL_STYLE)
+            mark_rows[iz][ix] = ("★" + separator, GOAL_STYLE)
 
     # Mark the shortest path, the path of the player over it, and the start.
     cells = standable_cells(scene.reach)
-    for marked_poses, mark in (
-        (shortest_poses, ("○", SEEN_STYLE)),
-        (poses, ("●", AGENT_STYLE)),
-        (poses[:1], ("S", "bold")),
-    ):
+    marked_paths = ((shortest_poses, "○", SEEN_STYLE), (poses, "●", AGENT_STYLE), (poses[:1], "S", "bold"))
+    for marked_poses, character, style in marked_paths:
         for pose in marked_poses:
             cell, _, _ = game.bank.task.rules.split_pose(pose)
             iz, ix = cells[cell - game.bank.first_cell[scene_index]]
-            mark_rows[iz][ix] = mark
-
-    # Characters are about twice as high as wide: spaces keep the proportions where they fit.
-    cell_separator = Text(" " if 2 * len(mark_rows[0]) <= columns else "")
-    text_lines = []
-    for mark_row in reversed(mark_rows):
-        text_lines.append(cell_separator.join(Text(*mark) for mark in mark_row))
-    return Text("\n").join(text_lines)
+            mark_rows[iz][ix] = (character + separator, style)
+    return _join_marks(mark_rows)
