@@ -74,7 +74,7 @@ def uniform_layout_model(num_categories: int) -> LayoutModel:
 
 
 def fit_layout_model(
-    snapshots: Sequence[SearchSnapshot], rates: np.ndarray, *, use_relations: bool = True, seed: int = 0
+    snapshots: Sequence[SearchSnapshot], rates: np.ndarray, *, use_relations: bool = True
 ) -> LayoutModel:
     """Fit the model to the sites of the goals.
 
@@ -83,13 +83,12 @@ def fit_layout_model(
       rates: float32 [K, L], see `detection_rates`.
       use_relations: False for a model without categories: all goals share the weights of the surroundings, and
         detections have no effect.
-      seed: seed of the order of the examples.
     """
     # An example is a snapshot and a goal that is in the scene but was not detected.
     num_categories = len(rates)
     is_example = [snapshot.sites.object_sites.any(axis=1) & ~snapshot.detected for snapshot in snapshots]
     examples = np.argwhere(is_example).astype(np.int32)  # [examples, (snapshot, goal)]
-    order = np.random.default_rng(seed).integers(len(examples), size=(NUM_STEPS, BATCH_SIZE))
+    order = np.random.default_rng(0).integers(len(examples), size=(NUM_STEPS, BATCH_SIZE))
 
     initial_weights = _Weights(
         shared=jnp.zeros(NUM_SURROUNDINGS),
