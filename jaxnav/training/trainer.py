@@ -9,7 +9,7 @@ those in a checkpoint.
 import dataclasses
 import operator
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -74,13 +74,16 @@ class Trainer:
         self._num_seeds = num_seeds
         self._chunk_size = chunk_size
 
-        # Functions of each arm; those that depend on the stage, (arm, stage index), are added when they are needed.
+        # Functions of each arm in each stage, (arm, stage index); those that train are compiled when they are needed.
         self._init_functions = {}
         self._keep_functions = {}
-        for arm in self.learners:
+        self._restart_functions = {}
+        for arm, learner in self.learners.items():
             self._init_functions[arm] = self._jit_init(self._stage_learner(arm, 0))
-            self._keep_functions[arm] = self._jit_keep(self.learners[arm])
-        self._restart_functions: dict[tuple[str, int], Any] = {}
+            self._keep_functions[arm] = self._jit_update(learner.keep_if_best, (0, 0))
+            for stage_index in range(len(self._stages)):
+                restart = self._stage_learner(arm, stage_index).restart_episodes
+                self._restart_functions[arm, stage_index] = self._jit_update(restart, (0, None, None))
         self._compiled: dict[tuple[str, int], Any] = {}
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
@@ -96,14 +99,21 @@ class Trainer:
         return states
 
     def init(self, env_params: EnvParams) -> TrainerStates:
-        """Start all seeds."""
-        return self._init_seeds(env_params)
+        """Start all seeds, each with a key of its own."""
+        seed_states: SeedStates = {}
+        for arm, init in self._init_functions.items():
+            arm_key = jax.random.fold_in(self._key, ARM_KEY_PURPOSES[arm])
+            seed_states[arm] = []
+            for seed in range(self._num_seeds):
+                seed_key = jax.random.fold_in(arm_key, seed)
+                seed_states[arm].append(init(seed_key, env_params, self._knowledge))
+        return seed_states
 
     def restart(self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> TrainerStates:
         """Start new episodes in all seeds; donates the states."""
         new_states: TrainerStates = {}
         for arm, arm_states in states.items():
-            restart = self._restart_function(arm, stage_index)
+            restart = self._restart_functions[arm, stage_index]
             new_states[arm] = [restart(state, env_params, self._knowledge) for state in arm_states]
         return new_states
 
@@ -159,27 +169,9 @@ class Trainer:
             metrics[arm].append({name: float(value) for name, value in values.items()})
         return new_states, metrics
 
-    def _init_seeds(self, env_params: EnvParams) -> SeedStates:
-        """Start all seeds, each with a key of its own."""
-        seed_states: SeedStates = {}
-        for arm, init in self._init_functions.items():
-            arm_key = jax.random.fold_in(self._key, ARM_KEY_PURPOSES[arm])
-            seed_states[arm] = []
-            for seed in range(self._num_seeds):
-                seed_key = jax.random.fold_in(arm_key, seed)
-                seed_states[arm].append(init(seed_key, env_params, self._knowledge))
-        return seed_states
-
     def _stage_learner(self, arm: str, stage_index: int) -> Learner:
         """Learner of an arm in a stage."""
         return dataclasses.replace(self.learners[arm], stage=self._stages[stage_index])
-
-    def _restart_function(self, arm: str, stage_index: int) -> Any:
-        """Jitted `Learner.restart_episodes` of an arm in a stage."""
-        if (arm, stage_index) not in self._restart_functions:
-            learner = self._stage_learner(arm, stage_index)
-            self._restart_functions[arm, stage_index] = self._jit_restart(learner)
-        return self._restart_functions[arm, stage_index]
 
     def _compiled_train(self, arm: str, stage_index: int, state: LearnerState, env_params: EnvParams) -> Any:
         """Compiled chunk of updates of an arm in a stage, for arguments like these."""
@@ -194,11 +186,9 @@ class Trainer:
     def _jit_init(self, learner: Learner) -> Any:
         return jax.jit(learner.init)
 
-    def _jit_keep(self, learner: Learner) -> Any:
-        return jax.jit(learner.keep_if_best, donate_argnums=0)
-
-    def _jit_restart(self, learner: Learner) -> Any:
-        return jax.jit(learner.restart_episodes, donate_argnums=0)
+    def _jit_update(self, function: Callable[..., LearnerState], seed_axes: tuple[int | None, ...]) -> Any:
+        """Jit a function of states, which it donates; `seed_axes` tells the arguments that have an axis of seeds."""
+        return jax.jit(function, donate_argnums=0)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
         def train(state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
@@ -235,7 +225,7 @@ class ShardedTrainer(Trainer):
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
         """Shapes, dtypes and shardings of all states in a checkpoint."""
-        abstract_states = jax.eval_shape(self._init_seeds, env_params)
+        abstract_states = jax.eval_shape(super().init, env_params)
 
         def add_shardings(state: LearnerState) -> LearnerState:
             shardings = jax.tree.broadcast(self._seed_sharding, state)
@@ -253,14 +243,14 @@ class ShardedTrainer(Trainer):
 
     def init(self, env_params: EnvParams) -> TrainerStates:
         """Start all seeds."""
-        return self.pack(self._init_seeds(self._replicate_env_params(env_params)))
+        return self.pack(super().init(self._replicate_env_params(env_params)))
 
     def restart(self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> TrainerStates:
         """Start new episodes in all seeds; donates the states."""
         env_params = self._replicate_env_params(env_params)
         new_states: TrainerStates = {}
         for arm, stacked_state in states.items():
-            restart = self._restart_function(arm, stage_index)
+            restart = self._restart_functions[arm, stage_index]
             new_states[arm] = restart(stacked_state, env_params, self._knowledge)
         return new_states
 
@@ -298,12 +288,8 @@ class ShardedTrainer(Trainer):
     def _jit_init(self, learner: Learner) -> Any:
         return jax.jit(learner.init, out_shardings=self._seed_sharding)
 
-    def _jit_keep(self, learner: Learner) -> Any:
-        return jax.jit(jax.vmap(learner.keep_if_best), out_shardings=self._stacked_sharding, donate_argnums=0)
-
-    def _jit_restart(self, learner: Learner) -> Any:
-        restart_seeds = jax.vmap(learner.restart_episodes, in_axes=(0, None, None))
-        return jax.jit(restart_seeds, out_shardings=self._stacked_sharding, donate_argnums=0)
+    def _jit_update(self, function: Callable[..., LearnerState], seed_axes: tuple[int | None, ...]) -> Any:
+        return jax.jit(jax.vmap(function, seed_axes), out_shardings=self._stacked_sharding, donate_argnums=0)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
         replicated = replicated_sharding(self._mesh)
