@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("cli",),
     ("report",),
-    ("study",),
+    ("experiments",),
     ("viz",),
     ("game",),
     ("runs",),

@@ -339,6 +339,7 @@ class ExperienceLead(NamedTuple):
     """Lead of a row over the agent without experience, in one metric.
 
     Attributes:
+      row_index: index of the row in the evaluation.
       variant: label of the row, as printed in tables.
       decoding: rule that turns logits into actions.
       metric: `sr`, `spl` or `sr@N`.
@@ -347,16 +348,12 @@ class ExperienceLead(NamedTuple):
         a value of experience it is the share kept; for a cost, 100 minus it is the share recovered.
     """
 
+    row_index: int
     variant: str
     decoding: Decoding
     metric: str
     lead: Interval
     left: Interval | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Convert to JSON."""
-        share = None if self.left is None else self.left.to_json()
-        return self._asdict() | {"lead": self.lead.to_json(), "left": share}
 
 
 def remaining_share(unaware: np.ndarray, agent: np.ndarray, removed: np.ndarray, scenes: Clusters) -> Interval:

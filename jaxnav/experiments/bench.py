@@ -14,7 +14,7 @@ from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
 from jaxnav.experiments.table import ResultRow, ResultTable, read_part
-from jaxnav.runs.evaluate import evaluate
+from jaxnav.runs.evaluate import Results, evaluate
 from jaxnav.runs.policies import load_policies
 from jaxnav.runs.run import Run, load_run_config, run_settings
 from jaxnav.runs.train import train
@@ -27,12 +27,12 @@ class Scores(NamedTuple):
     Attributes:
       metrics: by row of the evaluation, the metrics [S, E] in the units of the result table.
       episodes: the E episodes.
-      budgets: numbers of actions within which success is counted too, as `sr@N`.
+      results: the evaluation itself.
     """
 
     metrics: dict[EvaluationRow, Mapping[str, np.ndarray]]
     episodes: EpisodeList
-    budgets: tuple[int, ...]
+    results: Results
 
 
 def best_epsilon(table: ResultTable, world: str, agent: str, shift: float) -> float | None:
@@ -142,4 +142,4 @@ class Bench:
             for name, values in metrics.items():
                 row_metrics[name] = values[index] * (1.0 if name == "dts" else 100.0)
             metrics_by_row[row] = row_metrics
-        return Scores(metrics_by_row, results.episodes, results.budgets)
+        return Scores(metrics_by_row, results.episodes, results)

@@ -13,11 +13,11 @@ import json
 import operator
 import re
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from jaxnav.causal import Form
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import Decoding
+from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
 from jaxnav.runs.run import load_run_config, run_settings
@@ -130,8 +130,8 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
             raise InputError(f"{name}: {getattr(config, name)}: give at least 1")
     if not 0 <= config.seed < 2**32:
         raise InputError(f"seed: {config.seed}: give a whole number from 0 to 2**32 - 1")
-    if not isinstance(config.base.devices, int | None):
-        raise InputError(f"base.devices: {config.base.devices}: one process trains all runs; give a number of devices")
+    if not config.decodings:
+        raise InputError("decodings: empty: give one or more")
 
     # Names become parts of file names, and a slash separates an agent from its variant.
     for name in (*config.worlds, *config.agents):
@@ -140,16 +140,52 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
     for measurement, patterns in config.measure.items():
         if not isinstance(patterns, list) or not all(isinstance(pattern, str) for pattern in patterns):
             raise InputError(f"measure.{measurement}: {patterns}: give a list of agents, or ['*']")
+    for agent, agent_settings in config.agents.items():
+        _check_references(config, f"agents.{agent}.against", agent_settings.get("against", []))
+    for name, group in config.groups.items():
+        _check_group(config, f"groups.{name}", group)
 
     # Listing the runs checks the settings of each.
     runs = agent_runs(config)
     if not runs:
         raise InputError(f"only: {', '.join(config.only)}: selects no run; give other patterns")
     for run in runs:
-        unknown_agents = sorted({reference.partition("/")[0] for reference in run.against} - set(config.agents))
-        if unknown_agents:
-            raise InputError(f"agents.{run.agent}.against: {unknown_agents[0]!r} is none of the agents")
+        if not isinstance(run.config.devices, int | None):
+            raise InputError(f"{run.name}: devices is {run.config.devices}; one process trains all runs: give a number")
+    run_names = [run.name for run in runs]
+    for name in run_names:
+        if run_names.count(name) > 1:
+            raise InputError(f"worlds and agents: two runs are called {name}; give other names")
     return config
+
+
+def _check_references(config: ExperimentConfig, key: str, references: Any) -> None:
+    """Check a list of AGENT or AGENT/VARIANT."""
+    if not isinstance(references, list):
+        raise InputError(f"{key}: {references!r}: give a list of agents, or of AGENT/VARIANT")
+    for reference in references:
+        agent, has_variant, variant = str(reference).partition("/")
+        if agent not in config.agents:
+            raise InputError(f"{key}: {agent!r} is none of the agents")
+        if has_variant and variant not in get_args(Variant):
+            raise InputError(f"{key}: {variant!r} is unknown; choose from {', '.join(get_args(Variant))}")
+
+
+def _check_group(config: ExperimentConfig, key: str, group: dict[str, Any]) -> None:
+    """Check a group of agents and what it is compared with."""
+    if set(group) != {"agents", "variant", "against"}:
+        raise InputError(f"{key}: gives {', '.join(group) or 'nothing'}; give agents, variant and against")
+    if not group["agents"]:
+        raise InputError(f"{key}.agents: empty: give one or more")
+    _check_references(config, f"{key}.agents", group["agents"])
+
+    # The reference is another variant of the group, or AGENT/VARIANT.
+    for name in ("variant", "against"):
+        agent, is_other_agent, variant = str(group[name]).rpartition("/")
+        if variant not in get_args(Variant) or (is_other_agent and name == "variant"):
+            raise InputError(f"{key}.{name}: {group[name]!r} is unknown; choose from {', '.join(get_args(Variant))}")
+        if is_other_agent:
+            _check_references(config, f"{key}.{name}", [agent])
 
 
 def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
@@ -159,15 +195,16 @@ def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
             raise InputError(f"without: {config.without}: give the run that it is compared with, as `run`")
         return config
 
-    # The world is that of the run; results and page are kept in the run's folder.
+    # The world is that of the run, unless it is changed; results and page are kept in the run's folder.
     base = load_run_config(config.run)
     agents: dict[str, dict[str, Any]] = {"main": {"run": str(config.run)}}
     if config.without is not None:
         agents[config.unaware] = {"run": str(config.without)}
+    run_world = {base.scenes.stem.partition(".")[0] if base.scenes else base.world: {}}
     return dataclasses.replace(
         config,
         agents=agents,
-        worlds={base.scenes.stem.partition(".")[0] if base.scenes else base.world: {}},
+        worlds=run_world if config.worlds == ExperimentConfig().worlds else config.worlds,
         base=dataclasses.replace(base, devices=None),
         results=config.run / "results" if config.results == ExperimentConfig().results else config.results,
         pages={str(config.run / Path(document).name): template for document, template in config.pages.items()},
@@ -196,11 +233,17 @@ def _matches(name: str, patterns: tuple[str, ...]) -> bool:
 def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, Any], agent: str) -> AgentRun:
     """Settings of one run: the base, changed by the world, then by the agent."""
     agent_settings = config.agents[agent]
-    if "run" in agent_settings:
-        return AgentRun(world, agent, load_run_config(Path(agent_settings["run"])), is_trained=True)
-
+    against = tuple(agent_settings.get("against", ()))
     changes = {setting: value for setting, value in agent_settings.items() if setting not in AGENT_SETTINGS}
     name = f"{world}-{agent}".replace(":", "-")
+
+    # The settings of a finished run are fixed, but for its world.
+    if "run" in agent_settings:
+        if changes:
+            raise InputError(f"agents.{agent}: is a finished run; leave out {', '.join(changes)}")
+        run_config = load_run_config(Path(agent_settings["run"]))
+        run_config = apply_values(run_config, world_changes, Path(f"worlds.{world}"))
+        return AgentRun(world, agent, run_config, against, is_trained=True)
 
     # The scenes of finished results need not exist any more; whoever trains reads them first.
     world_config = apply_values(config.base, world_changes, Path(f"worlds.{world}"))
@@ -212,7 +255,7 @@ def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, An
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     run_config = dataclasses.replace(run_config, scenes=scenes)
-    return AgentRun(world, agent, run_config, tuple(agent_settings.get("against", ())))
+    return AgentRun(world, agent, run_config, against)
 
 
 def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:

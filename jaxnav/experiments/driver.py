@@ -4,7 +4,7 @@
 decoding rule) has a file of results, so that an interrupted experiment goes on with the first part that is missing.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -30,11 +30,13 @@ class Measurement(NamedTuple):
       measure: called with the bench and the run, and with a shift or a decoding if `parts` names either.
       parts: setting of the experiment whose values are measured in parts of their own.
       has_unaware: True if the run is compared with the agents that cannot know any layout.
+      compares_shifts: True if it compares layout shifts, and so needs several.
     """
 
     measure: Callable[..., Iterator[ResultRow]]
     parts: str | None = None
     has_unaware: bool = False
+    compares_shifts: bool = False
 
 
 MEASUREMENTS = {
@@ -44,11 +46,11 @@ MEASUREMENTS = {
     "account": Measurement(measure_account, has_unaware=True),
     "trials": Measurement(measure_trials, parts="shifts"),
     "variants": Measurement(measure_variants, parts="shifts"),
-    "growth": Measurement(measure_growth),
-    "instrument": Measurement(measure_instrument, has_unaware=True),
-    "gaps": Measurement(measure_gaps),
-    "mixture": Measurement(measure_mixture, parts="decodings", has_unaware=True),
-    "handover": Measurement(measure_handover, parts="decodings", has_unaware=True),
+    "growth": Measurement(measure_growth, compares_shifts=True),
+    "instrument": Measurement(measure_instrument, has_unaware=True, compares_shifts=True),
+    "gaps": Measurement(measure_gaps, compares_shifts=True),
+    "mixture": Measurement(measure_mixture, parts="decodings", has_unaware=True, compares_shifts=True),
+    "handover": Measurement(measure_handover, parts="decodings", has_unaware=True, compares_shifts=True),
 }
 
 
@@ -110,17 +112,22 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
     """List the files of results of an experiment, in the order in which they are measured.
 
     Raises:
-      InputError: an unknown measurement.
+      InputError: an unknown measurement, or one that compares shifts and has only one.
     """
     unknown_names = sorted(set(config.measure) - set(MEASUREMENTS))
     if unknown_names:
         raise InputError(f"measure: {unknown_names[0]!r} is unknown; choose from {', '.join(MEASUREMENTS)}")
+    for name in config.measure:
+        if MEASUREMENTS[name].compares_shifts and len(config.shifts) < 2:
+            raise InputError(f"shifts: {config.shifts}: give two or more, which the measurement {name} compares")
 
     parts = []
     for name, measurement in MEASUREMENTS.items():
         runs = measured_runs(config, name) if name in config.measure else []
         for run in runs:
             settings = part_settings(config, run, _references(bench, run, measurement))
+            if measurement.measure is measure_groups:
+                settings["groups"] = config.groups
             measure = partial(measurement.measure, bench, run)
             if measurement.parts is None:
                 parts.append(Part(f"{run.name}-{name}", settings, measure))
@@ -136,6 +143,9 @@ def _references(bench: Bench, run: AgentRun, measurement: Measurement) -> list[A
     agents = []
     if measurement.measure is measure_evaluation:
         agents = [reference.partition("/")[0] for reference in run.against]
+    if measurement.measure is measure_groups:
+        for group in bench.config.groups.values():
+            agents += [*group["agents"], group["against"].rpartition("/")[0]]
     if measurement.has_unaware:
         agents.append(bench.config.unaware)
     references = [bench.find_run(run.world, agent) for agent in agents]
@@ -144,25 +154,35 @@ def _references(bench: Bench, run: AgentRun, measurement: Measurement) -> list[A
 
 def write_pages(config: ExperimentConfig, parts: list[Part]) -> list[str]:
     """Write every page from the results that exist, and return their texts."""
-    tables = load_results(config)
-    missing = [part.name for part in parts if not (config.results / config.split / f"{part.name}.jsonl").exists()]
+    folder = config.results / config.split
+    missing = [part.name for part in parts if not has_part(folder / f"{part.name}.jsonl", part.settings)]
+    tables = load_results(config, missing)
     texts = []
     for document, template in config.pages.items():
         texts.append(render_page(Path(document), template, config, tables, missing))
     return texts
 
 
-def load_results(config: ExperimentConfig) -> dict[str, ResultTable]:
+def load_results(config: ExperimentConfig, missing: Collection[str] = ()) -> dict[str, ResultTable]:
     """Load the results of an experiment on every split that has any.
 
     Results of other evaluation settings are ignored. Experiments may share a folder, and then a table.
+
+    Args:
+      config: the experiment.
+      missing: names of parts of its split that are still to be measured, although there may be a file: a damaged one,
+        or one of another run.
+
+    Raises:
+      InputError: another file is damaged.
     """
     tables = {}
     for split in ("train", "val", "test"):
         settings = evaluation_settings(config) | {"split": split}
         rows: list[ResultRow] = []
         for path in sorted((config.results / split).glob("*.jsonl")):
-            rows += read_part(path, settings)
+            if split != config.split or path.stem not in missing:
+                rows += read_part(path, settings)
         if rows:
             tables[split] = ResultTable(rows)
     return tables

@@ -7,6 +7,7 @@ functions of this module. The summary of a page, between two `<!-- reading -->` 
 
 import functools
 import math
+import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def render_page(
       missing: names of the results that do not exist yet.
 
     Raises:
-      InputError: see `check_page`, or a fault in the template.
+      InputError: see `check_page`, or a fault in the template, with its file and line.
     """
     check_page(document, template)
     summary = "\n\n"
@@ -70,8 +71,10 @@ def render_page(
     }
     try:
         text = _load_template(template).render(context)
-    except (jinja2.TemplateError, KeyError, TypeError) as error:
-        raise InputError(f"template {template}: {type(error).__name__}: {error}") from error
+    except InputError:
+        raise
+    except (jinja2.TemplateError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{_fault_position(error, template)}: {type(error).__name__}: {error}") from error
     write_atomic(document, (text.strip() + "\n").encode())
     return text
 
@@ -111,7 +114,18 @@ def _load_template(template: str) -> jinja2.Template:
         names = ", ".join(sorted(page.stem for page in PAGES.glob("*.md")))
         raise InputError(f"pages: {template!r} is neither a file nor one of {names}") from error
     except jinja2.TemplateSyntaxError as error:
-        raise InputError(f"{path}, line {error.lineno}: {error.message}") from error
+        raise InputError(f"{_fault_position(error, template)}: {error.message}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no UTF-8 text") from error
+
+
+def _fault_position(error: Exception, template: str) -> str:
+    """File and line of a fault in a template, or in a template that it includes."""
+    if isinstance(error, jinja2.TemplateSyntaxError):
+        return f"{error.filename}, line {error.lineno}"
+    # Jinja puts the lines of templates into the traceback; the innermost is at fault.
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.endswith(".py")]
+    return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else template
 
 
 def _runs_with_results(config: ExperimentConfig, table: ResultTable) -> dict[str, dict[str, AgentRun]]:
@@ -146,8 +160,8 @@ def format_value(value: Interval | float, spec: str) -> str:
 
 
 def format_with_std(value: Interval, digits: int = 1) -> str:
-    """Format a mean and, with several seeds, their standard deviation."""
-    mean = f"{value.mean:.{digits}f}"
+    """Format a mean and, with several seeds, their standard deviation; `-` if it is undefined."""
+    mean = format_value(value.mean, f".{digits}f")
     return mean if math.isnan(value.std) else f"{mean} ± {value.std:.{digits}f}"
 
 
@@ -200,13 +214,14 @@ def effect_cells(table: ResultTable, fields: dict[str, Any], shifts: Iterable[fl
     for shift in shifts:
         effect = table.find(**fields, shift=shift, reference="layout", metric="sr")
         weight = table.find(**fields, shift=shift, metric="weight")
-        cells.append(f"{effect:+.1f} ({weight.mean:.2f})")
+        cells.append(f"{effect:+.1f} ({format_value(weight.mean, '.2f')})")
     return cells
 
 
 def format_weights(table: ResultTable, fields: dict[str, Any], shifts: Iterable[float]) -> str:
     """Mean weights of a removal at some shifts."""
-    return ", ".join(f"{table.find(**fields, shift=shift, metric='weight').mean:.2f}" for shift in shifts)
+    weights = [table.find(**fields, shift=shift, metric="weight").mean for shift in shifts]
+    return ", ".join(format_value(weight, ".2f") for weight in weights)
 
 
 def requested_steps(run: AgentRun) -> int:

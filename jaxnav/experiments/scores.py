@@ -16,7 +16,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import episode_metrics
 from jaxnav.evaluation.notes import last_quarter_success
-from jaxnav.evaluation.report import UNTRAINED_VARIANTS, Decoding, remaining_share
+from jaxnav.evaluation.report import UNTRAINED_VARIANTS, Decoding
 from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.bench import Bench, Scores
@@ -24,7 +24,7 @@ from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import ResultRow
 from jaxnav.policies.method import ActionControl
 from jaxnav.policies.methods import find_method
-from jaxnav.runs.evaluate import draw_episode_lists
+from jaxnav.runs.evaluate import draw_episode_lists, measure_leads
 from jaxnav.runs.run import Run
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
@@ -171,7 +171,9 @@ def training_rows(run: AgentRun) -> Iterator[ResultRow]:
     trained_run = Run(run.config)
     budget = run.config.steps_by_purpose | {"exploration": trained_run.policies().prior_steps}
     values: dict[str, float] = {f"{purpose} (steps)": num_steps for purpose, num_steps in budget.items()}
-    values["training (s)"] = trained_run.times()[-1]["wall_s"]
+    times = trained_run.times()
+    if times:
+        values["training (s)"] = times[-1]["wall_s"]
 
     last_quarter = last_quarter_success(trained_run.log())
     if last_quarter is not None:
@@ -244,24 +246,12 @@ def measure_account(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
     for shift in bench.config.shifts:
         scores = bench.evaluate(run, shift)
         unaware_scores = bench.evaluate(unaware_run, shift)
-        check_same_episodes(scores.episodes, unaware_scores.episodes)
-        clusters = scores.episodes.clusters()
-        metric_names = ("sr", "spl", *(f"sr@{budget}" for budget in scores.budgets))
-
-        for row, metrics in scores.metrics.items():
-            if row.arm is None:
-                continue
-
-            # The agent without experience, and the agent with all of its experience, with the same decoding.
-            unaware_metrics = unaware_scores.metrics[EvaluationRow("baseline", None, None, row.decoding)]
-            agent_metrics = scores.metrics[EvaluationRow(row.arm, None, None, row.decoding)]
-            fields = row_fields(run, shift, row) | {"reference": unaware_run.agent, "scenes": num_scenes(scores)}
-            for metric in metric_names:
-                lead = paired_difference(unaware_metrics[metric], metrics[metric], clusters)
-                yield ResultRow(**fields, metric=metric, value=lead)
-                if metrics is not agent_metrics:
-                    share = remaining_share(unaware_metrics[metric], agent_metrics[metric], metrics[metric], clusters)
-                    yield ResultRow(**fields, metric=f"{metric} left", value=share)
+        for lead in measure_leads(scores.results, unaware_scores.results):
+            fields = row_fields(run, shift, scores.results.rows[lead.row_index])
+            fields |= {"reference": unaware_run.agent, "scenes": num_scenes(scores)}
+            yield ResultRow(**fields, metric=lead.metric, value=lead.lead)
+            if lead.left is not None:
+                yield ResultRow(**fields, metric=f"{lead.metric} left", value=lead.left)
 
 
 def require_unaware_run(bench: Bench, run: AgentRun) -> AgentRun:
@@ -277,6 +267,8 @@ def require_unaware_run(bench: Bench, run: AgentRun) -> AgentRun:
         if getattr(run.config, name) != getattr(unaware_run.config, name):
             directories = f"{run.config.run_dir} and {unaware_run.config.run_dir}"
             raise InputError(f"{directories} differ in {name}; train both alike")
+    if "baseline" not in unaware_run.config.arms:
+        raise InputError(f"{unaware_run.config.run_dir}: was trained without the arm `baseline`; train one with it")
     return unaware_run
 
 
@@ -298,6 +290,7 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             if member_run is not None:
                 members.append(variants_by_name(bench.evaluate(member_run, shift), "argmax"))
         variant, reference = group["variant"], group["against"]
+        members = [member for member in members if variant in member]
 
         # The reference is a variant of the same agents, or AGENT/VARIANT.
         agent, _, agent_variant = reference.rpartition("/")
@@ -305,16 +298,22 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             reference_run = bench.find_run(run.world, agent)
             if reference_run is None:
                 continue
-            references = [variants_by_name(bench.evaluate(reference_run, shift), "argmax")[agent_variant]]
+            reference_variants = variants_by_name(bench.evaluate(reference_run, shift), "argmax")
+            references = [reference_variants[agent_variant]] if agent_variant in reference_variants else []
         else:
-            members = [member for member in members if variant in member and reference in member]
+            members = [member for member in members if reference in member]
             references = [member[reference] for member in members]
-        if not members:
+        if not members or not references:
             continue
+
+        # The effect varies with the networks of both sides, unless they are the same or the reference has none.
         compared = [member[variant] for member in members]
         clusters = compared[0].episodes.clusters()
-        has_own_networks = agent_variant not in UNTRAINED_VARIANTS
-        effect = paired_difference(_mean_sr(references), _mean_sr(compared), clusters, same_runs=not has_own_networks)
+        is_untrained = agent_variant in UNTRAINED_VARIANTS
+        same_networks = not agent and "baseline" not in (variant, reference)
+        effect = paired_difference(
+            _mean_sr(references), _mean_sr(compared), clusters, same_runs=is_untrained or same_networks
+        )
         fields = {"world": run.world, "run": name, "variant": variant, "decoding": "argmax", "shift": shift}
         yield ResultRow(**fields, reference=reference, metric="sr", value=effect)
         yield ResultRow(**fields, reference=reference, metric="agents", value=Interval(float(len(members))))

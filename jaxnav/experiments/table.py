@@ -92,7 +92,9 @@ class ResultRow:
         for name in KEY_FIELDS:
             value = getattr(self, name)
             if value not in ("", None):
-                data[name] = _round(value) if isinstance(value, float) else value
+                # Results are found by these fields, so unlike values they keep all digits.
+                is_whole = isinstance(value, float) and value.is_integer()
+                data[name] = int(value) if is_whole else value
         if self.scenes:
             data["scenes"] = self.scenes
         return data | _value_to_json(self.value)
@@ -126,7 +128,7 @@ class ResultTable:
           selections: fields with their values; the other methods take them alike.
           fields: further fields.
         """
-        wanted = merge_fields(*selections, **fields)
+        wanted = _known_fields(selections, fields)
         rows = []
         for row in self.rows:
             if all(getattr(row, name) == value for name, value in wanted.items()):
@@ -145,6 +147,13 @@ class ResultTable:
         """
         row = self._find_row(selections, fields)
         return row.value if row is not None and isinstance(row.value, Interval) else Interval(math.nan)
+
+    def find_at(self, position: float, *selections: Mapping[str, Any], **fields: Any) -> Interval:
+        """Statistic at a position of the curve of one row; its mean is NaN if there is no such row or position."""
+        row = self._find_row(selections, fields)
+        if row is None or not isinstance(row.value, Curve) or position not in row.value.at:
+            return Interval(math.nan)
+        return row.value.interval_at(int(np.flatnonzero(row.value.at == position)[0]))
 
     def has(self, *selections: Mapping[str, Any], **fields: Any) -> bool:
         """True if a row has exactly these fields."""
@@ -166,7 +175,7 @@ class ResultTable:
         return self.where(*selections, **fields).rows[0].scenes
 
     def _find_row(self, selections: Sequence[Mapping[str, Any]], fields: Mapping[str, Any]) -> ResultRow | None:
-        wanted = merge_fields(*selections, **fields)
+        wanted = _known_fields(selections, fields)
         return self._row_by_key.get(tuple(wanted.get(name, _EMPTY[name]) for name in KEY_FIELDS))
 
 
@@ -180,6 +189,15 @@ def merge_fields(*selections: Mapping[str, Any], **fields: Any) -> dict[str, Any
 
 #: Value of every field that is not given.
 _EMPTY: Mapping[str, Any] = {name: None if name in ("shift", "epsilon") else "" for name in KEY_FIELDS}
+
+
+def _known_fields(selections: Sequence[Mapping[str, Any]], fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge fields, and refuse names that no row has: a misspelt field would find nothing."""
+    wanted = merge_fields(*selections, **fields)
+    unknown_names = sorted(wanted.keys() - _EMPTY.keys())
+    if unknown_names:
+        raise KeyError(f"rows have no field {unknown_names[0]!r}")
+    return wanted
 
 
 def _row_key(row: ResultRow) -> tuple[Any, ...]:
@@ -210,7 +228,8 @@ def _value_from_json(data: Mapping[str, Any]) -> Interval | Curve:
     # The deviation over the training runs follows from their values.
     seeds = tuple(data.get("seeds", ()))
     std = float(np.std(seeds, ddof=1)) if len(seeds) > 1 else math.nan
-    return Interval(data["mean"], data.get("low", math.nan), data.get("high", math.nan), std, seeds)
+    bounds = [float(data.get(name, math.nan)) for name in ("low", "high")]
+    return Interval(float(data["mean"]), *bounds, std, seeds)
 
 
 def _round(number: float) -> float:
@@ -244,10 +263,10 @@ def write_part(path: Path, settings: Mapping[str, Any], rows: Iterable[ResultRow
         if isinstance(row.value, Curve) or not math.isnan(row.value.mean):
             row_lines.append(row.to_json())
 
-    # Fields that all rows share are written once.
+    # Fields that all rows share are written once. They are compared as text, which tells -0 from 0.
     shared = dict(row_lines[0]) if len(row_lines) > 1 else {}
     for line in row_lines:
-        shared = {name: value for name, value in shared.items() if line.get(name) == value}
+        shared = {name: value for name, value in shared.items() if str(line.get(name)) == str(value)}
     head = {"settings": settings, "versions": package_versions(), "format": RESULTS_FORMAT, "shared": shared}
 
     text = json.dumps(head) + "\n"
@@ -261,10 +280,10 @@ def write_part(path: Path, settings: Mapping[str, Any], rows: Iterable[ResultRow
 def has_part(path: Path, settings: Mapping[str, Any]) -> bool:
     """True if the file is undamaged and holds results of these settings."""
     try:
-        head, *_ = _read_lines(path)
+        part_settings, _ = _read_file(path)
     except (FileNotFoundError, InputError):
         return False
-    return head["settings"] == settings
+    return part_settings == settings
 
 
 def read_part(path: Path, settings: Mapping[str, Any] | None = None) -> list[ResultRow]:
@@ -277,19 +296,20 @@ def read_part(path: Path, settings: Mapping[str, Any] | None = None) -> list[Res
     Raises:
       InputError: the file is damaged, or is no file of results.
     """
-    head, *row_lines = _read_lines(path)
+    part_settings, rows = _read_file(path)
     for name, value in (settings or {}).items():
-        if head["settings"].get(name) != value:
+        if part_settings.get(name) != value:
             return []
-    return [ResultRow.from_json(head["shared"] | line) for line in row_lines]
+    return rows
 
 
-def _read_lines(path: Path) -> list[dict[str, Any]]:
-    """Parse all lines of a file, of which the first is the head."""
+def _read_file(path: Path) -> tuple[dict[str, Any], list[ResultRow]]:
+    """Read the settings and the rows of a file."""
     try:
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        if lines[0]["format"] == RESULTS_FORMAT:
-            return lines
-    except (ValueError, KeyError, IndexError, TypeError) as error:
+        head, *row_lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        if head["format"] == RESULTS_FORMAT:
+            rows = [ResultRow.from_json(head["shared"] | line) for line in row_lines]
+            return dict(head["settings"]), rows
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: is damaged ({error}); delete it, and it is measured again") from error
     raise InputError(f"{path}: holds no results of format {RESULTS_FORMAT}; measure them again")

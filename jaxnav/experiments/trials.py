@@ -263,6 +263,11 @@ def measure_variants(bench: Bench, run: AgentRun, shift: float) -> Iterator[Resu
 
 def measure_trials(bench: Bench, run: AgentRun, shift: float) -> Iterator[ResultRow]:
     """Evaluate all trials of a run at one shift, and relate its success to layout similarity."""
+    # On `test`, of all thresholds only the one that was chosen on `val` is evaluated; without one, nothing is trained.
+    is_test = bench.config.split == "test"
+    swept_thresholds = (bench.chosen_epsilon(run),) if is_test else bench.config.epsilon
+    thresholds = {*swept_thresholds, *(options.epsilon for options in STDE_OPTIONS)}
+
     evaluated_run = prepare_run(bench, run, shift)
     policies, _, episodes = evaluated_run
     runner = TrialRunner(bench.config.seed)
@@ -275,18 +280,14 @@ def measure_trials(bench: Bench, run: AgentRun, shift: float) -> Iterator[Result
     plain = TrialOutcomes(plain_outcomes, episodes)
     yield from plain.trial_rows(fields, "")
 
-    # sTDE with every gap, compared with the same outcomes without sTDE. On `test`, of all thresholds only the one that
-    # was chosen on `val` is evaluated.
-    is_test = bench.config.split == "test"
-    swept_thresholds = (bench.chosen_epsilon(run),) if is_test else bench.config.epsilon
-    thresholds = {*swept_thresholds, *(options.epsilon for options in STDE_OPTIONS)}
+    # sTDE with every gap, compared with the same outcomes without sTDE.
     for gap in GAPS:
         stde_outcomes = _run_stde_trials(evaluated_run, gap, estimators[gap], runner, sorted(thresholds))
         outcomes = TrialOutcomes(plain_outcomes | stde_outcomes, episodes)
         yield from outcomes.trial_rows(fields, gap)
 
-        # Similarity and effects by scene are reported for the gap of the paper.
-        if gap == "novelty":
+        # Gains over the baseline are related to similarity for the gap of the paper.
+        if gap == "novelty" and "baseline" in run.config.arms:
             yield from _similarity_rows(fields, evaluated_run, outcomes)
     yield from _size_rows(fields, evaluated_run)
 

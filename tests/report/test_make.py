@@ -21,7 +21,7 @@ from jaxnav.report.config import ReportConfig
 from jaxnav.report.make import make_report, make_sections
 from jaxnav.report.measure import measure_shift
 from jaxnav.report.replays import ReplayAgent, select_episodes
-from jaxnav.runs.evaluate import account
+from jaxnav.runs.evaluate import measure_leads
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS
 
@@ -64,7 +64,7 @@ def test_tables_hold_the_numbers_of_eval_and_account(run, measured, evaluated):
     short = [row[0] for table in results.tables for row in table.rows]
     assert "+ w + sTDE (eps=0.2)" in short
     assert "+ w + sTDE (eps=0)" not in short
-    entries = [e for e in account(run, run, **EVALUATION) if "eps=0)" not in e.variant]
+    entries = [e for e in measure_leads(evaluated, evaluated) if "eps=0)" not in e.variant]
     assert re.findall(r"[-+]?\d+\.\d+", str(experience.tables[0].rows)) == printed(accounting_table(entries))
     assert results.notes == tuple(dict.fromkeys(evaluated.report["notes"]))
 
