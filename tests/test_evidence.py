@@ -60,8 +60,8 @@ def zoned_prior() -> jax.Array:
     return prior_from_counts(jnp.asarray(views.T @ views), "evidence")
 
 
-def area_under_curve(low: np.ndarray, high: np.ndarray) -> float:
-    return float(mannwhitneyu(high, low).statistic / (len(low) * len(high)))
+def area_under_curve(low_values: np.ndarray, high_values: np.ndarray) -> float:
+    return float(mannwhitneyu(high_values, low_values).statistic / (len(low_values) * len(high_values)))
 
 
 def test_evidence_gap_follows_worked_arithmetic():

@@ -24,63 +24,72 @@ def mean_interval_of(means: np.ndarray, weights=EQUAL, names: Sequence[str] = NA
     return design.interval(design.jackknife_means(means * weights, np.array(weights), names))
 
 
-def growth_interval(first: np.ndarray, last: np.ndarray, names: Sequence[str] = NAMES) -> Interval:
+def growth_interval(first_means: np.ndarray, last_means: np.ndarray, names: Sequence[str] = NAMES) -> Interval:
     """Return how much the mean grows; `names` are those at the end."""
     design = SharedDesign.from_conditions([(NAMES, KITCHENS), (names, KITCHENS)], SEEDS)
-    start, end = (
-        design.jackknife_means(EPISODES * means, EQUAL, condition_names)
-        for means, condition_names in ((first, NAMES), (last, names))
-    )
-    return design.interval(end - start)
+    first_replicates = design.jackknife_means(EPISODES * first_means, EQUAL, NAMES)
+    last_replicates = design.jackknife_means(EPISODES * last_means, EQUAL, names)
+    return design.interval(last_replicates - first_replicates)
 
 
 @given(MEANS)
 def test_balanced_mean_interval_is_the_analysis_of_variance(means):
     # Mean squares of scenes, runs and the rest; the mean's variance is (scenes + runs - rest) / (S N), at least that of
     # scenes or of runs alone.
-    by_scene, by_run, whole = means.mean(axis=0), means.mean(axis=1), means.mean()
-    residuals = means - by_scene - by_run[:, None] + whole
+    by_scene = means.mean(axis=0)
+    by_run = means.mean(axis=1)
+    overall_mean = means.mean()
+    residuals = means - by_scene - by_run[:, None] + overall_mean
     degrees = np.array([SCENES - 1, SEEDS - 1, (SCENES - 1) * (SEEDS - 1)])
-    squares = SEEDS * ((by_scene - whole) ** 2).sum(), SCENES * ((by_run - whole) ** 2).sum(), (residuals**2).sum()
+    squares = (
+        SEEDS * ((by_scene - overall_mean) ** 2).sum(),
+        SCENES * ((by_run - overall_mean) ** 2).sum(),
+        (residuals**2).sum(),
+    )
     mean_squares = squares / degrees / (SEEDS * SCENES)
     variance = max(mean_squares[0] + mean_squares[1] - mean_squares[2], mean_squares[0], mean_squares[1])
     squared_spread = (mean_squares**2 / degrees).sum()
     satterthwaite_degrees = np.clip(variance**2 / squared_spread, 2, 4 + 2) if squared_spread > 1e-18 else 4 + 2
-    assert bounds(mean_interval_of(means)) == pytest.approx(around(whole, variance, satterthwaite_degrees), abs=1e-6)
+    assert bounds(mean_interval_of(means)) == pytest.approx(
+        around(overall_mean, variance, satterthwaite_degrees), abs=1e-6
+    )
 
 
 @given(MEANS, MEANS)
-def test_growth_over_shared_scenes_is_the_interval_of_differences(first, last):
-    assert bounds(growth_interval(first, last)) == pytest.approx(bounds(mean_interval_of(last - first)), abs=1e-6)
+def test_growth_over_shared_scenes_is_the_interval_of_differences(first_means, last_means):
+    assert bounds(growth_interval(first_means, last_means)) == pytest.approx(
+        bounds(mean_interval_of(last_means - first_means)), abs=1e-6
+    )
 
 
 def test_growth_over_shared_scenes_has_a_narrower_interval():
     # Scenes of unlike difficulty, all of which gain 2 points or 4, alike in all runs.
-    first = np.tile([10.0, 20, 30, 40, 50], (SEEDS, 1))
-    last = first + np.array([2.0, 4, 2, 4, 3])
-    shared, apart = growth_interval(first, last), growth_interval(first, last, OTHERS)
-    assert shared.mean == apart.mean == pytest.approx(3.0)
+    first_means = np.tile([10.0, 20, 30, 40, 50], (SEEDS, 1))
+    last_means = first_means + np.array([2.0, 4, 2, 4, 3])
+    shared_growth = growth_interval(first_means, last_means)
+    separate_growth = growth_interval(first_means, last_means, OTHERS)
+    assert shared_growth.mean == separate_growth.mean == pytest.approx(3.0)
     # Gains have squares 1 + 1 + 1 + 1 + 0: variance 4 / 4 of one, / 5 of the mean.
-    assert bounds(shared) == pytest.approx(around(3, 1 / 5, 4))
+    assert bounds(shared_growth) == pytest.approx(around(3, 1 / 5, 4))
     # Apart, ten scenes are left out, each of one mean of five, which moves by (x - mean) / 4. Squares about the
     # means 30 and 33: 400 + 100 + 0 + 100 + 400 = 1000 and 441 + 81 + 1 + 121 + 400 = 1044, 9 / 10 of which count.
-    assert bounds(apart) == pytest.approx(around(3, 0.9 * 2044 / 16, 9))
-    assert shared.low > 0 > apart.low
+    assert bounds(separate_growth) == pytest.approx(around(3, 0.9 * 2044 / 16, 9))
+    assert shared_growth.low > 0 > separate_growth.low
 
 
 def test_growth_matches_scenes_by_name_not_by_order():
     generator = np.random.default_rng(0)
-    first, last = generator.random((2, SEEDS, SCENES))
+    first_means, last_means = generator.random((2, SEEDS, SCENES))
     order = [3, 0, 4, 1, 2]
-    shuffled = growth_interval(first, last[:, order], [NAMES[i] for i in order])
-    assert bounds(shuffled) == pytest.approx(bounds(growth_interval(first, last)))
+    shuffled_growth = growth_interval(first_means, last_means[:, order], [NAMES[index] for index in order])
+    assert bounds(shuffled_growth) == pytest.approx(bounds(growth_interval(first_means, last_means)))
 
 
 def test_growth_leaves_a_run_out_of_all_conditions():
     # Runs are unlike, by as much at both shifts: their growth is equal. With their order changed it is not.
-    first = np.arange(SCENES) + 10.0 * np.arange(SEEDS)[:, None]
-    assert bounds(growth_interval(first, first + 1.0)) == pytest.approx((1.0, 1.0, 1.0))
-    assert growth_interval(first, first[::-1] + 1.0).low < 0
+    first_means = np.arange(SCENES) + 10.0 * np.arange(SEEDS)[:, None]
+    assert bounds(growth_interval(first_means, first_means + 1.0)) == pytest.approx((1.0, 1.0, 1.0))
+    assert growth_interval(first_means, first_means[::-1] + 1.0).low < 0
 
 
 def test_scenes_are_weighted_by_their_episodes():
@@ -88,7 +97,8 @@ def test_scenes_are_weighted_by_their_episodes():
     means = generator.random((SEEDS, SCENES))
 
     def mean(scene: int | None, run: int | None) -> float:
-        has_scene, has_run = (np.arange(n) != out for n, out in ((SCENES, scene), (SEEDS, run)))
+        has_scene = np.arange(SCENES) != scene
+        has_run = np.arange(SEEDS) != run
         return float(np.average(means[has_run].mean(axis=0)[has_scene], weights=weights[has_scene]))
 
     assert bounds(mean_interval_of(means, weights)) == pytest.approx(left_out(mean, SCENES, SEEDS))

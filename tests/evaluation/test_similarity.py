@@ -28,12 +28,14 @@ def test_cooccurrence_counts_equal_a_loop_over_poses():
     bank, row_format = tiny.BANK, RowFormat(len(tiny.CATEGORIES))
     counts = cooccurrence_counts(bank)
     assert counts.shape == (2, 3, 3)
-    first = bank.num_cells[0] * tiny.POSES_PER_CELL  # the kitchen's 16 cells, then the bedroom's 6
-    for scene, rows in enumerate((bank.rows[:first], bank.rows[first:])):
+    num_kitchen_poses = bank.num_cells[0] * tiny.POSES_PER_CELL  # the kitchen's 16 cells, then the bedroom's 6
+    for scene, rows in enumerate((bank.rows[:num_kitchen_poses], bank.rows[num_kitchen_poses:])):
         visible_sets = [set(np.flatnonzero(row)) for row in row_format.presence(rows)]
-        for i in range(3):
-            for j in range(3):
-                assert counts[scene, i, j] == (i != j) * sum({i, j} <= visible_set for visible_set in visible_sets)
+        for row_category in range(3):
+            for column_category in range(3):
+                assert counts[scene, row_category, column_category] == (row_category != column_category) * sum(
+                    {row_category, column_category} <= visible_set for visible_set in visible_sets
+                )
     assert (counts.sum(axis=(1, 2)) > 0).all()
 
 
@@ -106,6 +108,6 @@ def test_priors_may_differ_between_scenes():
     counts = np.random.default_rng(0).integers(0, 9, (3, NUM_CATEGORIES, NUM_CATEGORIES))
     priors = np.random.default_rng(1).integers(0, 9, (3, NUM_CATEGORIES, NUM_CATEGORIES))
     for measure in (scene_layout_gap, scene_layout_similarity):
-        alone = [measure(scene[None], prior)[0] for scene, prior in zip(counts, priors, strict=True)]
-        np.testing.assert_allclose(measure(counts, priors), alone, rtol=1e-12)
+        single_values = [measure(scene[None], prior)[0] for scene, prior in zip(counts, priors, strict=True)]
+        np.testing.assert_allclose(measure(counts, priors), single_values, rtol=1e-12)
         assert measure(counts, priors) != pytest.approx(measure(counts, priors[::-1]))

@@ -73,10 +73,10 @@ def test_scene_means_have_students_interval():
 def test_interval_counts_the_episodes_of_a_scene_as_one():
     # Twenty episodes in each scene, all alike, say no more than one. Treated as independent they would give a fifth.
     values = np.repeat([[1.0, 2, 3, 4, 5]], 20, axis=1)
-    clustered = mean_interval(values, scenes_of(5, 20), trained=False)
-    assert half_width(clustered) == pytest.approx(t.ppf(0.975, 4) * math.sqrt(0.5))
-    apart = mean_interval(values, scenes_of(100), trained=False)
-    assert half_width(apart) < 0.4 * half_width(clustered)
+    clustered_interval = mean_interval(values, scenes_of(5, 20), trained=False)
+    assert half_width(clustered_interval) == pytest.approx(t.ppf(0.975, 4) * math.sqrt(0.5))
+    independent_interval = mean_interval(values, scenes_of(100), trained=False)
+    assert half_width(independent_interval) < 0.4 * half_width(clustered_interval)
 
 
 def test_strata_remove_the_variance_between_room_types():
@@ -118,8 +118,8 @@ def analyse_variance(values: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_mean_interval_follows_the_analysis_of_variance(seed):
-    draw = np.random.default_rng(seed)
-    values = draw.normal(size=(4, 1)) + draw.normal(size=(1, 9)) + 0.5 * draw.normal(size=(4, 9))
+    generator = np.random.default_rng(seed)
+    values = generator.normal(size=(4, 1)) + generator.normal(size=(1, 9)) + 0.5 * generator.normal(size=(4, 9))
     variance, degrees = analyse_variance(values)
     assert half_width(mean_interval(values, scenes_of(9))) == pytest.approx(t.ppf(0.975, degrees) * math.sqrt(variance))
 
