@@ -1,11 +1,11 @@
 """The seconds of a run."""
 
-import json
 import time
 
 import pytest
 
 from jaxnav.runs.train import Stopwatch
+from jaxnav.store.files import append_log_rows
 
 
 def test_it_counts_from_its_start_and_goes_on_after_an_interruption(tmp_path):
@@ -13,9 +13,7 @@ def test_it_counts_from_its_start_and_goes_on_after_an_interruption(tmp_path):
     clock = Stopwatch.start()
     assert clock.resume(tmp_path / "missing.jsonl") == clock
     path = tmp_path / "times.jsonl"
-    path.write_text(
-        "".join(json.dumps({"step": step, "wall_s": 10.0 * step, "cpu_s": 4.0 * step}) + "\n" for step in (1, 2))
-    )
+    append_log_rows(path, [{"step": step, "wall_s": 10.0 * step, "cpu_s": 4.0 * step} for step in (1, 2)])
     read, resumed = clock.read(), clock.resume(path).read()
     assert 0 <= read["wall_s"] <= time.monotonic() - began + 0.01
     # Twenty and eight seconds were over when it was interrupted.
