@@ -1,8 +1,8 @@
 """Parts shared by all commands: running one, printing text, parsing options into settings, caching compiled programs.
 
 `run_command` turns the errors of a command into one-line messages and exit codes. `PlainConsole` prints text from files
-safely. `parse_config`, `parse_options` and `parse_arguments` build dataclasses of settings from a command line, with
-and without `--config`.
+safely. `parse_config` and `parse_arguments` build dataclasses of settings from a command line, with and without
+`--config`.
 """
 
 import argparse
@@ -194,31 +194,6 @@ def parse_config(
     if namespace.config is not None:
         default = apply_yaml(default, namespace.config, configs)
 
-    config = parse_options(type(default), other_arguments, prog, description, default, configs)
-    try:
-        return check(config)
-    except InputError as error:
-        raise InputError(f"{namespace.config}: {error}" if namespace.config else str(error)) from error
-
-
-def parse_options(
-    kind: type[Config],
-    arguments: list[str] | None,
-    prog: str,
-    description: str,
-    default: Config | None = None,
-    configs: Mapping[str, Path] = CONFIGS,
-) -> Config:
-    """Parse the options of a command, with `--config` in its help.
-
-    Args:
-      kind: dataclass of the settings; fields without a default are positional.
-      arguments: the options, without `--config`; None for those of the process.
-      prog: name of the command in its help.
-      description: of the command, for its help.
-      default: settings without any option; None for those of the dataclass.
-      configs: packaged configurations by name, for the help.
-    """
     # Wrap the settings beside a field for `--config`, so that the help lists both.
     config_option = tyro.conf.arg(
         metavar="NAME|FILE.yaml",
@@ -226,13 +201,13 @@ def parse_options(
         "the other options override them.",
     )
     config_field = ("config", Annotated[str | None, config_option], None)
-    settings_field = ("settings", Annotated[kind, tyro.conf.arg(name="")])
-    fields = [settings_field, config_field] if default is None else [config_field, (*settings_field, default)]
-    options_class = dataclasses.make_dataclass("Options", fields)
-
-    positional = (tyro.conf.PositionalRequiredArgs,)
-    options = parse_arguments(options_class, arguments, prog, description, registry=_REGISTRY, config=positional)
-    return options.settings
+    settings_field = ("settings", Annotated[type(default), tyro.conf.arg(name="")], default)
+    options_class = dataclasses.make_dataclass("Options", [config_field, settings_field])
+    options = parse_arguments(options_class, other_arguments, prog, description, registry=_REGISTRY)
+    try:
+        return check(options.settings)
+    except InputError as error:
+        raise InputError(f"{namespace.config}: {error}" if namespace.config else str(error)) from error
 
 
 def parse_arguments(
