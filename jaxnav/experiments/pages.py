@@ -22,6 +22,7 @@ from jaxnav.experiments.scores import chooses_actions
 from jaxnav.experiments.table import ResultTable, merge_fields
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import write_atomic
+from jaxnav.viz import require_plotting_packages
 
 PAGES = Path(__file__).parent / "pages"
 READING_MARK = "<!-- reading -->"
@@ -31,9 +32,12 @@ def check_page(document: Path, template: str) -> None:
     """Check that a page can be written.
 
     Raises:
-      InputError: there is no such template, or the document exists and does not hold two reading marks.
+      InputError: there is no such template, it draws figures without the plotting packages, or the document exists and
+        does not hold two reading marks.
     """
-    _load_template(template)
+    page_path = _load_template(template).filename
+    if page_path and "figure(" in Path(page_path).read_text(encoding="utf-8"):
+        require_plotting_packages()
     if document.exists() and document.read_text(encoding="utf-8").count(READING_MARK) != 2:
         raise InputError(f"{document}: exists without two lines {READING_MARK}; give another document in `pages`")
 
@@ -130,7 +134,8 @@ def _fault_position(error: Exception, template: str) -> str:
 
 def _runs_with_results(config: ExperimentConfig, table: ResultTable) -> dict[str, dict[str, AgentRun]]:
     """Runs that have results, by world and agent."""
-    measured = {(row.world, row.run) for row in table.rows}
+    # The name of a run that hands over to another begins with the name of its agent.
+    measured = {(row.world, row.run.partition(",")[0]) for row in table.rows}
     runs: dict[str, dict[str, AgentRun]] = {world: {} for world in config.worlds}
     for run in agent_runs(config):
         if (run.world, run.agent) in measured:

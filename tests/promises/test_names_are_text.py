@@ -31,16 +31,12 @@ HOSTILE = "[/x][bold]\x1b[31m\x07\n\u202e$\\frac$"
 GIVEN = {
     "train": [("--run-dir", "@", "--scenes", "@"), ("--config", "@"), ("--method", "@")],
     "eval": [("@",), ("@", "--scenes", "@"), ("@", "--json", "@")],
-    "account": [("@", "@"), ("@",)],
-    "mixture": [("@", "@"), ("@",)],
     "report": [("@",), ("@", "--beside", "@"), ("@", "--out", "@")],
     "export": [("@",), ("@", "--policy", "@")],
     "episode": [("@",), ("@", "--scenes", "@")],
-    "instrument": [("@",), ("--config", "@")],
     "play": [("--scenes", "@"), ("--goal", "@"), ("--policy", "@")],
     "log": [("@", "--to", "tensorboard")],
-    "study": [("--config", "@")],
-    "compare": [("--config", "@")],
+    "study": [("@",), ("--config", "@"), ("account", "--run", "@"), ("table2", "--only", "@")],
     "scenes": [
         ("stats", "@"),
         ("show", "@"),

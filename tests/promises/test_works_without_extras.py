@@ -41,7 +41,7 @@ def test_every_name_and_every_help_is_there(tmp_path):
     assert (done.returncode, done.stderr) == (0, "imported\n[]\n")
 
 
-@pytest.mark.parametrize("command", ["episode run", "report run", "scenes show rooms", "study"])
+@pytest.mark.parametrize("command", ["episode run", "report run", "scenes show rooms", "study study_quick"])
 def test_a_command_that_draws_is_refused(tmp_path, command):
     script = f"from jaxnav.__main__ import main\nsys.exit(main({command.split()}))"
     done = without_pictures(script, tmp_path)

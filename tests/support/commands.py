@@ -18,12 +18,13 @@ method_sizes: {relation_layers: 1}
 ppo: {num_envs: 16, rollout: 8, epochs: 1, minibatches: 2, learning_rate: 1e-2, distil: 0.1}
 """
 SHIFTS = (0.0, 1.0)
-STUDY = f"""
-trainings: [coin]
+EXPERIMENT = f"""
+agents:
+  main: {{}}
+  anonymous: {{method: anonymous, arms: [baseline]}}
+measure: {{variants: [main], instrument: [main]}}
 shifts: {list(SHIFTS)}
-epsilon: [0.0, 0.5, 1.0]
 episodes: 24
-steps: 6
 base:
   direct: goal
   done_gate: true
@@ -47,11 +48,11 @@ def write_config(folder):
 
 
 def study_command(folder):
-    """Options of a small study with all its files below a folder."""
-    config = folder / "study.yaml"
-    config.write_text(STUDY)
-    places = {"results": "results", "document": "docs/study.md", "runs": "runs"}
-    return ["--config", config, *(part for name, place in places.items() for part in (f"--{name}", folder / place))]
+    """Options of a small experiment with all its files below a folder."""
+    config = folder / "experiment.yaml"
+    config.write_text(EXPERIMENT)
+    pages = f"{{{folder / 'docs/study.md'}: instrument}}"
+    return [config, "--results", folder / "results", "--runs", folder / "runs", "--pages", pages]
 
 
 def finished_run(tmp_path_factory):
