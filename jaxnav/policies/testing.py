@@ -19,7 +19,7 @@ from jaxnav.layout import ESTIMATORS, prior_from_counts
 from jaxnav.policies.agent_loop import Agent, AgentLoop, PolicyInputs, decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Percept
 from jaxnav.policies.methods import find_method
-from jaxnav.policies.network import Params, Policy, init_params
+from jaxnav.policies.network import Params, init_params
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.compile import Bank, compile_bank
@@ -86,7 +86,12 @@ def check_method(
 
     @jax.jit
     def act_once(agent: Agent, step_key: jax.Array) -> tuple[Agent, jax.Array]:
-        return _act_once(agent_loop, agent_loop.bind(params), agent, step_key, knowledge, env_params)
+        policy = agent_loop.bind(params)
+        _, decision = decide(policy, agent_loop.policy_inputs(agent, knowledge, env_params), policy_memory(agent))
+        # Sample the choices, and step all episodes without a reset.
+        choice = jax.random.categorical(step_key, decision.logits)
+        next_agent, _ = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
+        return next_agent, choice
 
     # `choices[t]` leads from `agents[t]` to `agents[t + 1]`.
     agents = [start_episodes()]
@@ -118,18 +123,6 @@ def _with_random_actor(params: dict[str, Any], key: jax.Array) -> dict[str, Any]
     """Replace the actor's kernel, which is nearly zero at first, by a random one."""
     kernel = jax.random.normal(key, params["actor"]["kernel"].shape)
     return params | {"actor": params["actor"] | {"kernel": kernel}}
-
-
-def _act_once(
-    agent_loop: AgentLoop, policy: Policy, agent: Agent, key: jax.Array, knowledge: Knowledge, env_params: EnvParams
-) -> tuple[Agent, jax.Array]:
-    """Act once without auto-reset, and return the agent and its choices."""
-    memory = policy_memory(agent)
-    _, decision = decide(policy, agent_loop.policy_inputs(agent, knowledge, env_params), memory)
-    # Sample the choices, and step all episodes without a reset.
-    choice = jax.random.categorical(key, decision.logits)
-    next_agent, _ = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
-    return next_agent, choice
 
 
 def _check_tracker_states(

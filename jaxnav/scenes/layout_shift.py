@@ -91,9 +91,7 @@ def _group_by_size(category: np.ndarray, volumes: np.ndarray, is_goal: np.ndarra
     size_groups: list[list[int]] = []
     for among_goals in (True, False):
         candidates = [k for k in by_size if is_goal[k] == among_goals]
-        size_pairs: list[list[int]] = []
-        for i in range(0, len(candidates) - 1, 2):
-            size_pairs.append(candidates[i : i + 2])
+        size_pairs = [candidates[i : i + 2] for i in range(0, len(candidates) - 1, 2)]
         if size_pairs and len(candidates) % 2:
             size_pairs[-1].append(candidates[-1])
         size_groups += size_pairs

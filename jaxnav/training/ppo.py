@@ -507,9 +507,12 @@ def ppo_loss(
     loss = policy_loss + scalars.value_weight * value_loss - scalars.entropy_weight * entropy
     loss_terms = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
 
-    # Distillation of the counterfactual branch.
+    # Distillation of the counterfactual branch, KL(pi || pi_counterfactual); no gradient enters pi.
     if use_distillation:
-        distil_loss = _distillation_loss(log_probs, replay.counterfactual.logits, is_decision_step)
+        divergence = optax.losses.kl_divergence_with_log_targets(
+            jax.nn.log_softmax(replay.counterfactual.logits), jax.lax.stop_gradient(log_probs)
+        )
+        distil_loss = masked_mean(divergence, is_decision_step)
         loss = loss + scalars.distil_weight * distil_loss
         loss_terms["distil_loss"] = distil_loss
 
@@ -519,16 +522,6 @@ def ppo_loss(
         loss = loss + auxiliary_loss
         loss_terms = loss_terms | auxiliary_terms
     return loss, loss_terms
-
-
-def _distillation_loss(
-    log_probs: jax.Array, counterfactual_logits: jax.Array, is_decision_step: jax.Array | None
-) -> jax.Array:
-    """Mean KL(pi || pi_counterfactual) over decision steps, float32 []; no gradient enters pi."""
-    target_log_probs = jax.lax.stop_gradient(log_probs)
-    log_ratio = target_log_probs - jax.nn.log_softmax(counterfactual_logits)
-    divergence = (jnp.exp(target_log_probs) * log_ratio).sum(axis=-1)
-    return masked_mean(divergence, is_decision_step)
 
 
 # 4. Gradient steps

@@ -47,7 +47,6 @@ FUNCTIONS = {
         "_replay_in_parallel",
         "_replay_step_by_step",
         "ppo_loss",
-        "_distillation_loss",
     },
     "evaluation/grid.py": {"episode_metrics"},
 }
