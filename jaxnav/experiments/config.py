@@ -148,7 +148,7 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
     # Listing the runs checks the settings of each.
     runs = agent_runs(config)
     if not runs:
-        raise InputError(f"only: {', '.join(config.only)}: selects no run; give other patterns")
+        raise InputError("worlds, agents, only and left_out: select no run; give others")
     for run in runs:
         if not isinstance(run.config.devices, int | None):
             raise InputError(f"{run.name}: devices is {run.config.devices}; one process trains all runs: give a number")

@@ -1,0 +1,254 @@
+"""Configurations of experiments: their runs, and the settings that are refused."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from jaxnav.errors import InputError
+from jaxnav.experiments.bench import Bench
+from jaxnav.experiments.config import (
+    EXPERIMENTS,
+    AgentRun,
+    ExperimentConfig,
+    agent_runs,
+    check_experiment,
+    measured_runs,
+    part_settings,
+)
+from jaxnav.experiments.driver import MEASUREMENTS, list_parts
+from jaxnav.experiments.pages import check_page
+from jaxnav.experiments.table import has_part
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.config_files import apply_yaml
+from jaxnav.runs.run import run_settings
+
+REPOSITORY = Path(__file__).parents[2]
+#: Experiments that measure finished runs.
+OF_FINISHED_RUNS = ("account", "mixture", "handover", "instrument")
+WORLDS = {"near": {"world": "rooms"}, "far": {"world": "apartments", "seeds": 4}}
+AGENTS = {"plain": {}, "wide": {"sizes": {"hidden": 256}, "seeds": 5}}
+
+
+def make_config(**changes: Any) -> ExperimentConfig:
+    config = ExperimentConfig(worlds=WORLDS, agents=AGENTS, base=RunConfig(seeds=2, total_steps=1000))
+    return dataclasses.replace(config, **changes)
+
+
+def names_of(runs: list[AgentRun]) -> list[str]:
+    return [run.name for run in runs]
+
+
+def run_of(config: ExperimentConfig, name: str) -> AgentRun:
+    (run,) = [run for run in agent_runs(config) if run.name == name]
+    return run
+
+
+# Runs of an experiment
+
+
+def test_agents_change_the_worlds_which_change_the_base():
+    config = make_config()
+    seeds = {run.name: run.config.seeds for run in agent_runs(config)}
+    # The base has two seeds, the world `far` four, and the agent `wide` five.
+    assert seeds == {"near-plain": 2, "near-wide": 5, "far-plain": 4, "far-wide": 5}
+
+    # Nested settings that nobody names stay.
+    far_wide = run_of(config, "far-wide").config
+    assert (far_wide.world, far_wide.total_steps, far_wide.sizes.hidden) == ("apartments", 1000, 256)
+    assert far_wide.sizes == dataclasses.replace(RunConfig().sizes, hidden=256)
+
+
+def test_runs_have_folders_of_their_own():
+    config = make_config(runs=Path("somewhere"), agents={"hoz:PERMUTED": {"method": "hoz"}})
+    run_dirs = [run.config.run_dir for run in agent_runs(config)]
+    # A colon is no part of file names everywhere.
+    assert run_dirs == [Path("somewhere/near-hoz-PERMUTED"), Path("somewhere/far-hoz-PERMUTED")]
+
+
+@pytest.mark.parametrize(
+    ("patterns", "names"),
+    [
+        ({"left_out": ("far-*",)}, ["near-plain", "near-wide"]),
+        ({"left_out": ("*-wide", "far-plain")}, ["near-plain"]),
+        ({"only": ("*-wide",)}, ["near-wide", "far-wide"]),
+        ({"only": ("near-*", "far-wide"), "left_out": ("*-wide",)}, ["near-plain"]),
+    ],
+)
+def test_patterns_select_runs(patterns, names):
+    assert names_of(agent_runs(make_config(**patterns))) == names
+
+
+def test_measured_runs_match_by_agent_or_by_world_and_agent():
+    config = make_config(measure={"evaluation": ["wide", "far-plain"], "trials": []})
+    assert names_of(measured_runs(config, "evaluation")) == ["near-wide", "far-plain", "far-wide"]
+    assert measured_runs(config, "trials") == []
+
+
+def test_scenes_that_are_missing_do_not_hinder_whoever_only_reads_results():
+    config = check_experiment(make_config(worlds={"near": {"scenes": "missing.jsonl.gz"}}))
+    assert run_of(config, "near-plain").config.scenes == Path("missing.jsonl.gz")
+
+
+def test_part_settings_tell_the_runs_and_evaluations_apart_that_differ():
+    config = make_config()
+    plain, wide = (run_of(config, name) for name in ("near-plain", "near-wide"))
+    settings = part_settings(config, plain, [wide])
+    assert settings == part_settings(make_config(runs=Path("elsewhere"), title="Another"), plain, [wide])
+
+    # Another run, another setting of the evaluation, another reference, and no reference.
+    longer = wide._replace(config=dataclasses.replace(wide.config, total_steps=2000))
+    others = [
+        part_settings(config, wide, [wide]),
+        part_settings(make_config(episodes=7), plain, [wide]),
+        part_settings(config, plain, [longer]),
+        part_settings(config, plain, []),
+    ]
+    assert all(other != settings for other in others)
+
+
+# Finished runs in place of agents
+
+
+def test_finished_runs_replace_the_agents(drawn_run):
+    run_dir = drawn_run.config.run_dir
+    config = check_experiment(
+        ExperimentConfig(run=run_dir, without=run_dir, agents=AGENTS, pages={"docs/account.md": "account"})
+    )
+    # The world is that of the run, and everything that is written goes to its folder.
+    runs = agent_runs(config)
+    assert names_of(runs) == ["rooms-main", "rooms-anonymous"]
+    for run in runs:
+        assert run.is_trained
+        assert run.config.run_dir == run_dir
+        assert run_settings(run.config) == run_settings(drawn_run.config)
+    assert config.results == run_dir / "results"
+    assert config.pages == {str(run_dir / "account.md"): "account"}
+
+
+def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
+    finished = {"run": str(drawn_run.config.run_dir), "against": ["plain/layout"]}
+    runs = agent_runs(check_experiment(make_config(agents={"plain": {}, "done": finished}, only=("near-*",))))
+    assert run_settings(runs[1].config) == run_settings(drawn_run.config)
+    assert runs[1].against == ("plain/layout",)
+    assert [run.is_trained for run in runs] == [False, True]
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        # The evaluation.
+        ({"shifts": ()}, "shifts"),
+        ({"shifts": (0.5, 0.5)}, "shifts"),
+        ({"shifts": (1.0, 0.0)}, "shifts"),
+        ({"shifts": (0.0, 2.0)}, "shifts"),
+        ({"shifts": (float("nan"),)}, "shifts"),
+        ({"epsilon": ()}, "epsilon"),
+        ({"epsilon": (-1.0,)}, "epsilon"),
+        ({"epsilon": (float("inf"),)}, "epsilon"),
+        ({"epsilon": (float("nan"),)}, "epsilon"),
+        ({"episodes": 0}, "episodes"),
+        ({"steps": 0}, "steps"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 2**32}, "seed"),
+        ({"decodings": ()}, "decodings"),
+        # Names.
+        ({"worlds": {"a/b": {}}}, "'a/b'"),
+        ({"agents": {"": {}}}, "''"),
+        ({"worlds": {"a": {}, "a-b": {}}, "agents": {"b-c": {}, "c": {}}}, "a-b-c"),
+        # Runs.
+        ({"base": RunConfig(seeds=0)}, "near-plain.*seeds"),
+        ({"base": RunConfig(devices="cluster")}, "near-plain.*devices"),
+        ({"agents": {"plain": {"devices": "cluster"}}}, "near-plain.*devices"),
+        ({"worlds": {"near": {"world": "flats"}}}, "worlds.near.*world"),
+        ({"agents": {"plain": {"sizes": {"hiden": 8}}}}, "agents.plain.*sizes.hiden"),
+        ({"agents": {"plain": {"ppo": {"rollout": 0}}}}, "near-plain.*ppo.rollout"),
+        ({"worlds": {}}, "worlds"),
+        ({"agents": {}}, "agents"),
+        ({"left_out": ("*",)}, "left_out"),
+        ({"only": ("nothing-*",)}, "only"),
+        # References.
+        ({"agents": {"plain": {"against": ["plane"]}}}, "agents.plain.against.*'plane'"),
+        ({"agents": {"plain": {"against": ["plain/layuot"]}}}, "agents.plain.against.*'layuot'"),
+        ({"agents": {"plain": {"against": "plain"}}}, "agents.plain.against"),
+        ({"agents": {"plain": {"run": "nowhere"}}}, "nowhere"),
+        # Measurements and groups.
+        ({"measure": {"evaluation": "plain"}}, "measure.evaluation"),
+        ({"measure": {"evaluation": [1]}}, "measure.evaluation"),
+        ({"groups": {"all": {}}}, "groups.all"),
+        ({"groups": {"all": {"agents": [], "variant": "stde", "against": "layout"}}}, "groups.all.agents"),
+        ({"groups": {"all": {"agents": ["plane"], "variant": "stde", "against": "layout"}}}, "groups.all.agents"),
+        ({"groups": {"all": {"agents": ["plain"], "variant": "std", "against": "layout"}}}, "groups.all.variant"),
+        (
+            {"groups": {"all": {"agents": ["plain"], "variant": "stde", "against": "plane/layout"}}},
+            "groups.all.against",
+        ),
+        # Finished runs.
+        ({"run": Path("nowhere")}, "nowhere"),
+        ({"without": Path("nowhere")}, "without"),
+    ],
+)
+def test_invalid_settings_are_refused_by_name(changes, named):
+    with pytest.raises(InputError, match=named) as refusal:
+        check_experiment(make_config(**changes))
+    assert "\n" not in str(refusal.value)
+
+
+def test_finished_runs_refuse_settings(drawn_run):
+    agents = {"done": {"run": str(drawn_run.config.run_dir), "seeds": 3}}
+    with pytest.raises(InputError, match=r"agents\.done.*seeds"):
+        check_experiment(make_config(agents=agents))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"measure": {"trails": ["*"]}}, "measure: 'trails'"),
+        # One shift has nothing to be compared with.
+        ({"measure": {"growth": ["*"]}, "shifts": (0.5,)}, "shifts"),
+        ({"measure": {"mixture": ["*"]}, "shifts": (0.5,)}, "shifts"),
+    ],
+)
+def test_impossible_measurements_are_refused_by_name(changes, named):
+    config = check_experiment(make_config(**changes))
+    with pytest.raises(InputError, match=named):
+        list_parts(config, Bench(config, Console(quiet=True)))
+
+
+# Packaged experiments
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_packaged_experiments_are_valid(name, drawn_run, monkeypatch):
+    monkeypatch.chdir(REPOSITORY)
+    config = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
+    if name in OF_FINISHED_RUNS:
+        config = dataclasses.replace(config, run=drawn_run.config.run_dir, without=drawn_run.config.run_dir)
+    config = check_experiment(config)
+
+    # Every pattern measures something, every page can be written, and every reference exists.
+    assert set(config.measure) <= set(MEASUREMENTS)
+    for measurement in config.measure:
+        assert measured_runs(config, measurement)
+    for document, template in config.pages.items():
+        check_page(Path(document), template)
+    parts = list_parts(config, Bench(config, Console(quiet=True)))
+    assert len({part.name for part in parts}) == len(parts) > 0
+
+
+@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - set(OF_FINISHED_RUNS)))
+def test_committed_results_are_recognized(name, monkeypatch):
+    monkeypatch.chdir(REPOSITORY)
+    packaged = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
+
+    # Those of `val` are complete; of `test` some were measured.
+    for split in ("val", "test"):
+        config = check_experiment(dataclasses.replace(packaged, split=split))
+        for part in list_parts(config, Bench(config, Console(quiet=True))):
+            path = config.results / split / f"{part.name}.jsonl"
+            assert has_part(path, part.settings) or (split == "test" and not path.exists()), path
