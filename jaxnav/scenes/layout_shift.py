@@ -8,7 +8,6 @@ import zlib
 
 import numpy as np
 
-from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
@@ -63,16 +62,6 @@ def exchange_places(scene: Scene, task: Task, shift: float, seed: int) -> Scene:
 
     new_types = tuple(scene.types[i] for i in new_objects)
     return dataclasses.replace(scene, types=new_types, boxes=_boxes_at_new_places(scene, new_objects))
-
-
-def check_shift(shift: float, seed: int) -> None:
-    """Check the numbers of a layout shift.
-
-    Raises:
-      InputError: `shift` or `seed` is out of range.
-    """
-    if seed < 0 or not 0.0 <= shift <= 1.0:  # also rejects NaN
-        raise InputError(f"layout shift: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
 
 
 def _group_by_size(category: np.ndarray, volumes: np.ndarray, is_goal: np.ndarray) -> list[list[int]]:

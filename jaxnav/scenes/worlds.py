@@ -17,7 +17,7 @@ from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
 from jaxnav.scenes.generate.rooms import generate_room
-from jaxnav.scenes.layout_shift import check_shift, exchange_places
+from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
 
@@ -216,7 +216,8 @@ def shift_scenes(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Sce
     Raises:
       InputError: an impossible number.
     """
-    check_shift(shift, seed)
+    if seed < 0 or not 0.0 <= shift <= 1.0:  # also rejects NaN
+        raise InputError(f"layout shift: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
     return ShiftedScenes(scenes, task, shift, seed) if shift else scenes
 
 

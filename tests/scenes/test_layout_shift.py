@@ -13,11 +13,11 @@ from support.scenes import draw
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
-from jaxnav.scenes.layout_shift import check_shift, exchange_places
+from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.observation_row import object_size
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import load_scenes
+from jaxnav.scenes.worlds import load_scenes, make_generated_scenes, shift_scenes
 
 TASK = Task()
 GOALS = Task(goals=("AlarmClock", "Book", "Bowl", "CellPhone"))
@@ -200,7 +200,7 @@ def test_name_and_seed_alone_fix_the_exchange():
 @pytest.mark.parametrize(("shift", "seed"), [(-0.1, 0), (1.1, 0), (float("nan"), 0), (0.5, -1)])
 def test_impossible_numbers_are_refused(shift, seed):
     with pytest.raises(InputError, match="give a seed of at least 0, a shift from 0 to 1"):
-        check_shift(shift, seed)
+        shift_scenes(make_generated_scenes("rooms", "val"), TASK, shift, seed)
 
 
 def test_real_objects_keep_their_size_and_leave_the_cells_free():
