@@ -222,14 +222,16 @@ def _value_to_json(value: Interval | Curve) -> dict[str, Any]:
 def _value_from_json(data: Mapping[str, Any]) -> Interval | Curve:
     if "at" in data:
         undefined = [None] * len(data["at"])
-        columns = (data["at"], data["mean"], data.get("low", undefined), data.get("high", undefined))
-        return Curve(*(np.array(column, np.float64) for column in columns))
+        low = np.array(data.get("low", undefined), np.float64)
+        high = np.array(data.get("high", undefined), np.float64)
+        return Curve(np.array(data["at"], np.float64), np.array(data["mean"], np.float64), low, high)
 
     # The deviation over the training runs follows from their values.
     seeds = tuple(data.get("seeds", ()))
     std = float(np.std(seeds, ddof=1)) if len(seeds) > 1 else math.nan
-    bounds = [float(data.get(name, math.nan)) for name in ("low", "high")]
-    return Interval(float(data["mean"]), *bounds, std, seeds)
+    low = float(data.get("low", math.nan))
+    high = float(data.get("high", math.nan))
+    return Interval(float(data["mean"]), low, high, std, seeds)
 
 
 def _round(number: float) -> float:

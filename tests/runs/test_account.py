@@ -1,12 +1,8 @@
 """The accounting of a run beside one without experience."""
 
-import json
-
 import numpy as np
 import pytest
-from support.commands import refusal
 
-from jaxnav.cli import account as command
 from jaxnav.errors import InputError
 from jaxnav.runs.evaluate import measure_leads
 
@@ -56,20 +52,3 @@ def test_runs_that_cannot_be_compared_are_refused(evaluated):
     layouts = evaluated._replace(rows=[row for row in evaluated.rows if row.variant != "baseline"])
     with pytest.raises(InputError, match="no arm `baseline`"):
         measure_leads(evaluated, layouts)
-
-
-def test_the_command_refuses_what_is_no_run(tmp_path, capsys):
-    assert command.main([str(tmp_path / "a"), str(tmp_path / "b")]) == 2
-    assert str(tmp_path / "a") in refusal(capsys)
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_table_for_every_shift(drawn_run, tmp_path, capsys):
-    target = tmp_path / "account.json"
-    run = str(drawn_run.config.run_dir)
-    assert command.main([run, run, "--episodes", "24", "--json", str(target)]) == 0
-    written = json.loads(target.read_text())
-    assert list(written["shifts"]) == ["0", "1"]
-    first = written["shifts"]["0"][0]
-    assert (first["variant"], first["metric"], first["lead"]["mean"]) == ("ORG (baseline)", "sr", 0.0)
-    assert "Lead over org at shift 1" in capsys.readouterr().out
