@@ -1,0 +1,330 @@
+"""The layout gap along walks: traces against a plain loop and closed forms, statistics against SciPy and by hand."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import mannwhitneyu
+from support import tiny_world as tiny
+from support.dirichlet import exact_kl
+from support.episodes import episodes_in
+from support.intervals import around, left_out
+
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.experiments.gap_traces import (
+    FROZEN,
+    UPDATED,
+    GapTraces,
+    auc_by_step,
+    mean_by_step,
+    trace_gaps,
+    truncate_to_shortest,
+    weighted_auc,
+)
+from jaxnav.layout import EstimatorConfig, LayoutEstimator
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.pathways import NO_ACTION, PolicyState
+from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.task import DONE, LOOK_UP
+
+# Area under the ROC curve
+
+VALUES = st.lists(st.integers(-3, 3), min_size=1, max_size=20).map(np.array)
+
+
+def plain_auc(positive: np.ndarray, negative: np.ndarray) -> float:
+    """AUC where all weights are 1."""
+    return weighted_auc(positive, negative, np.ones((len(positive), 1)), np.ones((len(negative), 1)))[0]
+
+
+def test_auc_counts_pairs_won_and_half_of_the_ties():
+    # Against 2: lost, tied, tied; against 0: all three won. (0.5 + 0.5 + 3) / 6.
+    assert plain_auc(np.array([1, 2, 2]), np.array([2, 0])) == pytest.approx(4 / 6)
+
+
+@given(VALUES, VALUES)
+def test_auc_is_the_statistic_of_mann_and_whitney(positive, negative):
+    expected = mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
+    assert plain_auc(positive, negative) == pytest.approx(expected)
+    assert plain_auc(negative, positive) == pytest.approx(1 - expected)
+
+
+# Statistics by step
+
+
+def make_traces(gap, scene, room=None, names=None, running=None) -> GapTraces:
+    """Traces of one estimator, with equal gaps [N, E, T + 1] by both beliefs."""
+    gap = np.asarray(gap, np.float32)
+    return GapTraces(
+        gap=np.stack([gap, gap])[None],
+        running=np.ones(gap.shape, bool) if running is None else np.array(running),
+        episodes=episodes_in(scene, room=room, names=names),
+    )
+
+
+def first_step(curves: np.ndarray) -> tuple[float, float, float]:
+    """Mean, low and high of the updated belief at step 0."""
+    mean, low, high = curves[:, 0, UPDATED, 0].tolist()
+    return mean, low, high
+
+
+def test_intervals_by_step_are_those_of_a_plain_loop():
+    # Six scenes, in another order and with more episodes at the shift; some episodes end early.
+    rng = np.random.default_rng(2)
+    num_runs, num_scenes = 3, 6
+    unshifted_scene = np.repeat(np.arange(num_scenes), 4)
+    unshifted = make_traces(
+        rng.integers(0, 9, (num_runs, 24, 2)) / 10, unshifted_scene, running=rng.random((num_runs, 24, 2)) < 0.8
+    )
+    shifted = make_traces(
+        rng.integers(2, 9, (num_runs, 30, 2)) / 10,
+        np.tile(np.arange(num_scenes), 5),
+        names=unshifted.episodes.scenes[::-1],
+    )
+
+    def remaining_gaps(traces: GapTraces, step: int, scene: int | None, run: int | None) -> np.ndarray:
+        """Gaps of the episodes that still run, without a scene and a run."""
+        name = None if scene is None else f"room{scene:02}"
+        other_scene = np.array([traces.episodes.scenes[index] != name for index in traces.episodes.scene])
+        other_run = np.arange(num_runs)[:, None] != run
+        return traces.gap[0, UPDATED, ..., step][traces.running[..., step] & other_scene & other_run]
+
+    aucs = auc_by_step(shifted, unshifted)
+    means = mean_by_step(unshifted)
+    for step in (0, 1):
+
+        def auc_without(scene, run, step=step):
+            shifted_gaps = remaining_gaps(shifted, step, scene, run)
+            unshifted_gaps = remaining_gaps(unshifted, step, scene, run)
+            pairs = len(shifted_gaps) * len(unshifted_gaps)
+            return mannwhitneyu(shifted_gaps, unshifted_gaps).statistic / pairs
+
+        def mean_without(scene, run, step=step):
+            return remaining_gaps(unshifted, step, scene, run).mean(dtype=float)
+
+        assert aucs[:, 0, UPDATED, step] == pytest.approx(left_out(auc_without, num_scenes, num_runs))
+        assert means[:, 0, FROZEN, step] == pytest.approx(left_out(mean_without, num_scenes, num_runs), rel=1e-5)
+
+
+def test_scenes_of_a_floor_plan_are_left_out_of_both_shifts_at_once():
+    # Scene i has a gap of i / 20 unshifted, a little more shifted. Of n scenes, each wins against itself and all below:
+    # AUC = (1 + 1 / n) / 2. Without a scene and its twin it is (1 + 1 / 19) / 2, whichever scene it is, so scenes have
+    # a variance of 19 / 20 x 20 x (0.5 / 19 - 0.5 / 20)^2, the runs none.
+    scenes = np.arange(20)
+    unshifted = make_traces(np.tile(scenes[:, None] / 20, (2, 1, 1)), scenes)
+    reversed_names = unshifted.episodes.scenes[::-1]
+    shifted = make_traces(np.tile(scenes[::-1, None] / 20 + 0.01, (2, 1, 1)), scenes, names=reversed_names)
+    variance = 19 * (0.5 / 19 - 0.5 / 20) ** 2
+    assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(around(0.525, variance, 19))
+
+    # Copies of a floor plan with other objects are left out together, other floor plans are not.
+    for name_format, same_plans in (("room{:02}-replaced-1", True), ("other{:02}", False)):
+        names = tuple(name_format.format(scene) for scene in scenes)
+        replaced = make_traces(np.tile(scenes[:, None] / 20 + 0.01, (2, 1, 1)), scenes, names=names)
+        mean, low, _ = first_step(auc_by_step(replaced, unshifted))
+        assert mean == pytest.approx(0.525)
+        assert (low > 0.5) == same_plans
+
+
+def test_room_types_keep_their_shares():
+    # Kitchens at 0.1 and 0.3, bedrooms at 0.6, 0.7 and 0.8, alike in two runs: sample variances 0.02 and 0.01, so
+    # (2 / 5)^2 0.02 / 2 + (3 / 5)^2 0.01 / 3 = 0.0028 of the mean. In one stratum it would be 0.085 / 5.
+    gaps = np.tile(np.array([0.1, 0.3, 0.6, 0.7, 0.8])[:, None], (2, 1, 1))
+    for room, variance, degrees in (([1, 1, 0, 0, 0], 0.0028, 3), ([1, 1, 1, 1, 1], 0.085 / 5, 4)):
+        means = mean_by_step(make_traces(gaps, range(5), room=room))
+        assert first_step(means) == pytest.approx(around(0.5, variance, degrees), rel=1e-5)
+
+
+def test_a_policy_is_left_out_of_both_shifts_at_once():
+    # In three equal scenes, the first policy shows the shift and the second does not.
+    shifted = make_traces(np.repeat([[0.9], [0.3]], 3, axis=1)[..., None], range(3))
+    unshifted = make_traces(np.repeat([[0.5], [0.3]], 3, axis=1)[..., None], range(3))
+
+    # 0.9 > 0.5 and 0.3, 0.3 < 0.5, 0.3 = 0.3: 2.5 of 4. The second alone has 0.5, the first 1: by run
+    # 1 / 2 x (0.125^2 + 0.375^2), with one degree of freedom.
+    variance = 0.5 * (0.125**2 + 0.375**2)
+    assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(around(0.625, variance, 1))
+
+    # Equal policies show no variance.
+    equal = make_traces(np.repeat([[0.9], [0.9]], 3, axis=1)[..., None], range(3))
+    assert first_step(mean_by_step(equal)) == pytest.approx([0.9, 0.9, 0.9])
+
+
+def test_only_running_episodes_count():
+    # At step 1 one episode of one run still runs: its scene and run cannot be left out. At step 2 none does.
+    running = [[[True, True, False], [True, False, False], [True, False, False]], [[True, False, False]] * 3]
+    shifted = make_traces([[[0.5, 0.5, 9], [0.1, 9, 9], [0.3, 9, 9]]] * 2, range(3), running=running)
+    unshifted = make_traces([[[0.3, 0.6, 0.0], [0.3, 0.4, 0.0], [0.3, 0.5, 0.0]]] * 2, range(3))
+    means = mean_by_step(shifted)
+    aucs = auc_by_step(shifted, unshifted)
+    assert means[0, 0, FROZEN, :2] == pytest.approx([0.3, 0.5])
+    assert aucs[0, 0, UPDATED, :2] == pytest.approx([0.5, 0.5])
+    for mean, low, high in (means, aucs):
+        assert np.isfinite(low[..., 0]).all()
+        assert np.isnan(low[..., 1:]).all()
+        assert np.isnan(high[..., 1:]).all()
+        assert np.isnan(mean[..., 2]).all()
+
+
+def test_the_auc_of_noise_is_a_half_and_that_of_a_shift_is_not():
+    rng = np.random.default_rng(7)
+    scene = np.repeat(np.arange(20), 5)
+    noise, unshifted_noise = rng.random((2, 3, 100, 1))
+    unshifted = make_traces(unshifted_noise, scene)
+    _, low, high = first_step(auc_by_step(make_traces(noise, scene), unshifted))
+    assert 0.3 < low < 0.5 < high < 0.7
+
+    # Uniform against uniform + 0.4: 1 - 0.6^2 / 2 = 0.82, with a standard error of about 0.02.
+    mean, low, _ = first_step(auc_by_step(make_traces(noise + 0.4, scene), unshifted))
+    assert mean == pytest.approx(0.82, abs=0.06)
+    assert low > 0.7
+
+
+def test_traces_end_with_the_last_step_that_every_shift_reaches():
+    # One side has episodes of two and three steps, the other of one and two: two steps are left.
+    longer = make_traces(np.zeros((1, 2, 4)), range(2), running=[[[1, 1, 0, 0], [1, 1, 1, 0]]])
+    shorter = make_traces(np.zeros((1, 2, 4)), range(2), running=[[[1, 0, 0, 0], [1, 1, 0, 0]]])
+    for traces in truncate_to_shortest([longer, shorter]):
+        assert traces.gap.shape == (1, 2, 1, 2, 2)
+        assert traces.running.shape == (1, 2, 2)
+
+
+# Walks
+
+ENV, ENV_PARAMS = tiny.world()
+AGENT_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.SETTING)
+KNOWLEDGE = tiny.knowledge()
+UNGATED = EstimatorConfig(gate=False)
+#: `paper` sees every row, `calibrated` has a gate that shuts, UNGATED has none; each has another prior.
+ESTIMATORS = ("paper", "calibrated", UNGATED)
+PRIORS = jnp.stack([KNOWLEDGE.layout, 0.3 * KNOWLEDGE.layout, 2 * KNOWLEDGE.layout])
+NUM_STEPS = max(tiny.LIMITS) + 1
+KEY = jax.random.key(4)
+WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(tiny.lively, (6, 11)))
+
+
+def detected_categories(pose) -> np.ndarray:
+    """Categories that are detected at poses, bool [..., K]."""
+    return RowFormat(len(tiny.CATEGORIES)).presence(tiny.BANK.rows[pose])
+
+
+def draw_walks() -> EpisodeList:
+    """Five episodes in each scene, of which two start with a level view of two categories or more."""
+    drawn = draw_episodes(tiny.BANK, 10, seed=1)
+    poses = np.arange(len(tiny.BANK.rows))
+    is_level = poses % len(tiny.BANK.task.rules.horizons) == 0
+    poses = poses[is_level & (detected_categories(poses).sum(axis=1) >= 2)]
+    in_bedroom = poses >= tiny.BANK.first_cell[1] * tiny.POSES_PER_CELL
+    for scene in (0, 1):
+        drawn.pose[np.flatnonzero(drawn.scene == scene)[:2]] = poses[in_bedroom == scene][[0, -1]]
+    return drawn
+
+
+EPISODES = draw_walks()
+STEP_LIMITS = np.array(tiny.LIMITS)[EPISODES.scene]
+
+
+def walk(weights) -> GapTraces:
+    return trace_gaps(weights, EPISODES, ENV_PARAMS, AGENT_LOOP, KNOWLEDGE, ESTIMATORS, PRIORS, NUM_STEPS, KEY)
+
+
+def weights_that_always(action: int):
+    """Policies that take one action only."""
+    bias = WEIGHTS["actor"]["bias"].at[:, action].set(1e4)
+    return WEIGHTS | {"actor": WEIGHTS["actor"] | {"bias": bias}}
+
+
+@pytest.fixture(scope="module")
+def standing_traces() -> GapTraces:
+    """Traces of policies that always see one view."""
+    return walk(weights_that_always(LOOK_UP))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def update_belief(estimator, prior, belief, presence):
+    return LayoutEstimator(prior, estimator).update(belief, presence)
+
+
+@jax.jit
+def sample_step(policy_index, episode, time, pose, logits):
+    """The sampled action, and the pose after it."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(KEY, policy_index), episode), time)
+    action = jax.random.categorical(key, logits).astype(jnp.int32)
+    return action, ENV.next_pose(pose, action, ENV_PARAMS)
+
+
+def test_traces_are_those_of_a_plain_loop():
+    traces = walk(WEIGHTS)
+    assert traces.gap.shape == (3, 2, 2, len(EPISODES.pose), NUM_STEPS + 1)
+    assert traces.gap.dtype == np.float32
+    lengths = set()
+    for policy_index, episode in ((0, 0), (0, 6), (1, 1), (1, 9)):
+        scene = EPISODES.scene[episode]
+        goal = jnp.int32(EPISODES.goal[episode])
+        room = int(ENV_PARAMS.room[scene])
+
+        # Before the first view, both beliefs of every estimator equal its prior.
+        beliefs = []
+        for estimator, prior in zip(ESTIMATORS, PRIORS[:, room], strict=True):
+            beliefs.append([LayoutEstimator(prior, estimator).init()] * 2)
+        layout, memory = None, PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
+        pose, running, time = int(EPISODES.pose[episode]), True, 0
+        while running:
+            # Every estimator observes the view; its frozen belief returns to the prior.
+            for index, (estimator, prior) in enumerate(zip(ESTIMATORS, PRIORS[:, room], strict=True)):
+                presence = detected_categories(pose)
+                updated, frozen = (update_belief(estimator, prior, belief, presence) for belief in beliefs[index])
+                gaps = traces.gap[index, :, policy_index, episode, time]
+                np.testing.assert_allclose(gaps, [updated.gap, frozen.gap], atol=1e-6)
+                beliefs[index] = [updated, frozen.replace(alpha=prior)]
+
+            # The policy acts by its own estimate of the layout.
+            row = jnp.asarray(tiny.BANK.rows[pose])
+            layout = tiny.believe(KNOWLEDGE.layout[room], layout, row)
+            weights = tiny.leaves_at(WEIGHTS, policy_index)
+            decision, _ = tiny.decide(weights, row, goal, tiny.goal_weights(layout, goal), memory)
+            action, pose = sample_step(policy_index, episode, time, pose, decision.logits)
+            memory = PolicyState(decision.hidden, action)
+            time += 1
+            running = action != DONE and time < STEP_LIMITS[episode]
+        lengths.add(time)
+        assert traces.running[policy_index, episode].tolist() == [True] * time + [False] * (NUM_STEPS + 1 - time)
+    assert len(lengths) > 1
+
+
+def test_the_gap_of_a_view_that_stays_has_a_closed_form(standing_traces):
+    for episode in (0, 1, 5, 6):
+        presence = detected_categories(EPISODES.pose[episode]).astype(int)
+        assert presence.sum() >= 2
+        counts = np.outer(presence, presence) * (1 - np.eye(len(presence), dtype=int))
+        prior = np.asarray(PRIORS[2][ENV_PARAMS.room[EPISODES.scene[episode]]])[presence > 0]
+
+        # The belief of UNGATED gains the view's counts at every step.
+        num_steps = STEP_LIMITS[episode]
+        updated = standing_traces.gap[2, UPDATED, 0, episode, :num_steps]
+        for step in range(num_steps):
+            divergences = []
+            for row, row_counts in zip(prior, counts[presence > 0], strict=True):
+                others = row > 0
+                divergences.append(exact_kl((row + step * row_counts)[others], row_counts[others]))
+            np.testing.assert_allclose(updated[step], np.tanh(np.mean(divergences)), rtol=2e-4)
+
+        # Frozen, every step is the first again.
+        frozen = standing_traces.gap[2, FROZEN, 0, episode, :num_steps]
+        np.testing.assert_array_equal(frozen, np.full(num_steps, frozen[0]))
+        assert frozen[0] == updated[0] > updated[1]
+
+        # The gate of `calibrated` stays shut: both gaps decay by 0.8 a step.
+        for belief in (UPDATED, FROZEN):
+            gap = standing_traces.gap[1, belief, 0, episode, :num_steps]
+            np.testing.assert_allclose(gap, gap[0] * 0.8 ** np.arange(num_steps), rtol=1e-5)
+
+
+def test_episodes_run_to_their_limit_or_to_done(standing_traces):
+    # A limit of L leaves steps 0 ... L - 1; Done at once leaves step 0.
+    np.testing.assert_array_equal(standing_traces.running[0], np.arange(NUM_STEPS + 1) < STEP_LIMITS[:, None])
+    np.testing.assert_array_equal(walk(weights_that_always(DONE)).running.sum(axis=-1), 1)
