@@ -11,21 +11,20 @@ import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.variants import table_row
+from jaxnav.experiments.trials import EvaluatedRun, Trial, TrialRunner
+from jaxnav.experiments.trials import EvaluatedRun, Trial, TrialRunner
 from jaxnav.layout import ESTIMATORS
 from jaxnav.policies.methods import METHODS
 from jaxnav.runs.evaluate import evaluate_rows, replay_episodes
 from jaxnav.runs.train import explore_world
 from jaxnav.runs.worlds import compile_evaluation_world, compile_training_world
-from jaxnav.study.config import StudyConfig
-from jaxnav.study.measure import EvaluatedRun, TrialRunner
-from jaxnav.study.records import Trial
 from jaxnav.training.calibration import co_visibility_from_counts, layout_priors
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", ["evidence", "learned", "overdue", "clock"])
+@pytest.mark.parametrize("setting", ["evidence", "clock"])
 def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, evaluated, setting):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting=setting)
     assert other.rows == evaluated.rows
@@ -118,12 +117,11 @@ def test_scenes_that_a_method_cannot_act_in_are_refused_wherever_it_acts(drawn_r
     )
     subject = EvaluatedRun(searching, world, draw_episodes(world.banks[0], 4))
     row = table_row("baseline", None, None, "argmax")
-    config = StudyConfig(split="val", shifts=(0.0,), episodes=4)
     for act in (
         lambda: searching.make_agent_loop(world),
         lambda: evaluate_rows([row], searching, world, 4, 0),
         lambda: replay_episodes(searching, world, subject.episodes, row),
-        lambda: TrialRunner(config).run_trials(subject, None, [Trial("baseline", "argmax")]),
+        lambda: TrialRunner(seed=0).run_trials(subject, None, [Trial("baseline", "argmax")]),
     ):
         with pytest.raises(InputError, match=r"needs a map of .* cells, and that of the training homes has 12"):
             act()

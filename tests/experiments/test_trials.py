@@ -1,0 +1,346 @@
+"""Trials: their cells of the evaluation grid, their rows of results, and the measurements that run them."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.episodes import episodes_in
+from support.intervals import around, bounds
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.grid import EpisodeOutcome
+from jaxnav.evaluation.removal import GapSource, RemovedLogits
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.evaluation.variants import inference_grid, table_rows
+from jaxnav.experiments.bench import best_epsilon
+from jaxnav.experiments.table import ResultRow, ResultTable, write_part
+from jaxnav.experiments.trials import (
+    NEVER,
+    GapSchedule,
+    Trial,
+    TrialControl,
+    TrialOutcomes,
+    mean_removal_weight,
+    measure_growth,
+    measure_trials,
+    measure_variants,
+    prepare_run,
+    require_estimator_config,
+    sum_by_scene,
+    trial_grid,
+)
+
+ARMS = ("baseline", "layout")
+SEEDS = 2
+AT = {"world": "rooms", "run": "main", "shift": 0.0}
+#: sTDE at the paper's threshold, and without a threshold in the paper's form.
+PAPER = {"variant": "stde", "epsilon": 0.5, "form": "residual"}
+ZERO = {"variant": "stde", "epsilon": 0.0, "form": "paper"}
+
+
+# Cells of the grid
+
+
+def cells_of(grid, index: int):
+    """Cells of one row or trial of a grid."""
+    return jax.tree.map(lambda leaf: leaf[SEEDS * index : SEEDS * (index + 1)], grid)
+
+
+@pytest.mark.parametrize("epsilon", [float("nan"), -0.1, float("inf"), float("-inf")])
+def test_table_rows_refuse_impossible_epsilons(epsilon):
+    with pytest.raises(InputError, match="--epsilon"):
+        table_rows([0.5, epsilon], ["paper"], ARMS)
+
+
+def test_inference_grid_holds_a_cell_per_row_and_seed():
+    rows = table_rows([0.0, 0.2, 1.0], ["residual", "paper"], ARMS)
+    grid = inference_grid(rows, ARMS, SEEDS)
+    assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(rows) * SEEDS,)}
+    for index, row in enumerate(rows):
+        cells = cells_of(grid, index)
+        # Baseline and Random use the first two sets of parameters, all others the last two.
+        is_plain = row.variant in ("baseline", "random")
+        np.testing.assert_array_equal(cells.policy_index, [0, 1] if is_plain else [2, 3])
+        np.testing.assert_array_equal(cells.use_layout, [not is_plain] * 2)
+        np.testing.assert_array_equal(cells.greedy, [row.decoding == "argmax"] * 2)
+        np.testing.assert_array_equal(cells.act_randomly, [row.variant == "random"] * 2)
+        np.testing.assert_array_equal(cells.use_tde, [row.variant == "tde"] * 2)
+        epsilon = np.inf if row.epsilon is None else row.epsilon
+        np.testing.assert_array_equal(cells.epsilon, np.full(2, epsilon, np.float32))
+
+
+def test_controls_change_the_cells_of_stde_and_nothing_else():
+    plain_cells = Trial("stde", "sample", 0.5, "residual").grid_cells(ARMS, SEEDS)
+    given = GapSource.GIVEN
+    changed_fields: dict[TrialControl | GapSchedule, dict[str, Any]] = {
+        "shuffled": {"gap_source": GapSource.OTHER},
+        "course": {"gap_source": GapSource.MEAN},
+        "constant": {"gap_source": given, "given_gap": np.float32(0.3), "gap_end": NEVER, "epsilon": np.float32(0.0)},
+        "after": {"gap_source": given, "given_gap": 1.0, "gap_begin": 7, "gap_end": NEVER},
+        "until": {"gap_source": given, "given_gap": 1.0, "gap_end": 7},
+        "zeros": {"removed": RemovedLogits.ZEROS},
+        "noise": {"removed": RemovedLogits.NOISE},
+        "random": {"intervention": 1.0},
+    }
+    assert set(changed_fields) == {*get_args(TrialControl), *get_args(GapSchedule)}
+    for control, changes in changed_fields.items():
+        cells = Trial("stde", "sample", 0.5, "residual", control, 7, 0.3).grid_cells(ARMS, SEEDS)
+        chex.assert_trees_all_equal_shapes_and_dtypes(cells, plain_cells)
+        for name in vars(plain_cells):
+            expected = np.broadcast_to(changes.get(name, getattr(plain_cells, name)), (SEEDS,))
+            np.testing.assert_array_equal(getattr(cells, name), expected, err_msg=f"{control}: {name}")
+
+
+def test_trial_grid_holds_the_seeds_of_one_trial_after_the_other():
+    trials = [Trial("baseline", "sample"), Trial("stde", "argmax", 0.2, "paper", "noise"), Trial("tde", "argmax")]
+    grid = trial_grid(trials, ARMS, SEEDS)
+    assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(trials) * SEEDS,)}
+    for index, trial in enumerate(trials):
+        chex.assert_trees_all_equal(cells_of(grid, index), trial.grid_cells(ARMS, SEEDS))
+
+
+# Rows of results
+
+#: Outcomes of two runs in four episodes; L* = 2, so that success after 4 actions has SPL 0.5.
+SUCCESS: Mapping[Trial, Sequence[Sequence[int]]] = {
+    Trial("baseline", "sample"): [[0, 0, 1, 1], [0, 1, 0, 1]],  # 50 %
+    Trial("layout", "sample"): [[1, 0, 1, 1], [1, 1, 1, 1]],  # 75 % and 100 %
+    Trial("stde", "sample", 0.5, "residual"): [[1, 1, 1, 1], [1, 1, 1, 0]],  # 100 % and 75 %
+    Trial("layout", "argmax"): [[0, 0, 0, 0], [0, 0, 0, 1]],  # 0 % and 25 %
+}
+BASELINE, LAYOUT, STDE, BEST_LAYOUT = SUCCESS
+LENGTH = np.array([[2, 4, 4, 10], [2, 4, 4, 10]])
+WEIGHT = np.array([[0.5, 0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 0.0]], np.float32)
+FOUR_EPISODES = episodes_in([0, 1, 2, 3], best_length=2)
+
+
+def make_outcome(success, length=LENGTH, weight=WEIGHT) -> EpisodeOutcome:
+    """Outcomes [S, E] that end 2.5 m from the goal."""
+    shape = np.shape(length)
+    return EpisodeOutcome(
+        done=jnp.ones(shape, bool),
+        success=jnp.asarray(success, bool),
+        length=jnp.asarray(length),
+        moves=jnp.ones(shape, jnp.int32),
+        distance=jnp.full(shape, 2.5),
+        choices=jnp.asarray(length),
+        mean_weight=jnp.asarray(weight),
+    )
+
+
+def rows_of(success_by_trial, episodes: EpisodeList = FOUR_EPISODES, gap: str = "") -> ResultTable:
+    outcomes = {trial: make_outcome(success) for trial, success in success_by_trial.items()}
+    return ResultTable(TrialOutcomes(outcomes, episodes).trial_rows(AT, gap))
+
+
+def test_mean_removal_weight_is_over_choices():
+    outcome = make_outcome(SUCCESS[STDE])
+    # 0.5 in 2 choices and 0.1 in 10, of 2 x 20 choices: (1 + 1) / 40. Over episodes it would be 0.6 / 8.
+    assert mean_removal_weight(outcome) == pytest.approx(0.05)
+    assert mean_removal_weight(outcome._replace(choices=np.zeros_like(outcome.choices))) == 0.0
+
+
+def test_trial_rows_hold_metrics_and_weights():
+    layout = AT | LAYOUT.row_fields()
+    table = rows_of(SUCCESS)
+    assert table.find(layout, metric="sr").mean == 87.5
+    assert table.find(layout, metric="sr").seeds == (75.0, 100.0)
+    # 2 / length where it succeeds: (1 + 1/2 + 1/5) / 4 and (1 + 1/2 + 1/2 + 1/5) / 4.
+    assert table.find(layout, metric="spl").seeds == pytest.approx((42.5, 55.0))
+    # 2.5 m less the metre within which an episode succeeds.
+    assert table.find(layout, metric="dts").mean == 1.5
+    assert table.find(layout, metric="weight").mean == pytest.approx(0.05)
+    assert table.num_scenes(layout) == 4
+
+
+def test_trial_rows_compare_the_layout_with_the_baseline_and_all_others_with_the_layout():
+    table = rows_of(SUCCESS)
+    # Other networks: the deviation is that of both, 0 and 25 / sqrt(2), and there are no gains run by run.
+    layout_gain = table.find(AT | LAYOUT.row_fields(), reference="baseline", metric="sr")
+    assert layout_gain.mean == 37.5
+    assert layout_gain.std == pytest.approx(25 / 2**0.5)
+    assert layout_gain.seeds == ()
+
+    # The same networks: +25 and -25 points, run by run.
+    stde_table = rows_of(SUCCESS, gap="evidence")
+    stde_gain = stde_table.find(AT | STDE.row_fields(), gap="evidence", reference="layout", metric="sr")
+    assert stde_gain.mean == 0.0
+    assert stde_gain.seeds == pytest.approx((25.0, -25.0))
+    # sTDE less + w: 0, 100, 0, 0 points in the first run, 0, 0, 0, -100 in the second. By run 1250 / 2 = 625; by scene
+    # 0, 50, 0 and -50, 5000 / 3 / 4 = 417; what is left is 25 or -25 in all eight, 8 x 625 / 3 / 8 = 208. In all
+    # 417 + 625 - 208 = 833, with 833^2 / (417^2 / 3 + 625^2 / 1 + 208^2 / 3) = 1.51 degrees of freedom.
+    parts = np.array([5000 / 12, 625, 5000 / 24])
+    variance = parts[0] + parts[1] - parts[2]
+    degrees = variance**2 / (parts**2 / [3, 1, 3]).sum()
+    assert bounds(stde_gain) == pytest.approx(around(0, variance, degrees))
+
+    # Only outcomes with the same decoding are compared, and the baseline with nothing.
+    assert not table.where(AT | BEST_LAYOUT.row_fields(), reference="baseline").rows
+    assert not table.where(variant="baseline", reference="layout").rows
+
+
+def test_trial_rows_of_a_gap_are_those_of_stde():
+    assert set(rows_of(SUCCESS).distinct("variant")) == {"baseline", "layout"}
+    table = rows_of(SUCCESS, gap="clock")
+    assert table.distinct("variant") == ["stde"]
+    assert table.distinct("gap") == ["clock"]
+
+
+def test_equal_outcomes_have_equal_intervals_and_no_difference():
+    success = {LAYOUT: SUCCESS[LAYOUT], STDE: SUCCESS[LAYOUT]}
+    layout_sr = rows_of(success).find(AT | LAYOUT.row_fields(), metric="sr")
+    table = rows_of(success, gap="novelty")
+    assert layout_sr.has_bounds
+    assert table.find(AT | STDE.row_fields(), gap="novelty", metric="sr") == layout_sr
+    difference = table.find(AT | STDE.row_fields(), gap="novelty", reference="layout", metric="sr")
+    assert difference == Interval(0.0, 0.0, 0.0, 0.0, (0.0, 0.0))
+
+
+def test_intervals_are_over_floor_plans_of_a_room_type():
+    # Six episodes, three of which succeed. Apartments 00-0 and 00-1 are one floor plan: by plan 0, 100 and 50 %, whose
+    # sample variance is 2500. Both runs are equal, so that only scenes count.
+    names = ("val-apartment-00-0", "val-apartment-00-1", "val-apartment-01-0", "val-apartment-02-0")
+    episodes = episodes_in([0, 1, 2, 2, 3, 3], names=names, best_length=2)
+    length = np.full((2, 6), 2)
+    outcome = make_outcome([[0, 0, 1, 1, 0, 1]] * 2, length, np.zeros((2, 6), np.float32))
+    table = ResultTable(TrialOutcomes({LAYOUT: outcome}, episodes).trial_rows(AT, ""))
+    interval = table.find(AT | LAYOUT.row_fields(), metric="sr")
+    assert bounds(interval) == pytest.approx(around(50, 2500 / 3, 2))
+
+
+def test_sum_by_scene_leaves_out_scenes_without_episodes():
+    sums = sum_by_scene(np.array([[1.0, 2.0, 4.0], [0.0, 8.0, 0.0]]), episodes_in([2, 0, 2], room=[0, 0, 0]))
+    # Scene 0 has the second episode, scene 2 the other two.
+    np.testing.assert_array_equal(sums.values, [[2.0, 5.0], [8.0, 0.0]])
+    np.testing.assert_array_equal(sums.counts, [1, 2])
+
+
+# Measurements
+
+
+def test_variants_are_those_of_an_evaluation(make_bench, evaluated):
+    bench = make_bench()
+    table = ResultTable(measure_variants(bench, bench.find_run("rooms", "main"), 0.0))
+    reported = {}
+    for row in evaluated.report["rows"]:
+        if row["decoding"] == "argmax":
+            reported[row["variant"]] = row
+    for variant, fields in {"baseline": {}, "layout": {}, "tde": {}, "stde": PAPER | {"gap": "novelty"}}.items():
+        for metric in ("sr", "spl", "dts"):
+            score = table.find(AT, {"variant": variant, "decoding": "argmax"} | fields, metric=metric)
+            assert bounds(score) == pytest.approx(bounds(Interval.from_json(reported[variant][metric])), nan_ok=True)
+    # TDE removes all experience at every choice.
+    assert table.find(AT, variant="tde", decoding="argmax", metric="weight").mean == 1.0
+    assert table.find(AT, ZERO, gap="novelty", decoding="argmax", metric="weight").mean > 0.0
+
+
+def test_growth_is_the_change_of_the_gain_between_the_shifts(make_bench):
+    bench = make_bench(shifts=(0.0, 1.0))
+    run = bench.find_run("rooms", "main")
+    gains = []
+    for shift in (0.0, 1.0):
+        table = ResultTable(measure_variants(bench, run, shift))
+        stde = PAPER | {"gap": "novelty", "decoding": "argmax", "shift": shift}
+        gains.append(table.find(AT, stde, reference="layout", metric="sr").mean)
+
+    growth = ResultTable(measure_growth(bench, run))
+    fields = PAPER | {"world": "rooms", "run": "main", "gap": "novelty", "decoding": "argmax", "reference": "layout"}
+    assert growth.find(fields, metric="sr growth").mean == pytest.approx(gains[1] - gains[0])
+    assert len(growth.rows) == 1
+
+
+@pytest.mark.slow
+def test_trials_vary_gap_threshold_and_controls(make_bench):
+    bench = make_bench(epsilon=(0.0, 1.0))
+    table = ResultTable(measure_trials(bench, bench.find_run("rooms", "main"), 0.0))
+    best = AT | {"decoding": "argmax"}
+    assert set(table.distinct("gap", variant="stde", metric="sr")) == {"novelty", "evidence", "clock"}
+    assert {len(table.where(variant=variant, metric="dts").rows) for variant in ("baseline", "layout", "tde")} == {2}
+
+    # The sweep holds the given thresholds and those of the paper. From 1 on nothing is removed.
+    for form in ("residual", "paper"):
+        sweep = {"variant": "stde", "form": form, "gap": "novelty", "control": "", "metric": "sr", "reference": ""}
+        assert sorted(table.distinct("epsilon", best, sweep)) == [0.0, 0.5, 1.0]
+    layout_sr = table.find(best, variant="layout", metric="sr")
+    still = best | {"variant": "stde", "epsilon": 1.0, "form": "residual", "gap": "novelty"}
+    assert table.find(still, metric="sr") == layout_sr
+    assert table.find(still, metric="weight").mean == 0.0
+
+    # The constant control removes as much as sTDE does on average.
+    for gap in ("novelty", "evidence"):
+        assert set(table.distinct("control", best, ZERO, gap=gap)) == {"", "shuffled", "noise", "random", "constant"}
+        weight = table.find(best, ZERO, gap=gap, metric="weight").mean
+        assert table.find(best, ZERO, gap=gap, control="constant", metric="weight").mean == pytest.approx(weight, 1e-5)
+        assert weight > 0.0
+        # Zeros change no best action, and are sampled.
+        assert table.has(AT, PAPER, gap=gap, decoding="sample", control="zeros", metric="sr")
+
+    # Success is related to similarity, and policies have a size.
+    assert table.has(AT, variant="baseline", metric="sr by similarity, pearson")
+    assert table.find(AT, metric="parameters").mean > 1000
+
+
+def test_runs_without_a_baseline_arm_have_only_the_variants_of_the_layout(make_bench, drawn_run):
+    bench = make_bench()
+    run = bench.find_run("rooms", "main")
+    layout_run = run._replace(config=dataclasses.replace(drawn_run.config, arms=("layout",)))
+    policies = prepare_run(bench, layout_run, 0.0).policies
+    # Both arms have the parameters of the layout arm, so that its policies have the same random numbers as else.
+    all_policies = prepare_run(bench, run, 0.0).policies
+    chex.assert_trees_all_equal(policies.arm_params("layout"), all_policies.arm_params("layout"))
+    chex.assert_trees_all_equal(policies.arm_params("baseline"), all_policies.arm_params("layout"))
+    assert policies.arms == all_policies.arms
+
+
+def test_trials_need_policies_with_the_layout(drawn_run):
+    with pytest.raises(InputError, match="layout"):
+        require_estimator_config(drawn_run.policies(("baseline",))._replace(estimator_config=None))
+
+
+# The threshold that is chosen on `val`
+
+
+def success_of_stde(success: float, epsilon: float = 0.5, **fields: Any) -> ResultRow:
+    row = ResultRow(
+        world="rooms",
+        run="main",
+        variant="stde",
+        decoding="argmax",
+        shift=0.0,
+        gap="novelty",
+        epsilon=epsilon,
+        form="residual",
+        metric="sr",
+        value=Interval(success),
+    )
+    return dataclasses.replace(row, **fields)
+
+
+def test_best_epsilon_has_the_greatest_success_of_plain_stde():
+    # The first of the best counts; other gaps, forms, controls, shifts, actions and differences do not.
+    others = [{"gap": "clock"}, {"form": "paper"}, {"control": "noise"}, {"shift": 1.0}, {"decoding": "sample"}]
+    others += [{"reference": "layout"}, {"metric": "spl"}, {"run": "other"}, {"category": "Book"}]
+    rows = [success_of_stde(60, 0.2), success_of_stde(70, 0.4), success_of_stde(70, 0.6)]
+    rows += [success_of_stde(90, 0.9, **changes) for changes in others]
+    assert best_epsilon(ResultTable(rows), "rooms", "main", 0.0) == 0.4
+    assert best_epsilon(ResultTable([]), "rooms", "main", 0.0) is None
+
+
+def test_trials_on_test_need_the_threshold_that_was_chosen_on_val(make_bench, drawn_run):
+    # The run is not even trained without one.
+    bench = make_bench(split="test", agents={"main": {}}, base=drawn_run.config)
+    run = bench.find_run("rooms", "main")
+    with pytest.raises(InputError, match="--split val"):
+        next(measure_trials(bench, run, 0.0))
+    assert not run.config.run_dir.exists()
+
+    # It is that of the run's own trials.
+    for name, epsilon in (("rooms-main-trials-0", 0.3), ("rooms-other-trials-0", 0.7)):
+        write_part(bench.config.results / "val" / f"{name}.jsonl", {}, [success_of_stde(50, epsilon)])
+    assert bench.chosen_epsilon(run) == 0.3
