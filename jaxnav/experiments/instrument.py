@@ -220,7 +220,7 @@ class DetectionShares(NamedTuple):
     Attributes:
       detected: share of the poses with the goal in view (see `in_view`) that detect it.
       succeeds: share of the detecting poses where Done would succeed; NaN for a goal that is never detected.
-      distance: mean distance of the cells to the nearest goal object, metres; see `CompiledScene.goal_distance`.
+      distance: mean distance of the cells to the nearest goal object, metres; see `Bank.goal_distance`.
     """
 
     detected: np.ndarray
