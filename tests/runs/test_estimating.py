@@ -12,7 +12,6 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.variants import table_row
 from jaxnav.experiments.trials import EvaluatedRun, Trial, TrialRunner
-from jaxnav.experiments.trials import EvaluatedRun, Trial, TrialRunner
 from jaxnav.layout import ESTIMATORS
 from jaxnav.policies.methods import METHODS
 from jaxnav.runs.evaluate import evaluate_rows, replay_episodes
