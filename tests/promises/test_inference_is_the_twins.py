@@ -2,12 +2,16 @@
 
 The twin goes along the episodes that the package plays: from the same bytes it makes features, belief, gap and weights,
 both decisions and what is left of them by equations 1 and 2, and has to choose the same action.
+
+`JAXNAV_TWIN_EPISODES=1000` takes ten times as many episodes of every method and decision, the whole campaign of
+docs/promises.md.
 """
 
 import collections
 import dataclasses
 import functools
 import itertools
+import os
 from typing import Any, NamedTuple
 
 import jax
@@ -55,8 +59,9 @@ TOLERANCE = 2e-3
 #: its weights alone would move logits by 2.6e-3.
 CALMER = {"vtnet": 0.5}
 DECISIONS = ("fused", "streams")
-#: Of the episodes, where the twin takes thousands of derivatives a step.
-FEWER = {"savn": 100}
+#: Episodes of each method and decision; fewer where the twin takes thousands of derivatives a step.
+NUM_EPISODES = int(os.environ.get("JAXNAV_TWIN_EPISODES", "100"))
+FEWER_EPISODES = {"savn": max(12, NUM_EPISODES // 10)}
 
 
 @functools.cache
@@ -160,7 +165,7 @@ def compare(method: str, decision: str, row: EvaluationRow, episodes: EpisodeLis
     [
         ("org", "fused", 12),
         *(
-            pytest.param(name, decision, FEWER.get(name, 1000), marks=pytest.mark.slow)
+            pytest.param(name, decision, FEWER_EPISODES.get(name, NUM_EPISODES), marks=pytest.mark.slow)
             for name, decision in itertools.product(METHODS, DECISIONS)
         ),
     ],
