@@ -1,74 +1,85 @@
-"""The recurrent core, against the library's cell and JAX's gradients."""
+"""The recurrent core against the cell of Flax and the gradients of JAX."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from support.arrays import normal
+from support.arrays import normal_array
 
 from jaxnav.numerics.recurrence import UnrolledGRU, gru_step, unroll_gru
 
-T, B, H = 7, 5, 4
+NUM_STEPS, BATCH, HIDDEN = 7, 5, 4
 
 
 @pytest.fixture
 def rollout():
-    ended = jnp.zeros((T, B), bool).at[2, 1].set(True).at[4, :].set(True).at[T - 1, 0].set(True)
-    return normal(0, H, 3 * H), normal(1, T, B, 3 * H), ended, normal(2, B, H)
+    """Kernel [H, 3H], input gates [T, B, 3H], episode endings [T, B] and the first hidden state [B, H]."""
+    ended = jnp.zeros((NUM_STEPS, BATCH), bool).at[2, 1].set(True).at[4, :].set(True).at[NUM_STEPS - 1, 0].set(True)
+    kernel = normal_array(0, HIDDEN, 3 * HIDDEN)
+    input_gates = normal_array(1, NUM_STEPS, BATCH, 3 * HIDDEN)
+    return kernel, input_gates, ended, normal_array(2, BATCH, HIDDEN)
 
 
-def plain(kernel, drive, ended, hidden):
-    """Unroll by definition, in a Python loop.
-
-    A second decision must not move the memory.
-    """
-    after, before, projected = [], [], []
-    for t in range(T):
-        before.append(jax.lax.stop_gradient(hidden))
-        projected.append(jax.lax.stop_gradient(hidden) @ kernel)
-        after.append(gru_step(drive[t], hidden @ kernel, hidden))
-        hidden = jnp.where(ended[t][:, None], 0.0, after[-1])
-    return UnrolledGRU(jnp.stack(after), jnp.stack(before), jnp.stack(projected))
-
-
-def test_gru_is_the_librarys_cell():
-    cell = nnx.GRUCell(3, H, rngs=nnx.Rngs(0))
-    hidden, inputs = normal(3, B, H), normal(4, B, 3)
-    expected, _ = cell(hidden, inputs)
-    hidden_after = gru_step(cell.dense_i(inputs), hidden @ cell.dense_h.kernel[...], hidden)
-    np.testing.assert_allclose(hidden_after, expected, atol=1e-6)
+def unroll_by_definition(kernel, input_gates, ended, hidden):
+    """Unroll in a Python loop; no gradient of a second decision reaches the hidden states."""
+    hidden_after = []
+    hidden_before = []
+    hidden_gates = []
+    for step in range(NUM_STEPS):
+        hidden_before.append(jax.lax.stop_gradient(hidden))
+        hidden_gates.append(jax.lax.stop_gradient(hidden) @ kernel)
+        next_hidden = gru_step(input_gates[step], hidden @ kernel, hidden)
+        hidden_after.append(next_hidden)
+        hidden = jnp.where(ended[step][:, None], 0.0, next_hidden)
+    return UnrolledGRU(jnp.stack(hidden_after), jnp.stack(hidden_before), jnp.stack(hidden_gates))
 
 
-def test_unrolled_values(rollout):
-    for one, other in zip(unroll_gru(*rollout), plain(*rollout), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6)
+def test_gru_step_equals_the_cell_of_flax():
+    cell = nnx.GRUCell(3, HIDDEN, rngs=nnx.Rngs(0))
+    hidden = normal_array(3, BATCH, HIDDEN)
+    inputs = normal_array(4, BATCH, 3)
+    expected_hidden, _ = cell(hidden, inputs)
+    next_hidden = gru_step(cell.dense_i(inputs), hidden @ cell.dense_h.kernel[...], hidden)
+    np.testing.assert_allclose(next_hidden, expected_hidden, atol=1e-6)
 
 
-def test_hidden_state_starts_at_zero_after_an_ending(rollout):
-    run = unroll_gru(*rollout)
-    assert np.all(run.hidden_before[3, 1] == 0)
-    assert np.all(run.hidden_before[5] == 0)
-    assert np.all(run.hidden_before[3, 0] != 0)
-    np.testing.assert_array_equal(run.hidden_before[1], run.hidden_after[0])
+def test_unroll_gru_equals_a_loop_of_single_steps(rollout):
+    for unrolled_part, expected_part in zip(unroll_gru(*rollout), unroll_by_definition(*rollout), strict=True):
+        np.testing.assert_allclose(unrolled_part, expected_part, atol=1e-6)
 
 
-def test_unrolled_gradients(rollout):
-    """Check gradients of a loss with a second decision.
+def test_unroll_gru_starts_from_zero_after_an_ending(rollout):
+    unrolled = unroll_gru(*rollout)
+    assert np.all(unrolled.hidden_before[3, 1] == 0)
+    assert np.all(unrolled.hidden_before[5] == 0)
+    assert np.all(unrolled.hidden_before[3, 0] != 0)
+    np.testing.assert_array_equal(unrolled.hidden_before[1], unrolled.hidden_after[0])
 
-    The second decision shares memory and products.
-    """
-    ended, other = rollout[2], normal(5, T, B, 3 * H)
 
-    def loss(loop, kernel, drive, hidden):
-        run = loop(kernel, drive, ended, hidden)
-        second = gru_step(other, run.hidden_gates, run.hidden_before)
-        return (jnp.sin(3 * run.hidden_after) * normal(6, T, B, H)).sum() + (second**2 * normal(7, T, B, H)).sum()
+def test_unroll_gru_has_the_gradients_of_the_loop_with_a_second_decision(rollout):
+    """The second decision uses the hidden states and their products with the kernel."""
+    kernel, input_gates, ended, first_hidden = rollout
+    second_gates = normal_array(5, NUM_STEPS, BATCH, 3 * HIDDEN)
+    first_weights = normal_array(6, NUM_STEPS, BATCH, HIDDEN)
+    second_weights = normal_array(7, NUM_STEPS, BATCH, HIDDEN)
 
-    given = rollout[0], rollout[1], rollout[3]
-    gradients = jax.grad(lambda *args: loss(unroll_gru, *args), argnums=(0, 1, 2))(*given)
-    expected = jax.grad(lambda *args: loss(plain, *args), argnums=(0, 1, 2))(*given)
-    for one, two in zip(gradients, expected, strict=True):
-        np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
-    without = jax.grad(lambda k: (unroll_gru(k, rollout[1], ended, rollout[3]).hidden_after).sum())(rollout[0])
-    assert np.abs(np.asarray(gradients[0] - without)).max() > 0.1  # the second decision does teach the kernel
+    def loss(unroll, kernel, input_gates, first_hidden):
+        unrolled = unroll(kernel, input_gates, ended, first_hidden)
+        second_hidden = gru_step(second_gates, unrolled.hidden_gates, unrolled.hidden_before)
+        first_loss = (jnp.sin(3 * unrolled.hidden_after) * first_weights).sum()
+        return first_loss + (second_hidden**2 * second_weights).sum()
+
+    # Both ways of unrolling have the same gradients.
+    gradient_of_loss = jax.grad(loss, argnums=(1, 2, 3))
+    gradients = gradient_of_loss(unroll_gru, kernel, input_gates, first_hidden)
+    expected_gradients = gradient_of_loss(unroll_by_definition, kernel, input_gates, first_hidden)
+    for gradient, expected_gradient in zip(gradients, expected_gradients, strict=True):
+        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-4, atol=1e-5)
+
+    # The second decision reaches the kernel: without it, the gradient differs.
+    def loss_of_first_decision(kernel):
+        return (jnp.sin(3 * unroll_gru(kernel, input_gates, ended, first_hidden).hidden_after) * first_weights).sum()
+
+    first_gradient = jax.grad(loss_of_first_decision)(kernel)
+    assert np.abs(np.asarray(gradients[0] - first_gradient)).max() > 0.1

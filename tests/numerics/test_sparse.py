@@ -1,4 +1,4 @@
-"""Updates of the masked members of a batch, against updates of all of them."""
+"""Updates of the masked members of a batch, against updates of all members."""
 
 import functools
 
@@ -12,75 +12,90 @@ from hypothesis import strategies as st
 from jaxnav.numerics.sparse import update_where
 
 
-def cubes(weight, inputs, state):
-    return {"sum": weight * (inputs["a"] ** 3).sum() * state["sum"], "rows": weight * inputs["a"] ** 3 + state["rows"]}
+def cubic_update(weight, inputs, state):
+    """The next state of one member: a number and a vector that depend on weight, input and state."""
+    cubes = inputs["a"] ** 3
+    return {"sum": weight * cubes.sum() * state["sum"], "rows": weight * cubes + state["rows"]}
 
 
 def random_batch(seed, *shape):
-    """What is known of each member, with a number that no gradient reaches, and its state."""
-    draws = np.random.default_rng(seed)
-    a, rows, sums = (jnp.asarray(draws.normal(size=(*shape, *inner)), jnp.float32) for inner in ((3,), (3,), ()))
-    return {"a": a, "count": jnp.zeros(shape, jnp.int32)}, {"sum": sums, "rows": rows}
+    """Inputs of members in `shape`, with a count that no gradient reaches, and their states."""
+    rng = np.random.default_rng(seed)
+    values = jnp.asarray(rng.normal(size=(*shape, 3)), jnp.float32)
+    rows = jnp.asarray(rng.normal(size=(*shape, 3)), jnp.float32)
+    sums = jnp.asarray(rng.normal(size=shape), jnp.float32)
+    inputs = {"a": values, "count": jnp.zeros(shape, jnp.int32)}
+    return inputs, {"sum": sums, "rows": rows}
 
 
-def one_by_one(mask, weight, inputs, state):
-    """Update all members, and restore those that are not in the mask."""
-    function = cubes
+def update_masked(mask, weight, inputs, state):
+    return update_where(mask, cubic_update, weight, inputs, state)
+
+
+def update_all_then_restore(mask, weight, inputs, state):
+    """Update all members, and restore those outside the mask."""
+    update = cubic_update
     for _ in mask.shape:
-        function = jax.vmap(function, (None, 0, 0))
-    after = function(weight, inputs, state)
-    return jax.tree.map(
-        lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b), after, state
-    )
+        update = jax.vmap(update, (None, 0, 0))
+    next_state = update(weight, inputs, state)
+
+    def select(new_leaf, old_leaf):
+        leaf_mask = mask.reshape(mask.shape + (1,) * (new_leaf.ndim - mask.ndim))
+        return jnp.where(leaf_mask, new_leaf, old_leaf)
+
+    return jax.tree.map(select, next_state, state)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def update_and_gradients(change, mask, inputs, state):
-    """The next state, and the gradients by weight, inputs and previous state."""
+def update_and_gradients(update, mask, inputs, state):
+    """The next state, and the gradients with respect to weight, inputs and previous state."""
 
-    def by(weight, a, state):
-        after = change(mask, weight, inputs | {"a": a}, state)
-        return sum(jnp.square(leaf).sum() for leaf in jax.tree.leaves(after)), after
+    def loss(weight, values, state):
+        next_state = update(mask, weight, inputs | {"a": values}, state)
+        return sum(jnp.square(leaf).sum() for leaf in jax.tree.leaves(next_state)), next_state
 
-    return jax.value_and_grad(by, argnums=(0, 1, 2), has_aux=True)(2.0, inputs["a"], state)
-
-
-def sparsely(mask, weight, inputs, state):
-    return update_where(mask, cubes, weight, inputs, state)
+    return jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)(2.0, inputs["a"], state)
 
 
-def close(mask, batch):
-    one, other = update_and_gradients(sparsely, mask, *batch), update_and_gradients(one_by_one, mask, *batch)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), one, other)
+def assert_trees_close(tree, expected_tree):
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4), tree, expected_tree)
+
+
+def check_update_where(mask, batch):
+    masked_result = update_and_gradients(update_masked, mask, *batch)
+    expected_result = update_and_gradients(update_all_then_restore, mask, *batch)
+    assert_trees_close(masked_result, expected_result)
 
 
 @given(seed=st.integers(0, 99), mask=st.lists(st.booleans(), min_size=16, max_size=16))
-def test_those_that_are_due_get_what_all_would(seed, mask):
-    close(jnp.asarray(mask), random_batch(seed, 16))
+def test_update_where_equals_updating_all_and_restoring_the_rest(seed, mask):
+    check_update_where(jnp.asarray(mask), random_batch(seed, 16))
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 4)])
-def test_batches_have_any_shape(shape):
-    for mask in (jnp.ones(shape, bool), jnp.zeros(shape, bool), jnp.arange(np.prod(shape)).reshape(shape) % 2 == 0):
-        close(mask, random_batch(1, *shape))
+def test_update_where_takes_batches_of_any_shape(shape):
+    even_members = jnp.arange(np.prod(shape)).reshape(shape) % 2 == 0
+    for mask in (jnp.ones(shape, bool), jnp.zeros(shape, bool), even_members):
+        check_update_where(mask, random_batch(1, *shape))
 
 
-def test_runs_side_by_side_have_due_members_of_their_own():
+def test_update_where_under_vmap_uses_the_mask_of_each_run():
     mask = jnp.arange(32).reshape(2, 16) > 27
     inputs, state = random_batch(2, 2, 16)
-    both = jax.vmap(functools.partial(update_and_gradients, sparsely))(mask, inputs, state)
+    both_runs = jax.vmap(functools.partial(update_and_gradients, update_masked))(mask, inputs, state)
     for run in range(2):
-        alone = update_and_gradients(one_by_one, *jax.tree.map(lambda leaf, run=run: leaf[run], (mask, inputs, state)))
-        jax.tree.map(lambda a, b, run=run: np.testing.assert_allclose(a[run], b, rtol=1e-4, atol=1e-4), both, alone)
+        run_arguments = jax.tree.map(lambda leaf, run=run: leaf[run], (mask, inputs, state))
+        run_result = jax.tree.map(lambda leaf, run=run: leaf[run], both_runs)
+        assert_trees_close(run_result, update_and_gradients(update_all_then_restore, *run_arguments))
 
 
 @pytest.mark.parametrize("count", [0, 1, 9, 16])
-def test_parts_without_any_are_left_out(count):
-    """Sixteen members are eight parts of two; what is broken in the others shows only where a part is worked on."""
+def test_update_where_skips_parts_without_a_masked_member(count):
+    """Sixteen members are eight parts of two; a NaN outside the mask spreads only within a part that is computed."""
     mask = jnp.arange(16) >= 16 - count
     inputs, state = random_batch(0, 16)
-    broken = {**inputs, "a": jnp.where(mask[:, None], inputs["a"], jnp.nan)}
-    _, (_, by_a, _) = update_and_gradients(sparsely, mask, broken, state)
-    touched = np.isnan(by_a).any(axis=-1)
-    assert not touched[np.asarray(mask)].any()
-    assert touched.sum() == count % 2
+    broken_inputs = {**inputs, "a": jnp.where(mask[:, None], inputs["a"], jnp.nan)}
+    _, (_, input_gradient, _) = update_and_gradients(update_masked, mask, broken_inputs, state)
+    is_broken = np.isnan(input_gradient).any(axis=-1)
+    assert not is_broken[np.asarray(mask)].any()
+    assert is_broken.sum() == count % 2

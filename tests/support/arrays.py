@@ -3,6 +3,6 @@
 import jax
 
 
-def normal(seed: int, *shape: int) -> jax.Array:
-    """Draw normal numbers float32 of a shape."""
+def normal_array(seed: int, *shape: int) -> jax.Array:
+    """Standard normal numbers, float32 of `shape`."""
     return jax.random.normal(jax.random.key(seed), shape)

@@ -6,11 +6,16 @@ import pytest
 from jaxnav.viz.learning import learning_figure
 from jaxnav.viz.style import save_figure
 
+
+def log_row(seed, env_steps, success, **val_success):
+    return {"arm": "baseline", "seed": seed, "env_steps": env_steps, "success": success, **val_success}
+
+
 ROWS = [
-    {"arm": "baseline", "seed": seed, "env_steps": steps, "success": success}
-    | ({"val_success": success / 2, "val_success_sampled": success / 4} if steps == 2_000_000 else {})
-    for steps, successes in ((1_000_000, (0.2, 0.4)), (2_000_000, (0.6, 0.8)))
-    for seed, success in enumerate(successes)
+    log_row(0, 1_000_000, 0.2),
+    log_row(1, 1_000_000, 0.4),
+    log_row(0, 2_000_000, 0.6, val_success=0.3, val_success_sampled=0.15),
+    log_row(1, 2_000_000, 0.8, val_success=0.4, val_success_sampled=0.2),
 ]
 REACH = {
     "budgets": [10, 100],
@@ -19,22 +24,29 @@ REACH = {
 }
 
 
-def lines(axes):
+def drawn_lines(axes):
+    """The x and y of every line of a panel."""
     return [(np.asarray(line.get_xdata()), np.asarray(line.get_ydata())) for line in axes.get_lines()]
 
 
-def test_curves_are_means_over_seeds_in_percent(tmp_path):
+def test_learning_figure_draws_percentages_as_means_over_seeds(tmp_path):
     figure = learning_figure(ROWS, REACH, "ORG")
     curve_axes, budget_axes = figure.axes
-    training, best, sampled = lines(curve_axes)
-    np.testing.assert_allclose(training, ([1, 2], [30, 70]))  # (20 + 40) / 2 and (60 + 80) / 2
-    np.testing.assert_allclose(best, ([2], [35]))
-    np.testing.assert_allclose(sampled, ([2], [17.5]))
-    np.testing.assert_allclose(lines(budget_axes), [([10, 100], course) for course in ([10, 50], [20, 60], [30, 70])])
+
+    # Success by million steps: (20 + 40) / 2 and (60 + 80) / 2 in training, then (30 + 40) / 2 and (15 + 20) / 2.
+    training_line, argmax_line, sampled_line = drawn_lines(curve_axes)
+    np.testing.assert_allclose(training_line, ([1, 2], [30, 70]))
+    np.testing.assert_allclose(argmax_line, ([2], [35]))
+    np.testing.assert_allclose(sampled_line, ([2], [17.5]))
+
+    # Success by budget of actions: argmax and sampled in val scenes, argmax in training scenes.
+    expected_lines = [([10, 100], [10, 50]), ([10, 100], [20, 60]), ([10, 100], [30, 70])]
+    np.testing.assert_allclose(drawn_lines(budget_axes), expected_lines)
+
     save_figure(figure, tmp_path / "learning.png")
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("rows", [ROWS, []])
-def test_without_val_scenes_there_is_one_panel(rows):
+def test_learning_figure_without_val_scenes_has_one_panel(rows):
     assert len(learning_figure(rows, None, "ORG").axes) == 1
