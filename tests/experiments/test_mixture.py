@@ -1,0 +1,223 @@
+"""Removal in a mixed population: what is compared with what."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.grid import EpisodeOutcome
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments.mixture import (
+    ORACLE_NAME,
+    REMOVAL_RULES,
+    WITHOUT_EXPERIENCE,
+    WITHOUT_REMOVAL,
+    PopulationMetrics,
+    clock_trials,
+    join_end_to_end,
+    measure_handover,
+    measure_mixture,
+)
+from jaxnav.experiments.table import ResultTable
+from jaxnav.experiments.trials import NEVER
+
+NUM_SCENES, EPISODES_PER_SCENE, NUM_RUNS = 6, 4, 3
+SHIFT = np.repeat([0, 1], NUM_SCENES * EPISODES_PER_SCENE)
+METRICS = ("sr", "spl", "sr@20", "sr@50")
+
+
+# Metrics of a population
+
+
+def population_episodes(pose: int = 0) -> EpisodeList:
+    """Episodes in six scenes at both shifts, L* = 10."""
+    num_episodes = len(SHIFT)
+    return EpisodeList(
+        scene=np.repeat(np.arange(2 * NUM_SCENES), EPISODES_PER_SCENE).astype(np.int32),
+        goal=np.zeros(num_episodes, np.int32),
+        pose=np.full(num_episodes, pose, np.int32),
+        best_length=np.full(num_episodes, 10, np.int32),
+        room=np.zeros(num_episodes, int),
+        rooms=("house",),
+        scenes=tuple(f"house-{index}" for index in range(NUM_SCENES)) * 2,
+    )
+
+
+def make_outcome(success: tuple[float, float], weight: float = 0.0) -> EpisodeOutcome:
+    """Outcomes of three runs, whose episodes take 20 actions.
+
+    Args:
+      success: share of the episodes of each scene that succeed, at either shift.
+      weight: mean weight of the removed logits at the second shift; nothing is removed at the first.
+    """
+    shape = (NUM_RUNS, len(SHIFT))
+    episode_in_scene = np.tile(np.arange(EPISODES_PER_SCENE), 2 * NUM_SCENES)
+    is_success = episode_in_scene < EPISODES_PER_SCENE * np.where(SHIFT == 0, *success)
+    weights = np.where(SHIFT == 0, 0.0, weight)
+    return EpisodeOutcome.zeros(shape)._replace(
+        done=jnp.ones(shape, bool),
+        success=jnp.asarray(np.broadcast_to(is_success, shape)),
+        length=jnp.full(shape, 20),
+        choices=jnp.full(shape, 20),
+        mean_weight=jnp.asarray(np.broadcast_to(weights, shape), jnp.float32),
+    )
+
+
+POPULATION = PopulationMetrics(population_episodes(), SHIFT, (15, 30))
+#: Without experience half of the goals are found. With it three of four where the layout holds, and else one of four.
+UNAWARE = make_outcome((0.5, 0.5))
+AGENT = make_outcome((0.75, 0.25))
+#: Hard removal makes the agent as good as one without experience.
+HARD = make_outcome((0.5, 0.5), weight=1.0)
+
+
+def means_of(intervals: tuple[Interval, ...]) -> list[float]:
+    return [interval.mean for interval in intervals]
+
+
+def test_population_metrics_are_means_at_each_shift():
+    means = POPULATION.means(POPULATION.percent_metrics(AGENT))
+    # All take 20 actions where 10 do: SPL is half of SR, and none succeeds within 15.
+    assert {name: means_of(intervals) for name, intervals in means.items()} == {
+        "sr": [75.0, 25.0],
+        "spl": [37.5, 12.5],
+        "sr@15": [0.0, 0.0],
+        "sr@30": [75.0, 25.0],
+    }
+
+
+def test_value_and_cost_are_differences_to_the_agent_without_experience():
+    unaware, agent = POPULATION.percent_metrics(UNAWARE), POPULATION.percent_metrics(AGENT)
+    assert means_of(POPULATION.differences(unaware, agent, same_runs=False)["sr"]) == [25.0, -25.0]
+
+
+def test_overall_differences_weigh_both_shifts():
+    agent, hard = POPULATION.percent_metrics(AGENT), POPULATION.percent_metrics(HARD)
+    assert means_of(POPULATION.differences(agent, hard, same_runs=True)["sr"]) == [-25.0, 25.0]
+    assert POPULATION.overall_differences(agent, hard)["sr"].mean == 0.0
+
+
+def test_oracle_keeps_the_value_and_recovers_the_cost():
+    oracle = POPULATION.oracle_removal(AGENT, HARD)
+    assert POPULATION.removal_weights(oracle) == (0.0, 1.0)
+    unaware, agent, removed = (POPULATION.percent_metrics(outcome) for outcome in (UNAWARE, AGENT, oracle))
+    # Of the value all is left, of the cost nothing. All scenes are alike, so that the leads are clear of 0.
+    assert means_of(POPULATION.remaining_shares(unaware, agent, removed)["sr"]) == [100.0, 0.0]
+    # Nothing at the first shift, 25 points at the second.
+    assert POPULATION.overall_differences(agent, removed)["sr"].mean == 12.5
+
+
+# Clocks and populations
+
+
+def test_clocks_remove_at_shares_of_the_budget():
+    trials = clock_trials("sample", 150)
+    # 0.1, 0.25 and 0.5 of 150 actions, rounded.
+    assert list(trials) == [
+        *("constant 0.25", "constant 0.5", "constant 0.75"),
+        *("after step 15", "after step 38", "after step 75"),
+        *("until step 15", "until step 38", "until step 75"),
+    ]
+
+    # Begin, end and size of the gap; without a threshold the gap is the weight.
+    expected_gaps = {
+        "after step 38": (38, NEVER, 1.0),
+        "until step 38": (0, 38, 1.0),
+        "constant 0.25": (0, NEVER, 0.25),
+    }
+    for name, expected in expected_gaps.items():
+        cell = trials[name].grid_cells(("layout",), 1)
+        assert (cell.gap_begin.item(), cell.gap_end.item(), cell.given_gap.item()) == expected
+        assert cell.epsilon.item() == 0.0
+
+
+def test_joined_lists_number_the_poses_and_scenes_of_all_banks():
+    joined = join_end_to_end([population_episodes(3), population_episodes(4)], [100, 200])
+    # The poses of the second bank follow the 100 of the first.
+    assert sorted(set(joined.pose.tolist())) == [3, 104]
+    assert joined.scene.max() == 4 * NUM_SCENES - 1
+    # A floor plan is one cluster, at whatever shift: six of them, and so five degrees of freedom.
+    second_list = joined.take(joined.pose == 104)
+    assert len(second_list.goal) == len(SHIFT)
+    assert joined.clusters().degrees_of_freedom == second_list.clusters().degrees_of_freedom == NUM_SCENES - 1
+
+
+# Measurements. The run's own baseline stands in for agents without experience.
+
+
+@pytest.fixture
+def bench(make_bench, drawn_run):
+    run = {"run": str(drawn_run.config.run_dir)}
+    return make_bench(agents={"main": run, "anonymous": run}, shifts=(0.0, 1.0), episodes=8)
+
+
+@pytest.mark.slow
+def test_mixture_measures_every_removal_at_both_shifts(bench):
+    rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each estimator is compiled anew
+    table = ResultTable(measure_mixture(bench, bench.find_run("rooms", "main"), "sample", rules))
+    at = {"world": "rooms", "run": "main", "decoding": "sample"}
+    assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
+    assert {row.scenes for row in table.rows} == {4}
+
+    # TDE and the oracle, then nine clocks, then the rules.
+    removals = table.distinct("variant", at, reference=WITHOUT_REMOVAL)
+    assert removals[:2] == ["TDE", ORACLE_NAME]
+    assert removals[-2:] == [str(rule) for rule in rules]
+    assert len(removals) == 2 + 9 + 2
+
+    # The oracle removes nothing at the first shift, and all experience at the last.
+    for shift, weight in ((0.0, 0.0), (1.0, 1.0)):
+        assert table.find(at, variant="TDE", shift=shift, metric="weight").mean == 1.0
+        assert table.find(at, variant=ORACLE_NAME, shift=shift, metric="weight").mean == weight
+    change = {"reference": WITHOUT_REMOVAL, "metric": "sr"}
+    assert table.find(at, change, variant=ORACLE_NAME, shift=0.0).mean == 0.0
+    last_change = table.find(at, change, variant="TDE", shift=1.0)
+    assert table.find(at, change, variant=ORACLE_NAME, shift=1.0) == last_change
+
+    # Values, leads and changes add up, and the mixture weighs both shifts alike.
+    for metric in METRICS:
+        for shift in (0.0, 1.0):
+            values = {}
+            for variant in (WITHOUT_EXPERIENCE, WITHOUT_REMOVAL):
+                values[variant] = table.find(at, variant=variant, shift=shift, metric=metric).mean
+            lead = table.find(at, variant=WITHOUT_REMOVAL, reference=WITHOUT_EXPERIENCE, shift=shift, metric=metric)
+            assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[WITHOUT_EXPERIENCE])
+        for removal in removals:
+            changes = []
+            for shift in (0.0, 1.0):
+                changes.append(
+                    table.find(at, variant=removal, reference=WITHOUT_REMOVAL, shift=shift, metric=metric).mean
+                )
+            overall = table.find(at, variant=removal, reference=WITHOUT_REMOVAL, metric=metric).mean
+            assert overall == pytest.approx(sum(changes) / 2)
+
+    # Every rule is compared with the gap of another episode, the mean gap unless it is a switch, and one clock.
+    for rule, own_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
+        controls = table.distinct("control", at, variant=str(rule), reference="control")
+        assert controls[:-1] == own_controls
+        assert controls[-1] in removals[2:-2]
+
+
+@pytest.mark.slow
+def test_handover_leaves_the_agents_without_experience(bench):
+    table = ResultTable(measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ()))
+    (name,) = table.distinct("run")
+    at = {"world": "rooms", "run": name, "decoding": "argmax"}
+    # An agent that hands over at once is worth as much as the agents without experience.
+    for metric in METRICS:
+        for shift in (0.0, 1.0):
+            agent = table.find(at, variant=WITHOUT_REMOVAL, shift=shift, metric=metric)
+            change = table.find(at, variant="TDE", reference=WITHOUT_REMOVAL, shift=shift, metric=metric)
+            unaware = table.find(at, variant=WITHOUT_EXPERIENCE, shift=shift, metric=metric)
+            assert agent.mean + change.mean == pytest.approx(unaware.mean)
+
+
+@pytest.mark.parametrize("measure", [measure_mixture, measure_handover])
+@pytest.mark.parametrize("changes", [{"seeds": 3}, {"world": "houses"}, {"worlds": {"num_val": 5}}])
+def test_mixtures_refuse_runs_that_differ_before_any_training(make_bench, drawn_run, measure, changes):
+    bench = make_bench(agents={"main": {}, "anonymous": changes}, base=drawn_run.config, shifts=(0.0, 1.0))
+    run = bench.find_run("rooms", "main")
+    with pytest.raises(InputError, match=f"differ in {next(iter(changes))}"):
+        next(measure(bench, run, "sample"))
+    assert not run.config.run_dir.exists()
