@@ -31,13 +31,13 @@ class State(flax.struct.PyTreeNode):
 
 
 def make_state(seed: int) -> State:
-    key = jax.random.key(seed)
-    kernel = jax.random.normal(key, (3, 4))
+    root_key = jax.random.key(seed)
+    dense_kernel = jax.random.normal(root_key, (3, 4))
     return State(
-        key=key,
-        env_keys=jax.random.split(key, 5),
-        params={"dense": {"kernel": kernel, "half": kernel.astype(jnp.bfloat16)}},
-        moments=(jnp.uint8(seed), None, kernel > 0),
+        key=root_key,
+        env_keys=jax.random.split(root_key, 5),
+        params={"dense": {"kernel": dense_kernel, "half": dense_kernel.astype(jnp.bfloat16)}},
+        moments=(jnp.uint8(seed), None, dense_kernel > 0),
         step=jnp.int32(seed),
     )
 
@@ -51,97 +51,110 @@ def as_data(state: State) -> State:
     return state.replace(key=jax.random.key_data(state.key), env_keys=jax.random.key_data(state.env_keys))
 
 
-def restored(run_dir: Path, abstract: Any = ABSTRACT, manifest: Mapping[str, Any] = MANIFEST) -> tuple[Any, int]:
-    """Return the latest state and its step, which must exist."""
-    result = checkpoint.restore_checkpoint(run_dir, abstract, manifest)
-    assert result is not None
-    assert result.damaged == ()
-    return result.state, result.step
+def restore_latest(
+    run_dir: Path, abstract_state: Any = ABSTRACT, manifest: Mapping[str, Any] = MANIFEST
+) -> tuple[Any, int]:
+    """Return the latest state and its step; fail without an undamaged checkpoint."""
+    restore_result = checkpoint.restore_checkpoint(run_dir, abstract_state, manifest)
+    assert restore_result is not None
+    assert restore_result.damaged == ()
+    return restore_result.state, restore_result.step
 
 
-def test_state_round_trips_with_types_keys_and_step(tmp_path):
-    state = make_state(7)
-    assert not np.array_equal(state.params["dense"]["kernel"], make_state(8).params["dense"]["kernel"])
-    checkpoint.save_checkpoint(tmp_path, 3, state, MANIFEST)
-    loaded, step = restored(tmp_path)
-    assert step == 3
-    assert jax.tree.structure(loaded) == jax.tree.structure(state)
-    chex.assert_trees_all_equal(as_data(loaded), as_data(state), strict=True)
+def test_checkpoint_restores_state_types_keys_and_step(tmp_path):
+    saved_state = make_state(7)
+    assert not np.array_equal(saved_state.params["dense"]["kernel"], make_state(8).params["dense"]["kernel"])
+    checkpoint.save_checkpoint(tmp_path, 3, saved_state, MANIFEST)
+    loaded_state, restored_step = restore_latest(tmp_path)
+    assert restored_step == 3
+    assert jax.tree.structure(loaded_state) == jax.tree.structure(saved_state)
+    chex.assert_trees_all_equal(as_data(loaded_state), as_data(saved_state), strict=True)
     # The restored key is a live key: it draws what the saved one draws.
-    assert jax.random.uniform(loaded.key) == jax.random.uniform(state.key)
+    assert jax.random.uniform(loaded_state.key) == jax.random.uniform(saved_state.key)
 
 
-def test_nothing_saved_restores_nothing(tmp_path):
+def test_restore_returns_none_without_checkpoints(tmp_path):
     assert checkpoint.restore_checkpoint(tmp_path / "none", ABSTRACT, MANIFEST) is None
     (tmp_path / "checkpoints").mkdir()
     assert checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST) is None
     assert not (tmp_path / "none").exists()
 
 
-def test_the_latest_two_steps_are_kept(tmp_path, monkeypatch):
+def test_checkpoints_keep_the_latest_two_steps(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_dir = Path("run")  # Orbax itself refuses relative paths
-    for step in (1, 5, 10):
-        checkpoint.save_checkpoint(run_dir, step, make_state(step), MANIFEST)
-    assert sorted(p.name for p in (run_dir / "checkpoints").iterdir()) == ["10", "5"]
-    loaded, step = restored(run_dir)
-    assert (step, loaded.step) == (10, 10)
+    for saved_step in (1, 5, 10):
+        checkpoint.save_checkpoint(run_dir, saved_step, make_state(saved_step), MANIFEST)
+    assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["10", "5"]
+    loaded_state, restored_step = restore_latest(run_dir)
+    assert (restored_step, loaded_state.step) == (10, 10)
 
 
-@pytest.mark.parametrize("step", [4, 5])
-def test_a_step_cannot_be_saved_twice_or_backwards(tmp_path, step):
+@pytest.mark.parametrize("saved_step", [4, 5])
+def test_checkpoint_refuses_a_step_that_is_not_newer(tmp_path, saved_step):
     checkpoint.save_checkpoint(tmp_path, 5, make_state(5), MANIFEST)
-    with pytest.raises(InputError, match="holds step 5 already"):
-        checkpoint.save_checkpoint(tmp_path, step, make_state(step), MANIFEST)
-    assert restored(tmp_path)[1] == 5
+    with pytest.raises(InputError, match="step 5"):
+        checkpoint.save_checkpoint(tmp_path, saved_step, make_state(saved_step), MANIFEST)
+    assert restore_latest(tmp_path)[1] == 5
 
 
-def test_another_config_is_refused_with_keys_and_values(tmp_path):
+def test_restore_refuses_another_config_naming_keys_and_values(tmp_path):
     checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
-    other = make_manifest({"env": {"num_envs": 16, "view": (11, 11), "limit": 5}, "name": "run"})
+    other_manifest = make_manifest({"env": {"num_envs": 16, "view": (11, 11), "limit": 5}, "name": "run"})
     with pytest.raises(InputError) as error:
-        checkpoint.restore_checkpoint(tmp_path, ABSTRACT, other)
-    assert "env.limit: (absent) != 5; env.num_envs: 8 != 16;" in str(error.value)
+        checkpoint.restore_checkpoint(tmp_path, ABSTRACT, other_manifest)
+    assert "env.limit: (absent) != 5" in str(error.value)
+    assert "env.num_envs: 8 != 16" in str(error.value)
     assert "env.view" not in str(error.value)
 
 
-def test_another_format_version_is_refused(tmp_path):
+def test_restore_refuses_another_format_version(tmp_path):
     checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST | {"format_version": 99})
-    with pytest.raises(InputError, match=f"has format version 99, this code reads version {CHECKPOINT_FORMAT_VERSION}"):
+    with pytest.raises(InputError, match=f"version 99.*version {CHECKPOINT_FORMAT_VERSION}"):
         checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST)
 
 
-def test_other_package_versions_are_allowed(tmp_path):
+def test_restore_accepts_other_package_versions(tmp_path):
     checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST | {"versions": {"jax": "0.0.1"}})
-    assert restored(tmp_path)[1] == 1
+    assert restore_latest(tmp_path)[1] == 1
 
 
 @pytest.mark.parametrize(
-    ("change", "difference"),
+    ("change_state", "difference"),
     [
-        (lambda s: s.replace(step=jnp.float32(0)), ".step: 'int32[]' != 'float32[]'"),  # Orbax would cast it
-        (lambda s: s.replace(params={"dense": jnp.ones((3, 5))}), ".params['dense']: (absent) != 'float32[3,5]'"),
-        (lambda s: s.replace(env_keys=s.env_keys[:2]), ".env_keys: 'key<fry>[5]' != 'key<fry>[2]'"),
-        (lambda s: s.replace(moments=s.moments[:2]), ".moments[2]: 'bool[3,4]' != (absent)"),
+        # Orbax would cast this one.
+        (lambda saved_state: saved_state.replace(step=jnp.float32(0)), ".step: 'int32[]' != 'float32[]'"),
+        (
+            lambda saved_state: saved_state.replace(params={"dense": jnp.ones((3, 5))}),
+            ".params['dense']: (absent) != 'float32[3,5]'",
+        ),
+        (
+            lambda saved_state: saved_state.replace(env_keys=saved_state.env_keys[:2]),
+            ".env_keys: 'key<fry>[5]' != 'key<fry>[2]'",
+        ),
+        (
+            lambda saved_state: saved_state.replace(moments=saved_state.moments[:2]),
+            ".moments[2]: 'bool[3,4]' != (absent)",
+        ),
     ],
 )
-def test_another_state_is_refused_with_its_leaves(tmp_path, change, difference):
+def test_restore_refuses_another_state_structure_naming_leaves(tmp_path, change_state, difference):
     checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
-    abstract = jax.eval_shape(lambda: change(make_state(1)))
+    abstract_state = jax.eval_shape(lambda: change_state(make_state(1)))
     with pytest.raises(InputError) as error:
-        checkpoint.restore_checkpoint(tmp_path, abstract, MANIFEST)
+        checkpoint.restore_checkpoint(tmp_path, abstract_state, MANIFEST)
     assert difference in str(error.value)
 
 
-@pytest.mark.parametrize("leaf", [3, 0.5, np.zeros(2), jnp.zeros((0, 2))])
-def test_leaves_that_could_not_be_restored_are_not_saved(tmp_path, leaf):
-    with pytest.raises(TypeError, match=r"state\.step is .*non-empty jax.Array"):
-        checkpoint.save_checkpoint(tmp_path, 1, make_state(1).replace(step=leaf), MANIFEST)
+@pytest.mark.parametrize("invalid_leaf", [3, 0.5, np.zeros(2), jnp.zeros((0, 2))])
+def test_checkpoint_refuses_leaves_it_could_not_restore(tmp_path, invalid_leaf):
+    with pytest.raises(TypeError, match=r"state\.step .*non-empty jax.Array"):
+        checkpoint.save_checkpoint(tmp_path, 1, make_state(1).replace(step=invalid_leaf), MANIFEST)
     assert checkpoint.restore_checkpoint(tmp_path, ABSTRACT, MANIFEST) is None
 
 
 @pytest.mark.parametrize("error", [MemoryError("full"), TypeError("a bug")])
-def test_what_is_no_damage_is_not_reported_as_such(tmp_path, monkeypatch, error):
+def test_restore_does_not_report_other_errors_as_damage(tmp_path, monkeypatch, error):
     checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
 
     def fail(*args, **kwargs):
@@ -153,17 +166,17 @@ def test_what_is_no_damage_is_not_reported_as_such(tmp_path, monkeypatch, error)
     assert not isinstance(raised.value, InputError)
 
 
-def test_unfinished_commits_are_ignored_and_cleared(tmp_path):
+def test_unfinished_commits_are_ignored_and_removed_by_the_next_save(tmp_path):
     checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
-    unfinished = tmp_path / "checkpoints" / "2.orbax-checkpoint-tmp"
-    (unfinished / "state").mkdir(parents=True)
-    assert restored(tmp_path)[1] == 1
+    unfinished_dir = tmp_path / "checkpoints" / "2.orbax-checkpoint-tmp"
+    (unfinished_dir / "state").mkdir(parents=True)
+    assert restore_latest(tmp_path)[1] == 1
     checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
-    assert not unfinished.exists()
-    assert restored(tmp_path)[1] == 2
+    assert not unfinished_dir.exists()
+    assert restore_latest(tmp_path)[1] == 2
 
 
-# Saves step after step, each with arrays that only this step has, and says when a step is safe.
+# Program that saves step after step, each with arrays of its own, and prints a step as soon as it is safe.
 ENDLESS_SAVES = """
 import sys
 from pathlib import Path
@@ -178,22 +191,28 @@ for step in range(1, 10**6):
 
 
 @pytest.mark.parametrize(
-    "delay", [0.0, *(pytest.param(seconds, marks=pytest.mark.slow) for seconds in (0.01, 0.03, 0.1))]
+    "kill_delay", [0.0, *(pytest.param(seconds, marks=pytest.mark.slow) for seconds in (0.01, 0.03, 0.1))]
 )
-def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path, delay):
+def test_kill_during_save_leaves_a_whole_checkpoint(tmp_path, kill_delay):
     command = [sys.executable, "-c", ENDLESS_SAVES, str(tmp_path)]
+
+    # Kill the process at a chosen moment of a save.
     with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:
         # From step 3 on a save also removes an older step. Wait until its commit is being written, then a little more.
         while not list(tmp_path.glob("checkpoints/[3-9].orbax-checkpoint-tmp")):
             assert process.poll() is None
             time.sleep(0.001)
-        time.sleep(delay)
+        time.sleep(kill_delay)
         process.send_signal(signal.SIGKILL)
-        safe = [int(line) for line in process.stdout or []]
+        reported_steps = [int(line) for line in process.stdout or []]
     assert process.returncode == -signal.SIGKILL
-    abstract = {"bits": jax.ShapeDtypeStruct((1024, 1024), jnp.uint32)}
-    state, step = restored(tmp_path, abstract, make_manifest({}))
-    assert step >= safe[-1] >= 2  # what was said to be safe is there; a commit just before the kill may be too
-    chex.assert_trees_all_equal(state, {"bits": jax.random.bits(jax.random.key(step), (1024, 1024))})
-    checkpoint.save_checkpoint(tmp_path, step + 1, state, make_manifest({}))  # and the run goes on
-    assert restored(tmp_path, abstract, make_manifest({}))[1] == step + 1
+
+    # The latest checkpoint is whole, and no older than the last one that was reported.
+    abstract_state = {"bits": jax.ShapeDtypeStruct((1024, 1024), jnp.uint32)}
+    restored_state, restored_step = restore_latest(tmp_path, abstract_state, make_manifest({}))
+    assert restored_step >= reported_steps[-1] >= 2  # a commit just before the kill may be missing from the report
+    chex.assert_trees_all_equal(restored_state, {"bits": jax.random.bits(jax.random.key(restored_step), (1024, 1024))})
+
+    # The run continues with the next step.
+    checkpoint.save_checkpoint(tmp_path, restored_step + 1, restored_state, make_manifest({}))
+    assert restore_latest(tmp_path, abstract_state, make_manifest({}))[1] == restored_step + 1

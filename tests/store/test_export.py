@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+from support.commands import contents
 
 from jaxnav.errors import InputError
 from jaxnav.store.export import POLICY_FORMAT_VERSION, export_params, load_params
@@ -20,91 +21,113 @@ PARAMS = {"torso": {"dense": {"kernel": np.arange(6, dtype=np.float32).reshape(2
 SPEC = {"method": "vtnet", "hidden": 8}
 
 
-def test_params_round_trip_and_read_with_safetensors_alone(tmp_path):
+def test_exported_params_round_trip_and_load_with_safetensors_alone(tmp_path):
     export_params(tmp_path / "policy", jax.tree.map(jnp.asarray, PARAMS), SPEC)
-    params, spec = load_params(tmp_path / "policy")
-    assert spec == SPEC
-    chex.assert_trees_all_equal(params, PARAMS, strict=True)
-    flat = safetensors.numpy.load_file(tmp_path / "policy" / "params.safetensors")
-    assert sorted(flat) == ["scale", "torso/dense/kernel"]
-    export_params(tmp_path / "again", PARAMS, SPEC)  # not contiguous: the transposed kernel keeps its order
+
+    # Parameters, specification and types are the same.
+    loaded_params, loaded_spec = load_params(tmp_path / "policy")
+    assert loaded_spec == SPEC
+    chex.assert_trees_all_equal(loaded_params, PARAMS, strict=True)
+
+    # The file is readable without jaxnav.
+    flat_params = safetensors.numpy.load_file(tmp_path / "policy" / "params.safetensors")
+    assert sorted(flat_params) == ["scale", "torso/dense/kernel"]
+
+    # An array that is not contiguous, the transposed kernel, keeps its order.
+    export_params(tmp_path / "again", PARAMS, SPEC)
     chex.assert_trees_all_equal(load_params(tmp_path / "again")[0], PARAMS)
 
 
-def test_an_export_stays_is_mended_and_is_not_replaced_by_another(tmp_path):
+@pytest.mark.parametrize(
+    ("other_params", "other_spec"), [({"scale": np.float32(3)}, SPEC), (PARAMS, {"method": "org"})]
+)
+def test_export_refuses_to_replace_another_policy(tmp_path, other_params, other_spec):
     export_params(tmp_path, PARAMS, SPEC)
-    written = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert sorted(written) == ["params.safetensors", "policy.json"]
-    for params, spec in (({"scale": np.float32(3)}, SPEC), (PARAMS, {"method": "org"})):
-        with pytest.raises(InputError, match="holds another policy than would be exported"):
-            export_params(tmp_path, params, spec)
-    for name in written:
-        (tmp_path / name).write_bytes(b"damaged")
-        export_params(tmp_path, PARAMS, SPEC)
-        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == written
+    exported_files = contents(tmp_path)
+    with pytest.raises(InputError, match="another policy"):
+        export_params(tmp_path, other_params, other_spec)
+    assert contents(tmp_path) == exported_files
 
 
-def test_reading_an_export_needs_no_jax(tmp_path):
+@pytest.mark.parametrize("file_name", ["params.safetensors", "policy.json"])
+def test_export_repairs_a_damaged_file(tmp_path, file_name):
     export_params(tmp_path, PARAMS, SPEC)
-    script = (
+    exported_files = contents(tmp_path)
+    assert sorted(exported_files) == ["params.safetensors", "policy.json"]
+    (tmp_path / file_name).write_bytes(b"damaged")
+    export_params(tmp_path, PARAMS, SPEC)
+    assert contents(tmp_path) == exported_files
+
+
+def test_load_params_imports_no_jax(tmp_path):
+    export_params(tmp_path, PARAMS, SPEC)
+    reading_script = (
         "import sys; from pathlib import Path; from jaxnav.store.export import load_params\n"
         "params, spec = load_params(Path(sys.argv[1])); print(spec['method'], float(params['scale']))\n"
         "print(sorted({'jax', 'flax', 'orbax'} & set(sys.modules)))"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path)], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    finished_process = subprocess.run(
+        [sys.executable, "-c", reading_script, str(tmp_path)],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert run.stdout == "vtnet 2.0\n[]\n"
+    assert finished_process.stdout == "vtnet 2.0\n[]\n"
 
 
-@pytest.mark.parametrize("name", [0, "a/b"])
-def test_ambiguous_parameter_names_are_refused(tmp_path, name):
-    with pytest.raises(TypeError, match="must be a string without '/'"):
-        export_params(tmp_path, {"layers": {name: np.zeros(1)}}, SPEC)
+@pytest.mark.parametrize("parameter_name", [0, "a/b"])
+def test_export_refuses_ambiguous_parameter_names(tmp_path, parameter_name):
+    with pytest.raises(TypeError, match="string without '/'"):
+        export_params(tmp_path, {"layers": {parameter_name: np.zeros(1)}}, SPEC)
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "problem"),
+    ("file_name", "file_content", "expected_message"),
     [
-        ("policy.json", None, "not an exported policy"),
-        ("params.safetensors", None, "not an exported policy"),
+        ("policy.json", None, "exported policy"),
+        ("params.safetensors", None, "exported policy"),
         ("policy.json", b"{", "policy.json: not JSON"),
         ("policy.json", b"[]", "policy.json: lacks"),
-        ("policy.json", b'{"format_version": 9, "params_sha256": "", "spec": {}}', "has format version 9"),
-        ("params.safetensors", b"", "params.safetensors: does not belong to policy.json or is damaged"),
+        ("policy.json", b'{"format_version": 9, "params_sha256": "", "spec": {}}', "version 9"),
+        ("params.safetensors", b"", "params.safetensors: .*damaged"),
     ],
 )
-def test_broken_exports_are_refused(tmp_path, file, content, problem):
+def test_load_params_refuses_broken_exports(tmp_path, file_name, file_content, expected_message):
     export_params(tmp_path, PARAMS, SPEC)
-    (tmp_path / file).unlink()
-    if content is not None:
-        (tmp_path / file).write_bytes(content)
-    with pytest.raises(InputError, match=problem):
+    (tmp_path / file_name).unlink()
+    if file_content is not None:
+        (tmp_path / file_name).write_bytes(file_content)
+    with pytest.raises(InputError, match=expected_message):
         load_params(tmp_path)
 
 
-def test_an_export_killed_between_its_files_is_refused_not_mixed(tmp_path, monkeypatch):
+def test_load_params_refuses_files_of_two_exports(tmp_path, monkeypatch):
     export_params(tmp_path, PARAMS, SPEC)
     (tmp_path / "params.safetensors").write_bytes(b"damaged")  # or it would not be replaced
-    replace = os.replace
+    original_replace = os.replace
 
-    def killed_at_policy(source, target):
-        if Path(target).name == "policy.json":
+    def killed_at_policy(source_path, target_path):
+        if Path(target_path).name == "policy.json":
             raise KeyboardInterrupt
-        replace(source, target)
+        original_replace(source_path, target_path)
 
     monkeypatch.setattr(os, "replace", killed_at_policy)
+
+    # The parameters are replaced, but not the file that holds their digest.
     with pytest.raises(KeyboardInterrupt):
         export_params(tmp_path, {"scale": np.float32(3)}, SPEC)
-    with pytest.raises(InputError, match="does not belong"):
+    with pytest.raises(InputError, match=r"params\.safetensors"):
         load_params(tmp_path)
 
 
-def test_an_export_of_another_format_version_is_not_overwritten(tmp_path):
+def test_export_does_not_overwrite_another_format_version(tmp_path):
     export_params(tmp_path, PARAMS, SPEC)
-    policy = tmp_path / "policy.json"
-    policy.write_text(policy.read_text().replace(f'"format_version": {POLICY_FORMAT_VERSION}', '"format_version": 9'))
-    before = policy.read_bytes()
-    with pytest.raises(InputError, match="has format version 9, this code reads"):
+    policy_file = tmp_path / "policy.json"
+    policy_file.write_text(
+        policy_file.read_text().replace(f'"format_version": {POLICY_FORMAT_VERSION}', '"format_version": 9')
+    )
+    content_before = policy_file.read_bytes()
+    with pytest.raises(InputError, match=f"version 9.*version {POLICY_FORMAT_VERSION}"):
         export_params(tmp_path, PARAMS, SPEC)
-    assert policy.read_bytes() == before
+    assert policy_file.read_bytes() == content_before
