@@ -1,0 +1,153 @@
+"""The study command: its options, what it refuses, and what it prints of a finished run."""
+
+import pytest
+from support.commands import contents, refusal
+from support.drawn_run import draw_run, tiny_config
+
+from jaxnav import __main__ as commands
+from jaxnav.experiments.config import EXPERIMENTS
+from jaxnav.runs.run import Run
+
+#: An experiment that needs no policies: frontier search.
+EXPERIMENT = r"""
+title: "Search \e[31m in red"
+pages: {PAGE: TEMPLATE}
+measure: {frontier: [main]}
+shifts: [0.0]
+episodes: 8
+"""
+TEMPLATE = """# {{ config.title }}
+
+{{ summary }}
+
+{% for row in table.rows %}
+{{ line(row.run, row.metric, row.value.mean | f(".2f")) }}
+{% endfor %}
+"""
+
+
+@pytest.fixture(scope="module")
+def drawn_run(tmp_path_factory) -> Run:
+    return draw_run(tiny_config(tmp_path_factory.mktemp("runs")))
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    """A small experiment with a template of its own, and all its files below a folder."""
+    template = tmp_path / "template.md"
+    template.write_text(TEMPLATE)
+    path = tmp_path / "experiment.yaml"
+    path.write_text(EXPERIMENT.replace("PAGE", str(tmp_path / "page.md")).replace("TEMPLATE", str(template)))
+    return path
+
+
+def study(*options) -> int:
+    return commands.main(["study", *map(str, options)])
+
+
+# Help and refusals
+
+
+def test_help_lists_experiments_and_settings(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        study("--help")
+    words = capsys.readouterr().out.replace(",", " ").split()
+    assert {*EXPERIMENTS, "--run", "--without", "--split", "--episodes"} <= set(words)
+
+
+def test_unknown_experiments_are_refused_with_the_known_ones(capsys):
+    assert study("studdy") == 2
+    error = refusal(capsys)
+    for name in ("studdy", *EXPERIMENTS):
+        assert name in error
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--shifts", "1", "0"], "shifts"),
+        (["--epsilon", "-1"], "epsilon"),
+        (["--episodes", "0"], "episodes"),
+        (["--only", "nothing"], "only"),
+        (["--base.seeds", "0"], "seeds"),
+        (["--base.devices", "cluster"], "devices"),
+        (["--worlds", "{a/b: {}}"], "a/b"),
+        (["--agents", "{main: {sedes: 1}}"], "agents.main"),
+        (["--agents", "{main: {against: [plane]}}"], "plane"),
+        (["--measure", "{trails: ['*']}"], "trails"),
+        (["--measure", "{mixture: ['*']}"], "shifts"),
+        (["--pages", "{page.md: no_such_page}"], "no_such_page"),
+        (["--run", "nowhere"], "nowhere"),
+        (["--without", "nowhere"], "without"),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line_and_write_nothing(
+    experiment, tmp_path, monkeypatch, capsys, options, named
+):
+    monkeypatch.chdir(tmp_path)
+    before = contents(tmp_path)
+    assert study(experiment, *options) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    (error,) = output.err.splitlines()
+    assert error.startswith("error: ")
+    assert named in error
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(("option", "value"), [("--split", "all"), ("--worlds", "[1"), ("--agents", "{near: 1}")])
+def test_options_of_another_kind_are_refused_by_name(experiment, capsys, option, value):
+    with pytest.raises(SystemExit, match="2"):
+        study(experiment, option, value)
+    assert option in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [("shifts: [0.0", "line"), ("shfits: [0.0]", "shfits"), ("shifts: 0.0", "shifts"), ("agents: {a: 1}", "agents")],
+)
+def test_bad_files_are_refused_by_file_and_key(tmp_path, capsys, text, named):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    assert study(path) == 2
+    error = refusal(capsys)
+    assert str(path) in error
+    assert named in error
+
+
+@pytest.mark.parametrize("name", ["account", "mixture", "instrument", "compare"])
+def test_former_commands_name_the_experiment_that_replaces_them(capsys, name):
+    assert commands.main([name, "run"]) == 2
+    error = refusal(capsys)
+    replacement = error.partition("jaxnav study ")[2].split()[0]
+    assert replacement in EXPERIMENTS
+    assert name == "compare" or replacement == name
+
+
+# Finished runs
+
+
+def test_results_of_a_finished_run_are_printed_and_kept_with_it(experiment, drawn_run, capsys):
+    run_dir = drawn_run.config.run_dir
+    assert study(experiment, "--run", run_dir) == 0
+    printed = capsys.readouterr().out
+    # Control characters of a title would change the terminal.
+    assert "# Search \\x1b[31m in red" in printed
+    assert "| frontier | sr | " in printed
+    assert (run_dir / "page.md").exists()
+    assert [path.stem for path in (run_dir / "results" / "val").iterdir()] == ["rooms-main-frontier"]
+
+
+@pytest.mark.slow
+def test_the_account_of_a_finished_run_is_its_lead_over_another(drawn_run, capsys):
+    # The run itself stands in for agents without experience, so that its baseline has no lead.
+    run_dir = drawn_run.config.run_dir
+    assert study("account", "--run", run_dir, "--without", run_dir, "--episodes", 24) == 0
+    printed = capsys.readouterr().out
+    assert printed.strip() == (run_dir / "account.md").read_text().strip()
+    for shift in (0, 1):
+        section = printed.partition(f"Shift {shift}:")[2]
+        (baseline,) = [
+            line for line in section.partition("Shift")[0].splitlines() if line.startswith("| `main` | best")
+        ]
+        assert baseline.count("+0.0") >= 4
