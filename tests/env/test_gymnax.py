@@ -15,105 +15,124 @@ import jaxnav
 from jaxnav.scenes.task import DONE
 
 wrappers = pytest.importorskip("gymnax.wrappers")
-flat = pytest.importorskip("jaxnav.env.gymnax")
+jaxnav_gymnax = pytest.importorskip("jaxnav.env.gymnax")
 
 KEY = jax.random.key(0)
 
 
 @pytest.fixture(autouse=True)
-def usual_promotion():
-    """That of users: gymnax's and rejax's own arithmetic needs it."""
+def user_promotion():
+    """The promotion rules of users: the arithmetic of gymnax and rejax needs them."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
 @pytest.fixture(scope="module")
-def made():
-    return flat.make("rooms", split="val")
+def flat_env():
+    """The environment and its parameters."""
+    return jaxnav_gymnax.make("rooms", split="val")
 
 
-def test_an_observation_holds_what_the_row_does(made):
-    env, params = made
-    plain, _ = jaxnav.make("rooms", split="val")
-    keys = jax.random.split(KEY, 64)
-    observations, state = jax.vmap(env.reset, (0, None))(keys, params)
-    seen, same = jax.vmap(plain.reset, (0, None))(keys, params)
-    np.testing.assert_array_equal(state.pose, same.pose)
-    space, count = env.observation_space(params), len(env.categories)
-    assert observations.shape == (64, *space.shape) == (64, 5 * count + 2 * 121)
-    assert observations.dtype == space.dtype == jnp.float32
-    assert jax.vmap(space.contains)(observations).all()
-    table = np.asarray(observations[:, : 4 * count]).reshape(64, count, 4)
-    row = np.asarray(plain.row_format.detections(seen.row), np.float64)
-    is_detected = row[..., 0] > 0
-    expected = (row - [0, 0, 128, 0]) / [255, 51, 25.4, 127.5] * is_detected[..., None]
-    np.testing.assert_allclose(table, expected, rtol=1e-5, atol=1e-6)
+def test_flat_observation_holds_the_entries_of_the_row(flat_env):
+    env, params = flat_env
+    row_env, _ = jaxnav.make("rooms", split="val")
+    num_episodes = 64
+    num_categories = len(env.categories)
+
+    # Both environments start the same episodes.
+    keys = jax.random.split(KEY, num_episodes)
+    flat_observations, state = jax.vmap(env.reset, (0, None))(keys, params)
+    row_observations, row_state = jax.vmap(row_env.reset, (0, None))(keys, params)
+    np.testing.assert_array_equal(state.pose, row_state.pose)
+
+    # Shape, type and bounds are those of the space: four numbers and a goal of each category, two masks of 11 x 11.
+    space = env.observation_space(params)
+    assert flat_observations.shape == (num_episodes, *space.shape) == (num_episodes, 5 * num_categories + 2 * 121)
+    assert flat_observations.dtype == space.dtype == jnp.float32
+    assert jax.vmap(space.contains)(flat_observations).all()
+
+    # Detections in units: confidence of 255, 51 bytes a metre ahead, 25.4 to the right around 128, size of 127.5.
+    detection_bytes = np.asarray(row_env.row_format.detections(row_observations.row), np.float64)
+    is_detected = detection_bytes[..., 0] > 0
+    expected_detections = (detection_bytes - [0, 0, 128, 0]) / [255, 51, 25.4, 127.5] * is_detected[..., None]
+    detections = np.asarray(flat_observations[:, : 4 * num_categories]).reshape(num_episodes, num_categories, 4)
+    np.testing.assert_allclose(detections, expected_detections, rtol=1e-5, atol=1e-6)
     assert is_detected.any()
-    np.testing.assert_array_equal(observations[:, 4 * count : 5 * count].argmax(axis=1), seen.goal)
-    free, blocked = np.split(np.asarray(observations[:, 5 * count :]), 2, axis=1)
-    np.testing.assert_array_equal(free + 2 * blocked, plain.row_format.view_cells(seen.row))
+
+    # The goal, then the masks of free and blocked cells.
+    one_hot_goals = flat_observations[:, 4 * num_categories : 5 * num_categories]
+    np.testing.assert_array_equal(one_hot_goals.argmax(axis=1), row_observations.goal)
+    free_mask, blocked_mask = np.split(np.asarray(flat_observations[:, 5 * num_categories :]), 2, axis=1)
+    np.testing.assert_array_equal(free_mask + 2 * blocked_mask, row_env.row_format.view_cells(row_observations.row))
 
 
-def test_the_log_wrapper_counts_returns(made):
-    """Two turns at -0.01 and a wrong or right Done: its own reward more, in three steps."""
-    env, params = wrappers.LogWrapper(made[0]), made[1]
+def test_log_wrapper_counts_returns_and_lengths(flat_env):
+    """Two turns and a Done: three steps, and the sum of their rewards."""
+    env = wrappers.LogWrapper(flat_env[0])
+    params = flat_env[1]
     _, state = env.reset(KEY, params)
-    total = 0.0
+    total_reward = 0.0
     for action in (1, 2, DONE):
         _, state, reward, terminated, truncated, info = env.step(KEY, state, jnp.int32(action), params)
-        total += float(reward)
+        total_reward += float(reward)
     assert (bool(terminated), bool(truncated), bool(info["returned_episode"])) == (True, False, True)
     assert int(info["returned_episode_lengths"]) == 3
-    assert float(info["returned_episode_returns"]) == pytest.approx(total)
+    assert float(info["returned_episode_returns"]) == pytest.approx(total_reward)
 
 
-def test_the_sticky_wrapper_replays_actions(made):
-    env, params = wrappers.StickyActionWrapper(made[0], 1.0), made[1]
+def test_sticky_action_wrapper_replays_the_last_action(flat_env):
+    env = wrappers.StickyActionWrapper(flat_env[0], 1.0)
+    params = flat_env[1]
     _, state = env.reset(KEY, params)
-    before = state.env_state.pose
-    _, state, *_, info = env.step(KEY, state, jnp.int32(DONE), params)  # the first action is MoveAhead, always
+    first_pose = state.env_state.pose
+
+    # With probability 1 the last action is repeated, which before the first step is MoveAhead.
+    _, state, *_, info = env.step(KEY, state, jnp.int32(DONE), params)
     assert int(info["length"]) == 1
-    assert int(state.env_state.pose) == int(made[0].next_pose(before, jnp.int32(0), params))
+    assert int(state.env_state.pose) == int(flat_env[0].next_pose(first_pose, jnp.int32(0), params))
 
 
-def test_the_flatten_wrapper_has_nothing_to_do(made):
-    env, params = wrappers.FlattenObservationWrapper(made[0]), made[1]
+def test_flatten_wrapper_changes_nothing(flat_env):
+    env = wrappers.FlattenObservationWrapper(flat_env[0])
+    params = flat_env[1]
     observation, state = env.reset(KEY, params)
     assert env.observation_space(params).shape == observation.shape
     *_, info = env.step(KEY, state, jnp.int32(1), params)
     assert info["final_observation"].shape == observation.shape
 
 
-def test_the_legacy_wrapper_gives_five_values(made):
-    env, params = wrappers.LegacyStepAPIWrapper(made[0]), made[1]
+def test_legacy_step_wrapper_gives_five_values(flat_env):
+    env = wrappers.LegacyStepAPIWrapper(flat_env[0])
+    params = flat_env[1]
     _, state = env.reset(KEY, params)
     _, _, _, done, info = env.step(KEY, state, jnp.int32(DONE), params)
     assert bool(done)
     assert int(info["length"]) == 1
 
 
-def test_gymnax_makes_it_an_environment_of_gymnasium(made):
-    env = wrappers.GymnaxToGymWrapper(made[0], params=made[1])
+def test_gymnax_to_gym_wrapper_makes_a_gymnasium_environment(flat_env):
+    env = wrappers.GymnaxToGymWrapper(flat_env[0], params=flat_env[1])
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(np.asarray(observation))
     _, _, terminated, truncated, _ = env.step(DONE)
     assert (bool(terminated), bool(truncated)) == (True, False)
 
 
-class Adapter(wrappers.LegacyStepAPIWrapper):
-    """gymnax's adapter, which rejax copies, and which cannot be copied without end of recursion."""
+class RejaxAdapter(wrappers.LegacyStepAPIWrapper):
+    """gymnax's adapter; rejax copies it deeply, which without this method recurses without end."""
 
     def __deepcopy__(self, memo):
         return self
 
 
 @pytest.mark.slow
-def test_rejax_learns_on_it(made):
-    """PPO beats the same policy untrained, on the return of 128 episodes: 1.5 to 0.5; shortest paths give about 5."""
-    rejax, evaluate = pytest.importorskip("rejax"), pytest.importorskip("rejax.evaluate").evaluate
-    env, params = made
+def test_rejax_ppo_improves_on_the_untrained_policy(flat_env):
+    """Mean returns of 128 episodes: about 1.5 against 0.5 untrained; shortest paths give about 5."""
+    rejax = pytest.importorskip("rejax")
+    evaluate = pytest.importorskip("rejax.evaluate").evaluate
+    env, params = flat_env
     trainer = rejax.PPO.create(
-        env=Adapter(env),
+        env=RejaxAdapter(env),
         env_params=params,
         total_timesteps=262_144,
         eval_freq=262_144,
@@ -124,13 +143,15 @@ def test_rejax_learns_on_it(made):
         learning_rate=1e-3,
         ent_coef=0.01,
         skip_initial_evaluation=True,
-    ).replace(eval_callback=lambda *_: jnp.float32(0.0))  # its own asks for `max_steps_in_episode`
+    )
+    # Its own evaluation reads `max_steps_in_episode` of the parameters.
+    trainer = trainer.replace(eval_callback=lambda *_: jnp.float32(0.0))
 
-    def reward(state):
-        act = trainer.make_act(state)
-        return float(evaluate(act, jax.random.key(1), trainer.env, params, 128, 100)[1].mean())
+    def mean_return(train_state):
+        act = trainer.make_act(train_state)
+        _, returns = evaluate(act, jax.random.key(1), trainer.env, params, 128, 100)
+        return float(returns.mean())
 
-    before = reward(jax.jit(trainer.init_state)(KEY))
-    state, _ = jax.jit(trainer.train)(KEY)
-    after = reward(state)
-    assert after > before + 0.5, (before, after)
+    untrained_return = mean_return(jax.jit(trainer.init_state)(KEY))
+    trained_state, _ = jax.jit(trainer.train)(KEY)
+    assert mean_return(trained_state) > untrained_return + 0.5

@@ -15,44 +15,53 @@ from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 #: Scenes of each world, enough that a perfect predictor differs from the detector beyond chance for most goals.
 NUM_SCENES = {"rooms": 12, "apartments": 8, "houses": 4}
-EACH = ["rooms", "houses", pytest.param("apartments", marks=pytest.mark.slow)]
+all_worlds = pytest.mark.parametrize("world", ["rooms", "houses", pytest.param("apartments", marks=pytest.mark.slow)])
 
 
 @functools.cache
-def world(name: str) -> tuple[Bank, ObjectNav, EnvParams]:
-    scenes = make_generated_scenes(name, "train", NUM_SCENES[name])
-    bank = compile_bank([scenes[i] for i in range(len(scenes))], WORLDS[name].task)
-    return bank, *build_environment(bank, {}, 10)
+def build_world(world: str) -> tuple[Bank, ObjectNav, EnvParams]:
+    scenes = make_generated_scenes(world, "train", NUM_SCENES[world])
+    bank = compile_bank([scenes[index] for index in range(len(scenes))], WORLDS[world].task)
+    env, params = build_environment(bank, {}, 10)
+    return bank, env, params
 
 
-@pytest.mark.parametrize("name", EACH)
-def test_no_bit_predicts_success_better_than_the_detection_of_the_goal(name):
-    bank, env, params = world(name)
+@all_worlds
+def test_no_observation_bit_predicts_success_better_than_the_goals_detection(world):
+    bank, env, params = build_world(world)
     leaks = find_leaks(env, params, bank)
     assert not leaks.bits
     assert len(leaks.goals) >= 0.75 * leaks.num_goals
 
 
-@pytest.mark.parametrize("name", EACH)
-def test_success_bits_in_the_rows_are_flagged(name):
-    bank, env, params = world(name)
-    answers = np.packbits(bank.best_length == 1, axis=1, bitorder="little")
-    rows = bank.rows.copy()
-    padding = rows[:, -answers.shape[1] :]
-    assert not padding.any()
-    padding[:] = answers
-    leaky = params.replace(tables=params.tables.replace(rows=jnp.asarray(rows)))
-    leaks = find_leaks(env, leaky, bank)
-    first = 8 * (rows.shape[1] - answers.shape[1])
-    arrays = ("observation.row", "final_observation.row")
-    assert leaks.bits == {(goal, array, first + goal) for goal in leaks.goals for array in arrays}
+@all_worlds
+def test_find_leaks_flags_success_bits_planted_in_the_rows(world):
+    bank, env, params = build_world(world)
+
+    # Bit g of the padding says whether Done would succeed for goal g.
+    success_bits = np.packbits(bank.best_length == 1, axis=1, bitorder="little")
+    num_bytes = success_bits.shape[1]
+    leaky_rows = bank.rows.copy()
+    assert not leaky_rows[:, -num_bytes:].any()
+    leaky_rows[:, -num_bytes:] = success_bits
+    leaky_params = params.replace(tables=params.tables.replace(rows=jnp.asarray(leaky_rows)))
+
+    # The bits are found in both observations of a step, and no other bit is.
+    leaks = find_leaks(env, leaky_params, bank)
+    first_bit = 8 * (leaky_rows.shape[1] - num_bytes)
+    expected_bits = set()
+    for goal in leaks.goals:
+        expected_bits.add((goal, "observation.row", first_bit + goal))
+        expected_bits.add((goal, "final_observation.row", first_bit + goal))
+    assert leaks.bits == expected_bits
     assert len(leaks.goals) >= 0.75 * leaks.num_goals
 
 
-@pytest.mark.parametrize("name", EACH)
-def test_a_reset_shows_what_a_step_shows(name):
-    _, env, params = world(name)
-    shown, states = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 500), params)
-    stepped = jax.vmap(functools.partial(step_into, env), (0, None))(states, params)
-    for observation in stepped.values():
-        jax.tree.map(np.testing.assert_array_equal, observation, shown)
+@all_worlds
+def test_reset_and_step_observe_a_state_alike(world):
+    _, env, params = build_world(world)
+    keys = jax.random.split(jax.random.key(0), 500)
+    reset_observation, states = jax.vmap(env.reset, (0, None))(keys, params)
+    step_observations = jax.vmap(functools.partial(step_into, env), (0, None))(states, params)
+    for observation in step_observations.values():
+        jax.tree.map(np.testing.assert_array_equal, observation, reset_observation)
