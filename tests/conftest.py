@@ -1,6 +1,8 @@
 """Settings of the whole suite: no silent promotion of dtypes or ranks, no cache between runs, reproducible examples."""
 
 import atexit
+import gc
+import importlib.metadata
 import os
 import shutil
 import tempfile
@@ -10,10 +12,13 @@ from pathlib import Path
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # What one test has compiled another need not; nothing is kept from one run to the next.
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxnav-tests-")
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
     # Most of the time goes into compilation, which this makes quicker; the README's commands run as users run them.
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    # XLA ends a process whose flags it does not know, and the flag is no promise of other versions.
+    if "XLA_FLAGS" not in os.environ and importlib.metadata.version("jaxlib").startswith("0.10."):
+        os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"  # a third of the time of compilation
 
 import hypothesis
 import jax
@@ -30,11 +35,11 @@ hypothesis.settings.load_profile("jaxnav")
 
 
 class ByFixtures(LoadScopeScheduling):
-    """Keep together what shares fixtures: the tests of a file, all of `runs` and all of `cli`."""
+    """Keep together what shares fixtures: the tests of a file, all of `runs`, of `cli` and of `experiments`."""
 
     def _split_scope(self, nodeid: str) -> str:
         file, folder = nodeid.partition("::")[0], Path(nodeid.partition("::")[0]).parent
-        return str(folder) if folder.name in ("runs", "cli") else file
+        return str(folder) if folder.name in ("runs", "cli", "experiments") else file
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -52,8 +57,21 @@ def optimised():
     jax.config.update("jax_disable_most_optimizations", before)
 
 
+def pytest_collection_finish() -> None:
+    """Collect garbage seldom: tracing makes many objects that live on."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
+#: A process dies at 65,530 memory maps; at so many its programs hold some three gigabytes.
+MAX_MEMORY_MAPS = 15_000
+
+
 @pytest.fixture(autouse=True, scope="module")
-def programs_of_a_module_are_let_go():
-    """A program holds memory maps; a process dies at 65,530 of them, which the slow tests together reach."""
+def programs_are_let_go_before_there_are_too_many():
+    """Keep compiled programs from module to module while there is room for their memory maps."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MAX_MEMORY_MAPS:
+        jax.clear_caches()

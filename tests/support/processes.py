@@ -33,7 +33,9 @@ def start(address, index, config_file, run_dir, *options, **environment):
     """One of two processes on this machine that train one run."""
     command = ["train.py", "--config", config_file, "--run-dir", run_dir, "--seeds", 1]
     devices = f"--devices={address},{index},2"
-    return run([*command, devices, *options], JAX_COORDINATOR_BIND_ADDRESS=address, XLA_FLAGS="", **environment)
+    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag]
+    environment |= {"JAX_COORDINATOR_BIND_ADDRESS": address, "XLA_FLAGS": " ".join(flags)}
+    return run([*command, devices, *options], **environment)
 
 
 def ends(*processes, timeout=600):

@@ -73,7 +73,7 @@ print(json.dumps(found))
 def trained(*counts):
     """Policies of runs on so many devices each, by their number."""
     path = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])
-    flags = "--xla_force_host_platform_device_count=4"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
     process = run(["-c", AGREEMENT, *counts], PYTHONPATH=path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu")
     output, error = process.communicate(timeout=200)
     assert process.returncode == 0, error

@@ -1,6 +1,8 @@
 """Chunks, seeds side by side and poisoned rewards change nothing that they should not."""
 
 import dataclasses
+import functools
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import chex
@@ -23,18 +25,21 @@ METRICS = {
     "policy_loss", "value_loss", "entropy", "distil_loss", "gradient_norm",
 }  # fmt: skip
 
+#: Equal bits are promised of the programs that users get, see tests/conftest.py.
+AS_FOR_USERS = {"xla_cpu_use_fusion_emitters": True} if "fusion_emitters" in os.environ.get("XLA_FLAGS", "") else None
+
 init = jax.jit(LEARNER.init)
 traces = []
 
 
-@jax.jit
+@functools.partial(jax.jit, compiler_options=AS_FOR_USERS)
 def one_update(states, scalars, params, knowledge):
     """A chunk of one update of several seeds, as in a run."""
     traces.append(1)
     return jax.lax.map(lambda state: LEARNER.train(state, scalars, params, knowledge, 1), states)
 
 
-@jax.jit
+@functools.partial(jax.jit, compiler_options=AS_FOR_USERS)
 def two_updates(state, scalars, params, knowledge):
     """A chunk of two updates of one seed."""
     traces.append(2)
