@@ -133,10 +133,8 @@ def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
     [
         ("org", "streams"),
         *(
-            pytest.param(method, decision, marks=pytest.mark.slow)
+            pytest.param(method, "streams" if method in ("savn", "sp", "vtnet") else "fused", marks=pytest.mark.slow)
             for method in METHODS
-            for decision in ("fused", "streams")
-            if (method, decision) != ("org", "streams")
         ),
     ],
 )

@@ -14,29 +14,47 @@ from jaxnav.errors import InputError
 from jaxnav.policies.methods import find_method
 from jaxnav.runs.train import train, warn_if_rollout_too_short
 
+SMALL_VTNET = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
+SIZES = {"vtnet": SMALL_VTNET, "tpn": {"tentative_width": 8}}
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"])
-def test_a_method_goes_from_training_to_actions(method, tmp_path, monkeypatch):
-    """Two chunks, stopped between them; what is exported decides as the run's policy, from the same knowledge."""
-    config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1)
+
+def config_of(method, folder):
+    """Settings of a run of two chunks of a method, one of each of its stages."""
+    sizes = SIZES.get(method, {})
+    config = dataclasses.replace(tiny_config(folder), method=method, method_sizes=sizes, seeds=1, validations=0)
     worlds = dataclasses.replace(config.worlds, num_train=16)  # among them rooms as large as those of val, for maps
     config = dataclasses.replace(config, arms=("baseline",), worlds=worlds)
     if any(stage.uses_expert for stage in find_method(method).stages):
         config = dataclasses.replace(config, imitation=0.5)  # a chunk for each stage
+    return config
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"])
+def test_a_method_goes_from_training_to_actions(method, tmp_path):
+    """The exported policy is that of the run, with the same knowledge."""
+    run = train(config_of(method, tmp_path / "one"))
+    folder = run.config.run_dir
+    assert main(["export", str(folder), "--policy", "baseline-0", "--out", str(tmp_path / "out")]) == 0
+    exported = jaxnav.load_policy(tmp_path / "out")
+    chex.assert_trees_all_equal(exported, jaxnav.load_policy(folder / "policies" / "baseline-0"))
+    assert bool(exported.knowledge.method) == (find_method(method).learn is not None)
+
+    results = jaxnav.evaluate(run, episodes=8)
+    assert {leaf.shape[-1] for leaf in results.outcome} == {8}
+    assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["savn", "hoz", "semexp"])
+def test_a_method_that_keeps_a_state_in_an_episode_resumes_to_the_same_run(method, tmp_path, monkeypatch):
+    """Fast weights, zones and maps are in the checkpoint; those of several stages are resumed in `test_budget`."""
+    config = config_of(method, tmp_path / "one")
     whole = train(config)
     resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "two"), monkeypatch)
     assert resumed.log() == whole.log()
     runs = [jaxnav.load_policy(run.config.run_dir / "policies" / "baseline-0") for run in (whole, resumed)]
     chex.assert_trees_all_equal(*runs)
-    assert main(["export", str(tmp_path / "two"), "--policy", "baseline-0", "--out", str(tmp_path / "out")]) == 0
-    exported = jaxnav.load_policy(tmp_path / "out")
-    chex.assert_trees_all_equal(exported, runs[0])
-    assert bool(exported.knowledge.method) == (find_method(method).learn is not None)
-
-    results = jaxnav.evaluate(resumed, episodes=8)
-    assert {leaf.shape[-1] for leaf in results.outcome} == {8}
-    assert main(["export", str(tmp_path / "two"), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
 
 
 PRIORS = """
