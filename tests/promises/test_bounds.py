@@ -155,14 +155,14 @@ def test_random_input_never_ends_a_command_otherwise_than_by_code(kind, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_thousand_random_inputs_neither_crash_nor_hang_nor_fill_the_memory(kind):
-    """In a process of their own, whose memory is theirs alone."""
-    process = run(["-m", "support.fuzz", kind, 1000, 1], PYTHONPATH=REPOSITORY / "tests")
+def test_two_hundred_random_inputs_neither_crash_nor_hang_nor_fill_the_memory(kind):
+    """In a process of their own, whose memory is theirs alone; docs/promises.md has the command of more."""
+    process = run(["-m", "support.fuzz", kind, 200, 1], PYTHONPATH=REPOSITORY / "tests")
     output, error = process.communicate()
     assert process.returncode == 0, error[-2000:]
     result = json.loads(output.splitlines()[-1])
     print(kind, result)
     assert {code for code, _ in result["codes"]} <= {0, 2}, result
-    assert sum(number for _, number in result["codes"]) == 1000
+    assert sum(number for _, number in result["codes"]) == 200
     assert result["slowest"] < 10
     assert result["peak"] < 1024
