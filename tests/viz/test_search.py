@@ -1,4 +1,4 @@
-"""The picture of a search shows the agent's own map, and the way that it walks next where nothing new is seen."""
+"""The picture of a search shows the agent's own map, and the way that it walks next while it sees nothing new."""
 
 import dataclasses
 
@@ -32,105 +32,146 @@ from jaxnav.viz.style import GOAL_COLOR
 #: A corridor along z, one cell wide, a book at its north end.
 CORRIDOR = draw([["."]] * 24, ("Book", 0.0, 0.8, 5.75, *SMALL))
 BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))
-KNOWN = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_search_setup([BANK], np.zeros(0))))
+KNOWLEDGE = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_search_setup([BANK], np.zeros(0))))
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("semexp"), method_sizes=())
-SIZE = len(KNOWN.method["lines"])
-STEPS, NORTH = 8, BLOCKS_PER_SIDE * (BLOCKS_PER_SIDE - 1) + BLOCKS_PER_SIDE // 2  # the block at the map's north end
+NUM_LINES = len(KNOWLEDGE.method["lines"])  # of the map, to each side
+NUM_STEPS = 8
+NORTH_BLOCK = BLOCKS_PER_SIDE * (BLOCKS_PER_SIDE - 1) + BLOCKS_PER_SIDE // 2  # at the map's north end
+COLORS = {"near": NEAR_COLOR, "blocked": OBSTACLE_COLOR, "block": BLOCK_COLOR, "goal": GOAL_COLOR}
 
 
 @pytest.fixture(scope="module")
-def walked():
-    """An episode from line 6 on, and the agent's notes at each step."""
+def corridor_walk():
+    """An episode that starts at line 6 and heads north, and the state of the agent's search after each step."""
     env, params = build_environment(BANK, {}, 100)
-    acting = AgentLoop(env, SPEC)
-    start = State(*(jnp.array([number], jnp.int32) for number in (6 * tiny.POSES_PER_CELL, 0, BOOK, 0)))
-    agent, step = jax.jit(acting.start_from)(start, None, KNOWN, params), jax.jit(acting.step)
-    poses, actions, notes = [], [], []
-    act = jax.jit(lambda note: SEMEXP.control.act(jnp.int32(NORTH), note, KNOWN))
-    for _ in range(STEPS):
-        action, note = act(tiny.leaves_at(agent.perception.tracker_state, 0))
+    agent_loop = AgentLoop(env, SPEC)
+    start_step = (6 * tiny.POSES_PER_CELL, 0, BOOK, 0)  # pose, scene, goal and time
+    start_state = State(*(jnp.array([value], jnp.int32) for value in start_step))
+    agent = jax.jit(agent_loop.start_from)(start_state, None, KNOWLEDGE, params)
+    take_step = jax.jit(agent_loop.step)
+    control = jax.jit(lambda tracker_state: SEMEXP.control.act(jnp.int32(NORTH_BLOCK), tracker_state, KNOWLEDGE))
+
+    # Walk: the policy chooses the northern block at every step.
+    poses = []
+    actions = []
+    search_states = []
+    for _ in range(NUM_STEPS):
+        action, search_state = control(tiny.leaves_at(agent.perception.tracker_state, 0))
         poses.append(int(agent.state.pose[0]))
         actions.append(int(action))
-        notes.append(note)
-        agent, _ = step(agent, jnp.array([NORTH], jnp.int32), KNOWN, params)
-    choices = np.repeat(np.eye(BLOCKS_PER_SIDE**2, dtype=np.float32)[NORTH][None], STEPS, axis=0)
-    inferred = InferenceTrace(
-        *map(jnp.asarray, (np.zeros((STEPS, 1)), np.zeros(STEPS), np.zeros(STEPS), *3 * [choices]))
+        search_states.append(search_state)
+        agent, _ = take_step(agent, jnp.array([NORTH_BLOCK], jnp.int32), KNOWLEDGE, params)
+
+    # Package the walk as a played episode; all three policies are certain of the northern block.
+    certain_choice = np.zeros((NUM_STEPS, BLOCKS_PER_SIDE**2), np.float32)
+    certain_choice[:, NORTH_BLOCK] = 1
+    zeros = jnp.zeros(NUM_STEPS)
+    choices = [jnp.asarray(certain_choice)] * 3
+    trace = EpisodeTrace(
+        np.array(poses), np.array(actions), InferenceTrace(zeros[:, None], zeros, zeros, *choices), success=False
     )
-    trace = EpisodeTrace(np.array(poses), np.array(actions), inferred, success=False)
+    places = cell_centres(CORRIDOR, standable_cells(CORRIDOR.reach))
     episode = PlayedEpisode(
         trace=trace,
         scene=CORRIDOR,
-        places=cell_centres(CORRIDOR, standable_cells(CORRIDOR.reach))[trace.pose // tiny.POSES_PER_CELL],
+        places=places[trace.pose // tiny.POSES_PER_CELL],
         rows=BANK.rows[trace.pose],
         task=BANK.task,
         goal=BOOK,
         best_length=1,
         epsilon=np.inf,
         title="test",
-        policies=tiny.untrained(SPEC, KNOWN, BANK.task),
+        policies=tiny.untrained(SPEC, KNOWLEDGE, BANK.task),
     )
-    return episode, notes
+    return episode, search_states
 
 
-def test_the_map_is_that_of_the_agent(walked):
-    episode, notes = walked
-    for shown, expected in zip(take_snapshot(episode, STEPS - 1).search_state, notes[-1], strict=True):
-        np.testing.assert_array_equal(shown, expected)
+def test_snapshot_holds_the_search_state_of_the_agent(corridor_walk):
+    episode, search_states = corridor_walk
+    snapshot = take_snapshot(episode, NUM_STEPS - 1)
+    for snapshot_leaf, agent_leaf in zip(snapshot.search_state, search_states[-1], strict=True):
+        np.testing.assert_array_equal(snapshot_leaf, agent_leaf)
 
 
-def test_the_way_planned_is_walked_where_nothing_new_is_seen(walked):
-    """The floor to the north is open, as the plan takes it to be: a cell a step, but the first, which looks down."""
-    episode, notes = walked
-    places = np.array([note.position for note in notes])
-    np.testing.assert_array_equal(places[:, 0] - places[0, 0], [0, *range(STEPS - 1)])
-    np.testing.assert_array_equal(take_snapshot(episode, 0).predicted_cells[: STEPS - 1], places[1:])
+def test_snapshot_predicts_the_walk_while_nothing_new_is_seen(corridor_walk):
+    """The floor to the north is open, as the plan assumes: a cell a step, except for the first, which looks down."""
+    episode, search_states = corridor_walk
+    positions = np.array([search_state.position for search_state in search_states])
+    np.testing.assert_array_equal(positions[:, 0] - positions[0, 0], [0, *range(NUM_STEPS - 1)])
+    np.testing.assert_array_equal(take_snapshot(episode, 0).predicted_cells[: NUM_STEPS - 1], positions[1:])
 
 
-def test_the_map_lies_over_the_home(walked):
-    """Where the map says visited, there the agent was; by its cells, and by the pixels of its image."""
-    episode, notes = walked
-    projection = MapProjection(episode, take_snapshot(episode, STEPS - 1))
-    np.testing.assert_allclose(
-        projection.to_world(np.array([note.position for note in notes])), episode.places, atol=1e-9
-    )
-    visited = np.argwhere(projection.unroll(np.asarray(notes[-1].cells)) & VISITED_BIT)
-    left_border, _, bottom, top = projection.borders
-    centres = np.array([left_border, bottom]) + (top - bottom) / SIZE * (visited[:, ::-1] + 0.5)
-    np.testing.assert_allclose(centres, np.unique(episode.places, axis=0), atol=1e-9)
-    # Beyond an edge it goes on: from line N - 1 to line 1 are two lines, not N - 2.
-    ways = np.diff(projection.path_to_world(np.array([[SIZE - 1, 3], [1, 3]])), axis=0)
-    np.testing.assert_allclose(ways, [[0.0, 0.5]], atol=1e-9)
+def test_projection_puts_visited_cells_at_the_places_of_the_agent(corridor_walk):
+    episode, search_states = corridor_walk
+    projection = MapProjection(episode, take_snapshot(episode, NUM_STEPS - 1))
+
+    # By the positions on the map.
+    positions = np.array([search_state.position for search_state in search_states])
+    np.testing.assert_allclose(projection.to_world(positions), episode.places, atol=1e-9)
+
+    # By the pixels of the map's image.
+    visited_pixels = np.argwhere(projection.unroll(np.asarray(search_states[-1].cells)) & VISITED_BIT)
+    west, _, south, north = projection.borders
+    pixel_size = (north - south) / NUM_LINES
+    pixel_centres = np.array([west, south]) + pixel_size * (visited_pixels[:, ::-1] + 0.5)
+    np.testing.assert_allclose(pixel_centres, np.unique(episode.places, axis=0), atol=1e-9)
 
 
-def test_the_picture_shows_what_is_known_and_chosen(walked, tmp_path):
-    """The goal is in the first view; where another is sought that was never seen, a block is shown."""
-    episode, _ = walked
-    shares, first, last = {}, take_snapshot(episode, 0), take_snapshot(episode, STEPS - 1)
-    cells = last.search_state.cells
-    unseen = next(k for k in range(len(episode.task.categories)) if not (cells >> np.uint32(k) & np.uint32(1)).any())
-    other = last._replace(search_state=last.search_state._replace(goal=np.int32(unseen)))
-    for name, search, step in (("first", first, 0), ("last", last, STEPS - 1), ("other", other, STEPS - 1)):
+def test_projection_continues_paths_across_the_edge_of_the_map(corridor_walk):
+    """From line N - 1 to line 1 are two lines, not N - 2."""
+    episode, _ = corridor_walk
+    projection = MapProjection(episode, take_snapshot(episode, NUM_STEPS - 1))
+    path = projection.path_to_world(np.array([[NUM_LINES - 1, 3], [1, 3]]))
+    np.testing.assert_allclose(np.diff(path, axis=0), [[0.0, 0.5]], atol=1e-9)
+
+
+def count_pixels(path):
+    """Number of pixels of each colour in the map's part of a picture, without the legend."""
+    with Image.open(path) as image:
+        assert image.size == (960, 540)
+        pixels = np.asarray(image.convert("RGB"))[:, :670]
+    num_pixels = {}
+    for part, color in COLORS.items():
+        num_pixels[part] = (pixels == np.rint(255 * np.array(to_rgb(color)))).all(axis=-1).sum()
+    return num_pixels
+
+
+def test_draw_search_shows_the_goal_or_else_the_chosen_block(corridor_walk, tmp_path):
+    """The goal is in the first view; a block is shown only while the goal's category was never seen."""
+    episode, _ = corridor_walk
+    first_snapshot = take_snapshot(episode, 0)
+    last_snapshot = take_snapshot(episode, NUM_STEPS - 1)
+
+    # Another goal, of a category without a mark on the map.
+    cells = last_snapshot.search_state.cells
+    category_seen = [bool((cells >> np.uint32(index) & np.uint32(1)).any()) for index in range(len(CATEGORIES))]
+    unseen_goal = np.int32(category_seen.index(False))
+    unseen_snapshot = last_snapshot._replace(search_state=last_snapshot.search_state._replace(goal=unseen_goal))
+
+    pictures = {
+        "first": (first_snapshot, 0),
+        "last": (last_snapshot, NUM_STEPS - 1),
+        "unseen": (unseen_snapshot, NUM_STEPS - 1),
+    }
+    num_pixels = {}
+    for name, (snapshot, step) in pictures.items():
         path = tmp_path / "new" / f"{name}.png"
-        draw_search(episode, search, step, path)
-        with Image.open(path) as image:
-            assert image.size == (960, 540)
-            pixels = np.asarray(image.convert("RGB"))[:, :670]  # without the legend
-        for part, colour in {
-            "near": NEAR_COLOR,
-            "blocked": OBSTACLE_COLOR,
-            "block": BLOCK_COLOR,
-            "goal": GOAL_COLOR,
-        }.items():
-            shares[part, name] = (pixels == np.rint(255 * np.array(to_rgb(colour)))).all(axis=-1).sum()
-    assert shares["near", "last"] > shares["near", "first"] > 0
-    assert min(shares["block", "other"], shares["goal", "last"]) > 0
-    assert shares["block", "first"] == shares["block", "last"] == 0
+        draw_search(episode, snapshot, step, path)
+        num_pixels[name] = count_pixels(path)
+
+    assert num_pixels["last"]["near"] > num_pixels["first"]["near"] > 0
+    assert num_pixels["last"]["goal"] > 0
+    assert num_pixels["unseen"]["block"] > 0
+    assert num_pixels["first"]["block"] == num_pixels["last"]["block"] == 0
 
 
-def test_what_has_no_map_or_no_such_step_is_refused(walked):
-    episode, _ = walked
-    with pytest.raises(InputError, match=f"--step {STEPS + 1}: give a number from 1 to {STEPS}"):
-        take_snapshot(episode, STEPS)
-    with pytest.raises(InputError, match="--map: method 'org' keeps no map to plan on; give a run of semexp"):
+def test_snapshot_refuses_a_step_after_the_end(corridor_walk):
+    episode, _ = corridor_walk
+    with pytest.raises(InputError, match=f"--step {NUM_STEPS + 1}: give a number from 1 to {NUM_STEPS}"):
+        take_snapshot(episode, NUM_STEPS)
+
+
+def test_snapshot_refuses_a_method_without_a_map(corridor_walk):
+    episode, _ = corridor_walk
+    with pytest.raises(InputError, match=r"--map: method 'org' .*; give a run of semexp"):
         take_snapshot(episode._replace(policies=tiny.untrained()), 0)
