@@ -13,77 +13,95 @@ from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, Detector, Row
 from jaxnav.scenes.task import Task
 
 
-def detect(detector, seen, distance, half_view=ROOMS.half_view_tangents[0], num_poses=40_000):
-    """Return detections uint8 [P, 2, 4] of objects straight ahead.
-
-    They are of 0.6 m (range 5 m).
-    """
+def detect(detector, in_view, distance, half_view=ROOMS.half_view_tangents[0], num_poses=40_000):
+    """Return detections uint8 [P, 2, 4] of two objects of 0.6 m (range 5 m) straight ahead."""
     shape = (num_poses, 2)
-    ahead, size = np.full(shape, float(distance)), np.full(shape, 0.6)
-    return detector.detect("room", half_view, np.full(shape, seen), ahead, np.zeros(shape), ahead, size)
+    ahead = np.full(shape, float(distance))
+    size = np.full(shape, 0.6)
+    return detector.detect("room", half_view, np.full(shape, in_view), ahead, np.zeros(shape), ahead, size)
 
 
-@pytest.mark.parametrize(("distance", "rate"), [(0.0, 0.1), (2.5, 0.2), (5.0, 0.5)])
-def test_misses_grow_with_the_square_of_the_distance(distance, rate):
+@pytest.mark.parametrize(("distance", "miss_rate"), [(0.0, 0.1), (2.5, 0.2), (5.0, 0.5)])
+def test_detector_miss_rate_grows_with_the_squared_distance(distance, miss_rate):
     # 0.1 + 0.4 (2.5 / 5)^2 = 0.2.
-    entries = detect(Detector(miss_near=0.1, miss_far=0.5, false_alarm=0.5), True, distance)
-    missed = entries[..., 0] == 0
-    assert binomtest(int(missed.sum()), missed.size, rate).pvalue > 1e-3
-    assert binomtest(int(missed.sum()), missed.size, rate + 0.02).pvalue < 1e-3  # the test can tell
-    assert not entries[missed].any()
+    detections = detect(Detector(miss_near=0.1, miss_far=0.5, false_alarm=0.5), True, distance)
+    is_missed = detections[..., 0] == 0
+    assert binomtest(int(is_missed.sum()), is_missed.size, miss_rate).pvalue > 1e-3
+    assert binomtest(int(is_missed.sum()), is_missed.size, miss_rate + 0.02).pvalue < 1e-3  # the test has the power
+    assert not detections[is_missed].any()
+
     # Confidence 1 - 0.5 d / 5 m, plus or minus 0.1; the place is not noisy.
-    confidence = entries[~missed][:, 0] / 255
-    expected = 1.0 - 0.1 * distance
-    assert confidence.min() >= expected - 0.1 - 1 / 255
-    assert confidence.max() <= min(expected + 0.1, 1.0) + 1 / 255
-    assert (entries[~missed][:, 1:3] == [round(51 * distance), 128]).all()
+    confidence = detections[~is_missed][:, 0] / 255
+    mean_confidence = 1.0 - 0.1 * distance
+    assert confidence.min() >= mean_confidence - 0.1 - 1 / 255
+    assert confidence.max() <= min(mean_confidence + 0.1, 1.0) + 1 / 255
+    assert (detections[~is_missed][:, 1:3] == [round(51 * distance), 128]).all()
 
 
-def test_false_alarms_fill_the_view_cone():
-    entries = detect(Detector(false_alarm=0.1), False, 1.0)
-    alarms = entries[entries[..., 0] > 0]
-    assert binomtest(len(alarms), entries[..., 0].size, 0.1).pvalue > 1e-3
-    confidence, ahead, right = alarms[:, 0] / 255, alarms[:, 1] / 51, (alarms[:, 2] - 128.0) / 25.4
+def test_detector_false_alarms_are_uniform_in_the_field_of_view():
+    detections = detect(Detector(false_alarm=0.1), False, 1.0)
+    alarms = detections[detections[..., 0] > 0]
+    assert binomtest(len(alarms), detections[..., 0].size, 0.1).pvalue > 1e-3
+
+    # Confidence is uniform, and the place is within the field of view.
+    confidence = alarms[:, 0] / 255
+    ahead = alarms[:, 1] / 51
+    right = (alarms[:, 2] - 128.0) / 25.4
     assert kstest(confidence, "uniform", (0.3, 0.3)).pvalue > 1e-6  # quantised, hence not 1e-3
     assert (np.abs(right) <= np.tan(np.deg2rad(50)) * ahead + 0.05).all()  # a quantum is 0.02 m and 0.04 m
+
     # The range of 0.3 m is 0.3 / 0.12 = 2.5 m, the greatest offset to a side 2.5 sin 50 = 1.92 m.
     distance = np.hypot(ahead, right)
     assert (max(distance), max(np.abs(right))) == pytest.approx((2.5, 1.92), abs=0.05)
+
     # Uniform in a sector: a quarter of the area lies within half the radius, and half of it to the right.
     assert binomtest(int((distance < 1.25).sum()), len(alarms), 0.25).pvalue > 1e-3
     assert binomtest(int((right > 0).sum()), int((right != 0).sum()), 0.5).pvalue > 1e-3
-    # The confidence says nothing of the place: 8,000 independent pairs have correlations of 0.011 or so.
+
+    # The confidence does not depend on the place: 8,000 independent pairs have correlations of 0.011 or so.
     for offset in (np.arctan2(right, ahead), distance):
         assert abs(np.corrcoef(confidence, offset)[0, 1]) < 0.05
+
     # An object of that apparent size at that distance could be detected (a quantum of either is worth 0.1 m).
     size = alarms[:, 3] / 127.5 * np.maximum(distance, 0.25)
     assert (distance <= detection_range(size) + 0.12).all()
-    assert not entries[entries[..., 0] == 0].any()
+    assert not detections[detections[..., 0] == 0].any()
 
 
-def test_false_alarms_keep_to_a_narrower_view():
-    entries = detect(Detector(false_alarm=0.1), False, 1.0, APARTMENTS.half_view_tangents[0])
-    alarms = entries[entries[..., 0] > 0]
-    bearing = np.rad2deg(np.arctan2((alarms[:, 2] - 128.0) / 25.4, alarms[:, 1] / 51))[alarms[:, 1] > 51]
+def test_detector_false_alarms_stay_in_a_narrower_field_of_view():
+    detections = detect(Detector(false_alarm=0.1), False, 1.0, APARTMENTS.half_view_tangents[0])
+    alarms = detections[detections[..., 0] > 0]
+    ahead = alarms[:, 1] / 51
+    right = (alarms[:, 2] - 128.0) / 25.4
+    bearing = np.rad2deg(np.arctan2(right, ahead))[alarms[:, 1] > 51]
     assert 38 < np.abs(bearing).max() < 39.5 + 2  # a quantum is 0.04 m, over 1 m away
     assert kstest(bearing, "uniform", (-39.5, 79)).pvalue > 1e-3
 
 
-def test_errors_are_frozen_and_belong_to_the_scene():
-    scenes, task = [generate_room("train", i, 0) for i in range(3)], Task()
-    together, again, alone = compile_bank(scenes, task), compile_bank(scenes, task), compile_bank(scenes[1:2], task)
-    np.testing.assert_array_equal(together.rows, again.rows)
-    first = together.first_cell[1] * task.rules.poses_per_cell
-    np.testing.assert_array_equal(together.rows[first : first + len(alone.rows)], alone.rows)
-    other_seed, other_name = Task(detector=Detector(seed=1)), dataclasses.replace(scenes[1], name="other")
-    assert (compile_bank(scenes[1:2], other_seed).rows != alone.rows).any()
-    assert (compile_bank([other_name], task).rows != alone.rows).any()
+def test_detector_errors_depend_on_scene_name_and_seed_alone():
+    scenes = [generate_room("train", i, 0) for i in range(3)]
+    task = Task()
+    bank_of_three = compile_bank(scenes, task)
+    bank_alone = compile_bank(scenes[1:2], task)
+    np.testing.assert_array_equal(bank_of_three.rows, compile_bank(scenes, task).rows)
+
+    # Other scenes in the bank do not change the errors.
+    first_row = bank_of_three.first_cell[1] * task.rules.poses_per_cell
+    np.testing.assert_array_equal(bank_of_three.rows[first_row : first_row + len(bank_alone.rows)], bank_alone.rows)
+
+    # The seed of the detector and the name of the scene do.
+    other_seed = Task(detector=Detector(seed=1))
+    other_name = dataclasses.replace(scenes[1], name="other")
+    assert (compile_bank(scenes[1:2], other_seed).rows != bank_alone.rows).any()
+    assert (compile_bank([other_name], task).rows != bank_alone.rows).any()
 
 
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
-def test_success_is_never_noisy(rules):
+def test_detector_errors_leave_best_lengths_unchanged(rules):
     scenes = [generate_room("train", i, 0) for i in range(2)]
-    row_format, blind = RowFormat(22), Detector(miss_near=1.0, miss_far=1.0)
-    blind, perfect = (compile_bank(scenes, Task(rules=rules, detector=d)) for d in (blind, PERFECT_DETECTOR))
-    np.testing.assert_array_equal(blind.best_length, perfect.best_length)
-    assert row_format.presence(blind.rows).sum() < 0.1 * row_format.presence(perfect.rows).sum()
+    blind_detector = Detector(miss_near=1.0, miss_far=1.0)
+    blind_bank = compile_bank(scenes, Task(rules=rules, detector=blind_detector))
+    perfect_bank = compile_bank(scenes, Task(rules=rules, detector=PERFECT_DETECTOR))
+    row_format = RowFormat(22)
+    np.testing.assert_array_equal(blind_bank.best_length, perfect_bank.best_length)
+    assert row_format.presence(blind_bank.rows).sum() < 0.1 * row_format.presence(perfect_bank.rows).sum()
