@@ -1,5 +1,7 @@
 """A game by scripted keys is the environment's episode, and shows what an agent perceives."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,63 +16,67 @@ from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.game.session import KEY_ACTIONS, Game, PlayConfig, choose_episode, play_game, prepare_game
 from jaxnav.layout import LayoutEstimator
 from jaxnav.runs.policy import LoadedPolicy
-from jaxnav.runs.worlds import CompiledWorld
-from jaxnav.scenes.task import MOVE_AHEAD, NUM_ACTIONS
-from jaxnav.scenes.worlds import FileScenes
+from jaxnav.scenes.task import NUM_ACTIONS
 
-ENV, _ = tiny.world()
-SCENES = FileScenes((tiny.KITCHEN, tiny.BEDROOM), "tiny")
-LIMITS = {"kitchen": tiny.LIMITS[0], "bedroom": tiny.LIMITS[1]}
-WORLD = CompiledWorld(SCENES, ENV, (tiny.BANK,), LIMITS, 0, len(tiny.BANK.ahead), 2, "tiny")
+EPSILON = 0.1
+WORLD = tiny.compiled_world()
+_, PARAMS = tiny.world()
 EPISODES = draw_episodes(tiny.BANK, 40)
 POLICY = LoadedPolicy(tiny.lively(3), tiny.knowledge(), tiny.SPEC, tiny.SETTING, tiny.BANK.task)
-NAMES = {action: key for key, action in KEY_ACTIONS.items()}
+KEY_OF_ACTION = {action: key for key, action in KEY_ACTIONS.items()}
 
 
-def game(index, policy=None):
-    return Game(WORLD, EPISODES.take(np.array([index])), tiny.knowledge(), tiny.SETTING, policy, 0.1)
+def start_game(index, policy=None):
+    """A game in one of `EPISODES`."""
+    episode = EPISODES.take(np.array([index]))
+    return Game(WORLD, episode, tiny.knowledge(), tiny.SETTING, policy, EPSILON)
 
 
-def longest():
-    return int(EPISODES.best_length.argmax())
+def start_longest_game(policy=None):
+    return start_game(int(EPISODES.best_length.argmax()), policy)
 
 
-def played(game, keys):
-    frames = []
-    return play_game(game, keys, frames.append), frames
+def play_keys(game, keys):
+    """The result of a game, and the views that were shown before each action."""
+    views = []
+    result = play_game(game, keys, views.append)
+    return result, views
 
 
-def follow(start, actions):
-    """The poses of actions, by the tables alone."""
-    poses = [start]
-    for action in actions:
-        poses.append(int(tiny.BANK.successor[poses[-1], action]))
+def poses_along(game, keys):
+    """The poses to which keys lead, by the tables alone."""
+    poses = [int(game.episode.pose[0])]
+    for key in keys:
+        poses.append(int(tiny.BANK.successor[poses[-1], KEY_ACTIONS[key]]))
     return poses
 
 
-def shortest_keys(it):
-    return [NAMES[action] for action in oracle_actions(it.bank, it.episode)[:, 0]]
+def shortest_keys(game):
+    return [KEY_OF_ACTION[action] for action in oracle_actions(game.bank, game.episode)[:, 0]]
 
 
-def test_the_shortest_path_is_found():
-    it = game(longest())
-    best = int(it.episode.best_length[0])
-    assert best > 2
-    keys = shortest_keys(it)
-    result, frames = played(it, keys)
+def test_play_game_finds_the_goal_by_the_keys_of_the_shortest_path():
+    game = start_longest_game()
+    best_length = int(game.episode.best_length[0])
+    assert best_length > 2
+    keys = shortest_keys(game)
+    result, views = play_keys(game, keys)
     assert result.ending == "found in"
-    assert result.poses == follow(int(it.episode.pose[0]), [KEY_ACTIONS[key] for key in keys])
-    assert len(frames) == best  # the view after the last action is not shown
+    assert result.poses == poses_along(game, keys)
+    assert len(views) == best_length  # the view after the last action is not shown
 
 
-def test_a_detour_is_counted_and_other_keys_do_nothing():
-    fits = EPISODES.best_length + 2 <= np.array(tiny.LIMITS)[EPISODES.scene]
-    it = game(int(np.where(fits, EPISODES.best_length, 0).argmax()))
-    best = int(it.episode.best_length[0])
-    assert best > 1
-    result, _ = played(it, ["left", "x", "d", "?", *shortest_keys(it), "up"])
+def test_play_game_counts_detours_and_ignores_unknown_keys():
+    # The longest episode in which two more actions are within the step limit.
+    has_time = EPISODES.best_length + 2 <= np.array(tiny.LIMITS)[EPISODES.scene]
+    game = start_game(int(np.where(has_time, EPISODES.best_length, 0).argmax()))
+    best_length = int(game.episode.best_length[0])
+    assert best_length > 1
+
+    # Left and d undo each other; the arrow after Done comes too late.
+    result, _ = play_keys(game, ["left", "x", "d", "?", *shortest_keys(game), "up"])
     assert result.ending == "found in"
-    assert len(result.poses) == best + 3
+    assert len(result.poses) == best_length + 3
 
 
 @pytest.mark.parametrize(
@@ -82,72 +88,92 @@ def test_a_detour_is_counted_and_other_keys_do_nothing():
         ([], "left after"),
     ],
 )
-def test_wrong_done_and_quitting_end_the_game(keys, ending):
-    assert played(game(longest()), keys)[0].ending == ending
+def test_wrong_done_quitting_and_no_more_keys_end_the_game(keys, ending):
+    result, _ = play_keys(start_longest_game(), keys)
+    assert result.ending == ending
 
 
-def test_time_runs_out():
-    it = game(longest())
-    limit = tiny.LIMITS[it.episode.scene[0]]
-    result, frames = played(it, iter(lambda: "a", None))
+def test_play_game_ends_at_the_step_limit():
+    game = start_longest_game()
+    step_limit = tiny.LIMITS[game.episode.scene[0]]
+    result, views = play_keys(game, itertools.repeat("a"))
     assert result.ending == "out of time after"
-    assert len(result.poses) == limit + 1
-    assert [look.time for look in frames] == list(range(limit))
-    assert {look.step_limit for look in frames} == {limit}
+    assert len(result.poses) == step_limit + 1
+    assert [view.time for view in views] == list(range(step_limit))
+    assert {view.step_limit for view in views} == {step_limit}
 
 
-def test_a_look_is_what_an_agent_perceives():
+def test_game_views_show_the_pose_belief_and_gap_of_an_agent():
     """The pose is that of the tables; belief and gap are those of the estimator, view by view."""
-    it, keys = game(longest()), ["a", "w", "f", "d"]
-    result, frames = played(it, keys)
-    assert result.poses == follow(int(it.episode.pose[0]), [KEY_ACTIONS[key] for key in keys])
-    assert result.poses == [look.pose for look in frames]
-    prior = tiny.knowledge().layout[tiny.world()[1].room[it.episode.scene[0]]]
+    game = start_longest_game()
+    keys = ["a", "w", "f", "d"]
+    result, views = play_keys(game, keys)
+    assert result.poses == poses_along(game, keys)
+    assert result.poses == [view.pose for view in views]
+
+    prior = tiny.knowledge().layout[PARAMS.room[game.episode.scene[0]]]
     belief = None
-    for look in frames:
-        belief = tiny.believe(prior, belief, tiny.BANK.rows[look.pose])
-        expected_weights = LayoutEstimator.goal_weights(belief, int(it.episode.goal[0]))
-        np.testing.assert_allclose(look.layout_weights, expected_weights, 1e-6)
-        assert look.layout_gap == pytest.approx(float(belief.gap), rel=1e-6)
-        assert look.advice is None
+    for view in views:
+        belief = tiny.believe(prior, belief, tiny.BANK.rows[view.pose])
+        expected_weights = LayoutEstimator.goal_weights(belief, int(game.episode.goal[0]))
+        np.testing.assert_allclose(view.layout_weights, expected_weights, 1e-6)
+        assert view.layout_gap == pytest.approx(float(belief.gap), rel=1e-6)
+        assert view.advice is None
 
 
-def _chosen(choice, memory):
-    """Logits, and the memory after each action."""
-    return choice.logits, [
-        POLICY.apply_choice(choice, jnp.int32(action), memory.room)[1] for action in range(NUM_ACTIONS)
-    ]
+@jax.jit
+def logits_and_next_memories(observation, memory, **odometry):
+    """The policy's logits, and its memory after each of the actions."""
+    choice = POLICY.decide(observation, memory, EPSILON, **odometry)
+    next_memories = []
+    for action in range(NUM_ACTIONS):
+        _, next_memory = POLICY.apply_choice(choice, jnp.int32(action), memory.room)
+        next_memories.append(next_memory)
+    return choice.logits, next_memories
 
 
-def test_the_advice_is_the_policys_whatever_is_done():
-    it, keys = game(longest(), POLICY), ["w", "a", "f", "d", "w"]
-    result, frames = played(it, keys)
-    memory, moved = POLICY.begin(tiny.world()[1].room[it.episode.scene[0]]), False
-    decide = jax.jit(lambda seen, memory, **odometry: _chosen(POLICY.decide(seen, memory, 0.1, **odometry), memory))
-    for time, (pose, look) in enumerate(zip(result.poses, frames, strict=True)):
-        observation = Observation(jnp.asarray(tiny.BANK.rows[pose]), jnp.asarray(it.episode.goal[0]))
+def test_game_advice_is_the_policys_choice_along_the_players_way():
+    game = start_longest_game(POLICY)
+    keys = ["w", "a", "f", "d", "w"]
+    result, views = play_keys(game, keys)
+
+    # Repeat the policy's decisions along the poses of the game.
+    memory = POLICY.begin(PARAMS.room[game.episode.scene[0]])
+    moved = False
+    for time, (pose, view) in enumerate(zip(result.poses, views, strict=True)):
+        observation = Observation(jnp.asarray(tiny.BANK.rows[pose]), jnp.asarray(game.episode.goal[0]))
         odometry = {"heading": pose // 2 % 8, "moved": moved, "horizon": pose % 2}
-        logits, memories = decide(observation, memory, **odometry)
-        np.testing.assert_allclose(look.advice, jax.nn.softmax(logits), 1e-5)
+        logits, next_memories = logits_and_next_memories(observation, memory, **odometry)
+        np.testing.assert_allclose(view.advice, jax.nn.softmax(logits), 1e-5)
         if time < len(keys):
-            memory = memories[KEY_ACTIONS[keys[time]]]
+            memory = next_memories[KEY_ACTIONS[keys[time]]]
             moved = pose // tiny.POSES_PER_CELL != result.poses[time + 1] // tiny.POSES_PER_CELL
-    assert not np.allclose(frames[0].advice, frames[-1].advice)
-    assert any(KEY_ACTIONS[key] == MOVE_AHEAD for key in keys)
+    assert not np.allclose(views[0].advice, views[-1].advice)
 
 
-def test_an_episode_is_drawn_for_a_goal():
+def test_choose_episode_draws_an_episode_for_the_goal():
     for seed in range(3):
         episode = choose_episode(tiny.BANK, "Chair", seed)
         assert tiny.CATEGORIES[episode.goal[0]] == "Chair"
-    starts = {int(choose_episode(tiny.BANK, None, seed).pose[0]) for seed in range(5)}
-    assert len(starts) > 1
-    with pytest.raises(InputError, match=r"^--goal Sofa: choose one of Book, Chair"):
-        choose_episode(tiny.BANK, "Sofa", 0)
-    with pytest.raises(InputError, match="--seed -1: give a number of at least 0"):
-        choose_episode(tiny.BANK, None, -1)
 
 
-def test_a_policy_of_another_world_is_refused():
-    with pytest.raises(InputError, match="--policy rooms-org: was trained for rooms; play with --world rooms"):
+def test_choose_episode_starts_at_different_poses_by_seed():
+    start_poses = {int(choose_episode(tiny.BANK, None, seed).pose[0]) for seed in range(5)}
+    assert len(start_poses) > 1
+
+
+@pytest.mark.parametrize(
+    ("goal", "seed", "problem"),
+    [
+        ("Sofa", 0, r"^--goal Sofa: choose one of Book, Chair"),
+        (None, -1, "--seed -1: give a number of at least 0"),
+    ],
+)
+def test_choose_episode_refuses_invalid_options(goal, seed, problem):
+    with pytest.raises(InputError, match=problem):
+        choose_episode(tiny.BANK, goal, seed)
+
+
+def test_prepare_game_refuses_a_policy_of_another_world():
+    with pytest.raises(InputError, match=r"--policy rooms-org: .*; play with --world rooms"):
         prepare_game(PlayConfig("houses", policy="rooms-org"), Console(quiet=True))

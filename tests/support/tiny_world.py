@@ -16,11 +16,14 @@ from jaxnav.policies.network import bind, init_params
 from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.runs.policies import Policies
+from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
+from jaxnav.scenes.worlds import FileScenes
 from support.scenes import CATEGORIES, SMALL, draw
 
+#: Layer sizes of the policies.
 SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
 SPEC = PolicySpec(find_method("org"), len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),), goal_row=False)
 STREAMS = dataclasses.replace(SPEC, decision="streams", direct="goal")
@@ -44,17 +47,35 @@ def world():
     return build_environment(BANK, {"kitchen": LIMITS[0], "bedroom": LIMITS[1]}, 0)
 
 
+def compiled_world(bank=BANK):
+    """The kitchen and the bedroom as commands see them; `bank` may hold other rows for the same scenes."""
+    env, _ = world()
+    return CompiledWorld(
+        scenes=FileScenes((KITCHEN, BEDROOM), "tiny"),
+        env=env,
+        banks=(bank,),
+        step_limits={"kitchen": LIMITS[0], "bedroom": LIMITS[1]},
+        step_limit=0,
+        num_cells=len(bank.ahead),
+        num_scenes=2,
+        fingerprint="tiny",
+    )
+
+
 def knowledge():
-    """Some prior of each room type."""
-    counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, *2 * [len(CATEGORIES)]))
-    return Knowledge(jax.vmap(lambda c: prior_from_counts(c, SETTING))(jnp.asarray(counts)))
+    """A random layout prior of each room type, [NUM_PRIORS, K, K]."""
+    num_categories = len(CATEGORIES)
+    counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, num_categories, num_categories))
+    priors = jax.vmap(lambda room_counts: prior_from_counts(room_counts, SETTING))(jnp.asarray(counts))
+    return Knowledge(priors)
 
 
 def untrained(spec=SPEC, learned_knowledge=None, task=BANK.task):
     """Policies without parameters, enough for callers that need only the method and its knowledge."""
     if learned_knowledge is None:
         learned_knowledge = knowledge()
-    return Policies({}, (), learned_knowledge, jnp.zeros_like(learned_knowledge.layout), spec, None, 0, task)
+    prior_counts = jnp.zeros_like(learned_knowledge.layout)
+    return Policies({}, (), learned_knowledge, prior_counts, spec, None, 0, task)
 
 
 def reading(method, count):
