@@ -62,8 +62,7 @@ def render_page(
     if document.exists():
         summary = document.read_text(encoding="utf-8").split(READING_MARK)[1]
 
-    # Pages show `val`, unless an experiment was done on another split alone.
-    table = tables.get("val", tables.get(config.split, ResultTable([])))
+    table = tables.get(config.split, ResultTable([]))
     context = {
         "config": config,
         "table": table,
@@ -77,8 +76,12 @@ def render_page(
         text = _load_template(template).render(context)
     except InputError:
         raise
-    except (jinja2.TemplateError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+    except (jinja2.TemplateError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise InputError(f"{_fault_position(error, template)}: {type(error).__name__}: {error}") from error
+
+    # Without its marks, the document would be refused the next time.
+    if text.count(READING_MARK) != 2:
+        raise InputError(f"template {template}: give {{{{ summary }}}} once; text written by hand is kept there")
     write_atomic(document, (text.strip() + "\n").encode())
     return text
 
@@ -188,9 +191,11 @@ def table_header(*titles: Any) -> str:
 def verdict(effect: Interval, min_effect: float) -> str:
     """Verdict on a claim that an effect is above 0.
 
-    An interval below 0 refutes the claim; one below `min_effect`, the least effect that would matter, shows that the
-    effect is too small to matter, whatever its sign; one above 0 confirms the claim; all others leave it open.
+    An interval below 0 refutes the claim; one below `min_effect`, the least effect that would matter, shows that no
+    effect that would matter supports the claim; one above 0 confirms the claim; all others leave it open.
     """
+    if math.isnan(effect.mean):
+        return "not measured"
     if effect.high < 0:
         return "refuted"
     if effect.high < min_effect:

@@ -1,0 +1,136 @@
+"""The committed pages are those of the committed results, and these those of the packaged experiments."""
+
+import dataclasses
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from jaxnav.cli.study import parse_study
+from jaxnav.experiments import pages
+from jaxnav.experiments.bench import Bench
+from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig, agent_runs
+from jaxnav.experiments.driver import Part, list_parts, write_pages
+from jaxnav.experiments.pages import READING_MARK, total_steps
+from jaxnav.experiments.table import read_part, write_part
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.methods.local_policy import LocalPolicy
+
+ROOT = Path(__file__).parents[2]
+#: Experiments with results of their own; all others measure a run that is given.
+CONFIGS = {name: parse_study([name]) for name in EXPERIMENTS}
+COMMITTED = {name: config for name, config in CONFIGS.items() if config.results != ExperimentConfig().results}
+
+
+@pytest.fixture(autouse=True)
+def without_figures(monkeypatch):
+    """Work at the root of the checkout, to which the paths of experiments are relative, and draw no figures."""
+    monkeypatch.chdir(ROOT)
+
+    def name_figure(document, name, table, shifts, fields):
+        return f"images/{document.stem}/{name}.png"
+
+    monkeypatch.setattr(pages, "_draw_figure", name_figure)
+
+
+def list_all_parts(config: ExperimentConfig) -> list[Part]:
+    return list_parts(config, Bench(config, Console(quiet=True)))
+
+
+def copy_documents(config: ExperimentConfig, folder: Path) -> ExperimentConfig:
+    """The experiment, with copies of its documents in a folder."""
+    copies = {}
+    for document, template in config.pages.items():
+        copies[str(shutil.copy(document, folder))] = template
+    return dataclasses.replace(config, pages=copies)
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_committed_documents_are_written_from_the_committed_results(name, tmp_path):
+    config = COMMITTED[name]
+    copied_config = copy_documents(config, tmp_path)
+    write_pages(copied_config, list_all_parts(copied_config))
+    for document, copied_document in zip(config.pages, copied_config.pages, strict=True):
+        content = Path(document).read_bytes()
+        assert Path(copied_document).read_bytes() == content
+
+        # Every figure that the document names is committed, too.
+        for image in re.findall(r"!\[[^\]]*\]\((images/[^)]+)\)", content.decode()):
+            assert (Path(document).parent / image).is_file()
+
+
+def test_every_committed_file_of_results_belongs_to_an_experiment():
+    known_paths = set()
+    for config in COMMITTED.values():
+        for split in ("val", "test"):
+            split_config = dataclasses.replace(config, split=split)
+            known_paths |= {config.results / split / f"{part.name}.jsonl" for part in list_all_parts(split_config)}
+    committed_paths = {path.relative_to(ROOT) for path in (ROOT / "results").rglob("*.jsonl")}
+    assert committed_paths
+    assert committed_paths <= known_paths
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_committed_results_are_written_as_they_were_read(name, tmp_path):
+    for path in sorted(COMMITTED[name].results.rglob("*.jsonl")):
+        head, *lines = path.read_text().splitlines()
+        write_part(tmp_path / "part.jsonl", json.loads(head)["settings"], read_part(path))
+        new_head, *new_lines = (tmp_path / "part.jsonl").read_text().splitlines()
+        assert new_lines == lines
+        assert json.loads(new_head)["shared"] == json.loads(head)["shared"]
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
+    """Pages are written after every part, so that an interrupted experiment has them."""
+    config = dataclasses.replace(copy_documents(COMMITTED[name], tmp_path), results=tmp_path / "results")
+    parts = list_all_parts(config)
+    (config.results / "val").mkdir(parents=True)
+
+    # Parts arrive one after the other; a few of them, with the first and the last, stand for all.
+    for index, part in enumerate(parts):
+        shutil.copy(COMMITTED[name].results / "val" / f"{part.name}.jsonl", config.results / "val")
+        if index in (0, len(parts) // 3, 2 * len(parts) // 3, len(parts) - 1):
+            for text in write_pages(config, parts):
+                assert text.count(READING_MARK) == 2
+                assert "nan" not in re.findall(r"\w+", text)
+
+
+# Agents of the tables
+
+
+def test_table_2_has_the_methods_of_the_paper():
+    # Beside them are agents without experience, and EOTP adapted to ever changing scenes.
+    methods = set(COMMITTED["table2"].agents) - {"anonymous", "eotp:ADAPTED"}
+    hosts = {method for method in methods if not method.endswith("-streams")}
+    assert hosts == {"rgb", "sp", "savn", "eotp", "org", "tpn", "vtnet", "hoz"}
+
+    # Whatever hosts the layout is trained without and with it, and with two streams.
+    for run in agent_runs(COMMITTED["table2"]):
+        hosts_layout = find_method(run.config.method).hosts_layout
+        if run.agent.endswith("-streams"):
+            assert (run.config.decision, run.config.arms) == ("streams", ("layout",))
+        else:
+            assert (run.config.decision, "layout" in run.config.arms) == ("fused", hosts_layout)
+        if hosts_layout and run.agent in hosts:
+            assert f"{run.agent}-streams" in methods
+
+
+@pytest.mark.parametrize("name", ["table2", "table3", "ablations", "real", "real_homes"])
+def test_all_methods_of_a_world_learn_from_as_many_steps(name):
+    runs_by_world: dict[str, list] = {}
+    for run in agent_runs(COMMITTED[name]):
+        if run.agent != "semexp:NEAREST":  # it learns nothing
+            runs_by_world.setdefault(run.world, []).append(run)
+    for runs in runs_by_world.values():
+        assert len({total_steps([run]) for run in runs}) == 1
+        assert len({run.config.seeds for run in runs}) == 1
+
+
+@pytest.mark.parametrize("name", ["table3", "real_homes"])
+def test_rollouts_hold_two_choices_of_methods_that_choose_goals(name):
+    for run in agent_runs(COMMITTED[name]):
+        assert run.config.ppo.rollout >= 2 * LocalPolicy.interval

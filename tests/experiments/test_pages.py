@@ -1,0 +1,508 @@
+"""Pages: verdicts, lines of tables, kept summaries, templates of one's own, and what packaged templates claim."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxnav.cli.study import parse_study
+from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments.config import ExperimentConfig
+from jaxnav.experiments.pages import (
+    READING_MARK,
+    check_page,
+    difference_of_worlds,
+    effect_cells,
+    format_value,
+    format_weights,
+    format_with_std,
+    render_page,
+    table_header,
+    table_line,
+    verdict,
+)
+from jaxnav.experiments.table import Curve, ResultRow, ResultTable
+
+AGENTS = {"main": {}, "anonymous": {"method": "anonymous", "arms": ["baseline"]}}
+CONFIG = ExperimentConfig(title="A title", agents=AGENTS)
+
+
+def make_row(value: Interval | Curve | float = 50.0, **fields: Any) -> ResultRow:
+    """Row of the main agent in rooms."""
+    row_value = value if isinstance(value, Interval | Curve) else Interval(value)
+    return ResultRow(**{"world": "rooms", "run": "main", "metric": "sr", **fields}, value=row_value)
+
+
+def make_interval(mean: float, half_width: float = 1.0) -> Interval:
+    return Interval(mean, mean - half_width, mean + half_width)
+
+
+def render(folder: Path, template: str, *rows: ResultRow, config: ExperimentConfig = CONFIG) -> str:
+    """Text of the page `page.md` of these results on `val`."""
+    return render_page(folder / "page.md", template, config, {"val": ResultTable(rows)}, [])
+
+
+def render_own(folder: Path, body: str, *rows: ResultRow) -> str:
+    """Text of a page by a template of one's own, `own.md`; the body begins in its second line."""
+    template = folder / "own.md"
+    template.write_text("{{ summary }}\n" + body)
+    return render(folder, str(template), *rows)
+
+
+def read_lines(text: str) -> dict[str, list[str]]:
+    """Cells of all Markdown tables by the first cell of their line; of equal lines the first counts."""
+    cells_by_name: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        if line.startswith("|"):
+            name, *cells = [cell.strip() for cell in line.strip("|").split("|")]
+            cells_by_name.setdefault(name, cells)
+    return cells_by_name
+
+
+# Functions of templates
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0.5, 3.0, "holds"),
+        (2.5, 3.0, "holds"),
+        (0.5, 1.5, "too small to matter"),  # whatever its sign
+        (-1.0, 1.5, "too small to matter"),
+        (-4.0, -1.0, "refuted"),
+        (-4.0, 0.0, "too small to matter"),  # 0 is within the interval
+        (-1.0, 2.5, "cannot be told"),
+        (0.0, 2.5, "cannot be told"),
+        (-1.0, 2.0, "cannot be told"),  # what would matter is within the interval, too
+        (math.nan, math.nan, "cannot be told"),
+    ],
+)
+def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(low, high, expected):
+    assert verdict(Interval((low + high) / 2, low, high), min_effect=2.0) == expected
+
+
+def test_undefined_values_are_dashes():
+    undefined = Interval(math.nan)
+    assert format_value(undefined, "+.1f") == format_value(math.nan, ".1f") == format_with_std(undefined) == "-"
+    assert effect_cells(ResultTable([]), {"world": "rooms"}, [0.0]) == ["- (-)"]
+    assert format_weights(ResultTable([]), {"world": "rooms"}, [0.0, 1.0]) == "-, -"
+
+
+def test_values_show_their_interval_or_their_deviation():
+    # The deviation of 60, 62.5 and 65 is 2.5.
+    interval = Interval(62.5, 60.25, 64.75, 2.5, (60.0, 62.5, 65.0))
+    assert format_value(interval, ".1f") == "62.5 [60.2, 64.8]"
+    assert format_with_std(interval) == "62.5 ± 2.5"
+    assert format_with_std(Interval(62.5, seeds=(62.5,)), digits=2) == "62.50"  # a single run has no deviation
+
+
+def test_lines_have_a_cell_for_each_column():
+    assert table_line("a", ["b", 2], ("c",), 3.5) == "| a | b | 2 | c | 3.5 |"
+    title_line, rule = table_header("", ["SR", "SPL"], "DTS").splitlines()
+    assert title_line.count("|") == rule.count("|") == 5
+    assert rule.split("|")[1:-1] == [" --- ", " ---: ", " ---: ", " ---: "]
+
+
+def test_a_difference_of_worlds_adds_both_widths():
+    # 10 [8, 12] and 5 [4, 7]: 8 - 7 = 1 and 12 - 4 = 8.
+    difference = difference_of_worlds(Interval(10.0, 8.0, 12.0), Interval(5.0, 4.0, 7.0))
+    assert (difference.mean, difference.low, difference.high) == (5.0, 1.0, 8.0)
+
+
+# Documents
+
+
+@pytest.mark.parametrize("content", ["", "My own notes.\n", f"{READING_MARK}\nOne mark of two.\n"])
+def test_a_document_that_is_no_page_is_not_written_over(tmp_path, content):
+    document = tmp_path / "page.md"
+    document.write_text(content)
+    with pytest.raises(InputError, match=r"page\.md"):
+        check_page(document, "factors")
+    with pytest.raises(InputError, match=r"page\.md"):
+        render(tmp_path, "factors")
+    assert document.read_text() == content
+
+
+def test_a_page_keeps_its_summary(tmp_path):
+    body = "SR: {{ table.find(world='rooms', run='main', metric='sr') | f('.1f') }}\n"
+    render_own(tmp_path, body, make_row(50.0))
+    document = tmp_path / "page.md"
+    head, _, tail = document.read_text().split(READING_MARK)
+
+    # What stands between the marks is text, even if it looks like a template.
+    summary = "\nAs found:\n\n* | a table |\n* {{ table }} {% if %}\n"
+    document.write_text(head + READING_MARK + summary + READING_MARK + tail)
+    render_own(tmp_path, body, make_row(12.5))
+    assert document.read_text().split(READING_MARK)[1] == summary
+    assert "SR: 12.5 [-]" in document.read_text()
+
+    # The same results give the same document.
+    content = document.read_bytes()
+    render_own(tmp_path, body, make_row(12.5))
+    assert document.read_bytes() == content
+
+
+def test_a_page_is_written_into_a_new_folder(tmp_path):
+    template = tmp_path / "own.md"
+    template.write_text("# {{ config.title }}\n{{ summary }}")
+    document = tmp_path / "new" / "docs" / "page.md"
+    text = render_page(document, str(template), CONFIG, {}, [])
+    assert document.read_text().strip() == text.strip()
+    assert text.startswith("# A title")
+
+
+# Templates of one's own
+
+
+def test_a_template_of_ones_own_knows_the_experiment_and_its_results(tmp_path):
+    body = """{% import "macros.md" as m %}
+{{ header("agent", shift_titles(config.shifts)) }}
+{% for world, agents in runs.items() %}
+{% for agent in agents %}
+{% set cells = [] %}
+{% for shift in config.shifts %}
+{% do cells.append(table.find(world=world, run=agent, shift=shift, metric="sr") | f(".1f")) %}
+{% endfor %}
+{{ line(m.label(agent), cells) }}
+{% endfor %}
+{% endfor %}
+"""
+    # Agents without results are left out.
+    text = render_own(tmp_path, body, make_row(make_interval(50.0), shift=0.0), make_row(40.0, shift=1.0))
+    cells = read_lines(text)
+    assert cells["agent"] == ["shift 0", "shift 1"]
+    assert cells["`main`"] == ["50.0 [49.0, 51.0]", "40.0 [-]"]
+    assert "`anonymous`" not in cells
+
+
+def test_a_template_may_include_templates_beside_it(tmp_path):
+    (tmp_path / "part.md").write_text("An included {{ config.title }}.")
+    assert "An included A title." in render_own(tmp_path, '{% include "part.md" %}')
+
+
+def test_a_template_may_draw_figures(tmp_path):
+    at = np.array([0.0, 1.0])
+    rows = [make_row(Curve(at, at, at, at), variant="paper", shift=1.0, control="updated", metric="gap auc")]
+    fields = '{"world": "rooms", "run": "main"}'
+    text = render_own(tmp_path, f'![AUC]({{{{ figure("auc", table, config.shifts, {fields}) }}}})', *rows)
+    (image,) = re.findall(r"!\[AUC\]\((.*)\)", text)
+    assert (tmp_path / image).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "{% if %}",
+        "{% for agent in runs %}",
+        "{{ unknown_name }}",
+        "{{ config.unknown_setting }}",
+        "{{ runs.rooms.unknown_agent.config }}",
+        "{{ table.find(unknown_field=1) }}",
+        "{{ table.num_scenes(world='nowhere') }}",
+        "{{ 1 / 0 }}",
+        "{{ 'word' + 1 }}",
+        "{{ 5.0 | f('nonsense') }}",
+        "{{ figure('unknown figure', table, config.shifts, {}) }}",
+        "{% include 'unknown.md' %}",
+    ],
+)
+def test_a_fault_in_a_template_is_one_error_with_file_and_line(tmp_path, line):
+    with pytest.raises(InputError, match=r"own\.md, line 4") as refusal:
+        render_own(tmp_path, f"A line.\n\n{line}\n", make_row())
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "page.md").exists()
+
+
+@pytest.mark.parametrize("line", ["{% if %}", "{{ unknown_name }}"])
+def test_a_fault_in_an_included_template_names_its_file(tmp_path, line):
+    (tmp_path / "part.md").write_text(f"A line.\n{line}\n")
+    with pytest.raises(InputError, match=r"part\.md, line 2"):
+        render_own(tmp_path, '{% include "part.md" %}')
+
+
+def test_a_template_that_is_no_template_is_refused(tmp_path):
+    # The message lists the packaged ones.
+    with pytest.raises(InputError, match=r"unknown.*factors.*study"):
+        check_page(tmp_path / "page.md", "unknown")
+    (tmp_path / "binary.md").write_bytes(b"\xff\xfe{{ summary }}")
+    with pytest.raises(InputError, match=r"binary\.md"):
+        check_page(tmp_path / "page.md", str(tmp_path / "binary.md"))
+
+    # Without its summary, a page could not be written again.
+    (tmp_path / "bare.md").write_text("No summary.\n")
+    with pytest.raises(InputError, match=r"bare\.md.*summary"):
+        render(tmp_path, str(tmp_path / "bare.md"))
+    assert not (tmp_path / "page.md").exists()
+
+
+# Claims of the study
+
+NUM_STEPS = 30
+PAPER_STDE = {"variant": "stde", "decoding": "argmax", "epsilon": 0.5, "form": "residual"}
+ZERO_STDE = {"variant": "stde", "decoding": "argmax", "epsilon": 0.0, "form": "paper"}
+
+
+def make_course(start: float, at_step_20: float) -> Curve:
+    """Line from step 0 through step 20 with bounds 0.01 away."""
+    steps = np.arange(NUM_STEPS, dtype=float)
+    mean = start + (at_step_20 - start) * steps / 20
+    return Curve(steps, mean, mean - 0.01, mean + 0.01)
+
+
+def study_rows() -> list[ResultRow]:
+    """Results whose effects differ, each with bounds 1 point away."""
+    to_layout = {"reference": "layout", "shift": 1.0}
+    rows = [
+        make_row(make_interval(9.0), shift=1.0, reference="first shift", metric="baseline_argmax_sr"),
+        make_row(make_interval(3.0), variant="layout", decoding="argmax", shift=0.0, reference="baseline"),
+        make_row(make_interval(1.0), variant="layout", decoding="argmax", shift=1.0, reference="baseline"),
+        make_row(make_interval(2.0), **PAPER_STDE, gap="novelty", **to_layout),
+        make_row(make_interval(5.0), **ZERO_STDE, gap="novelty", **to_layout),
+        make_row(make_interval(4.0), **ZERO_STDE, gap="evidence", **to_layout),
+        make_row(make_interval(2.0, 0.5), **PAPER_STDE, gap="novelty", reference="layout", metric="sr growth"),
+        make_row(make_interval(-6.0), variant="tde", decoding="argmax", shift=0.0, reference="layout"),
+        make_row(make_interval(0.3, 0.1), variant="baseline", shift=0.0, metric="sr by similarity, pearson"),
+        make_row(make_interval(-2.5, 0.25), **PAPER_STDE, shift=1.0, metric="gain by similarity, slope"),
+    ]
+
+    # Gaps fall from 0.9 to 0.2, or to 0.8 where the belief is frozen. `evidence` shows the shift, eq. 5 does not.
+    gaps = {"updated": make_course(0.9, 0.2), "frozen": make_course(0.9, 0.8)}
+    aucs = {"calibrated": make_course(0.5, 0.5), "evidence": make_course(0.5, 0.75)}
+    for belief, curve in gaps.items():
+        for shift in (0.0, 1.0):
+            rows.append(make_row(curve, variant="calibrated", control=belief, shift=shift, metric="gap"))
+    for setting, curve in aucs.items():
+        rows.append(make_row(curve, variant=setting, control="updated", shift=1.0, metric="gap auc"))
+    undefined = np.full(NUM_STEPS, math.nan)
+    running_share = 100 - 100 * np.arange(NUM_STEPS) / NUM_STEPS
+    running = Curve(np.arange(NUM_STEPS, dtype=float), running_share, undefined, undefined)
+    rows.append(make_row(running, shift=0.0, metric="running"))
+
+    # Experience is worth 8 points as trained and costs 7 if shifted, of which removal recovers 3.
+    sampled = {"decoding": "sample"}
+    lead = {"variant": "without removal", "reference": "without experience"}
+    rows.append(make_row(make_interval(8.0), **sampled, **lead, shift=0.0))
+    rows.append(make_row(make_interval(-7.0), **sampled, **lead, shift=1.0))
+    rows.append(make_row(make_interval(3.0), **sampled, variant="TDE", reference="without removal", shift=1.0))
+    for shift in (0.0, 1.0):
+        rows.append(make_row(50.0, **sampled, variant="without experience", shift=shift))
+        rows.append(make_row(50.0, **sampled, variant="without removal", shift=shift))
+        rows.append(make_row(20.0, **sampled, variant="without removal", shift=shift, metric="length"))
+    return rows
+
+
+#: Words of a claim, its effect with the half width of its interval, and its verdict.
+CLAIMS = [
+    ("baseline loses", 9.0, 1.0, "holds"),
+    ("weights help where the layout is as trained", 3.0, 1.0, "holds"),
+    ("weights help at shift 1", 1.0, 1.0, "cannot be told"),  # from 0 to 2
+    ("sTDE (epsilon 0.5) gains on the weights", 2.0, 1.0, "holds"),
+    ("sTDE (paper's form, epsilon 0) gains", 5.0, 1.0, "holds"),
+    ("sTDE with the `evidence` gap", 4.0, 1.0, "holds"),
+    ("grows with the shift", 2.0, 0.5, "holds"),
+    ("Hard TDE loses", 6.0, 1.0, "holds"),  # the effect is -6: losing is what is claimed
+    ("Success follows", 0.3, 0.1, "holds"),
+    ("larger where similarity is low", 2.5, 0.25, "holds"),  # -2.5 points per 0.1 more similarity
+    ("gap is below 0.5", 0.3, 0.01, "holds"),  # 0.5 - 0.2
+    ("Without updates", 0.3, 0.01, "holds"),  # 0.8 - 0.5
+    ("none at step 0", 0.0, 0.01, "too small to matter"),  # an AUC of 0.5 is chance
+    ("none at step 20", 0.0, 0.01, "too small to matter"),
+    ("The `evidence` gap does", 0.25, 0.01, "holds"),
+    ("Experience pays", 8.0, 1.0, "holds"),
+    ("Experience costs", 7.0, 1.0, "holds"),
+    ("Hard TDE gains", 3.0, 1.0, "holds"),
+]
+
+
+def find_claim(text: str, words: str) -> list[str]:
+    """Effect, least effect and verdict of the claim with these words."""
+    claims = text.split("### Claims")[1].split("###")[0]
+    (cells,) = [cells for name, cells in read_lines(claims).items() if words in name]
+    return cells
+
+
+@pytest.fixture(scope="module")
+def study_page(tmp_path_factory) -> str:
+    return render(tmp_path_factory.mktemp("study"), "study", *study_rows())
+
+
+@pytest.mark.parametrize(("words", "mean", "half_width", "expected"), CLAIMS)
+def test_a_claim_has_the_sign_of_what_it_claims(study_page, words, mean, half_width, expected):
+    effect, _, claim_verdict = find_claim(study_page, words)
+    low, high = mean - half_width, mean + half_width
+    numbers = [float(number) for number in re.findall(r"[-+]?[0-9.]+", effect)]
+    assert numbers == pytest.approx([mean, low, high], abs=0.051 if mean >= 1 else 0.0051)
+    assert claim_verdict == expected
+
+
+def test_the_study_claims_nothing_else(study_page):
+    claims = study_page.split("### Claims")[1].split("###")[0]
+    assert len(read_lines(claims)) == len(CLAIMS) + 2  # header and rule
+
+
+def test_a_claim_without_results_cannot_be_told(tmp_path):
+    rows = [row for row in study_rows() if row.metric != "sr growth" and row.variant != "tde"]
+    text = render(tmp_path, "study", *rows)
+    for words in ("grows with the shift", "Hard TDE loses"):
+        effect, _, claim_verdict = find_claim(text, words)
+        assert (effect, claim_verdict) == ("-", "cannot be told")
+
+
+def test_the_gap_is_shown_at_the_steps_that_episodes_reach(study_page):
+    gaps = study_page.split("### Does the gap track the layout?")[1].split("###")[0]
+    cells = read_lines(gaps)
+    assert cells["setting"] == ["0", "1", "5", "10", "20"]  # 30 steps
+    assert cells["`evidence`"][-1] == "0.75 [0.74, 0.76]"
+    assert "100, 97, 83, 67, 33 %" in gaps  # 1 - step / 30
+
+
+def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
+    # On `val`, epsilon 0.75 has the greatest SR at the first shift; on `test` it would be 0.25.
+    tables = {}
+    for split, success in (("val", {0.25: 60.0, 0.75: 70.0}), ("test", {0.25: 50.0, 0.75: 40.0})):
+        rows = study_rows()
+        for epsilon, sr in success.items():
+            rows.append(make_row(sr, **{**PAPER_STDE, "epsilon": epsilon}, gap="novelty", shift=0.0))
+        tables[split] = ResultTable(rows)
+    text = render_page(tmp_path / "page.md", "study", CONFIG, tables, [])
+    chosen = [line for line in text.split("## Test")[1].splitlines() if "chosen)" in line]
+    assert len(chosen) == 2  # at both shifts
+    assert "0.75" in chosen[0]
+    assert "40.0" in chosen[0]
+
+
+# Removal in a mixed population
+
+
+def mixture_rows(world: str) -> list[ResultRow]:
+    """Value 6 and cost -4 of experience, and two removals, in one world."""
+    at = {"world": world, "decoding": "sample"}
+    rows = []
+    for shift, lead in ((0.0, 6.0), (1.0, -4.0)):
+        for metric in ("sr", "spl", "sr@40"):
+            fields = {**at, "shift": shift, "metric": metric}
+            rows.append(make_row(50.0, **fields, variant="without experience"))
+            rows.append(make_row(50.0 + lead, **fields, variant="without removal"))
+            lead_fields = {"variant": "without removal", "reference": "without experience"}
+            rows.append(make_row(lead, **fields, **lead_fields))
+        rows.append(make_row(20.0, **at, shift=shift, variant="without removal", metric="length"))
+
+        # TDE keeps a third of the value, and leaves a quarter of the cost.
+        share = 33.0 if shift == 0.0 else 25.0
+        rows.append(make_row(1.0, **at, shift=shift, variant="TDE", metric="weight"))
+        for metric in ("sr", "spl", "sr@40"):
+            tde = {**at, "variant": "TDE", "shift": shift}
+            rows.append(make_row(lead * (share / 100 - 1), **tde, reference="without removal", metric=metric))
+            rows.append(make_row(share, **tde, metric=f"{metric} left"))
+    return rows
+
+
+def test_removal_keeps_value_and_recovers_cost(tmp_path):
+    text = render(tmp_path, "mixture", *mixture_rows("rooms"))
+    value = read_lines(text.split("### What experience is worth")[1])["its value (or cost)"]
+    assert value == ["+6.0 [-]"] * 3 + ["-4.0 [-]"] * 3
+
+    # Weights, then changes at both shifts and over the mixture, then value kept and cost recovered.
+    weights, *cells = read_lines(text.split("### Removal from")[1])["TDE"]
+    assert weights == "1.00, 1.00"
+    assert cells[:6] == ["-4.0 [-]"] * 3 + ["+3.0 [-]"] * 3
+    assert cells[6:9] == ["-"] * 3  # there is no row over the mixture
+    assert [cell.split()[0] for cell in cells[9:]] == ["33", "33", "75", "75"]
+
+
+def test_a_world_may_be_measured_on_one_split_alone(tmp_path):
+    config = ExperimentConfig(worlds={"rooms": {}, "apartments": {"world": "apartments"}}, agents={"main": {}})
+    tables = {
+        "val": ResultTable([*mixture_rows("rooms"), *mixture_rows("apartments")]),
+        "test": ResultTable(mixture_rows("rooms")),
+    }
+    text = render_page(tmp_path / "page.md", "mixture", config, tables, [])
+    titles = [line for line in text.splitlines() if line.startswith("## ") and "," in line]
+    assert [title.split(":")[0] for title in titles] == ["## rooms, val", "## apartments, val", "## rooms, test"]
+
+
+# The paper's tables
+
+
+def render_paper(folder: Path, *rows: ResultRow) -> str:
+    return render(folder, "paper", *rows, config=parse_study(["table2"]))
+
+
+def make_agent_rows(world: str, run: str, **sr: float) -> list[ResultRow]:
+    """SR of the variants of an agent with best actions."""
+    rows = []
+    for variant, value in sr.items():
+        stde = {"epsilon": 0.5, "form": "residual"} if variant == "stde" else {}
+        rows.append(make_row(value, world=world, run=run, variant=variant, decoding="argmax", shift=0.0, **stde))
+    return rows
+
+
+def make_effect(world: str, run: str, variant: str, reference: str, effect: Interval) -> ResultRow:
+    stde = {"epsilon": 0.5, "form": "residual"} if variant == "stde" and run not in ("hosts",) else {}
+    fields = {"variant": variant, "decoding": "argmax", "reference": reference, "shift": 0.0, **stde}
+    return make_row(effect, world=world, run=run, **fields)
+
+
+def test_orderings_are_judged_by_their_intervals(tmp_path):
+    rows = [
+        *make_agent_rows("rooms", "rgb", baseline=60.0),
+        *make_agent_rows("rooms", "org", baseline=80.0),
+        *make_agent_rows("rooms", "hoz", baseline=80.0),
+        make_effect("rooms", "methods", "baseline", "rgb/random", make_interval(68.0)),
+        make_effect("rooms", "structured methods", "baseline", "rgb/baseline", make_interval(20.0)),
+        make_effect("rooms", "org", "layout", "baseline", make_interval(5.0)),
+        make_effect("rooms", "org", "stde", "baseline", make_interval(0.5)),
+        make_effect("rooms", "org", "tde", "layout", make_interval(5.0)),
+        make_effect("rooms", "hoz", "layout", "baseline", make_interval(1.0, 3.0)),
+    ]
+    cells = read_lines(render_paper(tmp_path, *rows))
+
+    # The paper's means are over the methods that were run: (66.53 + 70.38) / 2 - 59.06 = 9.395, and
+    # (59.06 + 66.53 + 70.38) / 3 - 4.68 = 60.643.
+    assert cells["rooms: methods over `rgb` (2 of 6)"] == ["+9.4", "+20.0 [+19.0, +21.0]", "holds"]
+    assert cells["rooms: methods over Random (3 of 8)"] == ["+60.6", "+68.0 [+67.0, +69.0]", "holds"]
+
+    # Hosts: what the paper's Table 1 says of ORG, 71.40 - 66.48, its Table 2, 74.85 - 66.53, and 71.40 - 69.24.
+    assert cells["rooms: `org` + w over `org`"] == ["+4.9", "+5.0 [+4.0, +6.0]", "holds"]
+    assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "too small to matter"]
+    assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "refuted"]
+    assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "cannot be told"]
+
+    # What has no results is not judged.
+    assert cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "not run"]
+    assert cells["apartments: all"][-1] == cells["gains of hosts: apartments over rooms"][-1] == "not run"
+
+
+def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
+    rows = [
+        make_effect("apartments", "hosts", "stde", "baseline", make_interval(10.0)),
+        make_effect("rooms", "hosts", "stde", "baseline", make_interval(5.0)),
+        make_effect("houses", "semexp", "stde", "baseline", make_interval(0.0)),
+    ]
+    cells = read_lines(render_paper(tmp_path, *rows))
+
+    # Both widths add up to 2. The paper's hosts gain (8.53 + 9.63 + 9.91 + 9.86) / 4 = 9.4825 in RoboTHOR and
+    # (4.01 + 8.32 + 5.15 + 4.67) / 4 = 5.5375 in AI2-THOR, its SemExp 1.61.
+    assert cells["gains of hosts: apartments over rooms"] == ["+3.9", "+5.0 [+3.0, +7.0]", "holds"]
+    assert cells["gains: hosts in rooms over `semexp` in houses"] == ["+3.9", "+5.0 [+3.0, +7.0]", "holds"]
+
+
+@pytest.mark.parametrize(
+    ("title", "num_lines", "gains"),
+    [
+        ("Table 2: AI2-THOR", 13, {"eotp": 4.01, "org": 8.32, "vtnet": 5.15, "hoz": 4.67}),
+        ("Table 2: RoboTHOR", 13, {"eotp": 8.53, "org": 9.63, "vtnet": 9.91, "hoz": 9.86}),
+        ("Table 3: Gibson", 4, {"semexp": 1.61}),
+    ],
+)
+def test_the_papers_numbers_add_up_to_the_gains_that_it_prints(tmp_path, title, num_lines, gains):
+    section = render_paper(tmp_path).split(f"## {title}")[1].split("##")[0]
+    cells = read_lines(section)
+    assert len(cells) == num_lines + 2  # header and rule
+    for host, gain in gains.items():
+        paper_gain = float(cells[f"`{host}` + w + sTDE"][0]) - float(cells[f"`{host}`"][0])
+        assert paper_gain == pytest.approx(gain, abs=1e-6)
