@@ -9,7 +9,7 @@ from jaxnav.scenes.worlds import make_generated_scenes
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"),
+    ("scene_name", "plan_name"),
     [
         # RoboTHOR's apartments, furnished five times each.
         ("FloorPlan_Train3_1", "FloorPlan_Train3"),
@@ -24,7 +24,7 @@ from jaxnav.scenes.worlds import make_generated_scenes
         # Rooms with their objects moved.
         ("FloorPlan7-replaced-2", "FloorPlan7"),
         ("val-kitchen-003-replaced-10", "val-kitchen-003"),
-        # All others have a floor plan of their own.
+        # Any other name is that of its own floor plan.
         ("FloorPlan7", "FloorPlan7"),
         ("FloorPlan71", "FloorPlan71"),
         ("FloorPlan201_physics", "FloorPlan201_physics"),
@@ -37,20 +37,20 @@ from jaxnav.scenes.worlds import make_generated_scenes
         ("", ""),
     ],
 )
-def test_the_name_tells_the_floor_plan(name, expected):
-    assert floor_plan_name(name) == expected
+def test_floor_plan_name_follows_from_the_scene_name(scene_name, plan_name):
+    assert floor_plan_name(scene_name) == plan_name
 
 
 @pytest.mark.parametrize("world", ["rooms", "houses"])
-def test_generated_scenes_have_floor_plans_of_their_own(world):
-    names = [make_generated_scenes(world, "val", 4)[i].name for i in range(4)]
-    assert [floor_plan_name(name) for name in names] == names
+def test_generated_rooms_and_houses_have_their_own_floor_plans(world):
+    scene_names = [make_generated_scenes(world, "val", 4)[i].name for i in range(4)]
+    assert [floor_plan_name(scene_name) for scene_name in scene_names] == scene_names
 
 
-def test_generated_apartments_of_a_floor_plan_share_their_walls():
+def test_generated_apartments_of_one_floor_plan_share_walls():
     scenes = [make_generated_scenes("apartments", "val", 10)[i] for i in range(10)]
-    walls = collections.defaultdict(set)
+    wall_masks = collections.defaultdict(set)
     for scene in scenes:
-        walls[floor_plan_name(scene.name)].add((scene.walls.shape, scene.walls.tobytes()))
-    assert [len(kinds) for kinds in walls.values()] == [1, 1]
-    assert len(set.union(*walls.values())) == 2
+        wall_masks[floor_plan_name(scene.name)].add((scene.walls.shape, scene.walls.tobytes()))
+    assert [len(masks_of_plan) for masks_of_plan in wall_masks.values()] == [1, 1]
+    assert len(set.union(*wall_masks.values())) == 2

@@ -29,16 +29,18 @@ SIZES = st.sampled_from((0.1, 0.2, 0.4, 1.0))
 SIZED_OBJECTS = st.lists(st.tuples(TYPES, st.tuples(SIZES, SIZES, SIZES)), max_size=30)
 
 
-def scene_of(objects, name: str = "den") -> Scene:
+def shelf_scene(sized_objects, name: str = "den") -> Scene:
     """Return a scene with objects (type, size) in a row, 1 m apart, on a shelf at 0.6 m, far from the cells."""
-    drawn = draw(["..", ".."], *((kind, 9.0 + i, 0.6 + s[1] / 2, 9.0, *s) for i, (kind, s) in enumerate(objects)))
-    return dataclasses.replace(drawn, name=name)
+    objects = []
+    for i, (kind, size) in enumerate(sized_objects):
+        objects.append((kind, 9.0 + i, 0.6 + size[1] / 2, 9.0, *size))
+    return dataclasses.replace(draw(["..", ".."], *objects), name=name)
 
 
-def sized(types) -> list[tuple[str, tuple[float, float, float]]]:
-    """Return objects whose volume grows along the vocabulary."""
+def grow_along_vocabulary(types) -> list[tuple[str, tuple[float, float, float]]]:
+    """Return objects (type, size) whose volume grows along the vocabulary."""
     ids = category_ids(tuple(types), ITHOR_CATEGORIES)
-    return [(kind, (0.1 + 0.01 * k, 0.1, 0.1)) for kind, k in zip(types, ids, strict=True)]
+    return [(kind, (0.1 + 0.01 * category, 0.1, 0.1)) for kind, category in zip(types, ids, strict=True)]
 
 
 def ids_of(scene: Scene) -> list[int]:
@@ -62,156 +64,190 @@ DEN = {
 }
 
 
-def test_neighbours_in_size_exchange_places():
-    scene = scene_of(list(DEN.items()))
+def test_exchange_places_swaps_neighbours_in_size():
+    scene = shelf_scene(list(DEN.items()))
     # From the smallest: Book, Bowl | Chair, GarbageCan, Fridge. The first chair, a stool, comes to the only place.
-    pair = {"Book": "Bowl", "Bowl": "Book"}
-    three = {"Chair": "GarbageCan", "Stool": "GarbageCan", "GarbageCan": "Fridge", "Fridge": "Stool"}
-    assert exchange_places(scene, TASK, 1, 0).types == tuple((pair | three).get(kind, kind) for kind in DEN)
-    # Half of the two groups is one of them, which one the seed decides.
-    halves = {exchange_places(scene, TASK, 0.5, seed).types for seed in range(20)}
-    assert halves == {tuple(group.get(kind, kind) for kind in DEN) for group in (pair, three)}
+    pair_exchange = {"Book": "Bowl", "Bowl": "Book"}
+    triple_exchange = {"Chair": "GarbageCan", "Stool": "GarbageCan", "GarbageCan": "Fridge", "Fridge": "Stool"}
+    assert exchange_places(scene, TASK, 1, 0).types == tuple(
+        (pair_exchange | triple_exchange).get(kind, kind) for kind in DEN
+    )
+
+    # Half of the two groups is one of them; the seed decides which one.
+    half_shifts = {exchange_places(scene, TASK, 0.5, seed).types for seed in range(20)}
+    assert half_shifts == {tuple(group.get(kind, kind) for kind in DEN) for group in (pair_exchange, triple_exchange)}
 
 
-def test_objects_keep_their_boxes_and_places_their_undersides():
-    small, large = ("Bowl", (0.2, 0.1, 0.3)), ("Pan", (0.5, 0.3, 0.4))
-    scene = scene_of([small, large, ("Bowl", (0.1, 0.2, 0.1))])
-    turned = dataclasses.replace(scene, yaws=np.array([0.0, 90.0, 180.0]))
-    shifted = exchange_places(turned, TASK, 1, 0)
-    assert shifted.types == ("Pan", "Bowl", "Pan")  # a pan is repeated, the second bowl is left out
+def test_exchange_places_keeps_box_sizes_and_undersides():
+    scene = shelf_scene([("Bowl", (0.2, 0.1, 0.3)), ("Pan", (0.5, 0.3, 0.4)), ("Bowl", (0.1, 0.2, 0.1))])
+    turned_scene = dataclasses.replace(scene, yaws=np.array([0.0, 90.0, 180.0]))
+    shifted_scene = exchange_places(turned_scene, TASK, 1, 0)
+    assert shifted_scene.types == ("Pan", "Bowl", "Pan")  # a pan is repeated, the second bowl is left out
+
     # Undersides are at 0.6 m; the bowl and the first pan are turned by a quarter with their places.
     expected = [[9, 0.75, 9, 0.4, 0.3, 0.5], [10, 0.65, 9, 0.3, 0.1, 0.2], [11, 0.75, 9, 0.4, 0.3, 0.5]]
-    np.testing.assert_allclose(shifted.boxes, expected)
-    np.testing.assert_array_equal(shifted.yaws, turned.yaws)
+    np.testing.assert_allclose(shifted_scene.boxes, expected)
+    np.testing.assert_array_equal(shifted_scene.yaws, turned_scene.yaws)
 
 
-def test_a_place_keeps_its_box_where_others_rest_or_cells_would_be_covered():
-    chair, can = ("Chair", 2.0, 0.5, 0.0, 0.5, 1.0, 0.5), ("GarbageCan", 4.0, 0.25, 0.0, 0.4, 0.5, 0.4)
-    free = draw(["......"], chair, can)
-    np.testing.assert_allclose(exchange_places(free, TASK, 1, 0).boxes[:, 3:], free.boxes[[1, 0], 3:])
+def test_exchange_places_keeps_a_box_under_objects_or_beside_cells():
+    chair = ("Chair", 2.0, 0.5, 0.0, 0.5, 1.0, 0.5)
+    garbage_can = ("GarbageCan", 4.0, 0.25, 0.0, 0.4, 0.5, 0.4)
+    free_scene = draw(["......"], chair, garbage_can)
+    shifted_scene = exchange_places(free_scene, TASK, 1, 0)
+    np.testing.assert_allclose(shifted_scene.boxes[:, 3:], free_scene.boxes[[1, 0], 3:])
+
     # A cell 0.22 m from the centre of the can is covered by a chair, but not by a can.
-    near = dataclasses.replace(free, boxes=free.boxes + np.array([[0] * 6, [1.25 + 0.22 - 4, 0, 0, 0, 0, 0]]))
-    shifted = exchange_places(near, TASK, 1, 0)
-    assert shifted.types == ("GarbageCan", "Chair")
-    np.testing.assert_allclose(shifted.boxes[:, 3], [0.4, 0.4])
-    # What rests on the chair stays in its place, and so does what carries it, if it is detected from as far: both of
+    offsets = np.array([[0] * 6, [1.25 + 0.22 - 4, 0, 0, 0, 0, 0]])
+    near_scene = dataclasses.replace(free_scene, boxes=free_scene.boxes + offsets)
+    shifted_scene = exchange_places(near_scene, TASK, 1, 0)
+    assert shifted_scene.types == ("GarbageCan", "Chair")
+    np.testing.assert_allclose(shifted_scene.boxes[:, 3], [0.4, 0.4])
+
+    # An object on the chair stays in its place, and so does the box below it, if it is detected from as far: both of
     # 0.6 m and more from 5 m, but a can of 0.45 m from 3.7 m.
-    for other, width in ((can, 0.4), (("GarbageCan", 4.0, 0.4, 0.0, 0.6, 0.8, 0.6), 0.5)):
-        carrying = draw(["......"], chair, other, ("Towel", 2.0, 1.05, 0.0, 0.3, 0.1, 0.3))
-        carrying = dataclasses.replace(carrying, parents=np.array([-1, -1, 0]))
-        np.testing.assert_allclose(exchange_places(carrying, TASK, 1, 0).boxes[:, 3], [width, 0.5, 0.3])
+    large_can = ("GarbageCan", 4.0, 0.4, 0.0, 0.6, 0.8, 0.6)
+    for can, chair_width in ((garbage_can, 0.4), (large_can, 0.5)):
+        scene = draw(["......"], chair, can, ("Towel", 2.0, 1.05, 0.0, 0.3, 0.1, 0.3))
+        scene = dataclasses.replace(scene, parents=np.array([-1, -1, 0]))
+        np.testing.assert_allclose(exchange_places(scene, TASK, 1, 0).boxes[:, 3], [chair_width, 0.5, 0.3])
 
 
 @given(SIZED_OBJECTS, SHIFTS, SEEDS, NAMES)
-def test_a_share_of_the_categories_exchanges_places_by_a_derangement(objects, shift, seed, name):
-    scene = scene_of(objects, name)
-    shifted, new = exchange_places(scene, TASK, shift, seed), category_at_places(scene, shift, seed)
-    before, after = ids_of(scene), ids_of(shifted)
+def test_exchange_places_deranges_a_share_of_the_categories(objects, shift, seed, name):
+    scene = shelf_scene(objects, name)
+    shifted_scene = exchange_places(scene, TASK, shift, seed)
+    new_category = category_at_places(scene, shift, seed)
+    ids_before = ids_of(scene)
+    ids_after = ids_of(shifted_scene)
+
     # One category comes to all places of another; so the numbers of objects are permuted.
-    assert [new[k] for k in before] == after
-    assert set(new.values()) == set(new)
-    assert sorted(collections.Counter(before).values()) == sorted(collections.Counter(after).values())
-    # What is no category and what is not exchanged stays; so do centres, undersides, cells, walls, name, ...
-    same = [new[k] == k for k in before]
-    assert new.get(-1, -1) == -1
-    assert all(b == a for b, a, stays in zip(scene.types, shifted.types, same, strict=True) if stays)
-    np.testing.assert_array_equal(shifted.boxes[same], scene.boxes[same])
-    np.testing.assert_array_equal(shifted.boxes[:, [0, 2]], scene.boxes[:, [0, 2]])
-    np.testing.assert_allclose(shifted.boxes[:, 1] - shifted.boxes[:, 4] / 2, np.full(len(objects), 0.6))
-    assert_scenes_equal(dataclasses.replace(shifted, types=scene.types, boxes=scene.boxes), scene)
-    # Every object is one of its category, with its size.
-    known_sizes = {(k, size) for k, size in zip(before, object_size(scene.boxes).round(9), strict=True)}
-    assert {(k, size) for k, size in zip(after, object_size(shifted.boxes).round(9), strict=True)} <= known_sizes
-    # The nearest number of groups, but at least one; all at full shift.
-    exchanged, present = sum(k != v for k, v in new.items()), len(set(before) - {-1})
-    groups = present // 2
-    assert exchanged == 0 if shift == 0 or groups == 0 else abs(exchanged // 2 - max(1, shift * groups)) <= 0.5
-    assert present % 2 or exchanged % 2 == 0
-    assert exchanged == present or shift < 1 or groups == 0
+    assert [new_category[category] for category in ids_before] == ids_after
+    assert set(new_category.values()) == set(new_category)
+    assert sorted(collections.Counter(ids_before).values()) == sorted(collections.Counter(ids_after).values())
+
+    # Objects of no category or of one that is not exchanged stay; so do centres, undersides, cells, walls, name, ...
+    is_same = np.array(ids_before, int) == np.array(ids_after, int)
+    assert new_category.get(-1, -1) == -1
+    np.testing.assert_array_equal(np.array(shifted_scene.types)[is_same], np.array(scene.types)[is_same])
+    np.testing.assert_array_equal(shifted_scene.boxes[is_same], scene.boxes[is_same])
+    np.testing.assert_array_equal(shifted_scene.boxes[:, [0, 2]], scene.boxes[:, [0, 2]])
+    np.testing.assert_allclose(shifted_scene.boxes[:, 1] - shifted_scene.boxes[:, 4] / 2, np.full(len(objects), 0.6))
+    assert_scenes_equal(dataclasses.replace(shifted_scene, types=scene.types, boxes=scene.boxes), scene)
+
+    # Every object has the size of one of its category.
+    known_sizes = set(zip(ids_before, object_size(scene.boxes).round(9), strict=True))
+    assert set(zip(ids_after, object_size(shifted_scene.boxes).round(9), strict=True)) <= known_sizes
+
+    # The number of groups is the nearest one to the share, but at least one; all at full shift.
+    num_exchanged = sum(old != new for old, new in new_category.items())
+    num_present = len(set(ids_before) - {-1})
+    num_groups = num_present // 2
+    if shift == 0 or num_groups == 0:
+        assert num_exchanged == 0
+    else:
+        assert abs(num_exchanged // 2 - max(1, shift * num_groups)) <= 0.5
+    assert num_present % 2 or num_exchanged % 2 == 0
+    assert num_exchanged == num_present or shift < 1 or num_groups == 0
 
 
 @given(SIZED_OBJECTS, SEEDS, NAMES)
-def test_every_category_exchanges_with_a_neighbour_in_size(objects, seed, name):
-    scene = scene_of(objects, name)
-    volumes, ids = np.prod([size for _, size in objects], axis=-1), np.array(ids_of(scene))
-    mean = {k: volumes[ids == k].mean() for k in set(ids) - {-1}}
-    for k, new in category_at_places(scene, 1.0, seed).items():
-        if k != new:  # only one category of the same group, and only of three, may lie between the two
-            low, high = sorted((mean[k], mean[new]))
-            assert sum(low + 1e-9 < volume < high - 1e-9 for volume in mean.values()) <= len(mean) % 2
+def test_exchange_places_pairs_every_category_with_a_neighbour_in_size(objects, seed, name):
+    scene = shelf_scene(objects, name)
+    volumes = np.prod([size for _, size in objects], axis=-1)
+    ids = np.array(ids_of(scene))
+    mean_volume = {category: volumes[ids == category].mean() for category in set(ids) - {-1}}
+
+    # Only one category of the same group, and only of three, may lie between the two that exchange.
+    for old, new in category_at_places(scene, 1.0, seed).items():
+        if old != new:
+            low, high = sorted((mean_volume[old], mean_volume[new]))
+            num_between = sum(low + 1e-9 < volume < high - 1e-9 for volume in mean_volume.values())
+            assert num_between <= len(mean_volume) % 2
 
 
 @given(SIZED_OBJECTS, SHIFTS, SEEDS)
-def test_goals_exchange_with_goals(objects, shift, seed):
+def test_exchange_places_swaps_goals_with_goals(objects, shift, seed):
     is_goal = GOALS.is_goal()
-    for k, new in category_at_places(scene_of(objects), shift, seed, GOALS).items():
-        assert k == new or is_goal[k] == is_goal[new]
+    for old, new in category_at_places(shelf_scene(objects), shift, seed, GOALS).items():
+        assert old == new or is_goal[old] == is_goal[new]
 
 
 @given(SIZED_OBJECTS, SHIFTS, SHIFTS, SEEDS, NAMES)
-def test_a_greater_shift_exchanges_more_of_the_same(objects, one, other, seed, name):
-    scene = scene_of(objects, name)
-    less, more = (category_at_places(scene, shift, seed) for shift in sorted((one, other)))
-    assert all(new in (k, more[k]) for k, new in less.items())
+def test_exchange_places_at_a_larger_shift_extends_the_smaller_one(objects, first_shift, second_shift, seed, name):
+    scene = shelf_scene(objects, name)
+    at_small_shift = category_at_places(scene, min(first_shift, second_shift), seed)
+    at_large_shift = category_at_places(scene, max(first_shift, second_shift), seed)
+    for old, new in at_small_shift.items():
+        assert new in (old, at_large_shift[old])
 
 
 @pytest.mark.parametrize(
-    ("present", "shift", "exchanged"),
+    ("num_present", "shift", "num_exchanged"),
     [(4, 0.01, 2), (10, 0.25, 2), (10, 0.34, 4), (10, 0.66, 6), (10, 1, 10), (3, 0.1, 3), (11, 1, 11)],
 )
-def test_the_share_is_rounded(present, shift, exchanged):
-    scene = scene_of(sized(ITHOR_CATEGORIES[:present]))
-    shifted = exchange_places(scene, TASK, shift, 0)
-    assert sum(a != b for a, b in zip(scene.types, shifted.types, strict=True)) == exchanged
+def test_exchange_places_rounds_the_share(num_present, shift, num_exchanged):
+    scene = shelf_scene(grow_along_vocabulary(ITHOR_CATEGORIES[:num_present]))
+    shifted_scene = exchange_places(scene, TASK, shift, 0)
+    assert (np.array(scene.types) != np.array(shifted_scene.types)).sum() == num_exchanged
 
 
-def test_like_volumes_keep_the_order_of_the_vocabulary():
-    scene = scene_of([(kind, (0.6, 0.6, 0.05)) for kind in ITHOR_CATEGORIES[3::-1]])
+def test_exchange_places_orders_equal_volumes_by_vocabulary():
+    scene = shelf_scene([(kind, (0.6, 0.6, 0.05)) for kind in ITHOR_CATEGORIES[3::-1]])
     assert category_at_places(scene, 1.0) == {0: 1, 1: 0, 2: 3, 3: 2}
 
 
-def test_an_alias_is_its_category():
-    scene = scene_of(sized(["Stool", "Book", "Chair", "Sofa"]))
+def test_exchange_places_treats_an_alias_as_its_category():
+    scene = shelf_scene(grow_along_vocabulary(["Stool", "Book", "Chair", "Sofa"]))
     assert exchange_places(scene, TASK, 1, 0).types == ("Book", "Stool", "Book", "Sofa")
 
 
 @pytest.mark.parametrize(
     ("types", "shift"), [(["Book", "Chair"], 0.0), (["Stool", "Chair", "Sofa"], 1.0), (["Sofa"], 1), ([], 1.0)]
 )
-def test_what_cannot_change_is_the_same_scene(types, shift):
-    scene = scene_of(sized(types))
+def test_exchange_places_returns_the_scene_without_a_possible_exchange(types, shift):
+    scene = shelf_scene(grow_along_vocabulary(types))
     assert exchange_places(scene, TASK, shift, 0) is scene
 
 
-def test_name_and_seed_alone_fix_the_exchange():
-    objects = sized(ITHOR_CATEGORIES)
-    first = exchange_places(scene_of(objects), TASK, 0.5, 0)
-    assert exchange_places(scene_of(objects), TASK, 0.5, 0).types == first.types
+def test_exchange_places_depends_on_scene_name_and_seed_alone():
+    objects = grow_along_vocabulary(ITHOR_CATEGORIES)
+    first_exchange = exchange_places(shelf_scene(objects), TASK, 0.5, 0)
+    assert exchange_places(shelf_scene(objects), TASK, 0.5, 0).types == first_exchange.types
+
     # Order and number of the objects do not count.
-    again = exchange_places(scene_of([*objects[::-1], *sized(["Book", "Sofa"])]), TASK, 0.5, 0)
-    assert again.types[:22] == first.types[::-1]
-    assert exchange_places(scene_of(objects, "other"), TASK, 0.5, 0).types != first.types
-    assert exchange_places(scene_of(objects), TASK, 0.5, 1).types != first.types
-    # In the end all exchange, whatever the order.
-    ends = [exchange_places(scene_of(objects, name), TASK, 1, seed) for name, seed in (("den", 0), ("other", 1))]
-    assert ends[0].types == ends[1].types
+    reordered = exchange_places(shelf_scene([*objects[::-1], *grow_along_vocabulary(["Book", "Sofa"])]), TASK, 0.5, 0)
+    assert reordered.types[:22] == first_exchange.types[::-1]
+
+    # Name and seed do.
+    assert exchange_places(shelf_scene(objects, "other"), TASK, 0.5, 0).types != first_exchange.types
+    assert exchange_places(shelf_scene(objects), TASK, 0.5, 1).types != first_exchange.types
+
+    # At full shift all exchange, for any name and seed.
+    full_shift = exchange_places(shelf_scene(objects), TASK, 1, 0)
+    assert exchange_places(shelf_scene(objects, "other"), TASK, 1, 1).types == full_shift.types
 
 
 @pytest.mark.parametrize(("shift", "seed"), [(-0.1, 0), (1.1, 0), (float("nan"), 0), (0.5, -1)])
-def test_impossible_numbers_are_refused(shift, seed):
-    with pytest.raises(InputError, match="give a seed of at least 0, a shift from 0 to 1"):
+def test_shift_scenes_refuses_impossible_shifts_and_seeds(shift, seed):
+    with pytest.raises(InputError, match="seed of at least 0, a shift from 0 to 1"):
         shift_scenes(make_generated_scenes("rooms", "val"), TASK, shift, seed)
 
 
-def test_real_objects_keep_their_size_and_leave_the_cells_free():
+def test_exchange_places_keeps_sizes_in_real_scenes():
     scenes = load_scenes(require(ITHOR), "val")
-    num_kept = num_moved = 0
+    num_kept = 0
+    num_moved = 0
     for i in range(len(scenes)):
         before = scenes[i]
         after = exchange_places(before, TASK, 1, 0)
+
+        # The sizes of each type in the original scene.
         sizes_by_type = collections.defaultdict(set)
         for kind, size in zip(before.types, object_size(before.boxes).round(6), strict=True):
             sizes_by_type[kind].add(size)
+
+        # Count the exchanged objects, and those with a size of their new type.
         new_sizes = object_size(after.boxes).round(6)
         for old_type, new_type, size in zip(before.types, after.types, new_sizes, strict=True):
             if old_type != new_type:

@@ -11,25 +11,25 @@ from jaxnav.scenes.worlds import WORLDS, SceneSource
 
 
 @pytest.mark.parametrize(
-    ("origin", "world"),
+    ("recorded_world", "expected_world"),
     [("ithor", "rooms"), ("robothor", "apartments"), ("procthor", "houses"), ("gibson", "houses"), ("mine", "rooms")],
 )
-def test_a_file_tells_its_world(tmp_path, origin, world):
-    file = tmp_path / "scenes.jsonl.gz"
-    write_scenes(file, [dataclasses.replace(coarse_scene(0), world=origin)])
-    source = SceneSource(str(file))
-    assert source.world_name == world
-    assert source.task == WORLDS[world].task
-    assert SceneSource(str(file), world="rooms").world_name == "rooms"  # what is asked for comes first
+def test_scene_source_infers_the_world_of_a_file(tmp_path, recorded_world, expected_world):
+    scene_file = tmp_path / "scenes.jsonl.gz"
+    write_scenes(scene_file, [dataclasses.replace(coarse_scene(0), world=recorded_world)])
+    scene_source = SceneSource(str(scene_file))
+    assert scene_source.world_name == expected_world
+    assert scene_source.task == WORLDS[expected_world].task
+    assert SceneSource(str(scene_file), world="rooms").world_name == "rooms"  # an explicit world takes precedence
 
 
-def test_a_generated_world_is_itself():
+def test_scene_source_of_a_generated_world_has_its_name():
     assert SceneSource("apartments").world_name == "apartments"
 
 
-def test_the_first_scene_that_can_be_used_decides(tmp_path):
-    file = tmp_path / "scenes.jsonl"
-    file.write_text("[]\n")
-    assert SceneSource(str(file)).world_name == "rooms"
+def test_scene_source_of_a_file_without_scenes_defaults_to_rooms(tmp_path):
+    scene_file = tmp_path / "scenes.jsonl"
+    scene_file.write_text("[]\n")
+    assert SceneSource(str(scene_file)).world_name == "rooms"
     with pytest.raises(InputError, match="cannot be read"):
         _ = SceneSource(str(tmp_path / "absent.jsonl.gz")).world_name

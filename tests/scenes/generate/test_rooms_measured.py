@@ -24,17 +24,22 @@ MEASURED = {
 
 
 @pytest.mark.parametrize("room_type", ROOM_TYPES)
-def test_statistics_follow_the_measured_ones(rooms: list[Scene], room_type: str):
-    quartiles, instances, distinct, fill = MEASURED[room_type]
+def test_generated_room_statistics_follow_the_measured_ones(rooms: list[Scene], room_type: str):
+    quartiles, mean_instances, mean_targets, fill_share = MEASURED[room_type]
     scenes = of_type(rooms, room_type)
-    cells = [scene.reach.sum() for scene in scenes]
+    num_cells = [scene.reach.sum() for scene in scenes]
     # The standard error of a quartile of 50 rooms is about 15 %.
-    np.testing.assert_allclose(np.quantile(cells, [0.25, 0.5, 0.75]), quartiles, rtol=0.35)
-    targets = [[name for name in scene.types if name in ITHOR_CATEGORIES] for scene in scenes]
-    assert np.mean([len(names) for names in targets]) == pytest.approx(instances, rel=0.1)
-    assert np.mean([len(set(names)) for names in targets]) == pytest.approx(distinct, rel=0.1)
+    np.testing.assert_allclose(np.quantile(num_cells, [0.25, 0.5, 0.75]), quartiles, rtol=0.35)
+
+    # Numbers of target objects and of different targets.
+    num_instances = [np.isin(scene.types, ITHOR_CATEGORIES).sum() for scene in scenes]
+    num_targets = [len(set(scene.types) & set(ITHOR_CATEGORIES)) for scene in scenes]
+    assert np.mean(num_instances) == pytest.approx(mean_instances, rel=0.1)
+    assert np.mean(num_targets) == pytest.approx(mean_targets, rel=0.1)
+
+    # Share of standable cells in the rectangle around them.
     spans = [np.ptp(np.argwhere(scene.reach), axis=0) + 1 for scene in scenes]
-    assert np.median(np.array(cells) / np.prod(spans, axis=1)) == pytest.approx(fill, rel=0.2)
+    assert np.median(np.array(num_cells) / np.prod(spans, axis=1)) == pytest.approx(fill_share, rel=0.2)
 
 
 #: (room type, target): share of rooms that have it, median height of its centre (0 where it varies by support).
@@ -54,35 +59,35 @@ PRESENCE = {
 
 
 @pytest.mark.parametrize(("room_type", "target"), PRESENCE)
-def test_presence_and_height_follow_the_measured_ones(rooms: list[Scene], room_type: str, target: str):
-    has, height = PRESENCE[room_type, target]
+def test_generated_room_presence_and_height_follow_the_measured_ones(rooms: list[Scene], room_type: str, target: str):
+    presence_share, median_height = PRESENCE[room_type, target]
     scenes = of_type(rooms, room_type)
-    heights = [y for scene in scenes for name, y in zip(scene.types, scene.boxes[:, 1], strict=True) if name == target]
+    heights = np.concatenate([scene.boxes[np.array(scene.types) == target, 1] for scene in scenes])
     # The standard error of a share over 50 rooms is at most 0.07.
-    assert np.mean([target in scene.types for scene in scenes]) == pytest.approx(has, abs=0.2)
-    assert np.median(heights) == pytest.approx(height, abs=0.12)
+    assert np.mean([target in scene.types for scene in scenes]) == pytest.approx(presence_share, abs=0.2)
+    assert np.median(heights) == pytest.approx(median_height, abs=0.12)
 
 
-def lift(scenes: list[Scene], a: str, b: str) -> float:
-    """Return how much likelier an `a` has a `b` near.
-
-    It is the share of those within 1.5 m of one, over that of other targets.
-    """
-
-    def near(name: str) -> float:
-        shares = []
-        for scene in scenes:
-            if name in scene.types and b in scene.types:
-                types, places = np.array(scene.types), scene.boxes[:, [0, 2]]
-                distances = np.linalg.norm(places[types == name][:, None] - places[types == b], axis=-1)
-                shares.append((distances.min(axis=1) <= 1.5).mean())
-        return float(np.mean(shares)) if shares else np.nan
-
-    others = [name for name in ITHOR_CATEGORIES if name not in (a, b)]
-    return near(a) / float(np.nanmean([near(name) for name in others]))
+def near_share(scenes: list[Scene], type_name: str, neighbour: str) -> float:
+    """Return the share of the objects of a type within 1.5 m of one of another, NaN where they never meet."""
+    shares = []
+    for scene in scenes:
+        if type_name in scene.types and neighbour in scene.types:
+            types = np.array(scene.types)
+            places = scene.boxes[:, [0, 2]]
+            distances = np.linalg.norm(places[types == type_name][:, None] - places[types == neighbour], axis=-1)
+            shares.append((distances.min(axis=1) <= 1.5).mean())
+    return float(np.mean(shares)) if shares else np.nan
 
 
-def shuffled(scene: Scene, rng: np.random.Generator) -> Scene:
+def neighbour_lift(scenes: list[Scene], type_name: str, neighbour: str) -> float:
+    """Return the share of the objects of a type near another, over the mean share of other targets."""
+    others = [other for other in ITHOR_CATEGORIES if other not in (type_name, neighbour)]
+    other_shares = [near_share(scenes, other, neighbour) for other in others]
+    return near_share(scenes, type_name, neighbour) / float(np.nanmean(other_shares))
+
+
+def shuffle_places(scene: Scene, rng: np.random.Generator) -> Scene:
     boxes = scene.boxes.copy()
     boxes[:, :3] = boxes[rng.permutation(len(boxes)), :3]
     return dataclasses.replace(scene, boxes=boxes)
@@ -100,15 +105,22 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize(("room_type", "a", "b"), PAIRS)
-def test_objects_stand_near_what_they_belong_to(rooms: list[Scene], room_type: str, a: str, b: str):
-    assert lift(of_type(rooms, room_type), a, b) > 1.5
+@pytest.mark.parametrize(("room_type", "type_name", "neighbour"), PAIRS)
+def test_generated_rooms_place_related_objects_near_each_other(
+    rooms: list[Scene], room_type: str, type_name: str, neighbour: str
+):
+    assert neighbour_lift(of_type(rooms, room_type), type_name, neighbour) > 1.5
 
 
-def test_shuffled_positions_carry_no_co_occurrence(rooms: list[Scene]):
+def test_neighbour_lift_of_shuffled_rooms_is_one(rooms: list[Scene]):
     rng = np.random.default_rng(0)
-    mixed = [shuffled(scene, rng) for scene in rooms]
-    lifts = np.array([[lift(of_type(world, t), a, b) for t, a, b in PAIRS] for world in (rooms, mixed)])
+    shuffled_rooms = [shuffle_places(scene, rng) for scene in rooms]
+    lifts = []
+    shuffled_lifts = []
+    for room_type, type_name, neighbour in PAIRS:
+        lifts.append(neighbour_lift(of_type(rooms, room_type), type_name, neighbour))
+        shuffled_lifts.append(neighbour_lift(of_type(shuffled_rooms, room_type), type_name, neighbour))
+
     # By chance the lift is 1; the mean of eight of them over 50 rooms each stays within about 0.2 of it.
-    assert np.mean(lifts[0]) > 2.5
-    assert np.mean(lifts[1]) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(lifts) > 2.5
+    assert np.mean(shuffled_lifts) == pytest.approx(1.0, abs=0.3)
