@@ -7,16 +7,17 @@ import shutil
 import subprocess
 
 import pytest
-from support.report_page import page, replays
+from support.report_page import example_page, example_replays
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="no Chromium")]
 
-#: What would run if it were taken for a tag or an attribute.
+#: Code that would run if a name became a tag or an attribute.
 PAYLOAD = "document.documentElement.dataset.ran = 1"
 HOSTILE = f"</script><script>{PAYLOAD}</script><img src=x onerror='{PAYLOAD}'>"
 
-DRIVE = """
+#: Moves the slider, presses keys and buttons, and writes down what the page shows.
+DRIVE_SCRIPT = """
 <script>
 const seen = [], by = (query) => [...document.querySelectorAll(query)];
 const read = () => seen.push({
@@ -58,79 +59,95 @@ setTimeout(() => {
 """
 
 
-def browse(folder, text):
-    """The document as it is after a while, and what was said on the console."""
+def open_in_browser(folder, page_text):
+    """The document after a while, and the lines on the browser's console."""
     file = folder / "page.html"
-    file.write_text(text, encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr"]
-    options += [f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=8000", "--dump-dom", file.as_uri()]
-    done = subprocess.run([str(BROWSER), *options], capture_output=True, text=True, timeout=120)
-    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    file.write_text(page_text, encoding="utf-8")
+    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+    command += ["--enable-logging=stderr", f"--user-data-dir={folder / 'profile'}"]
+    command += ["--virtual-time-budget=8000", "--dump-dom", file.as_uri()]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    console_lines = [line for line in process.stderr.splitlines() if "CONSOLE" in line]
+    return process.stdout, console_lines
 
 
-def open_to_scripts(text):
-    """The page without its policy."""
-    return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)
+def without_policy(page_text):
+    """The page without its content security policy."""
+    return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page_text)
+
+
+def payload_ran(document):
+    return "data-ran" in document.partition("<head>")[0]
 
 
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory):
-    """What a reader who uses slider, keys and button sees."""
-    text = open_to_scripts(page()).replace("</body>", DRIVE + "</body>")
-    document, console = browse(tmp_path_factory.mktemp("browser"), text)
-    assert console == []
-    return json.loads(html.unescape(document.partition('<pre id="verdict">')[2].partition("</pre>")[0]))
+def verdict(tmp_path_factory):
+    """The page as a reader sees it who uses slider, keys and buttons."""
+    page_text = without_policy(example_page()).replace("</body>", DRIVE_SCRIPT + "</body>")
+    document, console_lines = open_in_browser(tmp_path_factory.mktemp("browser"), page_text)
+    assert console_lines == []
+    verdict_text = document.partition('<pre id="verdict">')[2].partition("</pre>")[0]
+    return json.loads(html.unescape(verdict_text))
 
 
-def test_the_slider_moves_both_agents_in_step(driven):
-    (plan,), episode = replays().plans, replays().episodes[1]  # that in which the agents differ
-    assert [state["now"] for state in driven["seen"][:5]] == [f"step {step + 1} of 5" for step in range(5)]
-    for step, state in enumerate(driven["seen"][:5]):
-        places = [plan.views[c.views[min(step, len(c.views) - 1)]] for c in episode.courses]
-        poses = [tuple(map(int, re.findall(r"-?\d+", agent)[:2])) for agent in state["agents"]]
-        assert poses == [(view.x, -view.z) for view in places]
+def test_slider_moves_both_agents_in_step(verdict):
+    replays = example_replays()
+    (plan,) = replays.plans
+    slider_states = verdict["seen"][:5]
+    assert [state["now"] for state in slider_states] == [f"step {step + 1} of 5" for step in range(5)]
+
+    # The second episode, in which the agents differ: the shorter walk waits at its end.
+    for step, state in enumerate(slider_states):
+        expected_places = []
+        for trace in replays.episodes[1].courses:
+            view = plan.views[trace.views[min(step, len(trace.views) - 1)]]
+            expected_places.append((view.x, -view.z))
+        agent_places = [tuple(map(int, re.findall(r"-?\d+", transform)[:2])) for transform in state["agents"]]
+        assert agent_places == expected_places
         assert state["cursors"] == [min(step, 2) + 0.5, step + 0.5]
-    assert len({tuple(state["agents"]) for state in driven["seen"][:5]}) > 3
+    assert len({tuple(state["agents"]) for state in slider_states}) > 3
 
 
-def test_keys_step_and_change_the_episode(driven):
-    assert [state["step"] for state in driven["seen"][5:9]] == ["3", "2", "3", "3"]
-    goals = [replays().categories[episode.goal] for episode in reversed(replays().episodes)]
-    assert driven["goals"] == goals  # those that differ come first
-    assert driven["after"] == goals[1]
+def test_keys_step_and_change_the_episode(verdict):
+    assert [state["step"] for state in verdict["seen"][5:9]] == ["3", "2", "3", "3"]
+    replays = example_replays()
+    goals = [replays.categories[episode.goal] for episode in reversed(replays.episodes)]
+    assert verdict["goals"] == goals  # episodes in which the agents differ come first
+    assert verdict["after"] == goals[1]
 
 
-def test_a_comparison_chooses_both_agents(driven):
-    assert (driven["before"], driven["swapped"]) == ([0, 1], [1, 0])
+def test_comparison_button_selects_both_agents(verdict):
+    assert (verdict["before"], verdict["swapped"]) == ([0, 1], [1, 0])
 
 
-def test_the_button_plays_to_the_end(driven):
-    assert (driven["playing"], driven["stopped"]) == ("Pause", "Play")
-    assert driven["seen"][-1]["step"] == "4"
+def test_play_button_plays_to_the_end(verdict):
+    assert (verdict["playing"], verdict["stopped"]) == ("Pause", "Play")
+    assert verdict["seen"][-1]["step"] == "4"
 
 
-def test_the_count_of_differing_episodes_is_told(driven):
-    assert "in 7 of 24 episodes" in driven["count"]
-    assert driven["options"] == 2 * replays().players
+def test_page_counts_the_episodes_that_differ(verdict):
+    assert "in 7 of 24 episodes" in verdict["count"]
+    assert verdict["options"] == 2 * example_replays().players
 
 
-@pytest.mark.parametrize("name", ["", HOSTILE])
-def test_the_console_is_silent_and_nothing_runs(tmp_path, name):
-    document, console = browse(tmp_path, page(name))
-    assert console == []
-    assert "data-ran" not in document.partition("<head>")[0]
-    assert document.count('class="side"') == 2  # the replays are there
+@pytest.mark.parametrize("suffix", ["", HOSTILE])
+def test_page_logs_nothing_and_runs_no_name(tmp_path, suffix):
+    document, console_lines = open_in_browser(tmp_path, example_page(suffix))
+    assert console_lines == []
+    assert not payload_ran(document)
+    assert document.count('class="side"') == 2  # the replays are shown
 
 
-def test_nothing_runs_even_without_the_policy(tmp_path):
-    document, _ = browse(tmp_path, open_to_scripts(page(HOSTILE)))
-    assert "data-ran" not in document.partition("<head>")[0]
+def test_page_runs_no_name_without_its_policy(tmp_path):
+    document, _ = open_in_browser(tmp_path, without_policy(example_page(HOSTILE)))
+    assert not payload_ran(document)
 
 
-def test_what_is_no_text_runs_unless_the_policy_forbids_it(tmp_path):
-    """A control: the payload works, and the policy stops it."""
-    text = page().replace("</body>", f"<script>{PAYLOAD}</script></body>")
-    ran, stopped = (browse(tmp_path, page_text) for page_text in (open_to_scripts(text), text))
-    assert "data-ran" in ran[0].partition("<head>")[0]
-    assert "data-ran" not in stopped[0].partition("<head>")[0]
-    assert "Content Security Policy" in stopped[1][0]  # the console is heard
+def test_policy_stops_a_script_that_would_run_without_it(tmp_path):
+    """Control: the payload works, and the policy stops it."""
+    page_text = example_page().replace("</body>", f"<script>{PAYLOAD}</script></body>")
+    open_document, _ = open_in_browser(tmp_path, without_policy(page_text))
+    guarded_document, console_lines = open_in_browser(tmp_path, page_text)
+    assert payload_ran(open_document)
+    assert not payload_ran(guarded_document)
+    assert "Content Security Policy" in console_lines[0]

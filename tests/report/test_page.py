@@ -1,6 +1,7 @@
-"""The page: names are text, whatever they hold, and it is one file that loads nothing."""
+"""The page: names stay text, whatever they hold, and it is one file that loads nothing."""
 
 import base64
+import collections
 import dataclasses
 import hashlib
 import json
@@ -10,7 +11,7 @@ from html.parser import HTMLParser
 import pytest
 from rich.table import Table as ConsoleTable
 from rich.text import Text
-from support.report_page import page, replays
+from support.report_page import example_page, example_replays
 
 from jaxnav.report.page import to_text_table
 
@@ -19,96 +20,112 @@ HOSTILE = (
 )
 
 
-class Reader(HTMLParser):
-    """Collects tags with their attributes, and the texts of scripts and tables."""
+class PageReader(HTMLParser):
+    """Collects the tags of a page with their attributes, and the texts by the innermost tag around them."""
 
-    def __init__(self, text):
+    def __init__(self, page_text):
         super().__init__()
-        self.tags, self.texts, self.open = [], {}, []
-        self.feed(text)
+        self.tags = []
+        self.texts = {}
+        self.open_tags = []
+        self.feed(page_text)
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
-        self.open.append(tag)
+        self.open_tags.append(tag)
 
     def handle_endtag(self, tag):
-        if tag in self.open:
-            while self.open.pop() != tag:
+        if tag in self.open_tags:
+            while self.open_tags.pop() != tag:
                 pass
 
     def handle_data(self, data):
-        if self.open:
-            self.texts.setdefault(self.open[-1], []).append(data)
+        if self.open_tags:
+            self.texts.setdefault(self.open_tags[-1], []).append(data)
 
+    def count_tags(self):
+        return collections.Counter(tag for tag, _ in self.tags)
 
-def count(reader):
-    names = [tag for tag, _ in reader.tags]
-    return {name: names.count(name) for name in set(names)}
+    def attribute_names(self):
+        names = set()
+        for _, attributes in self.tags:
+            names.update(attributes)
+        return names
+
+    def attributes_of(self, tag):
+        """The attributes of each of the tags with a name."""
+        return [attributes for name, attributes in self.tags if name == tag]
 
 
 @pytest.fixture(scope="module")
-def hostile():
-    return Reader(page(HOSTILE))
+def hostile_reader():
+    return PageReader(example_page(HOSTILE))
 
 
-def test_hostile_names_make_no_tags_and_no_attributes(hostile):
-    plain = Reader(page())
-    assert count(hostile) == count(plain)
-    attributes = [{name for _, attributes in reader.tags for name in attributes} for reader in (hostile, plain)]
-    assert attributes[0] == attributes[1]
-    assert not any(name.startswith("on") for name in attributes[0])
+@pytest.fixture(scope="module")
+def plain_reader():
+    return PageReader(example_page())
 
 
-def test_hostile_names_are_still_read_as_they_are(hostile):
+def test_hostile_names_add_no_tags_and_no_attributes(hostile_reader, plain_reader):
+    assert hostile_reader.count_tags() == plain_reader.count_tags()
+    assert hostile_reader.attribute_names() == plain_reader.attribute_names()
+    assert not any(name.startswith("on") for name in hostile_reader.attribute_names())
+
+
+def test_hostile_names_are_shown_unchanged(hostile_reader):
     for tag, text in (("h1", "title"), ("th", "row"), ("th", "group"), ("caption", "Shift 0"), ("dd", "run")):
-        assert text + HOSTILE in hostile.texts[tag], tag
-    assert {tag["aria-label"] for name, tag in hostile.tags if name == "figure"} == {"chart" + HOSTILE}
+        assert text + HOSTILE in hostile_reader.texts[tag], tag
+    figure_labels = {attributes["aria-label"] for attributes in hostile_reader.attributes_of("figure")}
+    assert figure_labels == {"chart" + HOSTILE}
 
 
-def test_the_data_is_what_was_given():
-    text = page(HOSTILE)
-    data = text.partition('id="data">')[2].partition("</script>")[0]
-    assert not set("<>&") & set(data)
-    assert json.loads(data) == json.loads(json.dumps([dataclasses.asdict(replays(HOSTILE))]))
+def test_page_embeds_the_replays_as_json_without_markup():
+    page_text = example_page(HOSTILE)
+    embedded_json = page_text.partition('id="data">')[2].partition("</script>")[0]
+    assert not set("<>&") & set(embedded_json)
+    expected_data = json.loads(json.dumps([dataclasses.asdict(example_replays(HOSTILE))]))
+    assert json.loads(embedded_json) == expected_data
 
 
-def test_nothing_is_loaded_and_one_script_is_allowed():
-    text = page()
-    reader = Reader(text)
-    assert not re.findall(r"(?:src|href)=\"(?!#)", text.partition("<script")[0])
-    assert not {"link", "img", "iframe", "object", "embed", "base", "form"} & {tag for tag, _ in reader.tags}
-    assert "@import" not in text
-    assert "url(" not in text
-    (policy,) = (tag["content"] for name, tag in reader.tags if tag.get("http-equiv") == "Content-Security-Policy")
-    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
-    script = reader.texts["script"][-1]
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    assert (rules["default-src"], rules["script-src"]) == ("'none'", f"'sha256-{digest}'")
+def test_page_loads_nothing(plain_reader):
+    page_text = example_page()
+    assert not re.findall(r"(?:src|href)=\"(?!#)", page_text.partition("<script")[0])
+    assert not {"link", "img", "iframe", "object", "embed", "base", "form"} & set(plain_reader.count_tags())
+    assert "@import" not in page_text
+    assert "url(" not in page_text
 
 
-def test_the_script_parses_no_names():
-    script = Reader(page()).texts["script"][-1]
-    assert "textContent" in script
-    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|Function\(|fetch\(", script)
+def test_page_policy_allows_its_own_script_alone(plain_reader):
+    policies = []
+    for attributes in plain_reader.attributes_of("meta"):
+        if attributes.get("http-equiv") == "Content-Security-Policy":
+            policies.append(attributes["content"])
+    (policy,) = policies
+    directives = dict(directive.split(" ", 1) for directive in policy.split("; "))
+    script = plain_reader.texts["script"][-1]
+    script_digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert directives["default-src"] == "'none'"
+    assert directives["script-src"] == f"'sha256-{script_digest}'"
 
 
-def test_tables_are_there_without_a_script():
-    reader = Reader(page())
-    assert reader.texts["td"].count("50.0 [40.0, 60.0]") == 4  # two sections, open and folded
-    assert any("need JavaScript" in text for text in reader.texts["p"])
-    (player,) = (tag for _, tag in reader.tags if tag.get("id") == "player")
-    assert "hidden" in player
+def test_page_shows_tables_without_javascript(plain_reader):
+    assert plain_reader.texts["td"].count("50.0 [40.0, 60.0]") == 4  # two sections, open and folded
+    assert any("need JavaScript" in text for text in plain_reader.texts["p"])
+    (player_attributes,) = (attributes for _, attributes in plain_reader.tags if attributes.get("id") == "player")
+    assert "hidden" in player_attributes
 
 
-def test_links_lead_to_sections():
-    reader = Reader(page(HOSTILE))
-    targets = {tag["href"].removeprefix("#") for name, tag in reader.tags if name == "a"}
-    assert targets <= {tag["id"] for _, tag in reader.tags if "id" in tag}
-    assert "replays" in targets
+def test_page_links_lead_to_its_sections(hostile_reader):
+    link_targets = {attributes["href"].removeprefix("#") for attributes in hostile_reader.attributes_of("a")}
+    section_ids = {attributes["id"] for _, attributes in hostile_reader.tags if "id" in attributes}
+    assert link_targets <= section_ids
+    assert "replays" in link_targets
 
 
-def test_cells_are_those_of_the_terminal():
+def test_to_text_table_copies_the_cells_of_a_console_table():
     table = ConsoleTable("Variant", "SR (%)")
     table.add_row(Text("rooms val", style="bold"))
     table.add_row(Text("a [b]"), Text("1.0 [0.5, 1.5]"))
-    assert to_text_table("t", table) == ("t", ("Variant", "SR (%)"), (("rooms val",), ("a [b]", "1.0 [0.5, 1.5]")))
+    expected_rows = (("rooms val",), ("a [b]", "1.0 [0.5, 1.5]"))
+    assert to_text_table("t", table) == ("t", ("Variant", "SR (%)"), expected_rows)

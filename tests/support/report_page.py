@@ -1,4 +1,4 @@
-"""A page made by hand: two agents in two episodes of a drawn room."""
+"""A report page made by hand: two agents in two episodes of the kitchen."""
 
 import dataclasses
 
@@ -9,52 +9,56 @@ from jaxnav.report.replays import ReplayEpisode, Replays, ReplayTrace, make_plan
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 from support import tiny_world as tiny
 
-CATEGORIES = len(tiny.CATEGORIES)
+NUM_CATEGORIES = len(tiny.CATEGORIES)
 #: Poses of scene 0: cells 0 to 3, heading 0.
 POSES = tiny.POSES_PER_CELL * np.arange(4)
 
 
-def course(views, success=True):
-    """A course through views that ends with Done."""
-    steps = len(views)
-    chances = np.full((steps, 3, NUM_ACTIONS), 0.1)
-    chances[:, :, 0] = 0.5
+def trace_through(views, success=True):
+    """A walk through views by their indices that ends with Done."""
+    num_steps = len(views)
+    probabilities = np.full((num_steps, 3, NUM_ACTIONS), 0.1)
+    probabilities[:, :, 0] = 0.5
+    layout_weights = np.tile(np.linspace(0, 0.9, NUM_CATEGORIES), (num_steps, 1))
     return ReplayTrace(
         views=list(views),
-        actions=[0] * (steps - 1) + [DONE],
+        actions=[0] * (num_steps - 1) + [DONE],
         success=success,
-        gap=pack_shares(np.linspace(1, 0, steps)),
-        weight=pack_shares(np.linspace(0.5, 0, steps)),
-        layout=pack_shares(np.tile(np.linspace(0, 0.9, CATEGORIES), (steps, 1))),
-        chances=pack_shares(chances),
+        gap=pack_shares(np.linspace(1, 0, num_steps)),
+        weight=pack_shares(np.linspace(0.5, 0, num_steps)),
+        layout=pack_shares(layout_weights),
+        chances=pack_shares(probabilities),
     )
 
 
-def replays(name=""):
-    """Replays whose names all end with `name`; the agents differ in the second episode."""
-    scene = dataclasses.replace(tiny.KITCHEN, name=tiny.KITCHEN.name + name)
-    same, other = course([0, 1, 2]), course([0, 1, 2, 3, 2], success=False)
+def example_replays(suffix=""):
+    """Replays in which every name ends with `suffix`; the agents differ in the second episode."""
+    scene = dataclasses.replace(tiny.KITCHEN, name=tiny.KITCHEN.name + suffix)
+    short_trace = trace_through([0, 1, 2])
+    long_trace = trace_through([0, 1, 2, 3, 2], success=False)
     return Replays(
         shift=0.0,
         split="val",
-        categories=[category + name for category in tiny.CATEGORIES],
-        players=["layout" + name, "removed" + name],
-        comparisons={"Removal" + name: (0, 1), "Other" + name: (1, 0)},
+        categories=[category + suffix for category in tiny.CATEGORIES],
+        players=["layout" + suffix, "removed" + suffix],
+        comparisons={"Removal" + suffix: (0, 1), "Other" + suffix: (1, 0)},
         thresholds=[None, 0.5],
         differ=[[0, 7], [7, 0]],
         evaluated=24,
         field_of_view=100.0,
         reach=500,
         plans=[make_plan(scene, tiny.BANK, 0, POSES)],
-        episodes=[ReplayEpisode(0, 0, 3, [same, same]), ReplayEpisode(0, 1, 3, [same, other])],
+        episodes=[
+            ReplayEpisode(0, 0, 3, [short_trace, short_trace]),
+            ReplayEpisode(0, 1, 3, [short_trace, long_trace]),
+        ],
     )
 
 
-def page(name=""):
-    """A page whose every text ends with `name`."""
-    table = TextTable(
-        "Shift 0" + name, ("Variant" + name, "SR"), (("group" + name,), ("row" + name, "50.0 [40.0, 60.0]"))
-    )
-    chart = Chart('<svg viewBox="0 0 1 1"><rect width="1" height="1"/></svg>', "chart" + name)
-    section = Section("Results" + name, "about" + name, (chart,), (table,), (table,), ("note" + name,))
-    return render_page("title" + name, {"Run": "run" + name}, [section, section], [replays(name)])
+def example_page(suffix=""):
+    """A page in which every text ends with `suffix`."""
+    rows = (("group" + suffix,), ("row" + suffix, "50.0 [40.0, 60.0]"))
+    table = TextTable("Shift 0" + suffix, ("Variant" + suffix, "SR"), rows)
+    chart = Chart('<svg viewBox="0 0 1 1"><rect width="1" height="1"/></svg>', "chart" + suffix)
+    section = Section("Results" + suffix, "about" + suffix, (chart,), (table,), (table,), ("note" + suffix,))
+    return render_page("title" + suffix, {"Run": "run" + suffix}, [section, section], [example_replays(suffix)])
