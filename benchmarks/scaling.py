@@ -177,6 +177,7 @@ def measure_processes(address: str, index: str, folder: str) -> None:
     # Constants of an update, for `simulate.py`.
     all_reduce = measure_all_reduce(shared_training.mesh)
     save_s = time_call(partial(shared_training.save, Path(folder)))
+    num_bytes = shared_training.count_bytes()
     log_row = {"step": 1, **{str(number): 1.0 for number in range(12)}}
     log_s = time_call(partial(append_log_rows, Path(folder, "log"), [log_row]))
     short_training = Training(make_local_mesh(), NUM_EPISODES // 16, minibatches=1)
@@ -205,7 +206,7 @@ def measure_processes(address: str, index: str, folder: str) -> None:
         "update": {
             "rollout_s": round(2 * median_update["alone"] - median_update["two_epochs_alone"], 4),
             "learning_s": round(median_update["two_epochs_alone"] - median_update["alone"], 4),
-            **shared_training.count_bytes(),
+            **num_bytes,
             "join_s": round(join_s, 2),
             "compile_s": round(first_call_s - median_update["shared_episodes"], 2),
             "save_s": round(save_s, 3),
