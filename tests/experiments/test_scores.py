@@ -148,15 +148,15 @@ def test_chance_is_random_in_other_scenes_for_the_same_policies(make_bench):
     run = make_bench().find_run("rooms", "main")
     scores = make_scores(
         {
-            "layout": [[1, 1, 1, 0, 0, 1], [1, 1, 0, 0, 0, 1]],
+            "layout": [[1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 0, 1]],
             "random": [[0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 1]],
         }
     )
     table = ResultTable(difference_rows(run, 0.0, scores, {}))
     lead = table.find(AT, variant="layout", decoding="argmax", reference="chance", metric="sr")
-    # By scene 100, 25 and 0 points: the mean is 125 / 3, and the variance (58.3^2 + 16.7^2 + 41.7^2) / 2 / 3 = 902.8.
-    # Both runs are given, so that their spread does not count.
-    assert bounds(lead) == pytest.approx(around(125 / 3, 65000 / 72, 2))
+    # By scene 100, 50 and 25 points: the mean is 175 / 3, and the variance (41.7^2 + 8.3^2 + 33.3^2) / 2 / 3 = 486.1.
+    # Both runs are given, so that their spread of 50 points does not count.
+    assert bounds(lead) == pytest.approx(around(175 / 3, 17500 / 36, 2))
 
     # Random choices of this method are random actions, which need no comparison in every metric.
     assert not table.where(reference="random").rows
