@@ -3,8 +3,17 @@
 import math
 
 import pytest
-from support.scenes import APARTMENTS, BOOK, CHAIR, HOUSES, SMALL, draw, single, twin
-from support.twin import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
+from support.scenes import APARTMENTS, BOOK, CHAIR, HOUSES, SMALL, draw
+from support.twin import (
+    DONE,
+    LOOK_DOWN,
+    LOOK_UP,
+    MOVE_AHEAD,
+    ROTATE_LEFT,
+    ROTATE_RIGHT,
+    start_in_one_cell,
+    start_twin,
+)
 
 
 @pytest.mark.parametrize(
@@ -13,7 +22,7 @@ from support.twin import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTA
 )
 def test_move_ahead_goes_to_the_neighbour_of_the_heading(heading, cell):
     # Clockwise from +z: 45 degrees is +z +x, 90 degrees +x, ...
-    episode = twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading)
+    episode = start_twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading)
     assert episode.step(MOVE_AHEAD) == (-0.01, False, False)
     assert episode.pose == (*cell, heading, 0)
 
@@ -34,13 +43,13 @@ def test_move_ahead_goes_to_the_neighbour_of_the_heading(heading, cell):
 def test_of_twelve_headings_two_lead_to_each_diagonal_cell(headings, cell):
     # 30 and 60 degrees are 15 from 45, and 30 from 0 and 90.
     for heading in headings:
-        episode = twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading, rules=APARTMENTS)
+        episode = start_twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading, rules=APARTMENTS)
         episode.step(MOVE_AHEAD)
         assert episode.pose == (*cell, heading, 0)
 
 
 def test_a_diagonal_move_needs_only_the_cell_it_leads_to():
-    episode = twin(draw([".#", "#."]), heading=1)
+    episode = start_twin(draw([".#", "#."]), heading=1)
     episode.step(MOVE_AHEAD)
     assert episode.cell == (1, 1)
 
@@ -48,20 +57,20 @@ def test_a_diagonal_move_needs_only_the_cell_it_leads_to():
 @pytest.mark.parametrize("heading", [0, 2, 4, 6, 7])
 def test_a_blocked_move_changes_nothing_and_costs_a_step(heading):
     # [1, 0] and [0, 1] are not standable, the other neighbours lie outside.
-    episode = twin(draw([".#", "#."]), heading=heading)
+    episode = start_twin(draw([".#", "#."]), heading=heading)
     assert episode.step(MOVE_AHEAD) == (-0.01, False, False)
     assert (episode.pose, episode.steps) == ((0, 0, heading, 0), 1)
 
 
 def test_standable_is_the_largest_component_and_the_first_of_equal_ones():
-    assert twin(draw([".#..", "##..", "####"]), cell=(0, 2)).standable() == {(0, 2), (0, 3), (1, 2), (1, 3)}
-    assert twin(draw(["..#..", "..#.."])).standable() == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    assert start_twin(draw([".#..", "##..", "####"]), cell=(0, 2)).standable() == {(0, 2), (0, 3), (1, 2), (1, 3)}
+    assert start_twin(draw(["..#..", "..#.."])).standable() == {(0, 0), (0, 1), (1, 0), (1, 1)}
     with pytest.raises(ValueError, match="not standable"):
-        twin(draw(["..#..", "..#.."]), cell=(0, 3))
+        start_twin(draw(["..#..", "..#.."]), cell=(0, 3))
 
 
 def test_rotations_wrap_and_horizons_stop_at_their_limits():
-    episode = twin(draw(["."]))
+    episode = start_twin(draw(["."]))
     poses = []
     for action in (ROTATE_LEFT, ROTATE_RIGHT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, LOOK_DOWN, LOOK_UP):
         assert episode.step(action) == (-0.01, False, False)
@@ -70,7 +79,7 @@ def test_rotations_wrap_and_horizons_stop_at_their_limits():
 
 
 def test_twelve_headings_go_around_and_a_single_horizon_stays():
-    episode = twin(draw(["."]), rules=HOUSES)
+    episode = start_twin(draw(["."]), rules=HOUSES)
     poses = []
     for action in (ROTATE_LEFT, LOOK_DOWN, LOOK_UP, ROTATE_RIGHT, ROTATE_RIGHT):
         episode.step(action)
@@ -80,16 +89,16 @@ def test_twelve_headings_go_around_and_a_single_horizon_stays():
 
 def test_done_ends_the_episode_and_pays_where_it_succeeds():
     book = ("Book", 0, 1.5, 1, *SMALL)
-    assert single(book).step(DONE) == (5.0, True, False)
-    assert single(book, heading=4).step(DONE) == (-0.01, True, False)
-    wrong = single(book, goal=CHAIR)
+    assert start_in_one_cell(book).step(DONE) == (5.0, True, False)
+    assert start_in_one_cell(book, heading=4).step(DONE) == (-0.01, True, False)
+    wrong = start_in_one_cell(book, goal=CHAIR)
     assert wrong.step(DONE) == (-0.01, True, False)
     with pytest.raises(RuntimeError, match="over"):
         wrong.step(DONE)
 
 
 def test_truncation_at_the_step_limit_unless_done():
-    episode = single(("Book", 0, 1.5, 1, *SMALL), step_limit=2)
+    episode = start_in_one_cell(("Book", 0, 1.5, 1, *SMALL), step_limit=2)
     assert episode.step(LOOK_UP) == (-0.01, False, False)
     assert episode.step(LOOK_UP) == (-0.01, False, True)
     episode.reset(BOOK, (0, 0), 0, 0, 2)
@@ -100,20 +109,22 @@ def test_truncation_at_the_step_limit_unless_done():
 def test_best_length_in_a_corridor():
     # The book at z = 2.5 is within 1.5 m from iz = 4 on. Along the corridor only headings 0 and 4 move.
     corridor = draw(["."] * 6, ("Book", 0, 1.5, 2.5, *SMALL))
-    assert twin(corridor).best_length() == 5  # 4 moves, Done
-    assert twin(corridor, heading=4).best_length() == 9  # 4 turns first
-    assert twin(corridor, cell=(5, 0), heading=4).best_length() == 4  # 45 degrees off (< 50) will do: 3 turns, Done
-    assert twin(corridor, cell=(4, 0)).best_length() == 1
-    assert twin(corridor, goal=CHAIR).best_length() is None
+    assert start_twin(corridor).best_length() == 5  # 4 moves, Done
+    assert start_twin(corridor, heading=4).best_length() == 9  # 4 turns first
+    assert (
+        start_twin(corridor, cell=(5, 0), heading=4).best_length() == 4
+    )  # 45 degrees off (< 50) will do: 3 turns, Done
+    assert start_twin(corridor, cell=(4, 0)).best_length() == 1
+    assert start_twin(corridor, goal=CHAIR).best_length() is None
 
 
 def test_best_length_counts_looking_down_and_starts_at_the_start():
     # On the floor at z = 2 and 1.5 m away from iz = 2: level, rise -1.5 >= -1.19 x 1.5 = -1.79, so it is in view.
     # From iz = 3, 1.25 m away, -1.49 > -1.5: one look down.
     scene = draw(["."] * 4, ("Book", 0, 0, 2, *SMALL))
-    assert twin(scene, cell=(2, 0)).best_length() == 1
-    assert twin(scene, cell=(3, 0)).best_length() == 2
-    episode = twin(scene)
+    assert start_twin(scene, cell=(2, 0)).best_length() == 1
+    assert start_twin(scene, cell=(3, 0)).best_length() == 2
+    episode = start_twin(scene)
     episode.step(MOVE_AHEAD)
     episode.step(MOVE_AHEAD)
     assert (episode.best_length(), episode.step(DONE)) == (3, (5.0, True, False))
@@ -121,17 +132,17 @@ def test_best_length_counts_looking_down_and_starts_at_the_start():
 
 def test_best_length_is_none_where_a_wall_hides_the_goal():
     scene = (["...", "###", "###"], ("Book", 0.25, 1.5, 0.75, *SMALL))
-    assert twin(draw(*scene), cell=(0, 1)).best_length() == 1
-    assert twin(draw(*scene, walls=[(1, 0), (1, 1), (1, 2)]), cell=(0, 1)).best_length() is None
+    assert start_twin(draw(*scene), cell=(0, 1)).best_length() == 1
+    assert start_twin(draw(*scene, walls=[(1, 0), (1, 1), (1, 2)]), cell=(0, 1)).best_length() is None
 
 
 def test_goal_distance_is_to_the_nearest_goal_less_a_metre():
     books = (("Book", 3, 0.5, 4, *SMALL), ("Book", 6, 0.5, 8, *SMALL), ("Chair", 0, 0.5, 2, *SMALL))
-    episode = twin(draw([".", ".", "."], *books))
+    episode = start_twin(draw([".", ".", "."], *books))
     assert episode.goal_distance() == pytest.approx(4.0)  # |(3, 4)| - 1
     episode.step(MOVE_AHEAD)
     assert episode.goal_distance() == pytest.approx(math.hypot(3, 3.75) - 1)
-    assert single(("Book", 0.6, 0.5, 0.8, *SMALL)).goal_distance() == 0.0
+    assert start_in_one_cell(("Book", 0.6, 0.5, 0.8, *SMALL)).goal_distance() == 0.0
 
 
 # Walking
@@ -142,12 +153,14 @@ CHEST = (0.5, 0.5, 0.5)  # its footprint reaches 0.25 m to every side
 @pytest.mark.parametrize(("z", "goals"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
 def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, goals):
     for heading in range(12):
-        assert single(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).successes() == goals
-    assert single(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).successes() == {BOOK}  # in its footprint: no way at all
+        assert start_in_one_cell(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).successes() == goals
+    assert start_in_one_cell(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).successes() == {
+        BOOK
+    }  # in its footprint: no way at all
 
 
 def walk_to_the_book(rows, *place, walls=(), cell=(0, 0)):
-    return twin(draw(rows, ("Book", *place), walls=walls), cell=cell, rules=HOUSES).scene.walk(cell, BOOK)
+    return start_twin(draw(rows, ("Book", *place), walls=walls), cell=cell, rules=HOUSES).scene.walk(cell, BOOK)
 
 
 def test_walks_go_by_cells_and_then_straight():
@@ -185,12 +198,12 @@ def test_walls_of_the_start_and_of_the_object_do_not_count():
 def test_measures_of_walks():
     # The footprint begins at z = 1.75: within 1 m from z = 0.75 on, three moves away, and half a turn before them.
     corridor = draw(["."] * 6, ("Book", 0, 0.5, 2, *CHEST))
-    assert twin(corridor, rules=HOUSES).best_length() == 4
-    assert twin(corridor, heading=6, rules=HOUSES).best_length() == 10
-    assert twin(corridor, cell=(3, 0), heading=6, rules=HOUSES).best_length() == 1
-    assert twin(corridor, rules=HOUSES).goal_distance() == pytest.approx(0.75)
-    assert twin(corridor, cell=(4, 0), rules=HOUSES).goal_distance() == 0.0
-    assert twin(corridor, goal=CHAIR, rules=HOUSES).goal_distance() == math.inf
+    assert start_twin(corridor, rules=HOUSES).best_length() == 4
+    assert start_twin(corridor, heading=6, rules=HOUSES).best_length() == 10
+    assert start_twin(corridor, cell=(3, 0), heading=6, rules=HOUSES).best_length() == 1
+    assert start_twin(corridor, rules=HOUSES).goal_distance() == pytest.approx(0.75)
+    assert start_twin(corridor, cell=(4, 0), rules=HOUSES).goal_distance() == 0.0
+    assert start_twin(corridor, goal=CHAIR, rules=HOUSES).goal_distance() == math.inf
 
 
 # The view
@@ -207,7 +220,7 @@ def test_the_view_at_30_degrees():
     # cell [3, 2], for 1.5 is rounded to 2; 1 step is [1, 0], for 0.5 is rounded to 0.
     rows = [list("." * 13) for _ in range(13)]
     rows[3][2] = rows[1][0] = "#"
-    seen = picture(twin(draw(["".join(row) for row in rows]), heading=1, rules=APARTMENTS))
+    seen = picture(start_twin(draw(["".join(row) for row in rows]), heading=1, rules=APARTMENTS))
     assert [row[5] for row in seen[:-5:-1]] == [".", "#", ".", "#"]
     # 4 steps are (2, 3.46), [3, 2] again; 3 to the left of it, at (2 - 2.60, 3.46 + 1.5), the lattice has ended.
     assert seen[-5:] == ["??#..#...??", "???..#..???", "????...????", "?????#?????", "?????.?????"]
@@ -217,11 +230,11 @@ def test_what_hides_the_floor():
     # 5 steps ahead of the camera stands a chest, 0.9 m high.
     chest = ("Chest", 1, 0.45, 1.25, 0.3, 0.9, 0.3)
     scene = draw(["." * 9] * 12, chest)
-    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=APARTMENTS))[::-1]] == ["."] * 11
-    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 6 + ["?"] * 5
+    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=APARTMENTS))[::-1]] == ["."] * 11
+    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 6 + ["?"] * 5
     # What stands beyond the lattice hides nothing.
     scene = draw(["." * 9] * 5, chest)
-    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 5 + ["#"] * 6
+    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 5 + ["#"] * 6
     # Neither does the cell of the agent, nor that which is looked at.
     scene = draw(["." * 9] * 5, walls=[(0, 4), (3, 4)])
-    assert [row[5] for row in picture(twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 4 + ["?"] * 7
+    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 4 + ["?"] * 7

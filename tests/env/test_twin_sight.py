@@ -7,16 +7,16 @@ import math
 import random
 
 import pytest
-from support.scenes import APARTMENTS, BOOK, CHAIR, FRIDGE, HOUSES, SMALL, detected, draw, single, twin
-from support.twin import LOOK_DOWN
+from support.scenes import APARTMENTS, BOOK, CHAIR, FRIDGE, HOUSES, SMALL, draw
+from support.twin import LOOK_DOWN, detected_categories, start_in_one_cell, start_twin
 from support.twin_shapes import meets
 
 
 @pytest.mark.parametrize(("offset", "seen"), [(1.19, True), (1.2, False), (-1.19, True), (-1.2, False)])
 def test_the_cone_is_50_degrees_to_every_side(offset, seen):
     # tan 50 = 1.19175, one metre ahead.
-    assert (BOOK in detected(single(("Book", offset, 1.5, 1, *SMALL)))) == seen
-    assert (BOOK in detected(single(("Book", 0, 1.5 + offset, 1, *SMALL)))) == seen
+    assert (BOOK in detected_categories(start_in_one_cell(("Book", offset, 1.5, 1, *SMALL)))) == seen
+    assert (BOOK in detected_categories(start_in_one_cell(("Book", 0, 1.5 + offset, 1, *SMALL)))) == seen
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,14 @@ def test_the_cone_of_apartments_and_houses(right, up, seen):
     # tan 39.5 = 0.8243 across and tan 31.75 = 0.6188 up, one metre ahead, around cameras at 1.5 and 0.88 m.
     for rules in (APARTMENTS, HOUSES):
         book = ("Book", right, rules.camera + up, 1, *SMALL)
-        assert (BOOK in detected(single(book, rules=rules))) == seen
+        assert (BOOK in detected_categories(start_in_one_cell(book, rules=rules))) == seen
 
 
 def test_thirty_degrees_to_the_right():
     # Heading 1 of 12, f = (1/2, sqrt 3 / 2): for v = (1, sqrt 3), ahead = 1/2 + 3/2 = 2, right = 0.
-    [(ahead, right, _)] = single(("Book", 1, 1.5, 3**0.5, *SMALL), heading=1, rules=APARTMENTS).detections()[BOOK]
+    [(ahead, right, _)] = start_in_one_cell(("Book", 1, 1.5, 3**0.5, *SMALL), heading=1, rules=APARTMENTS).detections()[
+        BOOK
+    ]
     assert (ahead, right) == pytest.approx((2.0, 0.0))
 
 
@@ -39,29 +41,29 @@ def test_offsets_ahead_and_right():
     # Facing +x (heading 2), the right hand points to -z: from [4, 0] at z = 1, v = (2, 0, -0.5).
     book = ("Book", 2, 1.5, 0.5, *SMALL)
     scene = draw(["."] * 5, book)
-    [(ahead, right, apparent)] = twin(scene, cell=(4, 0), heading=2).detections()[BOOK]
+    [(ahead, right, apparent)] = start_twin(scene, cell=(4, 0), heading=2).detections()[BOOK]
     assert (ahead, right) == pytest.approx((2.0, 0.5))
     assert apparent == pytest.approx(0.6 / math.sqrt(4.25))
     # Heading 1, f = (0.7071, 0.7071): ahead = 1.5 x 0.7071, right = (2 + 0.5) x 0.7071 = 1.67 ahead > tan 50.
-    assert detected(twin(scene, cell=(4, 0), heading=1)) == set()
+    assert detected_categories(start_twin(scene, cell=(4, 0), heading=1)) == set()
     # Heading 3, f = (0.7071, -0.7071): ahead = 2.5 x 0.7071, right = (-2 + 0.5) x 0.7071.
-    [(ahead, right, _)] = twin(scene, cell=(4, 0), heading=3).detections()[BOOK]
+    [(ahead, right, _)] = start_twin(scene, cell=(4, 0), heading=3).detections()[BOOK]
     assert (ahead, right) == pytest.approx((2.5 * math.sqrt(0.5), -1.5 * math.sqrt(0.5)))
 
 
 def test_the_origin_shifts_the_lattice():
     scene = draw(["..", ".."], ("Book", 3, 1.5, 2.5, *SMALL), origin=(2.75, -0.5))
     # Cell [1, 1] is at x = 3, z = -0.25.
-    [(ahead, right, _)] = twin(scene, cell=(1, 1)).detections()[BOOK]
+    [(ahead, right, _)] = start_twin(scene, cell=(1, 1)).detections()[BOOK]
     assert (ahead, right) == pytest.approx((2.75, 0.0))
 
 
 def test_a_near_floor_object_is_seen_only_looking_down():
     # ahead 1, up -1.5. Level: rise -1.5 < -1.19. Pitched: depth .866 + .75 = 1.616, rise .5 - 1.299 = -.799 > -1.926.
-    episode = single(("Book", 0, 0, 1, *SMALL))
-    assert (detected(episode), episode.successes()) == (set(), set())
+    episode = start_in_one_cell(("Book", 0, 0, 1, *SMALL))
+    assert (detected_categories(episode), episode.successes()) == (set(), set())
     episode.step(LOOK_DOWN)
-    assert (detected(episode), episode.successes()) == ({BOOK}, {BOOK})
+    assert (detected_categories(episode), episode.successes()) == ({BOOK}, {BOOK})
     [(ahead, right, _)] = episode.detections()[BOOK]
     assert (ahead, right) == pytest.approx((1.0, 0.0))  # of the level frame, not of the pitched one
 
@@ -69,8 +71,8 @@ def test_a_near_floor_object_is_seen_only_looking_down():
 def test_a_high_object_is_lost_looking_down():
     # ahead 1, up 1. Level: rise 1 < 1.19. Pitched: depth .866 - .5 = .366, rise .5 + .866 = 1.366 > .436.
     high = ("Book", 0, 2.5, 1, *SMALL)
-    assert detected(single(high)) == {BOOK}
-    assert detected(single(high, horizon=1)) == set()
+    assert detected_categories(start_in_one_cell(high)) == {BOOK}
+    assert detected_categories(start_in_one_cell(high, horizon=1)) == set()
 
 
 @pytest.mark.parametrize(
@@ -78,15 +80,19 @@ def test_a_high_object_is_lost_looking_down():
 )
 def test_the_pitched_view_reaches_from_20_degrees_up_to_80_down(height, z, seen):
     # tan 20 = 0.364; 1.5 / tan 80 = 0.2645.
-    assert detected(single(("Book", 0, height, z, *SMALL), horizon=1)) == ({BOOK} if seen else set())
+    assert detected_categories(start_in_one_cell(("Book", 0, height, z, *SMALL), horizon=1)) == (
+        {BOOK} if seen else set()
+    )
 
 
 @pytest.mark.parametrize("horizon", [0, 1])
 def test_what_is_behind_or_straight_below_is_out_of_view(horizon):
     # Straight below, pitched: depth .75, rise -1.299 < -.894.
-    assert detected(single(("Book", 0, 1.5, -1, *SMALL), horizon=horizon)) == set()
-    assert detected(single(("Book", 0, 0, 0, *SMALL), horizon=horizon)) == set()
-    assert detected(single(("Book", 0, 1.5, 0, *SMALL), horizon=horizon)) == set()  # in the camera: depth 0
+    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, -1, *SMALL), horizon=horizon)) == set()
+    assert detected_categories(start_in_one_cell(("Book", 0, 0, 0, *SMALL), horizon=horizon)) == set()
+    assert (
+        detected_categories(start_in_one_cell(("Book", 0, 1.5, 0, *SMALL), horizon=horizon)) == set()
+    )  # in the camera: depth 0
 
 
 # The line of sight
@@ -116,56 +122,60 @@ TARGET = ("Book", 0, 1, 2, *SMALL)  # the line falls from 1.5 to 1 m: it is 1.25
     ],
 )
 def test_boxes_between_camera_and_target(blocker, clear):
-    assert detected(single(TARGET, ("Wardrobe", *blocker))) == ({BOOK} if clear else set())
+    assert detected_categories(start_in_one_cell(TARGET, ("Wardrobe", *blocker))) == ({BOOK} if clear else set())
 
 
 @pytest.mark.parametrize(("top", "clear"), [(0.8, True), (0.85, False)])
 def test_a_box_below_085_hides_nothing(top, clear):
     # To the floor at z = 1.5 the line is 0.6 m high at z = 0.9, inside of either box, and goes on to z = 1.29.
     table = ("Table", 0, top / 2, 1.05, 0.3, top, 0.3)
-    assert detected(single(("Book", 0, 0, 1.5, *SMALL), table, horizon=1)) == ({BOOK} if clear else set())
+    assert detected_categories(start_in_one_cell(("Book", 0, 0, 1.5, *SMALL), table, horizon=1)) == (
+        {BOOK} if clear else set()
+    )
 
 
 def test_a_target_is_hidden_by_another_box_only():
     fridge = ("Fridge", 0, 0.9, 1.2, 0.7, 1.8, 0.7)
     # The book is in the fridge, the chair right behind it.
     scene = (fridge, ("Book", 0, 1.2, 1.4, *SMALL), ("Chair", 0, 0.8, 2, 0.4, 0.4, 0.4))
-    assert detected(single(*scene)) == {BOOK, FRIDGE}
-    assert detected(single(*scene[1:])) == {BOOK, CHAIR}
+    assert detected_categories(start_in_one_cell(*scene)) == {BOOK, FRIDGE}
+    assert detected_categories(start_in_one_cell(*scene[1:])) == {BOOK, CHAIR}
 
 
 @pytest.mark.parametrize("height", [0.2, 1.5, 2.4])
 def test_a_wall_cell_blocks_at_every_height(height):
     # Wall cell [8, 0]: z from 1.875 to 2.125.
     book = ("Book", 0, height, 3, *SMALL)
-    assert detected(single(book)) == {BOOK}
-    assert detected(single(book, walls=[(8, 0)])) == set()
-    assert detected(single(book, walls=[(8, 1)])) == {BOOK}  # beside the line
+    assert detected_categories(start_in_one_cell(book)) == {BOOK}
+    assert detected_categories(start_in_one_cell(book, walls=[(8, 0)])) == set()
+    assert detected_categories(start_in_one_cell(book, walls=[(8, 1)])) == {BOOK}  # beside the line
 
 
 def test_a_wall_cell_that_contains_the_target_does_not_block():
     # 1.1 ahead, 1.5 down: 1.860 m. The line ends at z = 1.1 (1 - 0.3 / 1.860) = 0.923, in cell [4, 0] (from 0.875).
     book = ("Book", 0, 0, 1.1, *SMALL)
-    assert detected(single(book, walls=[(4, 0)], horizon=1)) == {BOOK}
-    assert detected(single(book, walls=[(3, 0), (4, 0)], horizon=1)) == set()
+    assert detected_categories(start_in_one_cell(book, walls=[(4, 0)], horizon=1)) == {BOOK}
+    assert detected_categories(start_in_one_cell(book, walls=[(3, 0), (4, 0)], horizon=1)) == set()
 
 
 @pytest.mark.parametrize(("z", "clear"), [(0.9, True), (0.95, False)])
 def test_the_last_03_m_are_left_out(z, clear):
     # Wall cell [3, 0] is z from 0.625 to 0.875; the line ends at 0.6 or 0.65.
-    assert detected(single(("Book", 0, 1.5, z, *SMALL), walls=[(3, 0)])) == ({BOOK} if clear else set())
+    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, z, *SMALL), walls=[(3, 0)])) == (
+        {BOOK} if clear else set()
+    )
 
 
 def test_a_line_shorter_than_03_m_is_clear():
     # Wall cell [1, 0] is z from 0.125 to 0.375 and contains neither centre; x leaves it beside, in view.
-    assert detected(single(("Book", 0.14, 1.5, 0.2, *SMALL), walls=[(1, 0)])) == {BOOK}
+    assert detected_categories(start_in_one_cell(("Book", 0.14, 1.5, 0.2, *SMALL), walls=[(1, 0)])) == {BOOK}
 
 
 def test_the_diagonal_between_two_wall_cells_is_open():
     # The line x = z grazes cells [1, 2] and [2, 1] in the corner that they share (0.375, 0.375) and no more.
     book = ("Book", 1, 1.5, 1, *SMALL)
-    assert detected(single(book, walls=[(1, 2), (2, 1)])) == {BOOK}
-    assert detected(single(book, walls=[(2, 2)])) == set()
+    assert detected_categories(start_in_one_cell(book, walls=[(1, 2), (2, 1)])) == {BOOK}
+    assert detected_categories(start_in_one_cell(book, walls=[(2, 2)])) == set()
 
 
 def test_meets_agrees_with_points_along_the_segment():
@@ -192,8 +202,8 @@ def test_walls_stand_on_the_shifted_lattice():
     # Cell [0, 0] is at (2.75, -0.5), wall cell [4, 0] at z = 0.5, cell [4, 1] beside the line.
     book = ("Book", 2.75, 1.5, 1.5, *SMALL)
     rows = [".#"] + ["##"] * 8
-    assert detected(twin(draw(rows, book, walls=[(4, 0)], origin=(2.75, -0.5)))) == set()
-    assert detected(twin(draw(rows, book, walls=[(4, 1)], origin=(2.75, -0.5)))) == {BOOK}
+    assert detected_categories(start_twin(draw(rows, book, walls=[(4, 0)], origin=(2.75, -0.5)))) == set()
+    assert detected_categories(start_twin(draw(rows, book, walls=[(4, 1)], origin=(2.75, -0.5)))) == {BOOK}
 
 
 # Success, detection
@@ -202,13 +212,13 @@ def test_walls_stand_on_the_shifted_lattice():
 @pytest.mark.parametrize(("z", "goals"), [(1.5, {BOOK}), (1.5 + 5e-10, {BOOK}), (1.51, set())])
 def test_success_is_limited_to_15_m_in_the_plane(z, goals):
     # 0.9 m high, the centre at z = 1.5 is 1.62 m from the camera, but 1.5 m horizontally.
-    episode = single(("Book", 0, 0.9, z, *SMALL))
-    assert (episode.successes(), detected(episode)) == (goals, {BOOK})
+    episode = start_in_one_cell(("Book", 0, 0.9, z, *SMALL))
+    assert (episode.successes(), detected_categories(episode)) == (goals, {BOOK})
 
 
 @pytest.mark.parametrize(("z", "goals"), [(1.0, {BOOK}), (1.01, set())])
 def test_success_in_apartments_is_limited_to_1_m(z, goals):
-    assert single(("Book", 0, 1.5, z, *SMALL), rules=APARTMENTS).successes() == goals
+    assert start_in_one_cell(("Book", 0, 1.5, z, *SMALL), rules=APARTMENTS).successes() == goals
 
 
 @pytest.mark.parametrize(
@@ -220,27 +230,27 @@ def test_success_in_apartments_is_limited_to_1_m(z, goals):
     ],
 )
 def test_the_range_follows_from_the_size(sides, reached, missed):
-    assert detected(single(("Book", 0, 1.5, reached, *sides))) == {BOOK}
-    assert detected(single(("Book", 0, 1.5, missed, *sides))) == set()
+    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, reached, *sides))) == {BOOK}
+    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, missed, *sides))) == set()
 
 
 @pytest.mark.parametrize(("z", "apparent"), [(2.0, 0.3), (0.2, 2.4)])
 def test_the_apparent_size_is_bounded_near_the_camera(z, apparent):
     # 0.6 / 2, and 0.6 / max(0.2, 0.25).
-    assert single(("Book", 0, 1.5, z, *SMALL)).detections()[BOOK] == [pytest.approx((z, 0.0, apparent))]
+    assert start_in_one_cell(("Book", 0, 1.5, z, *SMALL)).detections()[BOOK] == [pytest.approx((z, 0.0, apparent))]
 
 
 def test_the_nearest_detected_instance_wins_and_equally_near_ones_are_all_accepted():
     far, near = ("Book", 0, 1.5, 3, *SMALL), ("Book", 0.5, 1.5, 1, 0.2, 0.2, 0.2)
     # sqrt(0.5^2 + 1) = 1.118.
-    assert single(far, near).detections()[BOOK] == [pytest.approx((1.0, 0.5, 0.2 / math.sqrt(1.25)))]
+    assert start_in_one_cell(far, near).detections()[BOOK] == [pytest.approx((1.0, 0.5, 0.2 / math.sqrt(1.25)))]
     # A wardrobe at x from 0.1 to 0.6, z from 0.25 to 0.55 hides the near one.
-    hidden = single(far, near, ("Wardrobe", 0.35, 1, 0.4, 0.5, 2, 0.3))
+    hidden = start_in_one_cell(far, near, ("Wardrobe", 0.35, 1, 0.4, 0.5, 2, 0.3))
     assert hidden.detections()[BOOK] == [pytest.approx((3.0, 0.0, 0.2))]
-    both = single(near, ("Book", -0.5, 1.5, 1, *SMALL)).detections()[BOOK]
+    both = start_in_one_cell(near, ("Book", -0.5, 1.5, 1, *SMALL)).detections()[BOOK]
     assert sorted(both) == [pytest.approx((1, -0.5, 0.6 / 1.25**0.5)), pytest.approx((1, 0.5, 0.2 / 1.25**0.5))]
 
 
 def test_success_counts_any_instance_and_types_are_mapped_by_name():
-    episode = single(("Stool", 0, 1.5, 1, *SMALL), ("Book", 0, 1.5, 3, *SMALL), ("Vase", 0, 1.5, 1, *SMALL))
-    assert (episode.successes(), detected(episode)) == ({CHAIR}, {BOOK, CHAIR})
+    episode = start_in_one_cell(("Stool", 0, 1.5, 1, *SMALL), ("Book", 0, 1.5, 3, *SMALL), ("Vase", 0, 1.5, 1, *SMALL))
+    assert (episode.successes(), detected_categories(episode)) == ({CHAIR}, {BOOK, CHAIR})

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.scenes import BOOK, CATEGORIES, FRIDGE, SMALL, draw
+from support.scenes import BOOK, CATEGORIES, FRIDGE, corridor_scene
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import State
@@ -45,7 +45,7 @@ from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("semexp"), method_sizes=())
 #: A corridor along z, one cell wide, a book at its north end.
-CORRIDOR = draw([["."]] * 24, ("Book", 0.0, 0.8, 5.75, *SMALL))
+CORRIDOR = corridor_scene(24)
 BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))
 ENV, PARAMS = build_environment(BANK, {}, 100)
 PER_CELL = tiny.POSES_PER_CELL

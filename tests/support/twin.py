@@ -5,9 +5,12 @@ It shares no arithmetic with the compiled environment; the best length is that o
 
 import math
 from collections import deque
+from collections.abc import Iterable
+from typing import Any
 
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Rules
+from support.scenes import BOOK, CATEGORIES, ROOMS, DrawnObject, draw
 from support.twin_scene import Cell, TwinScene, neighbour
 
 Pose = tuple[int, int, int, int]  # iz, ix, heading, horizon
@@ -144,3 +147,26 @@ class Twin:
             return max(self.scene.walk(self.cell, self.goal) - 1.0, 0.0)
         distances = (self.scene.distance(self.cell, box) for box in self.scene.boxes if box.category == self.goal)
         return max(min(distances, default=math.inf) - 1.0, 0.0)
+
+
+def start_twin(
+    scene: Scene,
+    goal: int = BOOK,
+    cell: Cell = (0, 0),
+    heading: int = 0,
+    horizon: int = 0,
+    step_limit: int = 100,
+    rules: Rules = ROOMS,
+) -> Twin:
+    """Start an episode in a scene with the categories of drawn scenes."""
+    return Twin(scene, CATEGORIES, rules, goal, cell, heading, horizon, step_limit)
+
+
+def start_in_one_cell(*objects: DrawnObject, walls: Iterable[Cell] = (), **start: Any) -> Twin:
+    """Start an episode in a lattice of 16 x 4 cells, of which only [0, 0] is standable."""
+    return start_twin(draw([".###"] + ["####"] * 15, *objects, walls=walls), **start)
+
+
+def detected_categories(twin: Twin) -> set[int]:
+    """Return the categories of which an instance is detected."""
+    return {category for category, detections in enumerate(twin.detections()) if detections}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, rolled
-from support.scenes import CATEGORIES, SMALL, draw
+from support.scenes import CATEGORIES, corridor_scene
 
 from jaxnav.env.make import build_environment
 from jaxnav.policies.agent_loop import AgentLoop
@@ -21,7 +21,7 @@ from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, ppo_loss, replay_rollout
 
 #: A corridor of 10 m with a book at its north end; the actions are enough for one way, not for both.
-CORRIDOR = draw([["."]] * 40, ("Book", 0.0, 0.8, 9.75, *SMALL))
+CORRIDOR = corridor_scene(40)
 BANK, LIMIT = compile_bank([CORRIDOR], Task(CATEGORIES)), 26
 
 

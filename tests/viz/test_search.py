@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 from support import tiny_world as tiny
-from support.scenes import BOOK, CATEGORIES, SMALL, draw
+from support.scenes import BOOK, CATEGORIES, corridor_scene
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import State
@@ -29,8 +29,7 @@ from jaxnav.viz.episode import PlayedEpisode
 from jaxnav.viz.search import BLOCK_COLOR, NEAR_COLOR, OBSTACLE_COLOR, MapProjection, draw_search, take_snapshot
 from jaxnav.viz.style import GOAL_COLOR
 
-#: A corridor along z, one cell wide, a book at its north end.
-CORRIDOR = draw([["."]] * 24, ("Book", 0.0, 0.8, 5.75, *SMALL))
+CORRIDOR = corridor_scene(24)
 BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))
 KNOWLEDGE = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_search_setup([BANK], np.zeros(0))))
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("semexp"), method_sizes=())
