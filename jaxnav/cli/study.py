@@ -5,8 +5,9 @@ import sys
 from rich.console import Console
 
 from jaxnav.cli.console import escape_control_chars, parse_config, run_command
-from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig, check_experiment
-from jaxnav.experiments.driver import run_experiment
+from jaxnav.errors import InputError
+from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig
+from jaxnav.experiments.driver import check_measurements, run_experiment
 
 DESCRIPTION = (
     f"Run an experiment: {', '.join(EXPERIMENTS)}, or a YAML file. Trains and measures what is missing, and writes its "
@@ -41,6 +42,8 @@ def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> Expe
       SystemExit: with code 2 after a bad option, 0 after --help.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words:
+        raise InputError(f"give an experiment: {', '.join(EXPERIMENTS)}, or a YAML file")
     if words and not words[0].startswith("-"):
         words = ["--config", *words]
-    return parse_config(ExperimentConfig(), words, prog, DESCRIPTION, check_experiment, EXPERIMENTS)
+    return parse_config(ExperimentConfig(), words, prog, DESCRIPTION, check_measurements, EXPERIMENTS)

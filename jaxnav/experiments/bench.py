@@ -85,7 +85,7 @@ class Bench:
 
     def train(self, run: AgentRun) -> None:
         """Train a run unless it is finished with the same settings."""
-        if run.is_trained:
+        if run.is_external:
             return
 
         # Loading the policies proves that they exist; equal settings prove that they are those of this experiment.

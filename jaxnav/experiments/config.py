@@ -32,17 +32,18 @@ class ExperimentConfig:
 
     Attributes:
       title: title of the page.
-      results: folder of the results; those of a split are in a folder of its name.
+      results: folder of the results; those of a split are in a folder of its name. With `run`, it is the run's folder.
       runs: folder of the training runs.
       pages: pages to write, as document: template. A template is a file, or the name of a packaged one.
       worlds: worlds by name, with the settings that all runs in it change.
       agents: agents by name, with the settings that their runs change. `against` lists what an agent is compared
         with: AGENT, or one of its variants as AGENT/VARIANT; `run` names a finished run to use in place of training.
-      left_out: patterns of WORLD-AGENT that are not run.
-      only: patterns of WORLD-AGENT that are run.
+      left_out: patterns of WORLD-AGENT that do not exist.
+      only: patterns of WORLD-AGENT that are measured now; pages show all that have results.
       measure: measurements by name (see `jaxnav.experiments.driver.MEASUREMENTS`), each with patterns of AGENT or
         WORLD-AGENT that are measured.
-      groups: groups of agents whose mean is compared with an agent, or with another variant of the group.
+      groups: groups of agents whose mean success, with best actions and at the first shift, is compared with an agent
+        or with another variant of the group.
       unaware: agent that cannot know any layout; the reference for the value and cost of experience.
       run: finished run to measure in place of the agents; the results are kept in its folder.
       without: finished run of agents that cannot know any layout, next to `run`.
@@ -95,14 +96,14 @@ class AgentRun(NamedTuple):
       agent: name of the agent.
       config: settings of the run.
       against: names of the agents with which it is compared.
-      is_trained: True if the run was given as a finished one, and is not trained by the experiment.
+      is_external: True if the run was given as a finished one, and is not trained by the experiment.
     """
 
     world: str
     agent: str
     config: RunConfig
     against: tuple[str, ...] = ()
-    is_trained: bool = False
+    is_external: bool = False
 
     @property
     def name(self) -> str:
@@ -117,6 +118,9 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
       InputError: names the first invalid setting.
     """
     config = _with_finished_runs(config)
+
+    if not config.agents:
+        raise InputError("agents: none; give --run RUN, a finished run, or agents to train")
 
     # Numbers of the evaluation; the first shift is the reference of every comparison, so it must be the smallest.
     shifts = config.shifts
@@ -143,12 +147,18 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
     for agent, agent_settings in config.agents.items():
         _check_references(config, f"agents.{agent}.against", agent_settings.get("against", []))
     for name, group in config.groups.items():
+        if name in config.agents:
+            raise InputError(f"groups.{name}: an agent is called so too; give another name")
         _check_group(config, f"groups.{name}", group)
 
     # Listing the runs checks the settings of each.
     runs = agent_runs(config)
-    if not runs:
+    if not any(_matches(f"{run.world}-{run.agent}", config.only) for run in runs):
         raise InputError("worlds, agents, only and left_out: select no run; give others")
+    for measurement in config.measure:
+        if not measured_runs(dataclasses.replace(config, only=("*",)), measurement):
+            raise InputError(f"measure.{measurement}: {config.measure[measurement]} match no agent; give others")
+    _check_seeds(runs)
     for run in runs:
         if not isinstance(run.config.devices, int | None):
             raise InputError(f"{run.name}: devices is {run.config.devices}; one process trains all runs: give a number")
@@ -157,6 +167,16 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
         if run_names.count(name) > 1:
             raise InputError(f"worlds and agents: two runs are called {name}; give other names")
     return config
+
+
+def _check_seeds(runs: list[AgentRun]) -> None:
+    """Check that agents that are compared have as many seeds."""
+    seeds = {(run.world, run.agent): run.config.seeds for run in runs}
+    for run in runs:
+        for reference in run.against:
+            agent = reference.partition("/")[0]
+            if seeds.get((run.world, agent), run.config.seeds) != run.config.seeds:
+                raise InputError(f"{run.name}: has other seeds than {agent}, with which it is compared; give as many")
 
 
 def _check_references(config: ExperimentConfig, key: str, references: Any) -> None:
@@ -195,6 +215,10 @@ def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
             raise InputError(f"without: {config.without}: give the run that it is compared with, as `run`")
         return config
 
+    # Agents of an experiment would be lost silently.
+    if config.unaware == "main":
+        raise InputError("unaware: with `run`, main is the measured run; give another name")
+
     # The world is that of the run, unless it is changed; results and page are kept in the run's folder.
     base = load_run_config(config.run)
     agents: dict[str, dict[str, Any]] = {"main": {"run": str(config.run)}}
@@ -206,7 +230,7 @@ def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
         agents=agents,
         worlds=run_world if config.worlds == ExperimentConfig().worlds else config.worlds,
         base=dataclasses.replace(base, devices=None),
-        results=config.run / "results" if config.results == ExperimentConfig().results else config.results,
+        results=config.run / "results",
         pages={str(config.run / Path(document).name): template for document, template in config.pages.items()},
     )
 
@@ -220,8 +244,7 @@ def agent_runs(config: ExperimentConfig) -> list[AgentRun]:
     runs = []
     for world, world_changes in config.worlds.items():
         for agent in config.agents:
-            name = f"{world}-{agent}"
-            if _matches(name, config.only) and not _matches(name, config.left_out):
+            if not _matches(f"{world}-{agent}", config.left_out):
                 runs.append(_agent_run(config, world, world_changes, agent))
     return runs
 
@@ -243,7 +266,7 @@ def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, An
             raise InputError(f"agents.{agent}: is a finished run; leave out {', '.join(changes)}")
         run_config = load_run_config(Path(agent_settings["run"]))
         run_config = apply_values(run_config, world_changes, Path(f"worlds.{world}"))
-        return AgentRun(world, agent, run_config, against, is_trained=True)
+        return AgentRun(world, agent, run_config, against, is_external=True)
 
     # The scenes of finished results need not exist any more; whoever trains reads them first.
     world_config = apply_values(config.base, world_changes, Path(f"worlds.{world}"))
@@ -259,11 +282,13 @@ def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, An
 
 
 def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:
-    """List the runs of which a measurement is taken."""
+    """List the runs of which a measurement is taken now."""
     patterns = tuple(config.measure[measurement])
     runs = []
     for run in agent_runs(config):
-        if _matches(run.agent, patterns) or _matches(f"{run.world}-{run.agent}", patterns):
+        full_name = f"{run.world}-{run.agent}"
+        is_measured = _matches(run.agent, patterns) or _matches(full_name, patterns)
+        if is_measured and _matches(full_name, config.only):
             runs.append(run)
     return runs
 

@@ -13,14 +13,22 @@ from rich.console import Console
 
 from jaxnav.errors import InputError
 from jaxnav.experiments.bench import Bench
-from jaxnav.experiments.config import AgentRun, ExperimentConfig, evaluation_settings, measured_runs, part_settings
+from jaxnav.experiments.config import (
+    AgentRun,
+    ExperimentConfig,
+    check_experiment,
+    evaluation_settings,
+    measured_runs,
+    part_settings,
+)
 from jaxnav.experiments.gap_traces import measure_gaps
 from jaxnav.experiments.instrument import measure_instrument
 from jaxnav.experiments.mixture import measure_handover, measure_mixture
 from jaxnav.experiments.pages import check_page, render_page
 from jaxnav.experiments.scores import measure_account, measure_evaluation, measure_frontier, measure_groups
-from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, write_part
+from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, read_settings, write_part
 from jaxnav.experiments.trials import measure_growth, measure_trials, measure_variants
+from jaxnav.store.files import list_differences
 
 
 class Measurement(NamedTuple):
@@ -29,13 +37,13 @@ class Measurement(NamedTuple):
     Attributes:
       measure: called with the bench and the run, and with a shift or a decoding if `parts` names either.
       parts: setting of the experiment whose values are measured in parts of their own.
-      has_unaware: True if the run is compared with the agents that cannot know any layout.
+      uses_unaware: True if the run is compared with the agents that cannot know any layout.
       compares_shifts: True if it compares layout shifts, and so needs several.
     """
 
     measure: Callable[..., Iterator[ResultRow]]
     parts: str | None = None
-    has_unaware: bool = False
+    uses_unaware: bool = False
     compares_shifts: bool = False
 
 
@@ -43,14 +51,14 @@ MEASUREMENTS = {
     "evaluation": Measurement(measure_evaluation),
     "frontier": Measurement(measure_frontier),
     "groups": Measurement(measure_groups),
-    "account": Measurement(measure_account, has_unaware=True),
+    "account": Measurement(measure_account, uses_unaware=True),
     "trials": Measurement(measure_trials, parts="shifts"),
     "variants": Measurement(measure_variants, parts="shifts"),
     "growth": Measurement(measure_growth, compares_shifts=True),
-    "instrument": Measurement(measure_instrument, has_unaware=True, compares_shifts=True),
+    "instrument": Measurement(measure_instrument, uses_unaware=True, compares_shifts=True),
     "gaps": Measurement(measure_gaps, compares_shifts=True),
-    "mixture": Measurement(measure_mixture, parts="decodings", has_unaware=True, compares_shifts=True),
-    "handover": Measurement(measure_handover, parts="decodings", has_unaware=True, compares_shifts=True),
+    "mixture": Measurement(measure_mixture, parts="decodings", uses_unaware=True, compares_shifts=True),
+    "handover": Measurement(measure_handover, parts="decodings", uses_unaware=True, compares_shifts=True),
 }
 
 
@@ -68,6 +76,21 @@ class Part(NamedTuple):
     measure: Callable[[], Iterator[ResultRow]]
 
 
+def check_measurements(config: ExperimentConfig) -> ExperimentConfig:
+    """Return an experiment completed by `check_experiment`, if its measurements are possible too.
+
+    Raises:
+      InputError: names the first invalid setting.
+    """
+    unknown_names = sorted(set(config.measure) - set(MEASUREMENTS))
+    if unknown_names:
+        raise InputError(f"measure: {unknown_names[0]!r} is unknown; choose from {', '.join(MEASUREMENTS)}")
+    for name in config.measure:
+        if MEASUREMENTS[name].compares_shifts and len(config.shifts) < 2:
+            raise InputError(f"shifts: {config.shifts}: give two or more, which the measurement {name} compares")
+    return check_experiment(config)
+
+
 def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     """Measure what is missing, and write the pages.
 
@@ -75,7 +98,7 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     after every part, from the files of results alone.
 
     Args:
-      config: the experiment; see `check_experiment`.
+      config: the experiment; see `check_measurements`.
       console: prints progress.
 
     Returns:
@@ -84,22 +107,24 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     Raises:
       InputError: a document is not a page of an experiment, or a run is impossible.
     """
-    # Fail early: a page that cannot be written would waste the measurements.
+    # Fail early: a page that cannot be written, or results that would be lost, would waste the measurements.
     for document, template in config.pages.items():
         check_page(Path(document), template)
-
     folder = config.results / config.split
     parts = list_parts(config, Bench(config, console))
-    num_reused = 0
-    for part in parts:
+    missing_parts = [part for part in parts if not _is_finished(folder, part)]
+
+    # Pages are written again after every part. Only the last ones must be without faults.
+    for part in missing_parts:
         path = folder / f"{part.name}.jsonl"
-        if has_part(path, part.settings):
-            num_reused += 1
-            continue
         console.print(f"{path}")
         write_part(path, part.settings, part.measure())
-        write_pages(config, parts)
+        try:
+            write_pages(config, parts)
+        except InputError as error:
+            console.print(f"warning: {error}", style="yellow")
 
+    num_reused = len(parts) - len(missing_parts)
     if num_reused:
         console.print(f"{num_reused} results in {folder} were there already; give another --results to measure again")
     texts = write_pages(config, parts)
@@ -108,24 +133,29 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     return texts
 
 
-def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
-    """List the files of results of an experiment, in the order in which they are measured.
+def _is_finished(folder: Path, part: Part) -> bool:
+    """True if the results of a part exist.
 
     Raises:
-      InputError: an unknown measurement, or one that compares shifts and has only one.
+      InputError: the file holds results of other settings, which must not be lost.
     """
-    unknown_names = sorted(set(config.measure) - set(MEASUREMENTS))
-    if unknown_names:
-        raise InputError(f"measure: {unknown_names[0]!r} is unknown; choose from {', '.join(MEASUREMENTS)}")
-    for name in config.measure:
-        if MEASUREMENTS[name].compares_shifts and len(config.shifts) < 2:
-            raise InputError(f"shifts: {config.shifts}: give two or more, which the measurement {name} compares")
+    path = folder / f"{part.name}.jsonl"
+    settings = read_settings(path)
+    if settings is None or settings == part.settings:
+        return settings is not None
+    differences = "; ".join(list_differences(settings, part.settings))
+    raise InputError(f"{path}: holds results of other settings ({differences}); delete it or give another --results")
 
+
+def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
+    """List the files of results of an experiment, in the order in which they are measured."""
     parts = []
     for name, measurement in MEASUREMENTS.items():
         runs = measured_runs(config, name) if name in config.measure else []
         for run in runs:
             settings = part_settings(config, run, _references(bench, run, measurement))
+            if measurement.measure is measure_evaluation:
+                settings["against"] = list(run.against)
             if measurement.measure is measure_groups:
                 settings["groups"] = config.groups
             measure = partial(measurement.measure, bench, run)
@@ -134,7 +164,8 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
                 continue
             for value in getattr(config, measurement.parts):
                 value_name = f"{value:g}" if isinstance(value, float) else value
-                parts.append(Part(f"{run.name}-{name}-{value_name}", settings, partial(measure, value)))
+                part_name = f"{run.name}-{name}-{value_name}"
+                parts.append(Part(part_name, settings | {measurement.parts: [value]}, partial(measure, value)))
     return parts
 
 
@@ -146,7 +177,7 @@ def _references(bench: Bench, run: AgentRun, measurement: Measurement) -> list[A
     if measurement.measure is measure_groups:
         for group in bench.config.groups.values():
             agents += [*group["agents"], group["against"].rpartition("/")[0]]
-    if measurement.has_unaware:
+    if measurement.uses_unaware:
         agents.append(bench.config.unaware)
     references = [bench.find_run(run.world, agent) for agent in agents]
     return [reference for reference in references if reference is not None]
@@ -179,6 +210,8 @@ def load_results(config: ExperimentConfig, missing: Collection[str] = ()) -> dic
     tables = {}
     for split in ("train", "val", "test"):
         settings = evaluation_settings(config) | {"split": split}
+        for name in ("shifts", "decodings", "steps"):
+            del settings[name]  # of single parts
         rows: list[ResultRow] = []
         for path in sorted((config.results / split).glob("*.jsonl")):
             if split != config.split or path.stem not in missing:

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import jinja2.meta
+import jinja2.nodes
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
@@ -26,17 +28,30 @@ from jaxnav.viz import require_plotting_packages
 
 PAGES = Path(__file__).parent / "pages"
 READING_MARK = "<!-- reading -->"
+#: Names that a template is given; see docs/experiments.md.
+CONTEXT_NAMES = frozenset(("config", "table", "tables", "runs", "summary", "missing", "figure"))
 
 
 def check_page(document: Path, template: str) -> None:
     """Check that a page can be written.
 
     Raises:
-      InputError: there is no such template, it draws figures without the plotting packages, or the document exists and
-        does not hold two reading marks.
+      InputError: there is no such template, it has unknown names or no summary, it draws figures without the plotting
+        packages, or the document exists and does not hold two reading marks.
     """
-    page_path = _load_template(template).filename
-    if page_path and "figure(" in Path(page_path).read_text(encoding="utf-8"):
+    # The names that the template takes from outside, found without filling it.
+    loaded_template = _load_template(template)
+    page_path = Path(loaded_template.filename or template)
+    syntax_tree = loaded_template.environment.parse(page_path.read_text(encoding="utf-8"))
+    names = jinja2.meta.find_undeclared_variables(syntax_tree) - loaded_template.environment.globals.keys()
+    own_names = {name.name for name in syntax_tree.find_all(jinja2.nodes.Name) if name.ctx != "load"}
+    unknown_names = sorted(names - own_names - CONTEXT_NAMES)
+    if unknown_names:
+        raise InputError(f"{page_path}: {unknown_names[0]!r} is unknown; pages have {', '.join(sorted(CONTEXT_NAMES))}")
+    if "summary" not in names:
+        raise InputError(f"{page_path}: give {{{{ summary }}}}; text written by hand is kept there")
+
+    if "figure" in names:
         require_plotting_packages()
     if document.exists() and document.read_text(encoding="utf-8").count(READING_MARK) != 2:
         raise InputError(f"{document}: exists without two lines {READING_MARK}; give another document in `pages`")

@@ -96,7 +96,9 @@ def difference_rows(
             for variant, other_variant in pairs:
                 if variant in variants and other_variant in other_variants:
                     reference_name = name if is_single else f"{name}/{variant}"
-                    yield from _compare(run, shift, variants[variant], other_variants[other_variant], reference_name)
+                    reference = other_variants[other_variant]
+                    same_runs = other_variant in UNTRAINED_VARIANTS  # which have no networks of their own
+                    yield from _compare(run, shift, variants[variant], reference, reference_name, same_runs=same_runs)
 
 
 class VariantScores(NamedTuple):
@@ -221,7 +223,7 @@ def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             interval = mean_interval(scale * metrics[metric], episodes.clusters(), trained=False)
             yield ResultRow(
                 world=run.world,
-                run="frontier",
+                run=run.agent,
                 variant="frontier",
                 shift=shift,
                 metric=metric,

@@ -114,12 +114,19 @@ class ResultTable:
     """Rows of results, found by their fields.
 
     Args:
-      rows: the rows; of several rows with equal fields the last one counts.
+      rows: the rows.
+
+    Raises:
+      InputError: two rows have equal fields and different values.
     """
 
     def __init__(self, rows: Iterable[ResultRow]) -> None:
         self.rows = tuple(rows)
-        self._row_by_key = {_row_key(row): row for row in self.rows}
+        self._row_by_key: dict[tuple[Any, ...], ResultRow] = {}
+        for row in self.rows:
+            first_row = self._row_by_key.setdefault(_row_key(row), row)
+            if row is not first_row and row.to_json() != first_row.to_json():
+                raise InputError(f"two results have the same fields: {first_row.to_json()} and {row.to_json()}")
 
     def where(self, *selections: Mapping[str, Any], **fields: Any) -> "ResultTable":
         """Select the rows whose fields have these values.
@@ -281,11 +288,16 @@ def write_part(path: Path, settings: Mapping[str, Any], rows: Iterable[ResultRow
 
 def has_part(path: Path, settings: Mapping[str, Any]) -> bool:
     """True if the file is undamaged and holds results of these settings."""
+    return read_settings(path) == settings
+
+
+def read_settings(path: Path) -> dict[str, Any] | None:
+    """Read the settings of a file; None if it is missing or damaged."""
     try:
         part_settings, _ = _read_file(path)
     except (FileNotFoundError, InputError):
-        return False
-    return part_settings == settings
+        return None
+    return part_settings
 
 
 def read_part(path: Path, settings: Mapping[str, Any] | None = None) -> list[ResultRow]:
