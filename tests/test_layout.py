@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from scipy.special import digamma
-from support.dirichlet import exact_kl
+from support.numerics import exact_kl
 
 from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutState, prior_from_counts
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import SEEDS, contents, evaluate, finished_run, refusal
-from support.records import resigned
+from support.mutations import resigned
 
 from jaxnav.cli.eval import EvalConfig, _find_target
 from jaxnav.scenes.categories import ITHOR_CATEGORIES

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 from support import tiny_world as tiny
-from support.dirichlet import exact_kl
 from support.episodes import episodes_in
 from support.intervals import around, left_out
+from support.numerics import exact_kl
 
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.experiments.gap_traces import (

@@ -9,7 +9,7 @@ import pytest
 from jax.scipy.special import digamma as digamma_float32
 from jax.scipy.special import gammaln as gammaln_float32
 from scipy.special import digamma, gammaln
-from support.dirichlet import exact_kl
+from support.numerics import exact_kl
 
 from jaxnav.numerics.dirichlet import presence_kl
 

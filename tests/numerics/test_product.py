@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from support.arrays import normal_array
+from support.numerics import normal_array
 
 from jaxnav.numerics.product import Linear, matmul_rows
 

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from rich.console import Console
-from support.records import resigned
+from support.mutations import resigned
 
 import jaxnav
 from jaxnav.errors import InputError

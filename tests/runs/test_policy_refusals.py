@@ -6,7 +6,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from support.records import resigned
+from support.mutations import resigned
 
 import jaxnav
 from jaxnav.errors import InputError

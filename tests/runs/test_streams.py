@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from support.records import resigned
+from support.mutations import resigned
 from support.tiny_world import lively
 
 import jaxnav

@@ -1,11 +1,16 @@
-"""Changed copies of JSON values, texts and bytes."""
+"""Changed copies of JSON values, texts and bytes, and changed records in signed files."""
 
+import contextlib
 import copy
 import functools
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from hypothesis import strategies as st
+
+from jaxnav.store.files import DIGEST_KEY, write_json_with_digest
 
 JSON_VALUES = st.recursive(
     st.none()
@@ -32,6 +37,15 @@ def without(document: Any, *keys: Any) -> Any:
     copied = copy.deepcopy(document)
     del functools.reduce(lambda node, key: node[key], keys[:-1], copied)[keys[-1]]
     return copied
+
+
+@contextlib.contextmanager
+def resigned(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the record in a signed file to be changed, and sign it again, as another version of the code would."""
+    record = json.loads(path.read_text())
+    del record[DIGEST_KEY]
+    yield record
+    write_json_with_digest(path, record)
 
 
 def edited(document: Any, choose: Callable[[Sequence[Any]], Any], draw_value: Callable[[], Any]) -> Any:

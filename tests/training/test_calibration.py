@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.dirichlet import exact_kl
+from support.numerics import exact_kl
 
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError

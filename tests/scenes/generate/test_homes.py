@@ -2,8 +2,17 @@
 
 import numpy as np
 import pytest
-from support.lattice import EIGHT, FOUR, parts_of
-from support.placement import MILLIMETRES, cell_centres, check_agent_fits, check_form, check_nothing_overlaps, corners
+from support.scene_geometry import (
+    EIGHT,
+    FOUR,
+    MILLIMETRES,
+    cell_centres,
+    check_agent_fits,
+    check_form,
+    check_nothing_overlaps,
+    corners,
+    parts_of,
+)
 from support.scene_records import assert_scenes_equal
 
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, GIBSON_GOALS, ROBOTHOR_GOALS

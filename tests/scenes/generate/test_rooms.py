@@ -4,7 +4,14 @@ import collections
 
 import numpy as np
 import pytest
-from support.placement import MILLIMETRES, cell_centres, check_agent_fits, check_form, check_nothing_overlaps, corners
+from support.scene_geometry import (
+    MILLIMETRES,
+    cell_centres,
+    check_agent_fits,
+    check_form,
+    check_nothing_overlaps,
+    corners,
+)
 
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, ROOM_TYPES
 from jaxnav.scenes.generate.rooms import (

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.importer_inputs.semantic_maps import CHAIR, l_shaped_floor, write_maps
-from support.lattice import points_of
+from support.scene_geometry import points_of
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.habitat import build_scene_from_map, parse_floor_map, read_floor_maps

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 from support.importer_inputs.procthor import ASSETS, BOWL, HOUSE, build, door, item, point, wall
-from support.lattice import block, points_of
 from support.mutations import changed
+from support.scene_geometry import block, points_of
 from support.scene_records import as_scene, assert_scenes_equal
 
 from jaxnav.scenes.files.importers.assemble import ImportNote

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 from support.importer_inputs.procthor import ASSET_LISTS, BOWL, HOUSE, TABLE, item
-from support.lattice import block, points_of
 from support.mutations import changed
 from support.real_scenes import PROCTHOR, require
+from support.scene_geometry import block, points_of
 from support.scene_records import assert_scenes_equal
 
 from jaxnav.scenes.files.importers.procthor import AssetInfo, read_assets, read_objects

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from support.importer_inputs.procthor import build, door, item, point
-from support.lattice import EIGHT, FOUR, parts_of
+from support.scene_geometry import EIGHT, FOUR, parts_of
 from support.scene_records import scenes_and_errors
 
 from jaxnav.scenes.files.importers.procthor import read_procthor
