@@ -194,7 +194,9 @@ class Trainer:
         def train(state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
             return learner.train(state, scalars, env_params, knowledge, self._chunk_size)
 
-        return jax.jit(train, donate_argnums=0).lower(*arguments).compile()
+        # Shapes say nothing of how the arrays came about, so a resumed run finds the compiled program in the cache.
+        shapes = jax.eval_shape(lambda *arrays: arrays, *arguments)
+        return jax.jit(train, donate_argnums=0).lower(*shapes).compile()
 
 
 class ShardedTrainer(Trainer):
