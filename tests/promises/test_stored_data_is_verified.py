@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import pytest
 from support.commands import POLICIES, finished_run, train
-from support.corridors import build
+from support.corridors import compile_corridors
 from support.damage import damage
 from support.drawn_run import tiny_config
 
@@ -99,7 +99,7 @@ def exported(folder):
 
 
 def bank(folder):
-    return [[np.asarray(part).tolist() for part in bank[1:]] for bank in build(folder)]
+    return [[np.asarray(part).tolist() for part in bank[1:]] for bank in compile_corridors(folder)]
 
 
 def reach(folder):
@@ -122,7 +122,7 @@ STORED = {
         reach,
     ),
     "export": Stored(lambda folder: export_params(folder, arrays(), {"method": "org", "size": 3}), exported),
-    "shards": Stored(build, bank),
+    "shards": Stored(compile_corridors, bank),
 }
 
 

@@ -1,6 +1,6 @@
 """Corridors of several lengths, compiled into shards.
 
-Processes that compile them import them from here.
+A module of its own, because the processes that compile shards import the classes of their scenes.
 """
 
 import dataclasses
@@ -20,43 +20,48 @@ TASK = Task(CATEGORIES)
 
 @dataclasses.dataclass(frozen=True)
 class Corridors:
-    """Hold corridors with a book at the end.
+    """Corridors of 4 to 8 rows with a book at their ends.
 
-    Those of `without` have none.
+    Attributes:
+      count: number of corridors.
+      goalless: indices of corridors without a book.
+      identity: name of the collection, part of the key of its shards.
     """
 
     count: int = 7
-    without: tuple[int, ...] = ()
+    goalless: tuple[int, ...] = ()
     identity: str = "corridors"
 
     def __len__(self) -> int:
         return self.count
 
     def __getitem__(self, index: int) -> Scene:
-        length = 4 + index % 5
-        objects = [] if index in self.without else [("Book", 0.25, 1.5, length / 4, *SMALL)]
-        scene = draw(["..", "#."] + [".."] * (length - 2), *objects)
+        num_rows = 4 + index % 5
+        objects = [] if index in self.goalless else [("Book", 0.25, 1.5, num_rows / 4, *SMALL)]
+        scene = draw(["..", "#."] + [".."] * (num_rows - 2), *objects)
         return dataclasses.replace(scene, name=f"corridor-{index}")
 
 
 @dataclasses.dataclass(frozen=True)
 class GatedCorridors(Corridors):
-    """Hold corridors that wait for a file.
+    """Corridors some of which wait for a file.
 
-    Those of `gated` wait until `gate` is there.
+    Attributes:
+      gate_path: file that opens the gate.
+      gated: indices of the corridors that wait for it.
     """
 
-    gate: str = "/nonexistent"
+    gate_path: str = "/nonexistent"
     gated: tuple[int, ...] = ()
 
     def __getitem__(self, index: int) -> Scene:
-        while index in self.gated and not Path(self.gate).exists():
+        while index in self.gated and not Path(self.gate_path).exists():
             time.sleep(0.01)
         return super().__getitem__(index)
 
 
 class FaultyCorridors(GatedCorridors):
-    """Hold corridors of which the fourth raises an error."""
+    """Corridors of which the fourth raises an error."""
 
     def __getitem__(self, index: int) -> Scene:
         if index == 3:
@@ -64,13 +69,13 @@ class FaultyCorridors(GatedCorridors):
         return super().__getitem__(index)
 
 
-def build(
-    cache: Path,
+def compile_corridors(
+    cache_folder: Path,
     scenes: Scenes = Corridors(),
     task: Task = TASK,
     shard_scenes: int = 2,
     workers: int = 1,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Shards:
-    """Compile corridors into shards below a folder."""
-    return compile_shards(scenes, task, shard_scenes, cache, report, workers)
+    """Compile corridors into shards of `shard_scenes` scenes below a folder."""
+    return compile_shards(scenes, task, shard_scenes, cache_folder, report, workers)

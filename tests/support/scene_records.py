@@ -1,4 +1,4 @@
-"""Scene files of a few records, and comparisons of scenes."""
+"""Scene files of a few records, and checks of the scenes that are read or imported."""
 
 import collections
 import dataclasses
@@ -31,7 +31,7 @@ RECORD: dict[str, Any] = {
 
 def write_records(path: Path, *records: object) -> Path:
     """Write a scene file, one record a line."""
-    path.write_bytes(gzip.compress("".join(json.dumps(r) + "\n" for r in records).encode()))
+    path.write_bytes(gzip.compress("".join(json.dumps(record) + "\n" for record in records).encode()))
     return path
 
 
@@ -43,33 +43,40 @@ def as_scene(result: Scene | InputError) -> Scene:
 
 def scenes_and_errors(results: Iterable[Scene | InputError | ImportNote]) -> tuple[list[Scene], list[str]]:
     """Return the scenes among results, and the errors' messages."""
-    results = list(results)
-    return [r for r in results if isinstance(r, Scene)], [str(r) for r in results if isinstance(r, InputError)]
+    scenes = []
+    messages = []
+    for result in results:
+        if isinstance(result, Scene):
+            scenes.append(result)
+        elif isinstance(result, InputError):
+            messages.append(str(result))
+    return scenes, messages
 
 
-def assert_scenes_equal(a: Scene | InputError, b: Scene | InputError) -> None:
+def assert_scenes_equal(result: Scene | InputError, expected: Scene | InputError) -> None:
     """Check that two scenes are equal, types and dtypes included."""
-    a, b = as_scene(a), as_scene(b)
+    scene = as_scene(result)
+    expected_scene = as_scene(expected)
     for field in dataclasses.fields(Scene):
-        a_value = getattr(a, field.name)
-        b_value = getattr(b, field.name)
-        assert type(a_value) is type(b_value), field.name
-        if isinstance(a_value, np.ndarray):
-            np.testing.assert_array_equal(a_value, b_value, field.name, strict=True)
+        value = getattr(scene, field.name)
+        expected_value = getattr(expected_scene, field.name)
+        assert type(value) is type(expected_value), field.name
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, expected_value, field.name, strict=True)
         elif field.name != "rooms":
-            assert a_value == b_value, field.name
-    assert [room.type for room in a.rooms] == [room.type for room in b.rooms]
-    for one, other in zip(a.rooms, b.rooms, strict=True):
-        np.testing.assert_array_equal(one.cells, other.cells, strict=True)
+            assert value == expected_value, field.name
+
+    # Rooms hold arrays, which have no equality.
+    assert [room.type for room in scene.rooms] == [room.type for room in expected_scene.rooms]
+    for room, expected_room in zip(scene.rooms, expected_scene.rooms, strict=True):
+        np.testing.assert_array_equal(room.cells, expected_room.cells, strict=True)
 
 
 def check_outcomes(
     results: Iterable[Scene | InputError | ImportNote], outcomes: collections.Counter[type], path: Path
 ) -> None:
-    """Check that results are storable scenes or named errors.
-
-    A scene file can hold the scenes, and errors name their file. They are counted by type.
-    """
+    """Check that a scene file can hold each scene and that each error names its file; count the results by type."""
+    scene_file = path.parent / "fuzzed.jsonl.gz"
     for result in results:
         outcomes[type(result)] += 1
         if isinstance(result, ImportNote):
@@ -77,5 +84,5 @@ def check_outcomes(
         elif isinstance(result, InputError):
             assert str(result).startswith(str(path))
         else:
-            write_scenes(path.parent / "fuzzed.jsonl.gz", [result])
-            assert_scenes_equal(read_scenes(path.parent / "fuzzed.jsonl.gz")[0], result)
+            write_scenes(scene_file, [result])
+            assert_scenes_equal(read_scenes(scene_file)[0], result)

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from support.commands import contents
-from support.corridors import TASK, Corridors, FaultyCorridors, GatedCorridors, build
+from support.corridors import TASK, Corridors, FaultyCorridors, GatedCorridors, compile_corridors
 from support.scenes import CATEGORIES
 
 from jaxnav.errors import InputError
@@ -59,8 +59,8 @@ def imported_files(code_folder, *modules):
 
 @pytest.mark.parametrize("goalless_scenes", [(), (1, 4, 5)])
 def test_concatenated_shards_equal_the_bank_of_all_scenes(tmp_path, goalless_scenes):
-    corridors = Corridors(without=goalless_scenes)
-    shards = build(tmp_path, corridors)
+    corridors = Corridors(goalless=goalless_scenes)
+    shards = compile_corridors(tmp_path, corridors)
     bank = compile_bank([corridors[i] for i in range(len(corridors))], TASK)
     # Seven scenes in shards of two at most: (0), (1, 2), (3, 4) and (5, 6).
     assert shards.counts == ((1, 1, 1, 1) if goalless_scenes else (1, 2, 2, 2))
@@ -83,7 +83,7 @@ def test_concatenated_shards_equal_the_bank_of_all_scenes(tmp_path, goalless_sce
 
 
 def test_shards_are_memory_mapped_and_report_the_largest_sizes(tmp_path):
-    shards = build(tmp_path)
+    shards = compile_corridors(tmp_path)
     for field_name in ARRAYS:
         array = getattr(shards[0], field_name)
         assert isinstance(array, np.memmap), field_name
@@ -94,11 +94,11 @@ def test_shards_are_memory_mapped_and_report_the_largest_sizes(tmp_path):
 
 
 def test_shards_without_a_goal_are_left_out_or_refused_altogether(tmp_path):
-    shards = build(tmp_path, Corridors(count=6, without=(2, 3)))
+    shards = compile_corridors(tmp_path, Corridors(count=6, goalless=(2, 3)))
     assert (shards.counts, shards.skipped) == ((2, 2), ("corridor-2", "corridor-3"))
     assert [shard.names[0] for shard in shards] == ["corridor-0", "corridor-4"]
     with pytest.raises(InputError, match=r"3 scenes .* Book, Chair, Fridge"):
-        build(tmp_path, Corridors(count=3, without=(0, 1, 2), identity="bare"))
+        compile_corridors(tmp_path, Corridors(count=3, goalless=(0, 1, 2), identity="bare"))
 
 
 # Folders of shards
@@ -106,8 +106,8 @@ def test_shards_without_a_goal_are_left_out_or_refused_altogether(tmp_path):
 
 def test_two_workers_write_identical_shards_and_report_progress(tmp_path):
     reports = []
-    by_one_worker = build(tmp_path / "one")
-    by_two_workers = build(tmp_path / "two", workers=2, report=lambda *numbers: reports.append(numbers))
+    by_one_worker = compile_corridors(tmp_path / "one")
+    by_two_workers = compile_corridors(tmp_path / "two", workers=2, report=lambda *numbers: reports.append(numbers))
     assert contents(by_one_worker.folder) == contents(by_two_workers.folder)
     assert len(contents(by_one_worker.folder)) == 4 * 9  # shards of eight arrays and the texts
     assert reports == [(1, 4), (2, 4), (3, 4), (4, 4)]
@@ -115,15 +115,15 @@ def test_two_workers_write_identical_shards_and_report_progress(tmp_path):
 
 def test_shard_folder_depends_on_scenes_task_size_and_code(tmp_path, monkeypatch):
     code_file = use_code_copy(tmp_path, monkeypatch) / "lattice.py"
-    folder = build(tmp_path).folder
-    assert build(tmp_path).folder == folder
+    folder = compile_corridors(tmp_path).folder
+    assert compile_corridors(tmp_path).folder == folder
     other_shards = [
-        build(tmp_path, Corridors(identity="others")),
-        build(tmp_path, task=Task(CATEGORIES, rules=Rules(success_distance=1.25))),
-        build(tmp_path, shard_scenes=3),
+        compile_corridors(tmp_path, Corridors(identity="others")),
+        compile_corridors(tmp_path, task=Task(CATEGORIES, rules=Rules(success_distance=1.25))),
+        compile_corridors(tmp_path, shard_scenes=3),
     ]
     code_file.write_text("# changed")
-    other_shards.append(build(tmp_path))
+    other_shards.append(compile_corridors(tmp_path))
     assert len({folder, *(shards.folder for shards in other_shards)}) == 5
 
 
@@ -154,7 +154,7 @@ def test_compile_shards_builds_only_missing_shards(tmp_path):
             compiled_indices.append(index)
             return super().__getitem__(index)
 
-    shards = build(tmp_path, Watched())
+    shards = compile_corridors(tmp_path, Watched())
     assert compiled_indices == list(range(7))
     contents_before = contents(shards.folder)
     times_before = modification_times(shards.folder)
@@ -167,7 +167,7 @@ def test_compile_shards_builds_only_missing_shards(tmp_path):
 
     # The missing shard is compiled, and the temporary folder is removed.
     compiled_indices.clear()
-    assert build(tmp_path, Watched(), report=lambda *numbers: reports.append(numbers)) == shards
+    assert compile_corridors(tmp_path, Watched(), report=lambda *numbers: reports.append(numbers)) == shards
     assert compiled_indices == [1, 2]
     assert reports == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert contents(shards.folder) == contents_before
@@ -180,11 +180,11 @@ def test_compile_shards_builds_only_missing_shards(tmp_path):
 
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
 def test_killed_build_leaves_whole_shards_and_no_process(tmp_path, signal_number):
-    gated_corridors = GatedCorridors(gate=str(tmp_path / "gate"), gated=(4, 5, 6))
+    gated_corridors = GatedCorridors(gate_path=str(tmp_path / "gate"), gated=(4, 5, 6))
     build_program = (
-        "import signal; from pathlib import Path; from support.corridors import GatedCorridors, build;"
+        "import signal; from pathlib import Path; from support.corridors import GatedCorridors, compile_corridors;"
         "signal.signal(signal.SIGINT, signal.default_int_handler);"
-        f"build(Path({str(tmp_path)!r}), {gated_corridors!r}, workers=2)"
+        f"compile_corridors(Path({str(tmp_path)!r}), {gated_corridors!r}, workers=2)"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, Path(__file__).parents[2:4]))}
 
@@ -202,9 +202,9 @@ def test_killed_build_leaves_whole_shards_and_no_process(tmp_path, signal_number
 
     # A second build writes the others, and does not touch the first two.
     (tmp_path / "gate").touch()
-    shards = build(tmp_path, gated_corridors)
+    shards = compile_corridors(tmp_path, gated_corridors)
     assert shards.folder == folder
-    assert contents(folder) == contents(build(tmp_path / "whole").folder)
+    assert contents(folder) == contents(compile_corridors(tmp_path / "whole").folder)
     assert times_before.items() <= modification_times(folder).items()
 
 
@@ -212,7 +212,9 @@ def test_killed_build_leaves_whole_shards_and_no_process(tmp_path, signal_number
 def test_scene_error_reaches_the_caller_and_ends_all_workers(tmp_path, workers):
     # Shards (0, 1, 2) and (3, 4, 5, 6), which fails; with two workers the first waits for ever.
     with pytest.raises(InputError) as caught:
-        build(tmp_path, FaultyCorridors(gated=(0,) if workers == 2 else ()), shard_scenes=4, workers=workers)
+        compile_corridors(
+            tmp_path, FaultyCorridors(gated=(0,) if workers == 2 else ()), shard_scenes=4, workers=workers
+        )
     assert str(caught.value) == "corridor 3: has no end; give it one"
     assert [path.name for path in tmp_path.glob("*/*")] == (["00000"] if workers == 1 else [])
     assert not multiprocessing.active_children()
@@ -225,12 +227,12 @@ def test_compile_shards_keeps_a_shard_of_another_process(tmp_path, monkeypatch):
     def save_after_other_process(file, array):
         monkeypatch.setattr(np, "save", original_save)
         times_of_other.update(
-            modification_times(build(tmp_path).folder)
+            modification_times(compile_corridors(tmp_path).folder)
         )  # also removes the shard that is being written
         original_save(file, array)
 
     monkeypatch.setattr(np, "save", save_after_other_process)
-    shards = build(tmp_path)
+    shards = compile_corridors(tmp_path)
     assert len(times_of_other) == 4 * 9
     assert modification_times(shards.folder) == times_of_other
 
@@ -238,14 +240,14 @@ def test_compile_shards_keeps_a_shard_of_another_process(tmp_path, monkeypatch):
 def test_full_disk_raises_and_leaves_no_shard(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "save", Mock(side_effect=OSError("No space left on device")))
     with pytest.raises(OSError, match="No space left"):
-        build(tmp_path)
+        compile_corridors(tmp_path)
     assert not list(tmp_path.glob("*/*"))
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "short", "shorter", "unclosed"])
 @pytest.mark.parametrize("file_name", ["rows.npy", "goals.npy", "shard.json"])
 def test_damaged_shard_is_refused_until_its_folder_is_deleted(tmp_path, file_name, damage):
-    shards = build(tmp_path)
+    shards = compile_corridors(tmp_path)
     path = shards.paths[2] / file_name
     original_content = path.read_bytes()
     damaged_contents = {
@@ -267,5 +269,5 @@ def test_damaged_shard_is_refused_until_its_folder_is_deleted(tmp_path, file_nam
 
     # Without the folder the shard is built anew.
     shutil.rmtree(path.parent)
-    build(tmp_path)[2]
+    compile_corridors(tmp_path)[2]
     assert path.read_bytes() == original_content
