@@ -133,7 +133,7 @@ def test_results_of_a_finished_run_are_printed_and_kept_with_it(experiment, draw
     printed = capsys.readouterr().out
     # Control characters of a title would change the terminal.
     assert "# Search \\x1b[31m in red" in printed
-    assert "| frontier | sr | " in printed
+    assert "| main | sr | " in printed
     assert (run_dir / "page.md").exists()
     assert [path.stem for path in (run_dir / "results" / "val").iterdir()] == ["rooms-main-frontier"]
 

@@ -18,7 +18,7 @@ from jaxnav.experiments.config import (
     measured_runs,
     part_settings,
 )
-from jaxnav.experiments.driver import MEASUREMENTS, list_parts
+from jaxnav.experiments.driver import check_measurements, list_parts
 from jaxnav.experiments.pages import check_page
 from jaxnav.experiments.table import has_part
 from jaxnav.runs.config import RunConfig
@@ -77,8 +77,14 @@ def test_runs_have_folders_of_their_own():
         ({"only": ("near-*", "far-wide"), "left_out": ("*-wide",)}, ["near-plain"]),
     ],
 )
-def test_patterns_select_runs(patterns, names):
-    assert names_of(agent_runs(make_config(**patterns))) == names
+def test_patterns_select_the_measured_runs(patterns, names):
+    config = check_experiment(make_config(**patterns))
+    assert names_of(measured_runs(config, "evaluation")) == names
+
+
+def test_runs_that_are_not_measured_now_exist_but_for_those_that_are_left_out():
+    config = make_config(only=("near-*",), left_out=("*-wide",))
+    assert names_of(agent_runs(config)) == ["near-plain", "far-plain"]
 
 
 def test_measured_runs_match_by_agent_or_by_world_and_agent():
@@ -121,7 +127,7 @@ def test_finished_runs_replace_the_agents(drawn_run):
     runs = agent_runs(config)
     assert names_of(runs) == ["rooms-main", "rooms-anonymous"]
     for run in runs:
-        assert run.is_trained
+        assert run.is_external
         assert run.config.run_dir == run_dir
         assert run_settings(run.config) == run_settings(drawn_run.config)
     assert config.results == run_dir / "results"
@@ -130,10 +136,11 @@ def test_finished_runs_replace_the_agents(drawn_run):
 
 def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
     finished = {"run": str(drawn_run.config.run_dir), "against": ["plain/layout"]}
-    runs = agent_runs(check_experiment(make_config(agents={"plain": {}, "done": finished}, only=("near-*",))))
+    config = make_config(worlds={"near": {}}, agents={"plain": {}, "done": finished})
+    runs = agent_runs(check_experiment(config))
     assert run_settings(runs[1].config) == run_settings(drawn_run.config)
     assert runs[1].against == ("plain/layout",)
-    assert [run.is_trained for run in runs] == [False, True]
+    assert [run.is_external for run in runs] == [False, True]
 
 
 # Refusals
@@ -177,7 +184,10 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         ({"agents": {"plain": {"against": ["plain/layuot"]}}}, "agents.plain.against.*'layuot'"),
         ({"agents": {"plain": {"against": "plain"}}}, "agents.plain.against"),
         ({"agents": {"plain": {"run": "nowhere"}}}, "nowhere"),
+        ({"agents": {"plain": {"against": ["wide"]}, "wide": {"seeds": 5}}}, "near-plain.*seeds"),
         # Measurements and groups.
+        ({"measure": {"evaluation": ["plane"]}}, "measure.evaluation"),
+        ({"groups": {"plain": {"agents": ["wide"], "variant": "stde", "against": "layout"}}}, "groups.plain"),
         ({"measure": {"evaluation": "plain"}}, "measure.evaluation"),
         ({"measure": {"evaluation": [1]}}, "measure.evaluation"),
         ({"groups": {"all": {}}}, "groups.all"),
@@ -215,9 +225,8 @@ def test_finished_runs_refuse_settings(drawn_run):
     ],
 )
 def test_impossible_measurements_are_refused_by_name(changes, named):
-    config = check_experiment(make_config(**changes))
     with pytest.raises(InputError, match=named):
-        list_parts(config, Bench(config, Console(quiet=True)))
+        check_measurements(make_config(**changes))
 
 
 # Packaged experiments
@@ -229,12 +238,9 @@ def test_packaged_experiments_are_valid(name, drawn_run, monkeypatch):
     config = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
     if name in OF_FINISHED_RUNS:
         config = dataclasses.replace(config, run=drawn_run.config.run_dir, without=drawn_run.config.run_dir)
-    config = check_experiment(config)
+    config = check_measurements(config)
 
-    # Every pattern measures something, every page can be written, and every reference exists.
-    assert set(config.measure) <= set(MEASUREMENTS)
-    for measurement in config.measure:
-        assert measured_runs(config, measurement)
+    # Every page can be written, and no result has the file of another.
     for document, template in config.pages.items():
         check_page(Path(document), template)
     parts = list_parts(config, Bench(config, Console(quiet=True)))

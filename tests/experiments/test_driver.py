@@ -124,17 +124,8 @@ def change_format(path: Path) -> None:
     path.write_text("".join([json.dumps(json.loads(head) | {"format": 2}) + "\n", *lines]))
 
 
-def change_settings(path: Path) -> None:
-    head, *lines = path.read_text().splitlines(keepends=True)
-    data = json.loads(head)
-    data["settings"]["run"]["seeds"] = 99
-    path.write_text("".join([json.dumps(data) + "\n", *lines]))
-
-
-@pytest.mark.parametrize(
-    "damage", [Path.unlink, truncate, change_format, change_settings, lambda path: path.write_text("")]
-)
-def test_driver_measures_parts_again_that_are_missing_damaged_or_of_another_run(measured, tmp_path, damage):
+@pytest.mark.parametrize("damage", [Path.unlink, truncate, change_format, lambda path: path.write_text("")])
+def test_driver_measures_parts_again_that_are_missing_or_damaged(measured, tmp_path, damage):
     config = make_config(tmp_path)
     run_experiment(config, QUIET)
     before = contents(tmp_path)
@@ -149,21 +140,38 @@ def test_driver_measures_parts_again_that_are_missing_damaged_or_of_another_run(
     assert contents(tmp_path) == before
 
 
-def test_driver_measures_again_whatever_changed(measured, tmp_path):
-    def calls_of(**changes) -> list[tuple[str, Any]]:
-        measured.clear()
-        run_experiment(make_config(tmp_path, **changes), QUIET)
-        return list(measured)
+@pytest.mark.parametrize(
+    ("changes", "calls"),
+    [
+        ({"agents": {"a": {}, "b": {"seeds": 4}, "c": {}}}, [("c", 0.0), ("c", 0.5)]),
+        ({"shifts": (0.0, 0.5, 1.0)}, [("a", 1.0), ("b", 1.0)]),
+        ({"split": "test"}, ALL_CALLS),
+        ({"title": "Two others", "runs": Path("elsewhere")}, []),
+    ],
+)
+def test_driver_measures_what_an_experiment_has_more(measured, tmp_path, changes, calls):
+    # Another shift does not concern what is measured at none.
+    measure = {"shifts": ["*"]} if "shifts" in changes else {"shifts": ["*"], "whole": ["b"]}
+    run_experiment(make_config(tmp_path, measure=measure), QUIET)
+    measured.clear()
+    run_experiment(make_config(tmp_path, measure=measure, **changes), QUIET)
+    assert measured == calls
 
-    assert calls_of() == ALL_CALLS
-    # An agent more, and an agent that changes, leave the results of others.
-    assert calls_of(agents={"a": {}, "b": {"seeds": 4}, "c": {}}) == [("c", 0.0), ("c", 0.5)]
-    assert calls_of(agents={"a": {"seed": 1}, "b": {"seeds": 4}}) == ALL_CALLS[:2]
-    # Other episodes concern all, and titles nobody.
-    assert calls_of(agents={"a": {"seed": 1}, "b": {"seeds": 4}}, episodes=30) == ALL_CALLS
-    assert calls_of(agents={"a": {"seed": 1}, "b": {"seeds": 4}}, episodes=30, title="Two others") == []
-    # Each split has results of its own.
-    assert calls_of(agents={"a": {"seed": 1}, "b": {"seeds": 4}}, episodes=30, split="test") == ALL_CALLS
+
+@pytest.mark.parametrize("changes", [{"agents": {"a": {"seed": 1}, "b": {"seeds": 4}}}, {"episodes": 30}])
+def test_driver_refuses_to_lose_results_of_other_settings(measured, tmp_path, changes):
+    run_experiment(make_config(tmp_path), QUIET)
+    before = contents(tmp_path)
+    measured.clear()
+
+    with pytest.raises(InputError, match=r"near-a-shifts-0\.jsonl.*(seed|episodes)"):
+        run_experiment(make_config(tmp_path, **changes), QUIET)
+    assert measured == []
+    assert contents(tmp_path) == before
+
+    # In another folder there is nothing to lose.
+    run_experiment(make_config(tmp_path, results=tmp_path / "others", **changes), QUIET)
+    assert measured == ALL_CALLS
 
 
 def test_driver_goes_on_where_it_was_stopped(measured, tmp_path, monkeypatch):
@@ -215,8 +223,8 @@ def test_driver_refuses_a_foreign_document_before_it_measures(measured, tmp_path
 
 
 def test_experiments_share_a_folder_and_ignore_results_of_other_evaluations(measured, tmp_path):
-    first = make_config(tmp_path, agents={"a": {}})
-    second = make_config(tmp_path, agents={"b": {}})
+    first = make_config(tmp_path, agents={"a": {}}, measure={"shifts": ["*"]})
+    second = make_config(tmp_path, agents={"b": {}}, measure={"shifts": ["*"]})
     run_experiment(first, QUIET)
     run_experiment(second, QUIET)
     assert load_results(first)["val"].distinct("run") == ["a", "b"]

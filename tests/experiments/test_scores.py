@@ -340,6 +340,6 @@ def test_frontier_rows_are_searches_of_the_same_episodes(make_bench, drawn_run):
         # Living rooms have 14 actions, all others 12.
         limits = np.array([14 if room == "living_room" else 12 for room in bank.room_types])
         searched = run_frontier_search(bank, draw_episodes(bank, 24), limits)
-        at = {"world": "rooms", "run": "frontier", "variant": "frontier", "shift": shift}
+        at = {"world": "rooms", "run": "main", "variant": "frontier", "shift": shift}
         assert table.find(at, metric="sr").mean == pytest.approx(100 * np.mean(searched.success))
         assert table.num_scenes(at) == 4
