@@ -1,4 +1,4 @@
-"""The compiled environment against the plain-Python twin: not one difference."""
+"""The compiled environment equals the plain-Python twin, without one difference."""
 
 import collections
 import dataclasses
@@ -29,8 +29,11 @@ from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
-NUM_ENVS, FEW, MANY = 20, 150, 5000  # 3,000 steps of a source and task, or 100,000
-LIVING_ROOM, OTHERS = 60, 30  # step limits
+NUM_ENVS = 20
+FEW_STEPS = 150  # of each environment: 3,000 steps of a source and task
+MANY_STEPS = 5000  # 100,000 steps
+LIVING_ROOM_LIMIT = 60
+OTHER_LIMIT = 30
 SLOW = pytest.mark.slow
 TASKS = {
     "rooms": Task(rules=ROOMS, detector=PERFECT_DETECTOR),
@@ -40,25 +43,39 @@ TASKS = {
 
 
 @functools.cache
-def scenes_of(source: str) -> list[Scene]:
-    """Return a scene of each room type, or six drawn."""
+def load_scenes(source: str) -> list[Scene]:
+    """Return a scene of each room type, or six scenes drawn at random."""
     if source == "coarse":
         return [coarse_scene(seed) for seed in range(6)]
     if source == "maze":
         return [maze_scene(seed) for seed in range(6)]
     if source == "rooms":
-        return [generate_room("train", i, 0) for i in range(4)]
-    scenes = [scene for scene in read_scenes(require(ITHOR)) if scene.split == "val"]
-    return [next(scene for scene in scenes if scene.room_type == room) for room in ROOM_TYPES]
+        return [generate_room("train", index, 0) for index in range(4)]
+
+    # The first validation scene of each room type of iTHOR.
+    first_scenes: dict[str, Scene] = {}
+    for scene in read_scenes(require(ITHOR)):
+        if scene.split == "val":
+            first_scenes.setdefault(scene.room_type, scene)
+    return [first_scenes[room_type] for room_type in ROOM_TYPES]
 
 
 @functools.cache
-def guides_of(source: str, task: Task) -> list[Guide]:
-    return [Guide(scene, task) for scene in scenes_of(source)]
+def make_guides(source: str, task: Task) -> list[Guide]:
+    return [Guide(scene, task) for scene in load_scenes(source)]
+
+
+def scenes_and_guides(source: str, task: Task, stride: int) -> list[tuple[Scene, Guide]]:
+    """Return every `stride`-th scene of a source with its twin."""
+    return list(zip(load_scenes(source), make_guides(source, task), strict=True))[::stride]
+
+
+def goals_of(task: Task) -> list[int]:
+    return np.flatnonzero(task.is_goal()).tolist()
 
 
 class Rollout(NamedTuple):
-    """Hold steps of several environments; leaves [steps, NUM_ENVS, ...]."""
+    """Steps of several environments; leaves [T, NUM_ENVS, ...]."""
 
     before: State
     action: Any
@@ -67,33 +84,32 @@ class Rollout(NamedTuple):
     truncated: Any
     info: dict[str, Any]
 
-    def at(self, time: int, env: int) -> "Rollout":
-        """Return one step."""
-        return jax.tree.map(lambda leaf: leaf[time, env], self)
+    def select_step(self, time: int, env_index: int) -> "Rollout":
+        """Return one step of one environment."""
+        return jax.tree.map(lambda leaf: leaf[time, env_index], self)
 
 
-def roll_out(env: ObjectNav, params: EnvParams, seed: int, steps: int) -> Rollout:
-    """Take random steps.
-
-    Done is likelier where it succeeds or time is up.
-    """
+def roll_out(env: ObjectNav, params: EnvParams, seed: int, num_steps: int) -> Rollout:
+    """Take random steps; Done is likelier where it succeeds or time is up."""
 
     def act(key, state):
-        steer, choose, step = jax.random.split(key, 3)
-        last = state.time + 1 == params.step_limit[state.scene]
-        done = jax.random.bernoulli(steer, jnp.where(env.done_succeeds(state, params) | last, 0.2, 0.01))
-        action = jnp.where(done, DONE, jax.random.randint(choose, (), 0, DONE))
-        _, after, reward, terminated, truncated, info = env.step(step, state, action, params)
-        return after, Rollout(state, action, reward, terminated, truncated, info)
+        done_key, action_key, step_key = jax.random.split(key, 3)
+        is_last_step = state.time + 1 == params.step_limit[state.scene]
+        done_probability = jnp.where(env.done_succeeds(state, params) | is_last_step, 0.2, 0.01)
+        is_done = jax.random.bernoulli(done_key, done_probability)
+        action = jnp.where(is_done, DONE, jax.random.randint(action_key, (), 0, DONE))
+        _, next_state, reward, terminated, truncated, info = env.step(step_key, state, action, params)
+        return next_state, Rollout(state, action, reward, terminated, truncated, info)
 
-    def one_step(state, key):
-        return jax.vmap(act)(jax.random.split(key, NUM_ENVS), state)
+    def act_everywhere(states, key):
+        return jax.vmap(act)(jax.random.split(key, NUM_ENVS), states)
 
     @jax.jit
     def run(key):
-        first, rest = jax.random.split(key)
-        _, state = jax.vmap(env.reset, (0, None))(jax.random.split(first, NUM_ENVS), params)
-        return jax.lax.scan(one_step, state, jax.random.split(rest, steps))[1]
+        reset_key, steps_key = jax.random.split(key)
+        _, states = jax.vmap(env.reset, (0, None))(jax.random.split(reset_key, NUM_ENVS), params)
+        _, rollout = jax.lax.scan(act_everywhere, states, jax.random.split(steps_key, num_steps))
+        return rollout
 
     return jax.device_get(run(jax.random.key(seed)))
 
@@ -101,86 +117,111 @@ def roll_out(env: ObjectNav, params: EnvParams, seed: int, steps: int) -> Rollou
 def step_differences(
     step: Rollout, guide: Guide, expected: tuple[float, bool, bool], first_pose: int, bank: Bank
 ) -> Iterator[str]:
-    """Yield names of what differs between step and twin."""
-    twin, after = guide.twin, step.info["final_state"]
-    cell = after.pose // bank.task.rules.poses_per_cell
+    """Yield names of the values that differ between a step and the twin."""
+    twin = guide.twin
+    final_state = step.info["final_state"]
+    cell = final_state.pose // bank.task.rules.poses_per_cell
+    goal_distance = float(bank.goal_distance[cell, final_state.goal])
+    expected_reward, expected_terminated, expected_truncated = expected
+
     yield from row_differences(step.info["final_observation"].row, twin, len(bank.task.categories))
-    checks = {
-        "reward": step.reward == np.float32(expected[0]),
-        "terminated": step.terminated == expected[1],
-        "truncated": step.truncated == expected[2],
-        "pose": after.pose - first_pose == guide.pose(),
+    is_equal = {
+        "reward": step.reward == np.float32(expected_reward),
+        "terminated": step.terminated == expected_terminated,
+        "truncated": step.truncated == expected_truncated,
+        "pose": final_state.pose - first_pose == guide.pose(),
         "length": step.info["length"] == twin.steps,
-        "success": step.info["success"] == (expected[0] > 0),
-        "goal distance": same_distance(float(bank.goal_distance[cell, after.goal]), twin.goal_distance()),
+        "success": step.info["success"] == (expected_reward > 0),
+        "goal distance": same_distance(goal_distance, twin.goal_distance()),
     }
-    yield from (name for name, same in checks.items() if not same)
+    for name, equal in is_equal.items():
+        if not equal:
+            yield name
 
 
 @pytest.mark.parametrize(
-    ("source", "world", "steps"),
+    ("source", "world", "num_steps"),
     [
-        ("rooms", "rooms", FEW),
-        ("ithor", "rooms", FEW),
-        *(pytest.param("rooms", world, MANY, marks=SLOW) for world in TASKS),
+        ("rooms", "rooms", FEW_STEPS),
+        ("ithor", "rooms", FEW_STEPS),
+        *(pytest.param("rooms", world, MANY_STEPS, marks=SLOW) for world in TASKS),
     ],
 )
-def test_random_steps(source, world, steps):
-    task, scenes = TASKS[world], scenes_of(source)
-    bank, guides = compile_bank(scenes, task), guides_of(source, task)
+def test_environment_equals_the_twin_at_random_steps(source, world, num_steps):
+    # Tables and twins of the same scenes.
+    task = TASKS[world]
+    scenes = load_scenes(source)
+    guides = make_guides(source, task)
+    bank = compile_bank(scenes, task)
     assert bank.names == tuple(scene.name for scene in scenes)
     assert [len(guide.cells) for guide in guides] == bank.num_cells.tolist()
-    # Padded: there are unused cells, and the first scenes again.
-    env, params = build_environment(bank, {"living_room": LIVING_ROOM}, OTHERS, len(bank.ahead) + 7, len(scenes) + 2)
-    assert params.room.tolist() == [0, 1, 2, 3, 0, 1]
-    rollout = roll_out(env, params, len(source), steps)
 
-    differences, endings, drawn = collections.Counter(), collections.Counter(), set()
-    for i, time in itertools.product(range(NUM_ENVS), range(steps)):
-        step = rollout.at(time, i)
-        drawn.add(int(step.before.scene))
-        scene, goal = int(step.before.scene) % len(scenes), int(step.before.goal)
-        first_pose = int(bank.first_cell[scene]) * task.rules.poses_per_cell
-        guide, limit = guides[scene], LIVING_ROOM if scenes[scene].room_type == "living_room" else OTHERS
-        if step.before.time == 0:  # after an ending, the twin refuses to go on
-            twin = guide.place(int(step.before.pose) - first_pose, goal, limit)
-            differences["start"] += twin.horizon or goal not in bank.goals[scene, : bank.num_goals[scene]]
+    # Padded: there are unused cells, and the first scenes again.
+    step_limits = {"living_room": LIVING_ROOM_LIMIT}
+    env, params = build_environment(bank, step_limits, OTHER_LIMIT, len(bank.ahead) + 7, len(scenes) + 2)
+    assert params.room.tolist() == [0, 1, 2, 3, 0, 1]
+    rollout = roll_out(env, params, len(source), num_steps)
+
+    # Follow each environment with the twin.
+    differences = collections.Counter()
+    early_endings = set()
+    late_endings = set()
+    visited_scenes = set()
+    for env_index, time in itertools.product(range(NUM_ENVS), range(num_steps)):
+        step = rollout.select_step(time, env_index)
+        visited_scenes.add(int(step.before.scene))
+        scene_index = int(step.before.scene) % len(scenes)
+        goal = int(step.before.goal)
+        guide = guides[scene_index]
+        first_pose = int(bank.first_cell[scene_index]) * task.rules.poses_per_cell
+        step_limit = LIVING_ROOM_LIMIT if scenes[scene_index].room_type == "living_room" else OTHER_LIMIT
+
+        # After an ending the twin refuses to go on: a new episode must have begun, level and with a goal of the scene.
+        if step.before.time == 0:
+            twin = guide.place(int(step.before.pose) - first_pose, goal, step_limit)
+            scene_goals = bank.goals[scene_index, : bank.num_goals[scene_index]]
+            differences["start"] += twin.horizon or goal not in scene_goals
+
         expected = guide.twin.step(int(step.action))
         differences.update(step_differences(step, guide, expected, first_pose, bank))
-        endings[(*expected, guide.twin.steps == limit)] += 1
+        endings = late_endings if guide.twin.steps == step_limit else early_endings
+        endings.add(expected)
     assert +differences == collections.Counter()
-    assert drawn == set(range(len(scenes) + 2))
+    assert visited_scenes == set(range(len(scenes) + 2))
+
     # Every kind of step was taken, before the limit and at it (a success at the limit is rare).
-    late, early = ({ending[:3] for ending in endings if ending[3] == last} for last in (True, False))
-    assert early == {(-0.01, False, False), (-0.01, True, False), (5.0, True, False)}
-    assert late >= {(-0.01, False, True), (-0.01, True, False)}
+    assert early_endings == {(-0.01, False, False), (-0.01, True, False), (5.0, True, False)}
+    assert late_endings >= {(-0.01, False, True), (-0.01, True, False)}
 
 
-def test_standable_cells():
-    draws = np.random.default_rng(0)
+def test_standable_cells_equal_the_largest_component_of_the_twin():
+    rng = np.random.default_rng(0)
     for _ in range(300):  # so few cells that the largest part often is not the only one
-        reach = draws.random((4, 6)) < 0.3
-        expected = largest_component({(iz, ix) for iz, ix in np.argwhere(reach).tolist()})
-        assert {(iz, ix) for iz, ix in standable_cells(reach).tolist()} == expected
+        free_cells = rng.random((4, 6)) < 0.3
+        expected_cells = largest_component({(iz, ix) for iz, ix in np.argwhere(free_cells).tolist()})
+        assert {(iz, ix) for iz, ix in standable_cells(free_cells).tolist()} == expected_cells
 
 
-def differences_of(scene: Scene, guide: Guide, task: Task, stride: int = 1) -> collections.Counter[str]:
-    """Count what differs from the twin at poses, by name."""
-    table, differences = compile_scene(scene, task), collections.Counter()
+def count_table_differences(scene: Scene, guide: Guide, task: Task, stride: int = 1) -> collections.Counter[str]:
+    """Count the differences of a scene's tables from the twin at every `stride`-th pose, by name."""
+    table = compile_scene(scene, task)
     successor = pose_successors(table.ahead, task.rules)
     assert len(successor) == len(table.rows) == len(guide.cells) * task.rules.poses_per_cell
+
+    # Rows, success of Done, and the poses after each action.
+    differences = collections.Counter()
     for pose in range(0, len(successor), stride):
         differences.update(row_differences(table.rows[pose], guide.place(pose), len(task.categories)))
-        goals = set(np.flatnonzero(task.is_goal()).tolist())
-        differences["success"] += (
-            set(np.flatnonzero(table.best_length[pose] == 1).tolist()) != goals & guide.place(pose).successes()
-        )
+        done_goals = set(np.flatnonzero(table.best_length[pose] == 1).tolist())
+        differences["success"] += done_goals != set(goals_of(task)) & guide.place(pose).successes()
         for action in range(DONE + 1):
             guide.place(pose).step(action)
             differences["successor"] += successor[pose, action] != guide.pose()
-    for cell, goal in itertools.product(range(len(guide.cells)), np.flatnonzero(task.is_goal()).tolist()):
-        expected = guide.place(cell * task.rules.poses_per_cell, goal).goal_distance()
-        differences["goal distance"] += not same_distance(table.goal_distance[cell, goal], expected)
+
+    # Distances to the goals.
+    for cell, goal in itertools.product(range(len(guide.cells)), goals_of(task)):
+        expected_distance = guide.place(cell * task.rules.poses_per_cell, goal).goal_distance()
+        differences["goal distance"] += not same_distance(table.goal_distance[cell, goal], expected_distance)
     return +differences
 
 
@@ -189,39 +230,41 @@ def differences_of(scene: Scene, guide: Guide, task: Task, stride: int = 1) -> c
     ("source", "stride"),
     [("coarse", 1), pytest.param("maze", 2, marks=SLOW), ("rooms", 3), pytest.param("ithor", 3, marks=SLOW)],
 )
-def test_every_pose(source, stride, world):
+def test_tables_equal_the_twin_at_every_pose(source, stride, world):
     task = TASKS[world]
-    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::stride]:
-        assert differences_of(scene, guide, task) == collections.Counter()
+    for scene, guide in scenes_and_guides(source, task, stride):
+        assert count_table_differences(scene, guide, task) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", ["apartments", "houses"])
-def test_generated_homes(world):
-    task, scene = (
-        dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR),
-        make_generated_scenes(world, "val")[0],
-    )
-    assert differences_of(scene, Guide(scene, task), task, stride=13) == collections.Counter()
+def test_tables_of_a_generated_home_equal_the_twin(world):
+    task = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR)
+    scene = make_generated_scenes(world, "val")[0]
+    assert count_table_differences(scene, Guide(scene, task), task, stride=13) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", ["apartments", "houses"])
-def test_real_apartments(world):
-    task, scene = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR), read_scenes(require(ROBOTHOR))[0]
-    assert differences_of(scene, Guide(scene, task), task, stride=7) == collections.Counter()
+def test_tables_of_a_real_apartment_equal_the_twin(world):
+    task = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR)
+    scene = read_scenes(require(ROBOTHOR))[0]
+    assert count_table_differences(scene, Guide(scene, task), task, stride=7) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize(("source", "stride"), [("coarse", 3), ("maze", 2), ("rooms", 3), ("ithor", 3)])
-def test_best_lengths(source, stride, world):
-    task, starts, differences, lengths = TASKS[world], np.random.default_rng(0), 0, set()
-    for scene, guide in list(zip(scenes_of(source), guides_of(source, task), strict=True))[::stride]:
+def test_best_lengths_equal_the_search_of_the_twin(source, stride, world):
+    task = TASKS[world]
+    rng = np.random.default_rng(0)
+    num_differences = 0
+    lengths = set()
+    for scene, guide in scenes_and_guides(source, task, stride):
         best_length = compile_scene(scene, task).best_length
         assert not best_length[:, ~task.is_goal()].any()
-        for pose in starts.choice(len(best_length), 4, replace=False).tolist():
-            for goal in np.flatnonzero(task.is_goal()).tolist():
-                length = guide.place(pose, goal).best_length() or 0
-                differences += length != best_length[pose, goal]
-                lengths.add(length)
-    assert differences == 0
+        for pose in rng.choice(len(best_length), 4, replace=False).tolist():
+            for goal in goals_of(task):
+                expected_length = guide.place(pose, goal).best_length() or 0
+                num_differences += expected_length != best_length[pose, goal]
+                lengths.add(expected_length)
+    assert num_differences == 0
     assert {0, 1} < lengths
     assert max(lengths) > 10

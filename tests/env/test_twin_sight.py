@@ -4,8 +4,8 @@ Most scenes have the one standable cell [0, 0]: the camera is at (0, 1.5, 0) and
 """
 
 import math
-import random
 
+import numpy as np
 import pytest
 from support.scenes import APARTMENTS, BOOK, CHAIR, FRIDGE, HOUSES, SMALL, draw
 from support.twin import LOOK_DOWN, detected_categories, start_in_one_cell, start_twin
@@ -178,23 +178,30 @@ def test_the_diagonal_between_two_wall_cells_is_open():
     assert detected_categories(start_in_one_cell(book, walls=[(2, 2)])) == set()
 
 
+def has_sampled_point(start, end, centre, half_sizes):
+    """Whether one of 201 points along a segment lies inside a box."""
+    points = np.linspace(start, end, 201)
+    return bool((np.abs(points - centre) < half_sizes).all(axis=1).any())
+
+
 def test_meets_agrees_with_points_along_the_segment():
     # A sampled point well inside proves a meeting; a meeting with the box shrunk by 0.05 must show in the samples.
-    draws = random.Random(0)
-    meetings = 0
+    rng = np.random.default_rng(0)
+    num_meetings = 0
     for _ in range(400):
-        size = draws.choice((2, 3))
-        start, end, centre = ([draws.uniform(-1, 1) for _ in range(size)] for _ in range(3))
-        half = [draws.uniform(0.1, 0.6) for _ in range(size)]
-        inside = any(
-            all(abs(a + k / 200 * (b - a) - c) < h for a, b, c, h in zip(start, end, centre, half, strict=True))
-            for k in range(201)
-        )
-        assert meets(start, end, centre, half) or not inside
-        assert inside or not meets(start, end, centre, [h - 0.05 for h in half])
-        meetings += inside
-    assert 50 < meetings < 300
-    assert meets((0, 0, 0), (0, 0, 2), (0, 0, 1), (0.1, 0.1, 0.1))  # parallel to four of the faces
+        num_axes = rng.integers(2, 4)
+        start, end, centre = rng.uniform(-1, 1, (3, num_axes)).tolist()
+        half_sizes = rng.uniform(0.1, 0.6, num_axes).tolist()
+        is_inside = has_sampled_point(start, end, centre, half_sizes)
+        assert meets(start, end, centre, half_sizes) or not is_inside
+        assert is_inside or not meets(start, end, centre, [half_size - 0.05 for half_size in half_sizes])
+        num_meetings += is_inside
+    assert 50 < num_meetings < 300
+
+
+def test_meets_handles_segments_parallel_to_faces():
+    # The segment is parallel to four of the faces.
+    assert meets((0, 0, 0), (0, 0, 2), (0, 0, 1), (0.1, 0.1, 0.1))
     assert not meets((0, 0, 0), (0, 0, 2), (0.2, 0, 1), (0.1, 0.1, 0.1))
 
 
