@@ -32,7 +32,8 @@ class ExperimentConfig:
 
     Attributes:
       title: title of the page.
-      results: folder of the results; those of a split are in a folder of its name. With `run`, it is the run's folder.
+      results: folder of the results; those of a split are in a folder of its name. With `run`, the default is in the
+        folder of that run.
       runs: folder of the training runs.
       pages: pages to write, as document: template. A template is a file, or the name of a packaged one.
       worlds: worlds by name, with the settings that all runs in it change.
@@ -215,7 +216,10 @@ def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
             raise InputError(f"without: {config.without}: give the run that it is compared with, as `run`")
         return config
 
-    # Agents of an experiment would be lost silently.
+    # Agents of the experiment, and a run without its own name, would be lost silently.
+    default = ExperimentConfig()
+    if config.agents and config.agents != default.agents:
+        raise InputError(f"run: {config.run}: the experiment has agents of its own; leave them out")
     if config.unaware == "main":
         raise InputError("unaware: with `run`, main is the measured run; give another name")
 
@@ -228,9 +232,9 @@ def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
     return dataclasses.replace(
         config,
         agents=agents,
-        worlds=run_world if config.worlds == ExperimentConfig().worlds else config.worlds,
+        worlds=run_world if config.worlds == default.worlds else config.worlds,
         base=dataclasses.replace(base, devices=None),
-        results=config.run / "results",
+        results=config.run / "results" if config.results == default.results else config.results,
         pages={str(config.run / Path(document).name): template for document, template in config.pages.items()},
     )
 

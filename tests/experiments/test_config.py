@@ -121,7 +121,7 @@ def test_part_settings_tell_the_runs_and_evaluations_apart_that_differ():
 def test_finished_runs_replace_the_agents(drawn_run):
     run_dir = drawn_run.config.run_dir
     config = check_experiment(
-        ExperimentConfig(run=run_dir, without=run_dir, agents=AGENTS, pages={"docs/account.md": "account"})
+        ExperimentConfig(run=run_dir, without=run_dir, agents={}, pages={"docs/account.md": "account"})
     )
     # The world is that of the run, and everything that is written goes to its folder.
     runs = agent_runs(config)
@@ -201,12 +201,18 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         # Finished runs.
         ({"run": Path("nowhere")}, "nowhere"),
         ({"without": Path("nowhere")}, "without"),
+        ({"run": Path("nowhere"), "agents": {"plain": {}}}, "nowhere"),
     ],
 )
 def test_invalid_settings_are_refused_by_name(changes, named):
     with pytest.raises(InputError, match=named) as refusal:
         check_experiment(make_config(**changes))
     assert "\n" not in str(refusal.value)
+
+
+def test_finished_runs_take_no_place_of_other_agents(drawn_run):
+    with pytest.raises(InputError, match="run: .*agents of its own"):
+        check_experiment(make_config(run=drawn_run.config.run_dir))
 
 
 def test_finished_runs_refuse_settings(drawn_run):
