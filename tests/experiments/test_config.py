@@ -211,7 +211,7 @@ def test_invalid_settings_are_refused_by_name(changes, named):
 
 
 def test_finished_runs_take_no_place_of_other_agents(drawn_run):
-    with pytest.raises(InputError, match="run: .*agents of its own"):
+    with pytest.raises(InputError, match=r"run: .*agents of its own"):
         check_experiment(make_config(run=drawn_run.config.run_dir))
 
 
