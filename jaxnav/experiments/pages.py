@@ -47,7 +47,10 @@ def check_page(document: Path, template: str) -> None:
     own_names = {name.name for name in syntax_tree.find_all(jinja2.nodes.Name) if name.ctx != "load"}
     unknown_names = sorted(names - own_names - CONTEXT_NAMES)
     if unknown_names:
-        raise InputError(f"{page_path}: {unknown_names[0]!r} is unknown; pages have {', '.join(sorted(CONTEXT_NAMES))}")
+        name = unknown_names[0]
+        line = min(node.lineno for node in syntax_tree.find_all(jinja2.nodes.Name) if node.name == name)
+        known_names = ", ".join(sorted(CONTEXT_NAMES))
+        raise InputError(f"{page_path}, line {line}: {name!r} is unknown; pages have {known_names}")
     if "summary" not in names:
         raise InputError(f"{page_path}: give {{{{ summary }}}}; text written by hand is kept there")
 

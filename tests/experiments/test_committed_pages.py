@@ -18,11 +18,14 @@ from jaxnav.experiments.pages import READING_MARK, total_steps
 from jaxnav.experiments.table import read_part, write_part
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.local_policy import LocalPolicy
+from jaxnav.runs.config_files import apply_yaml
 
 ROOT = Path(__file__).parents[2]
 #: Experiments with results of their own; all others measure a run that is given.
-CONFIGS = {name: parse_study([name]) for name in EXPERIMENTS}
-COMMITTED = {name: config for name, config in CONFIGS.items() if config.results != ExperimentConfig().results}
+COMMITTED: dict[str, ExperimentConfig] = {}
+for _name in EXPERIMENTS:
+    if apply_yaml(ExperimentConfig(), _name, EXPERIMENTS).results != ExperimentConfig().results:
+        COMMITTED[_name] = parse_study([_name])
 
 
 @pytest.fixture(autouse=True)

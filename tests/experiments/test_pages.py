@@ -82,7 +82,12 @@ def read_lines(text: str) -> dict[str, list[str]]:
     ],
 )
 def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(low, high, expected):
-    assert verdict(Interval((low + high) / 2, low, high), min_effect=2.0) == expected
+    assert verdict(Interval(5.0, low, high), min_effect=2.0) == expected
+
+
+def test_without_an_effect_the_verdict_says_so():
+    undefined = verdict(Interval(math.nan), min_effect=2.0)
+    assert undefined not in ("holds", "refuted", "too small to matter")
 
 
 def test_undefined_values_are_dashes():
@@ -344,12 +349,12 @@ def test_the_study_claims_nothing_else(study_page):
     assert len(read_lines(claims)) == len(CLAIMS) + 2  # header and rule
 
 
-def test_a_claim_without_results_cannot_be_told(tmp_path):
+def test_a_claim_without_results_has_the_verdict_of_no_effect(tmp_path):
     rows = [row for row in study_rows() if row.metric != "sr growth" and row.variant != "tde"]
     text = render(tmp_path, "study", *rows)
     for words in ("grows with the shift", "Hard TDE loses"):
         effect, _, claim_verdict = find_claim(text, words)
-        assert (effect, claim_verdict) == ("-", "cannot be told")
+        assert (effect, claim_verdict) == ("-", verdict(Interval(math.nan), 2.0))
 
 
 def test_the_gap_is_shown_at_the_steps_that_episodes_reach(study_page):

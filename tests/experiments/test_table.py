@@ -235,9 +235,12 @@ def test_rows_are_found_by_all_of_their_fields():
     assert math.isnan(TABLE.find(fields, metric="gap").mean)
 
 
-def test_of_rows_with_equal_fields_the_last_one_counts():
-    table = ResultTable([make_row(1.0), make_row(2.0)])
-    assert table.find(world="rooms", run="org", metric="sr").mean == 2.0
+def test_rows_with_equal_fields_must_have_equal_values():
+    # Experiments may share a folder, and then results such as those of frontier search.
+    table = ResultTable([make_row(1.0), make_row(1.0)])
+    assert table.find(world="rooms", run="org", metric="sr").mean == 1.0
+    with pytest.raises(InputError, match="org"):
+        ResultTable([make_row(1.0), make_row(2.0)])
 
 
 def test_rows_are_selected_by_some_of_their_fields():
