@@ -20,7 +20,7 @@ from support.twin import (
     ("heading", "cell"),
     [(0, (2, 1)), (1, (2, 2)), (2, (1, 2)), (3, (0, 2)), (4, (0, 1)), (5, (0, 0)), (6, (1, 0)), (7, (2, 0))],
 )
-def test_move_ahead_goes_to_the_neighbour_of_the_heading(heading, cell):
+def test_twin_moves_ahead_to_the_neighbour_of_its_heading(heading, cell):
     # Clockwise from +z: 45 degrees is +z +x, 90 degrees +x, ...
     episode = start_twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading)
     assert episode.step(MOVE_AHEAD) == (-0.01, False, False)
@@ -40,7 +40,7 @@ def test_move_ahead_goes_to_the_neighbour_of_the_heading(heading, cell):
         ((10, 11), (2, 0)),
     ],
 )
-def test_of_twelve_headings_two_lead_to_each_diagonal_cell(headings, cell):
+def test_twin_with_twelve_headings_reaches_each_diagonal_cell_by_two(headings, cell):
     # 30 and 60 degrees are 15 from 45, and 30 from 0 and 90.
     for heading in headings:
         episode = start_twin(draw(["...", "...", "..."]), cell=(1, 1), heading=heading, rules=APARTMENTS)
@@ -48,28 +48,28 @@ def test_of_twelve_headings_two_lead_to_each_diagonal_cell(headings, cell):
         assert episode.pose == (*cell, heading, 0)
 
 
-def test_a_diagonal_move_needs_only_the_cell_it_leads_to():
+def test_twin_moves_diagonally_between_blocked_cells():
     episode = start_twin(draw([".#", "#."]), heading=1)
     episode.step(MOVE_AHEAD)
     assert episode.cell == (1, 1)
 
 
 @pytest.mark.parametrize("heading", [0, 2, 4, 6, 7])
-def test_a_blocked_move_changes_nothing_and_costs_a_step(heading):
+def test_twin_stays_and_pays_for_a_step_when_blocked(heading):
     # [1, 0] and [0, 1] are not standable, the other neighbours lie outside.
     episode = start_twin(draw([".#", "#."]), heading=heading)
     assert episode.step(MOVE_AHEAD) == (-0.01, False, False)
     assert (episode.pose, episode.steps) == ((0, 0, heading, 0), 1)
 
 
-def test_standable_is_the_largest_component_and_the_first_of_equal_ones():
+def test_standable_cells_are_the_largest_component_or_the_first_of_equal_ones():
     assert start_twin(draw([".#..", "##..", "####"]), cell=(0, 2)).standable() == {(0, 2), (0, 3), (1, 2), (1, 3)}
     assert start_twin(draw(["..#..", "..#.."])).standable() == {(0, 0), (0, 1), (1, 0), (1, 1)}
     with pytest.raises(ValueError, match="not standable"):
         start_twin(draw(["..#..", "..#.."]), cell=(0, 3))
 
 
-def test_rotations_wrap_and_horizons_stop_at_their_limits():
+def test_twin_wraps_rotations_and_stops_horizons_at_their_limits():
     episode = start_twin(draw(["."]))
     poses = []
     for action in (ROTATE_LEFT, ROTATE_RIGHT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, LOOK_DOWN, LOOK_UP):
@@ -78,7 +78,7 @@ def test_rotations_wrap_and_horizons_stop_at_their_limits():
     assert poses == [(7, 0), (0, 0), (1, 0), (1, 0), (1, 1), (1, 1), (1, 0)]
 
 
-def test_twelve_headings_go_around_and_a_single_horizon_stays():
+def test_twin_of_houses_has_twelve_headings_and_one_horizon():
     episode = start_twin(draw(["."]), rules=HOUSES)
     poses = []
     for action in (ROTATE_LEFT, LOOK_DOWN, LOOK_UP, ROTATE_RIGHT, ROTATE_RIGHT):
@@ -87,7 +87,7 @@ def test_twelve_headings_go_around_and_a_single_horizon_stays():
     assert poses == [(11, 0), (11, 0), (11, 0), (0, 0), (1, 0)]
 
 
-def test_done_ends_the_episode_and_pays_where_it_succeeds():
+def test_done_terminates_and_pays_only_for_success():
     book = ("Book", 0, 1.5, 1, *SMALL)
     assert start_in_one_cell(book).step(DONE) == (5.0, True, False)
     assert start_in_one_cell(book, heading=4).step(DONE) == (-0.01, True, False)
@@ -97,7 +97,7 @@ def test_done_ends_the_episode_and_pays_where_it_succeeds():
         wrong.step(DONE)
 
 
-def test_truncation_at_the_step_limit_unless_done():
+def test_step_limit_truncates_unless_the_last_action_is_done():
     episode = start_in_one_cell(("Book", 0, 1.5, 1, *SMALL), step_limit=2)
     assert episode.step(LOOK_UP) == (-0.01, False, False)
     assert episode.step(LOOK_UP) == (-0.01, False, True)
@@ -106,7 +106,7 @@ def test_truncation_at_the_step_limit_unless_done():
     assert episode.step(DONE) == (5.0, True, False)
 
 
-def test_best_length_in_a_corridor():
+def test_best_length_counts_moves_turns_and_done():
     # The book at z = 2.5 is within 1.5 m from iz = 4 on. Along the corridor only headings 0 and 4 move.
     corridor = draw(["."] * 6, ("Book", 0, 1.5, 2.5, *SMALL))
     assert start_twin(corridor).best_length() == 5  # 4 moves, Done
@@ -118,7 +118,7 @@ def test_best_length_in_a_corridor():
     assert start_twin(corridor, goal=CHAIR).best_length() is None
 
 
-def test_best_length_counts_looking_down_and_starts_at_the_start():
+def test_best_length_counts_looking_down_and_is_of_the_start_pose():
     # On the floor at z = 2 and 1.5 m away from iz = 2: level, rise -1.5 >= -1.19 x 1.5 = -1.79, so it is in view.
     # From iz = 3, 1.25 m away, -1.49 > -1.5: one look down.
     scene = draw(["."] * 4, ("Book", 0, 0, 2, *SMALL))
@@ -151,7 +151,7 @@ CHEST = (0.5, 0.5, 0.5)  # its footprint reaches 0.25 m to every side
 
 
 @pytest.mark.parametrize(("z", "goals"), [(1.25, {BOOK}), (1.25 + 5e-10, {BOOK}), (1.26, set())])
-def test_success_by_walking_is_limited_to_1_m_to_the_footprint_whatever_is_seen(z, goals):
+def test_success_in_houses_is_within_1_m_of_the_footprint_seen_or_not(z, goals):
     for heading in range(12):
         assert start_in_one_cell(("Book", 0, 5, z, *CHEST), heading=heading, rules=HOUSES).successes() == goals
     assert start_in_one_cell(("Book", 0, 5, 0.1, *CHEST), rules=HOUSES).successes() == {
@@ -163,7 +163,7 @@ def walk_to_the_book(rows, *place, walls=(), cell=(0, 0)):
     return start_twin(draw(rows, ("Book", *place), walls=walls), cell=cell, rules=HOUSES).scene.walk(cell, BOOK)
 
 
-def test_walks_go_by_cells_and_then_straight():
+def test_walk_goes_by_cells_and_then_straight_to_the_footprint():
     # To the corner (0.5, 1) straight from [0, 0], 1.118 m: more than 1 m. From [1, 1], a diagonal step on, it is
     # |(0.25, 0.75)| = 0.791, from [1, 0], an upright one on, |(0.5, 0.75)| = 0.901: 1.144 and 1.151 in all.
     rows = ["..", ".."]
@@ -173,7 +173,7 @@ def test_walks_go_by_cells_and_then_straight():
     assert walk_to_the_book(["."], 0.75, 1, 1.25, *CHEST) == math.inf
 
 
-def test_walks_go_round_thin_walls():
+def test_walk_goes_round_thin_walls():
     # The footprint begins at z = 0.75 and ends at x = 0.25.
     book = (0, 1, 1, *CHEST)
     assert walk_to_the_book(["...."] * 4, *book) == pytest.approx(0.75)
@@ -184,7 +184,7 @@ def test_walks_go_round_thin_walls():
     assert walk_to_the_book(["....", "....", "####", "...."], *book, walls=[*walls, (2, 3)]) == math.inf
 
 
-def test_walls_of_the_start_and_of_the_object_do_not_count():
+def test_walk_ignores_wall_cells_at_the_start_and_around_the_object():
     # A footprint from z = 0.4 to 0.6 in the wall cell [2, 0] from 0.375 to 0.625 that holds its centre: 0.4 m.
     rows, thin = [".", "#", "#"], (0, 1, 0.5, 0.5, 0.5, 0.2)
     assert walk_to_the_book(rows, *thin, walls=[(2, 0)]) == pytest.approx(0.4)
@@ -195,7 +195,7 @@ def test_walls_of_the_start_and_of_the_object_do_not_count():
     assert walk_to_the_book([*rows, "#"], 0, 1, 0.75, *CHEST, walls=[(3, 0)]) == pytest.approx(0.5)
 
 
-def test_measures_of_walks():
+def test_best_length_and_goal_distance_in_houses_follow_walks():
     # The footprint begins at z = 1.75: within 1 m from z = 0.75 on, three moves away, and half a turn before them.
     corridor = draw(["."] * 6, ("Book", 0, 0.5, 2, *CHEST))
     assert start_twin(corridor, rules=HOUSES).best_length() == 4
@@ -209,32 +209,47 @@ def test_measures_of_walks():
 # The view
 
 
-def picture(episode):
-    """Return the view, the far edge first."""
+def view_rows(episode):
+    """Return the 11 rows of the view as text, the far edge first."""
     cells = episode.view()
-    return ["".join("?.#"[value] for value in cells[i : i + 11]) for i in range(110, -1, -11)]
+    rows = []
+    for first_cell in range(0, 121, 11):
+        rows.append("".join("?.#"[value] for value in cells[first_cell : first_cell + 11]))
+    return rows[::-1]
 
 
-def test_the_view_at_30_degrees():
+def cells_straight_ahead(episode):
+    """Return the middle column of the view, from the agent on."""
+    return "".join(row[5] for row in reversed(view_rows(episode)))
+
+
+def test_view_at_30_degrees_rounds_to_cells():
     # Half of it is 0.824 cells a step. Heading 1 of 12, f = (1/2, 0.866): 3 steps ahead are (x, z) = (1.5, 2.6), the
     # cell [3, 2], for 1.5 is rounded to 2; 1 step is [1, 0], for 0.5 is rounded to 0.
-    rows = [list("." * 13) for _ in range(13)]
-    rows[3][2] = rows[1][0] = "#"
-    seen = picture(start_twin(draw(["".join(row) for row in rows]), heading=1, rules=APARTMENTS))
-    assert [row[5] for row in seen[:-5:-1]] == [".", "#", ".", "#"]
+    rows = ["." * 13 for _ in range(13)]
+    rows[3] = "..#.........."
+    rows[1] = "#............"
+    episode = start_twin(draw(rows), heading=1, rules=APARTMENTS)
+    assert cells_straight_ahead(episode)[:4] == ".#.#"
+
     # 4 steps are (2, 3.46), [3, 2] again; 3 to the left of it, at (2 - 2.60, 3.46 + 1.5), the lattice has ended.
-    assert seen[-5:] == ["??#..#...??", "???..#..???", "????...????", "?????#?????", "?????.?????"]
+    expected_rows = ["??#..#...??", "???..#..???", "????...????", "?????#?????", "?????.?????"]
+    assert view_rows(episode)[-5:] == expected_rows
 
 
-def test_what_hides_the_floor():
-    # 5 steps ahead of the camera stands a chest, 0.9 m high.
+def test_view_hides_floor_behind_boxes_as_high_as_the_camera():
+    # 5 steps ahead of the camera stands a chest, 0.9 m high: above the camera of houses, below that of apartments.
     chest = ("Chest", 1, 0.45, 1.25, 0.3, 0.9, 0.3)
-    scene = draw(["." * 9] * 12, chest)
-    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=APARTMENTS))[::-1]] == ["."] * 11
-    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 6 + ["?"] * 5
-    # What stands beyond the lattice hides nothing.
-    scene = draw(["." * 9] * 5, chest)
-    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 5 + ["#"] * 6
-    # Neither does the cell of the agent, nor that which is looked at.
-    scene = draw(["." * 9] * 5, walls=[(0, 4), (3, 4)])
-    assert [row[5] for row in picture(start_twin(scene, cell=(0, 4), rules=HOUSES))[::-1]] == ["."] * 4 + ["?"] * 7
+    long_room = draw(["." * 9] * 12, chest)
+    assert cells_straight_ahead(start_twin(long_room, cell=(0, 4), rules=APARTMENTS)) == "..........."
+    assert cells_straight_ahead(start_twin(long_room, cell=(0, 4), rules=HOUSES)) == "......?????"
+
+    # A chest beyond the lattice hides nothing.
+    short_room = draw(["." * 9] * 5, chest)
+    assert cells_straight_ahead(start_twin(short_room, cell=(0, 4), rules=HOUSES)) == ".....######"
+
+
+def test_view_shows_the_wall_cells_at_both_ends_of_a_line():
+    # Neither the cell of the agent nor the cell that is looked at hides the floor.
+    walled_room = draw(["." * 9] * 5, walls=[(0, 4), (3, 4)])
+    assert cells_straight_ahead(start_twin(walled_room, cell=(0, 4), rules=HOUSES)) == "....???????"

@@ -12,24 +12,25 @@ from support.twin import LOOK_DOWN, detected_categories, start_in_one_cell, star
 from support.twin_shapes import meets
 
 
-@pytest.mark.parametrize(("offset", "seen"), [(1.19, True), (1.2, False), (-1.19, True), (-1.2, False)])
-def test_the_cone_is_50_degrees_to_every_side(offset, seen):
+@pytest.mark.parametrize(("offset", "is_detected"), [(1.19, True), (1.2, False), (-1.19, True), (-1.2, False)])
+def test_detection_cone_of_rooms_is_50_degrees_to_every_side(offset, is_detected):
     # tan 50 = 1.19175, one metre ahead.
-    assert (BOOK in detected_categories(start_in_one_cell(("Book", offset, 1.5, 1, *SMALL)))) == seen
-    assert (BOOK in detected_categories(start_in_one_cell(("Book", 0, 1.5 + offset, 1, *SMALL)))) == seen
+    assert (BOOK in detected_categories(start_in_one_cell(("Book", offset, 1.5, 1, *SMALL)))) == is_detected
+    assert (BOOK in detected_categories(start_in_one_cell(("Book", 0, 1.5 + offset, 1, *SMALL)))) == is_detected
 
 
 @pytest.mark.parametrize(
-    ("right", "up", "seen"), [(0.82, 0, True), (-0.83, 0, False), (0, 0.61, True), (0, -0.61, True), (0, -0.63, False)]
+    ("right", "up", "is_detected"),
+    [(0.82, 0, True), (-0.83, 0, False), (0, 0.61, True), (0, -0.61, True), (0, -0.63, False)],
 )
-def test_the_cone_of_apartments_and_houses(right, up, seen):
+def test_detection_cone_of_homes_is_wider_than_high(right, up, is_detected):
     # tan 39.5 = 0.8243 across and tan 31.75 = 0.6188 up, one metre ahead, around cameras at 1.5 and 0.88 m.
     for rules in (APARTMENTS, HOUSES):
         book = ("Book", right, rules.camera + up, 1, *SMALL)
-        assert (BOOK in detected_categories(start_in_one_cell(book, rules=rules))) == seen
+        assert (BOOK in detected_categories(start_in_one_cell(book, rules=rules))) == is_detected
 
 
-def test_thirty_degrees_to_the_right():
+def test_detection_at_30_degrees_is_straight_ahead_of_its_heading():
     # Heading 1 of 12, f = (1/2, sqrt 3 / 2): for v = (1, sqrt 3), ahead = 1/2 + 3/2 = 2, right = 0.
     [(ahead, right, _)] = start_in_one_cell(("Book", 1, 1.5, 3**0.5, *SMALL), heading=1, rules=APARTMENTS).detections()[
         BOOK
@@ -37,7 +38,7 @@ def test_thirty_degrees_to_the_right():
     assert (ahead, right) == pytest.approx((2.0, 0.0))
 
 
-def test_offsets_ahead_and_right():
+def test_detection_gives_offsets_ahead_and_right_of_the_heading():
     # Facing +x (heading 2), the right hand points to -z: from [4, 0] at z = 1, v = (2, 0, -0.5).
     book = ("Book", 2, 1.5, 0.5, *SMALL)
     scene = draw(["."] * 5, book)
@@ -51,14 +52,14 @@ def test_offsets_ahead_and_right():
     assert (ahead, right) == pytest.approx((2.5 * math.sqrt(0.5), -1.5 * math.sqrt(0.5)))
 
 
-def test_the_origin_shifts_the_lattice():
+def test_detection_offsets_follow_the_origin_of_the_lattice():
     scene = draw(["..", ".."], ("Book", 3, 1.5, 2.5, *SMALL), origin=(2.75, -0.5))
     # Cell [1, 1] is at x = 3, z = -0.25.
     [(ahead, right, _)] = start_twin(scene, cell=(1, 1)).detections()[BOOK]
     assert (ahead, right) == pytest.approx((2.75, 0.0))
 
 
-def test_a_near_floor_object_is_seen_only_looking_down():
+def test_detection_of_a_near_object_on_the_floor_needs_looking_down():
     # ahead 1, up -1.5. Level: rise -1.5 < -1.19. Pitched: depth .866 + .75 = 1.616, rise .5 - 1.299 = -.799 > -1.926.
     episode = start_in_one_cell(("Book", 0, 0, 1, *SMALL))
     assert (detected_categories(episode), episode.successes()) == (set(), set())
@@ -68,7 +69,7 @@ def test_a_near_floor_object_is_seen_only_looking_down():
     assert (ahead, right) == pytest.approx((1.0, 0.0))  # of the level frame, not of the pitched one
 
 
-def test_a_high_object_is_lost_looking_down():
+def test_detection_of_a_high_object_is_lost_looking_down():
     # ahead 1, up 1. Level: rise 1 < 1.19. Pitched: depth .866 - .5 = .366, rise .5 + .866 = 1.366 > .436.
     high = ("Book", 0, 2.5, 1, *SMALL)
     assert detected_categories(start_in_one_cell(high)) == {BOOK}
@@ -76,17 +77,17 @@ def test_a_high_object_is_lost_looking_down():
 
 
 @pytest.mark.parametrize(
-    ("height", "z", "seen"), [(1.86, 1, True), (1.87, 1, False), (0, 0.265, True), (0, 0.264, False)]
+    ("height", "z", "is_detected"), [(1.86, 1, True), (1.87, 1, False), (0, 0.265, True), (0, 0.264, False)]
 )
-def test_the_pitched_view_reaches_from_20_degrees_up_to_80_down(height, z, seen):
+def test_detection_cone_looking_down_reaches_from_20_degrees_up_to_80_down(height, z, is_detected):
     # tan 20 = 0.364; 1.5 / tan 80 = 0.2645.
     assert detected_categories(start_in_one_cell(("Book", 0, height, z, *SMALL), horizon=1)) == (
-        {BOOK} if seen else set()
+        {BOOK} if is_detected else set()
     )
 
 
 @pytest.mark.parametrize("horizon", [0, 1])
-def test_what_is_behind_or_straight_below_is_out_of_view(horizon):
+def test_objects_behind_or_straight_below_are_not_detected(horizon):
     # Straight below, pitched: depth .75, rise -1.299 < -.894.
     assert detected_categories(start_in_one_cell(("Book", 0, 1.5, -1, *SMALL), horizon=horizon)) == set()
     assert detected_categories(start_in_one_cell(("Book", 0, 0, 0, *SMALL), horizon=horizon)) == set()
@@ -101,7 +102,7 @@ TARGET = ("Book", 0, 1, 2, *SMALL)  # the line falls from 1.5 to 1 m: it is 1.25
 
 
 @pytest.mark.parametrize(
-    ("blocker", "clear"),
+    ("blocker", "is_visible"),
     [
         ((0, 1, 1, 0.5, 2, 0.5), False),  # a wardrobe between
         ((0, 1.25, 1, 0.5, 1.5, 0.5), True),  # underside 0.5: a cupboard that hangs
@@ -121,20 +122,20 @@ TARGET = ("Book", 0, 1, 2, *SMALL)  # the line falls from 1.5 to 1 m: it is 1.25
         ((0, 1, 0.35, 0.5, 2, 0.5), False),  # 0.1 m before the camera
     ],
 )
-def test_boxes_between_camera_and_target(blocker, clear):
-    assert detected_categories(start_in_one_cell(TARGET, ("Wardrobe", *blocker))) == ({BOOK} if clear else set())
+def test_line_of_sight_is_blocked_by_opaque_boxes_between_camera_and_target(blocker, is_visible):
+    assert detected_categories(start_in_one_cell(TARGET, ("Wardrobe", *blocker))) == ({BOOK} if is_visible else set())
 
 
-@pytest.mark.parametrize(("top", "clear"), [(0.8, True), (0.85, False)])
-def test_a_box_below_085_hides_nothing(top, clear):
+@pytest.mark.parametrize(("top", "is_visible"), [(0.8, True), (0.85, False)])
+def test_box_lower_than_085_m_hides_nothing(top, is_visible):
     # To the floor at z = 1.5 the line is 0.6 m high at z = 0.9, inside of either box, and goes on to z = 1.29.
     table = ("Table", 0, top / 2, 1.05, 0.3, top, 0.3)
     assert detected_categories(start_in_one_cell(("Book", 0, 0, 1.5, *SMALL), table, horizon=1)) == (
-        {BOOK} if clear else set()
+        {BOOK} if is_visible else set()
     )
 
 
-def test_a_target_is_hidden_by_another_box_only():
+def test_box_hides_neither_itself_nor_objects_inside():
     fridge = ("Fridge", 0, 0.9, 1.2, 0.7, 1.8, 0.7)
     # The book is in the fridge, the chair right behind it.
     scene = (fridge, ("Book", 0, 1.2, 1.4, *SMALL), ("Chair", 0, 0.8, 2, 0.4, 0.4, 0.4))
@@ -143,7 +144,7 @@ def test_a_target_is_hidden_by_another_box_only():
 
 
 @pytest.mark.parametrize("height", [0.2, 1.5, 2.4])
-def test_a_wall_cell_blocks_at_every_height(height):
+def test_wall_cell_blocks_sight_at_every_height(height):
     # Wall cell [8, 0]: z from 1.875 to 2.125.
     book = ("Book", 0, height, 3, *SMALL)
     assert detected_categories(start_in_one_cell(book)) == {BOOK}
@@ -151,27 +152,27 @@ def test_a_wall_cell_blocks_at_every_height(height):
     assert detected_categories(start_in_one_cell(book, walls=[(8, 1)])) == {BOOK}  # beside the line
 
 
-def test_a_wall_cell_that_contains_the_target_does_not_block():
+def test_wall_cell_around_the_target_does_not_block_sight():
     # 1.1 ahead, 1.5 down: 1.860 m. The line ends at z = 1.1 (1 - 0.3 / 1.860) = 0.923, in cell [4, 0] (from 0.875).
     book = ("Book", 0, 0, 1.1, *SMALL)
     assert detected_categories(start_in_one_cell(book, walls=[(4, 0)], horizon=1)) == {BOOK}
     assert detected_categories(start_in_one_cell(book, walls=[(3, 0), (4, 0)], horizon=1)) == set()
 
 
-@pytest.mark.parametrize(("z", "clear"), [(0.9, True), (0.95, False)])
-def test_the_last_03_m_are_left_out(z, clear):
+@pytest.mark.parametrize(("z", "is_visible"), [(0.9, True), (0.95, False)])
+def test_line_of_sight_ends_03_m_before_the_target(z, is_visible):
     # Wall cell [3, 0] is z from 0.625 to 0.875; the line ends at 0.6 or 0.65.
     assert detected_categories(start_in_one_cell(("Book", 0, 1.5, z, *SMALL), walls=[(3, 0)])) == (
-        {BOOK} if clear else set()
+        {BOOK} if is_visible else set()
     )
 
 
-def test_a_line_shorter_than_03_m_is_clear():
+def test_line_of_sight_shorter_than_03_m_is_clear():
     # Wall cell [1, 0] is z from 0.125 to 0.375 and contains neither centre; x leaves it beside, in view.
     assert detected_categories(start_in_one_cell(("Book", 0.14, 1.5, 0.2, *SMALL), walls=[(1, 0)])) == {BOOK}
 
 
-def test_the_diagonal_between_two_wall_cells_is_open():
+def test_line_of_sight_passes_between_two_diagonal_wall_cells():
     # The line x = z grazes cells [1, 2] and [2, 1] in the corner that they share (0.375, 0.375) and no more.
     book = ("Book", 1, 1.5, 1, *SMALL)
     assert detected_categories(start_in_one_cell(book, walls=[(1, 2), (2, 1)])) == {BOOK}
@@ -205,7 +206,7 @@ def test_meets_handles_segments_parallel_to_faces():
     assert not meets((0, 0, 0), (0, 0, 2), (0.2, 0, 1), (0.1, 0.1, 0.1))
 
 
-def test_walls_stand_on_the_shifted_lattice():
+def test_wall_cells_follow_the_origin_of_the_lattice():
     # Cell [0, 0] is at (2.75, -0.5), wall cell [4, 0] at z = 0.5, cell [4, 1] beside the line.
     book = ("Book", 2.75, 1.5, 1.5, *SMALL)
     rows = [".#"] + ["##"] * 8
@@ -217,37 +218,37 @@ def test_walls_stand_on_the_shifted_lattice():
 
 
 @pytest.mark.parametrize(("z", "goals"), [(1.5, {BOOK}), (1.5 + 5e-10, {BOOK}), (1.51, set())])
-def test_success_is_limited_to_15_m_in_the_plane(z, goals):
+def test_success_in_rooms_is_within_15_m_in_the_plane(z, goals):
     # 0.9 m high, the centre at z = 1.5 is 1.62 m from the camera, but 1.5 m horizontally.
     episode = start_in_one_cell(("Book", 0, 0.9, z, *SMALL))
     assert (episode.successes(), detected_categories(episode)) == (goals, {BOOK})
 
 
 @pytest.mark.parametrize(("z", "goals"), [(1.0, {BOOK}), (1.01, set())])
-def test_success_in_apartments_is_limited_to_1_m(z, goals):
+def test_success_in_apartments_is_within_1_m(z, goals):
     assert start_in_one_cell(("Book", 0, 1.5, z, *SMALL), rules=APARTMENTS).successes() == goals
 
 
 @pytest.mark.parametrize(
-    ("sides", "reached", "missed"),
+    ("sides", "last_detected", "first_missed"),
     [
         ((0.4, 0.2, 0.36), 3.16, 3.17),  # size sqrt(0.4 x 0.36) = 0.37947, range 3.1623
         ((0.05, 0.05, 0.01), 1.5 + 5e-10, 1.51),  # 0.05 / 0.12 < 1.5
         ((1.0, 0.2, 1.0), 5.0, 5.01),  # 1 / 0.12 > 5
     ],
 )
-def test_the_range_follows_from_the_size(sides, reached, missed):
-    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, reached, *sides))) == {BOOK}
-    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, missed, *sides))) == set()
+def test_detection_range_follows_from_the_size(sides, last_detected, first_missed):
+    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, last_detected, *sides))) == {BOOK}
+    assert detected_categories(start_in_one_cell(("Book", 0, 1.5, first_missed, *sides))) == set()
 
 
 @pytest.mark.parametrize(("z", "apparent"), [(2.0, 0.3), (0.2, 2.4)])
-def test_the_apparent_size_is_bounded_near_the_camera(z, apparent):
+def test_apparent_size_is_bounded_near_the_camera(z, apparent):
     # 0.6 / 2, and 0.6 / max(0.2, 0.25).
     assert start_in_one_cell(("Book", 0, 1.5, z, *SMALL)).detections()[BOOK] == [pytest.approx((z, 0.0, apparent))]
 
 
-def test_the_nearest_detected_instance_wins_and_equally_near_ones_are_all_accepted():
+def test_detections_hold_the_nearest_visible_instance_and_equally_near_ones():
     far, near = ("Book", 0, 1.5, 3, *SMALL), ("Book", 0.5, 1.5, 1, 0.2, 0.2, 0.2)
     # sqrt(0.5^2 + 1) = 1.118.
     assert start_in_one_cell(far, near).detections()[BOOK] == [pytest.approx((1.0, 0.5, 0.2 / math.sqrt(1.25)))]
