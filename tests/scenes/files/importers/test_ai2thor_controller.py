@@ -7,6 +7,7 @@ from collections.abc import Generator
 import pytest
 from support.importer_inputs.ai2thor import METADATA
 from support.mutations import changed
+from support.refusals import assert_message_names
 from support.scene_records import as_scene, assert_scenes_equal
 
 from jaxnav.errors import InputError
@@ -17,8 +18,11 @@ class FakeController:
     """Replay recorded metadata, as `ai2thor.controller.Controller` gives it."""
 
     def __init__(self, recordings: dict[str, dict], **settings: object):
-        self.recordings, self.settings = recordings, settings
-        self.scene, self.stops, self.resets = "FloorPlan9", 0, []
+        self.recordings = recordings
+        self.settings = settings
+        self.scene = "FloorPlan9"
+        self.num_stops = 0
+        self.resets = []
 
     def reset(self, scene: str, **settings: object) -> None:
         if scene not in self.recordings:
@@ -33,7 +37,7 @@ class FakeController:
         return types.SimpleNamespace(metadata=self.recordings[self.scene])
 
     def stop(self) -> None:
-        self.stops += 1
+        self.num_stops += 1
 
 
 APARTMENT = "FloorPlan_Train1_1"
@@ -47,60 +51,65 @@ RECORDINGS = {
 
 
 @pytest.fixture
-def controllers():
+def made_controllers():
     return []
 
 
 @pytest.fixture
-def factory(controllers):
-    def make(**settings: object) -> FakeController:
-        controllers.append(FakeController(RECORDINGS, **settings))
-        return controllers[-1]
+def make_controller(made_controllers):
+    """Return a maker of controllers, which are listed in `controllers`."""
 
-    return make
+    def make_controller(**settings: object) -> FakeController:
+        made_controllers.append(FakeController(RECORDINGS, **settings))
+        return made_controllers[-1]
+
+    return make_controller
 
 
-def test_a_controller_gives_what_its_saved_metadata_gives(read_metadata, controllers, factory):
-    scenes = list(read_controller(["FloorPlan201", APARTMENT], "val", factory))
+def test_read_controller_equals_the_import_of_saved_metadata(read_metadata, made_controllers, make_controller):
+    scenes = list(read_controller(["FloorPlan201", APARTMENT], "val", make_controller))
     assert_scenes_equal(scenes[0], read_metadata(METADATA))
     assert_scenes_equal(scenes[1], read_metadata(RECORDINGS[APARTMENT]))
-    (controller,) = controllers
+
+    # One controller has read both scenes.
+    (controller,) = made_controllers
     assert controller.settings["gridSize"] == 0.25
     assert controller.resets == [("FloorPlan201", "default"), (APARTMENT, "locobot")]
-    assert controller.stops == 1
+    assert controller.num_stops == 1
 
 
-def test_bad_scenes_of_a_controller_leave_the_others(controllers, factory):
-    unknown, field, failed, scene = read_controller(
-        ["FloorPlan999", "FloorPlan3", "FloorPlan4", "FloorPlan201"], "val", factory
-    )
-    expected = "controller, 'FloorPlan999': Scene 'FloorPlan999' not contained in build. Give the name"
-    assert str(unknown).startswith(expected)
-    assert "FloorPlan1_physics" not in str(unknown)
-    assert "objects[1]: rotation is 4" in str(field)
-    assert "'FloorPlan4': GetReachablePositions failed (out of bounds)" in str(failed)
+def test_read_controller_reports_bad_scenes_and_imports_the_rest(made_controllers, make_controller):
+    names = ["FloorPlan999", "FloorPlan3", "FloorPlan4", "FloorPlan201"]
+    unknown_scene, bad_field, failed_action, scene = read_controller(names, "val", make_controller)
+    assert_message_names(unknown_scene, "controller, 'FloorPlan999': ", "Give the name")
+    assert "FloorPlan1_physics" not in str(unknown_scene)
+    assert_message_names(bad_field, "objects[1]: rotation ")
+    assert_message_names(failed_action, "'FloorPlan4': ", "GetReachablePositions", "out of bounds")
     assert as_scene(scene).name == "FloorPlan201"
-    assert controllers[0].stops == 1
+    assert made_controllers[0].num_stops == 1
 
 
-def test_a_controller_is_stopped_whatever_happens(controllers, factory):
+def test_read_controller_stops_the_controller_on_errors_and_early_exit(made_controllers, make_controller):
+    # The first controller fails.
     with pytest.raises(RuntimeError, match="Unity crashed"):
-        list(read_controller(["FloorPlan201", "FloorPlan5"], "val", factory))
-    scenes = read_controller(["FloorPlan201", "FloorPlan201"], "val", factory)
+        list(read_controller(["FloorPlan201", "FloorPlan5"], "val", make_controller))
+
+    # The second one is no longer needed.
+    scenes = read_controller(["FloorPlan201", "FloorPlan201"], "val", make_controller)
     next(scenes)
     assert isinstance(scenes, Generator)
     scenes.close()
-    assert [controller.stops for controller in controllers] == [1, 1]
+    assert [controller.num_stops for controller in made_controllers] == [1, 1]
 
 
-def test_the_installed_package_is_used(monkeypatch, factory):
+def test_read_controller_uses_the_installed_package(monkeypatch, make_controller):
     monkeypatch.setitem(sys.modules, "ai2thor", types.ModuleType("ai2thor"))
-    monkeypatch.setitem(sys.modules, "ai2thor.controller", types.SimpleNamespace(Controller=factory))
+    monkeypatch.setitem(sys.modules, "ai2thor.controller", types.SimpleNamespace(Controller=make_controller))
     (scene,) = read_controller(["FloorPlan201"], "val")
     assert as_scene(scene).name == "FloorPlan201"
 
 
-def test_a_missing_package_is_named(monkeypatch):
+def test_read_controller_names_a_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "ai2thor", None)
-    with pytest.raises(InputError, match=r"--from-controller: .*pip install ai2thor"):
+    with pytest.raises(InputError, match=r"--from-controller.*pip install ai2thor"):
         next(read_controller(["FloorPlan201"], "val"))

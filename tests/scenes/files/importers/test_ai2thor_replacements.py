@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.mutations import mutated
 from support.real_scenes import ITHOR, ITHOR_SHUFFLES, require
+from support.refusals import assert_message_names
 from support.scene_records import as_scene, check_outcomes, write_records
 
 from jaxnav.__main__ import main
@@ -22,7 +23,9 @@ from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.task import ROOMS
 
-MUG, PEN, CUP = 4, 5, 7
+MUG = 4
+PEN = 5
+CUP = 7
 ROOM: dict[str, Any] = {
     "name": "den",
     "world": "ithor",
@@ -55,17 +58,20 @@ SETS: dict[str, Any] = {
 
 
 @pytest.fixture
-def base(tmp_path):
+def base_file(tmp_path):
+    """Return the scene file of the room before its objects are placed anew."""
     return write_records(tmp_path / "base.jsonl.gz", ROOM)
 
 
-def test_every_set_is_a_scene_with_its_objects_there(tmp_path, base):
-    path = write_records(tmp_path / "sets.jsonl.gz", SETS)
-    first, second = map(as_scene, read_replacements(path, base))
-    (room,) = read_scenes(base)
-    assert [first.name, second.name] == ["den-replaced-0", "den-replaced-1"]
-    assert first.types == room.types == ("Desk", "Book", "Book", "BasketBall", "Mug", "Pen", "Cup")
-    expected = [
+def test_read_replacements_moves_the_objects_of_every_set(tmp_path, base_file):
+    sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS)
+    first_scene, second_scene = map(as_scene, read_replacements(sets_file, base_file))
+    (base_room,) = read_scenes(base_file)
+    assert [first_scene.name, second_scene.name] == ["den-replaced-0", "den-replaced-1"]
+    assert first_scene.types == base_room.types == ("Desk", "Book", "Book", "BasketBall", "Mug", "Pen", "Cup")
+
+    # The first set moves all but the desk, the pen and the cup.
+    expected_boxes = [
         [0.5, 0.4, 1.0, 1.0, 0.8, 0.5],
         [0.0, 0.85, 0.9, 0.2, 0.1, 0.3],  # underside on the desk: 0.8 + 0.1 / 2
         [0.1, 0.05, 0.0, 0.4, 0.1, 0.1],  # the second row is the second book; underside on the floor
@@ -74,141 +80,153 @@ def test_every_set_is_a_scene_with_its_objects_there(tmp_path, base):
         [0.8, 0.95, 1.0, 0.01, 0.2, 0.01],
         [0.1, 0.85, 1.2, 0.1, 0.1, 0.1],
     ]
-    np.testing.assert_allclose(first.boxes, expected, atol=1e-12)
-    # The moved rest on nothing, nor does the pen, whose mug is elsewhere; the cup stays on the desk.
-    np.testing.assert_array_equal(room.parents, [-1, 0, 0, -1, 0, 4, 0])
-    np.testing.assert_array_equal(first.parents, [-1, -1, -1, -1, -1, -1, 0])
-    np.testing.assert_array_equal(second.parents, [-1, 0, 0, -1, 0, 4, -1])
-    np.testing.assert_allclose(second.boxes[:-1], room.boxes[:-1])
-    np.testing.assert_allclose(second.boxes[-1], [0.2, 0.85, 1.1, 0.1, 0.1, 0.1])
-    for scene in (first, second):
-        np.testing.assert_array_equal(scene.reach, room.reach)
-        np.testing.assert_array_equal(scene.walls, room.walls)
-        np.testing.assert_array_equal(scene.yaws, room.yaws)
+    np.testing.assert_allclose(first_scene.boxes, expected_boxes, atol=1e-12)
+
+    # Moved objects have no parent, nor has the pen, whose mug is elsewhere; the cup stays on the desk.
+    np.testing.assert_array_equal(base_room.parents, [-1, 0, 0, -1, 0, 4, 0])
+    np.testing.assert_array_equal(first_scene.parents, [-1, -1, -1, -1, -1, -1, 0])
+    np.testing.assert_array_equal(second_scene.parents, [-1, 0, 0, -1, 0, 4, -1])
+
+    # The second set moves the cup alone.
+    np.testing.assert_allclose(second_scene.boxes[:-1], base_room.boxes[:-1])
+    np.testing.assert_allclose(second_scene.boxes[-1], [0.2, 0.85, 1.1, 0.1, 0.1, 0.1])
+
+    # Neither changes the rest of the scene.
+    for scene in (first_scene, second_scene):
+        np.testing.assert_array_equal(scene.reach, base_room.reach)
+        np.testing.assert_array_equal(scene.walls, base_room.walls)
+        np.testing.assert_array_equal(scene.yaws, base_room.yaws)
 
 
 @pytest.mark.parametrize(
-    ("fields", "problem"),
+    ("changed_fields", "field_name", "mend"),
     [
-        ({"name": "attic"}, "name is 'attic', which is no scene of"),
-        ({"columns": ["type", "x", "z", "y"]}, "columns is"),
-        ({"sets": {}}, "sets is {}; give a list"),
-        ({"sets": [[["Book", 0, 0]]]}, "sets[0][0] is"),
-        ({"sets": [[["Cup", 0, None, 0]]]}, "sets[0][0] is null"),
-        ({"sets": [[["Sofa", 0, 0, 0]]]}, "sets[0][0] is one 'Sofa' more than the room has; leave it out"),
-        ({"sets": [[["Cup", 0, 0, 0], ["Cup", 1, 0, 0]]]}, "sets[0][1] is one 'Cup' more than the room has"),
+        ({"name": "attic"}, "name", "give its scene file"),
+        ({"columns": ["type", "x", "z", "y"]}, "columns", "give ['type', 'x', 'y', 'z']"),
+        ({"sets": {}}, "sets", "give a list"),
+        ({"sets": [[["Book", 0, 0]]]}, "sets[0][0]", "give a list of 4"),
+        ({"sets": [[["Cup", 0, None, 0]]]}, "sets[0][0]", "give the number or leave the object out"),
+        ({"sets": [[["Sofa", 0, 0, 0]]]}, "sets[0][0]", "leave it out"),
+        ({"sets": [[["Cup", 0, 0, 0], ["Cup", 1, 0, 0]]]}, "sets[0][1]", "leave it out"),
     ],
 )
-def test_rooms_that_cannot_be_used_are_named_and_the_others_kept(tmp_path, base, fields, problem):
-    path = write_records(tmp_path / "sets.jsonl.gz", SETS | fields, SETS)
-    refused, *scenes = read_replacements(path, base)
-    assert isinstance(refused, InputError)
-    assert str(refused).startswith(f"{path}, line 1: record")
-    assert problem in str(refused)
-    assert [scene.name for scene in scenes if isinstance(scene, Scene)] == ["den-replaced-0", "den-replaced-1"]
+def test_read_replacements_refuses_bad_rooms_and_imports_the_rest(
+    tmp_path, base_file, changed_fields, field_name, mend
+):
+    sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS | changed_fields, SETS)
+    error, *scenes = read_replacements(sets_file, base_file)
+    assert isinstance(error, InputError)
+    assert str(error).startswith(f"{sets_file}, line 1: record")
+    assert_message_names(error, f"{field_name} ", mend)
+    assert [as_scene(scene).name for scene in scenes] == ["den-replaced-0", "den-replaced-1"]
 
 
-def test_a_bad_set_leaves_the_others(tmp_path, base):
-    path = write_records(tmp_path / "sets.jsonl.gz", SETS | {"sets": [[["Sofa", 0, 0, 0]], ROWS]})
-    refused, scene = read_replacements(path, base)
-    assert isinstance(refused, InputError)
-    assert isinstance(scene, Scene)
-    assert scene.name == "den-replaced-1"
+def test_read_replacements_refuses_a_bad_set_and_imports_the_rest(tmp_path, base_file):
+    sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS | {"sets": [[["Sofa", 0, 0, 0]], ROWS]})
+    error, scene = read_replacements(sets_file, base_file)
+    assert isinstance(error, InputError)
+    assert as_scene(scene).name == "den-replaced-1"
 
 
-def test_files_that_cannot_be_read_at_all(tmp_path, base):
-    empty = write_records(tmp_path / "empty.jsonl.gz")
-    with pytest.raises(InputError, match=r"empty.jsonl.gz: holds no room"):
-        list(read_replacements(empty, base))
-    with pytest.raises(InputError, match=r"none.jsonl.gz: cannot be read"):
-        list(read_replacements(base, tmp_path / "none.jsonl.gz"))
+def test_read_replacements_refuses_empty_and_missing_files(tmp_path, base_file):
+    empty_file = write_records(tmp_path / "empty.jsonl.gz")
+    with pytest.raises(InputError, match=r"empty\.jsonl\.gz: .*no room"):
+        list(read_replacements(empty_file, base_file))
+    with pytest.raises(InputError, match=r"none\.jsonl\.gz: cannot be read"):
+        list(read_replacements(base_file, tmp_path / "none.jsonl.gz"))
 
 
-def test_mutated_records_are_imported_or_refused(tmp_path, base):
+def test_read_replacements_imports_or_refuses_mutated_records(tmp_path, base_file):
     outcomes = collections.Counter()
 
     @given(mutated(SETS))
-    def check(sets):
-        path = write_records(tmp_path / "sets.jsonl.gz", sets, SETS)
-        results = list(read_replacements(path, base))
-        check_outcomes(results[:-2], outcomes, path)
+    def check_import(mutated_sets):
+        sets_file = write_records(tmp_path / "sets.jsonl.gz", mutated_sets, SETS)
+        results = list(read_replacements(sets_file, base_file))
+        check_outcomes(results[:-2], outcomes, sets_file)
         assert [type(result) for result in results[-2:]] == [Scene, Scene]
 
-    check()
+    check_import()
     assert outcomes[InputError] >= 10
     assert outcomes[Scene] >= 1
 
 
 @given(st.one_of(st.text("Cup|+-.0123456789e\u0663 ", max_size=24), st.just(None), st.integers(), st.just([])))
-def test_strange_ids_put_the_underside_at_the_pivot(tmp_path_factory, key):
+def test_read_replacements_puts_the_underside_at_the_pivot_for_strange_ids(tmp_path_factory, object_id):
+    # The room has a cup with a strange id; the second set moves it.
     folder = tmp_path_factory.getbasetemp() / "ids"
     folder.mkdir(exist_ok=True)
-    room = write_records(folder / "room.jsonl.gz", ROOM | {"objects": [[*ROOM["objects"][CUP][:8], -1, key]]})
-    path = write_records(folder / "sets.jsonl.gz", SETS | {"sets": SETS["sets"][1:]})
-    (scene,) = read_replacements(path, room)
-    assert isinstance(scene, Scene)
-    assert scene.boxes[0, 1] == pytest.approx(0.85)
+    room_file = write_records(
+        folder / "room.jsonl.gz", ROOM | {"objects": [[*ROOM["objects"][CUP][:8], -1, object_id]]}
+    )
+    sets_file = write_records(folder / "sets.jsonl.gz", SETS | {"sets": SETS["sets"][1:]})
+    (scene,) = read_replacements(sets_file, room_file)
+    assert as_scene(scene).boxes[0, 1] == pytest.approx(0.85)
 
 
-def test_the_command_writes_a_scene_file(tmp_path, base, capsys):
-    path, out = write_records(tmp_path / "sets.jsonl.gz", SETS), tmp_path / "out.jsonl.gz"
-    options = ("--base", str(base), "--val", "*-1")
-    assert main(["scenes", "import", "replacements", str(path), str(out), *options]) == 0
-    assert [(scene.name, scene.split) for scene in read_scenes(out)] == [
-        ("den-replaced-0", "train"),
-        ("den-replaced-1", "val"),
-    ]
-    assert "2 scenes imported, 0 refused" in capsys.readouterr().err
+def test_scenes_import_replacements_writes_a_scene_file(tmp_path, base_file, capsys):
+    sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS)
+    scene_file = tmp_path / "out.jsonl.gz"
+    options = ("--base", str(base_file), "--val", "*-1")
+    assert main(["scenes", "import", "replacements", str(sets_file), str(scene_file), *options]) == 0
+    splits = {scene.name: scene.split for scene in read_scenes(scene_file)}
+    assert splits == {"den-replaced-0": "train", "den-replaced-1": "val"}
+    assert_message_names(capsys.readouterr().err, "2 scenes imported", "0 refused")
 
 
-def test_the_simulators_file_is_ten_sets_of_eighty_rooms():
+def test_read_replacements_reads_ten_sets_of_eighty_real_rooms():
     scenes = list(map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))))
     rooms = {scene.name: scene for scene in read_scenes(ITHOR)}
-    assert [type(scene) for scene in scenes] == [Scene] * 800
-    assert collections.Counter(scene.name.split("-")[0] for scene in scenes) == dict.fromkeys(
-        (name for name, room in rooms.items() if room.split == "train"), 10
-    )
-    moved = 0
+    train_rooms = [name for name, base_room in rooms.items() if base_room.split == "train"]
+    assert len(scenes) == 800
+    assert collections.Counter(scene.name.split("-")[0] for scene in scenes) == dict.fromkeys(train_rooms, 10)
+
+    # Objects are moved, but keep their types and sizes.
+    num_moved = 0
     for scene in scenes:
-        room = rooms[scene.name.split("-")[0]]
-        assert scene.types == room.types
-        np.testing.assert_array_equal(scene.boxes[:, 3:], room.boxes[:, 3:])
-        moved += np.any(scene.boxes != room.boxes, axis=1).sum()
-    assert 9700 <= moved <= 9830  # rows of the file; a few stay where they were
+        base_room = rooms[scene.name.split("-")[0]]
+        assert scene.types == base_room.types
+        np.testing.assert_array_equal(scene.boxes[:, 3:], base_room.boxes[:, 3:])
+        num_moved += np.any(scene.boxes != base_room.boxes, axis=1).sum()
+    assert 9700 <= num_moved <= 9830  # rows of the file; a few stay where they were
 
 
-def test_objects_put_back_on_their_pivots_are_where_they_were(tmp_path):
-    """Check the rule for heights against the rooms themselves.
+def read_json_lines(sets_file) -> list[Any]:
+    return [json.loads(line) for line in gzip.decompress(sets_file.read_bytes()).splitlines()]
 
-    The pivots in the ids of the base file give its boxes.
-    """
-    records = [json.loads(line) for line in gzip.decompress(require(ITHOR).read_bytes()).splitlines()]
-    movable = {row[0] for line in gzip.decompress(require(ITHOR_SHUFFLES).read_bytes()).splitlines()
-               for row in json.loads(line)["sets"][0]}  # fmt: skip
-    sets = [
-        {
-            "name": record["name"],
-            "columns": ["type", "x", "y", "z"],
-            "sets": [[[o[0], *map(float, o[9].split("|")[1:4])] for o in record["objects"] if o[0] in movable]],
-        }
-        for record in records
-    ]
-    scenes = list(read_replacements(write_records(tmp_path / "sets.jsonl.gz", *sets), ITHOR))
-    off = [
-        np.abs(scene.boxes[i, 1] - room.boxes[i, 1])
-        for scene, room in zip(scenes, read_scenes(ITHOR), strict=True)
-        if isinstance(scene, Scene)
-        for i in np.flatnonzero(np.isin(room.types, list(movable)))
-    ]
-    assert len(off) >= 900
-    assert np.mean(np.array(off) <= 0.02) >= 0.95
+
+def test_read_replacements_restores_real_heights_from_pivots(tmp_path):
+    """The rule for heights agrees with the real rooms: pivots, which stand in the ids, give back the boxes."""
+    movable_types = set()
+    for room_sets in read_json_lines(require(ITHOR_SHUFFLES)):
+        movable_types |= {row[0] for row in room_sets["sets"][0]}
+
+    # Put every movable object on the pivot in its id, `type|x|y|z`.
+    all_sets = []
+    for record in read_json_lines(require(ITHOR)):
+        rows = []
+        for type_name, *_, object_id in record["objects"]:
+            if type_name in movable_types:
+                rows.append([type_name, *map(float, object_id.split("|")[1:4])])
+        all_sets.append({"name": record["name"], "columns": ["type", "x", "y", "z"], "sets": [rows]})
+    scenes = read_replacements(write_records(tmp_path / "sets.jsonl.gz", *all_sets), ITHOR)
+
+    # At least 95 % of the heights are within 2 cm.
+    height_errors = []
+    for scene, base_room in zip(scenes, read_scenes(ITHOR), strict=True):
+        if isinstance(scene, Scene):
+            is_movable = np.isin(base_room.types, list(movable_types))
+            height_errors.extend(np.abs(scene.boxes[is_movable, 1] - base_room.boxes[is_movable, 1]))
+    assert len(height_errors) >= 900
+    assert np.mean(np.array(height_errors) <= 0.02) >= 0.95
 
 
 @pytest.mark.slow
-def test_nearly_every_object_can_be_reached_in_the_simulators_rooms():
-    present = reachable = 0
+def test_replaced_real_rooms_keep_nearly_all_categories_reachable():
+    num_present = 0
+    num_reachable = 0
     for scene in map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))):
-        present += len(set(category_ids(scene.types, ITHOR_CATEGORIES)) - {-1})
-        reachable += (compile_scene(scene, ROOMS).best_length > 0).any(axis=0).sum()
-    assert present == 6700
-    assert reachable / present >= 0.97
+        num_present += len(set(category_ids(scene.types, ITHOR_CATEGORIES)) - {-1})
+        num_reachable += (compile_scene(scene, ROOMS).best_length > 0).any(axis=0).sum()
+    assert num_present == 6700
+    assert num_reachable / num_present >= 0.97

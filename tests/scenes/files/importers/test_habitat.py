@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from support.importer_inputs.habitat import EPISODES, STARTS, episode, goal, write_json
 from support.importer_inputs.semantic_maps import bedroom, l_shaped_floor, write_maps
-from support.scene_records import scenes_and_errors
+from support.refusals import assert_message_names
+from support.scene_geometry import points_of
+from support.scene_records import assert_scenes_equal, scenes_and_errors
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.habitat import read_habitat
@@ -16,101 +18,114 @@ from jaxnav.scenes.scene import Scene
 
 
 @pytest.fixture
-def maps(tmp_path: Path) -> Path:
+def map_file(tmp_path: Path) -> Path:
+    """Return a file of semantic maps of a house with two floors, a chair on one and a bed on the other."""
     return write_maps(tmp_path / "val_info.pbz2", {"Home": {0: l_shaped_floor(), 1: bedroom()}})
 
 
-def test_floors_of_a_mapped_house(tmp_path, maps):
+def test_read_habitat_imports_the_floors_of_a_mapped_house(tmp_path, map_file):
     write_json(tmp_path / "val" / "content" / "Home_episodes.json.gz", {"episodes": STARTS})
-    scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val", maps))
+    scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val", map_file))
     assert not errors
-    assert [(scene.name, scene.world, scene.split, scene.types) for scene in scenes] == [
-        ("Home_floor0", "gibson", "val", ("Chair",)),
-        ("Home_floor1", "gibson", "val", ("Bed",)),
-    ]
+    assert [(scene.name, scene.types) for scene in scenes] == [("Home_floor0", ("Chair",)), ("Home_floor1", ("Bed",))]
+    assert {(scene.world, scene.split) for scene in scenes} == {("gibson", "val")}
+
     # The bed: pixels 38-51 and 2-15, x 3.90 to 4.60 m, Habitat's z -0.90 to -0.20 m; typical height 0.91, centre 0.46.
     np.testing.assert_allclose(scenes[1].boxes, [[4.25, 0.46, 0.55, 0.7, 0.91, 0.7]], atol=1e-12)
-    write_scenes(tmp_path / "scenes.jsonl.gz", scenes)
-    for scene, again in zip(scenes, read_scenes(tmp_path / "scenes.jsonl.gz"), strict=True):
-        np.testing.assert_array_equal(again.reach, scene.reach)
-        np.testing.assert_array_equal(again.walls, scene.walls)
-        np.testing.assert_array_equal(again.boxes, scene.boxes)
-        assert (again.origin, again.types) == (scene.origin, scene.types)
+
+    # The scenes survive their file.
+    scene_file = tmp_path / "scenes.jsonl.gz"
+    write_scenes(scene_file, scenes)
+    for scene, scene_read in zip(scenes, read_scenes(scene_file), strict=True):
+        assert_scenes_equal(scene_read, scene)
 
 
-def test_every_way_to_name_a_split(tmp_path, maps):
-    folder = tmp_path / "val"
-    file = write_json(folder / "content" / "Home_episodes.json.gz", {"episodes": STARTS})
-    for dummy in ("Home.json.gz", "Home.glb.json.gz"):  # Habitat's, not SemExp's
-        write_json(folder / "content" / dummy, {"episodes": [episode(99.0, 0.0, 99.0)]})
-    whole = write_json(folder / "val.json.gz", {"episodes": []})
-    for path in (folder, folder / "content", whole, file):
-        assert [scene.name for scene in scenes_and_errors(read_habitat(path, "val", maps))[0]] == [
-            "Home_floor0",
-            "Home_floor1",
-        ]
-    alone = write_json(tmp_path / "train" / "train.json.gz", {"episodes": []})
-    for path in (alone, alone.parent):  # no episode: all that the map has
-        assert len(scenes_and_errors(read_habitat(path, "train", maps))[0]) == 2
-        with pytest.raises(InputError, match="holds no episode; give the folder of a split, or a semantic floor map"):
-            list(read_habitat(path, "train"))
+@pytest.mark.parametrize("episode_path", ["val", "val/content", "val/val.json.gz", "val/content/Home_episodes.json.gz"])
+def test_read_habitat_accepts_folder_content_and_files_of_a_split(tmp_path, map_file, episode_path):
+    content = tmp_path / "val" / "content"
+    write_json(content / "Home_episodes.json.gz", {"episodes": STARTS})
+    write_json(tmp_path / "val" / "val.json.gz", {"episodes": []})
+
+    # Files of Habitat rather than SemExp, with the same scene, do not count.
+    for habitat_name in ("Home.json.gz", "Home.glb.json.gz"):
+        write_json(content / habitat_name, {"episodes": [episode(99.0, 0.0, 99.0)]})
+    scenes, _ = scenes_and_errors(read_habitat(tmp_path / episode_path, "val", map_file))
+    assert [scene.name for scene in scenes] == ["Home_floor0", "Home_floor1"]
 
 
-def shifted(dx: float, count: int) -> list[dict]:
-    """Return STARTS with `count` of those upstairs moved along x."""
-    return [episode(x + dx * (72 <= i < 72 + count), y, z) for i, (x, y, z) in enumerate(positions())]
+@pytest.mark.parametrize("episode_path", ["train", "train/train.json.gz"])
+def test_read_habitat_without_episodes_imports_every_mapped_floor(tmp_path, map_file, episode_path):
+    write_json(tmp_path / "train" / "train.json.gz", {"episodes": []})
+    scenes, _ = scenes_and_errors(read_habitat(tmp_path / episode_path, "train", map_file))
+    assert len(scenes) == 2
+
+    # Without a map either there is nothing to import.
+    with pytest.raises(InputError, match="give the folder of a split, or a semantic floor map"):
+        list(read_habitat(tmp_path / episode_path, "train"))
 
 
-def positions() -> list[list[float]]:
-    return [start["start_position"] for start in STARTS]
+def move_starts_upstairs(offset: float, num_moved: int) -> list[dict]:
+    """Return STARTS, the last 72 of which are upstairs, with some of those moved along x, in metres."""
+    episodes = []
+    for i, start in enumerate(STARTS):
+        x, y, z = start["start_position"]
+        is_moved = 72 <= i < 72 + num_moved
+        episodes.append(episode(x + offset * is_moved, y, z))
+    return episodes
 
 
 @pytest.mark.parametrize(
-    ("dx", "count", "fits"),
+    ("offset", "num_moved", "has_fit"),
     [
         (-0.3, 72, True),  # beside the map
         (-3.0, 14, True),  # 58 of 72 are 80.6 %
         (-3.0, 15, False),
     ],
 )
-def test_a_map_must_fit_the_starts(tmp_path, maps, dx, count, fits):
-    path = write_json(tmp_path / "e.json.gz", {"episodes": shifted(dx, count)})
-    scenes, errors = scenes_and_errors(read_habitat(path, "val", maps))
-    assert len(scenes) == 1 + fits
-    assert fits or "val_info.pbz2, scene 'Home': floor 1: sem_map has 57 of 72 starts" in errors[0]
+def test_read_habitat_refuses_a_map_that_fits_too_few_starts(tmp_path, map_file, offset, num_moved, has_fit):
+    episode_path = write_json(tmp_path / "e.json.gz", {"episodes": move_starts_upstairs(offset, num_moved)})
+    scenes, errors = scenes_and_errors(read_habitat(episode_path, "val", map_file))
+    assert len(scenes) == 1 + has_fit
+    assert len(errors) == 1 - has_fit
+    if errors:
+        assert_message_names(errors[0], "val_info.pbz2, scene 'Home': floor 1: sem_map ", "57 of 72")
 
 
-def test_floor_id_tells_the_floor_of_a_start(tmp_path, maps):
-    episodes = [start | {"floor_id": 0} for start in shifted(-3.0, 72)[72:]]  # by height they are upstairs
-    scenes, errors = scenes_and_errors(
-        read_habitat(write_json(tmp_path / "e.json.gz", {"episodes": episodes}), "val", maps)
-    )
+def test_read_habitat_assigns_starts_by_floor_id(tmp_path, map_file):
+    # By their height these starts are upstairs.
+    episodes = [start | {"floor_id": 0} for start in move_starts_upstairs(-3.0, 72)[72:]]
+    episode_path = write_json(tmp_path / "e.json.gz", {"episodes": episodes})
+    scenes, errors = scenes_and_errors(read_habitat(episode_path, "val", map_file))
     assert [scene.name for scene in scenes] == ["Home_floor1"]
-    assert "floor 0: sem_map has 0 of 72 starts" in errors[0]
+    assert_message_names(errors[0], "floor 0: sem_map ", "0 of 72")
 
 
-def test_floors_from_episodes_alone(tmp_path):
-    (ground, upstairs), errors = scenes_and_errors(
-        read_habitat(write_json(tmp_path / "Home.json.gz", EPISODES), "train")
-    )
+def test_read_habitat_imports_floors_from_episodes_alone(tmp_path):
+    episode_path = write_json(tmp_path / "Home.json.gz", EPISODES)
+    (ground_floor, upper_floor), errors = scenes_and_errors(read_habitat(episode_path, "train"))
     assert not errors
-    assert (ground.name, ground.world, ground.room_type) == ("Home_floor0", "habitat", "house")
+    assert (ground_floor.name, ground_floor.world, ground_floor.room_type) == ("Home_floor0", "habitat", "house")
+
     # z is negated. Starts at x = 0.03 .. 2.03 m go to 0 .. 2 m; the view points add (2, 1.25) and (2, 1.5).
-    cells = {(0.25 * i, 1.0) for i in range(9)} | {(2.0, 1.25), (2.0, 1.5)}
-    x, z = ground.origin
-    assert {(x + 0.25 * ix, z + 0.25 * iz) for iz, ix in np.argwhere(ground.reach).tolist()} == cells
+    standable_points = {(0.25 * i, 1.0) for i in range(9)} | {(2.0, 1.25), (2.0, 1.5)}
+    assert points_of(ground_floor, ground_floor.reach) == standable_points
+
     # The chair's centre is at 0.6 - 0.1 m above the floor; a typical chair is 0.56 x 0.95 x 0.56 m.
-    np.testing.assert_allclose(ground.boxes, [[2.5, 0.5, 1.5, 0.56, 0.95, 0.56]], atol=1e-12)
+    np.testing.assert_allclose(ground_floor.boxes, [[2.5, 0.5, 1.5, 0.56, 0.95, 0.56]], atol=1e-12)
+
     # The bed is in the file twice under one id, centre 3.5 - 3.1 m high and at z = -1.
-    assert (ground.types, upstairs.types) == (("chair",), ("bed",))
-    np.testing.assert_allclose(upstairs.boxes, [[1.0, 0.4, -1.0, 1.84, 0.91, 1.84]], atol=1e-12)
-    assert len(standable_cells(upstairs.reach)) == upstairs.reach.sum() == 9
+    assert (ground_floor.types, upper_floor.types) == (("chair",), ("bed",))
+    np.testing.assert_allclose(upper_floor.boxes, [[1.0, 0.4, -1.0, 1.84, 0.91, 1.84]], atol=1e-12)
+    assert len(standable_cells(upper_floor.reach)) == upper_floor.reach.sum() == 9
 
 
-def test_goals_of_episodes_and_shortest_paths(tmp_path):
-    chair = goal("chair", 7, [0.5, 0.4, 1.0], [[0.5, 0.0, 0.5]])
-    walk = [{"position": [0.25, 0.0, 0.25], "action": 1}, {"position": None, "action": 0}, 1, None]
-    episodes = [episode(0, 0, 0, goals=[chair], shortest_paths=[walk]), episode(0, 0, 0, goals=[chair])]
+def test_read_habitat_uses_goals_and_shortest_paths_of_episodes(tmp_path):
+    chair_goal = goal("chair", 7, [0.5, 0.4, 1.0], [[0.5, 0.0, 0.5]])
+    shortest_path = [{"position": [0.25, 0.0, 0.25], "action": 1}, {"position": None, "action": 0}, 1, None]
+    episodes = [
+        episode(0, 0, 0, goals=[chair_goal], shortest_paths=[shortest_path]),
+        episode(0, 0, 0, goals=[chair_goal]),
+    ]
     (scene,) = read_habitat(write_json(tmp_path / "e.json.gz", {"episodes": episodes}), "val")
     assert isinstance(scene, Scene)
     assert scene.types == ("chair",)

@@ -9,7 +9,7 @@ from jaxnav.scenes.files.importers import assemble as polygons
 
 
 @pytest.mark.parametrize(
-    ("corners", "simple"),
+    ("corners", "is_simple"),
     [
         ([(0, 0), (0, 4), (2, 4), (2, 2), (4, 2), (4, 0)], True),
         ([(0, 0), (1, 2), (3, 1)], True),
@@ -24,27 +24,36 @@ from jaxnav.scenes.files.importers import assemble as polygons
         ([(0, 0), (0, 0), (0, 3), (3, 3)], False),
     ],
 )
-def test_simple_polygons(corners, simple):
+def test_is_simple_polygon_of_drawn_corners(corners, is_simple):
+    # The first corner and the direction do not matter.
     for shift in range(len(corners)):
-        turned = np.roll(np.array(corners, float), shift, axis=0)
-        assert polygons.is_simple_polygon(turned) == polygons.is_simple_polygon(turned[::-1]) == simple
+        rolled = np.roll(np.array(corners, float), shift, axis=0)
+        assert polygons.is_simple_polygon(rolled) == is_simple
+        assert polygons.is_simple_polygon(rolled[::-1]) == is_simple
 
 
 @given(st.lists(st.floats(0.5, 3.0), min_size=7, max_size=7))
-def test_inside_equals_the_winding_number(radii):
+def test_points_in_polygon_equals_the_winding_number(radii):
     angles = np.linspace(0, 2 * np.pi, 7, endpoint=False) + 0.1
     corners = np.array(radii)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     assert polygons.is_simple_polygon(corners)  # radii around a centre
-    x, z = np.arange(-12, 13) * 0.25, np.arange(-10, 11) * 0.25
-    to = corners - np.stack(np.meshgrid(x, z), axis=-1)[..., None, :]
-    after = np.roll(to, -1, axis=-2)
-    cross = to[..., 0] * after[..., 1] - to[..., 1] * after[..., 0]
-    turns = np.arctan2(cross, (to * after).sum(axis=-1)).sum(axis=-1) / (2 * np.pi)
-    clear = np.abs(cross).min(axis=-1) > 1e-9  # not on the line of an edge
-    np.testing.assert_array_equal(polygons.points_in_polygon(corners, x, z)[clear], (np.abs(turns) > 0.5)[clear])
+    x = np.arange(-12, 13) * 0.25
+    z = np.arange(-10, 11) * 0.25
+
+    # The winding number of each point [Z, X] is the sum of the angles between successive corners [Z, X, 7, 2].
+    to_corner = corners - np.stack(np.meshgrid(x, z), axis=-1)[..., None, :]
+    to_next_corner = np.roll(to_corner, -1, axis=-2)
+    cross_product = to_corner[..., 0] * to_next_corner[..., 1] - to_corner[..., 1] * to_next_corner[..., 0]
+    dot_product = (to_corner * to_next_corner).sum(axis=-1)
+    winding_number = np.arctan2(cross_product, dot_product).sum(axis=-1) / (2 * np.pi)
+
+    # Points on the line of an edge do not count.
+    off_edge = np.abs(cross_product).min(axis=-1) > 1e-9
+    is_inside = polygons.points_in_polygon(corners, x, z)
+    np.testing.assert_array_equal(is_inside[off_edge], (np.abs(winding_number) > 0.5)[off_edge])
 
 
-def test_openings_are_taken_out_of_walls_along_them():
+def test_subtract_openings_removes_openings_along_a_wall():
     wall_line = np.array([(5.0, 2.0), (1.0, 2.0)])
     openings = [
         np.array([(4.0, 2.0), (3.5, 2.0)]),
@@ -54,5 +63,5 @@ def test_openings_are_taken_out_of_walls_along_them():
         np.array([(2.0, 2.5), (2.5, 2.5)]),  # in a parallel wall
         np.array([(2.0, 1.5), (2.0, 2.5)]),  # across
     ]
-    pieces = polygons.subtract_openings(wall_line, openings)
-    assert np.array(pieces).tolist() == [[[1.5, 2.0], [3.0, 2.0]], [[4.0, 2.0], [5.0, 2.0]]]
+    remaining_pieces = polygons.subtract_openings(wall_line, openings)
+    assert np.array(remaining_pieces).tolist() == [[[1.5, 2.0], [3.0, 2.0]], [[4.0, 2.0], [5.0, 2.0]]]
