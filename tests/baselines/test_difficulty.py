@@ -21,16 +21,16 @@ def test_random_success_where_every_pose_succeeds_follows_closed_form(step_limit
 
 def test_expected_length_and_random_success_equal_means_of_drawn_episodes():
     expected_lengths = expected_length(tiny.BANK)
-    success_rates = random_success(tiny.BANK, np.array(tiny.LIMITS))
+    success_rates = random_success(tiny.BANK, np.array(tiny.STEP_LIMITS))
 
     # Play drawn episodes with random actions; six kinds, Done among them.
     episodes = draw_episodes(tiny.BANK, 6000, seed=2)
-    step_limits = np.array(tiny.LIMITS)[episodes.scene]
+    step_limits = np.array(tiny.STEP_LIMITS)[episodes.scene]
     generator = np.random.default_rng(0)
     pose = episodes.pose
     running = np.ones(len(pose), bool)
     success = np.zeros(len(pose), bool)
-    for time_step in range(max(tiny.LIMITS)):
+    for time_step in range(max(tiny.STEP_LIMITS)):
         running = running & (time_step < step_limits)
         action = generator.integers(6, size=len(pose))
         success |= running & (action == DONE) & (tiny.BANK.best_length[pose, episodes.goal] == 1)

@@ -26,7 +26,7 @@ EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
 ARMS = ("baseline", "layout")
 ROWS = table_rows([0.0, 0.2, 1.0], ["residual", "paper"], ARMS)
 #: Parameters of the two baselines, then of the two layout policies; seeds that say Done here and there.
-WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(seed) for seed in (5, 9, 6, 11)))
+WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.random_params(seed) for seed in (5, 9, 6, 11)))
 
 
 def control_cells(epsilon, form, decoding, **changes):

@@ -42,7 +42,7 @@ def make_episode(action, success=False, shift=0.0):
         epsilon=0.1,
         title="test",
         shift=shift,
-        policies=tiny.untrained(),
+        policies=tiny.make_untrained_policies(),
     )
 
 

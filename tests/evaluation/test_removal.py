@@ -59,7 +59,7 @@ def removed_and_counterfactual(cell, weights, agent, keys, step_keys):
     return logits_to_remove(cell, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
 
 
-WEIGHTS = tiny.lively(6)
+WEIGHTS = tiny.random_params(6)
 
 
 @pytest.fixture(scope="module")

@@ -18,11 +18,11 @@ NUM_EPISODES = 64
 @pytest.mark.slow
 def test_tde_episodes_equal_those_of_the_direct_stream():
     """Sampled, in the whole grid: the same as those of a policy whose experience says nothing."""
-    weights = tiny.lively(1, tiny.STREAMS)
+    weights = tiny.random_params(1, tiny.STREAMS)
     stream = weights["experience_stream"]
     mute_weights = weights | {"experience_stream": stream | {"actor": jax.tree.map(jnp.zeros_like, stream["actor"])}}
     rows = [table_row(variant, None, None, "sample") for variant in ("layout", "tde")]
-    grid, evaluator = inference_grid(rows, ("layout",), 1), Evaluator(AgentLoop(ENV, tiny.STREAMS, tiny.SETTING))
+    grid, evaluator = inference_grid(rows, ("layout",), 1), Evaluator(AgentLoop(ENV, tiny.STREAMS, tiny.ESTIMATOR))
     parts = [(draw_episodes(tiny.BANK, NUM_EPISODES, seed=1), PARAMS)]
     full_outcome, mute_outcome = (
         evaluator(grid, jax.tree.map(lambda leaf: leaf[None], policy_weights), parts, KNOWLEDGE, jax.random.key(0))

@@ -196,15 +196,15 @@ def test_traces_end_with_the_last_step_that_every_shift_reaches():
 # Walks
 
 ENV, ENV_PARAMS = tiny.world()
-AGENT_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.SETTING)
+AGENT_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
 KNOWLEDGE = tiny.knowledge()
 UNGATED = EstimatorConfig(gate=False)
 #: `paper` sees every row, `calibrated` has a gate that shuts, UNGATED has none; each has another prior.
 ESTIMATORS = ("paper", "calibrated", UNGATED)
 PRIORS = jnp.stack([KNOWLEDGE.layout, 0.3 * KNOWLEDGE.layout, 2 * KNOWLEDGE.layout])
-NUM_STEPS = max(tiny.LIMITS) + 1
+NUM_STEPS = max(tiny.STEP_LIMITS) + 1
 KEY = jax.random.key(4)
-WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(tiny.lively, (6, 11)))
+WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(tiny.random_params, (6, 11)))
 
 
 def detected_categories(pose) -> np.ndarray:
@@ -225,7 +225,7 @@ def draw_walks() -> EpisodeList:
 
 
 EPISODES = draw_walks()
-STEP_LIMITS = np.array(tiny.LIMITS)[EPISODES.scene]
+STEP_LIMITS = np.array(tiny.STEP_LIMITS)[EPISODES.scene]
 
 
 def walk(weights) -> GapTraces:

@@ -22,14 +22,14 @@ EPSILON = 0.1
 WORLD = tiny.compiled_world()
 _, PARAMS = tiny.world()
 EPISODES = draw_episodes(tiny.BANK, 40)
-POLICY = LoadedPolicy(tiny.lively(3), tiny.knowledge(), tiny.SPEC, tiny.SETTING, tiny.BANK.task)
+POLICY = LoadedPolicy(tiny.random_params(3), tiny.knowledge(), tiny.SPEC, tiny.ESTIMATOR, tiny.BANK.task)
 KEY_OF_ACTION = {action: key for key, action in KEY_ACTIONS.items()}
 
 
 def start_game(index, policy=None):
     """A game in one of `EPISODES`."""
     episode = EPISODES.take(np.array([index]))
-    return Game(WORLD, episode, tiny.knowledge(), tiny.SETTING, policy, EPSILON)
+    return Game(WORLD, episode, tiny.knowledge(), tiny.ESTIMATOR, policy, EPSILON)
 
 
 def start_longest_game(policy=None):
@@ -68,7 +68,7 @@ def test_play_game_finds_the_goal_by_the_keys_of_the_shortest_path():
 
 def test_play_game_counts_detours_and_ignores_unknown_keys():
     # The longest episode in which two more actions are within the step limit.
-    has_time = EPISODES.best_length + 2 <= np.array(tiny.LIMITS)[EPISODES.scene]
+    has_time = EPISODES.best_length + 2 <= np.array(tiny.STEP_LIMITS)[EPISODES.scene]
     game = start_game(int(np.where(has_time, EPISODES.best_length, 0).argmax()))
     best_length = int(game.episode.best_length[0])
     assert best_length > 1
@@ -95,7 +95,7 @@ def test_wrong_done_quitting_and_no_more_keys_end_the_game(keys, ending):
 
 def test_play_game_ends_at_the_step_limit():
     game = start_longest_game()
-    step_limit = tiny.LIMITS[game.episode.scene[0]]
+    step_limit = tiny.STEP_LIMITS[game.episode.scene[0]]
     result, views = play_keys(game, itertools.repeat("a"))
     assert result.ending == "out of time after"
     assert len(result.poses) == step_limit + 1

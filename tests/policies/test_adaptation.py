@@ -93,7 +93,7 @@ def acted_plainly(spec, weights, observation, action, order=2):
 
 def judged(spec, window, method, fast):
     """The learned loss of a window that is acted again; with streams the direct stream acts alone."""
-    policy = bind(spec, tiny.lively(0, spec) | fast | {"method": method})
+    policy = bind(spec, tiny.random_params(0, spec) | fast | {"method": method})
     alone = None if spec.decision == "fused" else jnp.float32(0.0)
     hidden, rows = window[0][1].hidden, []
     for pathways, memory in window:
@@ -111,7 +111,7 @@ def judged(spec, window, method, fast):
 def test_factors_are_steps_of_the_whole_kernels(name):
     """What is added up, of rank 24, is what autodiff takes from kernels of the episode's own."""
     spec, (observation, action) = SPECS[name], given(0)
-    weights = tiny.lively(0, spec)
+    weights = tiny.random_params(0, spec)
     logits, fast = jax.jit(functools.partial(acted, spec, weights, LearnedLossAdaptation(learning_rate=RATE)))(
         observation, action
     )
@@ -128,7 +128,8 @@ def test_factors_are_steps_of_the_whole_kernels(name):
 @pytest.mark.parametrize("order", [1, 2])
 def test_training_differentiates_through_the_steps(order):
     spec, (observation, action) = SAVN, given(1)
-    weights, adaptation = tiny.lively(0, spec), LearnedLossAdaptation(learning_rate=RATE, second_order=order == 2)
+    weights = tiny.random_params(0, spec)
+    adaptation = LearnedLossAdaptation(learning_rate=RATE, second_order=order == 2)
     mixture = jnp.asarray(np.random.default_rng(2).normal(size=(STEPS, NUM_ACTIONS)), jnp.float32)
     gradient = jax.jit(jax.grad(lambda w: (mixture * acted(spec, w, adaptation, observation, action)[0]).sum()))(
         weights
@@ -170,7 +171,7 @@ def test_the_loss_is_two_causal_convolutions_and_a_length():
 def test_an_episode_ignores_the_others():
     """Every episode of a batch adapts as it does alone."""
     observation, action = given(3, 16)
-    weights, adaptation = tiny.lively(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)
+    weights, adaptation = tiny.random_params(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)
     go = jax.jit(functools.partial(acted, SAVN, weights, adaptation))
     logits, _ = go(observation, action)
     other = jax.tree.map(lambda leaf: leaf.at[:, 5].set(leaf[:, 6]), (observation, action))
@@ -183,9 +184,9 @@ def test_an_episode_ignores_the_others():
 
 
 def test_nothing_is_learned_before_a_window_is_full_nor_after_the_fourth():
-    _, fast = jax.jit(functools.partial(acted, SAVN, tiny.lively(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)))(
-        *given(4)
-    )
+    _, fast = jax.jit(
+        functools.partial(acted, SAVN, tiny.random_params(0, SAVN), LearnedLossAdaptation(learning_rate=RATE))
+    )(*given(4))
     changes = fast.layer_changes["hidden_gates"].outputs
     times = [time + 1 for time in range(STEPS) if np.any(changes[time] != (changes[time - 1] if time else 0.0))]
     assert times == [6, 12, 18, 24]
@@ -194,7 +195,7 @@ def test_nothing_is_learned_before_a_window_is_full_nor_after_the_fourth():
 @pytest.mark.slow
 def test_the_window_is_what_was_decided():
     """Deciding again along a window ends in what the agent decided and remembers."""
-    policy, (observation, action) = bind(SAVN, tiny.lively(0, SAVN)), given(5)
+    policy, (observation, action) = bind(SAVN, tiny.random_params(0, SAVN)), given(5)
 
     def step(memory, part):
         decision = policy.decide(policy.pathways(PolicyInputs(part[0], jnp.ones(K))), memory)
@@ -215,7 +216,7 @@ def test_the_window_is_what_was_decided():
 def test_fast_weights_can_be_stored(name):
     """Checkpoints hold no empty arrays, though experience may have no width."""
     spec = SPECS[name]
-    memory = jax.eval_shape(lambda: bind(spec, tiny.lively(0, spec)).initial_memory((3,)))
+    memory = jax.eval_shape(lambda: bind(spec, tiny.random_params(0, spec)).initial_memory((3,)))
     assert all(leaf.size > 0 for leaf in jax.tree.leaves(memory.fast))
 
 
@@ -241,7 +242,7 @@ def test_fewer_steps_are_possible_and_more_are_refused():
 
 @pytest.mark.slow
 def test_fewer_steps_are_the_first_of_more():
-    weights, (observation, action) = tiny.lively(0, SAVN), given(6)
+    weights, (observation, action) = tiny.random_params(0, SAVN), given(6)
     two, _ = acted(SAVN, weights, LearnedLossAdaptation(inner_steps=2, learning_rate=RATE), observation, action)
     four, _ = acted(SAVN, weights, LearnedLossAdaptation(learning_rate=RATE), observation, action)
     none, fast = acted(SAVN, weights, limit_inner_steps(LearnedLossAdaptation(), 0), observation, action)

@@ -25,7 +25,7 @@ BOOK_SEEN, CHAIR_SEEN, NOTHING = (204, 102, 128, 38), (150, 51, 140, 60), (0, 0,
 def deciding(method):
     """Return a compiled first decision of a lively policy."""
     spec = dataclasses.replace(tiny.SPEC, method=find_method(method), method_sizes=())
-    policy = bind(spec, tiny.lively(0, spec))
+    policy = bind(spec, tiny.random_params(0, spec))
 
     @jax.jit
     def decide(observation):
@@ -71,10 +71,10 @@ def test_the_view_and_the_goals_detection_do_matter():
 
 def test_its_networks_have_one_category():
     spec = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
-    params = tiny.lively(0, spec)
+    params = tiny.random_params(0, spec)
     chex.assert_shape(params["appearance"]["embedding"], (1, tiny.SIZES.appearance))
     chex.assert_shape(params["sought"]["embedding"], (1, tiny.SIZES.appearance))
     assert "method" not in params
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) < sum(
-        leaf.size for leaf in jax.tree.leaves(tiny.lively(0))
+        leaf.size for leaf in jax.tree.leaves(tiny.random_params(0))
     )

@@ -20,7 +20,7 @@ from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT
 
 K, HIDDEN = len(CATEGORIES), tiny.SIZES.hidden
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("eotp"), method_sizes=())
-WEIGHTS = tiny.lively(0, SPEC)
+WEIGHTS = tiny.random_params(0, SPEC)
 ONES = jnp.ones(K)
 MEMORY = PolicyState(jnp.sin(jnp.arange(HIDDEN, dtype=jnp.float32)), jnp.int32(MOVE_AHEAD))
 

@@ -25,9 +25,9 @@ from jaxnav.runs.policies import Policies
 ENV, PARAMS = tiny.world()
 KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
 ANONYMOUS = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
-PAIR = AgentLoop(ENV, tiny.SPEC, tiny.SETTING, fallback_spec=ANONYMOUS)
+PAIR = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR, fallback_spec=ANONYMOUS)
 ALONE = AgentLoop(ENV, ANONYMOUS)
-AGENT, WITHOUT = tiny.lively(6), tiny.lively(9, ANONYMOUS)
+AGENT, WITHOUT = tiny.random_params(6), tiny.random_params(9, ANONYMOUS)
 BOTH = {"agent": AGENT, "without": WITHOUT}
 EPISODES, KEY = draw_episodes(tiny.BANK, 24, seed=1), jax.random.key(3)
 
@@ -75,7 +75,7 @@ def test_what_removal_leaves_is_the_policy_without_experience_to_the_bit():
 
 def test_without_removal_the_policy_with_experience_acts():
     row = table_row("layout", None, None, "argmax")
-    alike(outcome(PAIR, BOTH, row), outcome(AgentLoop(ENV, tiny.SPEC, tiny.SETTING), AGENT, row))
+    alike(outcome(PAIR, BOTH, row), outcome(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, row))
 
 
 def test_under_tde_the_policy_without_experience_acts(unaware):

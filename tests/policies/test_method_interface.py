@@ -32,13 +32,13 @@ KNOWN = KNOWLEDGE._replace(method={"table": jnp.linspace(0, 1, 9).reshape(3, 3)}
 
 
 def acting_with(name):
-    return AgentLoop(ENV, SPECS[name], tiny.SETTING)
+    return AgentLoop(ENV, SPECS[name], tiny.ESTIMATOR)
 
 
 @functools.cache
 def rolled(name):
     """Weights, the agent before, the agent after and a rollout that begins in the middle of episodes."""
-    acting, weights = acting_with(name), tiny.lively(3, SPECS[name])
+    acting, weights = acting_with(name), tiny.random_params(3, SPECS[name])
 
     @jax.jit
     def go(agent, key):
@@ -133,7 +133,7 @@ def test_a_step_by_step_replay_is_the_parallel_one():
     """Decisions, counterfactual decisions and the gradient of the whole loss are those of ORG."""
     _, _, _, rollout = rolled("STEPWISE")
     org = dataclasses.replace(SPECS["STEPWISE"], method=find_method("org"))
-    weights = tiny.lively(7, org)
+    weights = tiny.random_params(7, org)
     scalars = PPOConfig(distil=0.5).scalars(1)
     advantage = jnp.asarray(np.random.default_rng(0).normal(size=(LENGTH, ENVS)), jnp.float32)
 
@@ -246,7 +246,7 @@ def test_choices_become_actions_by_the_control():
 def test_methods_are_evaluated(name):
     episodes = draw_episodes(tiny.BANK, 12, seed=1)
     rows = [table_row("baseline", None, None, "sample"), table_row("stde", 0.0, "paper", "sample")]
-    weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.lively(s, SPECS[name]) for s in range(2)))
+    weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.random_params(s, SPECS[name]) for s in range(2)))
     grid = inference_grid(rows, ("baseline", "layout"), 1)
     outcome = Evaluator(acting_with(name))(grid, weights, [(episodes, PARAMS)], KNOWN, jax.random.key(0))
     assert outcome.length.shape == (2, 12)
@@ -257,7 +257,7 @@ def test_methods_are_evaluated(name):
 @pytest.mark.slow
 def test_the_weight_of_an_episode_is_the_mean_over_choices_that_count():
     """Every second one, the first included: those between are neither counted nor averaged."""
-    episodes, weights = draw_episodes(tiny.BANK, 4, seed=1), tiny.lively(0, SPECS["PATIENT"])
+    episodes, weights = draw_episodes(tiny.BANK, 4, seed=1), tiny.random_params(0, SPECS["PATIENT"])
     grid = inference_grid([table_row("stde", 0.0, "paper", "argmax")], ("layout",), 1)
     stacked = jax.tree.map(lambda leaf: leaf[None], weights)
     acting = acting_with("PATIENT")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from flax import nnx
 from support.scenes import CATEGORIES
-from support.tiny_world import BANK, SIZES, SPEC, decide, leaves_at, lively
+from support.tiny_world import BANK, SIZES, SPEC, decide, leaves_at, random_params
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
@@ -48,7 +48,7 @@ class Compiled:
         spec = dataclasses.replace(
             SPEC, method=find_method(method), method_sizes=SPEC.method_sizes if method == "org" else ()
         )
-        policy = bind(spec, lively(0, spec))
+        policy = bind(spec, random_params(0, spec))
         self.experience_width = policy.method.width
         self.pathways = jax.jit(lambda *inputs: policy.pathways(PolicyInputs(*inputs)))
         self.decide = jax.jit(lambda pathways, memory: policy.decide(pathways, memory))
@@ -233,7 +233,7 @@ print(json.dumps({"modules": sorted(sys.modules), "logits": decision.logits.toli
 
 @pytest.mark.slow
 def test_an_exported_policy_runs_without_the_trainer(tmp_path, org):
-    export_params(tmp_path / "policy", lively(0), SPEC.to_json() | {"num_categories": K})
+    export_params(tmp_path / "policy", random_params(0), SPEC.to_json() | {"num_categories": K})
     observation, _ = batch()
     np.savez(tmp_path / "given.npz", row=observation.row, goal=observation.goal, weights=WEIGHTS)
     command = [sys.executable, "-c", USE_EXPORT, str(tmp_path / "policy"), str(tmp_path / "given.npz")]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
-from support.tiny_world import BANK, SIZES, SPEC, lively
+from support.tiny_world import BANK, SIZES, SPEC, random_params
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
@@ -51,7 +51,7 @@ class Compiled:
 
     def __init__(self, **options):
         spec = dataclasses.replace(SPEC, **options)
-        policy = bind(spec, lively(0))
+        policy = bind(spec, random_params(0))
         self.pathways = jax.jit(lambda observation: policy.pathways(PolicyInputs(observation, jnp.ones((BATCH, K)))))
         self.decide = jax.jit(lambda pathways, memory: policy.decide(pathways, memory))
 
@@ -94,7 +94,7 @@ def test_the_detection_of_the_goal_enters_in_one_place_whatever_is_sought():
     """Goals that look alike and are detected alike have equal rows there."""
     outputs, appearance = SIZES.row_outputs, SIZES.appearance
     spec = dataclasses.replace(SPEC, goal_row=True)
-    weights = lively(0, spec)
+    weights = random_params(0, spec)
     weights["appearance"]["embedding"] = jnp.ones_like(weights["appearance"]["embedding"])
     observation = with_detections(detections(SEEN, UNSEEN))
     goal = np.asarray(bind(spec, weights).pathways(PolicyInputs(observation, jnp.ones((BATCH, K)))).goal)

@@ -36,7 +36,7 @@ def changed(fast):
 
 @pytest.mark.slow
 def test_replay_decides_and_adapts_as_the_rollout_did():
-    weights = tiny.lively(3, SPEC)
+    weights = tiny.random_params(3, SPEC)
 
     @jax.jit
     def go():
@@ -65,7 +65,7 @@ def test_replay_decides_and_adapts_as_the_rollout_did():
 def outcome(inner_steps=None):
     episodes = draw_episodes(tiny.BANK, 32, seed=1)
     rows = inference_grid([table_row("baseline", None, None, "sample")], ("baseline",), 1)
-    weights = tiny.lively(0, SPEC)
+    weights = tiny.random_params(0, SPEC)
     weights["actor"]["kernel"] = 0.3 * weights["actor"]["kernel"]  # long episodes
     weights = jax.tree.map(lambda leaf: leaf[None], weights)
     acting = dataclasses.replace(ACTING, inner_steps=inner_steps)

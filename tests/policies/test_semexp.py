@@ -201,7 +201,7 @@ def test_a_mark_is_cleared_from_a_cell_once():
 
 @pytest.mark.slow
 def test_the_layout_enters_by_the_categories_on_the_map_alone():
-    weights = tiny.lively(0, SPEC)
+    weights = tiny.random_params(0, SPEC)
     policy = bind(SPEC, weights)
     agents, _, _ = walk(state_at(10, 0), [block_ahead(10)] * 8)
     view = acting().policy_inputs(agents[-1], knowledge_of(), PARAMS)

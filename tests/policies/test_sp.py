@@ -136,7 +136,8 @@ def module(spec, weights):
 
 
 SPEC = dataclasses.replace(tiny.SPEC, method=METHODS["sp"], method_sizes=())
-SP, APPEARANCE = module(SPEC, tiny.lively(0, SPEC)), bind(SPEC, tiny.lively(0, SPEC)).appearance.embedding[...]
+SP = module(SPEC, tiny.random_params(0, SPEC))
+APPEARANCE = bind(SPEC, tiny.random_params(0, SPEC)).appearance.embedding[...]
 
 
 def seen(*categories, goal=FRIDGE):
@@ -162,7 +163,7 @@ def test_a_graph_convolution_by_hand(second, expected):
     has: times -2 nothing is left.
     """
     spec = PolicySpec(METHODS["sp"], K, Sizes(hidden=4, view_outputs=2, appearance=1, row_hidden=1, row_outputs=1))
-    weights = tiny.lively(0, spec)
+    weights = tiny.random_params(0, spec)
     kernels = {
         "named": jnp.zeros((1, 1)),
         "seen": jnp.zeros((NUM_FEATURES, 1)).at[0].set(1.0),
@@ -218,7 +219,7 @@ def test_layout_weights_multiply_what_is_made():
 def test_no_fresh_policy_is_silent():
     """With a ReLU at the end some would be for all categories of this view, and could not learn otherwise."""
     spec = dataclasses.replace(SPEC, sizes=Sizes())
-    weights = [tiny.lively(seed, spec) for seed in range(12)]
+    weights = [tiny.random_params(seed, spec) for seed in range(12)]
     lines = [
         module(spec, w).encode(seen(BOOK), w["appearance"]["embedding"], jnp.ones(K), jnp.asarray(MIXING, jnp.float32))
         for w in weights

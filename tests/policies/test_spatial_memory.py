@@ -100,7 +100,7 @@ def test_one_hot_inputs():
 
 def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episode():
     spec = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
-    acting, weights = AgentLoop(ENV, spec, tiny.SETTING), tiny.lively(0, spec)
+    acting, weights = AgentLoop(ENV, spec, tiny.ESTIMATOR), tiny.random_params(0, spec)
 
     @jax.jit
     def go(key):
@@ -131,7 +131,7 @@ def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episod
 
 
 def test_a_policy_without_it_has_no_part_of_it():
-    policy = bind(tiny.SPEC, tiny.lively(0))
+    policy = bind(tiny.SPEC, tiny.random_params(0))
     assert policy.view.kernel.shape[0] == 2 * policy.row_format.view**2
     assert AgentLoop(ENV, tiny.SPEC).start(jax.random.key(0), 1, None, None, PARAMS).perception.spatial_map is None
     assert jaxnav.RunConfig(spatial_memory=False).policy_spec(22).spatial_memory is None

@@ -43,7 +43,7 @@ class Decisions(NamedTuple):
 @functools.cache
 def compiled(spec):
     """Decisions as a function of parameters, observation, layout weights, surroundings and memory."""
-    reading = tiny.reading(spec.method, BATCH)
+    reading = tiny.first_reading(spec.method, BATCH)
 
     @jax.jit
     def decide(weights, observation, layout, surroundings, memory):
@@ -68,7 +68,7 @@ def memories(generator, experienced=1.0, spec=tiny.STREAMS):
     """Random memories; an adaptation has changed the policy."""
     hidden = jnp.asarray(generator.uniform(-1, 1, (BATCH, 2 * HIDDEN)), jnp.float32)
     action = jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32)
-    fast = bind(spec, tiny.lively(0, spec)).initial_memory((BATCH,)).fast
+    fast = bind(spec, tiny.random_params(0, spec)).initial_memory((BATCH,)).fast
     if spec.method.name == "tpn":
         random_change = generator.normal(size=fast.actor_change.shape)
         fast = fast._replace(num_decisions=fast.num_decisions + 7, actor_change=jnp.asarray(random_change))
@@ -87,7 +87,7 @@ def decisions(spec, seed, experienced=1.0):
     if spec.spatial_memory is not None:
         read = jax.eval_shape(lambda: spec.spatial_memory.read(spec.spatial_memory.init()))
         surroundings = jnp.asarray(generator.integers(0, 2, (BATCH, *read.shape)), read.dtype)
-    weights = tiny.lively(seed, spec)
+    weights = tiny.random_params(seed, spec)
     return compiled(spec)(weights, observation, layout, surroundings, memories(generator, experienced, spec))
 
 
@@ -159,7 +159,7 @@ def test_detections_other_than_the_goals_matter_with_experience_alone(method, ex
     spec, memory = streams(method), memories(generator, experienced)
     decide, layout = compiled(spec), jnp.ones((BATCH, K))
     original, altered = (
-        decide(tiny.lively(0, spec), one.replace(row=row), layout, None, memory) for row in (one.row, changed)
+        decide(tiny.random_params(0, spec), one.replace(row=row), layout, None, memory) for row in (one.row, changed)
     )
     differ = (original.factual.logits != altered.factual.logits).any(axis=1)
     assert differ.tolist() == [changes and method != "rgb"] * BATCH  # the experience of rgb is its view
@@ -180,7 +180,7 @@ def test_each_stream_has_a_core_of_its_own():
     """The hidden states are those of two cells of Flax."""
     generator = np.random.default_rng(0)
     observation, memory, spec = observations(generator), memories(generator), streams("org")
-    policy = cast(StreamsPolicy, bind(spec, tiny.lively(0, spec)))
+    policy = cast(StreamsPolicy, bind(spec, tiny.random_params(0, spec)))
     pathways = policy.pathways(PolicyInputs(observation, jnp.ones((BATCH, K))))
     after = policy.decide(pathways, memory).hidden
     previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
@@ -197,7 +197,7 @@ def test_each_stream_has_a_core_of_its_own():
 
 def test_an_episode_begins_with_experience():
     spec = streams("support.methods:ADAPTIVE")
-    memory = bind(spec, tiny.lively(0, spec)).initial_memory((2, 3))
+    memory = bind(spec, tiny.random_params(0, spec)).initial_memory((2, 3))
     np.testing.assert_array_equal(memory.hidden, np.zeros((2, 3, 2 * HIDDEN)))
     np.testing.assert_array_equal(memory.use_experience, np.ones((2, 3)))
     assert memory.fast.shape == (2, 3, NUM_ACTIONS)

@@ -33,7 +33,7 @@ from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 
 HIDDEN, BATCH = tiny.SIZES.hidden, 32
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("tpn"))
-ACTING = AgentLoop(ENV, SPEC, tiny.SETTING)
+ACTING = AgentLoop(ENV, SPEC, tiny.ESTIMATOR)
 LEARN, IMITATE = METHODS["tpn"].stages
 
 
@@ -87,7 +87,7 @@ def test_without_a_choice_all_trials_are_attended_to_equally():
 def given(spec, decisions=7, seed=0):
     """A policy, pathways at poses half of which are repeated, and memories that have changed the actor."""
     draws = np.random.default_rng(seed)
-    policy = bind(spec, tiny.lively(seed, spec))
+    policy = bind(spec, tiny.random_params(seed, spec))
     row = jnp.asarray(tiny.BANK.rows[draws.integers(0, len(tiny.BANK.rows), BATCH)])
     goal = jnp.asarray(draws.integers(0, tiny.SPEC.num_categories, BATCH))
     reading = jnp.arange(BATCH) % 2 == 0
@@ -146,12 +146,12 @@ def test_an_agent_that_does_not_try_decides_plainly():
             ACTING, spec=dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.tpn:UNTRIED"))
         ),
     ):
-        policy, (_, pathways, memory) = acting.bind(tiny.lively(0, SPEC)), given(SPEC)
+        policy, (_, pathways, memory) = acting.bind(tiny.random_params(0, SPEC)), given(SPEC)
         memory = memory._replace(fast=memory.fast._replace(actor_change=jnp.zeros_like(memory.fast.actor_change)))
         decision = policy.decide(pathways, memory)
         chex.assert_trees_all_equal(decision.fast.actor_change, memory.fast.actor_change)
         np.testing.assert_allclose(decision.logits, policy.decide_with_changes(pathways, memory).logits, atol=1e-6)
-    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.lively(0, SPEC)).needs_stepwise_replay
+    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.random_params(0, SPEC)).needs_stepwise_replay
 
 
 # Training
@@ -209,7 +209,7 @@ def test_the_tentative_policy_learns_what_shortest_paths_do(params):
 
 @pytest.mark.slow
 def test_replay_decides_and_adapts_as_the_rollout_did():
-    weights = tiny.lively(3, SPEC)
+    weights = tiny.random_params(3, SPEC)
 
     @jax.jit
     def go():

@@ -162,7 +162,7 @@ def test_every_place_has_a_code_of_its_own():
 def test_queries_stay_under_an_intervention():
     """The view asks within experience: do(scene=0, goal=0) leaves that, and its answer still depends on the view."""
     spec = PolicySpec(find_method("vtnet"), len(CATEGORIES), tiny.SIZES, tuple(SIZES.items()))
-    weights, rows, detections = tiny.lively(0, spec), tiny.BANK.rows, 4 * len(CATEGORIES)
+    weights, rows, detections = tiny.random_params(0, spec), tiny.BANK.rows, 4 * len(CATEGORIES)
 
     @jax.jit
     def counterfactual(row):
@@ -212,7 +212,7 @@ def test_imitation_lowers_its_loss_and_leaves_the_policy_as_it_is():
     expert = jnp.asarray(tiny.BANK.expert)
     params = PARAMS.replace(tables=PARAMS.tables.replace(expert=expert))
     config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=2, learning_rate=3e-3)
-    learner = Learner(AgentLoop(ENV, spec, tiny.SETTING), config, "distil", find_method("vtnet").stages[0])
+    learner = Learner(AgentLoop(ENV, spec, tiny.ESTIMATOR), config, "distil", find_method("vtnet").stages[0])
     before = jax.jit(learner.init)(jax.random.key(0), params, KNOWLEDGE)
     state, first = jax.jit(learner.train, static_argnums=4)(before, config.scalars(400), params, KNOWLEDGE, 50)
     after, last = jax.jit(learner.train, static_argnums=4)(state, config.scalars(400), params, KNOWLEDGE, 50)

@@ -145,8 +145,8 @@ def test_a_program_acts_as_its_policy(method, decision):
     if learn is not None:
         learned = learn([tiny.BANK], np.ones((NUM_PRIORS, spec.num_categories, spec.num_categories)))
         method_knowledge = method_knowledge._replace(method=jax.tree.map(jnp.asarray, learned))
-    setting = tiny.SETTING if METHODS[method].hosts_layout else None
-    policy = LoadedPolicy(tiny.lively(2, spec), method_knowledge, spec, setting, tiny.BANK.task)
+    setting = tiny.ESTIMATOR if METHODS[method].hosts_layout else None
+    policy = LoadedPolicy(tiny.random_params(2, spec), method_knowledge, spec, setting, tiny.BANK.task)
     exported, steps = jax.export.deserialize(bytearray(export_program(policy))), walk(policy)
     memory = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in input_shapes(policy, 3)["memory"].items()}
     result = []

@@ -242,14 +242,14 @@ class Steered(Experience):
 @pytest.mark.parametrize("name", ["semexp", "savn", "tpn"])
 def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
     """Over a whole episode of more than a window of six actions: what is adapted changes the logits of both."""
-    setting = tiny.SETTING if METHODS[name].hosts_layout else None
+    setting = tiny.ESTIMATOR if METHODS[name].hosts_layout else None
     spec = dataclasses.replace(tiny.SPEC, method=METHODS[name], method_sizes=())
     env, params = tiny.world()
     params = params.replace(step_limit=jnp.full(2, LONG, jnp.int32))
     learn = METHODS[name].learn
     learned = {} if learn is None else learn([tiny.BANK], np.ones(tiny.knowledge().layout.shape))
     knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
-    weights = tiny.lively(2, spec)
+    weights = tiny.random_params(2, spec)
     if METHODS[name].control.num_choices == env.num_actions:
         weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
     state = before = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(2), time=jnp.int32(0))
@@ -277,14 +277,14 @@ def test_a_tracker_takes_in_every_step():
     steered = Method(Steered, tracker=Compass(), name="steered")
     spec = dataclasses.replace(tiny.SPEC, method=steered, method_sizes=())
     env, params = tiny.world()
-    weights, knowledge = tiny.lively(2, spec), tiny.knowledge()
+    weights, knowledge = tiny.random_params(2, spec), tiny.knowledge()
     weights["actor"]["bias"] = weights["actor"]["bias"].at[-1].set(-9.0)  # to the step limit
-    policy = LoadedPolicy(weights, knowledge, spec, tiny.SETTING, env.task)
+    policy = LoadedPolicy(weights, knowledge, spec, tiny.ESTIMATOR, env.task)
     start = State(pose=jnp.int32(8), scene=jnp.int32(0), goal=jnp.int32(1), time=jnp.int32(0))
     (trace,) = play_episodes(
-        cell_of("stde", 0.1), weights, alone(start), AgentLoop(env, spec, tiny.SETTING), params, knowledge
+        cell_of("stde", 0.1), weights, alone(start), AgentLoop(env, spec, tiny.ESTIMATOR), params, knowledge
     )
-    assert len(trace.action) == tiny.LIMITS[0]
+    assert len(trace.action) == tiny.STEP_LIMITS[0]
     walk = functools.partial(follow, policy, env, params, start, "kitchen", len(trace.action), epsilon=0.1)
     assert walk() == trace.action.tolist()
     assert walk(use_pose=False) != trace.action.tolist()

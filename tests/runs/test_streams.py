@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support.mutations import resigned
-from support.tiny_world import lively
+from support.tiny_world import random_params
 
 import jaxnav
 from jaxnav.errors import InputError
@@ -35,7 +35,7 @@ def test_streams_need_no_training_of_the_counterfactual_branch(streams):
 
 def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
     drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
-    params = lively(0, streams.policy_spec(len(streams.task.categories)))
+    params = random_params(0, streams.policy_spec(len(streams.task.categories)))
     explored = Exploration(jnp.ones_like(drawn.knowledge.layout), jnp.int32(1), jnp.int32(1))
     export_policy(tmp_path / "policy", streams, params, drawn.knowledge, drawn.estimator_config, explored)
     policy = jaxnav.load_policy(tmp_path / "policy")

@@ -16,7 +16,7 @@ from jaxnav.runs.run import Run, claim_run_dir
 from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import Exploration, co_visibility_from_counts, layout_priors
 from support.commands import SEEDS, write_config
-from support.tiny_world import lively
+from support.tiny_world import random_params
 
 #: With weak prior rows a view changes the belief much: large gaps, which sTDE acts on.
 SETTING = dataclasses.replace(ESTIMATORS["calibrated"], strength=1.0)
@@ -43,7 +43,7 @@ def draw_run(config) -> Run:
     knowledge = Knowledge(layout_priors(explored.counts, SETTING), cooccurrence=signs)
     for number, arm in enumerate(config.arms):
         for seed in range(SEEDS):
-            params = lively(SEEDS * number + seed, config.policy_spec(categories))
+            params = random_params(SEEDS * number + seed, config.policy_spec(categories))
             params["actor"]["bias"] = params["actor"]["bias"].at[DONE].set(-2.0)  # episodes of several steps
             setting = SETTING if arm == "layout" else None
             folder = config.run_dir / POLICIES_DIR / f"{arm}-{seed}"

@@ -9,7 +9,7 @@ from support import tiny_world as tiny
 
 #: A weak prior: the belief follows the first views, so gaps are large.
 KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
-AGENT_LOOP = AgentLoop(tiny.world()[0], tiny.SPEC, tiny.SETTING)
+AGENT_LOOP = AgentLoop(tiny.world()[0], tiny.SPEC, tiny.ESTIMATOR)
 
 
 @jax.jit

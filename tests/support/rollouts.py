@@ -13,12 +13,12 @@ from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 from support import tiny_world as tiny
 
-ENVS, LENGTH = 64, tiny.LIMITS[0]
+ENVS, LENGTH = 64, tiny.STEP_LIMITS[0]
 SLOTS = 20  # of the plain loop
 ENV, PARAMS = tiny.world()
 KNOWLEDGE = tiny.knowledge()
 PRIORS = KNOWLEDGE.layout
-ACTING = AgentLoop(ENV, tiny.SPEC, tiny.SETTING)
+ACTING = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
 CONFIG = PPOConfig(
     num_envs=ENVS,
     rollout=LENGTH,
@@ -46,7 +46,7 @@ def act(weights, agent, key, coin, acting=ACTING):
 
 @functools.partial(jax.jit, static_argnums=1)
 def begin(key, acting=ACTING):
-    memory = acting.bind(tiny.lively(0)).initial_memory((ENVS,))
+    memory = acting.bind(tiny.random_params(0)).initial_memory((ENVS,))
     return acting.start(key, ENVS, memory, KNOWLEDGE, PARAMS)
 
 
@@ -80,7 +80,7 @@ class Rolled(NamedTuple):
 
 @functools.cache
 def rolled(coin: bool) -> Rolled:
-    weights = tiny.lively(5)
+    weights = tiny.random_params(5)
     key = jax.random.key(1)
     before, _ = act(weights, begin(jax.random.key(0)), jax.random.fold_in(key, 0), coin)
     after, rollout = act(weights, before, jax.random.fold_in(key, 1), coin)

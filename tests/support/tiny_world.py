@@ -1,4 +1,7 @@
-"""A world of two drawn rooms and policies of a few thousand parameters: what acts and learns compiles in seconds."""
+"""A world of two drawn rooms and policies of a few thousand parameters, which compile in seconds.
+
+Import it as `from support import tiny_world as tiny`.
+"""
 
 import dataclasses
 
@@ -27,9 +30,9 @@ from support.scenes import CATEGORIES, SMALL, draw
 SIZES = Sizes(hidden=32, view_outputs=8, appearance=4, row_hidden=8, row_outputs=4)
 SPEC = PolicySpec(find_method("org"), len(CATEGORIES), SIZES, method_sizes=(("relation_layers", 2),), goal_row=False)
 STREAMS = dataclasses.replace(SPEC, decision="streams", direct="goal")
-SETTING = ESTIMATORS["calibrated"]
+ESTIMATOR = ESTIMATORS["calibrated"]
 #: Step limits of the kitchen, scene 0, and of the bedroom, scene 1.
-LIMITS = (6, 8)
+STEP_LIMITS = (6, 8)
 
 _ITEMS = (("Book", 0.25, 0.8, 1.75, *SMALL), ("Chair", 1.5, 0.5, 1.5, 0.5, 0.9, 0.5), ("Book", 1.5, 0.8, 0.0, *SMALL))
 KITCHEN = draw(["....##", "....##", "....##", "....##", "######"], *_ITEMS)
@@ -44,7 +47,7 @@ POSES_PER_CELL = BANK.task.rules.poses_per_cell
 
 def world():
     """The environment and its parameters."""
-    return build_environment(BANK, {"kitchen": LIMITS[0], "bedroom": LIMITS[1]}, 0)
+    return build_environment(BANK, {"kitchen": STEP_LIMITS[0], "bedroom": STEP_LIMITS[1]}, 0)
 
 
 def compiled_world(bank=BANK):
@@ -54,7 +57,7 @@ def compiled_world(bank=BANK):
         scenes=FileScenes((KITCHEN, BEDROOM), "tiny"),
         env=env,
         banks=(bank,),
-        step_limits={"kitchen": LIMITS[0], "bedroom": LIMITS[1]},
+        step_limits={"kitchen": STEP_LIMITS[0], "bedroom": STEP_LIMITS[1]},
         step_limit=0,
         num_cells=len(bank.ahead),
         num_scenes=2,
@@ -66,11 +69,11 @@ def knowledge():
     """A random layout prior of each room type, [NUM_PRIORS, K, K]."""
     num_categories = len(CATEGORIES)
     counts = np.random.default_rng(0).integers(0, 9, (NUM_PRIORS, num_categories, num_categories))
-    priors = jax.vmap(lambda room_counts: prior_from_counts(room_counts, SETTING))(jnp.asarray(counts))
+    priors = jax.vmap(lambda room_counts: prior_from_counts(room_counts, ESTIMATOR))(jnp.asarray(counts))
     return Knowledge(priors)
 
 
-def untrained(spec=SPEC, learned_knowledge=None, task=BANK.task):
+def make_untrained_policies(spec=SPEC, learned_knowledge=None, task=BANK.task):
     """Policies without parameters, enough for callers that need only the method and its knowledge."""
     if learned_knowledge is None:
         learned_knowledge = knowledge()
@@ -78,7 +81,7 @@ def untrained(spec=SPEC, learned_knowledge=None, task=BANK.task):
     return Policies({}, (), learned_knowledge, prior_counts, spec, None, 0, task)
 
 
-def reading(method, count):
+def first_reading(method, count):
     """The reading of a method's tracker before the first view, [count, ...]; None without a tracker."""
     if method.tracker is None:
         return None
@@ -86,48 +89,52 @@ def reading(method, count):
     if method.learn is not None:
         learned = method.learn([BANK], np.ones((NUM_PRIORS, len(CATEGORIES), len(CATEGORIES))))
     method_knowledge = knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
-    first_reading = method.tracker.read(method.tracker.init(method_knowledge), method_knowledge, jnp.int32(0))
-    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), first_reading)
+    reading = method.tracker.read(method.tracker.init(method_knowledge), method_knowledge, jnp.int32(0))
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), reading)
 
 
-_init = jax.jit(init_params, static_argnums=0)
+_init_params = jax.jit(init_params, static_argnums=0)
 
 
-def lively(seed, spec=SPEC):
+def random_params(seed, spec=SPEC):
     """Random parameters that act by what they see, unlike those of a fresh policy, which are close to indifferent."""
-    params = _loud(_init(spec, jax.random.key(seed)), seed + 1000)
+    params = _amplify(_init_params(spec, jax.random.key(seed)), seed + 1000)
     if spec.decision == "streams":
-        params["experience_stream"] = _loud(params["experience_stream"], seed + 2000)
+        params["experience_stream"] = _amplify(params["experience_stream"], seed + 2000)
     return params
 
 
-def _loud(params, seed):
+def _amplify(params, seed):
+    """Draw the kernel of the actor anew, and triple the weights before it."""
     kernel = jax.random.normal(jax.random.key(seed), params["actor"]["kernel"].shape)
-    loud = {}
+    actor = params["actor"] | {"kernel": kernel, "bias": jnp.zeros(kernel.shape[-1])}
+    larger_weights = {}
     for name in ("fuse", "method"):
         if name in params:
-            loud[name] = jax.tree.map(lambda leaf: 3 * leaf, params[name])
-    return params | loud | {"actor": params["actor"] | {"kernel": kernel, "bias": jnp.zeros(kernel.shape[-1])}}
+            larger_weights[name] = jax.tree.map(lambda leaf: 3 * leaf, params[name])
+    return params | larger_weights | {"actor": actor}
 
 
 @jax.jit
 def decide(weights, row, goal, layout_weights, memory):
-    """One decision and its counterfactual, both direct pathways zero."""
+    """The decision of `SPEC` on a row [R] with layout weights [K], and its counterfactual without direct pathways."""
     policy = bind(SPEC, weights)
     pathways = policy.pathways(PolicyInputs(Observation(row=row, goal=goal), layout_weights))
-    return policy.decide(pathways, memory), policy.decide(do(pathways, scene=0.0, goal=0.0), memory)
+    counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
+    return policy.decide(pathways, memory), policy.decide(counterfactual_pathways, memory)
 
 
 @jax.jit
 def believe(prior, layout, row):
-    """One belief after what is detected in `row`; `layout` is None at the start of an episode."""
-    estimator = LayoutEstimator(prior, SETTING)
-    return estimator.update(estimator.init() if layout is None else layout, RowFormat(len(CATEGORIES)).presence(row))
+    """The belief after the detections of a row [R]; `layout` is None at the start of an episode."""
+    estimator = LayoutEstimator(prior, ESTIMATOR)
+    last_belief = estimator.init() if layout is None else layout
+    return estimator.update(last_belief, RowFormat(len(CATEGORIES)).presence(row))
 
 
 goal_weights = jax.jit(LayoutEstimator.goal_weights)
 
 
 def leaves_at(tree, *index):
-    """The leaves at an index."""
+    """A tree of the leaves at an index, such as the episode of a batch."""
     return jax.tree.map(lambda leaf: leaf[index], tree)

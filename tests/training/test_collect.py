@@ -85,7 +85,7 @@ def test_rewards_and_lengths():
     np.testing.assert_array_equal(t.terminated, t.action == DONE)
     np.testing.assert_array_equal(t.success, t.terminated & succeeds)
     np.testing.assert_array_equal(t.reward, np.where(t.success, np.float32(5), np.float32(-0.01)))
-    np.testing.assert_array_equal(t.episode_length[t.truncated], np.array(tiny.LIMITS)[SCENE[t.pose]][t.truncated])
+    np.testing.assert_array_equal(t.episode_length[t.truncated], np.array(tiny.STEP_LIMITS)[SCENE[t.pose]][t.truncated])
 
 
 def test_poses_are_stored_as_integers():
@@ -96,7 +96,7 @@ def test_poses_are_stored_as_integers():
 
 def test_an_episode_slot_is_truncated_at_most_once():
     """A rollout as long as the shortest limit, by an agent that never says Done."""
-    weights = tiny.lively(0)
+    weights = tiny.random_params(0)
     bias = weights["actor"]["bias"].at[DONE].set(-1e9)
     weights |= {"actor": weights["actor"] | {"bias": bias}}
     agent, truncations = begin(jax.random.key(0)), []
@@ -111,7 +111,7 @@ def test_an_episode_slot_is_truncated_at_most_once():
 
 
 def test_equal_keys_give_equal_rollouts_and_others_do_not():
-    weights, agent = tiny.lively(0), begin(jax.random.key(0))
+    weights, agent = tiny.random_params(0), begin(jax.random.key(0))
     first = act(weights, agent, jax.random.key(5), False)
     chex.assert_trees_all_equal(act(weights, agent, jax.random.key(5), False), first)
     assert (act(weights, agent, jax.random.key(6), False)[1].transitions.action != first[1].transitions.action).any()
@@ -120,7 +120,7 @@ def test_equal_keys_give_equal_rollouts_and_others_do_not():
 def test_without_a_setting_no_layout_is_carried_and_its_weights_are_ones():
     acting = dataclasses.replace(ACTING, estimator_config=None)
     key = jax.random.key(0)
-    agent, rollout = jax.eval_shape(lambda: act(tiny.lively(0), begin(key, acting), key, False, acting))
+    agent, rollout = jax.eval_shape(lambda: act(tiny.random_params(0), begin(key, acting), key, False, acting))
     assert agent.perception.layout is None
     assert rollout.transitions.layout_weights.shape == (LENGTH, ENVS, 3)
     weights = acting.policy_inputs(begin(key, acting), KNOWLEDGE, PARAMS).layout_weights

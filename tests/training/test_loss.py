@@ -120,7 +120,8 @@ def test_at_lambda_one_the_advantage_is_the_discounted_return_minus_the_value(se
 
 # The PPO loss
 
-NEW = jax.tree.map(lambda a, b: a + 0.2 * b, tiny.lively(0), tiny.lively(1))  # another policy than the one that acted
+# Another policy than the one that acted.
+NEW = jax.tree.map(lambda a, b: a + 0.2 * b, tiny.random_params(0), tiny.random_params(1))
 
 
 def scalars(**changes) -> PPOScalars:

@@ -69,7 +69,7 @@ def _success(learning_rate: float, updates: int) -> float:
     knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_search_setup([BANK], np.zeros(0))))
     spec = dataclasses.replace(tiny.SPEC, method=find_method("semexp"), method_sizes=())
     config = PPOConfig(num_envs=ENVS, rollout=LIMIT, epochs=4, minibatches=2, gamma=0.97, learning_rate=learning_rate)
-    learner = Learner(AgentLoop(env, spec, tiny.SETTING), config, "none")
+    learner = Learner(AgentLoop(env, spec, tiny.ESTIMATOR), config, "none")
     state = jax.jit(learner.init)(jax.random.key(0), params, knowledge)
     train = jax.jit(functools.partial(learner.train, num_updates=20))
     metrics = {}

@@ -73,7 +73,7 @@ def test_a_method_learns(name):
     tables = PARAMS.tables.replace(expert=jnp.asarray(tiny.BANK.expert))
     params = PARAMS.replace(step_limit=jnp.full(2, LIMIT, jnp.int32), tables=tables)
     spec = PolicySpec(method, 3, tiny.SIZES, tuple(SMALLER.get(name, {}).items()))
-    agent_loop = AgentLoop(ENV, spec, tiny.SETTING if method.hosts_layout else None)
+    agent_loop = AgentLoop(ENV, spec, tiny.ESTIMATOR if method.hosts_layout else None)
     state, begin, metrics = None, 0, {}
     for stage in method.stages:
         learner = Learner(agent_loop, CONFIG, "none", stage)

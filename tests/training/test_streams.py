@@ -28,7 +28,7 @@ def spec_of(method):
 
 
 def acting_with(method):
-    return AgentLoop(ENV, spec_of(method), tiny.SETTING)
+    return AgentLoop(ENV, spec_of(method), tiny.ESTIMATOR)
 
 
 def scalars_of(config):
@@ -44,7 +44,7 @@ def learner_with(method, **settings):
 def rolled(method):
     """Weights, and rollouts that go on from one another."""
     learner = learner_with(method, experience=SHARE)
-    acting, weights = learner.agent_loop, tiny.lively(3, spec_of(method))
+    acting, weights = learner.agent_loop, tiny.random_params(3, spec_of(method))
 
     @jax.jit
     def go(agent, key, share):
@@ -84,7 +84,7 @@ def test_the_coin_is_constant_within_an_episode():
 
 @pytest.mark.parametrize("share", [0.25, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_its_share_is_as_configured(share):
-    learner, weights = learner_with("org", experience=share), tiny.lively(3, tiny.STREAMS)
+    learner, weights = learner_with("org", experience=share), tiny.random_params(3, tiny.STREAMS)
     learner = dataclasses.replace(learner, config=dataclasses.replace(learner.config, num_envs=1024))
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
     first = state.agent.memory.use_experience

@@ -80,7 +80,7 @@ def corridor_walk():
         best_length=1,
         epsilon=np.inf,
         title="test",
-        policies=tiny.untrained(SPEC, KNOWLEDGE, BANK.task),
+        policies=tiny.make_untrained_policies(SPEC, KNOWLEDGE, BANK.task),
     )
     return episode, search_states
 
@@ -173,4 +173,4 @@ def test_snapshot_refuses_a_step_after_the_end(corridor_walk):
 def test_snapshot_refuses_a_method_without_a_map(corridor_walk):
     episode, _ = corridor_walk
     with pytest.raises(InputError, match=r"--map: method 'org' .*; give a run of semexp"):
-        take_snapshot(episode._replace(policies=tiny.untrained()), 0)
+        take_snapshot(episode._replace(policies=tiny.make_untrained_policies()), 0)
