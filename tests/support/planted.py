@@ -26,7 +26,7 @@ class Mistake(NamedTuple):
     tests: str
 
 
-INFERENCE = "promises/test_inference_is_the_twins.py"
+INFERENCE = "twins/test_inference.py"
 PROBES = "promises/test_ppo_learns.py"
 STORED = "promises/test_stored_data_is_verified.py"
 NAMES = "promises/test_names_are_text.py"

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from support.real_scenes import ITHOR, ROBOTHOR, require
 from support.scenes import APARTMENTS, HOUSES, ROOMS, coarse_scene, maze_scene
-from support.twin import DONE
-from support.twin_guide import Guide, row_differences, same_distance
-from support.twin_scene import largest_component
+from twins.environment import DONE
+from twins.guide import Guide, row_differences, same_distance
+from twins.scene import largest_component
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav, State

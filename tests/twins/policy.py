@@ -7,10 +7,10 @@ holds the part in which methods differ.
 from typing import Any, NamedTuple
 
 import numpy as np
+from twins.perception import TwinFeatures
 
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.spec import PolicySpec
-from support.twin_percept import TwinFeatures
 
 NUM_ACTIONS = 6
 Params = dict[str, Any]

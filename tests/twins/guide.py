@@ -7,11 +7,11 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from twins.environment import Twin
+from twins.scene import largest_component
 
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Task
-from support.twin import Twin
-from support.twin_scene import largest_component
 
 
 class Guide:

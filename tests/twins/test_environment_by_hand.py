@@ -4,7 +4,7 @@ import math
 
 import pytest
 from support.scenes import APARTMENTS, BOOK, CHAIR, HOUSES, SMALL, draw
-from support.twin import (
+from twins.environment import (
     DONE,
     LOOK_DOWN,
     LOOK_UP,

@@ -11,12 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-from jaxnav.policies.method import Knowledge, Percept
-from jaxnav.policies.methods import METHODS
-from support.twin_adaptation import TwinLearnedSteps, TwinTentative
-from support.twin_percept import TwinFeatures
-from support.twin_policy import (
+from twins.adaptation import TwinLearnedSteps, TwinTentative
+from twins.perception import TwinFeatures
+from twins.policy import (
     NUM_ACTIONS,
     Params,
     TwinMemory,
@@ -27,7 +24,10 @@ from support.twin_policy import (
     relu,
     softmax,
 )
-from support.twin_transformer import TwinTransformer
+from twins.transformer import TwinTransformer
+
+from jaxnav.policies.method import Knowledge, Percept
+from jaxnav.policies.methods import METHODS
 
 
 class TwinAnonymous(TwinMethod):

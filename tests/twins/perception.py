@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.special import digamma, gammaln
-
-from support.twin_scene import NOT_STANDABLE, STANDABLE, Cell
+from twins.scene import NOT_STANDABLE, STANDABLE, Cell
 
 #: State of a cell on the map; the larger number replaces the smaller one.
 UNKNOWN, BLOCKED, FREE, VISITED = range(4)

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 from support.scenes import APARTMENTS, BOOK, CHAIR, FRIDGE, HOUSES, SMALL, draw
-from support.twin import LOOK_DOWN, detected_categories, start_in_one_cell, start_twin
-from support.twin_shapes import meets
+from twins.environment import LOOK_DOWN, detected_categories, start_in_one_cell, start_twin
+from twins.shapes import meets
 
 
 @pytest.mark.parametrize(("offset", "is_detected"), [(1.19, True), (1.2, False), (-1.19, True), (-1.2, False)])

@@ -11,10 +11,11 @@ import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
+from twins.shapes import SHRINK, Box, contains, meets
+
 from jaxnav.scenes.categories import ALIASES
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Rules
-from support.twin_shapes import SHRINK, Box, contains, meets
 
 Cell = tuple[int, int]  # iz, ix
 

@@ -4,9 +4,8 @@ import math
 from typing import Any
 
 import numpy as np
-
-from support.twin_percept import TwinFeatures
-from support.twin_policy import Params, TwinMemory, TwinMethod, linear, relu, softmax
+from twins.perception import TwinFeatures
+from twins.policy import Params, TwinMemory, TwinMethod, linear, relu, softmax
 
 #: Squares along a side of the view, and its cells.
 SIDE = 5

@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
+from support.scenes import BOOK, CATEGORIES, ROOMS, DrawnObject, draw
+from twins.scene import Cell, TwinScene, neighbour
+
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.task import Rules
-from support.scenes import BOOK, CATEGORIES, ROOMS, DrawnObject, draw
-from support.twin_scene import Cell, TwinScene, neighbour
 
 Pose = tuple[int, int, int, int]  # iz, ix, heading, horizon
 

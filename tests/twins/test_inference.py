@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.twin_episode import TwinEpisode
-from support.twin_methods import TWINS, TwinRelations
-from support.twin_policy import TwinMethod, TwinPolicy
+from twins.agent import TwinEpisode
+from twins.methods import TWINS, TwinRelations
+from twins.policy import TwinMethod, TwinPolicy
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS, prior_index
@@ -104,7 +104,7 @@ def case(name: str, decision: Any) -> Case:
         decision=decision,
     )
     knowledge = Knowledge(prior, jax.tree.map(jnp.asarray, learned))
-    weights = jax.tree.map(lambda leaf: CALMER.get(name, 1.0) * leaf, tiny.lively(3, spec))
+    weights = jax.tree.map(lambda leaf: CALMER.get(name, 1.0) * leaf, tiny.random_params(3, spec))
     return Case(AgentLoop(env, spec, SETTING if method.hosts_layout else None), weights, knowledge)
 
 

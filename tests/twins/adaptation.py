@@ -3,8 +3,7 @@
 from typing import Any
 
 import numpy as np
-
-from support.twin_policy import (
+from twins.policy import (
     NUM_ACTIONS,
     LayerChanges,
     Params,
@@ -18,7 +17,7 @@ from support.twin_policy import (
     run_stream,
     softmax,
 )
-from support.twin_transformer import residual_perceptron
+from twins.transformer import residual_perceptron
 
 #: Decisions between inner steps, and inner steps of an episode.
 WINDOW = 6

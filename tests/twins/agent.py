@@ -3,11 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
+from twins.perception import TwinBelief, TwinMap, unpack_cells, unpack_row
+from twins.policy import NUM_ACTIONS, TwinDecision, TwinPolicy
 
 from jaxnav.policies.method import Percept
 from jaxnav.scenes.tables.compile import Bank
-from support.twin_percept import TwinBelief, TwinMap, unpack_cells, unpack_row
-from support.twin_policy import NUM_ACTIONS, TwinDecision, TwinPolicy
 
 
 class TwinTrace(NamedTuple):
