@@ -17,10 +17,12 @@ from jaxnav.scenes.scene import Scene
 
 @pytest.fixture
 def read_metadata(tmp_path: Path) -> Callable[[object], Scene | InputError]:
+    """Return a reader of one record of controller metadata."""
+
     def read(record: object) -> Scene | InputError:
-        path = tmp_path / "room.json"
-        path.write_text(json.dumps(record))
-        (result,) = read_ai2thor(path, "val")
+        metadata_file = tmp_path / "room.json"
+        metadata_file.write_text(json.dumps(record))
+        (result,) = read_ai2thor(metadata_file, "val")
         return result
 
     return read
@@ -28,11 +30,14 @@ def read_metadata(tmp_path: Path) -> Callable[[object], Scene | InputError]:
 
 @pytest.fixture
 def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
+    """Return a reader of one house with an asset database, or without one if it is empty."""
+
     def read(house: object, assets: object = ASSETS, *, agent_part: bool = False) -> Scene | InputError:
-        (tmp_path / "house.json").write_text(json.dumps(house))
-        (tmp_path / "assets.json").write_text(json.dumps(assets))
-        database = tmp_path / "assets.json" if assets else None
-        result, *notes = read_procthor(tmp_path / "house.json", "val", database, agent_part)
+        house_file = tmp_path / "house.json"
+        house_file.write_text(json.dumps(house))
+        asset_file = tmp_path / "assets.json"
+        asset_file.write_text(json.dumps(assets))
+        result, *notes = read_procthor(house_file, "val", asset_file if assets else None, agent_part)
         assert all(isinstance(note, ImportNote) for note in notes)
         assert not isinstance(result, ImportNote)
         return result
@@ -41,6 +46,6 @@ def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
 
 
 @pytest.fixture
-def scene_of(read_house: Callable[..., Scene | InputError]) -> Callable[..., Scene]:
+def house_scene(read_house: Callable[..., Scene | InputError]) -> Callable[..., Scene]:
     """Return a reader of houses that must give a scene."""
     return lambda *arguments, **options: as_scene(read_house(*arguments, **options))

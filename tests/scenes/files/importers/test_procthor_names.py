@@ -1,5 +1,8 @@
 """Types by names, and real houses with and without the database."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 from support.real_scenes import PROCTHOR, require
 
@@ -16,7 +19,7 @@ from jaxnav.scenes.task import HOUSES
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("asset_name", "expected_type"),
     [
         ("bin_8", "GarbageCan"),
         ("Houseplant_29", "HousePlant"),
@@ -30,12 +33,12 @@ from jaxnav.scenes.task import HOUSES
         ("", None),
     ],
 )
-def test_names_of_assets_tell_types(name, kind):
-    assert type_from_asset_name(name) == kind
+def test_type_from_asset_name_of_typical_names(asset_name, expected_type):
+    assert type_from_asset_name(asset_name) == expected_type
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("object_type", "expected_type"),
     [
         ("ObjaTrashCan", "GarbageCan"),
         ("ObjaBarStool", "Stool"),
@@ -48,27 +51,42 @@ def test_names_of_assets_tell_types(name, kind):
         ("Chair", "Chair"),
     ],
 )
-def test_types_of_objaverse_that_are_categories_are_renamed(name, kind):
-    assert normalize_object_type(name) == kind
+def test_normalize_object_type_renames_objaverse_types_of_categories(object_type, expected_type):
+    assert normalize_object_type(object_type) == expected_type
 
 
-def test_names_tell_the_type_of_every_asset_of_the_database():
+def test_type_from_asset_name_of_every_asset_of_the_database():
     assets = read_assets(require(PROCTHOR / "asset-database.json"))
     assert len(assets) == 1653
-    assert {name: asset.type for name, asset in assets.items() if type_from_asset_name(name) != asset.type} == {}
+    asset_types = {asset_name: asset.type for asset_name, asset in assets.items()}
+    assert {asset_name: type_from_asset_name(asset_name) for asset_name in assets} == asset_types
 
 
-@pytest.mark.parametrize(("file", "houses", "guessed"), [("100k", 30, 2821), ("ai2", 20, 1431), ("objaverse", 100, 0)])
-def test_real_houses_lose_no_goal_without_the_database(file, houses, guessed):
-    path = require(PROCTHOR / f"houses_{file}.jsonl.gz")
-    types, numbers = [], []
-    for database in (PROCTHOR / "asset-database.json", None):
-        results = list(read_procthor(path, "train", database))
-        types.append([result.types for result in results if isinstance(result, Scene)])
-        notes = [note for note in results if isinstance(note, ImportNote)]
-        numbers.append(sum(note.number for note in notes if note.text.startswith("types of objects are guessed")))
-    assert len(types[0]) == houses
-    assert types[0] == types[1]
-    assert numbers == [0, guessed]
-    num_known = sum(category >= 0 for house in types[1] for category in category_ids(house, HOUSES.categories))
-    assert num_known > 17 * houses
+def types_and_guesses(house_file: Path, asset_file: Path | None) -> tuple[list[tuple[str, ...]], int]:
+    """Return the types of the objects of every house in a file, and how many of them were guessed."""
+    types = []
+    num_guesses = 0
+    for result in read_procthor(house_file, "train", asset_file):
+        if isinstance(result, Scene):
+            types.append(result.types)
+        elif isinstance(result, ImportNote) and result.text.startswith("types of objects are guessed"):
+            num_guesses += result.number
+    return types, num_guesses
+
+
+@pytest.mark.parametrize(
+    ("house_set", "num_houses", "num_guessed"), [("100k", 30, 2821), ("ai2", 20, 1431), ("objaverse", 100, 0)]
+)
+def test_read_procthor_guesses_types_of_real_houses_without_the_database(house_set, num_houses, num_guessed):
+    house_file = require(PROCTHOR / f"houses_{house_set}.jsonl.gz")
+    types, num_guesses = types_and_guesses(house_file, PROCTHOR / "asset-database.json")
+    guessed_types, num_guesses_without = types_and_guesses(house_file, None)
+    assert len(types) == num_houses
+    assert guessed_types == types
+    assert (num_guesses, num_guesses_without) == (0, num_guessed)
+
+    # Most objects have a category.
+    num_known = 0
+    for house_types in guessed_types:
+        num_known += np.count_nonzero(np.array(category_ids(house_types, HOUSES.categories)) >= 0)
+    assert num_known > 17 * num_houses

@@ -17,7 +17,7 @@ from jaxnav.scenes.generate.sizes import typical_box
 
 
 @pytest.mark.parametrize(
-    ("fields", "expected"),
+    ("bowl_fields", "expected_type"),
     [
         ({"objectType": "ObjaTrashCan", "id": "Bowl|2|0", "assetId": "Bowl_1"}, "GarbageCan"),
         ({"objectType": "ObjaBucket", "id": "Bowl|2|0", "assetId": "Bowl_1"}, "ObjaBucket"),
@@ -28,26 +28,33 @@ from jaxnav.scenes.generate.sizes import typical_box
         ({"id": "2|0|1", "assetId": "Dining_Table_27_2"}, "DiningTable"),
     ],
 )
-def test_types_come_from_the_first_name_that_tells(scene_of, fields, expected):
-    scene = scene_of(changed(HOUSE, "objects", 0, "children", 0, BOWL | fields))
-    assert scene.types == ("DiningTable", expected)
+def test_read_procthor_takes_types_from_the_first_informative_name(house_scene, bowl_fields, expected_type):
+    scene = house_scene(changed(HOUSE, "objects", 0, "children", 0, BOWL | bowl_fields))
+    assert scene.types == ("DiningTable", expected_type)
 
 
-def test_sizes_come_from_the_asset_database_turned_or_are_typical(scene_of):
-    turned = scene_of(changed(HOUSE, "objects", 0, "rotation", "y", -30.0))
+def test_read_procthor_takes_sizes_from_the_asset_database_or_typical_ones(house_scene):
+    # Sizes of the database are turned with the object.
+    turned_house = changed(HOUSE, "objects", 0, "rotation", "y", -30.0)
+    turned_scene = house_scene(turned_house)
     # 1.0 x 0.6 m turned by 30 degrees: cos 30 + 0.6 sin 30 = 1.16603 by sin 30 + 0.6 cos 30 = 1.01962.
-    np.testing.assert_allclose(turned.boxes[0, 3:], [1.16603, 0.8, 1.01962], atol=1e-5)
-    typical = scene_of(changed(HOUSE, "objects", 0, "rotation", "y", -30.0), None)
-    assert typical.boxes[0].tolist() == [4.5, 0.4, 1.5, *typical_box("DiningTable")[:3]]
-    assert_scenes_equal(scene_of(HOUSE, ASSET_LISTS), scene_of(HOUSE))
-    assert_scenes_equal(scene_of(HOUSE, {"Bowl_1": {"boundingBox": None}}), scene_of(HOUSE, None))
+    np.testing.assert_allclose(turned_scene.boxes[0, 3:], [1.16603, 0.8, 1.01962], atol=1e-5)
+
+    # Typical sizes are not.
+    typical_scene = house_scene(turned_house, None)
+    assert typical_scene.boxes[0].tolist() == [4.5, 0.4, 1.5, *typical_box("DiningTable")[:3]]
+
+    # A database may list assets by type, or lack boxes.
+    assert_scenes_equal(house_scene(HOUSE, ASSET_LISTS), house_scene(HOUSE))
+    assert_scenes_equal(house_scene(HOUSE, {"Bowl_1": {"boundingBox": None}}), house_scene(HOUSE, None))
 
 
-L, C = "Countertop_L_10x8", "Countertop_C_8x6"
+L = "Countertop_L_10x8"
+C = "Countertop_C_8x6"
 
 
 @pytest.mark.parametrize(
-    ("asset", "yaw", "strips"),
+    ("asset_name", "yaw", "strip_boxes"),
     [
         # L at yaw 0, 3.0 x 2.4 m around (10, 20): along low z, 0.61 m deep, and along high x, the other 1.79 m.
         (L, 0.0, [(10.0, 19.105, 3.0, 0.61), (11.195, 20.305, 0.61, 1.79)]),
@@ -59,51 +66,62 @@ L, C = "Countertop_L_10x8", "Countertop_C_8x6"
         ("Countertop_I_8x6", 0.0, [(10.0, 20.0, 2.4, 1.8)]),
     ],
 )
-def test_counters_around_a_corner_are_strips(asset, yaw, strips):
-    size = {"L": [3.0, 0.9, 2.4], "C": [2.4, 0.9, 1.8], "I": [2.4, 0.9, 1.8]}[asset[11]]
+def test_read_objects_divides_corner_counters_into_strips(asset_name, yaw, strip_boxes):
+    # A counter with a pot on it, at a height of 0.9 m.
+    counter_size = {"L": [3.0, 0.9, 2.4], "C": [2.4, 0.9, 1.8], "I": [2.4, 0.9, 1.8]}[asset_name[11]]
     pot = item("Pot|2|1", "Pot_1", 10.0, 1.0, 19.3)
-    counter = item("CounterTop|2|0", asset, 10.0, 0.45, 20.0, yaw, children=[pot])
-    things = read_objects(JsonRecord("house", {"objects": [counter]}), {asset: AssetInfo("CounterTop", size)}).objects
-    boxes = np.array([thing.box for thing in things[:-1]])
-    np.testing.assert_allclose(boxes[:, [0, 2, 3, 5]], strips, atol=1e-9)
-    np.testing.assert_allclose(boxes[:, [1, 4]], [(0.45, 0.9)] * len(strips))
+    counter = item("CounterTop|2|0", asset_name, 10.0, 0.45, 20.0, yaw, children=[pot])
+    asset_database = {asset_name: AssetInfo("CounterTop", counter_size)}
+    house_things = read_objects(JsonRecord("house", {"objects": [counter]}), asset_database).objects
+
+    # The boxes are those of the strips.
+    boxes = np.array([thing.box for thing in house_things[:-1]])
+    np.testing.assert_allclose(boxes[:, [0, 2, 3, 5]], strip_boxes, atol=1e-9)
+    np.testing.assert_allclose(boxes[:, [1, 4]], [(0.45, 0.9)] * len(strip_boxes))
+
     # Further strips rest on the first, as the pot does.
-    assert [thing.parent for thing in things] == [-1] + [0] * len(strips)
-    assert [thing.type for thing in things] == ["CounterTop"] * len(strips) + ["Pot"]
+    assert [thing.parent for thing in house_things] == [-1] + [0] * len(strip_boxes)
+    assert [thing.type for thing in house_things] == ["CounterTop"] * len(strip_boxes) + ["Pot"]
 
 
-def test_all_that_stands_on_real_counters_stands_on_their_strips():
+def test_read_objects_puts_items_of_real_counters_on_their_strips():
     assets = read_assets(require(PROCTHOR / "asset-database.json"))
-    corners, on_them = 0, 0
-    for file in ("100k", "ai2", "objaverse"):
-        lines = gzip.decompress((PROCTHOR / f"houses_{file}.jsonl.gz").read_bytes()).splitlines()
-        for things in (read_objects(JsonRecord("house", json.loads(line)), assets).objects for line in lines):
-            boxes = np.array([thing.box for thing in things])[:, [0, 2, 3, 5]]
-            parents = np.array([thing.parent for thing in things])
-            counters = np.array([thing.type == "CounterTop" for thing in things])
-            for first in set(parents[counters & (parents >= 0)].tolist()):
-                strips = boxes[[first, *np.flatnonzero(counters & (parents == first))]]
-                items = boxes[~counters & (parents == first)]
-                away = np.abs(items[:, None, :2] - strips[:, :2]) - strips[:, 2:] / 2
-                assert (away.max(axis=2).min(axis=1) <= 0).all()
-                corners, on_them = corners + 1, on_them + len(items)
-    assert (corners, on_them) == (83, 1093)
+    num_corner_counters = 0
+    num_items = 0
+    for house_set in ("100k", "ai2", "objaverse"):
+        for line in gzip.decompress((PROCTHOR / f"houses_{house_set}.jsonl.gz").read_bytes()).splitlines():
+            house_things = read_objects(JsonRecord("house", json.loads(line)), assets).objects
+            boxes = np.array([thing.box for thing in house_things])[:, [0, 2, 3, 5]]
+            parents = np.array([thing.parent for thing in house_things])
+            is_counter = np.array([thing.type == "CounterTop" for thing in house_things])
+
+            # A counter around a corner is the parent of its further strips.
+            for first_strip in set(parents[is_counter & (parents >= 0)].tolist()):
+                on_counter = parents == first_strip
+                strip_boxes = boxes[[first_strip, *np.flatnonzero(is_counter & on_counter)]]
+                item_boxes = boxes[~is_counter & on_counter]
+                distance_outside = np.abs(item_boxes[:, None, :2] - strip_boxes[:, :2]) - strip_boxes[:, 2:] / 2
+                assert (distance_outside.max(axis=2).min(axis=1) <= 0).all()
+                num_corner_counters += 1
+                num_items += len(item_boxes)
+    assert (num_corner_counters, num_items) == (83, 1093)
 
 
-def test_the_name_of_a_counter_tells_its_size_in_feet():
+def test_read_objects_reads_counter_sizes_in_feet_from_names():
     counter = item("CounterTop|2|0", "Countertop_Island_10x3", 10.0, 0.47, 20.0)
-    objects = read_objects(JsonRecord("house", {"objects": [counter]}), {})
+    house_objects = read_objects(JsonRecord("house", {"objects": [counter]}), {})
     # 10 and 3 feet of 0.305 m.
-    assert objects.objects[0].box == pytest.approx((10.0, 0.47, 20.0, 3.05, 0.94, 0.915))
-    assert (objects.num_guessed_types, objects.num_guessed_sizes) == (0, 0)
+    assert house_objects.objects[0].box == pytest.approx((10.0, 0.47, 20.0, 3.05, 0.94, 0.915))
+    assert (house_objects.num_guessed_types, house_objects.num_guessed_sizes) == (0, 0)
 
 
-def test_children_follow_their_parents(scene_of):
+def test_read_procthor_lists_children_after_their_parents(house_scene):
     book = item("Book|3|3", "Book_1", 4.5, 0.9, 1.5)
     chair = item("Chair|3|2", "Chair_1", 5.5, 0.5, 2.5, children=[book])
     table = TABLE | {"children": [BOWL | {"children": [book]}, chair]}
-    scene = scene_of(changed(HOUSE, "objects", [table, book]))
+    scene = house_scene(changed(HOUSE, "objects", [table, book]))
     assert scene.types == ("DiningTable", "Bowl", "Book", "Chair", "Book", "Book")
     assert scene.parents.tolist() == [-1, 0, 1, 0, 3, -1]
+
     # A typical chair is 0.56 m wide, so the corner x 5.22-5.78, z 2.22-2.78 is taken although the chair is a child.
     assert points_of(scene, scene.reach) & block(5.25, 5.75, 2.25, 2.75) == set()
