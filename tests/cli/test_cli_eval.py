@@ -44,7 +44,7 @@ def _episodes(report):
 
 
 @pytest.mark.slow
-def test_the_report_holds_all_rows_and_differences(evaluated):
+def test_eval_report_holds_all_rows_and_differences(evaluated):
     report = json.loads(evaluated.read_text())
     assert list(report) == ["run", "rows", "differences", "notes", "compilations", "versions", "format"]
     assert report["run"]["method"] == "org"
@@ -71,7 +71,7 @@ def test_the_report_holds_all_rows_and_differences(evaluated):
 
 
 @pytest.mark.slow
-def test_what_limits_the_table_is_told_below_it(evaluated):
+def test_eval_prints_the_notes_below_the_table(evaluated):
     notes = json.loads(evaluated.read_text())["notes"]
     assert any("are told the type of the room by their prior" in note for note in notes)
     # Four updates are no training.
@@ -81,7 +81,7 @@ def test_what_limits_the_table_is_told_below_it(evaluated):
 
 
 @pytest.mark.slow
-def test_the_episodes_are_written_row_by_row(evaluated):
+def test_eval_episode_file_averages_to_the_report(evaluated):
     rows = _episodes(evaluated)
     assert len(rows) == ROWS * SEEDS * 20
     report = json.loads(evaluated.read_text())
@@ -110,21 +110,21 @@ def test_the_episodes_are_written_row_by_row(evaluated):
         (["--seed", "-1"], "--seed -1: give a whole number from 0"),
     ],
 )
-def test_bad_evaluations_are_refused_and_write_nothing(run_dir, capsys, options, problem):
+def test_eval_refuses_bad_options_and_writes_nothing(run_dir, capsys, options, problem):
     before = contents(run_dir)
     assert evaluate(run_dir, *options) == 2
     assert problem in refusal(capsys)
     assert contents(run_dir) == before
 
 
-def test_a_directory_without_a_run_is_refused(tmp_path, capsys):
+def test_eval_refuses_a_directory_without_a_run(tmp_path, capsys):
     for folder in (tmp_path, tmp_path / "none"):
         assert evaluate(folder) == 2
         assert f"{folder}: holds no run (config.json is missing); train one there first" in refusal(capsys)
     assert not (tmp_path / "none").exists()
 
 
-def test_a_run_that_is_not_finished_is_refused(tmp_path, run_dir, capsys):
+def test_eval_refuses_an_unfinished_run(tmp_path, run_dir, capsys):
     shutil.copy(run_dir / "config.json", tmp_path)
     assert evaluate(tmp_path) == 2
     assert f"{tmp_path}/policies/baseline-0: is missing, so training has not finished" in refusal(capsys)
@@ -136,7 +136,7 @@ def test_a_run_that_is_not_finished_is_refused(tmp_path, run_dir, capsys):
     assert not list(tmp_path.glob("eval*"))
 
 
-def test_a_run_whose_method_is_not_there_is_refused(tmp_path, run_dir, capsys):
+def test_eval_refuses_a_run_of_an_unknown_method(tmp_path, run_dir, capsys):
     run = shutil.copytree(run_dir, tmp_path / "run")
     for name, problem in {
         "no_such_package:MINE": "cannot be imported (ModuleNotFoundError: No module named 'no_such_package'); inst",
@@ -150,7 +150,7 @@ def test_a_run_whose_method_is_not_there_is_refused(tmp_path, run_dir, capsys):
 
 
 @pytest.mark.slow
-def test_evaluations_are_equal_byte_for_byte(run_dir, evaluated, tmp_path):
+def test_eval_is_reproducible_byte_for_byte(run_dir, evaluated, tmp_path):
     for seed, equal in ((0, True), (1, False)):
         again = tmp_path / f"{seed}.json"
         assert evaluate(run_dir, "--episodes", 18, "--epsilon", 0, 0.5, "--json", again, "--seed", seed) == 0
@@ -159,7 +159,7 @@ def test_evaluations_are_equal_byte_for_byte(run_dir, evaluated, tmp_path):
         assert (episodes[0] == episodes[1]) == equal
 
 
-def test_damaged_files_are_named(tmp_path, run_dir, capsys):
+def test_eval_names_damaged_files(tmp_path, run_dir, capsys):
     scenes = tmp_path / "scenes.jsonl.gz"
     scenes.write_bytes(b"not compressed")
     assert evaluate(run_dir, "--scenes", scenes) == 2
@@ -171,7 +171,7 @@ def test_damaged_files_are_named(tmp_path, run_dir, capsys):
 
 
 @pytest.mark.slow
-def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys):
+def test_eval_of_a_shift_is_named_in_file_and_report(run_dir, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(run_dir, run)
     assert evaluate(run, "--episodes", 4, "--shift", 1) == 0
@@ -185,7 +185,7 @@ def test_a_shift_is_evaluated_beside_the_run_and_named(run_dir, tmp_path, capsys
 
 
 @pytest.mark.slow
-def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
+def test_eval_shifts_the_scenes_of_a_file(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
     shutil.copytree(run_dir, run)
     with resigned(run / "config.json") as config:
@@ -205,7 +205,7 @@ def test_a_shift_of_a_scene_file(run_dir, tmp_path, capsys):
     assert "layout shift: seed 0, shift 1.5; give" in refusal(capsys)
 
 
-def test_a_world_and_a_file_of_its_name_have_reports_of_their_own():
+def test_eval_report_names_differ_for_a_world_and_a_file():
     run, file = Path("run"), Path("elsewhere/rooms.jsonl.gz")
     configs = [EvalConfig(run), EvalConfig(run, world="rooms"), EvalConfig(run, scenes=file)]
     names = [str(_find_target(config)) for config in configs]
@@ -213,7 +213,7 @@ def test_a_world_and_a_file_of_its_name_have_reports_of_their_own():
 
 
 @pytest.mark.slow
-def test_a_policy_of_a_file_is_evaluated_in_a_generated_world(run_dir, tmp_path, capsys):
+def test_eval_of_a_run_on_a_file_accepts_a_generated_world(run_dir, tmp_path, capsys):
     run, file = tmp_path / "run", tmp_path / "a.jsonl.gz"
     shutil.copytree(run_dir, run)
     assert evaluate(run, "--episodes", 8) == 0  # in the run's own rooms
@@ -236,7 +236,7 @@ def test_a_policy_of_a_file_is_evaluated_in_a_generated_world(run_dir, tmp_path,
     assert f"--scenes, --world: both are given ({file}, rooms); leave one out" in refusal(capsys)
 
 
-def test_an_export_for_another_task_is_refused(run_dir, tmp_path, capsys):
+def test_eval_refuses_an_export_of_another_task(run_dir, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(run_dir, run)
     with resigned(run / "config.json") as config:

@@ -20,7 +20,7 @@ def until(controller, words, shown=""):
 
 
 @pytest.mark.slow
-def test_an_episode_is_played_in_a_terminal():
+def test_play_runs_an_episode_in_a_terminal():
     controller, terminal = pty.openpty()
     command = [sys.executable, "-m", "jaxnav", "play", "--policy", "rooms-org", "--goal", "Laptop", "--seed", "2"]
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "90", "LINES": "40"}
@@ -41,7 +41,7 @@ def test_an_episode_is_played_in_a_terminal():
         process.wait()
 
 
-def test_without_a_terminal_it_is_refused_at_once(capsys, monkeypatch):
+def test_play_is_refused_without_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", open(os.devnull))  # noqa: SIM115
     assert main(["play"]) == 2
     assert "play: the input is no terminal; start it in one" in " ".join(capsys.readouterr().err.split())

@@ -26,7 +26,7 @@ def made(monkeypatch):
     return calls
 
 
-def test_options_are_handed_on_and_the_page_is_written(run_dir, tmp_path, made):
+def test_report_command_passes_options_and_writes_the_page(run_dir, tmp_path, made):
     out = tmp_path / "new" / "page.html"
     assert report(run_dir, "--beside", run_dir, "--split", "test", "--shift", 0.5, "--replays", 6, "--out", out) == 0
     assert out.read_text() == "a page"
@@ -36,14 +36,14 @@ def test_options_are_handed_on_and_the_page_is_written(run_dir, tmp_path, made):
     assert options.episodes == 1000
 
 
-def test_the_page_is_kept_with_the_run(run_dir, tmp_path, made):
+def test_report_page_is_written_to_the_run_directory(run_dir, tmp_path, made):
     run = shutil.copytree(run_dir, tmp_path / "run")
     assert report(run) == 0
     assert (run / "report.html").read_text() == "a page"
     assert made[0][1] is None
 
 
-def test_what_is_no_finished_run_is_refused(run_dir, tmp_path, capsys):
+def test_report_refuses_folders_without_a_finished_run(run_dir, tmp_path, capsys):
     empty, unfinished, foreign = (tmp_path / name for name in ("empty", "unfinished", "foreign"))
     for folder in (empty, unfinished, foreign):
         folder.mkdir()

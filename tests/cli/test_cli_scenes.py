@@ -20,7 +20,7 @@ def run(*arguments):
 
 
 @pytest.mark.parametrize(("form", "world"), [(form, "rooms" if "a" in form.name[:2] else "houses") for form in FORMATS])
-def test_every_format_becomes_an_environment(tmp_path, capsys, form, world):
+def test_import_makes_an_environment_of_every_format(tmp_path, capsys, form, world):
     source, target = form.write(tmp_path, form.content), tmp_path / "new" / "scenes.jsonl.gz"
     options = [tmp_path / option if option.endswith(".pbz2") else option for option in form.options]
     code = run(form.name, source, target, "--split", "val", "--categories", "Chair", "Bed", "Fridge", "Sink",
@@ -38,7 +38,7 @@ def test_every_format_becomes_an_environment(tmp_path, capsys, form, world):
         check_environment(*make("houses", "val", target, Task(("DiningTable", "Bowl"), rules=rules)), num_steps=8)
 
 
-def test_patterns_divide_a_file_into_splits(tmp_path, capsys):
+def test_import_divides_a_file_into_splits_by_pattern(tmp_path, capsys):
     rooms = [METADATA | {"sceneName": f"FloorPlan{number}"} for number in (1, 21, 22, 23)]
     source = tmp_path / "rooms.jsonl"
     source.write_text("\n".join(map(json.dumps, rooms)))
@@ -50,7 +50,7 @@ def test_patterns_divide_a_file_into_splits(tmp_path, capsys):
     assert "4 scenes imported, 0 refused" in capsys.readouterr().err
 
 
-def test_refused_scenes_are_told_and_counted_and_the_others_kept(tmp_path, capsys):
+def test_import_counts_refused_scenes_and_keeps_the_rest(tmp_path, capsys):
     nowhere = HOUSE | {"doors": [door("wall|9|0.00|0.00|1.00|0.00", 1.0, 2.0)]}
     source, target = tmp_path / "houses.jsonl.gz", tmp_path / "scenes.jsonl.gz"
     source.write_bytes(gzip.compress("\n".join(json.dumps(house) for house in (HOUSE, nowhere)).encode()))
@@ -66,7 +66,7 @@ def test_refused_scenes_are_told_and_counted_and_the_others_kept(tmp_path, capsy
     assert len(read_scenes(target)) == 1
 
 
-def test_what_is_not_connected_is_counted(tmp_path, capsys):
+def test_import_counts_unconnected_cells(tmp_path, capsys):
     shut = HOUSE | {"doors": []}
     source, target = tmp_path / "houses.jsonl", tmp_path / "scenes.jsonl.gz"
     source.write_text("\n".join(json.dumps(house) for house in (HOUSE, shut)))
@@ -85,7 +85,7 @@ def test_what_is_not_connected_is_counted(tmp_path, capsys):
     assert "largest" not in output
 
 
-def test_homes_are_kept_by_room_type_and_size(tmp_path, capsys):
+def test_import_selects_homes_by_room_type_and_size(tmp_path, capsys):
     room = build(
         ("Kitchen", [(0, 0), (0, 3), (3, 3), (3, 0)]), objects=(item("2|0", "Dining_Table_27_1", 1.5, 0.4, 1),)
     )
@@ -108,7 +108,7 @@ def test_homes_are_kept_by_room_type_and_size(tmp_path, capsys):
         (["--room-types", "bedroom"], "--room-types bedroom: leaves no scene; there are house\n"),
     ],
 )
-def test_a_choice_that_leaves_no_home_is_refused(tmp_path, capsys, options, problem):
+def test_import_refuses_a_selection_without_scenes(tmp_path, capsys, options, problem):
     source, target = tmp_path / "houses.jsonl", tmp_path / "scenes.jsonl.gz"
     source.write_text(json.dumps(HOUSE))
     assert run("procthor", source, target, *options) == 2
@@ -116,7 +116,7 @@ def test_a_choice_that_leaves_no_home_is_refused(tmp_path, capsys, options, prob
     assert not target.exists()
 
 
-def test_many_unknown_types_take_one_line(tmp_path, capsys):
+def test_import_summarises_unknown_types_in_one_line(tmp_path, capsys):
     things = [METADATA["objects"][1] | {"objectId": f"T{i}", "objectType": f"T{i}"} for i in range(9)]
     source = tmp_path / "room.json"
     source.write_text(json.dumps(METADATA | {"objects": METADATA["objects"] + things + things[:2]}))
@@ -126,7 +126,7 @@ def test_many_unknown_types_take_one_line(tmp_path, capsys):
     assert line.endswith(": 13, of them T0 x 2, T1 x 2, DiningTable x 1, Drawer x 1, T2 x 1 and 6 more")
 
 
-def test_two_scenes_of_one_name_are_one_too_many(tmp_path, capsys):
+def test_import_refuses_a_repeated_scene_name(tmp_path, capsys):
     source, target = tmp_path / "rooms.jsonl", tmp_path / "scenes.jsonl.gz"
     source.write_text(f"{json.dumps(METADATA)}\n{json.dumps(METADATA)}")
     assert run("ai2thor", source, target) == 0
@@ -144,7 +144,7 @@ def test_two_scenes_of_one_name_are_one_too_many(tmp_path, capsys):
         (["room.json", "room.json/out.jsonl.gz"], "cannot be written"),
     ],
 )
-def test_what_cannot_be_imported_leaves_nothing(tmp_path, monkeypatch, capsys, arguments, problem):
+def test_failed_import_writes_nothing(tmp_path, monkeypatch, capsys, arguments, problem):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "room.json").write_text(json.dumps(METADATA))
     (tmp_path / "cut.json.gz").write_bytes(gzip.compress(json.dumps(METADATA).encode())[:-9])
@@ -156,7 +156,7 @@ def test_what_cannot_be_imported_leaves_nothing(tmp_path, monkeypatch, capsys, a
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_a_simulator_that_is_not_there_is_named(tmp_path, capsys):
+def test_import_names_the_missing_simulator(tmp_path, capsys):
     assert run("ai2thor", "FloorPlan1", tmp_path / "o.jsonl.gz", "--from-controller") == 2
     assert "pip install ai2thor" in refusal(capsys)
 
@@ -173,13 +173,13 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, capsys):
         ("ai2thor", ["--val", "FloorPlan9?"], "pattern 'FloorPlan9?': fits no scene"),
     ],
 )
-def test_options_without_effect_are_refused(tmp_path, capsys, form, option, problem):
+def test_import_refuses_options_of_other_formats(tmp_path, capsys, form, option, problem):
     (tmp_path / "room.json").write_text(json.dumps(METADATA))
     assert run(form, tmp_path / "room.json", tmp_path / "o.jsonl.gz", *option) == 2
     assert problem in refusal(capsys)
 
 
-def test_bad_lines_of_a_scene_file_leave_the_others(tmp_path, capsys):
+def test_import_skips_bad_lines_of_a_scene_file(tmp_path, capsys):
     (tmp_path / "room.json").write_text(json.dumps(METADATA))
     good, mixed = tmp_path / "good.jsonl.gz", tmp_path / "mixed.jsonl.gz"
     assert run("ai2thor", tmp_path / "room.json", good) == 0
@@ -194,7 +194,7 @@ def test_bad_lines_of_a_scene_file_leave_the_others(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_mutated_files_never_crash_nor_leave_half_a_file(form, capsys):
+def test_import_of_mutated_files_neither_crashes_nor_leaves_partial_files(form, capsys):
     codes, _ = fuzz(form, 40)
     assert codes[CRASHED] == 0
     assert min(codes[0], codes[2]) >= 2

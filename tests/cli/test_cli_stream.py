@@ -53,7 +53,7 @@ def world(cache):
     return compile_training_world(config, Console(file=io.StringIO()))
 
 
-def test_all_banks_have_one_shape_on_the_device(world):
+def test_streamed_banks_are_padded_to_one_shape(world):
     assert len(world.banks) == 3
     shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), world.make_env_params(i)) for i in range(3)]
     assert shapes[0] == shapes[1] == shapes[2]
@@ -64,7 +64,7 @@ def test_all_banks_have_one_shape_on_the_device(world):
         assert not tables.rows[len(bank.rows) :].any()
 
 
-def test_every_pass_meets_every_bank_in_an_order_of_its_own(world):
+def test_draw_bank_order_visits_every_bank_once_per_pass(world):
     order, other = draw_bank_order(world, 1, 30), draw_bank_order(world, 2, 30)
     passes = [tuple(order[start : start + 3]) for start in range(0, 30, 3)]
     assert all(sorted(one) == [0, 1, 2] for one in passes)
@@ -73,7 +73,7 @@ def test_every_pass_meets_every_bank_in_an_order_of_its_own(world):
     assert draw_bank_order(world, 1, 7) == order[:7]
 
 
-def test_banks_are_read_one_ahead(world, monkeypatch):
+def test_prefetch_env_params_reads_one_bank_ahead(world, monkeypatch):
     asked, params = [], type(world).make_env_params
     monkeypatch.setattr(type(world), "make_env_params", lambda self, bank: asked.append(bank) or params(self, bank))
     order = [2, 0, 0, 1]
@@ -86,7 +86,7 @@ def test_banks_are_read_one_ahead(world, monkeypatch):
 
 
 @pytest.mark.slow
-def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
+def test_trainer_restart_draws_new_episodes_and_keeps_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
     ppo = PPOConfig(num_envs=32, rollout=4, minibatches=2)
     config = RunConfig(ppo=ppo, seeds=1, sizes=tiny.SIZES, worlds=WorldConfig(near_starts=0.5))
@@ -105,7 +105,7 @@ def test_new_scenes_bring_new_episodes_and_keep_the_learner(world):
 
 
 @pytest.mark.slow
-def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache, tmp_path, monkeypatch, capsys):
+def test_streamed_run_resumes_bit_for_bit(finished, config_file, cache, tmp_path, monkeypatch, capsys):
     """8 updates in chunks of 2 go through four turns of three shards; the second half comes after a stop."""
     stopped, calls, whole = tmp_path / "stopped", [], Trainer.train
 
@@ -128,7 +128,7 @@ def test_a_streamed_run_resumes_to_the_same_numbers(finished, config_file, cache
 
 
 @pytest.mark.slow
-def test_streamed_evaluation_is_one_compilation_and_knows_all_scenes(finished, tmp_path):
+def test_streamed_evaluation_compiles_once_and_visits_all_scenes(finished, tmp_path):
     target = tmp_path / "train.json"
     assert evaluate(finished, "--split", "train", "--episodes", 24, "--json", target) == 0
     report = json.loads(target.read_text())
@@ -137,7 +137,7 @@ def test_streamed_evaluation_is_one_compilation_and_knows_all_scenes(finished, t
     assert scenes == {f"train-{room}-{i:03d}" for i, room in enumerate((2 * ROOM_TYPES + ROOM_TYPES)[:9])}
 
 
-def test_shards_hold_what_memory_would(world, cache):
+def test_sharded_world_equals_the_world_in_memory(world, cache):
     whole = RunConfig(worlds=WorldConfig(num_train=9), cache=cache)
     memory = compile_training_world(whole, Console(file=io.StringIO()))
     assert len(memory.banks) == 1

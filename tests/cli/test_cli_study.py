@@ -48,14 +48,14 @@ def study(*options) -> int:
 # Help and refusals
 
 
-def test_help_lists_experiments_and_settings(capsys):
+def test_study_help_lists_experiments_and_settings(capsys):
     with pytest.raises(SystemExit, match="0"):
         study("--help")
     words = capsys.readouterr().out.replace(",", " ").split()
     assert {*EXPERIMENTS, "--run", "--without", "--split", "--episodes"} <= set(words)
 
 
-def test_unknown_experiments_are_refused_with_the_known_ones(capsys):
+def test_study_lists_the_experiments_for_an_unknown_one(capsys):
     assert study("studdy") == 2
     error = refusal(capsys)
     for name in ("studdy", *EXPERIMENTS):
@@ -81,7 +81,7 @@ def test_unknown_experiments_are_refused_with_the_known_ones(capsys):
         (["--without", "nowhere"], "without"),
     ],
 )
-def test_bad_settings_are_refused_in_one_line_and_write_nothing(
+def test_study_refuses_bad_settings_in_one_line_and_writes_nothing(
     experiment, tmp_path, monkeypatch, capsys, options, named
 ):
     monkeypatch.chdir(tmp_path)
@@ -96,7 +96,7 @@ def test_bad_settings_are_refused_in_one_line_and_write_nothing(
 
 
 @pytest.mark.parametrize(("option", "value"), [("--split", "all"), ("--worlds", "[1"), ("--agents", "{near: 1}")])
-def test_options_of_another_kind_are_refused_by_name(experiment, capsys, option, value):
+def test_study_names_options_of_wrong_type(experiment, capsys, option, value):
     with pytest.raises(SystemExit, match="2"):
         study(experiment, option, value)
     assert option in capsys.readouterr().err
@@ -106,7 +106,7 @@ def test_options_of_another_kind_are_refused_by_name(experiment, capsys, option,
     ("text", "named"),
     [("shifts: [0.0", "line"), ("shfits: [0.0]", "shfits"), ("shifts: 0.0", "shifts"), ("agents: {a: 1}", "agents")],
 )
-def test_bad_files_are_refused_by_file_and_key(tmp_path, capsys, text, named):
+def test_study_names_file_and_key_of_a_bad_config(tmp_path, capsys, text, named):
     path = tmp_path / "bad.yaml"
     path.write_text(text)
     assert study(path) == 2
@@ -116,7 +116,7 @@ def test_bad_files_are_refused_by_file_and_key(tmp_path, capsys, text, named):
 
 
 @pytest.mark.parametrize("name", ["account", "mixture", "instrument", "compare"])
-def test_former_commands_name_the_experiment_that_replaces_them(capsys, name):
+def test_former_commands_name_their_replacement(capsys, name):
     assert commands.main([name, "run"]) == 2
     error = refusal(capsys)
     replacement = error.partition("jaxnav study ")[2].split()[0]
@@ -127,7 +127,7 @@ def test_former_commands_name_the_experiment_that_replaces_them(capsys, name):
 # Finished runs
 
 
-def test_results_of_a_finished_run_are_printed_and_kept_with_it(experiment, drawn_run, capsys):
+def test_study_of_a_run_prints_and_stores_the_results(experiment, drawn_run, capsys):
     run_dir = drawn_run.config.run_dir
     assert study(experiment, "--run", run_dir) == 0
     printed = capsys.readouterr().out
@@ -139,7 +139,7 @@ def test_results_of_a_finished_run_are_printed_and_kept_with_it(experiment, draw
 
 
 @pytest.mark.slow
-def test_the_account_of_a_finished_run_is_its_lead_over_another(drawn_run, capsys):
+def test_study_account_of_a_run_over_itself_is_zero_for_the_baseline(drawn_run, capsys):
     # The run itself stands in for agents without experience, so that its baseline has no lead.
     run_dir = drawn_run.config.run_dir
     assert study("account", "--run", run_dir, "--without", run_dir, "--episodes", 24) == 0

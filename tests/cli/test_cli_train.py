@@ -31,7 +31,7 @@ def run_dir(tmp_path_factory):
 # Training
 
 
-def test_a_run_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
+def test_train_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
     assert {folder.name for folder in (run_dir / "policies").iterdir()} == POLICIES
     assert {folder.name for folder in (run_dir / "checkpoints").iterdir()} == {"2", "4"}
     rows = read_log_rows(run_dir / "metrics.jsonl")
@@ -45,7 +45,7 @@ def test_a_run_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
         assert row["skipped_steps"] == 0
 
 
-def test_policies_say_how_they_are_used(run_dir):
+def test_exported_policies_record_method_estimator_and_prior(run_dir):
     loaded = {name: load_params(run_dir / "policies" / name) for name in POLICIES}
     for name, (tensors, spec) in loaded.items():
         assert spec["method"] == "org"
@@ -70,7 +70,7 @@ def test_policies_say_how_they_are_used(run_dir):
 
 
 @pytest.mark.slow
-def test_a_finished_run_is_left_as_it_is(run_dir, config_file, capsys):
+def test_train_leaves_a_finished_run_directory_unchanged(run_dir, config_file, capsys):
     before = contents(run_dir)
     assert train(config_file, run_dir) == 0
     assert "resumed after update 4 of 4" in capsys.readouterr().err
@@ -80,7 +80,7 @@ def test_a_finished_run_is_left_as_it_is(run_dir, config_file, capsys):
 # Refusals of training
 
 
-def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, capsys):
+def test_train_refuses_another_config_in_the_same_directory(run_dir, config_file, capsys):
     before = contents(run_dir)
     assert train(config_file, run_dir, "--seeds", 3, "--ppo.gamma", 0.5) == 2
     error = refusal(capsys)
@@ -145,7 +145,7 @@ def test_another_config_in_the_same_directory_is_refused(run_dir, config_file, c
         ("seeds: 1\nseeds: 2", "line 2: not valid YAML (seeds is given twice)"),
     ],
 )
-def test_bad_settings_are_refused_before_anything_is_made(tmp_path, capsys, line, problem):
+def test_train_refuses_bad_settings_before_writing(tmp_path, capsys, line, problem):
     file = tmp_path / "bad.yaml"
     file.write_text(line)
     assert train(file, tmp_path / "run", "--cache", tmp_path / "cache") == 2
@@ -173,7 +173,7 @@ WIDTH, RAISING = Method(Width), Method(Raising)
 
 
 @pytest.mark.parametrize(("name", "reason"), [("WIDTH", "TypeError: "), ("RAISING", "RuntimeError: first line); mend")])
-def test_methods_that_break_their_contract_are_refused(tmp_path, monkeypatch, capsys, name, reason):
+def test_train_refuses_methods_that_fail_check_method(tmp_path, monkeypatch, capsys, name, reason):
     (tmp_path / "broken_method.py").write_text(BROKEN)
     monkeypatch.syspath_prepend(tmp_path)
     options = ["--method", f"broken_method:{name}", "--run-dir", str(tmp_path / "run")]
@@ -199,7 +199,7 @@ WHOLE = gzip.compress(b'{"name": "a"}\n' * 9, mtime=0)
         (gzip.compress(b"", mtime=0), "holds no scene"),
     ],
 )
-def test_bad_scene_files_are_refused_by_name(tmp_path, capsys, data, problem):
+def test_train_names_bad_scene_files(tmp_path, capsys, data, problem):
     file = tmp_path / "scenes.jsonl.gz"
     if data is not None:
         file.write_bytes(data)
@@ -210,7 +210,7 @@ def test_bad_scene_files_are_refused_by_name(tmp_path, capsys, data, problem):
     assert not (tmp_path / "new").exists()
 
 
-def test_directories_that_are_something_else_are_refused(tmp_path, config_file, capsys):
+def test_train_refuses_directories_that_hold_no_run(tmp_path, config_file, capsys):
     file = tmp_path / "file"
     file.write_text("mine")
     assert train(config_file, file) == 2
@@ -220,7 +220,7 @@ def test_directories_that_are_something_else_are_refused(tmp_path, config_file, 
     assert contents(tmp_path) == {"file": b"mine"}
 
 
-def test_a_damaged_config_is_named(tmp_path, run_dir, config_file, capsys):
+def test_train_names_a_damaged_config_file(tmp_path, run_dir, config_file, capsys):
     text = (run_dir / "config.json").read_text()
     (tmp_path / "config.json").write_text(text[: len(text) // 2])
     assert train(config_file, tmp_path) == 2
@@ -228,7 +228,7 @@ def test_a_damaged_config_is_named(tmp_path, run_dir, config_file, capsys):
 
 
 @pytest.mark.slow
-def test_a_vocabulary_of_ones_own_is_trained_resumed_and_evaluated(tmp_path, config_file, capsys):
+def test_custom_categories_are_trained_resumed_and_evaluated(tmp_path, config_file, capsys):
     """Three categories, two of them goals, in a run that is then found finished and evaluated."""
     run_dir = tmp_path / "own"
     options = ("--seeds", 1, "--total-steps", 256, "--worlds.categories", "Chair", "Sink", "LightSwitch",
@@ -243,7 +243,7 @@ def test_a_vocabulary_of_ones_own_is_trained_resumed_and_evaluated(tmp_path, con
         assert {row["goal"] for row in csv.DictReader(file)} == {"Sink", "LightSwitch"}
 
 
-def test_room_types_without_training_scenes_get_the_prior_of_all_together():
+def test_layout_priors_pool_rooms_without_training_scenes():
     counts = np.zeros((3, 2, 2), np.float32)
     counts[0], counts[2] = [[5, 3], [3, 4]], [[2, 1], [1, 2]]
     # By the letter of the paper the prior is the counts and one: 3 + 1, 3 + 1 + 1, 1 + 1.

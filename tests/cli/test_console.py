@@ -32,7 +32,7 @@ def folder_of_a_command():
     return seen[0]
 
 
-def test_compiled_programs_are_kept_in_the_cache_of_the_user(home, capsys):
+def test_compilation_cache_is_in_the_user_cache_folder(home, capsys):
     folder = folder_of_a_command()
     assert folder == str(home / ".cache" / "jaxnav" / "xla")
     assert Path(folder).is_dir()
@@ -40,19 +40,19 @@ def test_compiled_programs_are_kept_in_the_cache_of_the_user(home, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_another_folder_is_respected(home):
+def test_compilation_cache_respects_a_configured_folder(home):
     jax.config.update("jax_compilation_cache_dir", str(home / "other"))
     assert folder_of_a_command() == str(home / "other")
     assert contents(home) == {}
 
 
-def test_nothing_is_kept_where_it_is_turned_off(home):
+def test_disabled_compilation_cache_writes_nothing(home):
     jax.config.update("jax_enable_compilation_cache", False)
     assert folder_of_a_command() is None
     assert not any(home.iterdir())
 
 
-def test_a_folder_that_cannot_be_made_is_told_in_a_line(home, capsys):
+def test_console_reports_a_cache_folder_that_cannot_be_made(home, capsys):
     (home / ".cache").write_text("a file")
     assert folder_of_a_command() is None
     error = capsys.readouterr().err
@@ -60,7 +60,7 @@ def test_a_folder_that_cannot_be_made_is_told_in_a_line(home, capsys):
     assert error.count("\n") == 1
 
 
-def test_a_folder_that_cannot_be_written_is_told_in_a_line(home, capsys, monkeypatch):
+def test_console_reports_a_cache_folder_that_cannot_be_written(home, capsys, monkeypatch):
     monkeypatch.setattr("os.access", lambda *_: False)
     assert folder_of_a_command() is None
     assert str(home / ".cache" / "jaxnav" / "xla") in capsys.readouterr().err
@@ -81,15 +81,15 @@ def trims(monkeypatch, library, seconds):
 
 
 @pytest.mark.parametrize(("seconds", "expected"), [(2.0, [0]), (0.1, [])])
-def test_a_long_compilation_gives_its_memory_back(monkeypatch, seconds, expected):
+def test_long_compilation_trims_the_heap(monkeypatch, seconds, expected):
     assert trims(monkeypatch, ["malloc_trim"], seconds) == expected
 
 
-def test_another_c_library_is_left_alone(monkeypatch):
+def test_heap_is_not_trimmed_without_glibc(monkeypatch):
     assert trims(monkeypatch, [], 2.0) == []
 
 
-def test_jax_tells_of_its_compilations(monkeypatch):
+def test_jax_reports_compilations_to_listeners(monkeypatch):
     calls = []
     monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=calls.append))
     monkeypatch.setattr(console, "_LONG_COMPILATION_S", 0.0)

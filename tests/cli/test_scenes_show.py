@@ -30,7 +30,7 @@ def show(*arguments):
     return scenes_command.main(["show", *map(str, arguments)])
 
 
-def test_the_file_is_a_png_of_the_figures_size(file, tmp_path, capsys):
+def test_scenes_show_writes_a_png_of_the_figure_size(file, tmp_path, capsys):
     out = tmp_path / "new" / "hall.png"
     assert show(file, "--scene", "drawn", "--pose", 0, 1.5, -90, "--out", out) == 0
     assert str(out) in capsys.readouterr().err.replace("\n", "")
@@ -41,7 +41,7 @@ def test_the_file_is_a_png_of_the_figures_size(file, tmp_path, capsys):
     assert [path.name for path in out.parent.iterdir()] == ["hall.png"]
 
 
-def test_scenes_by_name_by_number_and_the_first(file, tmp_path, monkeypatch, capsys):
+def test_scenes_show_selects_by_name_number_or_the_first(file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pictures = {}
     for options in ((), ("--scene", "a/b $x"), ("--index", 1), ("--split", "val")):
@@ -57,7 +57,7 @@ def test_scenes_by_name_by_number_and_the_first(file, tmp_path, monkeypatch, cap
     assert (tmp_path / "test-apartment-03-1.png").exists()
 
 
-def test_what_is_refused(file, tmp_path, capsys):
+def test_scenes_show_refuses_bad_requests(file, tmp_path, capsys):
     (tmp_path / "folder.png").mkdir()
     out = ("--out", tmp_path / "no.png")
     for arguments, words in (

@@ -51,7 +51,7 @@ def file(tmp_path):
     return path
 
 
-def test_sizes_and_counts(file, capsys):
+def test_scenes_stats_prints_sizes_and_counts(file, capsys):
     rows = stats(capsys, file)
     # Scenes of train, val and test; cells; size; objects, of categories. -0.3 to 3.125 is 3.4 m, -0.125 to 1.25 1.4 m.
     assert row(rows, "kitchen") == ["1", "0", "0", "1 1 1 1 1", "3.4 x 1.4 m", "4", "3"]
@@ -63,7 +63,7 @@ def test_sizes_and_counts(file, capsys):
     assert row(rows, "Scenes without a goal: plain") == []
 
 
-def test_categories_and_path_lengths(file, capsys):
+def test_scenes_stats_prints_categories_and_path_lengths(file, capsys):
     rows = stats(capsys, file)
     # The books are 1 m straight ahead of heading 0 and in view from headings 0 and 45 degrees to either side (the view
     # is 50 degrees wide on each); 2, 3 and 4 further turns away the path is as much longer. From the 8 starts L* is
@@ -76,7 +76,7 @@ def test_categories_and_path_lengths(file, capsys):
     assert any(cells[0].startswith("Categories in no scene: AlarmClock, Bowl,") for cells in rows)
 
 
-def test_pairs_seen_together(file, capsys):
+def test_scenes_stats_prints_cooccurring_pairs(file, capsys):
     shown = stats(capsys, file)
     row_format, names = RowFormat(len(Task().categories)), Task().categories
     rows = np.concatenate([compile_scene(scene, Task()).rows for scene in (KITCHEN, BEDROOM)])
@@ -93,7 +93,7 @@ def test_pairs_seen_together(file, capsys):
 
 
 @pytest.mark.slow
-def test_splits_worlds_and_generated_scenes(file, capsys):
+def test_scenes_stats_selects_splits_worlds_and_generated_scenes(file, capsys):
     assert row(stats(capsys, file, "--split", "val"), "bed[room]")[:3] == ["0", "1", "0"]
     # A sofa is what houses look for.
     rows = stats(capsys, file, "--world", "houses")
@@ -102,7 +102,7 @@ def test_splits_worlds_and_generated_scenes(file, capsys):
     assert row(stats(capsys, "apartments", "--split", "test"), "apartment")[:3] == ["0", "0", "15"]
 
 
-def test_the_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
+def test_scenes_stats_prints_the_layout_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
     _, run_dir = commands.finished_run(tmp_path_factory)
     capsys.readouterr()
     kitchen, bath = make_generated_scenes("rooms", "val", 8)[0], make_generated_scenes("rooms", "val", 8)[3]
@@ -126,7 +126,7 @@ def test_the_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
     assert len(set(gaps.round(6))) == 3
 
 
-def test_scenes_in_which_nothing_is_seen_together_have_no_gap(tmp_path_factory, file, capsys):
+def test_scenes_stats_prints_no_gap_without_cooccurrence(tmp_path_factory, file, capsys):
     _, run_dir = commands.finished_run(tmp_path_factory)
     alone = dataclasses.replace(KITCHEN, types=KITCHEN.types[:1], boxes=KITCHEN.boxes[:1])
     alone = dataclasses.replace(alone, yaws=alone.yaws[:1], parents=alone.parents[:1])
@@ -143,7 +143,7 @@ def test_scenes_in_which_nothing_is_seen_together_have_no_gap(tmp_path_factory, 
     assert row(rows[start:], "kitchen") == ["0"]
 
 
-def test_a_shift_exchanges_places_in_a_file(file, capsys):
+def test_scenes_stats_shift_exchanges_places_of_a_file(file, capsys):
     plain, shifted = (stats(capsys, file, *options) for options in ((), ("--shift", "1")))
     # Two books and a stool: who is in half of the scenes, how many, how high. Undersides stay at 0.5, 0.7 and 0.05 m;
     # half of the stool's height of 0.9 m, and of the books' 0.6 m, comes on top.
@@ -153,7 +153,7 @@ def test_a_shift_exchanges_places_in_a_file(file, capsys):
     assert row(shifted, "Book")[:3] == ["50%", "1.00", "0.35 m"]
 
 
-def test_what_is_refused(tmp_path, tmp_path_factory, file, capsys):
+def test_scenes_stats_refuses_missing_files_splits_and_runs(tmp_path, tmp_path_factory, file, capsys):
     _, run_dir = commands.finished_run(tmp_path_factory)
     for arguments, words in (
         ((tmp_path / "no.jsonl.gz",), ("no.jsonl.gz", "check the path")),

@@ -20,13 +20,13 @@ PRESETS = ["long", "paper", "paper_vtnet", "small_goals", "smoke"]
 
 @pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
 @pytest.mark.parametrize("value", [" 2", "=2"])
-def test_renamed_options_are_refused_with_their_new_name(tmp_path, capsys, option, value):
+def test_train_names_the_new_name_of_a_renamed_option(tmp_path, capsys, option, value):
     assert train_command.main(["--run-dir", str(tmp_path / "run"), *f"{option}{value}".split()]) == 2
     assert refusal(capsys) == f"error: {option}: unknown option; it is --method-sizes relation_layers N now"
     assert not (tmp_path / "run").exists()
 
 
-def test_renamed_options_keep_the_group_they_are_nested_in():
+def test_renamed_option_keeps_its_nested_group():
     with pytest.raises(InputError, match=r"it is --base\.method-sizes relation_layers N now"):
         parse_config(RunConfig(), ["--base.sizes.relation-layers", "2"], "study", "")
 
@@ -45,13 +45,13 @@ def test_renamed_options_keep_the_group_they_are_nested_in():
         ("method_sizes: {relation_layers: 3}", ["--method-sizes"], {}),
     ],
 )
-def test_sizes_of_the_method_are_one_option(tmp_path, file, options, expected):
+def test_method_sizes_option_replaces_or_extends_the_config(tmp_path, file, options, expected):
     path = tmp_path / "config.yaml"
     path.write_text(file)
     assert parse_config(RunConfig(), ["--config", str(path), *options], "train.py", "").method_sizes == expected
 
 
-def test_the_help_names_every_setting(capsys):
+def test_train_help_names_every_setting(capsys):
     with pytest.raises(SystemExit) as exit:
         train_command.main(["--help"])
     assert exit.value.code == 0
@@ -66,7 +66,7 @@ def test_the_help_names_every_setting(capsys):
         assert f"--{field.name.replace('_', '-')}" in text
 
 
-def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
+def test_train_lists_the_packaged_configs_for_a_missing_one(tmp_path, capsys):
     for missing in (tmp_path / "none.yaml", "smoek"):
         assert train(missing, tmp_path / "run") == 2
         mend = f"choose from {', '.join(PRESETS)}, or give a file"
@@ -74,7 +74,7 @@ def test_a_config_that_does_not_exist_is_refused(tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_config_is_the_name_of_a_packaged_one_or_a_file(tmp_path, monkeypatch):
+def test_config_option_accepts_a_packaged_name_or_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "smoke").write_text("seeds: 4")  # the name goes first
 
@@ -85,7 +85,7 @@ def test_a_config_is_the_name_of_a_packaged_one_or_a_file(tmp_path, monkeypatch)
     assert (seeds("smoke"), seeds("./smoke"), seeds(str(CONFIGS["smoke"]))) == (1, 4, 1)
 
 
-def test_the_example_of_a_configuration_is_a_possible_run():
+def test_example_config_is_valid():
     (example,) = (Path(__file__).parents[2] / "configs").glob("*.yaml")
     config = check_config(apply_yaml(RunConfig(), example))
     assert config.seeds == 5
@@ -93,7 +93,7 @@ def test_the_example_of_a_configuration_is_a_possible_run():
 
 
 @pytest.mark.parametrize(("command", "first_name"), [("train", "long"), ("study", "ablations")])
-def test_help_lists_the_packaged_configurations(capsys, command, first_name):
+def test_command_help_lists_the_packaged_configurations(capsys, command, first_name):
     with pytest.raises(SystemExit):
         main([command, "--help"])
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
@@ -109,7 +109,7 @@ def test_help_lists_the_packaged_configurations(capsys, command, first_name):
         ("eval.py", "usage: eval.py "),
     ],
 )
-def test_the_help_of_a_script_names_the_script(monkeypatch, capsys, script, usage):
+def test_script_help_names_the_script(monkeypatch, capsys, script, usage):
     monkeypatch.setattr("sys.argv", [*script.split(), "--help"])
     with pytest.raises(SystemExit, match="0"):
         runpy.run_path(str(Path(__file__).parents[2] / script.split()[0]), run_name="__main__")
@@ -117,7 +117,7 @@ def test_the_help_of_a_script_names_the_script(monkeypatch, capsys, script, usag
 
 
 @pytest.mark.parametrize("value", [["nonsense"], ["relation_layers"], ["relation_layers", "two"]])
-def test_sizes_without_whole_numbers_are_refused(tmp_path, capsys, value):
+def test_method_sizes_option_refuses_values_without_integers(tmp_path, capsys, value):
     with pytest.raises(SystemExit) as exit:
         train_command.main(["--run-dir", str(tmp_path / "run"), "--method-sizes", *value])
     assert exit.value.code == 2
@@ -125,7 +125,7 @@ def test_sizes_without_whole_numbers_are_refused(tmp_path, capsys, value):
 
 
 @pytest.mark.parametrize("option", ["--ppo.gamma", "--seeds", "--layout.setting"])
-def test_bad_options_are_refused(tmp_path, capsys, option):
+def test_train_names_options_of_wrong_type(tmp_path, capsys, option):
     with pytest.raises(SystemExit) as exit:
         train_command.main(["--run-dir", str(tmp_path / "run"), option, "nonsense"])
     assert exit.value.code == 2

@@ -28,7 +28,7 @@ from jaxnav.scenes.files.scene_file import max_decompressed_size, read_bytes
 MIB = 2**20
 
 
-def test_compressed_zeros_are_refused_within_a_limit_of_memory(tmp_path):
+def test_read_bytes_refuses_a_gzip_bomb_within_a_memory_limit(tmp_path):
     bomb = tmp_path / "rooms.jsonl.gz"
     with gzip.GzipFile(bomb, "wb", compresslevel=1) as file:
         for _ in range(192):
@@ -42,7 +42,7 @@ def test_compressed_zeros_are_refused_within_a_limit_of_memory(tmp_path):
     tracemalloc.stop()
 
 
-def test_what_a_file_may_hold_grows_with_it():
+def test_max_decompressed_size_grows_with_the_file():
     assert [max_decompressed_size(size) // MIB for size in (0, MIB, 2 * MIB, 100 * MIB)] == [64, 64, 100, 5000]
 
 
@@ -53,7 +53,7 @@ def test_what_a_file_may_hold_grows_with_it():
         (b"I" + b"1" * 2**27, "holds more than 67,108,864 bytes"),  # one line
     ],
 )
-def test_a_pickle_of_nothing_is_refused_soon(tmp_path, content, problem):
+def test_read_pickle_refuses_too_many_parts_or_bytes(tmp_path, content, problem):
     path = tmp_path / "maps.pbz2"
     path.write_bytes(bz2.compress(content, 1))
     with pytest.raises(InputError, match=problem):
@@ -77,7 +77,7 @@ def test_a_pickle_of_nothing_is_refused_soon(tmp_path, content, problem):
         "--worlds.step-limit",
     ],
 )
-def test_absurd_sizes_are_refused_before_anything_is_made(tmp_path, capsys, option):
+def test_train_caps_every_size_before_writing(tmp_path, capsys, option):
     value = 10**18
     assert train(write_config(tmp_path), tmp_path / "run", option, value) == 2
     error = capsys.readouterr().err
@@ -86,7 +86,7 @@ def test_absurd_sizes_are_refused_before_anything_is_made(tmp_path, capsys, opti
     assert not (tmp_path / "run").exists()
 
 
-def test_products_of_sizes_are_bounded_too(tmp_path, capsys):
+def test_products_of_sizes_are_capped(tmp_path, capsys):
     config = write_config(tmp_path)
     assert train(config, tmp_path / "run", "--layout.walks", 10**6, "--layout.steps", 10**6) == 2
     assert "layout.walks x layout.steps is 1000000000000; give at most 268,435,456" in capsys.readouterr().err
@@ -108,7 +108,7 @@ def test_products_of_sizes_are_bounded_too(tmp_path, capsys):
         (PermissionError(errno.EACCES, "Permission denied", "a"), "error: a: Permission denied; mend the path, its"),
     ],
 )
-def test_what_the_system_refuses_is_told_in_a_line(capsys, error, last_line):
+def test_run_command_reports_system_errors_in_one_line(capsys, error, last_line):
     def command(_):
         raise error
 
@@ -118,7 +118,7 @@ def test_what_the_system_refuses_is_told_in_a_line(capsys, error, last_line):
     assert message.count("\n") == 1
 
 
-def test_a_mistake_of_the_program_is_not_hidden():
+def test_run_command_raises_unexpected_errors():
     def command(_):
         raise KeyError("a bug")
 
@@ -133,7 +133,7 @@ def test_a_mistake_of_the_program_is_not_hidden():
         *(pytest.param(words, marks=pytest.mark.slow) for words in (["train", "--help"], ["scenes", "stats", "rooms"])),
     ],
 )
-def test_a_reader_that_leaves_ends_the_command_quietly(arguments):
+def test_command_ends_quietly_on_a_closed_pipe(arguments):
     read, write = os.pipe()
     os.close(read)
     ended = subprocess.run(
@@ -146,7 +146,7 @@ def test_a_reader_that_leaves_ends_the_command_quietly(arguments):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_random_input_never_ends_a_command_otherwise_than_by_code(kind, tmp_path):
+def test_random_input_ends_commands_by_exit_code(kind, tmp_path):
     codes, slowest = fuzz(kind, tmp_path, 15, seed=0)
     assert set(codes) <= {0, 2}, codes
     assert codes[2] > 0
@@ -155,7 +155,7 @@ def test_random_input_never_ends_a_command_otherwise_than_by_code(kind, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_two_hundred_random_inputs_neither_crash_nor_hang_nor_fill_the_memory(kind):
+def test_two_hundred_random_inputs_stay_within_time_and_memory(kind):
     """In a process of their own, whose memory is theirs alone; docs/promises.md has the command of more."""
     process = run(["-m", "support.fuzz", kind, 200, 1], PYTHONPATH=REPOSITORY / "tests")
     output, error = process.communicate()

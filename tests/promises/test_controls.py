@@ -8,7 +8,7 @@ from support.planted import MISTAKES
 
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: f"{mistake.module}: {mistake.after!r}")
-def test_a_planted_mistake_has_one_place(mistake):
+def test_planted_mistakes_match_one_place(mistake):
     source = (ROOT / "jaxnav" / mistake.module).read_text()
     assert source.count(mistake.before) == 1
     ast.parse(source.replace(mistake.before, mistake.after))
@@ -16,12 +16,12 @@ def test_a_planted_mistake_has_one_place(mistake):
 
 
 @pytest.mark.parametrize("module", TESTS)
-def test_a_module_has_mutants_and_tests(module):
+def test_mutated_modules_have_mutants_and_tests(module):
     mutant = next(mutants_of(module))
     ast.parse(mutant.source)
     for name in TESTS[module].split():
         assert (ROOT / "tests" / name).is_file()
 
 
-def test_only_parts_of_tested_modules_are_chosen():
+def test_mutants_change_parts_of_tested_modules_alone():
     assert FUNCTIONS.keys() <= TESTS.keys()

@@ -15,11 +15,11 @@ from jaxnav.scenes.task import Task
 BANK = compile_bank([generate_room("train", i, 0) for i in range(4)], Task())  # one of each type
 
 
-def test_contract_on_generated_rooms():
+def test_generated_rooms_satisfy_the_environment_contract():
     check_environment(*build_environment(BANK, {}, 5))
 
 
-def test_contract_on_real_rooms():
+def test_imported_rooms_satisfy_the_environment_contract():
     check_environment(*build_environment(compile_bank(read_scenes(require(ITHOR))[::25], Task()), {}, 100))
 
 
@@ -64,7 +64,7 @@ class Lies(ObjectNav):
         (Lies, "a success that is not an ending"),
     ],
 )
-def test_contract_refuses_broken_environments(broken, promise):
+def test_check_environment_refuses_broken_environments(broken, promise):
     env, params = build_environment(BANK, {}, 5)
     check_environment(env, params, num_steps=1)
     with pytest.raises(AssertionError, match=promise):

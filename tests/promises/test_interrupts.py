@@ -40,7 +40,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_run_that_is_asked_to_end_saves_and_goes_on_to_the_same_end(whole, tmp_path, capsys):
+def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
     config_file, ended = write_config(tmp_path), tmp_path / "ended"
     process = run(["train.py", "--config", config_file, "--run-dir", ended, *LONG])
     while process.poll() is None and not (ended / "metrics.jsonl").exists():
@@ -63,7 +63,7 @@ def test_a_run_that_is_asked_to_end_saves_and_goes_on_to_the_same_end(whole, tmp
 
 
 @pytest.mark.slow
-def test_two_processes_end_together_when_one_is_asked(tmp_path):
+def test_signal_to_one_process_ends_both_at_the_same_chunk(tmp_path):
     """Both save the same chunk, end with the code of the signal, and go on together."""
     config_file, ended = write_config(tmp_path), tmp_path / "ended"
     address, again = free_address(), free_address()
@@ -82,7 +82,7 @@ def test_two_processes_end_together_when_one_is_asked(tmp_path):
     assert f"resumed after update {done} of 60" in messages[0]
 
 
-def test_the_first_signal_is_noted_and_the_second_ends_the_process():
+def test_interrupts_note_the_first_signal_and_restore_the_default_for_the_second():
     for number in (signal.SIGINT, signal.SIGTERM):
         before = signal.getsignal(number)
         with Interrupts() as interrupts:
@@ -94,7 +94,7 @@ def test_the_first_signal_is_noted_and_the_second_ends_the_process():
         assert signal.getsignal(number) == before
 
 
-def test_a_signal_that_is_ignored_stays_so():
+def test_interrupts_keep_an_ignored_signal_ignored():
     """As in a run that `nohup` or a script started in the background."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Interrupts() as interrupts:
@@ -104,7 +104,7 @@ def test_a_signal_that_is_ignored_stays_so():
 
 
 @pytest.mark.slow
-def test_a_signal_during_the_last_save_is_told(tmp_path, capsys, monkeypatch):
+def test_signal_during_the_last_save_is_reported(tmp_path, capsys, monkeypatch):
     """The run is saved and not exported; the same command exports it."""
     config_file, run_dir, whole_save = write_config(tmp_path), tmp_path / "run", updates.save_checkpoint
 
@@ -123,7 +123,7 @@ def test_a_signal_during_the_last_save_is_told(tmp_path, capsys, monkeypatch):
     assert (run_dir / "policies").exists()
 
 
-def test_threads_without_signals_train_too():
+def test_interrupts_work_in_threads_without_signal_handlers():
     seen = []
 
     def enter():
@@ -144,7 +144,7 @@ def test_threads_without_signals_train_too():
         (KeyboardInterrupt(), 130, "interrupted: "),
     ],
 )
-def test_every_command_tells_an_interrupt_in_a_line(capsys, end, code, message):
+def test_run_command_reports_an_interrupt_in_one_line(capsys, end, code, message):
     def command(_: Console) -> None:
         raise end
 

@@ -28,7 +28,7 @@ def finish(process):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_killed_and_resumed_run_is_an_uninterrupted_one_bit_for_bit(tmp_path):
+def test_killed_run_resumes_bit_for_bit(tmp_path):
     config_file = write_config(tmp_path)
     cache, long = tmp_path / "cache", ("--total-steps", "7680", "--validations", "6")  # 60 updates, 30 chunks
     whole, killed, other = tmp_path / "whole", tmp_path / "killed", tmp_path / "other"

@@ -37,14 +37,14 @@ def bytes_of(train, state, num_updates):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("train", "flat"), [(LEARNER.train, True), (hoarding, False)])
-def test_a_chunk_of_ten_times_the_updates_needs_the_same_memory(state, train, flat):
+def test_chunk_memory_is_independent_of_the_number_of_updates(state, train, flat):
     few, many = (bytes_of(train, state, updates) for updates in (2, 20))
     print(f"{few} bytes for 2 updates, {many} for 20")
     assert (many - few <= SLACK) == flat
 
 
 @pytest.mark.slow
-def test_chunks_leave_nothing_behind(state):
+def test_chunks_leave_no_live_arrays(state):
     train = jax.jit(functools.partial(LEARNER.train, num_updates=2))
     held = []
     for _ in range(11):

@@ -58,7 +58,7 @@ def assert_harmless(output):
 @pytest.mark.parametrize(
     ("name", "given"), [(name, given) for name, lines in GIVEN.items() for given in lines], ids=lambda value: str(value)
 )
-def test_every_command_shows_hostile_names_as_text(name, given, tmp_path, monkeypatch, capsys):
+def test_every_command_escapes_hostile_names(name, given, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = [word.replace("@", HOSTILE) for word in (name, *given)]
     try:
@@ -81,7 +81,7 @@ def test_every_command_shows_hostile_names_as_text(name, given, tmp_path, monkey
         ("scenes", "import", "@"),
     ],
 )
-def test_what_a_parser_quotes_is_text(words, capsys):
+def test_parser_errors_escape_hostile_options(words, capsys):
     with pytest.raises(SystemExit) as end:
         main([word.replace("@", HOSTILE) for word in words])
     assert end.value.code == 2
@@ -89,7 +89,7 @@ def test_what_a_parser_quotes_is_text(words, capsys):
     assert "[/x]" in output
 
 
-def test_a_help_quotes_a_configuration_as_text(tmp_path, capsys):
+def test_help_escapes_hostile_defaults(tmp_path, capsys):
     config = tmp_path / "run.yaml"
     config.write_text(json.dumps({"scenes": f"rooms{HOSTILE}.jsonl.gz"}))
     with pytest.raises(SystemExit) as end:
@@ -100,7 +100,7 @@ def test_a_help_quotes_a_configuration_as_text(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
-def test_a_refusal_is_legible_on_a_terminal():
+def test_parser_error_on_a_terminal_keeps_its_colours():
     """What a parser adds for a terminal is not taken for a part of a name."""
     ours, theirs = os.openpty()
     process = subprocess.Popen(
@@ -116,7 +116,7 @@ def test_a_refusal_is_legible_on_a_terminal():
     assert b"\\x1b" not in output
 
 
-def test_every_command_is_given_hostile_names():
+def test_hostile_arguments_cover_every_command():
     assert set(COMMANDS) <= set(GIVEN)
 
 
@@ -144,7 +144,7 @@ def scene_file(tmp_path):
     ],
     ids=str,
 )
-def test_hostile_names_in_a_scene_file_are_text(given, scene_file, monkeypatch, capsys):
+def test_scenes_command_escapes_hostile_names_in_a_file(given, scene_file, monkeypatch, capsys):
     monkeypatch.chdir(scene_file.parent)
     command, *options = given
     target = ["out.jsonl.gz"] if command == "import" else []
@@ -154,7 +154,7 @@ def test_hostile_names_in_a_scene_file_are_text(given, scene_file, monkeypatch, 
     assert_harmless(output.out + output.err)
 
 
-def test_a_console_shows_markup_and_escapes_in_lines_tables_and_titles(capsys):
+def test_console_escapes_lines_tables_and_titles(capsys):
     table = Table("[/x]", title=HOSTILE)
     table.add_row(HOSTILE, style="bold")
     console = PlainConsole(width=120)
@@ -165,7 +165,7 @@ def test_a_console_shows_markup_and_escapes_in_lines_tables_and_titles(capsys):
     assert output.startswith(r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile:")
 
 
-def test_a_refusal_is_one_line(capsys):
+def test_refusal_of_a_hostile_name_is_one_line(capsys):
     def refused(_):
         raise InputError(f"{HOSTILE}: mend it")
 
@@ -175,18 +175,18 @@ def test_a_refusal_is_one_line(capsys):
     assert output.count("\n") == 1
 
 
-def test_letters_of_any_language_stay():
+def test_escape_control_chars_keeps_letters_of_any_language():
     assert escape_control_chars("Küche, 台所, кухня, 🍳, ́") == "Küche, 台所, кухня, 🍳, ́"
     assert escape_control_chars("a\nb\x1bc", keep="\n") == "a\nb\\x1bc"
 
 
 @pytest.mark.filterwarnings("ignore:Glyph")  # an escape is drawn as a box
-def test_a_title_in_a_figure_is_text():
+def test_figure_title_accepts_unbalanced_mathematics():
     row = {"arm": "layout", "env_steps": 1, "success": 0.5}
     learning_figure([row], None, f"ORG in {HOSTILE}")
 
 
-def test_half_a_character_is_refused(scene_file):
+def test_read_scenes_refuses_a_lone_surrogate(scene_file):
     text = gzip.decompress(scene_file.read_bytes()).replace(b"\\u202e", b"\\ud800")
     scene_file.write_bytes(text)
     with pytest.raises(InputError, match=r"name is .*, which holds half a character; write the whole one"):

@@ -54,7 +54,7 @@ def run_of_0_2(tmp_path) -> Path:
         lambda run, file: log_command.main([str(run), "--to", "tensorboard"]),
     ],
 )
-def test_commands_refuse_a_run_of_0_1_and_leave_it_as_it_is(run_of_0_1, tmp_path, capsys, command):
+def test_commands_refuse_a_run_of_0_1_and_leave_it_unchanged(run_of_0_1, tmp_path, capsys, command):
     before = contents(run_of_0_1)
     assert command(run_of_0_1, write_config(tmp_path)) == 2
     message = refusal(capsys)
@@ -72,14 +72,14 @@ def test_table_refuses_a_report_of_0_1(run_of_0_2, tmp_path, capsys):
     assert refusal(capsys) == f"error: {path}: {REFUSED}"
 
 
-def test_policies_of_0_1_are_refused(run_of_0_1):
+def test_load_policy_refuses_a_policy_of_0_1(run_of_0_1):
     folder = run_of_0_1 / "policies" / "layout-0"
     with pytest.raises(InputError) as refused:
         jaxnav.load_policy(folder)
     assert str(refused.value) == f"{folder}/policy.json: {REFUSED}"
 
 
-def test_logs_of_0_1_are_refused(run_of_0_1):
+def test_read_log_rows_refuses_a_log_of_0_1(run_of_0_1):
     path = run_of_0_1 / "metrics.jsonl"
     with pytest.raises(InputError) as refused:
         read_log_rows(path)
@@ -87,7 +87,7 @@ def test_logs_of_0_1_are_refused(run_of_0_1):
     assert str(refused.value).endswith(REFUSED)
 
 
-def test_checkpoints_of_0_1_are_refused(tmp_path, monkeypatch):
+def test_restore_refuses_a_checkpoint_of_0_1(tmp_path, monkeypatch):
     """Their metadata has no digest."""
     manifest = make_manifest({})
     state = {"step": jnp.int32(1)}
@@ -100,7 +100,7 @@ def test_checkpoints_of_0_1_are_refused(tmp_path, monkeypatch):
 # Version 0.2
 
 
-def test_a_run_of_0_2_is_evaluated_as_by_that_version(run_of_0_2, tmp_path):
+def test_run_of_0_2_is_evaluated_as_by_that_version(run_of_0_2, tmp_path):
     before = json.loads((run_of_0_2 / "eval-val.json").read_text())
     assert evaluate(run_of_0_2, "--episodes", 24, "--json", tmp_path / "new.json") == 0
     after = json.loads((tmp_path / "new.json").read_text())
@@ -120,7 +120,7 @@ def test_policies_logs_and_reports_of_0_2_are_read(run_of_0_2, capsys):
     assert "| + w (layout) |" in capsys.readouterr().out
 
 
-def test_a_checkpoint_of_0_2_is_refused_by_its_version(run_of_0_2, tmp_path, capsys):
+def test_train_refuses_a_checkpoint_of_0_2_by_its_version(run_of_0_2, tmp_path, capsys):
     before = contents(run_of_0_2)
     config = tmp_path / "tiny.yaml"
     config.write_text(CONFIG.replace("seeds: 2", "seeds: 1"))

@@ -46,7 +46,7 @@ def holder(tmp_path):
         process.kill()
 
 
-def test_a_second_process_is_refused_in_a_line_that_names_the_first(tmp_path, holder):
+def test_folder_lock_names_the_process_that_holds_it(tmp_path, holder):
     with pytest.raises(InputError) as error:
         FolderLock(tmp_path).acquire()
     named = re.escape(f"process {holder.pid} on {socket.gethostname()}")
@@ -54,7 +54,7 @@ def test_a_second_process_is_refused_in_a_line_that_names_the_first(tmp_path, ho
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
-def test_the_lock_of_a_process_that_is_gone_holds_nothing(tmp_path, holder, end):
+def test_folder_lock_of_a_dead_process_is_free(tmp_path, holder, end):
     holder.send_signal(end)
     holder.wait()
     assert str(holder.pid) in (tmp_path / LOCK_FILE).read_text()
@@ -66,7 +66,7 @@ def test_the_lock_of_a_process_that_is_gone_holds_nothing(tmp_path, holder, end)
     FolderLock(tmp_path).acquire()
 
 
-def test_a_folder_that_is_removed_or_replaced_is_told(tmp_path):
+def test_folder_lock_check_refuses_a_removed_or_replaced_folder(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     lock = FolderLock(folder)
@@ -84,7 +84,7 @@ def test_a_folder_that_is_removed_or_replaced_is_told(tmp_path):
         lock.check()
 
 
-def test_a_run_directory_is_held_while_it_is_claimed(tmp_path):
+def test_lock_run_dir_refuses_a_second_run_until_released(tmp_path):
     config = tiny_config(tmp_path)
     with lock_run_dir(config):
         before = (config.run_dir / "config.json").read_bytes()
@@ -99,7 +99,7 @@ def test_a_run_directory_is_held_while_it_is_claimed(tmp_path):
         pass
 
 
-def test_what_fails_while_the_directory_is_gone_fails_for_that(tmp_path):
+def test_lock_run_dir_reports_a_removed_directory_before_other_errors(tmp_path):
     """A save, for one, of which Orbax tells much else."""
     config = tiny_config(tmp_path)
 
@@ -116,7 +116,7 @@ def test_what_fails_while_the_directory_is_gone_fails_for_that(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_second_training_is_refused_and_one_whose_directory_is_removed_ends(tmp_path, capsys):
+def test_train_refuses_a_second_process_and_ends_when_its_directory_is_removed(tmp_path, capsys):
     config_file, run_dir, long = write_config(tmp_path), tmp_path / "run", ("--total-steps", 10**6)
     process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *long, "--save-every", 1000])
     while process.poll() is None and not (run_dir / "metrics.jsonl").exists():

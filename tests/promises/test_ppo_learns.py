@@ -124,7 +124,7 @@ def values(t: Transition) -> dict[tuple[int, int], np.ndarray]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_probe_has_its_value_and_its_choice(rollouts, name):
+def test_ppo_learns_value_and_choice_of_each_probe(rollouts, name):
     case, t = CASES[name], rollouts[name]
     result = values(t)
     assert result.keys() == case.value.keys()
@@ -138,7 +138,7 @@ def test_a_probe_has_its_value_and_its_choice(rollouts, name):
 
 
 @pytest.mark.slow
-def test_another_discount_has_another_value(rollouts):
+def test_ppo_value_follows_the_discount(rollouts):
     """So the delayed reward is discounted, and once: nothing else about the probes changes."""
     result = tiny.leaves_at(jax.device_get(trained(jnp.float32(0.9), UPDATES)), list(CASES).index("delayed"))
     for goal in range(GOALS):
@@ -152,7 +152,7 @@ BOUNDS = {(0, 20): (0.0, 0.5), (80, 100): (0.75, 1.0), (180, 200): (0.9, 1.0), (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
-def test_success_stays_within_stored_bounds(seed):
+def test_training_success_stays_within_stored_bounds(seed):
     """A random policy soon says Done and is right by chance; a trained one finds the goals within 20 steps."""
     params = PARAMS.replace(step_limit=jnp.full(2, 20, jnp.int32))
     train = jax.jit(functools.partial(LEARNER.train, num_updates=20))

@@ -147,7 +147,7 @@ def campaign(name, folder, number, seed) -> collections.Counter[str]:
 @pytest.mark.parametrize(
     "name", [name if name != "checkpoint" else pytest.param(name, marks=pytest.mark.slow) for name in STORED]
 )
-def test_no_damage_is_used_silently(name, tmp_path):
+def test_random_damage_is_never_used_silently(name, tmp_path):
     outcomes = campaign(name, tmp_path, 8, seed=0)
     assert outcomes["silent"] == 0
     assert outcomes["told"] >= 2  # the others change what is not read, such as spaces
@@ -155,7 +155,7 @@ def test_no_damage_is_used_silently(name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STORED)
-def test_no_damage_of_many_is_used_silently(name, tmp_path):
+def test_many_random_damages_are_never_used_silently(name, tmp_path):
     outcomes = campaign(name, tmp_path, NUM_DAMAGES, seed=1)
     print(name, dict(outcomes))
     assert outcomes["silent"] == 0
@@ -163,7 +163,7 @@ def test_no_damage_of_many_is_used_silently(name, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "file"), [("config", CONFIG_FILE), ("reach", REACH_FILE), ("export", "policy.json")])
-def test_another_digit_in_a_record_is_told(name, file, tmp_path):
+def test_signed_record_with_a_changed_digit_is_refused(name, file, tmp_path):
     """Which a parser takes for another number."""
     STORED[name].write(tmp_path / "whole")
     path = tmp_path / "whole" / file
@@ -175,7 +175,7 @@ def test_another_digit_in_a_record_is_told(name, file, tmp_path):
             STORED[name].read(path.parent)
 
 
-def test_another_digit_in_a_log_is_told(tmp_path):
+def test_log_with_a_changed_digit_is_refused(tmp_path):
     log_rows(tmp_path)
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(path.read_bytes().replace(b"0.57", b"0.67"))  # success of 4 / 7
@@ -192,7 +192,7 @@ def test_another_digit_in_a_log_is_told(tmp_path):
         lambda folder: flip(max((folder / "state").rglob("d/*"), key=lambda path: path.stat().st_size)),
     ],
 )
-def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, hurt):
+def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, hurt):
     save_two(tmp_path)
     hurt(tmp_path / "checkpoints/2")
     result = checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(state, 0), MANIFEST)
@@ -213,7 +213,7 @@ def flip(path):
     path.write_bytes(data)
 
 
-def test_a_run_without_a_whole_checkpoint_does_not_begin_anew(tmp_path):
+def test_restore_refuses_when_every_checkpoint_is_damaged(tmp_path):
     save_two(tmp_path)
     for step in (1, 2):
         (tmp_path / f"checkpoints/{step}/_CHECKPOINT_METADATA").write_text("{")
@@ -222,7 +222,7 @@ def test_a_run_without_a_whole_checkpoint_does_not_begin_anew(tmp_path):
 
 
 @pytest.mark.parametrize("lost", [0, 3, 7])
-def test_a_log_without_a_row_is_refused_where_the_run_goes_on(tmp_path, lost):
+def test_log_with_a_missing_or_repeated_row_is_refused(tmp_path, lost):
     log_rows(tmp_path)
     path = tmp_path / "metrics.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
@@ -235,7 +235,7 @@ def test_a_log_without_a_row_is_refused_where_the_run_goes_on(tmp_path, lost):
 
 
 @pytest.mark.slow
-def test_a_run_with_a_damaged_checkpoint_ends_as_one_without(tmp_path, tmp_path_factory, capsys):
+def test_run_with_a_damaged_checkpoint_resumes_bit_for_bit(tmp_path, tmp_path_factory, capsys):
     config_file, run_dir = finished_run(tmp_path_factory)
     hurt = shutil.copytree(run_dir, tmp_path / "run")
     shutil.rmtree(hurt / "policies")
@@ -252,7 +252,7 @@ def test_a_run_with_a_damaged_checkpoint_ends_as_one_without(tmp_path, tmp_path_
 
 
 @pytest.mark.slow
-def test_a_finished_run_does_not_overwrite_an_export_that_differs(tmp_path, tmp_path_factory, capsys):
+def test_train_does_not_overwrite_a_different_export(tmp_path, tmp_path_factory, capsys):
     config_file, run_dir = finished_run(tmp_path_factory)
     run = shutil.copytree(run_dir, tmp_path / "run")
     folder = run / "policies" / "layout-0"
@@ -284,7 +284,7 @@ def test_a_finished_run_does_not_overwrite_an_export_that_differs(tmp_path, tmp_
         (lambda params: params["policy"].pop("actor"), "['policy']['actor']['bias']: (absent) != 'float32["),
     ],
 )
-def test_an_export_that_is_well_signed_but_wrong_is_refused(tmp_path, change, problem):
+def test_load_policy_refuses_signed_exports_with_invalid_arrays(tmp_path, change, problem):
     params, spec = load_params(PACKAGED_POLICIES / "rooms-org")
     params = jax.tree.map(np.array, params)
     export_params(tmp_path / "whole", params, spec)

@@ -35,14 +35,14 @@ def without_pictures(script, folder):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
 
 
-def test_every_name_and_every_help_is_there(tmp_path):
+def test_every_name_and_help_works_without_extras(tmp_path):
     commands = [*COMMANDS, *(f"scenes {name}" for name in ("import", "show", "stats"))]
     done = without_pictures(IMPORT + HELP.replace("ALL", repr(commands)), tmp_path)
     assert (done.returncode, done.stderr) == (0, "imported\n[]\n")
 
 
 @pytest.mark.parametrize("command", ["episode run", "report run", "scenes show rooms", "study study_quick"])
-def test_a_command_that_draws_is_refused(tmp_path, command):
+def test_drawing_command_is_refused_without_extras(tmp_path, command):
     script = f"from jaxnav.__main__ import main\nsys.exit(main({command.split()}))"
     done = without_pictures(script, tmp_path)
     assert (done.returncode, done.stderr) == (2, REFUSAL)

@@ -16,7 +16,7 @@ def halved(evaluated):
 
 
 @pytest.mark.slow
-def test_every_row_of_a_policy_has_a_lead_in_every_metric(evaluated, halved):
+def test_account_has_a_lead_per_row_and_metric(evaluated, halved):
     entries = measure_leads(evaluated, halved)
     assert {entry.metric for entry in entries} == {"sr", "spl", "sr@20", "sr@50"}
     assert len(entries) == 28 * 4  # neither Random nor the shortest path
@@ -28,7 +28,7 @@ def test_every_row_of_a_policy_has_a_lead_in_every_metric(evaluated, halved):
 
 
 @pytest.mark.slow
-def test_only_rows_that_remove_something_have_a_share(evaluated, halved):
+def test_account_has_a_share_for_rows_with_removal_alone(evaluated, halved):
     shares = {entry.variant: entry.left for entry in measure_leads(evaluated, halved) if entry.metric == "sr"}
     assert shares["ORG (baseline)"] is None
     assert shares["+ w (layout)"] is None
@@ -36,13 +36,13 @@ def test_only_rows_that_remove_something_have_a_share(evaluated, halved):
 
 
 @pytest.mark.slow
-def test_an_agent_has_no_lead_over_itself(evaluated):
+def test_account_of_a_run_over_itself_is_zero(evaluated):
     baselines = [entry for entry in measure_leads(evaluated, evaluated) if entry.variant == "ORG (baseline)"]
     assert [entry.lead.mean for entry in baselines] == [0.0] * 8
 
 
 @pytest.mark.slow
-def test_runs_that_cannot_be_compared_are_refused(evaluated):
+def test_account_refuses_runs_that_differ(evaluated):
     fewer = evaluated._replace(outcome=type(evaluated.outcome)(*(leaf[:, :1] for leaf in evaluated.outcome)))
     with pytest.raises(InputError, match="2 seeds with experience and 1 without"):
         measure_leads(evaluated, fewer)

@@ -27,7 +27,7 @@ CONFIG = RunConfig(
 )
 
 
-def test_imitation_is_part_of_the_budget():
+def test_imitation_stage_counts_towards_the_step_budget():
     # A fifth of ten chunks of 1,280 steps.
     assert CONFIG.stage_by_chunk == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
     assert CONFIG.steps_by_purpose == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
@@ -42,7 +42,7 @@ def test_imitation_is_part_of_the_budget():
 
 
 @pytest.mark.parametrize(("share", "chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
-def test_its_share_can_be_set_in_whole_chunks(share, chunks):
+def test_stage_share_is_rounded_to_whole_chunks(share, chunks):
     config = check_config(dataclasses.replace(CONFIG, imitation=share))
     assert config.stage_by_chunk == chunks * [0] + (10 - chunks) * [1]
     assert sum(stage.share for stage in config.stages) == pytest.approx(1.0)
@@ -64,7 +64,7 @@ def test_its_share_can_be_set_in_whole_chunks(share, chunks):
         ({"method": "org", "imitation": 0.2}, "config: imitation is 0.2; 'org' has no stages of both kinds; leave"),
     ],
 )
-def test_impossible_shares_are_refused(options, message):
+def test_config_refuses_impossible_stage_shares(options, message):
     with pytest.raises(InputError) as refusal:
         check_config(dataclasses.replace(CONFIG, **options))
     assert str(refusal.value).startswith(message)
@@ -72,14 +72,14 @@ def test_impossible_shares_are_refused(options, message):
 
 
 @pytest.mark.parametrize("shares", [(), (0.5,), (0.5, 0.6), (0.0, 1.0)])
-def test_the_shares_of_a_method_add_up(shares):
+def test_stage_shares_of_a_method_add_up(shares):
     with pytest.raises(ValueError, match="add up to 1"):
         Method(NoExperience, stages=tuple(Stage(share) for share in shares))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["vtnet", "tpn"])
-def test_a_run_goes_through_its_stages_and_stops_and_resumes_between_them(method, config, tmp_path, monkeypatch):
+def test_staged_run_resumes_between_its_stages(method, config, tmp_path, monkeypatch):
     """Two chunks, one of each stage; a run that stops after the first ends as one that does not."""
     sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
     sizes = sizes if method == "vtnet" else {"tentative_width": 8}

@@ -42,13 +42,13 @@ def overlay(tmp_path):
     return apply
 
 
-def test_only_named_values_change(overlay):
+def test_apply_yaml_changes_only_named_values(overlay):
     # ppo.epochs is 2 in the default instance (4 in the class): what the file leaves out stays as in the instance.
     assert overlay("ppo:\n  learning_rate: 0.5\nname: x\n") == Config(ppo=Ppo(learning_rate=0.5, epochs=2), name="x")
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "{}"])
-def test_empty_file_changes_nothing(overlay, text):
+def test_apply_yaml_of_an_empty_file_changes_nothing(overlay, text):
     assert overlay(text) == Config()
 
 
@@ -69,7 +69,7 @@ def test_empty_file_changes_nothing(overlay, text):
         ("name: '3'", Config(name="3")),
     ],
 )
-def test_values_are_taken_by_annotation(overlay, text, expected):
+def test_apply_yaml_converts_values_by_annotation(overlay, text, expected):
     result = overlay(text)
     assert result == expected
     assert repr(result) == repr(expected)  # 1 == 1.0, but their texts differ
@@ -98,7 +98,7 @@ def test_values_are_taken_by_annotation(overlay, text, expected):
         ("ppo:", "ppo", "a mapping", "null"),
     ],
 )
-def test_wrong_types_are_refused(overlay, text, key, expected, wrong_type):
+def test_apply_yaml_refuses_values_of_wrong_types(overlay, text, key, expected, wrong_type):
     with pytest.raises(InputError) as error:
         overlay(text)
     for part in ("config.yaml: ", f" {key} ", expected, wrong_type):
@@ -117,7 +117,7 @@ def test_wrong_types_are_refused(overlay, text, key, expected, wrong_type):
         ("just words", ["holds 'just words' (str)", "give a mapping"]),
     ],
 )
-def test_unknown_keys_and_other_shapes_are_refused(overlay, text, parts):
+def test_apply_yaml_refuses_unknown_keys_and_non_mappings(overlay, text, parts):
     with pytest.raises(InputError) as error:
         overlay(text)
     for part in ["config.yaml: ", *parts]:
@@ -129,7 +129,7 @@ class Nested:
     base: RunConfig = RunConfig()
 
 
-def test_renamed_keys_are_refused_with_their_new_name(tmp_path):
+def test_apply_yaml_names_the_new_name_of_a_renamed_key(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text("sizes: {relation_layers: 2}")
     with pytest.raises(InputError, match=r"key sizes.relation_layers; it is method_sizes.relation_layers now$"):
@@ -155,19 +155,19 @@ def test_renamed_keys_are_refused_with_their_new_name(tmp_path):
         ("[" * 5000, "not valid YAML ("),
     ],
 )
-def test_broken_yaml_is_refused_with_its_line(overlay, text, place):
+def test_apply_yaml_names_the_line_of_broken_yaml(overlay, text, place):
     with pytest.raises(InputError) as error:
         overlay(text)
     assert place in str(error.value)
 
 
-def test_missing_file_and_folder_are_refused(tmp_path):
+def test_apply_yaml_refuses_missing_files_and_folders(tmp_path):
     for path, problem in ((tmp_path / "none.yaml", "no such configuration; choose"), (tmp_path, "cannot be read")):
         with pytest.raises(InputError, match=f"{path}: {problem}"):
             apply_yaml(Config(), path)
 
 
-def test_a_name_is_that_of_a_packaged_configuration():
+def test_apply_yaml_reads_packaged_configurations_by_name():
     assert apply_yaml(RunConfig(), "smoke") == apply_yaml(RunConfig(), CONFIGS["smoke"])
     assert apply_yaml(RunConfig(), Path("smoke")).seeds == 1
 
@@ -183,7 +183,7 @@ def test_a_name_is_that_of_a_packaged_configuration():
         limit=st.none() | st.integers(),
     )
 )
-def test_a_dumped_config_reads_back(tmp_path_factory, config):
+def test_apply_yaml_inverts_a_yaml_dump(tmp_path_factory, config):
     path = tmp_path_factory.getbasetemp() / "dumped.yaml"
     values = dataclasses.asdict(config) | {"epsilons": list(config.epsilons), "view": list(config.view)}
     path.write_text(yaml.safe_dump(values, allow_unicode=True), encoding="utf-8")
@@ -191,7 +191,7 @@ def test_a_dumped_config_reads_back(tmp_path_factory, config):
 
 
 @given(st.binary(max_size=60) | st.text("ponamepochs: {}[]&*!|>-'\"\n\t1.e", max_size=60).map(str.encode))
-def test_any_bytes_give_a_config_or_an_input_error(tmp_path_factory, data):
+def test_apply_yaml_of_any_bytes_gives_a_config_or_an_input_error(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_bytes(data)
     try:

@@ -24,7 +24,7 @@ EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", ["evidence", "clock"])
-def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, evaluated, setting):
+def test_gap_estimator_changes_stde_rows_alone(drawn_run, evaluated, setting):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting=setting)
     assert other.rows == evaluated.rows
     assert other.report["run"]["evaluation_setting"] == setting
@@ -37,7 +37,7 @@ def test_another_gap_changes_what_is_taken_out_and_nothing_else(drawn_run, evalu
 
 
 @pytest.mark.slow
-def test_the_papers_estimator_makes_weights_of_its_own(drawn_run, evaluated):
+def test_paper_estimator_changes_layout_rows_alone(drawn_run, evaluated):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting="paper")
     by_arm = {"baseline": [], "layout": []}
     for i, row in enumerate(evaluated.rows):
@@ -47,7 +47,7 @@ def test_the_papers_estimator_makes_weights_of_its_own(drawn_run, evaluated):
     assert not all(by_arm["layout"])
 
 
-def test_settings_keep_what_they_do_not_name(drawn_run):
+def test_with_estimator_keeps_fields_that_the_setting_does_not_name(drawn_run):
     policies = drawn_run.policies()
     assert policies.with_estimator(None) is policies
     evidence = policies.with_estimator("evidence")
@@ -58,7 +58,7 @@ def test_settings_keep_what_they_do_not_name(drawn_run):
     np.testing.assert_array_equal(released.knowledge.layout, layout_priors(policies.prior_counts, "released"))
 
 
-def test_gaps_that_a_run_did_not_learn_are_refused(drawn_run):
+def test_with_estimator_refuses_gaps_without_learned_cooccurrence(drawn_run):
     policies = drawn_run.policies()
     np.testing.assert_array_equal(
         policies.knowledge.cooccurrence.co_visibility, co_visibility_from_counts(policies.prior_counts)
@@ -72,7 +72,7 @@ def test_gaps_that_a_run_did_not_learn_are_refused(drawn_run):
             without.with_estimator(name)
 
 
-def test_holding_is_for_every_estimator(drawn_run):
+def test_with_estimator_holds_the_gap_of_every_estimator(drawn_run):
     policies = drawn_run.policies()
     for name in (None, "evidence", "released", "clock"):
         plain, held = (
@@ -84,12 +84,12 @@ def test_holding_is_for_every_estimator(drawn_run):
         policies._replace(estimator_config=None).with_estimator(None, hold=True)
 
 
-def test_policies_without_the_layout_have_no_estimator(drawn_run):
+def test_with_estimator_refuses_policies_without_the_layout(drawn_run):
     with pytest.raises(InputError, match="--setting evidence: needs policies with the layout"):
         drawn_run.policies(("baseline",))._replace(estimator_config=None).with_estimator("evidence")
 
 
-def test_policies_adapt_by_as_many_steps_as_they_can(drawn_run):
+def test_with_inner_steps_refuses_more_steps_than_the_method_adapts(drawn_run):
     policies = drawn_run.policies()
     assert policies.with_inner_steps(None) is policies
     with pytest.raises(
@@ -106,7 +106,7 @@ def test_policies_adapt_by_as_many_steps_as_they_can(drawn_run):
     assert adaptive.make_agent_loop(world).inner_steps is None
 
 
-def test_scenes_that_a_method_cannot_act_in_are_refused_wherever_it_acts(drawn_run):
+def test_semexp_refuses_scenes_larger_than_its_map_at_every_entry_point(drawn_run):
     """A map of 12 lines holds a cell and the 11 of a view."""
     world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
     policies = drawn_run.policies()
@@ -126,7 +126,7 @@ def test_scenes_that_a_method_cannot_act_in_are_refused_wherever_it_acts(drawn_r
             act()
 
 
-def test_a_pooled_prior_is_one_for_all_rooms(config):
+def test_pooled_prior_sums_the_counts_of_all_rooms(config):
     world = compile_training_world(config, Console(quiet=True))
     pooled = dataclasses.replace(config, layout=dataclasses.replace(config.layout, prior="pooled"))
     by_room, whole = (np.asarray(explore_world(one_config, world).counts) for one_config in (config, pooled))

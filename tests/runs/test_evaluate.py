@@ -14,7 +14,7 @@ from jaxnav.evaluation.variants import EvaluationRow
 LAYOUT, TDE = EvaluationRow("layout", None, None, "argmax"), EvaluationRow("tde", None, "paper", "argmax")
 
 
-def test_the_rows_are_those_of_the_table_and_the_oracle(evaluated):
+def test_evaluate_returns_the_rows_of_the_table_and_the_oracle(evaluated):
     rows, epsilon = evaluated.rows, np.linspace(0, 1, 11)
     assert rows[-2:] == [EvaluationRow("random", None, None, "sample"), EvaluationRow("oracle", None, None, "argmax")]
     for decoding, part in (("argmax", rows[:14]), ("sample", rows[14:28])):
@@ -25,7 +25,7 @@ def test_the_rows_are_those_of_the_table_and_the_oracle(evaluated):
     assert len(rows) == 30
 
 
-def test_every_row_seed_and_episode_has_its_numbers(evaluated):
+def test_evaluate_returns_an_outcome_per_row_seed_and_episode(evaluated):
     shape = (30, 2, len(evaluated.episodes.goal))
     assert {leaf.shape for leaf in evaluated.outcome} == {shape}
     metrics = evaluated.metrics()
@@ -38,7 +38,7 @@ def test_every_row_seed_and_episode_has_its_numbers(evaluated):
     assert 0 < metrics["sr"][:-1].mean() < metrics["sr"][-1].mean()  # the oracle's
 
 
-def test_the_report_says_the_same(evaluated):
+def test_evaluation_report_equals_the_results(evaluated):
     rows, metrics = evaluated.report["rows"], evaluated.metrics()
     assert [(row["variant"], row["epsilon"], row["form"], row["decoding"]) for row in rows] == [*evaluated.rows]
     for name, scale in (("sr", 100), ("spl", 100), ("dts", 1)):
@@ -47,7 +47,7 @@ def test_the_report_says_the_same(evaluated):
     assert evaluated.report["compilations"] == 1
 
 
-def test_only_what_is_trained_varies_with_training(evaluated):
+def test_evaluation_reports_a_deviation_over_seeds_of_trained_rows_alone(evaluated):
     for row in evaluated.report["rows"]:
         trained = row["variant"] not in ("random", "oracle")
         for metric in ("sr", "spl", "dts", "sae", "timeout", "wrong_done"):
@@ -63,7 +63,7 @@ def test_only_what_is_trained_varies_with_training(evaluated):
     assert tde["seeds"] == pytest.approx(gain)
 
 
-def test_the_notes_are_those_of_the_rows_and_the_run(evaluated):
+def test_evaluation_notes_describe_the_rows_and_the_run(evaluated):
     success = evaluated.metrics()["sr"]
     expected = evaluation_notes(evaluated.rows, success, evaluated.episodes, has_room_prior=True)
     assert evaluated.report["notes"] == [*expected, budget_note(evaluated.report["run"]["budget"])]
@@ -71,7 +71,7 @@ def test_the_notes_are_those_of_the_rows_and_the_run(evaluated):
     assert expected != evaluation_notes(evaluated.rows, success, evaluated.episodes, has_room_prior=False)
 
 
-def test_it_is_written_as_json_and_csv(evaluated, tmp_path):
+def test_results_are_written_as_json_and_csv(evaluated, tmp_path):
     target = tmp_path / "new" / "table.json"
     evaluated.write(target)
     assert {path.name for path in target.parent.iterdir()} == {"table.json", "table.episodes.csv"}
@@ -87,6 +87,6 @@ def test_it_is_written_as_json_and_csv(evaluated, tmp_path):
 
 
 @pytest.mark.parametrize(("option", "value"), [("world", "cellar"), ("split", "all")])
-def test_unknown_worlds_and_splits_are_refused(drawn_run, option, value):
+def test_evaluate_refuses_unknown_worlds_and_splits(drawn_run, option, value):
     with pytest.raises(InputError, match=rf"^--{option} {value}: choose one of "):
         jaxnav.evaluate(drawn_run, **{option: value})

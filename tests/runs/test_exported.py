@@ -105,7 +105,7 @@ def assert_same(result, expected, rounding_step=0.0):
         np.testing.assert_allclose(result[name], expected[name], rtol=1e-4, atol=tolerance, err_msg=name)
 
 
-def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
+def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
     out = tmp_path / "out"
     options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out)]
     assert main(["export", str(drawn_run.config.run_dir), *options]) == 0
@@ -138,7 +138,7 @@ def test_the_program_of_the_card_needs_jax_alone(drawn_run, tmp_path):
         ),
     ],
 )
-def test_a_program_acts_as_its_policy(method, decision):
+def test_exported_program_acts_as_its_policy(method, decision):
     direct = "goal" if decision == "streams" else "all"
     spec = dataclasses.replace(tiny.SPEC, method=METHODS[method], method_sizes=(), decision=decision, direct=direct)
     learn, method_knowledge = METHODS[method].learn, tiny.knowledge()
@@ -160,7 +160,7 @@ def test_a_program_acts_as_its_policy(method, decision):
     assert_same(stacked, acted(policy, steps), rounding_step=2.0**-10 if decision == "streams" else 0.0)
 
 
-def test_exported_parameters_act_as_those_of_the_run(drawn_run, tmp_path):
+def test_export_command_copies_policies_and_replaces_earlier_exports(drawn_run, tmp_path):
     run, out = drawn_run.config.run_dir, tmp_path / "out"
     assert main(["export", str(run), "--policy", "baseline-1", "--out", str(out)]) == 0
     policies = [jaxnav.load_policy(folder) for folder in (out, run / POLICIES_DIR / "baseline-1")]
@@ -183,7 +183,7 @@ def test_exported_parameters_act_as_those_of_the_run(drawn_run, tmp_path):
         (["--out", "file/out"], "cannot be written"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(drawn_run, tmp_path, monkeypatch, capsys, options, mend):
+def test_export_refuses_unknown_policies_and_foreign_folders(drawn_run, tmp_path, monkeypatch, capsys, options, mend):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "mine").mkdir()
@@ -193,7 +193,7 @@ def test_what_cannot_be_exported_is_refused(drawn_run, tmp_path, monkeypatch, ca
     assert contents(tmp_path) == {"file": b"", "mine/README.md": b"a project of one's own"}
 
 
-def test_a_program_without_flatbuffers_names_the_extra(drawn_run, tmp_path, monkeypatch, capsys):
+def test_export_of_a_program_names_the_extra_without_flatbuffers(drawn_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(jax.export.Exported, "serialize", nothing_there)
     out = tmp_path / "out"
     assert main(["export", str(drawn_run.config.run_dir), "--format", "stablehlo", "--out", str(out)]) == 2

@@ -31,7 +31,7 @@ def config_of(method, folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"])
-def test_a_method_goes_from_training_to_actions(method, tmp_path):
+def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     """The exported policy is that of the run, with the same knowledge."""
     run = train(config_of(method, tmp_path / "one"))
     folder = run.config.run_dir
@@ -47,7 +47,7 @@ def test_a_method_goes_from_training_to_actions(method, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["savn", "hoz", "semexp"])
-def test_a_method_that_keeps_a_state_in_an_episode_resumes_to_the_same_run(method, tmp_path, monkeypatch):
+def test_method_with_tracker_state_resumes_bit_for_bit(method, tmp_path, monkeypatch):
     """Fast weights, zones and maps are in the checkpoint; those of several stages are resumed in `test_budget`."""
     config = config_of(method, tmp_path / "one")
     whole = train(config)
@@ -67,7 +67,7 @@ PRIORS = dataclasses.replace(METHODS["sp"], learn=functools.partial(graph_from_f
 
 
 @pytest.mark.slow
-def test_edges_of_ones_own_are_of_the_categories_of_the_world(tmp_path, monkeypatch, capsys):
+def test_custom_edges_must_match_the_categories_of_the_world(tmp_path, monkeypatch, capsys):
     (tmp_path / "my_priors.py").write_text(PRIORS)
     (tmp_path / "edges.csv").write_text("Mug,DiningTable")  # which rooms do not know
     monkeypatch.syspath_prepend(tmp_path)
@@ -85,7 +85,7 @@ def test_edges_of_ones_own_are_of_the_categories_of_the_world(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(("rollout", "is_warned"), [(24, True), (25, False)])
-def test_rollouts_that_hold_no_whole_choice_are_told(rollout, is_warned, tmp_path, capsys):
+def test_train_warns_of_rollouts_shorter_than_a_macro_step(rollout, is_warned, tmp_path, capsys):
     config = dataclasses.replace(tiny_config(tmp_path), method="semexp", method_sizes={})
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout=rollout))
     warn_if_rollout_too_short(config, Console(width=200))

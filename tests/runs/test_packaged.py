@@ -23,7 +23,7 @@ from jaxnav.runs.worlds import compile_evaluation_world
 from jaxnav.viz.episode import play_episode
 
 
-def test_the_world_is_the_one_of_the_task(drawn_run, tmp_path):
+def test_config_for_policy_names_the_world_of_its_task(drawn_run, tmp_path):
     assert config_for_policy("rooms-org").world == "rooms"
     baseline = config_for_policy(drawn_run.config.run_dir / POLICIES_DIR / "baseline-0")
     assert (baseline.world, baseline.arms) == ("rooms", ("baseline",))
@@ -34,14 +34,14 @@ def test_the_world_is_the_one_of_the_task(drawn_run, tmp_path):
         config_for_policy(export)
 
 
-def test_a_policy_read_as_a_run_has_one_seed():
+def test_packaged_policy_as_a_run_has_one_seed():
     config, policies = load_policy_as_run("rooms-org")
     assert (config.arms, policies.arms, policies.num_seeds) == (("layout",), ("layout",), 1)
     loaded = jaxnav.load_policy("rooms-org")
     np.testing.assert_array_equal(policies.arm_params("layout")["actor"]["bias"][0], loaded.params["actor"]["bias"])
 
 
-def test_a_folder_comes_before_a_policy_of_the_package(tmp_path, monkeypatch):
+def test_local_folder_precedes_a_packaged_policy_of_the_same_name(tmp_path, monkeypatch):
     assert find_policy_folder("rooms-org") == PACKAGED_POLICIES / "rooms-org"
     assert is_policy("rooms-org")
     monkeypatch.chdir(tmp_path)
@@ -51,7 +51,7 @@ def test_a_folder_comes_before_a_policy_of_the_package(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_episode_is_the_same_but_for_the_layout(drawn_run):
+def test_shifted_episode_differs_in_the_layout_alone(drawn_run):
     """Room, goal and start of the second panel are those of the first; L* is that of its own scenes."""
     console = Console(record=True, width=120, file=io.StringIO())
     index = 5
@@ -78,7 +78,7 @@ def test_an_episode_is_the_same_but_for_the_layout(drawn_run):
     np.testing.assert_array_equal(alone.trace.action, shifted.trace.action)
 
 
-def test_what_a_policy_cannot_play_is_refused(drawn_run):
+def test_play_episode_refuses_unknown_variants_and_indexes(drawn_run):
     with pytest.raises(InputError, match="is a policy of the arm 'layout'; choose another --variant"):
         play_episode("rooms-org", variant="baseline")
     with pytest.raises(InputError, match="--index 1000: give a number from 0 to 999"):

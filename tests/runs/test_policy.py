@@ -86,7 +86,7 @@ def alone(start):
         ("baseline", None, "argmax"),
     ],
 )
-def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsilon, decoding):
+def test_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsilon, decoding):
     arm, seed = "baseline" if variant == "baseline" else "layout", 1
     key = jax.random.fold_in(jax.random.key(0), 0)  # that of the first episode played
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / f"{arm}-{seed}")
@@ -106,7 +106,7 @@ def test_a_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, ep
 
 
 @pytest.mark.parametrize("setting", ["overdue", pytest.param("learned", marks=pytest.mark.slow)])
-def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setting):
+def test_handover_policy_switches_as_in_the_evaluation(drawn_run, world, setting):
     """It switches, and holds: once without experience, always without."""
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1", setting, hold=True, form="switch")
     policies, params, bank = (
@@ -129,7 +129,7 @@ def test_a_loaded_policy_hands_over_as_in_the_evaluation(drawn_run, world, setti
     assert 0 < np.mean(switched) < 1
 
 
-def test_removal_and_keys_change_actions(drawn_run, world):
+def test_loaded_policy_actions_depend_on_epsilon_and_key(drawn_run, world):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1")
     starts, bank = start_states(draw_episodes(world.banks[0], 8)), world.banks[0]
     room = bank.room_types[int(starts.scene[0])]
@@ -158,7 +158,7 @@ def stack(trees):
 
 
 @pytest.mark.parametrize("name", ["layout-0", "baseline-0"])
-def test_a_batch_equals_its_singles(drawn_run, world, name):
+def test_vmapped_observations_equal_single_steps(drawn_run, world, name):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / name)
     observations, memories = batch_of(policy, world.env, world.make_env_params(0))
     standing = functools.partial(policy.act, heading=0, moved=False)
@@ -168,7 +168,7 @@ def test_a_batch_equals_its_singles(drawn_run, world, name):
     chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
 
 
-def test_several_policies_act_in_one_call(drawn_run, world):
+def test_vmapped_policies_equal_single_policies(drawn_run, world):
     folders = [drawn_run.config.run_dir / POLICIES_DIR / f"layout-{seed}" for seed in range(2)]
     policies = [jaxnav.load_policy(folder) for folder in folders]
     (observation, *_), (memory, *_) = batch_of(policies[0], world.env, world.make_env_params(0), 1)
@@ -178,7 +178,7 @@ def test_several_policies_act_in_one_call(drawn_run, world):
     chex.assert_trees_all_close(together, singles, rtol=1e-5, atol=1e-6)
 
 
-def test_the_room_type_picks_the_prior(drawn_run):
+def test_policy_init_selects_the_prior_of_the_room_type(drawn_run):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     for number, room in enumerate([*ROOM_TYPES, None]):
         layout = policy.init(room).perception_state.layout
@@ -190,14 +190,14 @@ def test_the_room_type_picks_the_prior(drawn_run):
         policy.init("cellar")
 
 
-def test_a_policy_with_a_spatial_memory_needs_compass_and_odometry(drawn_run, world):
+def test_spatial_memory_policy_refuses_steps_without_compass_and_odometry(drawn_run, world):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     start = tiny.leaves_at(start_states(draw_episodes(world.banks[0], 8)), 0)
     with pytest.raises(InputError, match="goes by compass and odometry; give `heading` and `moved`"):
         policy.act(world.env.observe(start, world.make_env_params(0)), policy.init())
 
 
-def test_a_policy_knows_its_task_and_is_refused_for_another(drawn_run, world):
+def test_load_policy_refuses_an_environment_of_another_task(drawn_run, world):
     folder = drawn_run.config.run_dir / POLICIES_DIR / "layout-0"
     policy = jaxnav.load_policy(folder, env=world.env)
     assert policy.task == world.env.task
@@ -240,7 +240,7 @@ class Steered(Experience):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["semexp", "savn", "tpn"])
-def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
+def test_loaded_adaptive_or_controlled_policy_acts_as_in_the_evaluation(name):
     """Over a whole episode of more than a window of six actions: what is adapted changes the logits of both."""
     setting = tiny.ESTIMATOR if METHODS[name].hosts_layout else None
     spec = dataclasses.replace(tiny.SPEC, method=METHODS[name], method_sizes=())
@@ -273,7 +273,7 @@ def test_what_adapts_or_controls_acts_as_in_the_evaluation(name):
 
 
 @pytest.mark.slow
-def test_a_tracker_takes_in_every_step():
+def test_loaded_tracker_is_updated_at_every_step():
     steered = Method(Steered, tracker=Compass(), name="steered")
     spec = dataclasses.replace(tiny.SPEC, method=steered, method_sizes=())
     env, params = tiny.world()

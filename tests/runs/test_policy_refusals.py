@@ -37,12 +37,12 @@ def respecified(export, **changes):
     return export
 
 
-def test_folders_without_an_export_are_refused(tmp_path, drawn_run):
+def test_load_policy_refuses_folders_without_an_export(tmp_path, drawn_run):
     for folder in (tmp_path, tmp_path / "none", drawn_run.config.run_dir, str(tmp_path)):
         assert "not an exported policy (No such file or directory: " in refused(folder)
 
 
-def test_damaged_exports_are_refused(export):
+def test_load_policy_refuses_damaged_exports(export):
     data = bytearray((export / "params.safetensors").read_bytes())
     data[-1] ^= 1
     (export / "params.safetensors").write_bytes(data)
@@ -69,7 +69,7 @@ def test_damaged_exports_are_refused(export):
         ({"method_sizes": None}, "its spec does not fit this code (AttributeError: "),
     ],
 )
-def test_exports_of_other_code_are_refused(export, changes, problem):
+def test_load_policy_refuses_exports_of_other_code(export, changes, problem):
     assert jaxnav.load_policy(export).spec.method.name == "org"
     message = refused(respecified(export, **changes))
     assert problem in message
@@ -85,7 +85,9 @@ def test_exports_of_other_code_are_refused(export, changes, problem):
         ("semexp", {"reach": np.zeros(3, np.int32)}, "KeyError: 'lines'"),
     ],
 )
-def test_what_a_method_learned_has_to_fit_it(drawn_run, export, tmp_path, method, learned, problem):
+def test_load_policy_refuses_learned_arrays_that_do_not_fit_the_method(
+    drawn_run, export, tmp_path, method, learned, problem
+):
     tensors, spec = load_params(export)
     config = dataclasses.replace(drawn_run.config, method=method)
     policy = init_params(config.policy_spec(len(spec["categories"])), jax.random.key(0))
@@ -96,7 +98,7 @@ def test_what_a_method_learned_has_to_fit_it(drawn_run, export, tmp_path, method
     assert message.endswith("; train the run anew")
 
 
-def test_a_policy_that_is_not_there_is_refused_with_those_that_are(tmp_path, monkeypatch):
+def test_load_policy_lists_packaged_policies_for_an_unknown_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
         InputError, match=r"^room-org: not an exported policy .*; export it, or load one of the package: rooms-org$"

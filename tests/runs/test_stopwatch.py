@@ -8,7 +8,7 @@ from jaxnav.runs.train import Stopwatch
 from jaxnav.store.files import append_log_rows
 
 
-def test_it_counts_from_its_start_and_goes_on_after_an_interruption(tmp_path):
+def test_stopwatch_counts_from_its_start_and_continues_after_an_interruption(tmp_path):
     began = time.monotonic()
     clock = Stopwatch.start()
     assert clock.resume(tmp_path / "missing.jsonl") == clock

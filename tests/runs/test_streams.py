@@ -25,7 +25,7 @@ def streams(config):
     return check_config(dataclasses.replace(config, decision="streams"))
 
 
-def test_streams_need_no_training_of_the_counterfactual_branch(streams):
+def test_stream_config_disables_counterfactual_training(streams):
     assert (streams.direct, streams.counterfactual) == ("goal", "none")
     spec = streams.policy_spec(9)
     assert (spec.decision, spec.direct) == ("streams", "goal")
@@ -33,7 +33,7 @@ def test_streams_need_no_training_of_the_counterfactual_branch(streams):
     assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "all", "distil")
 
 
-def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
+def test_exported_stream_policy_acts(drawn_run, streams, tmp_path):
     drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     params = random_params(0, streams.policy_spec(len(streams.task.categories)))
     explored = Exploration(jnp.ones_like(drawn.knowledge.layout), jnp.int32(1), jnp.int32(1))
@@ -49,7 +49,7 @@ def test_an_exported_policy_of_streams_acts(drawn_run, streams, tmp_path):
     np.testing.assert_array_equal(memory.policy_state.use_experience, 1.0)
 
 
-def test_exports_that_do_not_name_a_decision_are_refused(drawn_run, tmp_path):
+def test_load_policy_refuses_export_without_decision(drawn_run, tmp_path):
     folder = shutil.copytree(drawn_run.config.run_dir / POLICIES_DIR / "layout-0", tmp_path / "layout-0")
     with resigned(folder / "policy.json") as exported:
         assert exported["spec"].pop("decision") == "fused"
@@ -58,7 +58,7 @@ def test_exports_that_do_not_name_a_decision_are_refused(drawn_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_streams_are_trained_and_evaluated(config, tmp_path):
+def test_stream_run_is_trained_and_evaluated(config, tmp_path):
     run = jaxnav.train(dataclasses.replace(config, decision="streams", run_dir=tmp_path / "run"))
     assert run.config.decision == "streams"
     policies = run.policies()

@@ -27,7 +27,7 @@ def swept(drawn_run):
 
 
 @pytest.mark.parametrize("decoding", DECODINGS)
-def test_a_sweep_equals_the_rows_of_an_evaluation(swept, evaluated, decoding):
+def test_sweep_equals_the_stde_rows_of_an_evaluation(swept, evaluated, decoding):
     sweep, metrics = swept[decoding], evaluated.metrics()
     assert sweep.compilations == 1
     np.testing.assert_array_equal(sweep.epsilon, EPSILON)
@@ -39,7 +39,7 @@ def test_a_sweep_equals_the_rows_of_an_evaluation(swept, evaluated, decoding):
 
 
 @pytest.mark.parametrize("decoding", DECODINGS)
-def test_from_epsilon_1_on_nothing_is_removed(swept, evaluated, decoding):
+def test_sweep_removes_nothing_from_epsilon_1_on(swept, evaluated, decoding):
     weights = swept[decoding].outcome.mean_weight.mean((1, 2))
     assert weights[-1] == 0
     assert (np.diff(weights) < 0).all()
@@ -50,7 +50,7 @@ def test_from_epsilon_1_on_nothing_is_removed(swept, evaluated, decoding):
 
 
 @pytest.mark.slow
-def test_parameters_of_ones_own_are_what_is_evaluated(swept, drawn_run):
+def test_sweep_evaluates_the_given_parameters(swept, drawn_run):
     params = drawn_run.policies(("layout",)).params
     again = {
         name: jaxnav.sweep(drawn_run, EPSILON, own, episodes=EPISODES).outcome
@@ -79,13 +79,13 @@ def test_parameters_of_ones_own_are_what_is_evaluated(swept, drawn_run):
         ({"epsilon": (0.5,), "seed": 2**32}, "seed 4294967296: give a whole number from 0"),
     ],
 )
-def test_impossible_arguments_are_refused(drawn_run, arguments, problem):
+def test_sweep_refuses_impossible_arguments(drawn_run, arguments, problem):
     for call in (jaxnav.sweep, jaxnav.evaluate):
         with pytest.raises(InputError, match=problem):
             call(drawn_run, **arguments)
 
 
-def test_runs_without_the_layout_are_refused(drawn_run, tmp_path):
+def test_sweep_refuses_runs_without_the_layout(drawn_run, tmp_path):
     baseline = Run(dataclasses.replace(drawn_run.config, arms=("baseline",)))
     with pytest.raises(InputError, match="was trained without the arm 'layout'; train one with all --arms"):
         jaxnav.sweep(baseline, EPSILON)

@@ -70,7 +70,7 @@ def sent(monkeypatch):
     return numbers, closed
 
 
-def test_every_row_goes_to_its_series(run, sent):
+def test_send_log_sends_every_row_to_its_series(run, sent):
     numbers, closed = sent
     log(run, row(1, loss=0.5, val_success=None), row(1, seed=1, loss=0.25), row(2, loss=float("nan"), success=1.0))
     assert send_log(run, ("tensorboard", "wandb")) == 3
@@ -79,7 +79,7 @@ def test_every_row_goes_to_its_series(run, sent):
     assert sorted(closed) == [(library, f"layout-{seed}") for library in sorted(MODULES) for seed in (0, 1)]
 
 
-def test_a_run_that_goes_on_is_followed_to_its_end(run, sent, monkeypatch):
+def test_send_log_follows_a_resumed_run_to_its_end(run, sent, monkeypatch):
     """Killed after update 2 of 4 and resumed: the row after the checkpoint is dropped and written again, the same."""
     numbers, closed = sent
     log(run, row(1, loss=1.0), row(1, seed=1, loss=1.0), row(2, loss=2.0))
@@ -101,7 +101,7 @@ def test_a_run_that_goes_on_is_followed_to_its_end(run, sent, monkeypatch):
     assert len(closed) == 2
 
 
-def test_sinks_are_closed_where_the_log_is_damaged(run, sent, monkeypatch):
+def test_send_log_closes_sinks_when_the_log_is_damaged(run, sent, monkeypatch):
     log(run, row(1, loss=0.5))
 
     def damage(_):
@@ -114,7 +114,7 @@ def test_sinks_are_closed_where_the_log_is_damaged(run, sent, monkeypatch):
 
 
 @pytest.mark.parametrize("extra", MODULES)
-def test_a_sink_that_is_not_installed_is_refused(run, extra, monkeypatch, capsys):
+def test_log_command_names_the_extra_of_a_missing_sink(run, extra, monkeypatch, capsys):
     log(run, row(1, loss=0.5))
     monkeypatch.setitem(sys.modules, MODULES[extra], None)
     assert main(["log", str(run.config.run_dir), "--to", extra]) == 2
@@ -122,7 +122,7 @@ def test_a_sink_that_is_not_installed_is_refused(run, extra, monkeypatch, capsys
     assert words == f"error: --to {extra}: needs {MODULES[extra]}; install it by: pip install 'jaxnav[{extra}]'"
 
 
-def test_the_command_tells_what_it_sent(run, sent, capsys):
+def test_log_command_prints_the_number_of_rows(run, sent, capsys):
     log(run, row(1, loss=0.5))
     assert main(["log", str(run.config.run_dir), "--to", "tensorboard", "wandb"]) == 0
     assert capsys.readouterr().err.split()[:2] == ["1", "rows"]
@@ -131,7 +131,7 @@ def test_the_command_tells_what_it_sent(run, sent, capsys):
 # With the libraries themselves
 
 
-def test_event_files_hold_the_log(run):
+def test_tensorboard_event_file_holds_the_log(run):
     """The records of a file: length uint64, its checksum, the event, its checksum; a second time replaces the first."""
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
     run = Run(dataclasses.replace(run.config, seeds=1))
@@ -165,7 +165,7 @@ def wandb_records(file):
 
 
 @pytest.mark.slow
-def test_wandb_keeps_the_log_offline(run, monkeypatch):
+def test_wandb_offline_file_holds_the_log(run, monkeypatch):
     wandb_internal_pb2 = pytest.importorskip("wandb.proto.wandb_internal_pb2")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
@@ -181,7 +181,7 @@ def test_wandb_keeps_the_log_offline(run, monkeypatch):
     assert values == {(128, "loss"): 0.5, (128, "success"): 0.25, (256, "loss"): 0.125}
 
 
-def test_a_sink_named_twice_is_sent_to_once_and_none_is_refused(run, sent):
+def test_send_log_ignores_repeated_sinks_and_refuses_none(run, sent):
     log(run, row(1, loss=0.5))
     assert send_log(run, ("tensorboard", "tensorboard")) == 1
     assert len(sent[0]) == 1

@@ -35,14 +35,14 @@ def trained(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_training_a_finished_run_leaves_it_as_it_is(trained, capsys):
+def test_train_leaves_a_finished_run_unchanged(trained, capsys):
     before = contents(trained.run_dir)
     assert jaxnav.train(trained) == jaxnav.Run(trained)
     assert contents(trained.run_dir) == before
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_run_is_opened_from_its_path(trained):
+def test_run_opens_from_its_path(trained):
     # Where it runs and what is kept how often is no part of what a run is.
     usual = {name: getattr(jaxnav.RunConfig(), name) for name in ("save_every", "cache", "devices")}
     for path in (trained.run_dir, str(trained.run_dir)):
@@ -54,7 +54,7 @@ def test_a_run_is_opened_from_its_path(trained):
         jaxnav.Run.open(trained.run_dir / "policies")
 
 
-def test_the_policies_are_stacked_arm_by_arm(trained):
+def test_run_policies_are_stacked_by_arm_and_seed(trained):
     policies = jaxnav.Run(trained).policies()
     assert (policies.arms, policies.num_seeds) == (("baseline", "layout"), SEEDS)
     assert policies.spec == trained.policy_spec(len(trained.task.categories))
@@ -71,7 +71,7 @@ def test_the_policies_are_stacked_arm_by_arm(trained):
     chex.assert_trees_all_equal(layout.params, policies.arm_params("layout"))
 
 
-def test_the_log_has_a_row_of_every_chunk_arm_and_seed(trained):
+def test_run_log_has_a_row_per_chunk_arm_and_seed(trained):
     rows = jaxnav.Run(trained).log()
     identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
     assert identities == [
@@ -94,7 +94,7 @@ def test_the_log_has_a_row_of_every_chunk_arm_and_seed(trained):
         ({"method_sizes": {"layers": 1}}, "method_sizes.layers is 1; is unknown; 'org' has relation_layers"),
     ],
 )
-def test_impossible_runs_are_refused_before_anything_is_made(config, tmp_path, changes, problem):
+def test_train_refuses_invalid_settings_before_writing(config, tmp_path, changes, problem):
     changed = {"method_sizes": {}, "run_dir": tmp_path / "run"} | changes
     with pytest.raises(InputError) as error:
         jaxnav.train(dataclasses.replace(config, **changed))
@@ -108,7 +108,7 @@ def small(config, run_dir, **changes):
 
 
 @pytest.mark.slow
-def test_a_method_that_cannot_host_the_layout_is_trained_without_it(config, tmp_path):
+def test_method_without_layout_support_is_trained_as_baseline_alone(config, tmp_path):
     anonymous = small(config, tmp_path / "run", method="anonymous", method_sizes={})
     run = jaxnav.train(anonymous)
     assert anonymous.arms == ("baseline", "layout")
@@ -139,7 +139,7 @@ def test_a_method_that_cannot_host_the_layout_is_trained_without_it(config, tmp_
 
 
 @pytest.mark.slow
-def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
+def test_layout_arm_is_trained_and_evaluated_alone(config, tmp_path):
     run = jaxnav.train(small(config, tmp_path / "run", arms=("layout",)))
     assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["layout-0"]
     assert run.policies().estimator_config is not None
@@ -152,13 +152,13 @@ def test_the_layout_is_trained_and_evaluated_alone(config, tmp_path):
     np.testing.assert_array_equal(sweep.outcome.length, results.outcome.length[[2, 0]])
 
 
-def test_paths_may_be_texts():
+def test_check_config_converts_strings_to_paths():
     config = check_config(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
     assert (config.run_dir, config.scenes) == (Path("runs/two"), Path("rooms.jsonl.gz"))
 
 
 @pytest.mark.slow
-def test_zones_are_learned_in_the_training_scenes_alone_and_exported(config, tmp_path):
+def test_hoz_zones_are_learned_from_training_scenes_and_exported(config, tmp_path):
     hoz = small(config, tmp_path / "run", method="hoz", method_sizes={})
     exported = jaxnav.train(hoz).policies().knowledge.method
 
@@ -175,7 +175,7 @@ def test_zones_are_learned_in_the_training_scenes_alone_and_exported(config, tmp
 
 
 @pytest.mark.slow
-def test_nothing_that_is_known_before_training_is_of_val_or_test(config, tmp_path):
+def test_prior_knowledge_depends_on_training_scenes_alone(config, tmp_path):
     """Priors, signs, calibration and zones: other training scenes change all of them, other val scenes nothing."""
 
     def known(name, **worlds):
@@ -195,7 +195,7 @@ def test_nothing_that_is_known_before_training_is_of_val_or_test(config, tmp_pat
 
 
 @pytest.mark.slow
-def test_scene_priors_are_learned_in_the_training_scenes_alone_and_exported(config, tmp_path):
+def test_sp_graph_is_learned_from_training_scenes_and_exported(config, tmp_path):
     sp, console = small(config, tmp_path / "run", method="sp", method_sizes={}), Console(quiet=True)
     exported = jaxnav.train(sp).policies().knowledge.method
 

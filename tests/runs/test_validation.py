@@ -38,7 +38,7 @@ def validated(drawn_run):
 
 
 @pytest.mark.slow
-def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
+def test_validator_equals_evaluation_on_the_same_episodes(validated):
     config, policies, validator, held = validated
     rows = [EvaluationRow(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
     world = compile_evaluation_world(config, "val", None, None, QUIET)
@@ -55,7 +55,7 @@ def test_a_measurement_is_what_evaluation_finds_in_the_same_episodes(validated):
 
 
 @pytest.mark.slow
-def test_success_within_budgets_grows_to_the_whole(validated):
+def test_success_by_budget_grows_to_the_validation_success(validated):
     _, policies, validator, held = validated
     reach, scores = validator.success_by_budget(held), validator.measure(held)
     assert reach["budgets"] == sorted(set(reach["budgets"]))
@@ -70,14 +70,14 @@ def test_success_within_budgets_grows_to_the_whole(validated):
 @pytest.mark.parametrize(
     ("validations", "after"), [(0, []), (1, [12]), (2, [6, 12]), (5, [4, 6, 8, 10, 12]), (99, [2, 4, 6, 8, 10, 12])]
 )
-def test_measurements_are_evenly_spaced_and_end_with_the_last_chunk(validations, after):
+def test_validation_updates_are_evenly_spaced_and_end_with_the_last_chunk(validations, after):
     ppo = PPOConfig(num_envs=64, rollout=10, minibatches=4)
     config = RunConfig(chunk=2, total_steps=12 * 640, ppo=ppo, validations=validations)
     assert sorted(config.validation_updates) == after
 
 
 @pytest.mark.slow
-def test_the_exported_policy_is_the_one_that_succeeded_most(config, tmp_path):
+def test_train_exports_the_policy_with_the_highest_validation_success(config, tmp_path):
     config = dataclasses.replace(config, run_dir=tmp_path / "run", total_steps=8 * config.total_steps, val_episodes=40)
     run = train(dataclasses.replace(config, validations=4))
     last = train(dataclasses.replace(config, validations=0, run_dir=tmp_path / "last"))
@@ -100,7 +100,7 @@ def test_the_exported_policy_is_the_one_that_succeeded_most(config, tmp_path):
 
 
 @pytest.mark.slow
-def test_layout_policies_are_validated_with_the_layout_in_any_order_of_the_arms(validated):
+def test_validator_uses_layout_weights_in_any_order_of_the_arms(validated):
     config, policies, validator, held = validated
     training = compile_training_world(config, QUIET)
     reversed_config = dataclasses.replace(config, arms=("layout", "baseline"), validations=1)
@@ -119,7 +119,7 @@ def test_layout_policies_are_validated_with_the_layout_in_any_order_of_the_arms(
 
 
 @pytest.mark.slow
-def test_a_file_without_val_scenes_exports_the_last_policy(config, tmp_path):
+def test_train_without_val_scenes_exports_the_last_policy(config, tmp_path):
     scenes = tmp_path / "train_only.jsonl"
     write_scenes(scenes, [make_generated_scenes("rooms", "train", 2)[i] for i in range(2)])
     output = io.StringIO()
