@@ -1,5 +1,7 @@
 """The planner: worked searches, that it knows nothing it has not seen, and that a true prior leads it sooner."""
 
+import itertools
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +18,7 @@ from jaxnav.scenes.task import Task
 FLAT = uniform_layout_model(len(CATEGORIES))
 #: An alley with a chamber at either end; a wall hides most of each from the alley.
 ALLEY = ["...##########...", "................", "...##########..."]
-WALLS = [(z, x) for z in (0, 2) for x in range(3, 13)]
+WALLS = list(itertools.product((0, 2), range(3, 13)))
 CLUES = (("Fridge", 0.25, 0.9, 0.5, 0.2, 0.2, 0.2), ("Chair", 3.5, 0.5, 0.5, 0.2, 0.2, 0.2))
 
 

@@ -17,9 +17,10 @@ def search_connected_parts(free_mask):
     unvisited_cells = dict.fromkeys(map(tuple, np.argwhere(free_mask).tolist()))
     parts = []
     while unvisited_cells:
-        start_pose = next(iter(unvisited_cells))
-        del unvisited_cells[start_pose]
-        pending = deque([start_pose])
+        # Begin a part at the first cell in row order that no part has.
+        first_part_cell = next(iter(unvisited_cells))
+        del unvisited_cells[first_part_cell]
+        pending = deque([first_part_cell])
         part_cells = []
         while pending:
             z, x = pending.popleft()

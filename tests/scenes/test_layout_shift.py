@@ -64,18 +64,21 @@ DEN = {
 }
 
 
+def rename_types(new_types: dict[str, str]) -> tuple[str, ...]:
+    """Return the types of the den with some of them renamed."""
+    return tuple(new_types.get(kind, kind) for kind in DEN)
+
+
 def test_exchange_places_swaps_neighbours_in_size():
     scene = shelf_scene(list(DEN.items()))
     # From the smallest: Book, Bowl | Chair, GarbageCan, Fridge. The first chair, a stool, comes to the only place.
     pair_exchange = {"Book": "Bowl", "Bowl": "Book"}
     triple_exchange = {"Chair": "GarbageCan", "Stool": "GarbageCan", "GarbageCan": "Fridge", "Fridge": "Stool"}
-    assert exchange_places(scene, TASK, 1, 0).types == tuple(
-        (pair_exchange | triple_exchange).get(kind, kind) for kind in DEN
-    )
+    assert exchange_places(scene, TASK, 1, 0).types == rename_types(pair_exchange | triple_exchange)
 
     # Half of the two groups is one of them; the seed decides which one.
     half_shifts = {exchange_places(scene, TASK, 0.5, seed).types for seed in range(20)}
-    assert half_shifts == {tuple(group.get(kind, kind) for kind in DEN) for group in (pair_exchange, triple_exchange)}
+    assert half_shifts == {rename_types(pair_exchange), rename_types(triple_exchange)}
 
 
 def test_exchange_places_keeps_box_sizes_and_undersides():

@@ -28,7 +28,9 @@ from jaxnav.scenes.scene import Scene
 
 def test_generated_rooms_balance_room_types_and_have_unique_names():
     num_rooms = {"train": 8, "val": 4, "test": 4}
-    rooms = [generate_room(split, i, 1) for split, count in num_rooms.items() for i in range(count)]
+    rooms = []
+    for split, count in num_rooms.items():
+        rooms.extend(generate_room(split, i, 1) for i in range(count))
     rooms_by_type = collections.Counter((scene.split, scene.room_type) for scene in rooms)
     for room_type in ROOM_TYPES:
         assert [rooms_by_type[split, room_type] for split in ("train", "val", "test")] == [2, 1, 1]

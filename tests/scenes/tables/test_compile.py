@@ -42,7 +42,8 @@ def view_picture(scene, cell, heading, rules=ROOMS):
     cell_index = standable_cells(scene.reach).tolist().index(list(cell))
     pose = cell_index * rules.poses_per_cell + heading * len(rules.horizons)
     cells = ROW_FORMAT.view_cells(compile_table(scene, rules).rows[pose]).reshape(11, 11)
-    return ["".join("?.#"[value] for value in row) for row in cells[::-1]]
+    marks = np.array(list("?.#"))[cells]
+    return ["".join(row) for row in marks[::-1]]
 
 
 def test_ego_centric_view_of_a_drawn_room():

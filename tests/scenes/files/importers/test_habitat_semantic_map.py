@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.importer_inputs.semantic_maps import CHAIR, l_shaped_floor, write_maps
 from support.refusals import assert_message_names
-from support.scene_geometry import points_of
+from support.scene_geometry import block, points_of
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.habitat import build_scene_from_map, parse_floor_map, read_floor_maps
@@ -74,7 +74,7 @@ def test_semantic_map_of_an_l_shaped_floor_with_a_chair(tmp_path):
     assert not {(1.75, 0.0), (5.25, 0.0)} & standable_points
 
     # Around the chair pixels 36-53 and 0-17 are x 3.80 to 4.70 m and z -1.00 to -0.10 m.
-    assert not {(x, z) for x in (4.0, 4.25, 4.5) for z in (1.0, 0.75, 0.5, 0.25)} & standable_points
+    assert not block(4.0, 4.5, 0.25, 1.0) & standable_points
     assert len(standable_cells(scene.reach)) == len(standable_points)
 
     # Chair: pixels 40-49 and 4-13, so x 4.00 to 4.50 and Habitat's z -0.80 to -0.30 m; a chair is 0.95 m high.
