@@ -1,4 +1,4 @@
-"""The searcher without prior: worked walks in drawn rooms, and that it knows nothing but what it perceives."""
+"""Frontier search: worked walks in drawn rooms, and independence of anything but perception."""
 
 import dataclasses
 

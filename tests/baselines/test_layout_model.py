@@ -1,4 +1,4 @@
-"""The fitted prior: closed forms, what it must find in made-up layouts, and what it must not."""
+"""Layout model of the planner: closed forms, fits to made-up layouts, and robustness to noise."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The planner: worked searches, that it knows nothing it has not seen, and that a true prior leads it sooner."""
+"""Planner: worked searches, independence of unseen objects, and the use of its layout model."""
 
 import itertools
 

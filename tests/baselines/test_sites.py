@@ -1,4 +1,4 @@
-"""Sites of drawn scenes: what is in view by hand, and that detections point at objects."""
+"""Sites of drawn scenes: views worked out by hand, detections and relations."""
 
 import numpy as np
 from hypothesis import given, settings

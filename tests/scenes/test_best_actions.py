@@ -1,4 +1,4 @@
-"""The expert: first actions of shortest paths, on a drawn map and against walks, and the same on the device."""
+"""Expert actions: shortest paths on a drawn map and in walks, and their copy on the device."""
 
 import jax
 import numpy as np

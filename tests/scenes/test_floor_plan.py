@@ -1,4 +1,4 @@
-"""The floor plan that a scene's name tells."""
+"""Floor plans named by scenes."""
 
 import collections
 

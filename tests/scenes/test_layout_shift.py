@@ -1,4 +1,4 @@
-"""The layout shift: categories of like size exchange their places."""
+"""Layout shift: categories of similar size exchange places."""
 
 import collections
 import dataclasses

@@ -1,4 +1,4 @@
-"""The layout shift in every world: what it changes, and what it leaves."""
+"""Layout shift in every world: goals, detection ranges and co-occurrence."""
 
 import collections
 import functools

@@ -1,4 +1,4 @@
-"""The world whose categories and rules count for a file of scenes."""
+"""World that supplies the categories and rules for a file of scenes."""
 
 import dataclasses
 

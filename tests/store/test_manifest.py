@@ -1,4 +1,4 @@
-"""The manifest of a run, and where two differ."""
+"""Manifest of a run, and differences between manifests."""
 
 import json
 

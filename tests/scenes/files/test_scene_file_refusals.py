@@ -1,4 +1,4 @@
-"""Scene files that cannot be read."""
+"""Refusals of unreadable scene files."""
 
 import functools
 import gzip

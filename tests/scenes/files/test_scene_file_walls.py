@@ -1,4 +1,4 @@
-"""Walls that follow from the standable cells and the boxes."""
+"""Walls derived from standable cells and boxes."""
 
 import numpy as np
 from hypothesis import given

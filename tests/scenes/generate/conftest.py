@@ -1,4 +1,4 @@
-"""Rooms that several files measure, generated once."""
+"""Generated rooms, shared by several files."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The procedural apartments and houses: reproducible, sound, of measured proportions."""
+"""Generated apartments and houses: reproducible, sound, of measured proportions."""
 
 import numpy as np
 import pytest

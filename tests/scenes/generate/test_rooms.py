@@ -1,4 +1,4 @@
-"""The procedural rooms: reproducible and physically sound."""
+"""Generated rooms: balanced over room types and physically sound."""
 
 import collections
 

@@ -1,4 +1,4 @@
-"""The procedural rooms against what was measured in AI2-THOR rooms."""
+"""Generated rooms against measurements of AI2-THOR rooms."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Scenes to tables: detections, the ego-centric view, and banks."""
+"""Compiled scenes: detections, the ego-centric view, and banks."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Rectangles that a mask of walls is divided into."""
+"""Rectangles that cover a mask of walls."""
 
 import numpy as np
 import pytest

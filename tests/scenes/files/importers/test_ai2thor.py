@@ -1,4 +1,4 @@
-"""Controller metadata to scenes, worked out by hand."""
+"""Import of AI2-THOR controller metadata, worked out by hand."""
 
 import numpy as np
 import pytest

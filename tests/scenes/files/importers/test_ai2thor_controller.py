@@ -1,4 +1,4 @@
-"""Scenes of a running simulator, which a recording stands for."""
+"""Import from a running AI2-THOR controller, with recorded metadata in its place."""
 
 import sys
 import types

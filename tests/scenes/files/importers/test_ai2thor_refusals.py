@@ -1,4 +1,4 @@
-"""Controller metadata that cannot be used."""
+"""Refusals of unusable AI2-THOR metadata."""
 
 import collections
 import gzip

@@ -1,4 +1,4 @@
-"""Offline Scene_Data folders to scenes."""
+"""Import of offline AI2-THOR Scene_Data folders."""
 
 import collections
 import json

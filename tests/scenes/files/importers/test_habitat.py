@@ -1,4 +1,4 @@
-"""Habitat ObjectNav episodes, with and without maps, to scenes."""
+"""Import of Habitat ObjectNav episodes with and without semantic maps."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Habitat ObjectNav files that cannot be used."""
+"""Refusals of unusable Habitat ObjectNav files."""
 
 import gzip
 import json

@@ -1,4 +1,4 @@
-"""Pickles: arrays of numbers are read, all else is refused."""
+"""Pickles of numeric arrays, and refusals of any other pickle."""
 
 import bz2
 import io

@@ -1,4 +1,4 @@
-"""ProcTHOR houses to scenes: two rooms worked out by hand."""
+"""Import of ProcTHOR houses: two rooms worked out by hand."""
 
 import json
 

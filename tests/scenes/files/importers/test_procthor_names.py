@@ -1,4 +1,4 @@
-"""Types by names, and real houses with and without the database."""
+"""Object types from ProcTHOR names, in real houses with and without the asset database."""
 
 from pathlib import Path
 

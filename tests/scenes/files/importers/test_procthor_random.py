@@ -1,4 +1,4 @@
-"""Random ProcTHOR houses against the rules, checked point by point."""
+"""Import of random ProcTHOR houses, checked point by point against the rules."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""ProcTHOR files that cannot be used."""
+"""Refusals of unusable ProcTHOR files."""
 
 import collections
 import gzip
