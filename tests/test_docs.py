@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.commands import write_config
+from support.tiny_run import write_config
 
 import jaxnav
 from jaxnav.env.objectnav import Observation

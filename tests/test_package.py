@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from support import tiny_world as tiny
-from support.commands import write_config
+from support.tiny_run import write_config
 
 import jaxnav
 from jaxnav.__main__ import main

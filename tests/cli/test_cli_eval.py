@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import SEEDS, contents, evaluate, finished_run, refusal
+from support.commands import contents, evaluate, refusal
 from support.mutations import resigned
+from support.tiny_run import NUM_SEEDS, finished_run
 
 from jaxnav.cli.eval import EvalConfig, _find_target
 from jaxnav.scenes.categories import ITHOR_CATEGORIES
@@ -53,7 +54,7 @@ def test_eval_report_holds_all_rows_and_differences(evaluated):
     assert report["compilations"] == 1
     assert len(report["rows"]) == ROWS
     for row in report["rows"]:
-        assert (row["method"], row["world"], row["split"], row["seeds"]) == ("ORG", "rooms", "val", SEEDS)
+        assert (row["method"], row["world"], row["split"], row["seeds"]) == ("ORG", "rooms", "val", NUM_SEEDS)
         assert row["episodes"] == 20  # rounded up to a multiple of the four room types
         for metric in ("sr", "spl", "dts", "sae", "timeout", "wrong_done"):
             # The only scenes of four room types are one stratum, and two training runs are enough.
@@ -83,14 +84,14 @@ def test_eval_prints_the_notes_below_the_table(evaluated):
 @pytest.mark.slow
 def test_eval_episode_file_averages_to_the_report(evaluated):
     rows = _episodes(evaluated)
-    assert len(rows) == ROWS * SEEDS * 20
+    assert len(rows) == ROWS * NUM_SEEDS * 20
     report = json.loads(evaluated.read_text())
     for row in report["rows"]:
         epsilon = "" if row["epsilon"] is None else str(row["epsilon"])
         own = [
             r for r in rows if (r["variant"], r["epsilon"], r["decoding"]) == (row["variant"], epsilon, row["decoding"])
         ]
-        assert len(own) == SEEDS * 20
+        assert len(own) == NUM_SEEDS * 20
         for metric, scale in (("sr", 100), ("spl", 100), ("dts", 1)):
             assert scale * np.mean([float(r[metric]) for r in own]) == pytest.approx(row[metric]["mean"], rel=1e-4)
     for row in rows:

@@ -4,7 +4,8 @@ import json
 import shutil
 
 import pytest
-from support.commands import contents, finished_run, refusal
+from support.commands import contents, refusal
+from support.tiny_run import finished_run
 
 from jaxnav.cli import report as command
 

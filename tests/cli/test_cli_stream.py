@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support import tiny_world as tiny
-from support.commands import CONFIG, evaluate, train
+from support.commands import evaluate, train
+from support.tiny_run import write_config
 
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.layout import EstimatorConfig
@@ -35,9 +36,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("stream") / "tiny.yaml"
-    path.write_text(CONFIG.replace("seeds: 2", "seeds: 1"))
-    return path
+    return write_config(tmp_path_factory.mktemp("stream"), num_seeds=1)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import pytest
 from support.commands import contents, refusal
-from support.drawn_run import draw_run, tiny_config
+from support.tiny_run import draw_run, tiny_config
 
 from jaxnav import __main__ as commands
 from jaxnav.experiments.config import EXPERIMENTS

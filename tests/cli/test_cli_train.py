@@ -3,12 +3,14 @@
 import csv
 import dataclasses
 import gzip
+import itertools
 import math
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.commands import POLICIES, SEEDS, contents, evaluate, finished_run, refusal, train
+from support.commands import contents, evaluate, refusal, train
+from support.tiny_run import NUM_SEEDS, POLICY_NAMES, finished_run
 
 from jaxnav.cli import train as train_command
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
@@ -32,11 +34,11 @@ def run_dir(tmp_path_factory):
 
 
 def test_train_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
-    assert {folder.name for folder in (run_dir / "policies").iterdir()} == POLICIES
+    assert {folder.name for folder in (run_dir / "policies").iterdir()} == set(POLICY_NAMES)
     assert {folder.name for folder in (run_dir / "checkpoints").iterdir()} == {"2", "4"}
     rows = read_log_rows(run_dir / "metrics.jsonl")
     identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
-    assert sorted(identities) == sorted((s, a, i) for s in (2, 4) for a in ("baseline", "layout") for i in range(SEEDS))
+    assert sorted(identities) == sorted(itertools.product((2, 4), ("baseline", "layout"), range(NUM_SEEDS)))
     for row in rows:
         assert row["distil_loss"] > 0
         assert all(math.isfinite(value) for value in row.values() if not isinstance(value, str))
@@ -46,7 +48,7 @@ def test_train_writes_policies_and_metrics_of_all_arms_and_seeds(run_dir):
 
 
 def test_exported_policies_record_method_estimator_and_prior(run_dir):
-    loaded = {name: load_params(run_dir / "policies" / name) for name in POLICIES}
+    loaded = {name: load_params(run_dir / "policies" / name) for name in POLICY_NAMES}
     for name, (tensors, spec) in loaded.items():
         assert spec["method"] == "org"
         assert spec["categories"] == list(ITHOR_CATEGORIES)

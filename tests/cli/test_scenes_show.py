@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 from PIL import Image
-from support import commands
+from support.commands import refusal
 from support.scenes import SMALL, draw
 
 from jaxnav.cli import scenes as scenes_command
@@ -76,7 +76,7 @@ def test_scenes_show_refuses_bad_requests(file, tmp_path, capsys):
         ((file, "--out", tmp_path / "folder.png"), ("folder.png", "cannot be written")),
     ):
         assert show(*arguments) == 2, arguments
-        message = commands.refusal(capsys)
+        message = refusal(capsys)
         assert all(word in message for word in words), message
     with pytest.raises(SystemExit):
         show(file, "--pose", "0 0", *out)

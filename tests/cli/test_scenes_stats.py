@@ -5,8 +5,9 @@ import re
 
 import numpy as np
 import pytest
-from support import commands
+from support.commands import refusal
 from support.scenes import SMALL, draw
+from support.tiny_run import finished_run
 
 from jaxnav.cli import scenes as scenes_command
 from jaxnav.env.objectnav import OTHER_ROOM
@@ -103,7 +104,7 @@ def test_scenes_stats_selects_splits_worlds_and_generated_scenes(file, capsys):
 
 
 def test_scenes_stats_prints_the_layout_gap_to_the_priors_of_a_run(tmp_path_factory, tmp_path, capsys):
-    _, run_dir = commands.finished_run(tmp_path_factory)
+    _, run_dir = finished_run(tmp_path_factory)
     capsys.readouterr()
     kitchen, bath = make_generated_scenes("rooms", "val", 8)[0], make_generated_scenes("rooms", "val", 8)[3]
     apartment = dataclasses.replace(make_generated_scenes("rooms", "val", 8)[4], room_type="apartment")
@@ -127,7 +128,7 @@ def test_scenes_stats_prints_the_layout_gap_to_the_priors_of_a_run(tmp_path_fact
 
 
 def test_scenes_stats_prints_no_gap_without_cooccurrence(tmp_path_factory, file, capsys):
-    _, run_dir = commands.finished_run(tmp_path_factory)
+    _, run_dir = finished_run(tmp_path_factory)
     alone = dataclasses.replace(KITCHEN, types=KITCHEN.types[:1], boxes=KITCHEN.boxes[:1])
     alone = dataclasses.replace(alone, yaws=alone.yaws[:1], parents=alone.parents[:1])
     # A false alarm has a chance of 0.5 % at each of the 16 poses and categories: the name decides whether there is one.
@@ -154,7 +155,7 @@ def test_scenes_stats_shift_exchanges_places_of_a_file(file, capsys):
 
 
 def test_scenes_stats_refuses_missing_files_splits_and_runs(tmp_path, tmp_path_factory, file, capsys):
-    _, run_dir = commands.finished_run(tmp_path_factory)
+    _, run_dir = finished_run(tmp_path_factory)
     for arguments, words in (
         ((tmp_path / "no.jsonl.gz",), ("no.jsonl.gz", "check the path")),
         ((file, "--split", "test"), ("no scene of split 'test'", "train, val")),
@@ -163,5 +164,5 @@ def test_scenes_stats_refuses_missing_files_splits_and_runs(tmp_path, tmp_path_f
         ((file, "--run", run_dir, "--world", "rooms"), ("--world, --run", "leave --world out")),
     ):
         assert scenes_command.main(["stats", *map(str, arguments)]) == 2
-        message = commands.refusal(capsys)
+        message = refusal(capsys)
         assert all(word in message for word in words), message

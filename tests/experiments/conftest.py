@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 from rich.console import Console
-from support.drawn_run import draw_run, tiny_config
+from support.tiny_run import draw_run, tiny_config
 
 import jaxnav
 from jaxnav.experiments.bench import Bench

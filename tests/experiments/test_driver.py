@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 from rich.console import Console
-from support.commands import CONFIG, contents
+from support.commands import contents
 from support.processes import run as start_python
+from support.tiny_run import CONFIG_YAML
 
 import jaxnav
 from jaxnav.cli import study as command
@@ -295,7 +296,7 @@ def experiment_file(folder: Path, text: str) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_an_experiment_from_training_to_its_page(tmp_path, capsys):
-    base = "".join(f"  {line}\n" for line in CONFIG.strip().splitlines() if not line.startswith("seeds"))
+    base = "".join(f"  {line}\n" for line in CONFIG_YAML.strip().splitlines() if not line.startswith("seeds"))
     document = tmp_path / "docs" / "page.md"
     path = experiment_file(
         tmp_path,

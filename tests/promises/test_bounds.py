@@ -14,9 +14,10 @@ import sys
 import tracemalloc
 
 import pytest
-from support.commands import train, write_config
+from support.commands import train
 from support.fuzz import KINDS, fuzz
 from support.processes import REPOSITORY, run
+from support.tiny_run import write_config
 from support.tiny_world import BANK
 
 from jaxnav.cli.console import run_command

@@ -10,8 +10,9 @@ import time
 
 import pytest
 from rich.console import Console
-from support.commands import train, write_config
+from support.commands import train
 from support.processes import ends, free_address, run, start
+from support.tiny_run import write_config
 
 from jaxnav.cli.console import run_command
 from jaxnav.errors import Interrupted

@@ -8,8 +8,8 @@ import signal
 import time
 
 import pytest
-from support.commands import POLICIES, SEEDS, write_config
 from support.processes import run
+from support.tiny_run import NUM_SEEDS, POLICY_NAMES, write_config
 
 from jaxnav.store.files import read_log_rows
 
@@ -47,10 +47,10 @@ def test_killed_run_resumes_bit_for_bit(tmp_path):
         process.communicate()
         assert process.returncode == -signal.SIGKILL
     assert "resumed after update" in finish(start(config_file, killed, cache, *long))
-    names = ["metrics.jsonl", "reach.json", *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES))]
+    names = ["metrics.jsonl", "reach.json", *(f"policies/{name}/params.safetensors" for name in POLICY_NAMES)]
     for name in names:
         assert (killed / name).read_bytes() == (whole / name).read_bytes(), name
-    assert len(read_log_rows(killed / "metrics.jsonl")) == 30 * 2 * SEEDS
+    assert len(read_log_rows(killed / "metrics.jsonl")) == 30 * 2 * NUM_SEEDS
     finish(start(config_file, other, cache, *long, "--seed", "1"))
     for name in names:
         assert (other / name).read_bytes() != (whole / name).read_bytes(), name

@@ -11,7 +11,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-from support.commands import CONFIG, contents, evaluate, refusal, train, write_config
+from support.commands import contents, evaluate, refusal, train
+from support.tiny_run import write_config
 
 import jaxnav
 from jaxnav.cli import log as log_command
@@ -122,9 +123,7 @@ def test_policies_logs_and_reports_of_0_2_are_read(run_of_0_2, capsys):
 
 def test_train_refuses_a_checkpoint_of_0_2_by_its_version(run_of_0_2, tmp_path, capsys):
     before = contents(run_of_0_2)
-    config = tmp_path / "tiny.yaml"
-    config.write_text(CONFIG.replace("seeds: 2", "seeds: 1"))
-    assert train(config, run_of_0_2) == 2
+    assert train(write_config(tmp_path, num_seeds=1), run_of_0_2) == 2
     assert "has format version 1, this code reads version 2; use the jaxnav that wrote it (0.2.0)" in refusal(capsys)
     after = contents(run_of_0_2)
     assert {name: after[name] for name in before} == before

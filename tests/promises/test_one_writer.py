@@ -16,9 +16,9 @@ import sys
 import time
 
 import pytest
-from support.commands import train, write_config
-from support.drawn_run import tiny_config
+from support.commands import train
 from support.processes import REPOSITORY, run
+from support.tiny_run import tiny_config, write_config
 
 from jaxnav.errors import InputError
 from jaxnav.runs.run import lock_run_dir

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
-from support.commands import POLICIES, finished_run, train
+from support.commands import train
 from support.corridors import compile_corridors
 from support.damage import damage
-from support.drawn_run import tiny_config
+from support.tiny_run import POLICY_NAMES, finished_run, tiny_config
 
 from jaxnav.errors import InputError
 from jaxnav.runs.policies import PACKAGED_POLICIES
@@ -246,7 +246,7 @@ def test_run_with_a_damaged_checkpoint_resumes_bit_for_bit(tmp_path, tmp_path_fa
     assert "resumed after update 2 of 4" in output
     for path in (
         "metrics.jsonl",
-        *(f"policies/{name}/params.safetensors" for name in sorted(POLICIES)),
+        *(f"policies/{name}/params.safetensors" for name in POLICY_NAMES),
     ):
         assert (hurt / path).read_bytes() == (run_dir / path).read_bytes(), path
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
-from support.drawn_run import draw_run, tiny_config
+from support.tiny_run import draw_run, tiny_config
 
 import jaxnav
 from jaxnav.errors import InputError

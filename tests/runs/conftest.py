@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.drawn_run import draw_run, tiny_config
+from support.tiny_run import draw_run, tiny_config
 
 import jaxnav
 from jaxnav.runs.config import RunConfig

@@ -5,8 +5,8 @@ import dataclasses
 import chex
 import pytest
 from rich.console import Console
-from support.drawn_run import tiny_config
 from support.stopping import train_in_two
+from support.tiny_run import tiny_config
 
 import jaxnav
 from jaxnav.__main__ import main

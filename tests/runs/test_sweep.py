@@ -6,7 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
-from support.commands import SEEDS
+from support.tiny_run import NUM_SEEDS
 
 import jaxnav
 from jaxnav.errors import InputError
@@ -34,7 +34,7 @@ def test_sweep_equals_the_stde_rows_of_an_evaluation(swept, evaluated, decoding)
     rows = np.array([evaluated.rows.index(EvaluationRow("stde", epsilon, "residual", decoding)) for epsilon in EPSILON])
     chex.assert_trees_all_equal(sweep.outcome, _row(evaluated.outcome, rows))
     for name in ("sr", "spl", "dts"):
-        assert getattr(sweep, name).shape == (len(EPSILON), SEEDS, EPISODES)
+        assert getattr(sweep, name).shape == (len(EPSILON), NUM_SEEDS, EPISODES)
         np.testing.assert_array_equal(getattr(sweep, name), metrics[name][rows])
 
 

@@ -7,7 +7,7 @@ import sys
 import types
 
 import pytest
-from support.drawn_run import tiny_config
+from support.tiny_run import tiny_config
 
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError

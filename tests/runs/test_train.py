@@ -9,7 +9,8 @@ import jax
 import numpy as np
 import pytest
 from rich.console import Console
-from support.commands import POLICIES, SEEDS, contents, finished_run
+from support.commands import contents
+from support.tiny_run import NUM_SEEDS, POLICY_NAMES, finished_run
 
 import jaxnav
 from jaxnav.env.objectnav import NUM_PRIORS
@@ -56,9 +57,9 @@ def test_run_opens_from_its_path(trained):
 
 def test_run_policies_are_stacked_by_arm_and_seed(trained):
     policies = jaxnav.Run(trained).policies()
-    assert (policies.arms, policies.num_seeds) == (("baseline", "layout"), SEEDS)
+    assert (policies.arms, policies.num_seeds) == (("baseline", "layout"), NUM_SEEDS)
     assert policies.spec == trained.policy_spec(len(trained.task.categories))
-    for name in POLICIES:
+    for name in POLICY_NAMES:
         arm, seed = name.split("-")
         loaded = jaxnav.load_policy(trained.run_dir / "policies" / name)
         chex.assert_trees_all_equal(
@@ -75,7 +76,7 @@ def test_run_log_has_a_row_per_chunk_arm_and_seed(trained):
     rows = jaxnav.Run(trained).log()
     identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
     assert identities == [
-        (step, arm, seed) for step in (2, 4) for arm in ("baseline", "layout") for seed in range(SEEDS)
+        (step, arm, seed) for step in (2, 4) for arm in ("baseline", "layout") for seed in range(NUM_SEEDS)
     ]
     assert all(math.isfinite(row["success"]) for row in rows)
 

@@ -8,15 +8,31 @@ import random
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from support.commands import contents, study_command, write_config
+from support.commands import contents
 from support.processes import ends, free_address, run, start
+from support.tiny_run import CONFIG_YAML, write_config
 
 LATE_S = 300  # after which a process counts as hanging
 LONG = ("--total-steps", 60 * 128)
+
+#: An experiment of two agents at two layout shifts, whose every run is the tiny run.
+EXPERIMENT_YAML = f"""
+agents:
+  main: {{}}
+  anonymous: {{method: anonymous, arms: [baseline]}}
+measure: {{variants: [main], instrument: [main]}}
+shifts: [0.0, 1.0]
+episodes: 24
+base:
+  direct: goal
+  done_gate: true
+{textwrap.indent(CONFIG_YAML.strip(), "  ")}
+"""
 
 
 def _training(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
@@ -24,12 +40,17 @@ def _training(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
 
 
 def _processes(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
-    address, config = free_address(), write_config(folder)
-    return [start(address, index, config, folder / "run", *LONG, **cache) for index in range(2)]
+    address = free_address()
+    config_file = write_config(folder)
+    return [start(address, index, config_file, folder / "run", *LONG, **cache) for index in range(2)]
 
 
 def _study(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
-    return [run(["-m", "jaxnav", "study", *study_command(folder)], **cache)]
+    config_file = folder / "experiment.yaml"
+    config_file.write_text(EXPERIMENT_YAML)
+    pages = f"{{{folder / 'docs/study.md'}: instrument}}"
+    options = ("--results", folder / "results", "--runs", folder / "runs", "--pages", pages)
+    return [run(["-m", "jaxnav", "study", config_file, *options], **cache)]
 
 
 _STARTED: dict[str, Callable[[Path, dict[str, object]], list[subprocess.Popen]]] = {

@@ -6,8 +6,9 @@ import os
 
 import numpy as np
 import pytest
-from support.commands import refusal, train, write_config
+from support.commands import refusal, train
 from support.processes import REPOSITORY, run
+from support.tiny_run import write_config
 
 from jaxnav.training.devices import Devices
 

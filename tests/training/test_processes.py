@@ -6,8 +6,9 @@ import time
 
 import chex
 import pytest
-from support.commands import evaluate, train, write_config
+from support.commands import evaluate, train
 from support.processes import ends, free_address, start
+from support.tiny_run import write_config
 
 from jaxnav.store.export import load_params
 from jaxnav.store.files import read_log_rows
