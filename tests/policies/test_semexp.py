@@ -1,7 +1,8 @@
-"""SemExp: the walk to what was chosen, Done by the map, when choices count, and where the layout enters."""
+"""SemExp: the walk to a chosen block, Done by the map, decision steps, and the pathways of the layout."""
 
 import dataclasses
 import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,235 +49,321 @@ SPEC = dataclasses.replace(tiny.SPEC, method=find_method("semexp"), method_sizes
 CORRIDOR = corridor_scene(24)
 BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))
 ENV, PARAMS = build_environment(BANK, {}, 100)
-PER_CELL = tiny.POSES_PER_CELL
+#: Headings of an agent in the corridor; the book is in the north.
+NORTH, SOUTH = 0, 4
+FLOOR_AND_WALL_BITS = np.uint32(7)
 
 
-def knowledge_of(bank=BANK):
-    return tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_search_setup([bank], np.zeros(0))))
+def make_knowledge(bank=BANK):
+    """The tiny world's priors with the search setup of a bank."""
+    search_setup = learn_search_setup([bank], np.zeros(0))
+    return tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, search_setup))
 
 
 @functools.lru_cache
-def acting(method="semexp", env=ENV):
-    return AgentLoop(env, dataclasses.replace(SPEC, method=find_method(method), num_categories=len(env.categories)))
+def make_agent_loop(method_name="semexp", env=ENV):
+    spec = dataclasses.replace(SPEC, method=find_method(method_name), num_categories=len(env.categories))
+    return AgentLoop(env, spec)
 
 
-def walk(start, choices):
-    """Agents and actions of an episode in the corridor, given one choice for every step, and what came of it."""
-    agents, actions = [jax.jit(acting().start_from)(State(*start), None, knowledge_of(), PARAMS)], []
-    step = jax.jit(acting().step)
-    step_result = None
+class Walk(NamedTuple):
+    """An episode in the corridor.
+
+    Attributes:
+      agents: the agent before each of the T actions and after the last, leaves [1, ...]; T + 1 of them.
+      actions: T action numbers.
+      success: whether the episode ended with success.
+    """
+
+    agents: list[Any]
+    actions: list[int]
+    success: bool
+
+    def tracker_state(self, time):
+        """Return the tracker's state before an action, without the batch axis."""
+        return tiny.leaves_at(self.agents[time].perception.tracker_state, 0)
+
+
+def walk_corridor(start_state, choices):
+    """Play an episode with one given choice for every step, until it ends or no choice is left."""
+    agents = [jax.jit(make_agent_loop().start_from)(State(*start_state), None, make_knowledge(), PARAMS)]
+    actions = []
+    success = False
+    step = jax.jit(make_agent_loop().step)
     for choice in choices:
-        after, step_result = step(agents[-1], jnp.array([choice], jnp.int32), knowledge_of(), PARAMS)
-        actions.append(int(acted(agents[-1], choice)[0]))
-        agents.append(after)
+        actions.append(int(choose_action(agents[-1], choice)[0]))
+        next_agent, step_result = step(agents[-1], jnp.array([choice], jnp.int32), make_knowledge(), PARAMS)
+        agents.append(next_agent)
+        success = bool(step_result.success[0])
         if bool(step_result.ended[0]):
             break
-    assert step_result is not None
-    return agents, actions, step_result
+    return Walk(agents, actions, success)
 
 
 @jax.jit
-def acted(agent, choice):
-    note = jax.tree.map(lambda leaf: leaf[0], agent.perception.tracker_state)
-    return SEMEXP.control.act(jnp.int32(choice), note, knowledge_of())
+def choose_action(agent, choice):
+    return act_on_choice(tiny.leaves_at(agent.perception.tracker_state, 0), choice)
 
 
-def state_at(cell, heading, goal=BOOK):
-    return [jnp.array([number], jnp.int32) for number in ((cell * 8 + heading) * 2, 0, goal, 0)]
+@jax.jit
+def act_on_choice(tracker_state, choice):
+    """The action [] of the control and its next tracker state."""
+    return SEMEXP.control.act(jnp.int32(choice), tracker_state, make_knowledge())
 
 
-def block_ahead(dz):
-    """The choice of the block with the cell dz lines north of the agent: lines -N / 2 to N / 2 - 1, N / 8 a block."""
-    size = len(knowledge_of().method["lines"])
-    return (size // 2 + dz) // (size // BLOCKS_PER_SIDE) * BLOCKS_PER_SIDE + BLOCKS_PER_SIDE // 2
+def make_start_state(cell, heading, goal=BOOK):
+    pose = (cell * 8 + heading) * 2
+    return [jnp.array([number], jnp.int32) for number in (pose, 0, goal, 0)]
 
 
-def test_the_agent_looks_down_walks_north_and_says_done_once_the_book_is_near_and_was_seen_before():
-    agents, actions, step_result = walk(state_at(10, 0), [block_ahead(10)] * 60)
-    assert actions[0] == LOOK_DOWN
-    assert actions[-1] == DONE
-    assert bool(step_result.success[0])
+def choice_ahead(num_lines):
+    """The choice of the block with the cell so many lines north of the agent.
+
+    The map has the lines -N / 2 to N / 2 - 1, N / 8 of them in a block.
+    """
+    map_size = len(make_knowledge().method["lines"])
+    block_line = (map_size // 2 + num_lines) // (map_size // BLOCKS_PER_SIDE)
+    return block_line * BLOCKS_PER_SIDE + BLOCKS_PER_SIDE // 2
+
+
+# The walk and Done
+
+
+def test_control_looks_down_walks_north_and_says_done_near_a_confirmed_goal():
+    walk = walk_corridor(make_start_state(10, NORTH), [choice_ahead(10)] * 60)
     # From line 10 to the first within 1.45 m of the book in line 23, 5.75 m: 4.5 m is line 18. Eight steps.
-    assert actions == [LOOK_DOWN] + 8 * [MOVE_AHEAD] + [DONE]
-    assert int(agents[-2].perception.tracker_state.goal_sight[0]) == GOAL_CONFIRMED
+    assert walk.actions == [LOOK_DOWN] + 8 * [MOVE_AHEAD] + [DONE]
+    assert walk.success
+    assert int(walk.tracker_state(-2).goal_sight) == GOAL_CONFIRMED
 
 
-def test_a_first_sight_nearby_is_not_enough():
-    """At line 20 the book is 0.75 m away and in view at once; a second pose has to agree."""
-    _, actions, step_result = walk(state_at(20, 0), [block_ahead(1)] * 60)
-    assert actions[0] != DONE
-    assert actions[-1] == DONE
-    assert len(actions) <= 4
-    assert bool(step_result.success[0])
+def test_control_says_done_only_after_a_second_pose_confirms_the_goal():
+    """At line 20 the book is 0.75 m away and in view at once."""
+    walk = walk_corridor(make_start_state(20, NORTH), [choice_ahead(1)] * 60)
+    assert walk.actions[0] != DONE
+    assert walk.actions[-1] == DONE
+    assert len(walk.actions) <= 4
+    assert walk.success
 
 
-def test_choices_count_only_when_they_are_due():
-    due, goal = LocalPolicy().is_decision_step, FRIDGE  # which is not there, so that the episode goes on
-    north = walk(state_at(2, 4, goal), [block_ahead(20)] * 40)
-    counted = [bool(due(agent.perception.tracker_state)[0]) for agent in north[0]]
-    second = counted.index(True, 1)
-    assert counted[0]
-    assert second <= LocalPolicy().interval
-    others = walk(state_at(2, 4, goal), [block_ahead(20), *range(second - 1)])
-    assert north[1][:second] == others[1]
+# Decision steps
 
 
-def test_nothing_is_chosen_while_the_goal_is_on_the_map():
-    """It is in the first view, so no choice counts; as soon as the mark is cleared one is due."""
-    agents, actions, _ = walk(state_at(10, 0), [block_ahead(10)] * 60)
-    notes = [jax.tree.map(lambda leaf: leaf[0], agent.perception.tracker_state) for agent in agents]
-    assert not any(bool(LocalPolicy().is_decision_step(note)) for note in notes)
-    assert walk(state_at(10, 0), range(60))[1] == actions
-    forgotten = notes[0]._replace(cells=notes[0].cells & ~category_bit(notes[0].goal))
-    assert bool(LocalPolicy().is_decision_step(forgotten))
+def test_control_ignores_choices_between_decision_steps():
+    is_decision_step = LocalPolicy().is_decision_step
+    start_state = make_start_state(2, SOUTH, FRIDGE)  # no fridge here, so that the episode goes on
+    constant_walk = walk_corridor(start_state, [choice_ahead(20)] * 40)
+    decision_flags = [bool(is_decision_step(agent.perception.tracker_state)[0]) for agent in constant_walk.agents]
+    second_decision = decision_flags.index(True, 1)
+    assert decision_flags[0]
+    assert second_decision <= LocalPolicy().interval
+
+    # Other choices between the first decision and the second lead to the same actions.
+    varied_walk = walk_corridor(start_state, [choice_ahead(20), *range(second_decision - 1)])
+    assert constant_walk.actions[:second_decision] == varied_walk.actions
 
 
-def test_the_planner_goes_by_the_map_and_not_by_the_walls():
-    """A wall in no view is walked into, and a wall that is only on the map is not."""
-    agents, _, _ = walk(state_at(10, 0), [block_ahead(10)] * 4)
-    note = jax.tree.map(lambda leaf: leaf[0], agents[-1].perception.tracker_state)
-    act = jax.jit(lambda note: SEMEXP.control.act(jnp.int32(0), note, knowledge_of())[0])
-    assert int(act(note)) == MOVE_AHEAD
-    # The whole line ahead is blocked on the map: the way there is round the map's other edge, so it turns.
-    imagined = note._replace(cells=note.cells.at[(note.position[0] + 1) % len(note.cells)].set(WALL_BIT))
-    assert int(act(imagined)) != MOVE_AHEAD
-    assert list(SEMEXP.control.act.__code__.co_varnames[1:4]) == ["choice", "state", "knowledge"]
+def test_no_step_is_a_decision_while_the_goal_is_on_the_map():
+    """The goal is in the first view, so no choice counts; as soon as its mark is cleared, one does."""
+    local_policy = LocalPolicy()
+    walk = walk_corridor(make_start_state(10, NORTH), [choice_ahead(10)] * 60)
+    for time in range(len(walk.agents)):
+        assert not bool(local_policy.is_decision_step(walk.tracker_state(time)))
+    assert walk_corridor(make_start_state(10, NORTH), range(60)).actions == walk.actions
+
+    first_state = walk.tracker_state(0)
+    unmarked_state = first_state._replace(cells=first_state.cells & ~category_bit(first_state.goal))
+    assert bool(local_policy.is_decision_step(unmarked_state))
 
 
-def test_the_long_term_goal_is_kept_for_n_actions():
+def test_control_keeps_the_long_term_goal_for_25_actions():
     """In a room without an end the block stays worth exploring: the choice counts every 25 actions."""
-    note = MapTracker().init(knowledge_of())._replace(search_horizon=jnp.int32(0))
-    act = jax.jit(lambda note: SEMEXP.control.act(jnp.int32(block_ahead(20)), note, knowledge_of())[1])
-    due = []
+    tracker_state = MapTracker().init(make_knowledge())._replace(search_horizon=jnp.int32(0))
+    decision_flags = []
     for _ in range(51):
-        due.append(bool(SEMEXP.control.is_decision_step(note)))
-        note = act(note)
-        note = note._replace(actions_left=jnp.maximum(note.actions_left - 1, 0))  # as the tracker counts
-    assert np.flatnonzero(due).tolist() == [0, 25, 50]
+        decision_flags.append(bool(SEMEXP.control.is_decision_step(tracker_state)))
+        _, tracker_state = act_on_choice(tracker_state, choice_ahead(20))
+        # The tracker counts the actions down.
+        tracker_state = tracker_state._replace(actions_left=jnp.maximum(tracker_state.actions_left - 1, 0))
+    assert np.flatnonzero(decision_flags).tolist() == [0, 25, 50]
 
 
-def test_where_the_goal_was_looked_at_in_vain_is_left():
+# The planner and the marks
+
+
+def test_planner_avoids_walls_of_the_map_alone():
+    walk = walk_corridor(make_start_state(10, NORTH), [choice_ahead(10)] * 4)
+    tracker_state = walk.tracker_state(-1)
+    assert int(act_on_choice(tracker_state, 0)[0]) == MOVE_AHEAD
+
+    # The whole line ahead is blocked on the map: the way there is round the map's other edge, so it turns.
+    line_ahead = (tracker_state.position[0] + 1) % len(tracker_state.cells)
+    walled_state = tracker_state._replace(cells=tracker_state.cells.at[line_ahead].set(WALL_BIT))
+    assert int(act_on_choice(walled_state, 0)[0]) != MOVE_AHEAD
+
+
+def test_control_clears_a_goal_mark_after_three_failed_views():
     """Behind the agent's back nothing clears the mark, but standing there and facing it does, after three tries."""
-    agents, _, _ = walk(state_at(4, 0), [block_ahead(3)] * 2)
-    note = jax.tree.map(lambda leaf: leaf[0], agents[-1].perception.tracker_state)
-    z, x = np.asarray(note.position)
-    here = note._replace(cells=note.cells.at[z + 1, x].set(FREE_BIT | np.uint32(1 << BOOK)))
-    act = jax.jit(lambda note: SEMEXP.control.act(jnp.int32(0), note, knowledge_of())[1])
-    once = act(here)
-    assert int(once.cells[z, x]) & int(TRIED_BIT)
-    assert int(once.failed_views) == 1
-    assert int(once.cells[z + 1, x]) & 1 << BOOK
-    last = act(here._replace(failed_views=jnp.int32(2)))
-    assert int(last.failed_views) == 0
-    assert not int(last.cells[z + 1, x]) & 1 << BOOK
+    walk = walk_corridor(make_start_state(4, NORTH), [choice_ahead(3)] * 2)
+    tracker_state = walk.tracker_state(-1)
+    z, x = np.asarray(tracker_state.position)
+    book_bit = np.uint32(1 << BOOK)
+    marked_state = tracker_state._replace(cells=tracker_state.cells.at[z + 1, x].set(FREE_BIT | book_bit))
+
+    _, state_after_first = act_on_choice(marked_state, 0)
+    assert int(state_after_first.cells[z, x]) & int(TRIED_BIT)
+    assert int(state_after_first.failed_views) == 1
+    assert int(state_after_first.cells[z + 1, x]) & book_bit
+
+    _, state_after_third = act_on_choice(marked_state._replace(failed_views=jnp.int32(2)), 0)
+    assert int(state_after_third.failed_views) == 0
+    assert not int(state_after_third.cells[z + 1, x]) & book_bit
 
 
-def test_a_mark_is_cleared_from_a_cell_once():
+def test_tracker_clears_a_mark_from_a_cell_only_once():
     """A mark that comes back, seen at another heading, stays after that, or the agent would turn to and fro."""
-    agents, _, _ = walk(state_at(4, 0, FRIDGE), [block_ahead(3)] * 2)
-    note = jax.tree.map(lambda leaf: leaf[0], agents[-1].perception.tracker_state)
-    z, x = np.asarray(note.position)
-    pose = jnp.int32(agents[-1].state.pose[0])
+    walk = walk_corridor(make_start_state(4, NORTH, FRIDGE), [choice_ahead(3)] * 2)
+    tracker_state = walk.tracker_state(-1)
+    z, x = np.asarray(tracker_state.position)
+    fridge_bit = np.uint32(1 << FRIDGE)
     percept = Percept(
-        PARAMS.tables.rows[pose], note.heading, jnp.int32(LOOK_DOWN), jnp.bool_(False), note.horizon, note.goal
+        PARAMS.tables.rows[jnp.int32(walk.agents[-1].state.pose[0])],
+        tracker_state.heading,
+        jnp.int32(LOOK_DOWN),
+        jnp.bool_(False),
+        tracker_state.horizon,
+        tracker_state.goal,
     )
 
     @jax.jit
-    def looked(note):
-        """Return the note after one more view of the floor ahead, marked with the fridge before."""
-        marked = note.cells.at[z + 1, x].set(note.cells[z + 1, x] | np.uint32(1 << FRIDGE))
-        return MapTracker().update(note._replace(cells=marked), knowledge_of(), percept)
+    def view_marked_floor(tracker_state):
+        """Return the state after one more view of the floor ahead, marked with the fridge before."""
+        marked_cells = tracker_state.cells.at[z + 1, x].set(tracker_state.cells[z + 1, x] | fridge_bit)
+        return MapTracker().update(tracker_state._replace(cells=marked_cells), make_knowledge(), percept)
 
-    def has(note, dz, bit):
-        return bool(note.cells[z + dz, x] & bit)
+    def has_bit(tracker_state, lines_ahead, bit):
+        return bool(tracker_state.cells[z + lines_ahead, x] & bit)
 
-    assert not has(note, 0, TRIED_BIT)
-    first = looked(note)
-    assert has(first, 0, TRIED_BIT)
-    assert not has(first, 1, np.uint32(1 << FRIDGE))
-    second = looked(first)
-    assert has(second, 0, TRIED_BIT)
-    assert has(second, 1, np.uint32(1 << FRIDGE))
+    # The first view clears the mark ahead and notes that this cell has tried; the second leaves the mark.
+    assert not has_bit(tracker_state, 0, TRIED_BIT)
+    state_after_first = view_marked_floor(tracker_state)
+    assert has_bit(state_after_first, 0, TRIED_BIT)
+    assert not has_bit(state_after_first, 1, fridge_bit)
+    state_after_second = view_marked_floor(state_after_first)
+    assert has_bit(state_after_second, 0, TRIED_BIT)
+    assert has_bit(state_after_second, 1, fridge_bit)
+
+
+# Pathways
 
 
 @pytest.mark.slow
-def test_the_layout_enters_by_the_categories_on_the_map_alone():
-    weights = tiny.random_params(0, SPEC)
-    policy = bind(SPEC, weights)
-    agents, _, _ = walk(state_at(10, 0), [block_ahead(10)] * 8)
-    view = acting().policy_inputs(agents[-1], knowledge_of(), PARAMS)
-    assert int(np.bitwise_or.reduce(np.asarray(view.reading.blocks[0]))) & 1 << BOOK
-    plain = policy.pathways(view)
-    louder = policy.pathways(view._replace(layout_weights=view.layout_weights.at[:, BOOK].set(3.0)))
-    assert np.abs(plain.experience - louder.experience).max() > 1e-3
-    np.testing.assert_array_equal(plain.scene, louder.scene)
-    np.testing.assert_array_equal(plain.goal, louder.goal)
-    # The categories on the map are no part of the direct pathway; floor and walls are no part of Z.
-    bare = view._replace(reading=view.reading._replace(blocks=view.reading.blocks & ~np.uint32(7)))
-    np.testing.assert_array_equal(plain.scene, policy.pathways(bare).scene)
-    flat = view._replace(reading=view.reading._replace(blocks=view.reading.blocks & np.uint32(7)))
-    np.testing.assert_array_equal(plain.experience, policy.pathways(flat).experience)
-    assert np.abs(plain.scene - policy.pathways(flat).scene).max() > 1e-3
+def test_layout_weights_reach_only_the_experience_by_categories_on_the_map():
+    policy = bind(SPEC, tiny.random_params(0, SPEC))
+    walk = walk_corridor(make_start_state(10, NORTH), [choice_ahead(10)] * 8)
+    inputs = make_agent_loop().policy_inputs(walk.agents[-1], make_knowledge(), PARAMS)
+    map_blocks = inputs.reading.blocks
+    assert int(np.bitwise_or.reduce(np.asarray(map_blocks[0]))) & 1 << BOOK
+
+    # A larger weight of the book on the map changes the experience and neither direct pathway.
+    pathways = policy.pathways(inputs)
+    reweighted_inputs = inputs._replace(layout_weights=inputs.layout_weights.at[:, BOOK].set(3.0))
+    reweighted_pathways = policy.pathways(reweighted_inputs)
+    assert np.abs(pathways.experience - reweighted_pathways.experience).max() > 1e-3
+    np.testing.assert_array_equal(pathways.scene, reweighted_pathways.scene)
+    np.testing.assert_array_equal(pathways.goal, reweighted_pathways.goal)
+
+    # The categories on the map are no part of the direct pathway.
+    categories_only = inputs.reading._replace(blocks=map_blocks & ~FLOOR_AND_WALL_BITS)
+    floor_and_walls_only = inputs.reading._replace(blocks=map_blocks & FLOOR_AND_WALL_BITS)
+    pathways_of_categories = policy.pathways(inputs._replace(reading=categories_only))
+    np.testing.assert_array_equal(pathways.scene, pathways_of_categories.scene)
+
+    # Floor and walls are no part of Z.
+    pathways_of_floor = policy.pathways(inputs._replace(reading=floor_and_walls_only))
+    np.testing.assert_array_equal(pathways.experience, pathways_of_floor.experience)
+    assert np.abs(pathways.scene - pathways_of_floor.scene).max() > 1e-3
 
 
-@pytest.mark.parametrize("world", ["rooms", "houses"])
-def test_cells_lie_where_they_lie_in_the_scene(world):
-    scene = make_generated_scenes(world, "train", 1)[0]
-    bank, cells = compile_bank([scene], WORLDS[world].task), standable_cells(scene.reach)
-    np.testing.assert_array_equal(cell_positions(bank.ahead, bank.task.rules.move_steps()), cells - cells[0])
+# Setup
 
 
-def test_bad_input_is_refused_by_name():
-    with pytest.raises(InputError, match="interval is 0; give 1 action or more"):
+@pytest.mark.parametrize("world_name", ["rooms", "houses"])
+def test_cell_positions_are_those_of_the_scene(world_name):
+    scene = make_generated_scenes(world_name, "train", 1)[0]
+    bank = compile_bank([scene], WORLDS[world_name].task)
+    scene_cells = standable_cells(scene.reach)
+    positions = cell_positions(bank.ahead, bank.task.rules.move_steps())
+    np.testing.assert_array_equal(positions, scene_cells - scene_cells[0])
+
+
+def test_local_policy_refuses_an_interval_of_zero():
+    with pytest.raises(InputError, match=r"interval is 0.*give 1"):
         LocalPolicy(interval=0)
+
+
+def test_check_map_size_refuses_a_scene_larger_than_the_map():
     # 24 lines and the 11 of a view.
     assert required_map_sizes(BANK) == {"drawn": 35}
-    small = knowledge_of()._replace(method={"lines": jnp.arange(32)})
-    with pytest.raises(InputError, match="scene drawn needs a map of 35 cells, and that of the training homes has 32"):
-        check_map_size(small, BANK)
-    check_map_size(knowledge_of(), BANK)
-    for headings in (4, 6):
-        turned = BANK._replace(task=Task(CATEGORIES, rules=Rules(headings=headings)), ahead=BANK.ahead[:, :headings])
-        with pytest.raises(InputError, match=f"has {headings} headings, .* eight neighbours; give 8 or 12"):
-            learn_search_setup([turned], np.zeros(0))
-    crowded = BANK._replace(task=Task(tuple(f"Thing{i}" for i in range(28))))
-    with pytest.raises(InputError, match="28 categories, and a map holds 27; leave some out"):
-        learn_search_setup([crowded], np.zeros(0))
+    check_map_size(make_knowledge(), BANK)
+    small_knowledge = make_knowledge()._replace(method={"lines": jnp.arange(32)})
+    with pytest.raises(InputError, match=r"drawn.*\b35\b.*\b32\b"):
+        check_map_size(small_knowledge, BANK)
+
+
+@pytest.mark.parametrize("num_headings", [4, 6])
+def test_learn_search_setup_refuses_headings_without_eight_neighbours(num_headings):
+    task = Task(CATEGORIES, rules=Rules(headings=num_headings))
+    bank = BANK._replace(task=task, ahead=BANK.ahead[:, :num_headings])
+    with pytest.raises(InputError, match=f"{num_headings} headings.*give 8 or 12"):
+        learn_search_setup([bank], np.zeros(0))
+
+
+def test_learn_search_setup_refuses_more_categories_than_map_bits():
+    crowded_bank = BANK._replace(task=Task(tuple(f"Thing{number}" for number in range(28))))
+    with pytest.raises(InputError, match=r"28 categories.*\b27\b.*leave some out"):
+        learn_search_setup([crowded_bank], np.zeros(0))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("world", ["apartments", "houses"])
-def test_homes_are_searched_without_learning(world):
-    """The nearest frontier finds most goals; without looking down, or with Done too far away, few of them."""
-    preset, count = WORLDS[world], 60
-    scenes = make_generated_scenes(world, "val", 3)
-    bank = compile_bank([scenes[i] for i in range(3)], preset.task)
+@pytest.mark.parametrize("world_name", ["apartments", "houses"])
+def test_nearest_frontier_finds_most_goals_of_homes_without_learning(world_name):
+    """Without looking down, or with Done said too far away, it finds few of them."""
+    preset = WORLDS[world_name]
+    num_episodes = 60
+    scenes = make_generated_scenes(world_name, "val", 3)
+    bank = compile_bank([scenes[index] for index in range(3)], preset.task)
     env, params = build_environment(bank, {}, preset.step_limit)
-    knowledge = knowledge_of(bank)
-    act = acting("jaxnav.policies.methods.semexp:NEAREST", env)
     prior = jnp.ones((6, len(env.categories), len(env.categories)))
+    knowledge = make_knowledge(bank)._replace(layout=prior)
+    agent_loop = make_agent_loop("jaxnav.policies.methods.semexp:NEAREST", env)
+    start_state = start_states(draw_episodes(bank, num_episodes, seed=0))
 
     @jax.jit
-    def success(start, method):
-        knowledge_ = knowledge._replace(layout=prior, method=method)
-        agent = act.start_from(start, None, knowledge_, params)
+    def success_rate(start_state, search_setup):
+        changed_knowledge = knowledge._replace(method=search_setup)
+
+        def any_running(carry):
+            return carry[1].any()
 
         def step(carry):
-            agent, running, has_found = carry
-            after, step_result = act.step(agent, jnp.zeros(count, jnp.int32), knowledge_, params)
+            agent, running, success = carry
+            choices = jnp.zeros(num_episodes, jnp.int32)
+            next_agent, step_result = agent_loop.step(agent, choices, changed_knowledge, params)
             return (
-                tree_where(running, after, agent),
+                tree_where(running, next_agent, agent),
                 running & ~step_result.ended,
-                has_found | (running & step_result.success),
+                success | (running & step_result.success),
             )
 
-        running = jnp.ones(count, bool)
-        return jax.lax.while_loop(lambda carry: carry[1].any(), step, (agent, running, ~running))[2].mean()
+        first_agent = agent_loop.start_from(start_state, None, changed_knowledge, params)
+        running = jnp.ones(num_episodes, bool)
+        _, _, success = jax.lax.while_loop(any_running, step, (first_agent, running, ~running))
+        return success.mean()
 
-    start = start_states(draw_episodes(bank, count, seed=0))
-    assert float(success(start, knowledge.method)) > 0.85
-    far = knowledge.method | {"enough": jnp.float32(1.45)}
-    assert float(success(start, far)) < 0.6
-    if world == "apartments":
-        level = knowledge.method | {"horizons": jnp.int32(1)}
-        assert float(success(start, level)) < 0.2
+    assert float(success_rate(start_state, knowledge.method)) > 0.85
+    # Done already at 1.45 m.
+    assert float(success_rate(start_state, knowledge.method | {"enough": jnp.float32(1.45)})) < 0.6
+    if world_name == "apartments":
+        # Only the level horizon.
+        assert float(success_rate(start_state, knowledge.method | {"horizons": jnp.int32(1)})) < 0.2
