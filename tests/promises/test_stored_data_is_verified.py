@@ -1,4 +1,4 @@
-"""What a run reads back is what it wrote: damage is told, and never used.
+"""Stored data are verified when read: damage is reported, and never used.
 
 Seen to fail, each planted alone: the digests of a checkpoint, of a record, the checksum of a shard, the SHA-256 of an
 export not compared; rows of a log not counted; shapes or values of an export not checked.
@@ -6,13 +6,12 @@ export not compared; rows of a log not counted; shapes or values of an export no
 
 import collections
 import dataclasses
-import functools
 import os
 import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -20,6 +19,7 @@ import pytest
 from support.commands import train
 from support.corridors import compile_corridors
 from support.damage import damage
+from support.refusals import assert_message_names
 from support.tiny_run import POLICY_NAMES, finished_run, tiny_config
 
 from jaxnav.errors import InputError
@@ -31,267 +31,347 @@ from jaxnav.store.export import export_params, load_params
 from jaxnav.store.files import make_manifest, write_json_with_digest
 
 MANIFEST = make_manifest({"seed": 1})
-CHUNKS = 4
+NUM_CHUNKS = 4
 #: Damages of each kind of stored file in the slow tests.
 NUM_DAMAGES = int(os.environ.get("JAXNAV_DAMAGES", "30"))
 
 
-class Stored(NamedTuple):
-    """Describe something that is stored: how it is written to a folder, read from it, and which part is damaged."""
+# What is stored, how it is written, and how it is read
+
+
+class StoredKind(NamedTuple):
+    """A kind of stored data.
+
+    Attributes:
+      write: writes the data to a folder.
+      read: reads the data from a folder.
+      damaged_part: path in the folder below which a file is damaged.
+    """
 
     write: Callable[[Path], object]
     read: Callable[[Path], object]
-    part: str = ""
+    damaged_part: str = ""
 
 
-def state(step: int) -> dict[str, jax.Array]:
+def make_state(step: int) -> dict[str, jax.Array]:
+    """Return the training state of an update: a key, a float32 kernel [40, 30] and the int32 step."""
     key = jax.random.key(step)
     return {"key": key, "kernel": jax.random.normal(key, (40, 30)), "step": jax.numpy.int32(step)}
 
 
-def save_two(folder):
+def save_two_checkpoints(folder):
     for step in (1, 2):
-        checkpoint.save_checkpoint(folder, step, state(step), MANIFEST)
+        checkpoint.save_checkpoint(folder, step, make_state(step), MANIFEST)
 
 
-def restored(folder):
-    """The state of the latest checkpoint, or its number and what is told of it if it is an earlier one."""
-    result = checkpoint.restore_checkpoint(folder, jax.eval_shape(state, 0), MANIFEST)
-    assert result is not None
-    right = state(result.step)
-    equal = jax.tree.map(lambda a, b: bool((a == b).all()), result.state, right)
-    assert all(jax.tree.leaves(equal)), "silent"
-    if result.step < 2:
-        raise InputError("the one before")
-    return result.step
+def restore_latest(folder):
+    """Return the restored checkpoint, whose state must be that of its step."""
+    restored = checkpoint.restore_checkpoint(folder, jax.eval_shape(make_state, 0), MANIFEST)
+    assert restored is not None
+    is_equal = jax.tree.map(lambda a, b: bool((a == b).all()), restored.state, make_state(restored.step))
+    assert all(jax.tree.leaves(is_equal)), "a damaged state was used"
+    return restored
 
 
-@functools.cache
-def config(folder):
-    return dataclasses.replace(tiny_config(folder), seeds=1, total_steps=CHUNKS * 256)
+def restore_second(folder):
+    """Return the step of the second checkpoint, and refuse if the first had to be used."""
+    restored = restore_latest(folder)
+    if restored.step < 2:
+        raise InputError("the first checkpoint was used")
+    return restored.step
 
 
-def in_run(folder):
-    return dataclasses.replace(config(folder.parent), run_dir=folder)
+def run_config(run_dir):
+    """Return the settings of a run of one seed in a directory."""
+    config = tiny_config(run_dir.parent)
+    return dataclasses.replace(config, seeds=1, total_steps=NUM_CHUNKS * 256, run_dir=run_dir)
 
 
-def log_rows(folder):
-    logs = RunLogs(in_run(folder))
-    for step in range(2, 2 * CHUNKS + 1, 2):
+def write_logs(folder):
+    """Write two rows, one per arm, and one row of times for each of the chunks of two updates."""
+    logs = RunLogs(run_config(folder))
+    for step in range(2, 2 * NUM_CHUNKS + 1, 2):
         rows = [{"step": step, "arm": arm, "seed": 0, "success": step / 7} for arm in ("baseline", "layout")]
         logs.append(rows, {"step": step, "wall_s": step / 3, "cpu_s": step / 2})
 
 
-def resumed_logs(folder):
-    logs = RunLogs(in_run(folder))
-    logs.rewind(2 * CHUNKS)
+def make_folder_of_logs(folder):
+    folder.mkdir()
+    write_logs(folder)
+
+
+def read_logs(folder):
+    """Read the logs as a resumed run does."""
+    logs = RunLogs(run_config(folder))
+    logs.rewind(2 * NUM_CHUNKS)
     return logs.read(LOG_FILE), logs.read(TIMES_FILE)
 
 
-def arrays() -> dict[str, Any]:
-    draw = np.random.default_rng(0)
-    return {"policy": {"kernel": draw.normal(size=(30, 40)).astype(np.float32)}, "counts": draw.integers(0, 9, (5, 5))}
+def claim_folder(folder):
+    claim_run_dir(run_config(folder))
 
 
-def exported(folder):
+def read_settings(folder):
+    return run_settings(Run.open(folder).config)
+
+
+def write_export(folder):
+    """Export a float32 kernel [30, 40] and int64 counts [5, 5]."""
+    rng = np.random.default_rng(0)
+    kernel = rng.normal(size=(30, 40)).astype(np.float32)
+    counts = rng.integers(0, 9, (5, 5))
+    export_params(folder, {"policy": {"kernel": kernel}, "counts": counts}, {"method": "org", "size": 3})
+
+
+def read_export(folder):
     params, spec = load_params(folder)
     return jax.tree.map(np.ndarray.tolist, params), spec
 
 
-def bank(folder):
-    return [[np.asarray(part).tolist() for part in bank[1:]] for bank in compile_corridors(folder)]
+def read_shards(folder):
+    """Return the arrays of every shard as lists."""
+    shards = []
+    for bank in compile_corridors(folder):
+        shards.append([np.asarray(array).tolist() for array in bank[1:]])
+    return shards
 
 
-def reach(folder):
-    result = Run(in_run(folder)).success_by_budget()
-    if result is None:
-        raise InputError("is removed: as in a run without val scenes, nothing is shown")
-    return result
+def write_reach(folder):
+    write_json_with_digest(folder / REACH_FILE, {"budgets": [10, 25], "val": {"layout": [0.25, 0.5]}})
 
 
-STORED = {
-    "checkpoint": Stored(save_two, restored, "checkpoints/2"),
-    "log": Stored(lambda folder: (folder.mkdir(), log_rows(folder)), resumed_logs),
-    "config": Stored(
-        lambda folder: claim_run_dir(in_run(folder)), lambda folder: run_settings(Run.open(folder).config)
-    ),
-    "reach": Stored(
-        lambda folder: write_json_with_digest(
-            folder / REACH_FILE, {"budgets": [10, 25], "val": {"layout": [0.25, 0.5]}}
-        ),
-        reach,
-    ),
-    "export": Stored(lambda folder: export_params(folder, arrays(), {"method": "org", "size": 3}), exported),
-    "shards": Stored(compile_corridors, bank),
+def read_reach(folder):
+    reach = Run(run_config(folder)).success_by_budget()
+    if reach is None:
+        raise InputError("the file is missing, as in a run without val scenes, so nothing is shown")
+    return reach
+
+
+STORED_KINDS = {
+    "checkpoint": StoredKind(save_two_checkpoints, restore_second, "checkpoints/2"),
+    "log": StoredKind(make_folder_of_logs, read_logs),
+    "config": StoredKind(claim_folder, read_settings),
+    "reach": StoredKind(write_reach, read_reach),
+    "export": StoredKind(write_export, read_export),
+    "shards": StoredKind(compile_corridors, read_shards),
 }
 
 
-def campaign(name, folder, number, seed) -> collections.Counter[str]:
-    """Damage what is stored so many times; return how often what came of it."""
-    stored, draw, outcomes = STORED[name], random.Random(f"{name} {seed}"), collections.Counter()
-    whole, hurt = folder / "whole", folder / "hurt"
-    stored.write(whole)
-    expected = stored.read(whole)
-    for _ in range(number):
-        shutil.copytree(whole, hurt)
-        damage(hurt / stored.part, draw)
+# Random damage
+
+
+def damage_repeatedly(name, folder, num_damages, seed) -> collections.Counter[str]:
+    """Damage one file of a copy of the stored data at a time, and count how reading it ends.
+
+    Returns:
+      The number of damages that were "reported", "harmless" (the data read are equal) or "silent" (they are not).
+    """
+    stored_kind = STORED_KINDS[name]
+    rng = random.Random(f"{name} {seed}")
+    original_dir = folder / "whole"
+    damaged_dir = folder / "hurt"
+    stored_kind.write(original_dir)
+    expected_data = stored_kind.read(original_dir)
+
+    outcomes = collections.Counter()
+    for _ in range(num_damages):
+        shutil.copytree(original_dir, damaged_dir)
+        damage(damaged_dir / stored_kind.damaged_part, rng)
         try:
-            read = stored.read(hurt)
-            outcomes["harmless" if read == expected else "silent"] += 1
+            is_harmless = stored_kind.read(damaged_dir) == expected_data
+            outcomes["harmless" if is_harmless else "silent"] += 1
         except InputError:
-            outcomes["told"] += 1
-        shutil.rmtree(hurt)
+            outcomes["reported"] += 1
+        shutil.rmtree(damaged_dir)
     return outcomes
 
 
 @pytest.mark.parametrize(
-    "name", [name if name != "checkpoint" else pytest.param(name, marks=pytest.mark.slow) for name in STORED]
+    "name", [name if name != "checkpoint" else pytest.param(name, marks=pytest.mark.slow) for name in STORED_KINDS]
 )
 def test_random_damage_is_never_used_silently(name, tmp_path):
-    outcomes = campaign(name, tmp_path, 8, seed=0)
+    outcomes = damage_repeatedly(name, tmp_path, 8, seed=0)
     assert outcomes["silent"] == 0
-    assert outcomes["told"] >= 2  # the others change what is not read, such as spaces
+    assert outcomes["reported"] >= 2  # harmless damage changes what is not read, such as spaces
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("name", STORED_KINDS)
 def test_many_random_damages_are_never_used_silently(name, tmp_path):
-    outcomes = campaign(name, tmp_path, NUM_DAMAGES, seed=1)
+    outcomes = damage_repeatedly(name, tmp_path, NUM_DAMAGES, seed=1)
     print(name, dict(outcomes))
     assert outcomes["silent"] == 0
-    assert outcomes["told"] >= 0.3 * NUM_DAMAGES
+    assert outcomes["reported"] >= 0.3 * NUM_DAMAGES
 
 
-@pytest.mark.parametrize(("name", "file"), [("config", CONFIG_FILE), ("reach", REACH_FILE), ("export", "policy.json")])
-def test_signed_record_with_a_changed_digit_is_refused(name, file, tmp_path):
-    """Which a parser takes for another number."""
-    STORED[name].write(tmp_path / "whole")
-    path = tmp_path / "whole" / file
-    whole = path.read_bytes()
-    places = [index for index, byte in enumerate(whole) if chr(byte).isdigit()]
-    for index in places[:: len(places) // 8]:
-        path.write_bytes(whole[:index] + str((whole[index] - ord("0") + 1) % 10).encode() + whole[index + 1 :])
-        with pytest.raises(InputError, match=file):
-            STORED[name].read(path.parent)
-
-
-def test_log_with_a_changed_digit_is_refused(tmp_path):
-    log_rows(tmp_path)
-    path = tmp_path / "metrics.jsonl"
-    path.write_bytes(path.read_bytes().replace(b"0.57", b"0.67"))  # success of 4 / 7
-    with pytest.raises(InputError, match=r"metrics.jsonl, line 3: is damaged or was changed by hand"):
-        RunLogs(in_run(tmp_path)).read(LOG_FILE)
+# Changed digits, which a parser reads as another number
 
 
 @pytest.mark.parametrize(
-    "hurt",
-    [
-        lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"),
-        pytest.param(lambda folder: (folder / "state/_METADATA").unlink(), marks=pytest.mark.slow),
-        pytest.param(lambda folder: (folder / "state/_METADATA").write_text(""), marks=pytest.mark.slow),
-        lambda folder: flip(max((folder / "state").rglob("d/*"), key=lambda path: path.stat().st_size)),
-    ],
+    ("name", "file_name"), [("config", CONFIG_FILE), ("reach", REACH_FILE), ("export", "policy.json")]
 )
-def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, hurt):
-    save_two(tmp_path)
-    hurt(tmp_path / "checkpoints/2")
-    result = checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(state, 0), MANIFEST)
-    assert result is not None
-    assert result.step == result.state["step"] == 1
-    (problem,) = result.damaged
-    # Before Orbax reads anything.
-    assert problem.startswith(f"{tmp_path}/checkpoints/2: is damaged (ValueError: missing or other than saved: ")
-    checkpoint.set_aside_checkpoints_after(tmp_path, result.step)
-    assert (tmp_path / "damaged/2").is_dir()
-    checkpoint.save_checkpoint(tmp_path, 2, state(2), MANIFEST)  # and the run goes on
-    assert restored(tmp_path) == 2
+def test_signed_record_with_a_changed_digit_is_refused(name, file_name, tmp_path):
+    record_dir = tmp_path / "whole"
+    STORED_KINDS[name].write(record_dir)
+    record = (record_dir / file_name).read_bytes()
+    digit_indices = [index for index, byte in enumerate(record) if chr(byte).isdigit()]
+
+    # Eight digits of the record, each changed alone: 0 becomes 1, ..., 9 becomes 0.
+    for index in digit_indices[:: len(digit_indices) // 8]:
+        next_digit = str((record[index] - ord("0") + 1) % 10).encode()
+        (record_dir / file_name).write_bytes(record[:index] + next_digit + record[index + 1 :])
+        with pytest.raises(InputError, match=file_name):
+            STORED_KINDS[name].read(record_dir)
 
 
-def flip(path):
+def test_log_with_a_changed_digit_is_refused(tmp_path):
+    write_logs(tmp_path)
+    log_file = tmp_path / LOG_FILE
+    log_file.write_bytes(log_file.read_bytes().replace(b"0.57", b"0.67"))  # success of 4 / 7
+    with pytest.raises(InputError, match=rf"{LOG_FILE}, line 3: .*damaged"):
+        RunLogs(run_config(tmp_path)).read(LOG_FILE)
+
+
+# Damaged checkpoints and incomplete logs
+
+
+def flip_bit(path):
+    """Flip one bit in the middle of a file."""
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
+def find_largest_array_file(checkpoint_dir):
+    return max((checkpoint_dir / "state").rglob("d/*"), key=lambda path: path.stat().st_size)
+
+
+@pytest.mark.parametrize(
+    "damage_checkpoint",
+    [
+        lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"),
+        pytest.param(lambda folder: (folder / "state/_METADATA").unlink(), marks=pytest.mark.slow),
+        pytest.param(lambda folder: (folder / "state/_METADATA").write_text(""), marks=pytest.mark.slow),
+        lambda folder: flip_bit(find_largest_array_file(folder)),
+    ],
+)
+def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, damage_checkpoint):
+    save_two_checkpoints(tmp_path)
+    damage_checkpoint(tmp_path / "checkpoints/2")
+
+    # The damage is found before Orbax reads anything.
+    restored = restore_latest(tmp_path)
+    assert restored.step == 1
+    (problem,) = restored.damaged
+    assert problem.startswith(f"{tmp_path}/checkpoints/2: is damaged (ValueError: missing or other than saved: ")
+
+    # The run can go on and save the second checkpoint again.
+    checkpoint.set_aside_checkpoints_after(tmp_path, restored.step)
+    assert (tmp_path / "damaged/2").is_dir()
+    checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
+    assert restore_latest(tmp_path).step == 2
+
+
 def test_restore_refuses_when_every_checkpoint_is_damaged(tmp_path):
-    save_two(tmp_path)
+    save_two_checkpoints(tmp_path)
     for step in (1, 2):
         (tmp_path / f"checkpoints/{step}/_CHECKPOINT_METADATA").write_text("{")
-    with pytest.raises(InputError, match=r"/2: is damaged .*/1: is damaged .*no checkpoint is left; restore one or"):
-        checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(state, 0), MANIFEST)
+    with pytest.raises(InputError) as error:
+        checkpoint.restore_checkpoint(tmp_path, jax.eval_shape(make_state, 0), MANIFEST)
+    assert_message_names(error.value, "/2: is damaged", "/1: is damaged", "no checkpoint is left", "restore one")
 
 
-@pytest.mark.parametrize("lost", [0, 3, 7])
-def test_log_with_a_missing_or_repeated_row_is_refused(tmp_path, lost):
-    log_rows(tmp_path)
-    path = tmp_path / "metrics.jsonl"
-    lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join(lines[:lost] + lines[lost + 1 :]))
-    with pytest.raises(InputError, match=f"metrics.jsonl, line {lost + 1}: rows are missing or out of order; restore"):
-        RunLogs(in_run(tmp_path)).rewind(2 * CHUNKS)
-    path.write_bytes(b"".join(lines + lines[lost : lost + 1]))
-    with pytest.raises(InputError, match=r"metrics.jsonl, line 9: rows are missing or out of order"):
-        RunLogs(in_run(tmp_path)).read(LOG_FILE)
+@pytest.mark.parametrize("row_index", [0, 3, 7])
+def test_log_with_a_missing_or_repeated_row_is_refused(tmp_path, row_index):
+    write_logs(tmp_path)
+    log_file = tmp_path / LOG_FILE
+    lines = log_file.read_bytes().splitlines(keepends=True)
+
+    log_file.write_bytes(b"".join(lines[:row_index] + lines[row_index + 1 :]))
+    with pytest.raises(InputError, match=f"{LOG_FILE}, line {row_index + 1}: rows are missing .*; restore"):
+        RunLogs(run_config(tmp_path)).rewind(2 * NUM_CHUNKS)
+
+    # A repeated row makes the ninth of eight.
+    log_file.write_bytes(b"".join([*lines, lines[row_index]]))
+    with pytest.raises(InputError, match=f"{LOG_FILE}, line 9: "):
+        RunLogs(run_config(tmp_path)).read(LOG_FILE)
+
+
+# Whole runs
 
 
 @pytest.mark.slow
 def test_run_with_a_damaged_checkpoint_resumes_bit_for_bit(tmp_path, tmp_path_factory, capsys):
-    config_file, run_dir = finished_run(tmp_path_factory)
-    hurt = shutil.copytree(run_dir, tmp_path / "run")
-    shutil.rmtree(hurt / "policies")
-    flip(max((hurt / "checkpoints/4/state").rglob("d/*"), key=lambda path: path.stat().st_size))
-    assert train(config_file, hurt) == 0
+    config_file, original_dir = finished_run(tmp_path_factory)
+    damaged_dir = shutil.copytree(original_dir, tmp_path / "run")
+    shutil.rmtree(damaged_dir / "policies")
+    flip_bit(find_largest_array_file(damaged_dir / "checkpoints/4"))
+
+    # The checkpoint of update 4 is reported, and training resumes from that of update 2.
+    assert train(config_file, damaged_dir) == 0
     output = capsys.readouterr().err
-    assert f"{hurt}/checkpoints/4: is damaged (" in output
+    assert f"{damaged_dir}/checkpoints/4: is damaged (" in output
     assert "resumed after update 2 of 4" in output
-    for path in (
-        "metrics.jsonl",
-        *(f"policies/{name}/params.safetensors" for name in POLICY_NAMES),
-    ):
-        assert (hurt / path).read_bytes() == (run_dir / path).read_bytes(), path
+
+    for file_name in ("metrics.jsonl", *(f"policies/{name}/params.safetensors" for name in POLICY_NAMES)):
+        assert (damaged_dir / file_name).read_bytes() == (original_dir / file_name).read_bytes(), file_name
 
 
 @pytest.mark.slow
 def test_train_does_not_overwrite_a_different_export(tmp_path, tmp_path_factory, capsys):
-    config_file, run_dir = finished_run(tmp_path_factory)
-    run = shutil.copytree(run_dir, tmp_path / "run")
-    folder = run / "policies" / "layout-0"
-    params, spec = load_params(folder)
+    config_file, original_dir = finished_run(tmp_path_factory)
+    run_dir = shutil.copytree(original_dir, tmp_path / "run")
+
+    # Another bias, in an export with a valid digest.
+    policy_dir = run_dir / "policies" / "layout-0"
+    params, spec = load_params(policy_dir)
     params["policy"]["actor"]["bias"] = params["policy"]["actor"]["bias"] + 1
-    shutil.rmtree(folder)
-    export_params(folder, params, spec)
-    before = (folder / "params.safetensors").read_bytes()
-    assert train(config_file, run) == 2
-    assert f"{folder}: holds another policy than would be exported" in capsys.readouterr().err
-    assert (folder / "params.safetensors").read_bytes() == before
+    shutil.rmtree(policy_dir)
+    export_params(policy_dir, params, spec)
+    exported_params = (policy_dir / "params.safetensors").read_bytes()
+
+    assert train(config_file, run_dir) == 2
+    assert f"{policy_dir}: holds another policy" in capsys.readouterr().err
+    assert (policy_dir / "params.safetensors").read_bytes() == exported_params
+
+
+# Exports with a valid digest and invalid arrays
+
+
+def set_bias_to_nan(params):
+    params["policy"]["actor"]["bias"].fill(np.nan)
+
+
+def drop_last_category_of_prior(params):
+    params["layout"]["prior"] = params["layout"]["prior"][:, :-1, :-1]
+
+
+def convert_counts_to_integers(params):
+    params["layout"]["counts"] = params["layout"]["counts"].astype(np.int32)
+
+
+def remove_actor(params):
+    del params["policy"]["actor"]
 
 
 @pytest.mark.parametrize(
-    ("change", "problem"),
+    ("change", "named_parts"),
     [
-        (
-            lambda params: params["policy"]["actor"]["bias"].fill(np.nan),
-            "policy/actor/bias holds numbers that are not fin",
-        ),
-        (
-            lambda params: params["layout"].update(prior=params["layout"]["prior"][:, :-1, :-1]),
-            "['layout']['prior']: 'float",
-        ),
-        (
-            lambda params: params["layout"].update(counts=params["layout"]["counts"].astype(np.int32)),
-            "'int32[5,22,22]' != ",
-        ),
-        (lambda params: params["policy"].pop("actor"), "['policy']['actor']['bias']: (absent) != 'float32["),
+        (set_bias_to_nan, ["policy/actor/bias", "not fin"]),
+        (drop_last_category_of_prior, ["['layout']['prior']", "'float"]),
+        (convert_counts_to_integers, ["'int32[5,22,22]' != "]),
+        (remove_actor, ["['policy']['actor']['bias']", "(absent) != 'float32["]),
     ],
 )
-def test_load_policy_refuses_signed_exports_with_invalid_arrays(tmp_path, change, problem):
-    params, spec = load_params(PACKAGED_POLICIES / "rooms-org")
-    params = jax.tree.map(np.array, params)
+def test_load_policy_refuses_signed_exports_with_invalid_arrays(tmp_path, change, named_parts):
+    exported_params, spec = load_params(PACKAGED_POLICIES / "rooms-org")
+    params = jax.tree.map(np.array, exported_params)
     export_params(tmp_path / "whole", params, spec)
     load_policy(tmp_path / "whole")
+
     change(params)
     export_params(tmp_path / "wrong", params, spec)
     with pytest.raises(InputError) as error:
         load_policy(tmp_path / "wrong")
     assert str(error.value).startswith(f"{tmp_path}/wrong: ")
-    assert problem in str(error.value)
+    assert_message_names(error.value, *named_parts)
