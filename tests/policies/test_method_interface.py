@@ -2,6 +2,9 @@
 
 import dataclasses
 import functools
+import math
+from importlib import metadata
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -10,7 +13,7 @@ import numpy as np
 import pytest
 from support import methods
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
+from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts, choice_log_probs
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
@@ -24,44 +27,61 @@ from jaxnav.policies.testing import check_method
 from jaxnav.training.config import PPOConfig, stage_index_at
 from jaxnav.training.ppo import Learner, collect_rollout, ppo_loss, replay_rollout
 
+METHOD_NAMES = ("ATTENTIVE", "COUNTING", "STAGED", "AUXILIARY", "ADAPTIVE", "CONTROLLED", "PATIENT", "STEPWISE")
 SPECS = {
     name: dataclasses.replace(tiny.SPEC, method=find_method(f"support.methods:{name}"), method_sizes=())
-    for name in ("ATTENTIVE", "COUNTING", "STAGED", "AUXILIARY", "ADAPTIVE", "CONTROLLED", "PATIENT", "STEPWISE")
+    for name in METHOD_NAMES
 }
-KNOWN = KNOWLEDGE._replace(method={"table": jnp.linspace(0, 1, 9).reshape(3, 3)})
+LEARNED_KNOWLEDGE = KNOWLEDGE._replace(method={"table": jnp.linspace(0, 1, 9).reshape(3, 3)})
 
 
-def acting_with(name):
+def make_agent_loop(name):
     return AgentLoop(ENV, SPECS[name], tiny.ESTIMATOR)
 
 
+class MethodRollout(NamedTuple):
+    """A rollout that begins in the middle of episodes.
+
+    Attributes:
+      weights: parameters of the policy.
+      agent_before, agent_after: `Agent` before and after the rollout, leaves [ENVS, ...].
+      rollout: `Rollout`, whose transitions have leaves [LENGTH, ENVS, ...].
+    """
+
+    weights: Any
+    agent_before: Any
+    agent_after: Any
+    rollout: Any
+
+
 @functools.cache
-def rolled(name):
-    """Weights, the agent before, the agent after and a rollout that begins in the middle of episodes."""
-    acting, weights = acting_with(name), tiny.random_params(3, SPECS[name])
+def collect_method_rollout(name) -> MethodRollout:
+    agent_loop = make_agent_loop(name)
+    weights = tiny.random_params(3, SPECS[name])
 
     @jax.jit
-    def go(agent, key):
-        return collect_rollout(acting, acting.bind(weights), agent, key, PARAMS, KNOWN, num_steps=LENGTH)
+    def collect(agent, key):
+        policy = agent_loop.bind(weights)
+        return collect_rollout(agent_loop, policy, agent, key, PARAMS, LEARNED_KNOWLEDGE, num_steps=LENGTH)
 
-    memory = acting.bind(weights).initial_memory((ENVS,))
-    agent = acting.start(jax.random.key(0), ENVS, memory, KNOWN, PARAMS)
-    before, _ = go(agent, jax.random.key(1))
-    after, rollout = go(before, jax.random.key(2))
+    memory = agent_loop.bind(weights).initial_memory((ENVS,))
+    first_agent = agent_loop.start(jax.random.key(0), ENVS, memory, LEARNED_KNOWLEDGE, PARAMS)
+    agent_before, _ = collect(first_agent, jax.random.key(1))
+    agent_after, rollout = collect(agent_before, jax.random.key(2))
     assert rollout.transitions.ended.sum() > 20
-    return weights, before, after, rollout
+    return MethodRollout(weights, agent_before, agent_after, rollout)
 
 
 # The contract
 
 
-def some(names, quick):
-    """Names as parameters, all but the quick ones marked slow."""
-    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in names]
+def params_slow_except(names, fast_name=None):
+    """Names as parameters of a test, all but one marked slow."""
+    return [pytest.param(name, marks=() if name == fast_name else pytest.mark.slow) for name in names]
 
 
-#: Those whose parts are in no method of the package.
-THEIRS = [f"support.methods:{name}" for name in ("COUNTING", "ADAPTIVE", "CONTROLLED", "PATIENT", "LEARNED")]
+#: Test methods whose parts no method of the package has.
+TEST_METHODS = [f"support.methods:{name}" for name in ("COUNTING", "ADAPTIVE", "CONTROLLED", "PATIENT", "LEARNED")]
 ABLATIONS = [
     f"jaxnav.policies.methods.{name}"
     for name in (
@@ -76,200 +96,230 @@ ABLATIONS = [
 ]
 
 
-@pytest.mark.parametrize("name", some([*METHODS, *ABLATIONS, *THEIRS], quick=("anonymous",)))
-def test_methods_keep_the_contract(name):
+@pytest.mark.parametrize("name", params_slow_except([*METHODS, *ABLATIONS, *TEST_METHODS], "anonymous"))
+def test_check_method_accepts_every_method_of_the_package(name):
     check_method(name, steps=4)
 
 
-@pytest.mark.parametrize("name", some(["BATCH", "WIDTH", "FINITE", "NOTE", "ACTION"], quick=("ACTION",)))
-def test_methods_that_break_the_contract_are_flagged(name):
-    """Negative controls: each breaks one promise."""
+@pytest.mark.parametrize("name", params_slow_except(["BATCH", "WIDTH", "FINITE", "NOTE", "ACTION"], "ACTION"))
+def test_check_method_rejects_a_method_that_breaks_one_promise(name):
     with pytest.raises((AssertionError, TypeError, ValueError)):
         check_method(f"support.methods:{name}", steps=3)
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("name", "parts"),
     [
-        ("nothing", "method 'nothing': is unknown; choose one of anonymous, eotp, hoz, org, rgb, savn, "),
-        ("orgg", "did you mean 'org'?"),
-        ("no.such.module:MINE", "cannot be imported (ModuleNotFoundError"),
-        ("support.methods:MISSING", "cannot be imported (AttributeError"),
-        ("support.methods:NO_METHOD", "no jaxnav Method"),
+        ("nothing", ("'nothing'", "choose one of", "anonymous", "eotp", "hoz", "org", "rgb", "savn")),
+        ("orgg", ("'orgg'", "did you mean 'org'")),
+        ("no.such.module:MINE", ("no.such.module", "ModuleNotFoundError")),
+        ("support.methods:MISSING", ("MISSING", "AttributeError")),
+        ("support.methods:NO_METHOD", ("NO_METHOD", "no jaxnav Method")),
     ],
 )
-def test_what_is_no_method_is_refused_by_name(name, message):
+def test_find_method_refuses_a_name_without_a_method(name, parts):
     with pytest.raises(InputError) as refusal:
         find_method(name)
-    assert message in str(refusal.value)
+    for part in parts:
+        assert part in str(refusal.value)
 
 
-def test_methods_of_other_packages_are_found_by_entry_point(monkeypatch):
-    from importlib import metadata
+def test_find_method_finds_methods_of_other_packages_by_entry_point(monkeypatch):
+    entry_point = metadata.EntryPoint("theirs", "support.methods:COUNTING", "jaxnav.methods")
 
-    point = metadata.EntryPoint("theirs", "support.methods:COUNTING", "jaxnav.methods")
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [point] if group == point.group else [])
+    def list_entry_points(group):
+        return [entry_point] if group == entry_point.group else []
+
+    monkeypatch.setattr(metadata, "entry_points", list_entry_points)
     assert find_method("theirs") == dataclasses.replace(methods.COUNTING, name="theirs")
     find_method.cache_clear()
 
 
-# Acting and replay agree
+# Acting and replay
 
 
-@pytest.mark.parametrize("name", some([name for name in SPECS if name not in ("STAGED", "AUXILIARY")], quick=()))
-def test_replay_decides_as_the_rollout_did(name):
-    weights, _, _, rollout = rolled(name)
-    again = jax.jit(
-        lambda: replay_rollout(acting_with(name).bind(weights), rollout.transitions, rollout.initial_memory, PARAMS)
-    )()
-    log_pi = jax.nn.log_softmax(again.factual.logits)
-    log_prob = jnp.take_along_axis(log_pi, rollout.transitions.choice[..., None], axis=-1)[..., 0]
-    np.testing.assert_allclose(log_prob, rollout.transitions.log_prob, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(again.factual.value, rollout.transitions.value, rtol=1e-4, atol=1e-5)
+@pytest.mark.parametrize(
+    "name", params_slow_except(["ATTENTIVE", "COUNTING", "ADAPTIVE", "CONTROLLED", "PATIENT", "STEPWISE"])
+)
+def test_replay_rollout_recomputes_log_probs_and_values(name):
+    weights, _, _, rollout = collect_method_rollout(name)
+    transitions = rollout.transitions
+
+    @jax.jit
+    def replay():
+        policy = make_agent_loop(name).bind(weights)
+        return replay_rollout(policy, transitions, rollout.initial_memory, PARAMS).factual
+
+    decisions = replay()
+    log_prob = choice_log_probs(decisions.logits, transitions.choice)
+    np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(decisions.value, transitions.value, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
-def test_a_step_by_step_replay_is_the_parallel_one():
+def test_step_by_step_replay_equals_the_parallel_replay():
     """Decisions, counterfactual decisions and the gradient of the whole loss are those of ORG."""
-    _, _, _, rollout = rolled("STEPWISE")
-    org = dataclasses.replace(SPECS["STEPWISE"], method=find_method("org"))
-    weights = tiny.random_params(7, org)
+    rollout = collect_method_rollout("STEPWISE").rollout
+    org_spec = dataclasses.replace(SPECS["STEPWISE"], method=find_method("org"))
+    weights = tiny.random_params(7, org_spec)
     scalars = PPOConfig(distil=0.5).scalars(1)
     advantage = jnp.asarray(np.random.default_rng(0).normal(size=(LENGTH, ENVS)), jnp.float32)
 
-    @functools.partial(jax.jit, static_argnums=1)
     def loss(weights, spec):
         policy = AgentLoop(ENV, spec).bind(weights)
         replayed = replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS)
         total, _ = ppo_loss(replayed, advantage, scalars, True, METHODS["org"])
         return total, (replayed.factual, replayed.counterfactual._replace(fast=None))
 
-    (one, parts), gradient = jax.value_and_grad(loss, has_aux=True)(weights, org)
-    (other, expected), wanted = jax.value_and_grad(loss, has_aux=True)(weights, SPECS["STEPWISE"])
-    assert one == pytest.approx(float(other), rel=1e-4)
-    chex.assert_trees_all_close(parts, expected, rtol=1e-4, atol=1e-5)
-    chex.assert_trees_all_close(gradient, wanted, rtol=1e-3, atol=1e-5)
+    loss_and_gradient = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnums=1)
+    (parallel_loss, parallel_decisions), parallel_gradient = loss_and_gradient(weights, org_spec)
+    (stepwise_loss, stepwise_decisions), stepwise_gradient = loss_and_gradient(weights, SPECS["STEPWISE"])
+    assert parallel_loss == pytest.approx(float(stepwise_loss), rel=1e-4)
+    chex.assert_trees_all_close(parallel_decisions, stepwise_decisions, rtol=1e-4, atol=1e-5)
+    chex.assert_trees_all_close(parallel_gradient, stepwise_gradient, rtol=1e-3, atol=1e-5)
 
 
 # Each part
 
 
 @pytest.mark.slow
-def test_experience_attends_with_the_memory():
-    acting = acting_with("ATTENTIVE")
-    weights, before, _, _ = rolled("ATTENTIVE")
-    policy, view = acting.bind(weights), acting.policy_inputs(before, KNOWN, PARAMS)
-    assert before.memory is not None
-    experience = jax.jit(lambda memory: policy.pathways(view, memory).experience)
-    first, other = experience(before.memory), experience(before.memory._replace(hidden=-before.memory.hidden))
-    assert np.abs(first - other).max() > 1e-3
-    with pytest.raises(ValueError, match="reads the memory"):
-        policy.pathways(view)
+def test_attending_experience_depends_on_the_memory():
+    agent_loop = make_agent_loop("ATTENTIVE")
+    weights, agent, _, _ = collect_method_rollout("ATTENTIVE")
+    policy = agent_loop.bind(weights)
+    inputs = agent_loop.policy_inputs(agent, LEARNED_KNOWLEDGE, PARAMS)
+    assert agent.memory is not None
+
+    @jax.jit
+    def encode_experience(memory):
+        return policy.pathways(inputs, memory).experience
+
+    experience = encode_experience(agent.memory)
+    experience_of_other_memory = encode_experience(agent.memory._replace(hidden=-agent.memory.hidden))
+    assert np.abs(experience - experience_of_other_memory).max() > 1e-3
+    with pytest.raises(ValueError, match="memory"):
+        policy.pathways(inputs)
 
 
 @pytest.mark.slow
-def test_a_tracker_takes_in_every_view_once():
-    """Auto-resets begin a new note, whose first view counts; of the actions the first is `NO_ACTION`."""
-    _, before, after, rollout = rolled("COUNTING")
-    for agent in (before, after):
+def test_tracker_counts_every_view_once_and_restarts_with_the_episode():
+    """Auto-resets begin a new state, whose first view counts; the first of the actions is `NO_ACTION`."""
+    _, agent_before, agent_after, rollout = collect_method_rollout("COUNTING")
+    for agent in (agent_before, agent_after):
         np.testing.assert_array_equal(agent.perception.tracker_state["views"], agent.state.time + 1)
-    t = rollout.transitions
-    # What the network read at each step is the note of that step: views, moves, goal.
-    # The length counts the action of this step.
-    np.testing.assert_allclose(t.reading[..., 0] * 10, t.episode_length, rtol=1e-6)
-    np.testing.assert_allclose(t.reading[..., 2] * 10, t.goal, rtol=1e-6)
-    cell = t.pose // tiny.POSES_PER_CELL
-    stayed = ~np.asarray(t.ended[:-1])
-    moved = (np.asarray(t.reading[1:, :, 1] - t.reading[:-1, :, 1]) * 10).round().astype(int)
-    np.testing.assert_array_equal(moved[stayed], (cell[1:] != cell[:-1])[stayed])
+
+    # The network read the state of each step: views, moves, goal. The length counts the action of this step.
+    transitions = rollout.transitions
+    views, moves, goals = np.moveaxis(np.asarray(transitions.reading), -1, 0) * 10
+    np.testing.assert_allclose(views, transitions.episode_length, rtol=1e-6)
+    np.testing.assert_allclose(goals, transitions.goal, rtol=1e-6)
+
+    # Within an episode a move is counted where the cell changes.
+    cell = transitions.pose // tiny.POSES_PER_CELL
+    same_episode = ~np.asarray(transitions.ended[:-1])
+    counted_moves = np.diff(moves, axis=0).round().astype(int)
+    np.testing.assert_array_equal(counted_moves[same_episode], (cell[1:] != cell[:-1])[same_episode])
 
 
 @pytest.mark.slow
-def test_stages_train_their_own_part():
-    learner = Learner(acting_with("STAGED"), PPOConfig(num_envs=16, rollout=LENGTH, minibatches=2), "none")
-    before = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWN)
-    scalars = learner.config.scalars(4)
-    moved = []
+def test_each_stage_trains_only_its_own_parameters():
+    config = PPOConfig(num_envs=16, rollout=LENGTH, minibatches=2)
+    learner = Learner(make_agent_loop("STAGED"), config, "none")
+    learner_state = jax.jit(learner.init)(jax.random.key(0), PARAMS, LEARNED_KNOWLEDGE)
+    changed_by_stage = []
     for stage in methods.STAGED.stages:
         update = jax.jit(dataclasses.replace(learner, stage=stage).update)
-        after, _ = update(before, scalars, PARAMS, KNOWN)
-        changes = jax.tree.map(lambda a, b: bool((a != b).any()), before.params, after.params)
-        moved.append({name for name, change in changes.items() if any(jax.tree.leaves(change))})
-    assert moved[0] == {"critic"}
-    assert {"critic", "actor", "method", "view"} <= moved[1]
-    shares = [stage_index_at(methods.STAGED.stages, done / 8) for done in range(8)]
-    assert shares == [0, 0, 1, 1, 1, 1, 1, 1]
+        next_state, _ = update(learner_state, config.scalars(4), PARAMS, LEARNED_KNOWLEDGE)
+        changed_by_stage.append(changed_parts(learner_state.params, next_state.params))
+    assert changed_by_stage[0] == {"critic"}
+    assert {"critic", "actor", "method", "view"} <= changed_by_stage[1]
+
+    # The first stage has a quarter of the updates.
+    stage_indices = [stage_index_at(methods.STAGED.stages, num_done / 8) for num_done in range(8)]
+    assert stage_indices == [0, 0, 1, 1, 1, 1, 1, 1]
 
 
 @pytest.mark.slow
-def test_an_auxiliary_loss_is_added_and_reported():
-    weights, _, _, rollout = rolled("AUXILIARY")
-    policy = acting_with("AUXILIARY").bind(weights)
+def test_ppo_loss_adds_and_reports_the_auxiliary_loss():
+    weights, _, _, rollout = collect_method_rollout("AUXILIARY")
+    policy = make_agent_loop("AUXILIARY").bind(weights)
     replayed = replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS)
-    advantage, scalars = jnp.ones((LENGTH, ENVS)), PPOConfig().scalars(1)
-    plain, parts = ppo_loss(replayed, advantage, scalars, False, METHODS["org"])
-    total, more = ppo_loss(replayed, advantage, scalars, False, methods.AUXILIARY)
+    advantage = jnp.ones((LENGTH, ENVS))
+    scalars = PPOConfig().scalars(1)
+    plain_loss, plain_parts = ppo_loss(replayed, advantage, scalars, False, METHODS["org"])
+    total_loss, total_parts = ppo_loss(replayed, advantage, scalars, False, methods.AUXILIARY)
+
+    # The test method's loss is three times the penalty that it reports.
     penalty = float(np.square(replayed.factual.value).mean())
     assert penalty > 1e-4
-    assert more.keys() - parts.keys() == {"squared_values"}
-    assert more["squared_values"] == pytest.approx(penalty, rel=1e-5)
-    assert total - plain == pytest.approx(3 * penalty, rel=1e-4)
+    assert total_parts.keys() - plain_parts.keys() == {"squared_values"}
+    assert total_parts["squared_values"] == pytest.approx(penalty, rel=1e-5)
+    assert total_loss - plain_loss == pytest.approx(3 * penalty, rel=1e-4)
 
 
 @pytest.mark.slow
-def test_fast_weights_are_an_episodes_own():
-    """The habit counts the actions of the episode, half a point each, and starts anew with it."""
-    _, before, after, rollout = rolled("ADAPTIVE")
-    t, memory = rollout.transitions, after.memory
-    assert memory is not None
-    assert before.memory is not None
+def test_fast_weights_start_anew_with_every_episode():
+    """The habit counts the actions of the episode, half a point each."""
+    _, agent_before, agent_after, rollout = collect_method_rollout("ADAPTIVE")
+    transitions = rollout.transitions
+    assert agent_before.memory is not None
+    assert agent_after.memory is not None
     for slot in range(ENVS):
-        ended = np.flatnonzero(t.ended[:, slot])
-        if not len(ended):
+        end_times = np.flatnonzero(transitions.ended[:, slot])
+        if not len(end_times):
             continue
         # After an ending at step e the last decision knew the actions e + 1 to T - 2.
-        done = t.action[ended[-1] + 1 : -1, slot]
-        np.testing.assert_allclose(memory.fast[slot], 0.5 * np.bincount(done, minlength=6))
+        known_actions = transitions.action[end_times[-1] + 1 : -1, slot]
+        expected = 0.5 * np.bincount(known_actions, minlength=6)
+        np.testing.assert_allclose(agent_after.memory.fast[slot], expected)
 
 
 @pytest.mark.slow
-def test_choices_become_actions_by_the_control():
-    _, _, _, rollout = rolled("CONTROLLED")
-    t = rollout.transitions
-    views = np.asarray(t.reading[..., 0] * 10).round().astype(int)
-    np.testing.assert_array_equal(t.action, 2 * (views % 3) + t.choice)
-    assert set(np.unique(t.choice)) == {0, 1}
+def test_control_turns_choices_into_actions():
+    transitions = collect_method_rollout("CONTROLLED").rollout.transitions
+    num_views = np.asarray(transitions.reading[..., 0] * 10).round().astype(int)
+    np.testing.assert_array_equal(transitions.action, 2 * (num_views % 3) + transitions.choice)
+    assert set(np.unique(transitions.choice)) == {0, 1}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ADAPTIVE", "CONTROLLED"])
-def test_methods_are_evaluated(name):
+def test_evaluator_runs_methods_with_fast_weights_and_control(name):
     episodes = draw_episodes(tiny.BANK, 12, seed=1)
     rows = [table_row("baseline", None, None, "sample"), table_row("stde", 0.0, "paper", "sample")]
-    weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(tiny.random_params(s, SPECS[name]) for s in range(2)))
     grid = inference_grid(rows, ("baseline", "layout"), 1)
-    outcome = Evaluator(acting_with(name))(grid, weights, [(episodes, PARAMS)], KNOWN, jax.random.key(0))
+    weights_by_policy = [tiny.random_params(seed, SPECS[name]) for seed in range(2)]
+    stacked_weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights_by_policy)
+    evaluator = Evaluator(make_agent_loop(name))
+    outcome = evaluator(grid, stacked_weights, [(episodes, PARAMS)], LEARNED_KNOWLEDGE, jax.random.key(0))
     assert outcome.length.shape == (2, 12)
     assert (outcome.length >= 1).all()
     assert (outcome.mean_weight[1] > 0).any()
 
 
 @pytest.mark.slow
-def test_the_weight_of_an_episode_is_the_mean_over_choices_that_count():
-    """Every second one, the first included: those between are neither counted nor averaged."""
-    episodes, weights = draw_episodes(tiny.BANK, 4, seed=1), tiny.random_params(0, SPECS["PATIENT"])
+def test_mean_weight_of_an_episode_averages_only_decision_steps():
+    """Every second step is one, the first included."""
+    agent_loop = make_agent_loop("PATIENT")
+    episodes = draw_episodes(tiny.BANK, 4, seed=1)
+    weights = tiny.random_params(0, SPECS["PATIENT"])
+    stacked_weights = jax.tree.map(lambda leaf: leaf[None], weights)
     grid = inference_grid([table_row("stde", 0.0, "paper", "argmax")], ("layout",), 1)
-    stacked = jax.tree.map(lambda leaf: leaf[None], weights)
-    acting = acting_with("PATIENT")
-    outcome = tiny.leaves_at(Evaluator(acting)(grid, stacked, [(episodes, PARAMS)], KNOWN, jax.random.key(0)), 0)
-    traces = play_episodes(tiny.leaves_at(grid, 0), weights, start_states(episodes), acting, PARAMS, KNOWN)
-    np.testing.assert_array_equal(outcome.choices, [-(-len(trace.action) // 2) for trace in traces])
-    expected = [trace.inferred.removal_weight[::2].mean() for trace in traces]
-    np.testing.assert_allclose(outcome.mean_weight, expected, rtol=1e-5)
-    # Over all actions it is another number.
-    assert np.abs(outcome.mean_weight - [trace.inferred.removal_weight.mean() for trace in traces]).max() > 0.01
+    outcomes = Evaluator(agent_loop)(grid, stacked_weights, [(episodes, PARAMS)], LEARNED_KNOWLEDGE, jax.random.key(0))
+    outcome = tiny.leaves_at(outcomes, 0)
+
+    # The same episodes step by step.
+    traces = play_episodes(
+        tiny.leaves_at(grid, 0), weights, start_states(episodes), agent_loop, PARAMS, LEARNED_KNOWLEDGE
+    )
+    num_decisions = [math.ceil(len(trace.action) / 2) for trace in traces]
+    mean_at_decisions = [trace.inferred.removal_weight[::2].mean() for trace in traces]
+    mean_at_all_steps = [trace.inferred.removal_weight.mean() for trace in traces]
+    np.testing.assert_array_equal(outcome.choices, num_decisions)
+    np.testing.assert_allclose(outcome.mean_weight, mean_at_decisions, rtol=1e-5)
+    assert np.abs(outcome.mean_weight - mean_at_all_steps).max() > 0.01
 
 
-def test_a_method_is_one_hashable_entry():
+def test_method_entries_are_hashable_and_compare_by_value():
     assert hash(Method(methods.Reading)) == hash(Method(methods.Reading))
     assert Method(methods.Reading) != methods.COUNTING

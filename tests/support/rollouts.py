@@ -57,6 +57,21 @@ def decide_again(weights, transitions, memory):
     return replayed.factual, replayed.counterfactual
 
 
+def choice_log_probs(logits, choice):
+    """Log-probabilities [T, B] of choices [T, B] under logits [T, B, A]."""
+    return jnp.take_along_axis(jax.nn.log_softmax(logits), choice[..., None], axis=-1)[..., 0]
+
+
+def changed_parts(params_before, params_after):
+    """Names of the top-level parts of two trees of parameters that differ."""
+    names = set()
+    for name in params_before:
+        is_equal = jax.tree.map(np.array_equal, params_before[name], params_after[name])
+        if not all(jax.tree.leaves(is_equal)):
+            names.add(name)
+    return names
+
+
 class Rolled(NamedTuple):
     """A rollout that continues another one, so that its episodes begin at all times.
 
