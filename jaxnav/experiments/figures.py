@@ -308,9 +308,9 @@ def effects_figure(groups: Mapping[str, Mapping[str, Interval]]) -> Figure:
 
 def draw_band(axes: Axes, curve: Curve, style: dict[str, Any]) -> None:
     """Draw a curve with its band and at most twelve markers."""
-    axes.fill_between(curve.at, curve.low, curve.high, color=style["color"], alpha=0.16, lw=0)
-    marker_interval = -(-len(curve.at) // 12)
-    axes.plot(curve.at, curve.mean, markevery=marker_interval, **style)
+    axes.fill_between(curve.positions, curve.low, curve.high, color=style["color"], alpha=0.16, lw=0)
+    marker_interval = -(-len(curve.positions) // 12)
+    axes.plot(curve.positions, curve.mean, markevery=marker_interval, **style)
 
 
 def legend_key(label: str, style: dict[str, Any]) -> Line2D:

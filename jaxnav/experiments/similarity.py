@@ -245,7 +245,7 @@ def success_of_table(table: ResultTable, **fields: Any) -> SuccessBySimilarity:
     episodes = table.curve(**fields, variant="baseline", metric="episodes by similarity")
     return SuccessBySimilarity(
         episodes=episodes.mean,
-        similarity=success.at,
+        similarity=success.positions,
         success=success.mean,
         pearson=table.find(**fields, variant="baseline", metric="sr by similarity, pearson"),
         spearman=table.find(**fields, variant="baseline", metric="sr by similarity, spearman"),

@@ -29,20 +29,20 @@ class Curve:
     """A statistic along an axis, such as the step of an episode, with its 95 % interval.
 
     Attributes:
-      at: float64 [T], positions on the axis.
+      positions: float64 [T], on the axis.
       mean, low, high: float64 [T]; NaN where the statistic is undefined.
     """
 
-    at: np.ndarray
+    positions: np.ndarray
     mean: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
     @classmethod
-    def from_intervals(cls, at: Sequence[float], intervals: Iterable[Interval]) -> "Curve":
+    def from_intervals(cls, positions: Sequence[float], intervals: Iterable[Interval]) -> "Curve":
         """Make a curve from one interval per position."""
         bounds = [(interval.mean, interval.low, interval.high) for interval in intervals]
-        return cls(np.asarray(at, np.float64), *np.array(bounds, np.float64).T)
+        return cls(np.asarray(positions, np.float64), *np.array(bounds, np.float64).T)
 
     def interval_at(self, index: int) -> Interval:
         """Interval at one position."""
@@ -158,9 +158,9 @@ class ResultTable:
     def find_at(self, position: float, *selections: Mapping[str, Any], **fields: Any) -> Interval:
         """Statistic at a position of the curve of one row; its mean is NaN if there is no such row or position."""
         row = self._find_row(selections, fields)
-        if row is None or not isinstance(row.value, Curve) or position not in row.value.at:
+        if row is None or not isinstance(row.value, Curve) or position not in row.value.positions:
             return Interval(math.nan)
-        return row.value.interval_at(int(np.flatnonzero(row.value.at == position)[0]))
+        return row.value.interval_at(int(np.flatnonzero(row.value.positions == position)[0]))
 
     def has(self, *selections: Mapping[str, Any], **fields: Any) -> bool:
         """True if a row has exactly these fields."""
@@ -214,7 +214,7 @@ def _row_key(row: ResultRow) -> tuple[Any, ...]:
 def _value_to_json(value: Interval | Curve) -> dict[str, Any]:
     """JSON of a statistic; numbers have seven digits, undefined ones are left out, or null in a curve."""
     if isinstance(value, Curve):
-        data: dict[str, Any] = {"at": _round_list(value.at), "mean": _round_list(value.mean)}
+        data: dict[str, Any] = {"positions": _round_list(value.positions), "mean": _round_list(value.mean)}
         if not np.isnan(value.low).all():
             data |= {"low": _round_list(value.low), "high": _round_list(value.high)}
         return data
@@ -227,11 +227,11 @@ def _value_to_json(value: Interval | Curve) -> dict[str, Any]:
 
 
 def _value_from_json(data: Mapping[str, Any]) -> Interval | Curve:
-    if "at" in data:
-        undefined = [None] * len(data["at"])
+    if "positions" in data:
+        undefined = [None] * len(data["positions"])
         low = np.array(data.get("low", undefined), np.float64)
         high = np.array(data.get("high", undefined), np.float64)
-        return Curve(np.array(data["at"], np.float64), np.array(data["mean"], np.float64), low, high)
+        return Curve(np.array(data["positions"], np.float64), np.array(data["mean"], np.float64), low, high)
 
     # The deviation over the training runs follows from their values.
     seeds = tuple(data.get("seeds", ()))

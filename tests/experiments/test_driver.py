@@ -325,10 +325,16 @@ base:
     table = load_results(apply_yaml(ExperimentConfig(), path))["val"]
     for row in expected.report["rows"]:
         if row["variant"] in ("baseline", "layout"):
-            at = {"world": "near", "run": "main", "variant": row["variant"], "decoding": row["decoding"], "shift": 0.0}
+            fields = {
+                "world": "near",
+                "run": "main",
+                "variant": row["variant"],
+                "decoding": row["decoding"],
+                "shift": 0.0,
+            }
             # Files have seven digits.
-            assert table.find(at, metric="sr").mean == pytest.approx(row["sr"]["mean"], rel=1e-6)
-            assert table.has(at, reference="anonymous", metric="sr")
+            assert table.find(fields, metric="sr").mean == pytest.approx(row["sr"]["mean"], rel=1e-6)
+            assert table.has(fields, reference="anonymous", metric="sr")
     assert table.find(world="near", run="main", metric="training (s)").mean == pytest.approx(
         run.times()[-1]["wall_s"], rel=1e-6
     )

@@ -105,7 +105,7 @@ def legend_texts(figure: Figure) -> list[str]:
 
 def assert_curve(axes: Axes, index: int, curve: Curve) -> None:
     """Assert that a line with markers and its band show a curve."""
-    np.testing.assert_allclose(marked_lines(axes)[index], np.stack([curve.at, curve.mean], axis=1))
+    np.testing.assert_allclose(marked_lines(axes)[index], np.stack([curve.positions, curve.mean], axis=1))
     np.testing.assert_allclose(band_limits(axes)[index], [curve.low.min(), curve.high.max()])
 
 

@@ -156,45 +156,47 @@ def bench(make_bench, drawn_run):
 def test_mixture_measures_every_removal_at_both_shifts(bench):
     rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each estimator is compiled anew
     table = ResultTable(measure_mixture(bench, bench.find_run("rooms", "main"), "sample", rules))
-    at = {"world": "rooms", "run": "main", "decoding": "sample"}
+    row_fields = {"world": "rooms", "run": "main", "decoding": "sample"}
     assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
     assert {row.scenes for row in table.rows} == {4}
 
     # TDE and the oracle, then nine clocks, then the rules.
-    removals = table.distinct("variant", at, reference=WITHOUT_REMOVAL)
+    removals = table.distinct("variant", row_fields, reference=WITHOUT_REMOVAL)
     assert removals[:2] == ["TDE", ORACLE_NAME]
     assert removals[-2:] == [str(rule) for rule in rules]
     assert len(removals) == 2 + 9 + 2
 
     # The oracle removes nothing at the first shift, and all experience at the last.
     for shift, weight in ((0.0, 0.0), (1.0, 1.0)):
-        assert table.find(at, variant="TDE", shift=shift, metric="weight").mean == 1.0
-        assert table.find(at, variant=ORACLE_NAME, shift=shift, metric="weight").mean == weight
+        assert table.find(row_fields, variant="TDE", shift=shift, metric="weight").mean == 1.0
+        assert table.find(row_fields, variant=ORACLE_NAME, shift=shift, metric="weight").mean == weight
     change = {"reference": WITHOUT_REMOVAL, "metric": "sr"}
-    assert table.find(at, change, variant=ORACLE_NAME, shift=0.0).mean == 0.0
-    last_change = table.find(at, change, variant="TDE", shift=1.0)
-    assert table.find(at, change, variant=ORACLE_NAME, shift=1.0) == last_change
+    assert table.find(row_fields, change, variant=ORACLE_NAME, shift=0.0).mean == 0.0
+    last_change = table.find(row_fields, change, variant="TDE", shift=1.0)
+    assert table.find(row_fields, change, variant=ORACLE_NAME, shift=1.0) == last_change
 
     # Values, leads and changes add up, and the mixture weighs both shifts alike.
     for metric in METRICS:
         for shift in (0.0, 1.0):
             values = {}
             for variant in (WITHOUT_EXPERIENCE, WITHOUT_REMOVAL):
-                values[variant] = table.find(at, variant=variant, shift=shift, metric=metric).mean
-            lead = table.find(at, variant=WITHOUT_REMOVAL, reference=WITHOUT_EXPERIENCE, shift=shift, metric=metric)
+                values[variant] = table.find(row_fields, variant=variant, shift=shift, metric=metric).mean
+            lead = table.find(
+                row_fields, variant=WITHOUT_REMOVAL, reference=WITHOUT_EXPERIENCE, shift=shift, metric=metric
+            )
             assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[WITHOUT_EXPERIENCE])
         for removal in removals:
             changes = []
             for shift in (0.0, 1.0):
                 changes.append(
-                    table.find(at, variant=removal, reference=WITHOUT_REMOVAL, shift=shift, metric=metric).mean
+                    table.find(row_fields, variant=removal, reference=WITHOUT_REMOVAL, shift=shift, metric=metric).mean
                 )
-            overall = table.find(at, variant=removal, reference=WITHOUT_REMOVAL, metric=metric).mean
+            overall = table.find(row_fields, variant=removal, reference=WITHOUT_REMOVAL, metric=metric).mean
             assert overall == pytest.approx(sum(changes) / 2)
 
     # Every rule is compared with the gap of another episode, the mean gap unless it is a switch, and one clock.
     for rule, own_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
-        controls = table.distinct("control", at, variant=str(rule), reference="control")
+        controls = table.distinct("control", row_fields, variant=str(rule), reference="control")
         assert controls[:-1] == own_controls
         assert controls[-1] in removals[2:-2]
 
@@ -203,13 +205,13 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
 def test_handover_leaves_the_agents_without_experience(bench):
     table = ResultTable(measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ()))
     (name,) = table.distinct("run")
-    at = {"world": "rooms", "run": name, "decoding": "argmax"}
+    row_fields = {"world": "rooms", "run": name, "decoding": "argmax"}
     # An agent that hands over at once is worth as much as the agents without experience.
     for metric in METRICS:
         for shift in (0.0, 1.0):
-            agent = table.find(at, variant=WITHOUT_REMOVAL, shift=shift, metric=metric)
-            change = table.find(at, variant="TDE", reference=WITHOUT_REMOVAL, shift=shift, metric=metric)
-            unaware = table.find(at, variant=WITHOUT_EXPERIENCE, shift=shift, metric=metric)
+            agent = table.find(row_fields, variant=WITHOUT_REMOVAL, shift=shift, metric=metric)
+            change = table.find(row_fields, variant="TDE", reference=WITHOUT_REMOVAL, shift=shift, metric=metric)
+            unaware = table.find(row_fields, variant=WITHOUT_EXPERIENCE, shift=shift, metric=metric)
             assert agent.mean + change.mean == pytest.approx(unaware.mean)
 
 

@@ -190,8 +190,10 @@ def test_a_template_may_include_templates_beside_it(tmp_path):
 
 
 def test_a_template_may_draw_figures(tmp_path):
-    at = np.array([0.0, 1.0])
-    rows = [make_row(Curve(at, at, at, at), variant="paper", shift=1.0, control="updated", metric="gap auc")]
+    steps = np.array([0.0, 1.0])
+    rows = [
+        make_row(Curve(steps, steps, steps, steps), variant="paper", shift=1.0, control="updated", metric="gap auc")
+    ]
     fields = '{"world": "rooms", "run": "main"}'
     text = render_own(tmp_path, f'![AUC]({{{{ figure("auc", table, config.shifts, {fields}) }}}})', *rows)
     (image,) = re.findall(r"!\[AUC\]\((.*)\)", text)
@@ -385,22 +387,22 @@ def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
 
 def mixture_rows(world: str) -> list[ResultRow]:
     """Value 6 and cost -4 of experience, and two removals, in one world."""
-    at = {"world": world, "decoding": "sample"}
+    sampled = {"world": world, "decoding": "sample"}
     rows = []
     for shift, lead in ((0.0, 6.0), (1.0, -4.0)):
         for metric in ("sr", "spl", "sr@40"):
-            fields = {**at, "shift": shift, "metric": metric}
+            fields = {**sampled, "shift": shift, "metric": metric}
             rows.append(make_row(50.0, **fields, variant="without experience"))
             rows.append(make_row(50.0 + lead, **fields, variant="without removal"))
             lead_fields = {"variant": "without removal", "reference": "without experience"}
             rows.append(make_row(lead, **fields, **lead_fields))
-        rows.append(make_row(20.0, **at, shift=shift, variant="without removal", metric="length"))
+        rows.append(make_row(20.0, **sampled, shift=shift, variant="without removal", metric="length"))
 
         # TDE keeps a third of the value, and leaves a quarter of the cost.
         share = 33.0 if shift == 0.0 else 25.0
-        rows.append(make_row(1.0, **at, shift=shift, variant="TDE", metric="weight"))
+        rows.append(make_row(1.0, **sampled, shift=shift, variant="TDE", metric="weight"))
         for metric in ("sr", "spl", "sr@40"):
-            tde = {**at, "variant": "TDE", "shift": shift}
+            tde = {**sampled, "variant": "TDE", "shift": shift}
             rows.append(make_row(lead * (share / 100 - 1), **tde, reference="without removal", metric=metric))
             rows.append(make_row(share, **tde, metric=f"{metric} left"))
     return rows

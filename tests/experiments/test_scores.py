@@ -312,10 +312,12 @@ def test_training_rows_count_steps_seconds_and_success(drawn_run, make_bench, tm
 
     # Without logs only the steps are known: 64 walks of 20 steps were drawn, and 4 updates of 16 x 8 learned from.
     table = ResultTable(training_rows(run))
-    at = {"world": "rooms", "run": "main"}
-    steps = [table.find(at, metric=f"{purpose} (steps)").mean for purpose in ("exploration", "imitation", "learning")]
+    fields = {"world": "rooms", "run": "main"}
+    steps = [
+        table.find(fields, metric=f"{purpose} (steps)").mean for purpose in ("exploration", "imitation", "learning")
+    ]
     assert steps == [1280, 0, 512]
-    assert not table.has(at, metric="training (s)")
+    assert not table.has(fields, metric="training (s)")
 
     # Two chunks of two updates each, with success on `val` after both.
     logs = RunLogs(run.config)
@@ -326,9 +328,9 @@ def test_training_rows_count_steps_seconds_and_success(drawn_run, make_bench, tm
                 rows.append({"step": chunk, "arm": arm, "seed": seed, "env_steps": 128 * chunk, "val_success": success})
         logs.append(rows, {"step": chunk, "wall_s": 10.0 * chunk, "cpu_s": 1.0})
     table = ResultTable(training_rows(run))
-    assert table.find(at, metric="training (s)").mean == 40
-    assert table.find(at, metric="val sr before the last quarter").mean == 25
-    assert table.find(at, metric="val sr at the end").mean == 50
+    assert table.find(fields, metric="training (s)").mean == 40
+    assert table.find(fields, metric="val sr before the last quarter").mean == 25
+    assert table.find(fields, metric="val sr at the end").mean == 50
 
 
 def test_frontier_rows_are_searches_of_the_same_episodes(make_bench, drawn_run):
@@ -340,6 +342,6 @@ def test_frontier_rows_are_searches_of_the_same_episodes(make_bench, drawn_run):
         # Living rooms have 14 actions, all others 12.
         limits = np.array([14 if room == "living_room" else 12 for room in bank.room_types])
         searched = run_frontier_search(bank, draw_episodes(bank, 24), limits)
-        at = {"world": "rooms", "run": "main", "variant": "frontier", "shift": shift}
-        assert table.find(at, metric="sr").mean == pytest.approx(100 * np.mean(searched.success))
-        assert table.num_scenes(at) == 4
+        fields = {"world": "rooms", "run": "main", "variant": "frontier", "shift": shift}
+        assert table.find(fields, metric="sr").mean == pytest.approx(100 * np.mean(searched.success))
+        assert table.num_scenes(fields) == 4

@@ -258,8 +258,8 @@ def test_the_interval_of_gains_is_that_of_a_plain_loop():
                 gains += [100 * (variant - baseline)] * members.sum()
         return np.asarray(linregress(similarities, gains))
 
-    slope = left_out(lambda *left: 0.1 * line_without(*left)[0], num_scenes, num_runs, arms=2)
-    pearson = left_out(lambda *left: line_without(*left)[2], num_scenes, num_runs, arms=2)
+    slope = left_out(lambda *omitted: 0.1 * line_without(*omitted)[0], num_scenes, num_runs, arms=2)
+    pearson = left_out(lambda *omitted: line_without(*omitted)[2], num_scenes, num_runs, arms=2)
     assert bounds(relation.slope) == pytest.approx(slope)
     assert bounds(relation.pearson) == pytest.approx(pearson)
 

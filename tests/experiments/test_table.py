@@ -55,7 +55,7 @@ def assert_same_row(read: ResultRow, written: ResultRow) -> None:
             assert_same_number(getattr(read.value, name), getattr(written.value, name))
         assert read.value.seeds == pytest.approx(written.value.seeds, rel=6e-7)
     elif isinstance(written.value, Curve) and isinstance(read.value, Curve):
-        for name in ("at", "mean", "low", "high"):
+        for name in ("positions", "mean", "low", "high"):
             for numbers in zip(getattr(read.value, name), getattr(written.value, name), strict=True):
                 assert_same_number(*numbers)
 
@@ -194,8 +194,8 @@ GOOD_HEAD = '{"settings": {}, "versions": {}, "format": 3, "shared": {"world": "
         GOOD_HEAD[:-4].encode(),
         *(GOOD_HEAD.encode() + line for line in (b"{", b"7", b"[]", b'{"metric": "sr"}', b'{"mean": 5}')),
         *(GOOD_HEAD.encode() + line for line in (b'{"metric": "sr", "mean": "x"}', b'{"metric": "sr", "mean": [1]}')),
-        GOOD_HEAD.encode() + b'{"metric": "gap", "at": [0, 1], "mean": ["x", "y"]}',
-        GOOD_HEAD.encode() + b'{"metric": "gap", "at": 0, "mean": 1}',
+        GOOD_HEAD.encode() + b'{"metric": "gap", "positions": [0, 1], "mean": ["x", "y"]}',
+        GOOD_HEAD.encode() + b'{"metric": "gap", "positions": 0, "mean": 1}',
         GOOD_HEAD.replace(": 3", ": 2").encode(),
     ],
 )
