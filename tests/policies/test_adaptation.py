@@ -27,8 +27,11 @@ from jaxnav.policies.network import bind
 from jaxnav.policies.pathways import PolicyInputs, mask_experience
 from jaxnav.scenes.task import NUM_ACTIONS
 
-STEPS, RATE, K = 27, 0.05, tiny.SPEC.num_categories
-FAST = ("fuse", "core", "actor")
+#: Four windows of six steps and what follows them.
+NUM_STEPS = 27
+LEARNING_RATE = 0.05
+NUM_CATEGORIES = tiny.SPEC.num_categories
+FAST_LAYERS = ("fuse", "core", "actor")
 SAVN = dataclasses.replace(tiny.SPEC, method=find_method("savn"), method_sizes=())
 SPECS = {
     "savn": SAVN,
@@ -38,66 +41,88 @@ SPECS = {
 }
 
 
-def given(seed, *batch):
-    """Observations and actions of 27 steps, leaves [27, *batch]: four windows and what follows them."""
-    draws, shape = np.random.default_rng(seed), (STEPS, *batch)
-    row = tiny.BANK.rows[draws.integers(0, len(tiny.BANK.rows), shape)]
-    goal, action = draws.integers(0, K, shape), draws.integers(0, NUM_ACTIONS, shape)
+def random_episode(seed, *batch_shape):
+    """Observations and actions of 27 steps, leaves [27, *batch_shape, ...]."""
+    rng = np.random.default_rng(seed)
+    shape = (NUM_STEPS, *batch_shape)
+    row = tiny.BANK.rows[rng.integers(0, len(tiny.BANK.rows), shape)]
+    goal = rng.integers(0, NUM_CATEGORIES, shape)
+    action = rng.integers(0, NUM_ACTIONS, shape)
     return Observation(jnp.asarray(row), jnp.asarray(goal)), jnp.asarray(action, jnp.int32)
 
 
-def acted(spec, weights, adaptation, observation, action):
-    """Logits and fast weights along given actions, leaves [27, *batch, ...]."""
+def run_package(spec, weights, adaptation, observation, action):
+    """Logits and fast weights of the package along given actions, leaves [27, *batch_shape, ...]."""
     policy = bind(spec, weights)
     policy.adaptation = adaptation
-    experienced = None if spec.decision == "fused" else jnp.ones(action.shape[1:])
+    batch_shape = action.shape[1:]
+    layout_weights = jnp.ones((*batch_shape, NUM_CATEGORIES))
 
-    def step(memory, part):
-        observation, action = part
-        pathways = policy.pathways(PolicyInputs(observation, jnp.ones((*action.shape, K))), memory)
+    def step(memory, observation_and_action):
+        observation, action = observation_and_action
+        pathways = policy.pathways(PolicyInputs(observation, layout_weights), memory)
         decision = policy.decide(pathways, memory)
         return decision.next_state(action), (decision.logits, decision.fast)
 
-    memory = policy.initial_memory(action.shape[1:])._replace(use_experience=experienced)
-    return jax.lax.scan(step, memory, (observation, action))[1]
+    use_experience = None if spec.decision == "fused" else jnp.ones(batch_shape)
+    memory = policy.initial_memory(batch_shape)._replace(use_experience=use_experience)
+    _, (logits, fast) = jax.lax.scan(step, memory, (observation, action))
+    return logits, fast
 
 
-def acted_plainly(spec, weights, observation, action, order=2):
+def run_reference(spec, weights, observation, action, order=2):
     """Logits [27, A] of one episode whose kernels take the steps themselves: the rule as SAVN's code has it.
 
     After each window the gradient of the learned loss by the kernels and biases that act is taken with the hidden
     state before the window and experience as they were. With `order` 1 it is no function of anything but the loss's
     parameters, with `order` 0 it is a constant.
     """
-    fast, memory = weights, bind(spec, weights).initial_memory()
-    window, logits = [], []
-    for time in range(STEPS):
-        policy = bind(spec, fast)
-        seen = jax.tree.map(lambda leaf, time=time: leaf[time], observation)
-        pathways = policy.pathways(PolicyInputs(seen, jnp.ones(K)), memory)
+    fast_weights = weights
+    memory = bind(spec, weights).initial_memory()
+    window = []
+    logits = []
+    for time in range(NUM_STEPS):
+        # Act with the present kernels.
+        policy = bind(spec, fast_weights)
+        step_observation = tiny.leaves_at(observation, time)
+        pathways = policy.pathways(PolicyInputs(step_observation, jnp.ones(NUM_CATEGORIES)), memory)
         window.append((pathways, memory))
         decision = policy.decide_with_changes(pathways, memory)
         logits.append(decision.logits)
         memory = decision.next_state(action[time])
-        if len(window) == WINDOW and time < 4 * WINDOW:
-            begin, held = fast, window
-            if order < 2:
-                begin, held = jax.lax.stop_gradient((begin, held))
-            loss = functools.partial(judged, spec, held, weights["method"])
-            gradient = jax.grad(loss)({name: begin[name] for name in FAST})
-            gradient = jax.lax.stop_gradient(gradient) if order == 0 else gradient
-            fast = fast | jax.tree.map(lambda w, g: w - RATE * g, {name: fast[name] for name in FAST}, gradient)
-        window = window if len(window) < WINDOW else []
+        if len(window) < WINDOW:
+            continue
+
+        # Take a step at the end of each of the first four windows.
+        if time < 4 * WINDOW:
+            fast_weights = descend(spec, fast_weights, weights["method"], window, order)
+        window = []
     return jnp.stack(logits)
 
 
-def judged(spec, window, method, fast):
+def descend(spec, fast_weights, method_weights, window, order):
+    """The parameters after one gradient step of the learned loss on a window."""
+    start_weights, loss_window = fast_weights, window
+    if order < 2:
+        start_weights, loss_window = jax.lax.stop_gradient((fast_weights, window))
+    loss = functools.partial(window_loss, spec, loss_window, method_weights)
+    gradient = jax.grad(loss)({name: start_weights[name] for name in FAST_LAYERS})
+    if order == 0:
+        gradient = jax.lax.stop_gradient(gradient)
+    layers = {name: fast_weights[name] for name in FAST_LAYERS}
+    return fast_weights | jax.tree.map(lambda weight, slope: weight - LEARNING_RATE * slope, layers, gradient)
+
+
+def window_loss(spec, window, method_weights, fast_layers):
     """The learned loss of a window that is acted again; with streams the direct stream acts alone."""
-    policy = bind(spec, tiny.random_params(0, spec) | fast | {"method": method})
-    alone = None if spec.decision == "fused" else jnp.float32(0.0)
-    hidden, rows = window[0][1].hidden, []
+    policy = bind(spec, tiny.random_params(0, spec) | fast_layers | {"method": method_weights})
+    use_experience = None if spec.decision == "fused" else jnp.float32(0.0)
+    _, first_memory = window[0]
+    hidden = first_memory.hidden
+    rows = []
     for pathways, memory in window:
-        decision = policy.decide_with_changes(mask_experience(pathways, alone), memory._replace(hidden=hidden))
+        masked_pathways = mask_experience(pathways, use_experience)
+        decision = policy.decide_with_changes(masked_pathways, memory._replace(hidden=hidden))
         hidden = decision.hidden
         rows.append(jnp.concatenate([hidden[: policy.hidden], jax.nn.softmax(decision.logits)]))
     return cast(HasLearnedLoss, policy.method).learned_loss(jnp.stack(rows))
@@ -107,57 +132,71 @@ def judged(spec, window, method, fast):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SPECS)
-def test_factors_are_steps_of_the_whole_kernels(name):
-    """What is added up, of rank 24, is what autodiff takes from kernels of the episode's own."""
-    spec, (observation, action) = SPECS[name], given(0)
+@pytest.mark.parametrize("spec_name", SPECS)
+def test_adaptation_by_factors_equals_gradient_steps_on_whole_kernels(spec_name):
+    """The sum of factors, of rank 24, is the change that autodiff makes to kernels of the episode's own."""
+    spec = SPECS[spec_name]
+    observation, action = random_episode(0)
     weights = tiny.random_params(0, spec)
-    logits, fast = jax.jit(functools.partial(acted, spec, weights, LearnedLossAdaptation(learning_rate=RATE)))(
-        observation, action
-    )
-    expected = jax.jit(functools.partial(acted_plainly, spec))(weights, observation, action)
+    adaptation = LearnedLossAdaptation(learning_rate=LEARNING_RATE)
+    run_adapted = jax.jit(functools.partial(run_package, spec, weights, adaptation))
+    logits, fast = run_adapted(observation, action)
+    expected = jax.jit(functools.partial(run_reference, spec))(weights, observation, action)
     np.testing.assert_allclose(logits, expected, rtol=2e-4, atol=2e-4)
-    plain = acted(spec, weights, None, observation, action)[0]
-    np.testing.assert_allclose(logits[:WINDOW], plain[:WINDOW], rtol=1e-5, atol=1e-5)
-    assert np.abs(logits - plain)[WINDOW:].max(axis=1).min() > 1e-4
+
+    # Adaptation changes every step after the first window, and none in it.
+    plain_logits, _ = run_package(spec, weights, None, observation, action)
+    np.testing.assert_allclose(logits[:WINDOW], plain_logits[:WINDOW], rtol=1e-5, atol=1e-5)
+    assert np.abs(logits - plain_logits)[WINDOW:].max(axis=1).min() > 1e-4
+
+    # The rank is at most 24.
     for factors in fast.layer_changes.values():
-        assert (np.abs(factors.outputs[-1]).max(axis=-1) > 0).sum() == 4 * WINDOW  # the rank is at most 24
+        is_factor_used = np.abs(factors.outputs[-1]).max(axis=-1) > 0
+        assert is_factor_used.sum() == 4 * WINDOW
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
-def test_training_differentiates_through_the_steps(order):
-    spec, (observation, action) = SAVN, given(1)
-    weights = tiny.random_params(0, spec)
-    adaptation = LearnedLossAdaptation(learning_rate=RATE, second_order=order == 2)
-    mixture = jnp.asarray(np.random.default_rng(2).normal(size=(STEPS, NUM_ACTIONS)), jnp.float32)
-    gradient = jax.jit(jax.grad(lambda w: (mixture * acted(spec, w, adaptation, observation, action)[0]).sum()))(
-        weights
-    )
+def test_training_gradient_of_adaptation_has_the_configured_order(order):
+    observation, action = random_episode(1)
+    weights = tiny.random_params(0, SAVN)
+    adaptation = LearnedLossAdaptation(learning_rate=LEARNING_RATE, second_order=order == 2)
+    logit_weights = jnp.asarray(np.random.default_rng(2).normal(size=(NUM_STEPS, NUM_ACTIONS)), jnp.float32)
 
-    @functools.partial(jax.jit, static_argnums=1)
-    def by_order(weights, order):
-        return jax.grad(lambda w: (mixture * acted_plainly(spec, w, observation, action, order)).sum())(weights)
+    def package_loss(weights):
+        logits, _ = run_package(SAVN, weights, adaptation, observation, action)
+        return (logit_weights * logits).sum()
 
+    def reference_loss(weights, order):
+        return (logit_weights * run_reference(SAVN, weights, observation, action, order)).sum()
+
+    gradient = jax.jit(jax.grad(package_loss))(weights)
+    reference_gradient = jax.jit(jax.grad(reference_loss), static_argnums=1)
     scale = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(gradient))
-    chex.assert_trees_all_close(gradient, by_order(weights, order), rtol=2e-3, atol=1e-4 * scale)
-    of_loss = jax.tree.leaves(gradient["method"]["learned_loss"])
-    assert max(np.abs(leaf).max() for leaf in of_loss) > 1e-3
-    # Negative controls: the orders differ, and the plain switch teaches the loss nothing.
-    other = by_order(weights, 3 - order)
-    assert np.abs(other["fuse"]["kernel"] - gradient["fuse"]["kernel"]).max() > 1e-3 * scale
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(by_order(weights, 0)["method"]))
+    chex.assert_trees_all_close(gradient, reference_gradient(weights, order), rtol=2e-3, atol=1e-4 * scale)
+
+    # The parameters of the learned loss have a gradient.
+    loss_gradients = jax.tree.leaves(gradient["method"]["learned_loss"])
+    assert max(np.abs(leaf).max() for leaf in loss_gradients) > 1e-3
+
+    # Negative controls: the orders differ, and a constant step teaches the loss nothing.
+    other_gradient = reference_gradient(weights, 3 - order)
+    assert np.abs(other_gradient["fuse"]["kernel"] - gradient["fuse"]["kernel"]).max() > 1e-3 * scale
+    for leaf in jax.tree.leaves(reference_gradient(weights, 0)["method"]):
+        assert not np.asarray(leaf).any()
 
 
-def test_the_loss_is_two_causal_convolutions_and_a_length():
+def test_learned_loss_is_the_norm_of_two_causal_convolutions():
     loss = LearnedLoss(nnx.Rngs(params=0))
     rows = np.random.default_rng(0).normal(size=(WINDOW, 9)).astype(np.float32)
 
-    def convolve(entries, layer, distance):  # [C, L] by taps [2, C, D], the earlier one first
+    def convolve(entries, layer, distance):
+        """Convolve entries [C, L] by taps [2, C, D], the earlier one first, and apply a leaky ReLU."""
         taps = np.asarray(layer.kernel[...]).reshape(2, len(entries), -1)
-        earlier = np.pad(entries, ((0, 0), (distance, 0)))[:, : entries.shape[1]]
-        outputs = np.einsum("cl,cd->dl", earlier, taps[0]) + np.einsum("cl,cd->dl", entries, taps[1])
-        outputs = outputs + np.asarray(layer.bias[...])[:, None]
+        earlier_entries = np.pad(entries, ((0, 0), (distance, 0)))[:, : entries.shape[1]]
+        earlier_outputs = np.einsum("cl,cd->dl", earlier_entries, taps[0])
+        present_outputs = np.einsum("cl,cd->dl", entries, taps[1])
+        outputs = earlier_outputs + present_outputs + np.asarray(layer.bias[...])[:, None]
         return np.where(outputs > 0, outputs, 0.01 * outputs)
 
     expected = np.linalg.norm(convolve(convolve(rows, loss.first, 1), loss.second, 2))
@@ -168,85 +207,113 @@ def test_the_loss_is_two_causal_convolutions_and_a_length():
 
 
 @pytest.mark.slow
-def test_an_episode_ignores_the_others():
-    """Every episode of a batch adapts as it does alone."""
-    observation, action = given(3, 16)
-    weights, adaptation = tiny.random_params(0, SAVN), LearnedLossAdaptation(learning_rate=RATE)
-    go = jax.jit(functools.partial(acted, SAVN, weights, adaptation))
-    logits, _ = go(observation, action)
-    other = jax.tree.map(lambda leaf: leaf.at[:, 5].set(leaf[:, 6]), (observation, action))
-    changed, _ = go(*other)
-    rest = np.arange(16) != 5
-    np.testing.assert_array_equal(changed[:, rest], logits[:, rest])
-    assert np.abs(changed[:, 5] - logits[:, 5]).max() > 0.1
-    one, _ = go(*jax.tree.map(lambda leaf: leaf[:, 2], (observation, action)))
-    np.testing.assert_allclose(one, logits[:, 2], rtol=1e-4, atol=1e-4)
+def test_each_episode_of_a_batch_adapts_as_it_does_alone():
+    episodes = random_episode(3, 16)
+    adaptation = LearnedLossAdaptation(learning_rate=LEARNING_RATE)
+    run_adapted = jax.jit(functools.partial(run_package, SAVN, tiny.random_params(0, SAVN), adaptation))
+    logits, _ = run_adapted(*episodes)
+
+    # Another fifth episode changes no other one.
+    changed_episodes = jax.tree.map(lambda leaf: leaf.at[:, 5].set(leaf[:, 6]), episodes)
+    changed_logits, _ = run_adapted(*changed_episodes)
+    is_other_episode = np.arange(16) != 5
+    np.testing.assert_array_equal(changed_logits[:, is_other_episode], logits[:, is_other_episode])
+    assert np.abs(changed_logits[:, 5] - logits[:, 5]).max() > 0.1
+
+    # An episode alone.
+    single_logits, _ = run_adapted(*tiny.leaves_at(episodes, slice(None), 2))
+    np.testing.assert_allclose(single_logits, logits[:, 2], rtol=1e-4, atol=1e-4)
 
 
-def test_nothing_is_learned_before_a_window_is_full_nor_after_the_fourth():
-    _, fast = jax.jit(
-        functools.partial(acted, SAVN, tiny.random_params(0, SAVN), LearnedLossAdaptation(learning_rate=RATE))
-    )(*given(4))
-    changes = fast.layer_changes["hidden_gates"].outputs
-    times = [time + 1 for time in range(STEPS) if np.any(changes[time] != (changes[time - 1] if time else 0.0))]
-    assert times == [6, 12, 18, 24]
+def test_adaptation_steps_only_at_the_ends_of_the_first_four_windows():
+    adaptation = LearnedLossAdaptation(learning_rate=LEARNING_RATE)
+    run_adapted = jax.jit(functools.partial(run_package, SAVN, tiny.random_params(0, SAVN), adaptation))
+    _, fast = run_adapted(*random_episode(4))
+    outputs = np.asarray(fast.layer_changes["hidden_gates"].outputs)
+    previous_outputs = np.concatenate([np.zeros_like(outputs[:1]), outputs[:-1]])
+    is_step = (outputs != previous_outputs).reshape(NUM_STEPS, -1).any(axis=1)
+    assert (np.flatnonzero(is_step) + 1).tolist() == [6, 12, 18, 24]
 
 
 @pytest.mark.slow
-def test_the_window_is_what_was_decided():
+def test_replay_window_repeats_the_decisions_of_the_window():
     """Deciding again along a window ends in what the agent decided and remembers."""
-    policy, (observation, action) = bind(SAVN, tiny.random_params(0, SAVN)), given(5)
+    policy = bind(SAVN, tiny.random_params(0, SAVN))
 
-    def step(memory, part):
-        decision = policy.decide(policy.pathways(PolicyInputs(part[0], jnp.ones(K))), memory)
-        return decision.next_state(part[1]), (memory, decision)
+    def step(memory, observation_and_action):
+        observation, action = observation_and_action
+        inputs = PolicyInputs(observation, jnp.ones(NUM_CATEGORIES))
+        decision = policy.decide(policy.pathways(inputs), memory)
+        return decision.next_state(action), (memory, decision)
 
-    # The second window: after the first step, before the second.
-    window = jax.tree.map(lambda leaf: leaf[: 2 * WINDOW], (observation, action))
-    _, (before, decision) = jax.lax.scan(step, policy.initial_memory(), window)
-    last, after = jax.tree.map(lambda leaf: leaf[-1], (before, decision))
-    nothing = {layer: jnp.zeros_like(f.outputs[:WINDOW]) for layer, f in last.fast.layer_changes.items()}
-    rows, inputs = replay_window(policy, after.fast._replace(layer_changes=last.fast.layer_changes), nothing)
-    np.testing.assert_allclose(rows[:, : policy.hidden], decision.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(rows[-1, policy.hidden :], jax.nn.softmax(after.logits), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(inputs["hidden_gates"], before.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
+    # Two windows; the second one comes after the first step and before the second.
+    first_two_windows = tiny.leaves_at(random_episode(5), slice(2 * WINDOW))
+    _, (memories, decisions) = jax.lax.scan(step, policy.initial_memory(), first_two_windows)
+    last_memory, last_decision = tiny.leaves_at((memories, decisions), -1)
+
+    # Replay the second window with the changes of the first step and no further ones.
+    layer_changes = last_memory.fast.layer_changes
+    no_output_changes = {}
+    for layer_name, factors in layer_changes.items():
+        no_output_changes[layer_name] = jnp.zeros_like(factors.outputs[:WINDOW])
+    fast = last_decision.fast._replace(layer_changes=layer_changes)
+    rows, layer_inputs = replay_window(policy, fast, no_output_changes)
+
+    last_probs = jax.nn.softmax(last_decision.logits)
+    np.testing.assert_allclose(rows[:, : policy.hidden], decisions.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rows[-1, policy.hidden :], last_probs, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(layer_inputs["hidden_gates"], memories.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", SPECS)
-def test_fast_weights_can_be_stored(name):
+@pytest.mark.parametrize("spec_name", SPECS)
+def test_initial_fast_weights_have_no_empty_arrays(spec_name):
     """Checkpoints hold no empty arrays, though experience may have no width."""
-    spec = SPECS[name]
-    memory = jax.eval_shape(lambda: bind(spec, tiny.random_params(0, spec)).initial_memory((3,)))
-    assert all(leaf.size > 0 for leaf in jax.tree.leaves(memory.fast))
+    spec = SPECS[spec_name]
+
+    def make_memory():
+        return bind(spec, tiny.random_params(0, spec)).initial_memory((3,))
+
+    for leaf in jax.tree.leaves(jax.eval_shape(make_memory).fast):
+        assert leaf.size > 0
 
 
 # Fewer steps
 
 
-def test_fewer_steps_are_possible_and_more_are_refused():
+def test_limit_inner_steps_reduces_the_steps_of_an_adaptation():
     adaptation = METHODS["savn"].adaptation
     assert limit_inner_steps(adaptation, 0) is None
     assert limit_inner_steps(adaptation, 2) == LearnedLossAdaptation(inner_steps=2)
-    for steps in (5, -1):
-        with pytest.raises(
-            InputError, match=rf"^inner_steps is {steps}; an episode remembers 4 windows of 6 actions: "
-        ):
-            limit_inner_steps(adaptation, steps)
-    with pytest.raises(InputError, match=r"^inner_steps is 1; the method adapts in another way: give 0"):
+
+
+@pytest.mark.parametrize("inner_steps", [5, -1])
+def test_limit_inner_steps_refuses_more_steps_than_windows(inner_steps):
+    with pytest.raises(InputError, match=rf"inner_steps is {inner_steps}.*4 windows of 6"):
+        limit_inner_steps(METHODS["savn"].adaptation, inner_steps)
+
+
+def test_limit_inner_steps_refuses_a_method_that_adapts_in_another_way():
+    with pytest.raises(InputError, match=r"inner_steps is 1.*give 0"):
         limit_inner_steps(METHODS["tpn"].adaptation, 1)
-    with pytest.raises(
-        InputError, match=r"^LearnedLossAdaptation: inner_steps is 0; give 1 or more, or no adaptation$"
-    ):
+
+
+def test_learned_loss_adaptation_refuses_zero_steps():
+    with pytest.raises(InputError, match=r"LearnedLossAdaptation: inner_steps is 0.*give 1"):
         LearnedLossAdaptation(inner_steps=0)
 
 
 @pytest.mark.slow
-def test_fewer_steps_are_the_first_of_more():
-    weights, (observation, action) = tiny.random_params(0, SAVN), given(6)
-    two, _ = acted(SAVN, weights, LearnedLossAdaptation(inner_steps=2, learning_rate=RATE), observation, action)
-    four, _ = acted(SAVN, weights, LearnedLossAdaptation(learning_rate=RATE), observation, action)
-    none, fast = acted(SAVN, weights, limit_inner_steps(LearnedLossAdaptation(), 0), observation, action)
-    assert fast is None
-    np.testing.assert_allclose(two[: 3 * WINDOW], four[: 3 * WINDOW], rtol=1e-5, atol=1e-5)
-    assert np.abs(two - four)[3 * WINDOW :].max() > 1e-3
-    assert np.abs(none - four)[WINDOW:].max() > 1e-3
+def test_adaptation_with_two_steps_takes_the_first_two_of_four():
+    weights = tiny.random_params(0, SAVN)
+    observation, action = random_episode(6)
+    two_steps = LearnedLossAdaptation(inner_steps=2, learning_rate=LEARNING_RATE)
+    four_steps = LearnedLossAdaptation(learning_rate=LEARNING_RATE)
+    no_steps = limit_inner_steps(LearnedLossAdaptation(), 0)
+    logits_of_two, _ = run_package(SAVN, weights, two_steps, observation, action)
+    logits_of_four, _ = run_package(SAVN, weights, four_steps, observation, action)
+    logits_of_none, fast_of_none = run_package(SAVN, weights, no_steps, observation, action)
+
+    assert fast_of_none is None
+    np.testing.assert_allclose(logits_of_two[: 3 * WINDOW], logits_of_four[: 3 * WINDOW], rtol=1e-5, atol=1e-5)
+    assert np.abs(logits_of_two - logits_of_four)[3 * WINDOW :].max() > 1e-3
+    assert np.abs(logits_of_none - logits_of_four)[WINDOW:].max() > 1e-3
