@@ -21,184 +21,208 @@ from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.task import NUM_ACTIONS
 
-K, BATCH, HIDDEN = len(CATEGORIES), 48, tiny.SIZES.hidden
+NUM_CATEGORIES = len(CATEGORIES)
+BATCH_SIZE = 48
+HIDDEN_SIZE = tiny.SIZES.hidden
 #: The package's methods, one that attends with its memory, and one that adapts.
 HOSTS = [*METHODS, "support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
 
 
-def streams(method, **options):
-    sizes = tiny.SPEC.method_sizes if method == "org" else ()
-    return dataclasses.replace(tiny.STREAMS, method=find_method(method), method_sizes=sizes, **options)
+def params_slow_except(*fast_names):
+    """All hosts as parameters of a test; all but some marked slow, as they take seconds each to compile."""
+    return [pytest.param(name, marks=() if name in fast_names else pytest.mark.slow) for name in HOSTS]
+
+
+def make_spec(method_name, **options):
+    method_sizes = tiny.SPEC.method_sizes if method_name == "org" else ()
+    return dataclasses.replace(tiny.STREAMS, method=find_method(method_name), method_sizes=method_sizes, **options)
 
 
 class Decisions(NamedTuple):
-    """One decision under interventions."""
+    """One decision under interventions: on nothing, on both direct pathways, on experience, and on all of them."""
 
     factual: Decision
     counterfactual: Decision
     direct: Decision
-    nothing: Decision
+    neither: Decision
 
 
 @functools.cache
-def compiled(spec):
+def compile_decisions(spec):
     """Decisions as a function of parameters, observation, layout weights, surroundings and memory."""
-    reading = tiny.first_reading(spec.method, BATCH)
+    reading = tiny.first_reading(spec.method, BATCH_SIZE)
 
     @jax.jit
-    def decide(weights, observation, layout, surroundings, memory):
+    def decide(weights, observation, layout_weights, surroundings, memory):
         policy = bind(spec, weights)
-        pathways = policy.pathways(PolicyInputs(observation, layout, reading, surroundings), memory)
-        counterfactual = do(pathways, scene=0.0, goal=0.0)
-        given = pathways, counterfactual, do(pathways, experience=0.0), do(counterfactual, experience=0.0)
-        return Decisions(*(policy.decide(pathways_i, memory) for pathways_i in given))
+        pathways = policy.pathways(PolicyInputs(observation, layout_weights, reading, surroundings), memory)
+        without_direct = do(pathways, scene=0.0, goal=0.0)
+        return Decisions(
+            factual=policy.decide(pathways, memory),
+            counterfactual=policy.decide(without_direct, memory),
+            direct=policy.decide(do(pathways, experience=0.0), memory),
+            neither=policy.decide(do(without_direct, experience=0.0), memory),
+        )
 
     return decide
 
 
-def observations(generator):
-    """Random rows and goals: what is seen need not exist."""
-    row = generator.integers(0, 256, (BATCH, tiny.BANK.rows.shape[1]), np.uint8)
-    row[:, 4 * K :] = tiny.BANK.rows[generator.integers(0, len(tiny.BANK.rows), BATCH), 4 * K :]
-    row[:, : 4 * K].reshape(BATCH, K, 4)[generator.random((BATCH, K)) < 0.5] = 0
-    return Observation(jnp.asarray(row), jnp.asarray(generator.integers(0, K, BATCH)))
+def random_observation(rng):
+    """Random rows and goals [BATCH_SIZE]: real views of cells with detections that need not exist."""
+    row = rng.integers(0, 256, (BATCH_SIZE, tiny.BANK.rows.shape[1]), np.uint8)
+    real_poses = rng.integers(0, len(tiny.BANK.rows), BATCH_SIZE)
+    row[:, 4 * NUM_CATEGORIES :] = tiny.BANK.rows[real_poses, 4 * NUM_CATEGORIES :]
+    is_invisible = rng.random((BATCH_SIZE, NUM_CATEGORIES)) < 0.5
+    row[:, : 4 * NUM_CATEGORIES].reshape(BATCH_SIZE, NUM_CATEGORIES, 4)[is_invisible] = 0
+    goal = rng.integers(0, NUM_CATEGORIES, BATCH_SIZE)
+    return Observation(jnp.asarray(row), jnp.asarray(goal))
 
 
-def memories(generator, experienced=1.0, spec=tiny.STREAMS):
-    """Random memories; an adaptation has changed the policy."""
-    hidden = jnp.asarray(generator.uniform(-1, 1, (BATCH, 2 * HIDDEN)), jnp.float32)
-    action = jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32)
-    fast = bind(spec, tiny.random_params(0, spec)).initial_memory((BATCH,)).fast
+def random_memory(rng, use_experience=1.0, spec=tiny.STREAMS):
+    """Random memories [BATCH_SIZE]; an adaptation has changed the policy."""
+    hidden = jnp.asarray(rng.uniform(-1, 1, (BATCH_SIZE, 2 * HIDDEN_SIZE)), jnp.float32)
+    action = jnp.asarray(rng.integers(0, NUM_ACTIONS + 1, BATCH_SIZE), jnp.int32)
+    fast = bind(spec, tiny.random_params(0, spec)).initial_memory((BATCH_SIZE,)).fast
     if spec.method.name == "tpn":
-        random_change = generator.normal(size=fast.actor_change.shape)
-        fast = fast._replace(num_decisions=fast.num_decisions + 7, actor_change=jnp.asarray(random_change))
+        actor_change = jnp.asarray(rng.normal(size=fast.actor_change.shape))
+        fast = fast._replace(num_decisions=fast.num_decisions + 7, actor_change=actor_change)
     if spec.method.name == "savn":
         layer_changes = jax.tree.map(
-            lambda leaf: jnp.asarray(generator.normal(size=leaf.shape), jnp.float32), fast.layer_changes
+            lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), fast.layer_changes
         )
         fast = fast._replace(layer_changes=layer_changes)
-    return PolicyState(hidden, action, fast, jnp.full(BATCH, experienced))
+    return PolicyState(hidden, action, fast, jnp.full(BATCH_SIZE, use_experience))
 
 
-def decisions(spec, seed, experienced=1.0):
-    generator = np.random.default_rng(seed)
-    observation, layout = observations(generator), jnp.asarray(generator.random((BATCH, K)), jnp.float32)
+def random_decisions(spec, seed, use_experience=1.0):
+    """Decisions of random parameters on random inputs."""
+    rng = np.random.default_rng(seed)
+    observation = random_observation(rng)
+    layout_weights = jnp.asarray(rng.random((BATCH_SIZE, NUM_CATEGORIES)), jnp.float32)
     surroundings = None
     if spec.spatial_memory is not None:
-        read = jax.eval_shape(lambda: spec.spatial_memory.read(spec.spatial_memory.init()))
-        surroundings = jnp.asarray(generator.integers(0, 2, (BATCH, *read.shape)), read.dtype)
+        spatial_memory = spec.spatial_memory
+        reading = jax.eval_shape(lambda: spatial_memory.read(spatial_memory.init()))
+        surroundings = jnp.asarray(rng.integers(0, 2, (BATCH_SIZE, *reading.shape)), reading.dtype)
+    memory = random_memory(rng, use_experience, spec)
     weights = tiny.random_params(seed, spec)
-    return compiled(spec)(weights, observation, layout, surroundings, memories(generator, experienced, spec))
+    return compile_decisions(spec)(weights, observation, layout_weights, surroundings, memory)
 
 
-def bits(values):
-    return np.asarray(values).view(np.uint32)
+def assert_bit_identical(actual, desired):
+    """Compare float32 arrays to the bit, but for the sign of zeros."""
+    np.testing.assert_array_equal(np.asarray(actual + 0.0).view(np.uint32), np.asarray(desired + 0.0).view(np.uint32))
 
 
 # Equations 1 and 2
 
 
-#: The others take seconds each to compile.
-QUICK = ("org", "rgb", "anonymous", "eotp")
-EACH = [pytest.param(method, marks=() if method in QUICK else pytest.mark.slow) for method in HOSTS]
-
-
-@pytest.mark.parametrize("method", EACH)
-def test_removing_experience_leaves_the_direct_stream_to_the_bit(method):
+@pytest.mark.parametrize("method_name", params_slow_except("org", "rgb", "anonymous", "eotp"))
+def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
     for seed in range(4):
-        result = decisions(streams(method), seed)
-        alone = result.direct.logits
-        if method.endswith("ADAPTIVE"):  # whose habit is part of either decision
-            alone = alone - result.nothing.logits
-        effect = tde(result.factual.logits, result.counterfactual.logits)
-        np.testing.assert_array_equal(bits(effect + 0.0), bits(alone + 0.0))  # zeros have one sign
-        assert np.std(alone) > 0.1
-        assert np.std(result.counterfactual.logits) > 0.1
+        decisions = random_decisions(make_spec(method_name), seed)
+        direct_logits = decisions.direct.logits
+        if method_name.endswith("ADAPTIVE"):  # whose habit is part of either decision
+            direct_logits = direct_logits - decisions.neither.logits
+        effect = tde(decisions.factual.logits, decisions.counterfactual.logits)
+        assert_bit_identical(effect, direct_logits)
+        assert np.std(direct_logits) > 0.1
+        assert np.std(decisions.counterfactual.logits) > 0.1
 
 
-@pytest.mark.parametrize(
-    "method",
-    [name if name in ("rgb", "org", "hoz") else pytest.param(name, marks=pytest.mark.slow) for name in HOSTS],
-)
-def test_soft_removal_keeps_a_share_of_experience(method):
-    result = decisions(streams(method), seed=5)
-    direct, experience = result.direct.logits - result.nothing.logits, result.counterfactual.logits
-    share = jnp.linspace(0, 1, BATCH)
-    softened = stde(result.factual.logits, experience, 1.0 - share, 0.0, "paper")
-    np.testing.assert_allclose(softened, direct + share[:, None] * experience, rtol=1e-6, atol=1e-6)
+@pytest.mark.parametrize("method_name", params_slow_except("rgb", "org", "hoz"))
+def test_stde_of_streams_keeps_a_share_of_the_experience_stream(method_name):
+    decisions = random_decisions(make_spec(method_name), seed=5)
+    direct_logits = decisions.direct.logits - decisions.neither.logits
+    experience_logits = decisions.counterfactual.logits
+    kept_share = jnp.linspace(0, 1, BATCH_SIZE)
+    effect = stde(decisions.factual.logits, experience_logits, 1.0 - kept_share, 0.0, "paper")
+    np.testing.assert_allclose(effect, direct_logits + kept_share[:, None] * experience_logits, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{"done_gate": True}, {"spatial_memory": SpatialMemory(4)}])
-def test_options_leave_the_equations_as_they_are(options):
-    result = decisions(streams("org", **options), seed=3)
-    effect = tde(result.factual.logits, result.counterfactual.logits)
-    np.testing.assert_array_equal(bits(effect + 0.0), bits(result.direct.logits + 0.0))
+def test_tde_of_streams_is_the_direct_stream_with_gate_and_spatial_memory(options):
+    decisions = random_decisions(make_spec("org", **options), seed=3)
+    effect = tde(decisions.factual.logits, decisions.counterfactual.logits)
+    assert_bit_identical(effect, decisions.direct.logits)
     assert np.std(effect) > 0.1
 
 
-def test_without_either_stream_nothing_is_left():
-    result = decisions(streams("org"), seed=1)
-    assert not result.nothing.logits.any()
-    assert not result.nothing.value.any()
-    np.testing.assert_allclose(result.direct.value + result.counterfactual.value, result.factual.value, rtol=1e-5)
+def test_decision_without_either_stream_is_zero():
+    decisions = random_decisions(make_spec("org"), seed=1)
+    assert not decisions.neither.logits.any()
+    assert not decisions.neither.value.any()
+    value_sum = decisions.direct.value + decisions.counterfactual.value
+    np.testing.assert_allclose(value_sum, decisions.factual.value, rtol=1e-5)
 
 
-# What the streams get
+# Inputs of the streams
 
 
-@pytest.mark.parametrize(("experienced", "changes"), [(0.0, False), (1.0, True)])
-@pytest.mark.parametrize("method", ["org", "rgb", "support.methods:ATTENTIVE"])
-def test_detections_other_than_the_goals_matter_with_experience_alone(method, experienced, changes):
-    generator = np.random.default_rng(0)
-    one = observations(generator)
-    others = np.ones((BATCH, K, 1), bool)
-    others[np.arange(BATCH), one.goal] = False
-    changed = np.array(one.row)
-    table = changed[:, : 4 * K].reshape(BATCH, K, 4)
-    table[:] = np.where(others, 255 - table, table)
-    spec, memory = streams(method), memories(generator, experienced)
-    decide, layout = compiled(spec), jnp.ones((BATCH, K))
-    original, altered = (
-        decide(tiny.random_params(0, spec), one.replace(row=row), layout, None, memory) for row in (one.row, changed)
-    )
-    differ = (original.factual.logits != altered.factual.logits).any(axis=1)
-    assert differ.tolist() == [changes and method != "rgb"] * BATCH  # the experience of rgb is its view
-    np.testing.assert_array_equal(original.direct.logits, altered.direct.logits)
-    chex.assert_trees_all_equal(original.factual.value == altered.factual.value, ~differ)
+@pytest.mark.parametrize(("use_experience", "is_changed"), [(0.0, False), (1.0, True)])
+@pytest.mark.parametrize("method_name", ["org", "rgb", "support.methods:ATTENTIVE"])
+def test_detections_of_other_categories_reach_only_the_experience_stream(method_name, use_experience, is_changed):
+    rng = np.random.default_rng(0)
+    observation = random_observation(rng)
+    spec = make_spec(method_name)
+    memory = random_memory(rng, use_experience)
+
+    # Invert the detections of all categories but the goal.
+    is_other_category = np.ones((BATCH_SIZE, NUM_CATEGORIES, 1), bool)
+    is_other_category[np.arange(BATCH_SIZE), observation.goal] = False
+    changed_row = np.array(observation.row)
+    detections = changed_row[:, : 4 * NUM_CATEGORIES].reshape(BATCH_SIZE, NUM_CATEGORIES, 4)
+    detections[:] = np.where(is_other_category, 255 - detections, detections)
+
+    decide = functools.partial(compile_decisions(spec), tiny.random_params(0, spec))
+    layout_weights = jnp.ones((BATCH_SIZE, NUM_CATEGORIES))
+    decisions = decide(observation, layout_weights, None, memory)
+    changed_decisions = decide(observation.replace(row=changed_row), layout_weights, None, memory)
+
+    # The experience of rgb is its view, which stays.
+    differs = (decisions.factual.logits != changed_decisions.factual.logits).any(axis=1)
+    assert differs.tolist() == [is_changed and method_name != "rgb"] * BATCH_SIZE
+    np.testing.assert_array_equal(decisions.direct.logits, changed_decisions.direct.logits)
+    chex.assert_trees_all_equal(decisions.factual.value == changed_decisions.factual.value, ~differs)
 
 
-def test_episodes_without_experience_are_decided_by_the_direct_stream():
-    for seed in range(3):
-        on, off = (decisions(streams("org"), seed, experienced) for experienced in (1.0, 0.0))
-        np.testing.assert_array_equal(off.factual.logits, on.direct.logits)
-        np.testing.assert_allclose(off.factual.value, on.direct.value, rtol=2e-6, atol=2e-7)  # a sum, rounded once
-        np.testing.assert_array_equal(off.factual.hidden[:, :HIDDEN], on.factual.hidden[:, :HIDDEN])
-        np.testing.assert_array_equal(off.factual.use_experience, np.zeros(BATCH))
+@pytest.mark.parametrize("seed", range(3))
+def test_episode_without_experience_is_decided_by_the_direct_stream(seed):
+    with_experience = random_decisions(make_spec("org"), seed, use_experience=1.0)
+    without_experience = random_decisions(make_spec("org"), seed, use_experience=0.0)
+    decision = without_experience.factual
+    np.testing.assert_array_equal(decision.logits, with_experience.direct.logits)
+    np.testing.assert_allclose(decision.value, with_experience.direct.value, rtol=2e-6, atol=2e-7)  # rounded once
+    direct_hidden = with_experience.factual.hidden[:, :HIDDEN_SIZE]
+    np.testing.assert_array_equal(decision.hidden[:, :HIDDEN_SIZE], direct_hidden)
+    np.testing.assert_array_equal(decision.use_experience, np.zeros(BATCH_SIZE))
 
 
-def test_each_stream_has_a_core_of_its_own():
+def test_each_stream_updates_its_half_of_the_hidden_state_by_its_own_core():
     """The hidden states are those of two cells of Flax."""
-    generator = np.random.default_rng(0)
-    observation, memory, spec = observations(generator), memories(generator), streams("org")
+    rng = np.random.default_rng(0)
+    observation = random_observation(rng)
+    memory = random_memory(rng)
+    spec = make_spec("org")
     policy = cast(StreamsPolicy, bind(spec, tiny.random_params(0, spec)))
-    pathways = policy.pathways(PolicyInputs(observation, jnp.ones((BATCH, K))))
-    after = policy.decide(pathways, memory).hidden
-    previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
-    entering = {
-        "direct": jnp.concatenate([pathways.scene, pathways.goal, previous], axis=-1),
-        "experience": jnp.concatenate([pathways.experience, previous], axis=-1),
-    }
-    cores = {"direct": policy, "experience": policy.experience_stream}
-    for half, (name, core) in enumerate(cores.items()):
-        place = slice(half * HIDDEN, (half + 1) * HIDDEN)
-        expected, _ = core.core(memory.hidden[:, place], jax.nn.relu(core.fuse(entering[name])))
-        np.testing.assert_allclose(after[:, place], expected, rtol=1e-4, atol=1e-5)
+    pathways = policy.pathways(PolicyInputs(observation, jnp.ones((BATCH_SIZE, NUM_CATEGORIES))))
+    hidden = policy.decide(pathways, memory).hidden
+
+    previous_action = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
+    direct_inputs = jnp.concatenate([pathways.scene, pathways.goal, previous_action], axis=-1)
+    experience_inputs = jnp.concatenate([pathways.experience, previous_action], axis=-1)
+    for stream, stream_inputs, half in (
+        (policy, direct_inputs, slice(HIDDEN_SIZE)),
+        (policy.experience_stream, experience_inputs, slice(HIDDEN_SIZE, None)),
+    ):
+        expected_hidden, _ = stream.core(memory.hidden[:, half], jax.nn.relu(stream.fuse(stream_inputs)))
+        np.testing.assert_allclose(hidden[:, half], expected_hidden, rtol=1e-4, atol=1e-5)
 
 
-def test_an_episode_begins_with_experience():
-    spec = streams("support.methods:ADAPTIVE")
+def test_initial_memory_of_streams_uses_experience():
+    spec = make_spec("support.methods:ADAPTIVE")
     memory = bind(spec, tiny.random_params(0, spec)).initial_memory((2, 3))
-    np.testing.assert_array_equal(memory.hidden, np.zeros((2, 3, 2 * HIDDEN)))
+    np.testing.assert_array_equal(memory.hidden, np.zeros((2, 3, 2 * HIDDEN_SIZE)))
     np.testing.assert_array_equal(memory.use_experience, np.ones((2, 3)))
     assert memory.fast.shape == (2, 3, NUM_ACTIONS)
 
@@ -206,16 +230,16 @@ def test_an_episode_begins_with_experience():
 # Parameters
 
 
-def test_streams_add_a_view_and_a_stream():
-    specs = tiny.SPEC, tiny.STREAMS
-    fused, both = (jax.eval_shape(functools.partial(init_params, spec), jax.random.key(0)) for spec in specs)
-    assert both.keys() - fused.keys() == {"experience_stream", "known_appearance"}
-    assert both["experience_stream"].keys() == {"fuse", "core", "actor", "critic"}
-    assert both["view"]["bias"].shape == (2 * tiny.SIZES.view_outputs,)
+def test_streams_add_a_view_and_a_stream_to_the_parameters():
+    fused_params = jax.eval_shape(functools.partial(init_params, tiny.SPEC), jax.random.key(0))
+    streams_params = jax.eval_shape(functools.partial(init_params, tiny.STREAMS), jax.random.key(0))
+    assert streams_params.keys() - fused_params.keys() == {"experience_stream", "known_appearance"}
+    assert streams_params["experience_stream"].keys() == {"fuse", "core", "actor", "critic"}
+    assert streams_params["view"]["bias"].shape == (2 * tiny.SIZES.view_outputs,)
     for name in ("core", "actor", "critic", "method", "detections", "sought", "appearance"):
-        assert both[name] == fused[name]
+        assert streams_params[name] == fused_params[name]
 
 
-def test_unknown_decisions_are_refused():
-    with pytest.raises(ValueError, match=r"^decision is 'both'; choose one of fused, streams$"):
+def test_policy_spec_refuses_an_unknown_decision():
+    with pytest.raises(ValueError, match=r"decision is 'both'.*fused, streams"):
         PolicySpec(METHODS["org"], decision="both")  # type: ignore[arg-type]
