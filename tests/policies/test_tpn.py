@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import nnx
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, LENGTH, PARAMS
+from support.rollouts import ENV, ENVS, LENGTH, PARAMS, changed_parts, choice_log_probs
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
@@ -31,201 +31,239 @@ from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 
-HIDDEN, BATCH = tiny.SIZES.hidden, 32
+HIDDEN_SIZE = tiny.SIZES.hidden
+BATCH_SIZE = 32
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("tpn"))
-ACTING = AgentLoop(ENV, SPEC, tiny.ESTIMATOR)
-LEARN, IMITATE = METHODS["tpn"].stages
-
-
-KNOWN = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_motion([tiny.BANK], np.zeros(0))))
+UNTRIED_SPEC = dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.tpn:UNTRIED"))
+AGENT_LOOP = AgentLoop(ENV, SPEC, tiny.ESTIMATOR)
+MAIN_STAGE, IMITATION_STAGE = METHODS["tpn"].stages
+KNOWLEDGE = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_motion([tiny.BANK], np.zeros(0))))
 
 
 # Past trials
 
 
 @functools.cache
-def tentative(kind: type[TentativePolicy] = TentativePolicy) -> Any:
-    return kind(SPEC, 16, nnx.Rngs(params=3))
+def make_tentative_policy(policy_class: type[TentativePolicy] = TentativePolicy) -> Any:
+    return policy_class(SPEC, 16, nnx.Rngs(params=3))
 
 
-def remembered(network, hidden, actions):
+def remember_trials(tentative_policy, hidden, actions):
     """The trials after hidden states [M, H] and actions [M]."""
-    trials = jnp.zeros((NUM_TRIALS, HIDDEN + NUM_ACTIONS))
-    for state, action in zip(hidden, actions, strict=True):
-        trials = network.remember(trials, state, action)
+    trials = jnp.zeros((NUM_TRIALS, HIDDEN_SIZE + NUM_ACTIONS))
+    for hidden_state, action in zip(hidden, actions, strict=True):
+        trials = tentative_policy.remember(trials, hidden_state, action)
     return trials
 
 
 @pytest.mark.slow
-def test_the_trial_in_the_same_state_is_retrieved():
-    draws, count = np.random.default_rng(0), 40
-    hidden = jnp.asarray(draws.uniform(-1, 1, (count, HIDDEN)), jnp.float32)
-    actions = jnp.asarray(draws.integers(0, NUM_ACTIONS, count))
-    network = tentative()
-    trials = remembered(network, hidden, actions)
-    attention = jax.vmap(lambda h: network.attention(network.state(h), trials, jnp.int32(count)))(hidden)
+def test_tentative_policy_attends_to_the_trial_in_the_same_state():
+    rng = np.random.default_rng(0)
+    num_trials = 40
+    hidden = jnp.asarray(rng.uniform(-1, 1, (num_trials, HIDDEN_SIZE)), jnp.float32)
+    actions = jnp.asarray(rng.integers(0, NUM_ACTIONS, num_trials))
+    tentative_policy = make_tentative_policy()
+    trials = remember_trials(tentative_policy, hidden, actions)
+
+    # Each state attends to a few trials, and most to its own.
+    @jax.vmap
+    def attend(hidden_state):
+        return tentative_policy.attention(tentative_policy.state(hidden_state), trials, jnp.int32(num_trials))
+
+    attention = attend(hidden)
     np.testing.assert_allclose(attention.sum(axis=1), 1.0, rtol=1e-5)
-    np.testing.assert_array_equal(attention.argmax(axis=1), NUM_TRIALS - count + np.arange(count))
+    np.testing.assert_array_equal(attention.argmax(axis=1), NUM_TRIALS - num_trials + np.arange(num_trials))
     assert attention.max(axis=1).min() > 0.3
     assert set((np.asarray(attention) > 0).sum(axis=1)) == {NUM_ATTENDED}
-    # What was done there decides what is predicted.
-    others = remembered(network, hidden, (actions + 1) % NUM_ACTIONS)
-    predict = jax.vmap(lambda h, t: network(h, t, jnp.int32(count)), (0, None))
-    assert np.abs(predict(hidden, trials) - predict(hidden, others)).max(axis=1).min() > 1e-3
+
+    # The actions of the trials decide what is predicted.
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def predict(hidden_state, trials):
+        return tentative_policy(hidden_state, trials, jnp.int32(num_trials))
+
+    other_trials = remember_trials(tentative_policy, hidden, (actions + 1) % NUM_ACTIONS)
+    change = np.abs(predict(hidden, trials) - predict(hidden, other_trials))
+    assert change.max(axis=1).min() > 1e-3
 
 
-def test_without_a_choice_all_trials_are_attended_to_equally():
-    network, hidden = tentative(UniformTentativePolicy), jnp.linspace(-1, 1, 3 * HIDDEN).reshape(3, HIDDEN)
-    trials = remembered(network, hidden, jnp.arange(3))
-    attention = network.attention(network.state(hidden[0]), trials, jnp.int32(3))
+def test_uniform_tentative_policy_attends_to_all_trials_equally():
+    tentative_policy = make_tentative_policy(UniformTentativePolicy)
+    hidden = jnp.linspace(-1, 1, 3 * HIDDEN_SIZE).reshape(3, HIDDEN_SIZE)
+    trials = remember_trials(tentative_policy, hidden, jnp.arange(3))
+    attention = tentative_policy.attention(tentative_policy.state(hidden[0]), trials, jnp.int32(3))
     np.testing.assert_allclose(attention, [0.0] * (NUM_TRIALS - 3) + [1 / 3] * 3, rtol=1e-6)
 
 
 # The step
 
 
-def given(spec, decisions=7, seed=0):
-    """A policy, pathways at poses half of which are repeated, and memories that have changed the actor."""
-    draws = np.random.default_rng(seed)
+def random_policy_inputs(spec, num_decisions=7, seed=0):
+    """A policy, pathways [BATCH_SIZE] at poses half of which are repeated, and memories with a changed actor."""
+    rng = np.random.default_rng(seed)
     policy = bind(spec, tiny.random_params(seed, spec))
-    row = jnp.asarray(tiny.BANK.rows[draws.integers(0, len(tiny.BANK.rows), BATCH)])
-    goal = jnp.asarray(draws.integers(0, tiny.SPEC.num_categories, BATCH))
-    reading = jnp.arange(BATCH) % 2 == 0
-    memory: PolicyState = policy.initial_memory((BATCH,))
+    row = jnp.asarray(tiny.BANK.rows[rng.integers(0, len(tiny.BANK.rows), BATCH_SIZE)])
+    goal = jnp.asarray(rng.integers(0, tiny.SPEC.num_categories, BATCH_SIZE))
+    is_repeated = jnp.arange(BATCH_SIZE) % 2 == 0
+
+    memory: PolicyState = policy.initial_memory((BATCH_SIZE,))
     fast = memory.fast._replace(
-        actor_change=jnp.asarray(draws.normal(size=memory.fast.actor_change.shape), jnp.float32),
-        num_decisions=jnp.full(BATCH, decisions, jnp.int32),
+        actor_change=jnp.asarray(rng.normal(size=memory.fast.actor_change.shape), jnp.float32),
+        num_decisions=jnp.full(BATCH_SIZE, num_decisions, jnp.int32),
     )
-    hidden = jnp.asarray(draws.uniform(-1, 1, memory.hidden.shape), jnp.float32)
-    memory = memory._replace(hidden=hidden, action=jnp.arange(BATCH) % NUM_ACTIONS, fast=fast)
-    inputs = PolicyInputs(Observation(row, goal), jnp.ones((BATCH, tiny.SPEC.num_categories)), reading)
-    pathways = policy.pathways(inputs)
+    hidden = jnp.asarray(rng.uniform(-1, 1, memory.hidden.shape), jnp.float32)
+    memory = memory._replace(hidden=hidden, action=jnp.arange(BATCH_SIZE) % NUM_ACTIONS, fast=fast)
+
+    layout_weights = jnp.ones((BATCH_SIZE, tiny.SPEC.num_categories))
+    pathways = policy.pathways(PolicyInputs(Observation(row, goal), layout_weights, is_repeated))
     return policy, pathways, memory
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"done_gate": True}, {"decision": "streams", "direct": "goal"}],
-)
+@pytest.mark.parametrize("options", [{}, {"done_gate": True}, {"decision": "streams", "direct": "goal"}])
 @pytest.mark.slow
-def test_the_step_descends_the_cross_entropy_at_repeated_poses(options):
-    policy, pathways, memory = given(dataclasses.replace(SPEC, **options))
+def test_actor_step_descends_the_cross_entropy_at_repeated_poses(options):
+    policy, pathways, memory = random_policy_inputs(dataclasses.replace(SPEC, **options))
     if "decision" in options:  # where experience is, no gradient is let through, though the step is the same
         pathways = do(pathways, experience=0.0)
     decision = policy.decide(pathways, memory)
-    best = decision.fast.predicted_logits.argmax(axis=-1)
+    predicted_action = decision.fast.predicted_logits.argmax(axis=-1)
 
-    def cross_entropy(change):
-        log_pi = jax.nn.log_softmax(policy.decide_with_changes(pathways, memory, make_layer_changes(change)).logits)
-        return -jnp.take_along_axis(log_pi, best[:, None], axis=-1).sum()
+    @jax.grad
+    def cross_entropy_gradient(actor_change):
+        changed_decision = policy.decide_with_changes(pathways, memory, make_layer_changes(actor_change))
+        log_probs = jax.nn.log_softmax(changed_decision.logits)
+        return -jnp.take_along_axis(log_probs, predicted_action[:, None], axis=-1).sum()
 
-    gradient = jax.grad(cross_entropy)(memory.fast.actor_change)
-    repeated = np.asarray(pathways.reading)
-    moved = np.asarray(decision.fast.actor_change - memory.fast.actor_change)
-    np.testing.assert_allclose(moved[repeated], -0.1 * np.asarray(gradient)[repeated], rtol=1e-3, atol=1e-6)
-    assert np.abs(moved[repeated]).max(axis=(1, 2)).min() > 1e-6
-    assert not moved[~repeated].any()
-
-
-def test_the_actor_is_renewed():
-    for decisions, is_kept in ((49, True), (50, False), (0, False)):
-        policy, pathways, memory = given(SPEC, decisions)
-        decision = policy.decide(pathways, memory)
-        expected = policy.decide_with_changes(
-            pathways, memory, make_layer_changes(memory.fast.actor_change) if is_kept else NO_CHANGES
-        )
-        np.testing.assert_allclose(decision.logits, expected.logits, rtol=1e-5, atol=1e-5)
-        unrepeated = ~np.asarray(pathways.reading)
-        assert np.asarray(decision.fast.actor_change)[unrepeated].any() == is_kept
+    # The learning rate is 0.1.
+    is_repeated = np.asarray(pathways.reading)
+    actor_step = np.asarray(decision.fast.actor_change - memory.fast.actor_change)
+    gradient = np.asarray(cross_entropy_gradient(memory.fast.actor_change))
+    np.testing.assert_allclose(actor_step[is_repeated], -0.1 * gradient[is_repeated], rtol=1e-3, atol=1e-6)
+    assert np.abs(actor_step[is_repeated]).max(axis=(1, 2)).min() > 1e-6
+    assert not actor_step[~is_repeated].any()
 
 
-def test_an_agent_that_does_not_try_decides_plainly():
-    for acting in (
-        dataclasses.replace(ACTING, inner_steps=0),
-        dataclasses.replace(
-            ACTING, spec=dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.tpn:UNTRIED"))
-        ),
-    ):
-        policy, (_, pathways, memory) = acting.bind(tiny.random_params(0, SPEC)), given(SPEC)
-        memory = memory._replace(fast=memory.fast._replace(actor_change=jnp.zeros_like(memory.fast.actor_change)))
-        decision = policy.decide(pathways, memory)
-        chex.assert_trees_all_equal(decision.fast.actor_change, memory.fast.actor_change)
-        np.testing.assert_allclose(decision.logits, policy.decide_with_changes(pathways, memory).logits, atol=1e-6)
-    assert not dataclasses.replace(ACTING, inner_steps=0).bind(tiny.random_params(0, SPEC)).needs_stepwise_replay
+@pytest.mark.parametrize(("num_decisions", "is_kept"), [(49, True), (50, False), (0, False)])
+def test_actor_change_is_reset_every_fifty_decisions(num_decisions, is_kept):
+    policy, pathways, memory = random_policy_inputs(SPEC, num_decisions)
+    decision = policy.decide(pathways, memory)
+    layer_changes = make_layer_changes(memory.fast.actor_change) if is_kept else NO_CHANGES
+    expected = policy.decide_with_changes(pathways, memory, layer_changes)
+    np.testing.assert_allclose(decision.logits, expected.logits, rtol=1e-5, atol=1e-5)
+    is_repeated = np.asarray(pathways.reading)
+    assert np.asarray(decision.fast.actor_change)[~is_repeated].any() == is_kept
+
+
+@pytest.mark.parametrize(
+    "agent_loop",
+    [dataclasses.replace(AGENT_LOOP, inner_steps=0), dataclasses.replace(AGENT_LOOP, spec=UNTRIED_SPEC)],
+    ids=["no inner steps", "untried"],
+)
+def test_agent_without_trials_decides_without_changes(agent_loop):
+    policy = agent_loop.bind(tiny.random_params(0, SPEC))
+    _, pathways, memory = random_policy_inputs(SPEC)
+    no_change = jnp.zeros_like(memory.fast.actor_change)
+    memory = memory._replace(fast=memory.fast._replace(actor_change=no_change))
+    decision = policy.decide(pathways, memory)
+    plain_decision = policy.decide_with_changes(pathways, memory)
+    chex.assert_trees_all_equal(decision.fast.actor_change, no_change)
+    np.testing.assert_allclose(decision.logits, plain_decision.logits, atol=1e-6)
+
+
+def test_policy_without_inner_steps_is_replayed_in_parallel():
+    policy = dataclasses.replace(AGENT_LOOP, inner_steps=0).bind(tiny.random_params(0, SPEC))
+    assert not policy.needs_stepwise_replay
 
 
 # Training
 
 
-def learner(stage, **settings):
-    config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=2, learning_rate=3e-3, **settings)
-    return Learner(ACTING, config, "distil", stage)
+def make_learner(stage):
+    config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=2, learning_rate=3e-3)
+    return Learner(AGENT_LOOP, config, "distil", stage)
 
 
 @pytest.fixture(scope="module")
 def params():
+    """Parameters of the environment with the expert's actions."""
     return PARAMS.replace(tables=PARAMS.tables.replace(expert=jnp.asarray(tiny.BANK.expert)))
 
 
-def moved(before, after):
-    """Which parts of the parameters differ, that of the method by its own parts."""
-    changed = jax.tree.map(lambda a, b: bool((a != b).any()), before, after)
-    changed |= {f"method.{name}": part for name, part in changed.pop("method").items()}
-    return {name for name, part in changed.items() if any(jax.tree.leaves(part))}
+def changed_parts_of_method(params_before, params_after):
+    """Names of the parts that differ, those of the method as `method.NAME`."""
+    names = changed_parts(params_before, params_after) - {"method"}
+    method_names = changed_parts(params_before["method"], params_after["method"])
+    return names | {f"method.{name}" for name in method_names}
 
 
 @pytest.mark.slow
-def test_the_first_stage_is_orgs_and_the_second_teaches_the_tentative_policy_alone(params):
+def test_each_stage_of_tpn_trains_its_own_parameters(params):
+    """The first stage trains as ORG does, the second the tentative policy alone."""
     scalars = PPOConfig().scalars(4)
-    begin = jax.jit(learner(LEARN).init)(jax.random.key(0), params, KNOWN)
-    middle, _ = jax.jit(learner(LEARN).update)(begin, scalars, params, KNOWN)
-    assert {"actor", "core", "method.maps"} <= moved(begin.params, middle.params)
-    assert "method.tentative" not in moved(begin.params, middle.params)
-    chex.assert_trees_all_equal(policy_memory(middle.agent).fast, policy_memory(begin.agent).fast)
-    # No gradient reaches the rest, even where all of it might be trained.
-    open_to_all = dataclasses.replace(IMITATE, lr_scale_by_path=None)
-    after, metrics = jax.jit(learner(open_to_all).update)(begin, scalars, params, KNOWN)
-    assert moved(begin.params, after.params) == {"method.tentative"}
-    chex.assert_trees_all_equal_shapes_and_dtypes(begin, middle, after)
+    state = jax.jit(make_learner(MAIN_STAGE).init)(jax.random.key(0), params, KNOWLEDGE)
+    main_state, _ = jax.jit(make_learner(MAIN_STAGE).update)(state, scalars, params, KNOWLEDGE)
+    changed_by_main = changed_parts_of_method(state.params, main_state.params)
+    assert {"actor", "core", "method.maps"} <= changed_by_main
+    assert "method.tentative" not in changed_by_main
+    chex.assert_trees_all_equal(policy_memory(main_state.agent).fast, policy_memory(state.agent).fast)
+
+    # No gradient reaches other parameters, even where the stage would let all of them be trained.
+    unrestricted_stage = dataclasses.replace(IMITATION_STAGE, lr_scale_by_path=None)
+    unrestricted_update = jax.jit(make_learner(unrestricted_stage).update)
+    imitation_state, metrics = unrestricted_update(state, scalars, params, KNOWLEDGE)
+    assert changed_parts_of_method(state.params, imitation_state.params) == {"method.tentative"}
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, main_state, imitation_state)
     assert 0.05 < metrics["repeated"] < 0.95
 
 
 @pytest.mark.slow
-def test_the_tentative_policy_learns_what_shortest_paths_do(params):
-    config = learner(IMITATE).config
-    train = jax.jit(learner(IMITATE).train, static_argnums=4)
-    before = jax.jit(learner(IMITATE).init)(jax.random.key(0), params, KNOWN)
-    state, first = train(before, config.scalars(400), params, KNOWN, 50)
-    after, last = train(state, config.scalars(400), params, KNOWN, 50)
-    assert last["imitation_loss"] < 0.9 * first["imitation_loss"]
-    assert last["imitation_agreement"] / last["repeated"] > 1.1 * first["imitation_agreement"] / first["repeated"]
-    assert moved(before.params, after.params) == {"method.tentative"}
-    # Negative control: an expert that does anything is not to be learned.
-    anything = jax.random.randint(jax.random.key(1), tiny.BANK.expert.shape, 0, NUM_ACTIONS).astype(jnp.uint8)
-    false = params.replace(tables=params.tables.replace(expert=anything))
-    _, control = train(state, config.scalars(400), false, KNOWN, 50)
-    assert control["imitation_loss"] / control["repeated"] > 1.5 * last["imitation_loss"] / last["repeated"]
+def test_tentative_policy_learns_the_actions_of_shortest_paths(params):
+    learner = make_learner(IMITATION_STAGE)
+    scalars = learner.config.scalars(400)
+    train = jax.jit(learner.train, static_argnums=4)
+    first_state = jax.jit(learner.init)(jax.random.key(0), params, KNOWLEDGE)
+    middle_state, first_metrics = train(first_state, scalars, params, KNOWLEDGE, 50)
+    last_state, last_metrics = train(middle_state, scalars, params, KNOWLEDGE, 50)
+
+    # The loss falls and the agreement at repeated poses rises.
+    first_agreement = first_metrics["imitation_agreement"] / first_metrics["repeated"]
+    last_agreement = last_metrics["imitation_agreement"] / last_metrics["repeated"]
+    assert last_metrics["imitation_loss"] < 0.9 * first_metrics["imitation_loss"]
+    assert last_agreement > 1.1 * first_agreement
+    assert changed_parts_of_method(first_state.params, last_state.params) == {"method.tentative"}
+
+    # Negative control: a random expert is not to be learned.
+    random_expert = jax.random.randint(jax.random.key(1), tiny.BANK.expert.shape, 0, NUM_ACTIONS).astype(jnp.uint8)
+    random_params = params.replace(tables=params.tables.replace(expert=random_expert))
+    _, random_metrics = train(middle_state, scalars, random_params, KNOWLEDGE, 50)
+    random_loss = random_metrics["imitation_loss"] / random_metrics["repeated"]
+    assert random_loss > 1.5 * last_metrics["imitation_loss"] / last_metrics["repeated"]
 
 
 @pytest.mark.slow
-def test_replay_decides_and_adapts_as_the_rollout_did():
+def test_replay_of_tpn_recomputes_log_probs_and_actor_changes():
     weights = tiny.random_params(3, SPEC)
 
     @jax.jit
-    def go():
-        policy = ACTING.bind(weights)
-        agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWN, PARAMS)
-        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), PARAMS, KNOWN, num_steps=LENGTH)
-        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), PARAMS, KNOWN, num_steps=LENGTH)
-        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS).factual
+    def collect_and_replay():
+        policy = AGENT_LOOP.bind(weights)
+        memory = policy.initial_memory((ENVS,))
+        agent = AGENT_LOOP.start(jax.random.key(0), ENVS, memory, KNOWLEDGE, PARAMS)
+        for seed in (1, 2):
+            agent, rollout = collect_rollout(
+                AGENT_LOOP, policy, agent, jax.random.key(seed), PARAMS, KNOWLEDGE, num_steps=LENGTH
+            )
+        replayed = replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS)
+        return agent, rollout, replayed.factual
 
-    agent, rollout, again = go()
+    agent, rollout, decisions = collect_and_replay()
     transitions = rollout.transitions
-    log_pi = jax.nn.log_softmax(again.logits)
-    log_prob = jnp.take_along_axis(log_pi, transitions.choice[..., None], axis=-1)[..., 0]
+    log_prob = choice_log_probs(decisions.logits, transitions.choice)
     np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-4)
+
+    # The last change of the actor, which episodes that have ended begin without.
     running = ~np.asarray(transitions.ended[-1])
-    change = np.asarray(policy_memory(agent).fast.actor_change)
-    np.testing.assert_allclose(change[running], np.asarray(again.fast.actor_change[-1])[running], rtol=1e-3, atol=1e-4)
-    assert np.abs(change[running]).max() > 0.01
-    assert not change[~running].any()
+    actor_change = np.asarray(policy_memory(agent).fast.actor_change)
+    replayed_change = np.asarray(decisions.fast.actor_change[-1])
+    np.testing.assert_allclose(actor_change[running], replayed_change[running], rtol=1e-3, atol=1e-4)
+    assert np.abs(actor_change[running]).max() > 0.01
+    assert not actor_change[~running].any()
