@@ -1,4 +1,4 @@
-"""Sizes are checked before memory is taken, and what is missing is told in one line.
+"""Sizes are capped before memory is allocated, and a lack of memory or disk is a one-line error.
 
 Seen to fail, each planted alone: `largest` without a limit, pickles of any number of parts, lists of any number of
 episodes, a console that does not know `MemoryError`, a `jaxnav` that does not know `BrokenPipeError`.
@@ -17,6 +17,7 @@ import pytest
 from support.commands import train
 from support.fuzz import KINDS, fuzz
 from support.processes import REPOSITORY, run
+from support.refusals import assert_message_names
 from support.tiny_run import write_config
 from support.tiny_world import BANK
 
@@ -30,16 +31,19 @@ MIB = 2**20
 
 
 def test_read_bytes_refuses_a_gzip_bomb_within_a_memory_limit(tmp_path):
-    bomb = tmp_path / "rooms.jsonl.gz"
-    with gzip.GzipFile(bomb, "wb", compresslevel=1) as file:
+    # 192 MiB of zeros in less than one.
+    gzip_bomb = tmp_path / "rooms.jsonl.gz"
+    with gzip.GzipFile(gzip_bomb, "wb", compresslevel=1) as file:
         for _ in range(192):
             file.write(bytes(MIB))
-    # 192 MiB in less than one; 64 MiB and one byte are read, and copied once.
-    assert bomb.stat().st_size < MIB
+    assert gzip_bomb.stat().st_size < MIB
+
+    # 64 MiB and one byte are read, and copied once.
     tracemalloc.start()
-    with pytest.raises(InputError, match=r"rooms.jsonl.gz: holds more than 67,108,864 bytes; split it"):
-        read_bytes(bomb)
-    assert tracemalloc.get_traced_memory()[1] < 160 * MIB
+    with pytest.raises(InputError, match=r"rooms.jsonl.gz: .*67,108,864 bytes; split it"):
+        read_bytes(gzip_bomb)
+    _, peak_memory = tracemalloc.get_traced_memory()
+    assert peak_memory < 160 * MIB
     tracemalloc.stop()
 
 
@@ -48,17 +52,17 @@ def test_max_decompressed_size_grows_with_the_file():
 
 
 @pytest.mark.parametrize(
-    ("content", "problem"),
+    ("content", "limit"),
     [
-        (b"N0" * 2**21, "holds more than 1,048,576 parts"),  # pushed and popped, two bytes at a time
-        (b"I" + b"1" * 2**27, "holds more than 67,108,864 bytes"),  # one line
+        (b"N0" * 2**21, "1,048,576 parts"),  # pushed and popped, two bytes at a time
+        (b"I" + b"1" * 2**27, "67,108,864 bytes"),  # one line
     ],
 )
-def test_read_pickle_refuses_too_many_parts_or_bytes(tmp_path, content, problem):
-    path = tmp_path / "maps.pbz2"
-    path.write_bytes(bz2.compress(content, 1))
-    with pytest.raises(InputError, match=problem):
-        read_pickle(path)
+def test_read_pickle_refuses_too_many_parts_or_bytes(tmp_path, content, limit):
+    pickle_file = tmp_path / "maps.pbz2"
+    pickle_file.write_bytes(bz2.compress(content, 1))
+    with pytest.raises(InputError, match=limit):
+        read_pickle(pickle_file)
 
 
 @pytest.mark.parametrize(
@@ -81,83 +85,90 @@ def test_read_pickle_refuses_too_many_parts_or_bytes(tmp_path, content, problem)
 def test_train_caps_every_size_before_writing(tmp_path, capsys, option):
     value = 10**18
     assert train(write_config(tmp_path), tmp_path / "run", option, value) == 2
-    error = capsys.readouterr().err
-    assert f"{option.removeprefix('--').replace('-', '_')} is {value}; give at most " in error
-    assert error.count("\n") == 1
+    message = capsys.readouterr().err
+    field_name = option.removeprefix("--").replace("-", "_")
+    assert_message_names(message, f"{field_name} is {value}", "give at most ")
+    assert message.count("\n") == 1
     assert not (tmp_path / "run").exists()
 
 
 def test_products_of_sizes_are_capped(tmp_path, capsys):
-    config = write_config(tmp_path)
-    assert train(config, tmp_path / "run", "--layout.walks", 10**6, "--layout.steps", 10**6) == 2
-    assert "layout.walks x layout.steps is 1000000000000; give at most 268,435,456" in capsys.readouterr().err
-    assert train(config, tmp_path / "run", "--total-steps", 10**12, "--chunk", 1) == 2
-    assert "makes 7,812,500,000 chunks; give a larger chunk" in capsys.readouterr().err  # of 16 x 8 steps
-    with pytest.raises(InputError, match=f"--episodes 1000001: give at least 1, and at most {MAX_EPISODES}"):
+    config_file = write_config(tmp_path)
+    run_dir = tmp_path / "run"
+    assert train(config_file, run_dir, "--layout.walks", 10**6, "--layout.steps", 10**6) == 2
+    walk_parts = ("layout.walks x layout.steps is 1000000000000", "give at most 268,435,456")
+    assert_message_names(capsys.readouterr().err, *walk_parts)
+
+    # Chunks of one update of 16 x 8 steps.
+    assert train(config_file, run_dir, "--total-steps", 10**12, "--chunk", 1) == 2
+    assert_message_names(capsys.readouterr().err, "7,812,500,000 chunks", "give a larger chunk")
+
+    with pytest.raises(InputError, match=f"--episodes 1000001: .*at most {MAX_EPISODES}"):
         draw_episodes(BANK, MAX_EPISODES + 1)
 
 
 @pytest.mark.parametrize(
-    ("error", "last_line"),
+    ("error", "named_parts"),
     [
-        (
-            MemoryError("Unable to allocate 6 GiB"),
-            "error: there is not enough memory (Unable to allocate 6 GiB); give ",
-        ),
-        (OSError(errno.ENOSPC, "No space left on device", "a/b"), "error: a/b: No space left on device; mend the path"),
-        (OSError(errno.EROFS, "Read-only file system", "a/b"), "error: a/b: Read-only file system; mend the path"),
-        (PermissionError(errno.EACCES, "Permission denied", "a"), "error: a: Permission denied; mend the path, its"),
+        (MemoryError("Unable to allocate 6 GiB"), ["error: ", "memory", "6 GiB", "give "]),
+        (OSError(errno.ENOSPC, "No space left on device", "a/b"), ["error: a/b: ", "No space left on device", "mend"]),
+        (OSError(errno.EROFS, "Read-only file system", "a/b"), ["error: a/b: ", "Read-only file system", "mend"]),
+        (PermissionError(errno.EACCES, "Permission denied", "a"), ["error: a: ", "Permission denied", "mend"]),
     ],
 )
-def test_run_command_reports_system_errors_in_one_line(capsys, error, last_line):
-    def command(_):
+def test_run_command_reports_system_errors_in_one_line(capsys, error, named_parts):
+    def raise_error(_):
         raise error
 
-    assert run_command(command) == 2
+    assert run_command(raise_error) == 2
     message = capsys.readouterr().err
-    assert message.startswith(last_line)
+    assert message.startswith("error: ")
+    assert_message_names(message, *named_parts)
     assert message.count("\n") == 1
 
 
 def test_run_command_raises_unexpected_errors():
-    def command(_):
+    def raise_key_error(_):
         raise KeyError("a bug")
 
     with pytest.raises(KeyError):
-        run_command(command)
+        run_command(raise_key_error)
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
         ["--help"],
-        *(pytest.param(words, marks=pytest.mark.slow) for words in (["train", "--help"], ["scenes", "stats", "rooms"])),
+        pytest.param(["train", "--help"], marks=pytest.mark.slow),
+        pytest.param(["scenes", "stats", "rooms"], marks=pytest.mark.slow),
     ],
 )
 def test_command_ends_quietly_on_a_closed_pipe(arguments):
-    read, write = os.pipe()
-    os.close(read)
-    ended = subprocess.run(
-        [sys.executable, "-m", "jaxnav", *arguments], cwd=REPOSITORY, stdout=write, stderr=subprocess.PIPE, check=False
-    )
-    os.close(write)
-    assert b"Traceback" not in ended.stderr
-    assert b"Exception ignored" not in ended.stderr
-    assert ended.returncode in (1, 141)  # 1 is what rich ends with
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "jaxnav", *arguments]
+    process = subprocess.run(command, cwd=REPOSITORY, stdout=write_end, stderr=subprocess.PIPE, check=False)
+    os.close(write_end)
+    assert b"Traceback" not in process.stderr
+    assert b"Exception ignored" not in process.stderr
+    assert process.returncode in (1, 141)  # rich ends with 1
+
+
+# Random input
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_input_ends_commands_by_exit_code(kind, tmp_path):
-    codes, slowest = fuzz(kind, tmp_path, 15, seed=0)
-    assert set(codes) <= {0, 2}, codes
-    assert codes[2] > 0
-    assert slowest < 10
+    exit_codes, slowest_s = fuzz(kind, tmp_path, 15, seed=0)
+    assert set(exit_codes) <= {0, 2}, exit_codes
+    assert exit_codes[2] > 0
+    assert slowest_s < 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_hundred_random_inputs_stay_within_time_and_memory(kind):
-    """In a process of their own, whose memory is theirs alone; docs/promises.md has the command of more."""
+    """The inputs have a process, and so a peak memory, of their own; docs/promises.md has the command for more."""
     process = run(["-m", "support.fuzz", kind, 200, 1], PYTHONPATH=REPOSITORY / "tests")
     output, error = process.communicate()
     assert process.returncode == 0, error[-2000:]

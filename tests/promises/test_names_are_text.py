@@ -1,4 +1,4 @@
-"""A name that comes from a file, a path or a command line is shown as text, whatever it holds.
+"""Names from files, paths and command lines are escaped before they are shown.
 
 Seen to fail: with a console that takes markup, `[/x]` in a path ends the commands with a `MarkupError`; without
 `escape_control_chars` escapes reach the terminal; with figures that parse mathematics, `$` in the name of a scene file
@@ -27,8 +27,8 @@ from jaxnav.viz.learning import learning_figure
 #: Markup, a colour, a bell, a new line, letters turned round, and mathematics without an end.
 HOSTILE = "[/x][bold]\x1b[31m\x07\n\u202e$\\frac$"
 
-#: What each command is given besides a hostile name, in place of `@`.
-GIVEN = {
+#: Arguments of each command, with the hostile name in place of `@`.
+HOSTILE_ARGUMENTS = {
     "train": [("--run-dir", "@", "--scenes", "@"), ("--config", "@"), ("--method", "@")],
     "eval": [("@",), ("@", "--scenes", "@"), ("@", "--json", "@")],
     "report": [("@",), ("@", "--beside", "@"), ("@", "--out", "@")],
@@ -48,25 +48,41 @@ GIVEN = {
 }
 
 
-def assert_harmless(output):
+#: Unicode categories of characters that are not shown: controls, formats, surrogates and separators of lines.
+HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def assert_escaped(output):
+    """Check that an output holds no hidden character but new lines, and no traceback."""
     assert output
     assert "Traceback" not in output
-    hidden = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-    assert not [char for char in output.replace("\n", "") if unicodedata.category(char) in hidden]
+    characters = output.replace("\n", "")
+    assert not [char for char in characters if unicodedata.category(char) in HIDDEN_CATEGORIES]
 
 
-@pytest.mark.parametrize(
-    ("name", "given"), [(name, given) for name, lines in GIVEN.items() for given in lines], ids=lambda value: str(value)
-)
-def test_every_command_escapes_hostile_names(name, given, tmp_path, monkeypatch, capsys):
+def insert_hostile_name(words):
+    return [word.replace("@", HOSTILE) for word in words]
+
+
+# Command lines
+
+
+COMMAND_LINES = [(command, *words) for command, lines in HOSTILE_ARGUMENTS.items() for words in lines]
+
+
+@pytest.mark.parametrize("words", COMMAND_LINES, ids=str)
+def test_every_command_escapes_hostile_names(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = [word.replace("@", HOSTILE) for word in (name, *given)]
     try:
-        code = main(arguments)
-    except SystemExit as end:  # from the parser
-        code = end.code
-    assert code == 2
-    assert_harmless("".join(capsys.readouterr()))
+        exit_code = main(insert_hostile_name(words))
+    except SystemExit as parser_exit:
+        exit_code = parser_exit.code
+    assert exit_code == 2
+    assert_escaped("".join(capsys.readouterr()))
+
+
+def test_hostile_arguments_cover_every_command():
+    assert set(COMMANDS) <= set(HOSTILE_ARGUMENTS)
 
 
 @pytest.mark.parametrize(
@@ -82,42 +98,50 @@ def test_every_command_escapes_hostile_names(name, given, tmp_path, monkeypatch,
     ],
 )
 def test_parser_errors_escape_hostile_options(words, capsys):
-    with pytest.raises(SystemExit) as end:
-        main([word.replace("@", HOSTILE) for word in words])
-    assert end.value.code == 2
-    assert_harmless(output := "".join(capsys.readouterr()))
+    with pytest.raises(SystemExit) as parser_exit:
+        main(insert_hostile_name(words))
+    assert parser_exit.value.code == 2
+    output = "".join(capsys.readouterr())
+    assert_escaped(output)
     assert "[/x]" in output
 
 
 def test_help_escapes_hostile_defaults(tmp_path, capsys):
-    config = tmp_path / "run.yaml"
-    config.write_text(json.dumps({"scenes": f"rooms{HOSTILE}.jsonl.gz"}))
-    with pytest.raises(SystemExit) as end:
-        main(["train", "--config", str(config), "--help"])
-    assert end.value.code == 0
-    assert_harmless(output := capsys.readouterr().out)
+    config_file = tmp_path / "run.yaml"
+    config_file.write_text(json.dumps({"scenes": f"rooms{HOSTILE}.jsonl.gz"}))
+    with pytest.raises(SystemExit) as parser_exit:
+        main(["train", "--config", str(config_file), "--help"])
+    assert parser_exit.value.code == 0
+    output = capsys.readouterr().out
+    assert_escaped(output)
     assert "[/x]" in output
+
+
+def read_until_closed(descriptor):
+    """Return all bytes from a pseudo terminal, whose reading fails when the process has closed its end."""
+    output = b""
+    with contextlib.suppress(OSError):
+        part = os.read(descriptor, 4096)
+        while part:
+            output += part
+            part = os.read(descriptor, 4096)
+    return output
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
 def test_parser_error_on_a_terminal_keeps_its_colours():
-    """What a parser adds for a terminal is not taken for a part of a name."""
-    ours, theirs = os.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "jaxnav", "table", "a", "--no-such"], stdout=theirs, stderr=theirs
-    )
-    os.close(theirs)
-    output = b""
-    with contextlib.suppress(OSError):  # the other end is closed
-        while part := os.read(ours, 4096):
-            output += part
+    """The escapes that a parser adds for a terminal are not escaped as parts of a name."""
+    controller, terminal = os.openpty()
+    command = [sys.executable, "-m", "jaxnav", "table", "a", "--no-such"]
+    process = subprocess.Popen(command, stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    output = read_until_closed(controller)
     assert process.wait() == 2
     assert b"--no-such" in output
     assert b"\\x1b" not in output
 
 
-def test_hostile_arguments_cover_every_command():
-    assert set(COMMANDS) <= set(GIVEN)
+# Scene files, tables and figures
 
 
 @pytest.fixture
@@ -134,24 +158,21 @@ def scene_file(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.parametrize(
-    "given",
+    "words",
     [
-        ("stats",),
-        ("stats", "--split", "val"),
-        ("show", "--scene", "none"),
-        ("show", "--index", "0", "--out", "a.png"),
-        ("import", "scenes"),
+        ("stats", "FILE"),
+        ("stats", "FILE", "--split", "val"),
+        ("show", "FILE", "--scene", "none"),
+        ("show", "FILE", "--index", "0", "--out", "a.png"),
+        ("import", "scenes", "FILE", "out.jsonl.gz"),
     ],
     ids=str,
 )
-def test_scenes_command_escapes_hostile_names_in_a_file(given, scene_file, monkeypatch, capsys):
+def test_scenes_command_escapes_hostile_names_in_a_file(words, scene_file, monkeypatch, capsys):
     monkeypatch.chdir(scene_file.parent)
-    command, *options = given
-    target = ["out.jsonl.gz"] if command == "import" else []
-    form = [options.pop(0)] if command == "import" else []
-    assert main(["scenes", command, *form, str(scene_file), *target, *options]) in (0, 2)
-    output = capsys.readouterr()
-    assert_harmless(output.out + output.err)
+    arguments = [str(scene_file) if word == "FILE" else word for word in words]
+    assert main(["scenes", *arguments]) in (0, 2)
+    assert_escaped("".join(capsys.readouterr()))
 
 
 def test_console_escapes_lines_tables_and_titles(capsys):
@@ -161,17 +182,17 @@ def test_console_escapes_lines_tables_and_titles(capsys):
     console.print(f"{HOSTILE} :smile:", style="bold")
     console.print(table)
     output = capsys.readouterr().out
-    assert_harmless(output)
+    assert_escaped(output)
     assert output.startswith(r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile:")
 
 
 def test_refusal_of_a_hostile_name_is_one_line(capsys):
-    def refused(_):
+    def refuse(_):
         raise InputError(f"{HOSTILE}: mend it")
 
-    assert run_command(refused) == 2
+    assert run_command(refuse) == 2
     output = capsys.readouterr().err
-    assert_harmless(output)
+    assert_escaped(output)
     assert output.count("\n") == 1
 
 
@@ -189,5 +210,5 @@ def test_figure_title_accepts_unbalanced_mathematics():
 def test_read_scenes_refuses_a_lone_surrogate(scene_file):
     text = gzip.decompress(scene_file.read_bytes()).replace(b"\\u202e", b"\\ud800")
     scene_file.write_bytes(text)
-    with pytest.raises(InputError, match=r"name is .*, which holds half a character; write the whole one"):
+    with pytest.raises(InputError, match=r"name is .*half a character; write"):
         read_scenes(scene_file)
