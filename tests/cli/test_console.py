@@ -18,22 +18,22 @@ SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_
 def home(tmp_path, monkeypatch):
     """A home of one's own, and JAX as it is where nobody has told it of a cache."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    before = {name: jax.config.values[name] for name in SETTINGS}
+    settings_before = {name: jax.config.values[name] for name in SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)
     yield tmp_path
-    for name, value in before.items():
+    for name, value in settings_before.items():
         jax.config.update(name, value)
 
 
-def folder_of_a_command():
+def cache_folder_of_command():
     """The folder for compiled programs that JAX has while a command runs."""
-    seen = []
-    assert run_command(lambda _: seen.append(jax.config.values["jax_compilation_cache_dir"])) == 0
-    return seen[0]
+    cache_folders = []
+    assert run_command(lambda _: cache_folders.append(jax.config.values["jax_compilation_cache_dir"])) == 0
+    return cache_folders[0]
 
 
 def test_compilation_cache_is_in_the_user_cache_folder(home, capsys):
-    folder = folder_of_a_command()
+    folder = cache_folder_of_command()
     assert folder == str(home / ".cache" / "jaxnav" / "xla")
     assert Path(folder).is_dir()
     assert jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 0.5
@@ -42,19 +42,19 @@ def test_compilation_cache_is_in_the_user_cache_folder(home, capsys):
 
 def test_compilation_cache_respects_a_configured_folder(home):
     jax.config.update("jax_compilation_cache_dir", str(home / "other"))
-    assert folder_of_a_command() == str(home / "other")
+    assert cache_folder_of_command() == str(home / "other")
     assert contents(home) == {}
 
 
 def test_disabled_compilation_cache_writes_nothing(home):
     jax.config.update("jax_enable_compilation_cache", False)
-    assert folder_of_a_command() is None
+    assert cache_folder_of_command() is None
     assert not any(home.iterdir())
 
 
 def test_console_reports_a_cache_folder_that_cannot_be_made(home, capsys):
     (home / ".cache").write_text("a file")
-    assert folder_of_a_command() is None
+    assert cache_folder_of_command() is None
     error = capsys.readouterr().err
     assert error.startswith("warning: compiled programs are not kept: ")
     assert error.count("\n") == 1
@@ -62,37 +62,37 @@ def test_console_reports_a_cache_folder_that_cannot_be_made(home, capsys):
 
 def test_console_reports_a_cache_folder_that_cannot_be_written(home, capsys, monkeypatch):
     monkeypatch.setattr("os.access", lambda *_: False)
-    assert folder_of_a_command() is None
+    assert cache_folder_of_command() is None
     assert str(home / ".cache" / "jaxnav" / "xla") in capsys.readouterr().err
 
 
-def trims(monkeypatch, library, seconds):
+def count_trims(monkeypatch, library, seconds):
     """What `malloc_trim` of a C library is called with after a compilation of so many seconds."""
-    calls = []
-    functions = dict.fromkeys(library, calls.append)
+    trim_calls = []
+    functions = dict.fromkeys(library, trim_calls.append)
     monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(**functions))
-    heard = []
-    monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", heard.append)
+    listeners = []
+    monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", listeners.append)
     console._trim_memory_after_compiling.__wrapped__()
-    for listener in heard:
+    for listener in listeners:
         listener("/jax/core/compile/backend_compile_duration", seconds, fun_name="f")
         listener("/jax/checkpoint/write/duration_secs", seconds)
-    return calls
+    return trim_calls
 
 
 @pytest.mark.parametrize(("seconds", "expected"), [(2.0, [0]), (0.1, [])])
 def test_long_compilation_trims_the_heap(monkeypatch, seconds, expected):
-    assert trims(monkeypatch, ["malloc_trim"], seconds) == expected
+    assert count_trims(monkeypatch, ["malloc_trim"], seconds) == expected
 
 
 def test_heap_is_not_trimmed_without_glibc(monkeypatch):
-    assert trims(monkeypatch, [], 2.0) == []
+    assert count_trims(monkeypatch, [], 2.0) == []
 
 
 def test_jax_reports_compilations_to_listeners(monkeypatch):
-    calls = []
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=calls.append))
+    trim_calls = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=trim_calls.append))
     monkeypatch.setattr(console, "_LONG_COMPILATION_S", 0.0)
     console._trim_memory_after_compiling.__wrapped__()
     jax.jit(lambda x: x * 3 + 1)(2)
-    assert set(calls) == {0}
+    assert set(trim_calls) == {0}
