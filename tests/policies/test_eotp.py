@@ -18,198 +18,244 @@ from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT
 
-K, HIDDEN = len(CATEGORIES), tiny.SIZES.hidden
+NUM_CATEGORIES = len(CATEGORIES)
+HIDDEN_SIZE = tiny.SIZES.hidden
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("eotp"), method_sizes=())
-WEIGHTS = tiny.random_params(0, SPEC)
-ONES = jnp.ones(K)
-MEMORY = PolicyState(jnp.sin(jnp.arange(HIDDEN, dtype=jnp.float32)), jnp.int32(MOVE_AHEAD))
+PARAMS = tiny.random_params(0, SPEC)
+EQUAL_WEIGHTS = jnp.ones(NUM_CATEGORIES)
+MEMORY = PolicyState(jnp.sin(jnp.arange(HIDDEN_SIZE, dtype=jnp.float32)), jnp.int32(MOVE_AHEAD))
+START_MEMORY = PolicyState(jnp.zeros(HIDDEN_SIZE), jnp.int32(NO_ACTION))
 
 
-def module(weights=WEIGHTS, spec=SPEC):
-    return cast(SpatialAttention, bind(spec, weights).method)
+def bind_attention(params=PARAMS, spec=SPEC):
+    return cast(SpatialAttention, bind(spec, params).method)
 
 
-EOTP = module()
-APPEARANCE = WEIGHTS["appearance"]["embedding"]
+EOTP = bind_attention()
+APPEARANCE = PARAMS["appearance"]["embedding"]
 
 
-def seen(*categories, goal=FRIDGE):
+def make_view(*categories, goal=FRIDGE):
     """Features of a view that detects categories."""
     row = np.array(tiny.BANK.rows[0])
-    row[: 4 * K] = 0
+    row[: 4 * NUM_CATEGORIES] = 0
     for category in categories:
         row[4 * category : 4 * category + 4] = 200, 10 + 9 * category, 110 + 20 * category, 30
-    return unpack_features(jnp.asarray(row), jnp.int32(goal), RowFormat(K))
+    return unpack_features(jnp.asarray(row), jnp.int32(goal), RowFormat(NUM_CATEGORIES))
 
 
-def encoded(view, weights=ONES, method=EOTP) -> AttentionEntries:
-    return method.encode(view, APPEARANCE, weights, None)
+def encode(view, layout_weights=EQUAL_WEIGHTS, method=EOTP) -> AttentionEntries:
+    return method.encode(view, APPEARANCE, layout_weights, None)
 
 
-def attention(view, memory=MEMORY, method=EOTP):
-    return np.asarray(method.attention_weights(encoded(view, method=method), memory))
+def attention_shares(view, memory=MEMORY, method=EOTP):
+    """Attention [K], which adds up to 1."""
+    return np.asarray(method.attention_weights(encode(view, method=method), memory))
 
 
 def with_parts(*parts):
     """The policy's parameters, the parts of goal, action and memory fixed."""
-    method = WEIGHTS["method"]
-    kernel = jnp.zeros_like(method["parts"]["kernel"])
-    return WEIGHTS | {"method": method | {"parts": {"kernel": kernel, "bias": jnp.array(parts, jnp.float32)}}}
+    method_params = PARAMS["method"]
+    kernel = jnp.zeros_like(method_params["parts"]["kernel"])
+    fixed_parts = {"kernel": kernel, "bias": jnp.array(parts, jnp.float32)}
+    return PARAMS | {"method": method_params | {"parts": fixed_parts}}
 
 
 # Attention
 
 
-def test_attention_is_over_what_is_detected_or_sought_and_adds_up_to_1():
-    for view, shown in (
-        (seen(BOOK, CHAIR), [1, 1, 1]),
-        (seen(BOOK), [1, 0, 1]),
-        (seen(FRIDGE), [0, 0, 1]),
-        (seen(), [0, 0, 1]),
-        (seen(CHAIR, goal=CHAIR), [0, 1, 0]),
-    ):
-        share = attention(view)
-        assert share.sum() == pytest.approx(1.0)
-        assert ((share > 0) == np.array(shown, bool)).all()
+@pytest.mark.parametrize(
+    ("detected", "goal", "is_attended"),
+    [
+        ((BOOK, CHAIR), FRIDGE, [True, True, True]),
+        ((BOOK,), FRIDGE, [True, False, True]),
+        ((FRIDGE,), FRIDGE, [False, False, True]),
+        ((), FRIDGE, [False, False, True]),
+        ((CHAIR,), CHAIR, [False, True, False]),
+    ],
+)
+def test_attention_is_shared_by_detected_and_sought_categories(detected, goal, is_attended):
+    shares = attention_shares(make_view(*detected, goal=goal))
+    assert shares.sum() == pytest.approx(1.0)
+    assert (shares > 0).tolist() == is_attended
 
 
-def test_the_experience_is_that_of_numpy():
+def test_attended_experience_equals_numpy():
     """An independent reference in float64, with all of its parameters."""
-    view, layout = seen(BOOK, CHAIR), np.array([0.3, 2.0, 1.0])
-    p = jax.tree.map(lambda leaf: np.asarray(leaf, float), WEIGHTS["method"])
+    view = make_view(BOOK, CHAIR)
+    layout_weights = np.array([0.3, 2.0, 1.0])
+    params = jax.tree.map(lambda leaf: np.asarray(leaf, float), PARAMS["method"])
+    appearance = np.asarray(APPEARANCE, float)
+    visible = np.asarray(view.visible)[:, None]
+    hidden = np.asarray(MEMORY.hidden, float)
 
-    def unit(vector):
-        return vector / np.linalg.norm(vector)
+    def normalize(vectors):
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
-    visible, hidden = np.asarray(view.visible)[:, None], np.asarray(MEMORY.hidden, float)
-    inputs = np.concatenate([visible * np.asarray(APPEARANCE, float), np.asarray(view.table, float)], axis=-1)
-    rows = inputs @ p["maps"]["inner"]["kernel"] + p["maps"]["inner"]["bias"]
-    asking = [
-        unit(np.asarray(APPEARANCE, float)[FRIDGE] @ p["goal"]["kernel"]),
-        unit(p["action"]["kernel"][MOVE_AHEAD]),
-        unit(hidden @ p["memory"]["kernel"]),
-    ]
-    parts = hidden @ p["parts"]["kernel"] + p["parts"]["bias"]
-    score = [sum(part * unit(row) @ query for part, query in zip(parts, asking, strict=True)) for row in rows]
-    share = np.exp(score) / np.exp(score).sum()
-    np.testing.assert_allclose(attention(view), share, rtol=1e-4)
-    read = (layout * share)[:, None] * np.maximum(rows, 0)
-    expected = np.maximum(read @ p["maps"]["outer"]["kernel"] + p["maps"]["outer"]["bias"], 0)
-    result = EOTP.attend(encoded(view, jnp.asarray(layout, jnp.float32)), MEMORY)
-    np.testing.assert_allclose(result, expected.reshape(-1), rtol=1e-4, atol=1e-6)
-    assert np.ptp(share) > 0.05
+    # Keys and values of the categories, [K, W].
+    inputs = np.concatenate([visible * appearance, np.asarray(view.table, float)], axis=-1)
+    rows = inputs @ params["maps"]["inner"]["kernel"] + params["maps"]["inner"]["bias"]
+
+    # Queries of goal, action and memory [3, W], and their parts [3].
+    queries = np.stack(
+        [
+            appearance[FRIDGE] @ params["goal"]["kernel"],
+            params["action"]["kernel"][MOVE_AHEAD],
+            hidden @ params["memory"]["kernel"],
+        ]
+    )
+    parts = hidden @ params["parts"]["kernel"] + params["parts"]["bias"]
+    cosines = normalize(rows) @ normalize(queries).T
+    scores = cosines @ parts
+    shares = np.exp(scores) / np.exp(scores).sum()
+    np.testing.assert_allclose(attention_shares(view), shares, rtol=1e-4)
+
+    # The weighted values through the outer map.
+    weighted_values = (layout_weights * shares)[:, None] * np.maximum(rows, 0)
+    expected = np.maximum(weighted_values @ params["maps"]["outer"]["kernel"] + params["maps"]["outer"]["bias"], 0)
+    experience = EOTP.attend(encode(view, jnp.asarray(layout_weights, jnp.float32)), MEMORY)
+    np.testing.assert_allclose(experience, expected.reshape(-1), rtol=1e-4, atol=1e-6)
+    assert np.ptp(shares) > 0.05
     assert (expected > 0).sum() > 3
 
 
-#: What each of the three asks for, beside `MEMORY` and the fridge: the goal, and the memory.
-OTHER = {
+#: Another goal and memory than the fridge and `MEMORY`, one change each.
+CHANGED_QUERIES = {
     "goal": (BOOK, MEMORY),
     "action": (FRIDGE, MEMORY._replace(action=jnp.int32(ROTATE_LEFT))),
     "memory": (FRIDGE, MEMORY._replace(hidden=-MEMORY.hidden)),
 }
 
 
-@pytest.mark.parametrize(("part", "name"), list(enumerate(OTHER)))
-def test_attention_moves_with_goal_action_and_memory(part, name):
+@pytest.mark.parametrize(("part_index", "query_name"), list(enumerate(CHANGED_QUERIES)))
+def test_each_query_changes_attention_only_by_its_part(part_index, query_name):
     """By each alone where its part is 4, and not where it is 0."""
-    alone, without = np.zeros(3), np.full(3, 4.0)
-    alone[part], without[part] = 4.0, 0.0
-    goal, memory = OTHER[name]
+    goal, memory = CHANGED_QUERIES[query_name]
+    only_part = np.zeros(3)
+    only_part[part_index] = 4.0
+    other_parts = 4.0 - only_part
 
-    def both(parts):
-        """The attention for the fridge, and as something else asks; the goal's flag in the rows stays."""
-        method = module(with_parts(*parts))
-        rows = encoded(seen(BOOK, CHAIR, FRIDGE), method=method)
-        asked = rows._replace(goal=encoded(seen(goal=goal), method=method).goal)
-        return np.asarray(method.attention_weights(rows, MEMORY)), np.asarray(method.attention_weights(asked, memory))
+    def shares_before_and_after(parts):
+        """The attention for the fridge, and with the changed query; the goal's flag in the rows stays."""
+        method = bind_attention(with_parts(*parts))
+        entries = encode(make_view(BOOK, CHAIR, FRIDGE), method=method)
+        changed_entries = entries._replace(goal=encode(make_view(goal=goal), method=method).goal)
+        shares = np.asarray(method.attention_weights(entries, MEMORY))
+        changed_shares = np.asarray(method.attention_weights(changed_entries, memory))
+        return shares, changed_shares
 
-    one, other = both(alone)
-    assert np.abs(one - other).max() > 0.02
-    np.testing.assert_array_equal(*both(without))
-    np.testing.assert_allclose(both(np.zeros(3)), np.full((2, K), 1 / K), rtol=1e-6)
-
-
-def test_the_memory_says_in_which_parts():
-    view = seen(BOOK, CHAIR, FRIDGE)
-    method = module(with_parts(1, 2, 0)).parts
-    np.testing.assert_array_equal(method(MEMORY.hidden), [1, 2, 0])
-    quiet = EOTP.parts(jnp.zeros(HIDDEN))
-    assert np.abs(EOTP.parts(MEMORY.hidden) - quiet).max() > 0.1
-    # Before anything is remembered or done, only the goal asks.
-    start = PolicyState(jnp.zeros(HIDDEN), jnp.int32(NO_ACTION))
-    np.testing.assert_allclose(
-        attention(view, start), attention(view, start, module(with_parts(quiet[0], 0, 0))), rtol=1e-5
-    )
+    shares, changed_shares = shares_before_and_after(only_part)
+    assert np.abs(shares - changed_shares).max() > 0.02
+    np.testing.assert_array_equal(*shares_before_and_after(other_parts))
+    uniform_shares = np.full((2, NUM_CATEGORIES), 1 / NUM_CATEGORIES)
+    np.testing.assert_allclose(shares_before_and_after(np.zeros(3)), uniform_shares, rtol=1e-6)
 
 
-def test_the_first_attention_of_a_fresh_policy_goes_by_the_goal():
-    weights = init_params(SPEC, jax.random.key(0))
-    method, start = module(weights), bind(SPEC, weights).initial_memory()
-    share = attention(seen(BOOK, CHAIR, FRIDGE), start, method)
-    assert np.ptp(share) > 0.01
-    np.testing.assert_array_equal(method.parts(start.hidden), [1, 1, 1])
+def test_parts_are_computed_from_the_memory():
+    np.testing.assert_array_equal(bind_attention(with_parts(1, 2, 0)).parts(MEMORY.hidden), [1, 2, 0])
+    assert np.abs(EOTP.parts(MEMORY.hidden) - EOTP.parts(START_MEMORY.hidden)).max() > 0.1
 
 
-# Lengths, and the layout's weights
+def test_first_attention_of_an_episode_uses_the_goal_alone():
+    view = make_view(BOOK, CHAIR, FRIDGE)
+    goal_part, _, _ = EOTP.parts(START_MEMORY.hidden)
+    goal_only = bind_attention(with_parts(goal_part, 0, 0))
+    shares = attention_shares(view, START_MEMORY)
+    np.testing.assert_allclose(shares, attention_shares(view, START_MEMORY, goal_only), rtol=1e-5)
 
 
-def test_cosines_know_directions_alone():
-    """Embeddings three times as long get the same attention; what is read of them is three times as much."""
-    maps = WEIGHTS["method"]["maps"]
-    louder = jax.tree.map(lambda leaf: 3 * leaf, maps["inner"])
-    long = module(WEIGHTS | {"method": WEIGHTS["method"] | {"maps": maps | {"inner": louder}}})
-    view = seen(BOOK, CHAIR)
-    short_window, long_window = encoded(view), encoded(view, method=long)
-    np.testing.assert_allclose(np.linalg.norm(short_window.keys, axis=-1), np.ones(K), rtol=1e-5)
-    np.testing.assert_allclose(short_window.keys, long_window.keys, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(attention(view), attention(view, method=long), rtol=1e-4)
-    np.testing.assert_allclose(3 * short_window.values, long_window.values, rtol=1e-4)
+def test_fresh_attention_depends_on_the_goal_from_the_start():
+    params = init_params(SPEC, jax.random.key(0))
+    method = bind_attention(params)
+    memory = bind(SPEC, params).initial_memory()
+    shares = attention_shares(make_view(BOOK, CHAIR, FRIDGE), memory, method)
+    assert np.ptp(shares) > 0.01
+    np.testing.assert_array_equal(method.parts(memory.hidden), [1, 1, 1])
 
 
-def test_layout_weights_multiply_after_the_norm():
-    """They leave attention as it is, and multiply what is read, also where all are the same factor."""
-    view, layout = seen(BOOK, CHAIR), jnp.array([0.0, 0.5, 2.0])
-    plain, weighted = encoded(view), encoded(view, layout)
-    np.testing.assert_array_equal(plain.keys, weighted.keys)
-    np.testing.assert_array_equal(EOTP.attention_weights(plain, MEMORY), EOTP.attention_weights(weighted, MEMORY))
-    np.testing.assert_allclose(weighted.values, layout[:, None] * plain.values, rtol=1e-6)
-    changed = np.asarray(EOTP.attend(weighted, MEMORY) != EOTP.attend(plain, MEMORY)).reshape(K, -1)
-    assert changed.any(axis=-1).all()
-    halved = EOTP.attend(encoded(view, 0.5 * ONES), MEMORY)
-    assert np.abs(halved - EOTP.attend(plain, MEMORY)).max() > 1e-3
-    # A category of weight 0 says the same whatever is detected of it.
-    read = [EOTP.attend(encoded(v, layout), MEMORY).reshape(K, -1)[BOOK] for v in (view, seen(CHAIR))]
-    np.testing.assert_array_equal(read[0], read[1])
+# Lengths and layout weights
+
+
+def test_attention_depends_on_directions_of_embeddings_alone():
+    """Embeddings three times as long get the same attention and have values three times as large."""
+    maps = PARAMS["method"]["maps"]
+    long_maps = maps | {"inner": jax.tree.map(lambda leaf: 3 * leaf, maps["inner"])}
+    long_method = bind_attention(PARAMS | {"method": PARAMS["method"] | {"maps": long_maps}})
+    view = make_view(BOOK, CHAIR)
+    entries = encode(view)
+    long_entries = encode(view, method=long_method)
+    np.testing.assert_allclose(np.linalg.norm(entries.keys, axis=-1), np.ones(NUM_CATEGORIES), rtol=1e-5)
+    np.testing.assert_allclose(entries.keys, long_entries.keys, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(attention_shares(view), attention_shares(view, method=long_method), rtol=1e-4)
+    np.testing.assert_allclose(3 * entries.values, long_entries.values, rtol=1e-4)
+
+
+def test_layout_weights_multiply_values_and_leave_attention():
+    view = make_view(BOOK, CHAIR)
+    layout_weights = jnp.array([0.0, 0.5, 2.0])
+    entries = encode(view)
+    weighted_entries = encode(view, layout_weights)
+    np.testing.assert_array_equal(entries.keys, weighted_entries.keys)
+    shares = EOTP.attention_weights(entries, MEMORY)
+    np.testing.assert_array_equal(shares, EOTP.attention_weights(weighted_entries, MEMORY))
+    np.testing.assert_allclose(weighted_entries.values, layout_weights[:, None] * entries.values, rtol=1e-6)
+
+    # The experience changes in every category, also where all weights are the same factor.
+    experience = EOTP.attend(entries, MEMORY)
+    is_changed = np.asarray(EOTP.attend(weighted_entries, MEMORY) != experience).reshape(NUM_CATEGORIES, -1)
+    assert is_changed.any(axis=-1).all()
+    halved_experience = EOTP.attend(encode(view, 0.5 * EQUAL_WEIGHTS), MEMORY)
+    assert np.abs(halved_experience - experience).max() > 1e-3
+
+
+def test_category_of_weight_zero_has_the_same_experience_detected_or_not():
+    layout_weights = jnp.array([0.0, 0.5, 2.0])
+
+    def book_experience(view):
+        return EOTP.attend(encode(view, layout_weights), MEMORY).reshape(NUM_CATEGORIES, -1)[BOOK]
+
+    np.testing.assert_array_equal(book_experience(make_view(BOOK, CHAIR)), book_experience(make_view(CHAIR)))
 
 
 # The ablation
 
-
-def test_uniform_attention_is_deaf_to_what_asks():
-    spec = dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.eotp:UNIFORM"))
-    uniform = module(spec=spec)
-    assert type(uniform) is UniformAttention is spec.method.experience
-    views = seen(BOOK, FRIDGE), *(seen(BOOK, CHAIR, FRIDGE, goal=goal) for goal, _ in OTHER.values())
-    for view, memory in zip(views, (MEMORY, *(memory for _, memory in OTHER.values())), strict=True):
-        shown = np.asarray(view.visible + view.goal > 0)
-        np.testing.assert_allclose(attention(view, memory, uniform), shown / shown.sum(), rtol=1e-6)
-    # The same parameters, and but for attention the same experience.
-    assert jax.tree.structure(init_params(spec, jax.random.key(0))) == jax.tree.structure(WEIGHTS)
-    alone = encoded(seen(FRIDGE))
-    np.testing.assert_array_equal(uniform.attend(alone, MEMORY), EOTP.attend(alone, MEMORY))
+UNIFORM_SPEC = dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.eotp:UNIFORM"))
+UNIFORM = bind_attention(spec=UNIFORM_SPEC)
 
 
-def test_gradients_are_finite_before_anything_is_remembered():
+@pytest.mark.parametrize(
+    ("detected", "goal", "memory"),
+    [
+        ((BOOK, FRIDGE), FRIDGE, MEMORY),
+        *(((BOOK, CHAIR, FRIDGE), goal, memory) for goal, memory in CHANGED_QUERIES.values()),
+    ],
+)
+def test_uniform_attention_ignores_every_query(detected, goal, memory):
+    view = make_view(*detected, goal=goal)
+    is_attended = np.asarray(view.visible + view.goal > 0)
+    np.testing.assert_allclose(attention_shares(view, memory, UNIFORM), is_attended / is_attended.sum(), rtol=1e-6)
+
+
+def test_uniform_attention_differs_from_eotp_by_attention_alone():
+    assert type(UNIFORM) is UniformAttention is UNIFORM_SPEC.method.experience
+    assert jax.tree.structure(init_params(UNIFORM_SPEC, jax.random.key(0))) == jax.tree.structure(PARAMS)
+    # A single category gets all attention.
+    entries = encode(make_view(FRIDGE))
+    np.testing.assert_array_equal(UNIFORM.attend(entries, MEMORY), EOTP.attend(entries, MEMORY))
+
+
+def test_gradients_are_finite_at_the_start_of_an_episode():
     """Vectors of length 0 have no direction."""
-    start, view = PolicyState(jnp.zeros(HIDDEN), jnp.int32(NO_ACTION)), seen(BOOK)
+    view = make_view(BOOK)
 
     @jax.jit
     @jax.grad
-    def gradient(weights):
-        method = module(weights)
-        return method.attend(method.encode(view, weights["appearance"]["embedding"], ONES, None), start).sum()
+    def compute_gradient(params):
+        method = bind_attention(params)
+        entries = method.encode(view, params["appearance"]["embedding"], EQUAL_WEIGHTS, None)
+        return method.attend(entries, START_MEMORY).sum()
 
-    for weights in (WEIGHTS, init_params(SPEC, jax.random.key(0))):
-        result = gradient(weights)["method"]
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
-        assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(result)) < 100
+    for params in (PARAMS, init_params(SPEC, jax.random.key(0))):
+        for leaf in jax.tree.leaves(compute_gradient(params)["method"]):
+            assert np.isfinite(leaf).all()
+            assert np.abs(leaf).max() < 100
