@@ -1,6 +1,7 @@
-"""Runs from Python: trained, opened again, evaluated, with some of the arms."""
+"""Training from Python: runs are trained, opened, evaluated, and restricted to one arm."""
 
 import dataclasses
+import itertools
 import math
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import jax
 import numpy as np
 import pytest
 from rich.console import Console
+from support import tiny_world as tiny
 from support.commands import contents
+from support.refusals import assert_message_names
 from support.tiny_run import NUM_SEEDS, POLICY_NAMES, finished_run
 
 import jaxnav
@@ -25,187 +28,229 @@ from jaxnav.runs.worlds import compile_evaluation_world, compile_training_world
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.worlds import make_generated_scenes
 
-EPISODES = 4
+NUM_EPISODES = 4
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def finished_config(tmp_path_factory):
     """The settings of a run that the train command has finished."""
     config_file, run_dir = finished_run(tmp_path_factory)
     return dataclasses.replace(apply_yaml(jaxnav.RunConfig(), config_file), run_dir=run_dir)
 
 
+# A finished run
+
+
 @pytest.mark.slow
-def test_train_leaves_a_finished_run_unchanged(trained, capsys):
-    before = contents(trained.run_dir)
-    assert jaxnav.train(trained) == jaxnav.Run(trained)
-    assert contents(trained.run_dir) == before
+def test_train_leaves_a_finished_run_unchanged(finished_config, capsys):
+    files_before = contents(finished_config.run_dir)
+    assert jaxnav.train(finished_config) == jaxnav.Run(finished_config)
+    assert contents(finished_config.run_dir) == files_before
     assert capsys.readouterr() == ("", "")
 
 
-def test_run_opens_from_its_path(trained):
-    # Where it runs and what is kept how often is no part of what a run is.
-    usual = {name: getattr(jaxnav.RunConfig(), name) for name in ("save_every", "cache", "devices")}
-    for path in (trained.run_dir, str(trained.run_dir)):
+def test_run_opens_from_its_path(finished_config):
+    # The cache, the devices and the interval of checkpoints are not part of a run's identity.
+    default_config = jaxnav.RunConfig()
+    defaults = {name: getattr(default_config, name) for name in ("save_every", "cache", "devices")}
+    run = jaxnav.Run(finished_config)
+    for path in (finished_config.run_dir, str(finished_config.run_dir)):
         opened = jaxnav.Run.open(path)
-        assert opened.config == dataclasses.replace(trained, **usual)
-        chex.assert_trees_all_equal(opened.policies(), jaxnav.Run(trained).policies())
-        assert opened.log() == jaxnav.Run(trained).log()
+        assert opened.config == dataclasses.replace(finished_config, **defaults)
+        chex.assert_trees_all_equal(opened.policies(), run.policies())
+        assert opened.log() == run.log()
     with pytest.raises(InputError, match="holds no run"):
-        jaxnav.Run.open(trained.run_dir / "policies")
+        jaxnav.Run.open(finished_config.run_dir / "policies")
 
 
-def test_run_policies_are_stacked_by_arm_and_seed(trained):
-    policies = jaxnav.Run(trained).policies()
-    assert (policies.arms, policies.num_seeds) == (("baseline", "layout"), NUM_SEEDS)
-    assert policies.spec == trained.policy_spec(len(trained.task.categories))
-    for name in POLICY_NAMES:
-        arm, seed = name.split("-")
-        loaded = jaxnav.load_policy(trained.run_dir / "policies" / name)
-        chex.assert_trees_all_equal(
-            loaded.params, jax.tree.map(lambda leaf, i=int(seed): leaf[i], policies.arm_params(arm))
-        )
+def test_run_policies_are_stacked_by_arm_and_seed(finished_config):
+    policies = jaxnav.Run(finished_config).policies()
+    assert policies.arms == ("baseline", "layout")
+    assert policies.num_seeds == NUM_SEEDS
+    assert policies.spec == finished_config.policy_spec(len(finished_config.task.categories))
+
+    # Each is the exported policy of its name.
+    for policy_name in POLICY_NAMES:
+        arm, seed_text = policy_name.split("-")
+        loaded = jaxnav.load_policy(finished_config.run_dir / "policies" / policy_name)
+        seed_params = tiny.leaves_at(policies.arm_params(arm), int(seed_text))
+        chex.assert_trees_all_equal(loaded.params, seed_params)
         chex.assert_trees_all_equal(loaded.knowledge, policies.knowledge)
         assert loaded.spec == policies.spec
         assert loaded.estimator_config == (policies.estimator_config if arm == "layout" else None)
-    layout = jaxnav.Run(trained).policies(("layout",))
-    chex.assert_trees_all_equal(layout.params, policies.arm_params("layout"))
+
+    # One arm can be read alone.
+    layout_policies = jaxnav.Run(finished_config).policies(("layout",))
+    chex.assert_trees_all_equal(layout_policies.params, policies.arm_params("layout"))
 
 
-def test_run_log_has_a_row_per_chunk_arm_and_seed(trained):
-    rows = jaxnav.Run(trained).log()
-    identities = [(row["step"], row["arm"], row["seed"]) for row in rows]
-    assert identities == [
-        (step, arm, seed) for step in (2, 4) for arm in ("baseline", "layout") for seed in range(NUM_SEEDS)
-    ]
-    assert all(math.isfinite(row["success"]) for row in rows)
+def test_run_log_has_a_row_per_chunk_arm_and_seed(finished_config):
+    log_rows = jaxnav.Run(finished_config).log()
+    row_keys = [(row["step"], row["arm"], row["seed"]) for row in log_rows]
+    assert row_keys == list(itertools.product((2, 4), ("baseline", "layout"), range(NUM_SEEDS)))
+    assert all(math.isfinite(row["success"]) for row in log_rows)
+
+
+# Settings
 
 
 @pytest.mark.parametrize(
-    ("changes", "problem"),
+    ("changes", "named_parts"),
     [
-        (
-            {"method": "anonymous", "arms": ("layout",)},
-            "config: arms is ('layout',); method 'anonymous' cannot host",
-        ),
-        ({"method": "anonymous", "arms": ("layout", "baseline")}, "method 'anonymous' cannot host the layout; give"),
-        ({"arms": ()}, "config: arms is (); give some of baseline, layout"),
-        ({"arms": ("layout", "layout")}, "give some of baseline, layout, each once"),
-        ({"method": "orgy"}, "method 'orgy': is unknown; did you mean 'org'?"),
-        ({"method_sizes": {"layers": 1}}, "method_sizes.layers is 1; is unknown; 'org' has relation_layers"),
+        ({"method": "anonymous", "arms": ("layout", "baseline")}, ["method 'anonymous'", "layout; give"]),
+        ({"arms": ()}, ["config: arms is ()", "give some of baseline, layout"]),
+        ({"arms": ("layout", "layout")}, ["give some of baseline, layout, each once"]),
     ],
 )
-def test_train_refuses_invalid_settings_before_writing(config, tmp_path, changes, problem):
-    changed = {"method_sizes": {}, "run_dir": tmp_path / "run"} | changes
+def test_train_refuses_invalid_settings_before_writing(config, tmp_path, changes, named_parts):
+    settings = {"method_sizes": {}, "run_dir": tmp_path / "run"} | changes
     with pytest.raises(InputError) as error:
-        jaxnav.train(dataclasses.replace(config, **changed))
-    assert problem in str(error.value)
+        jaxnav.train(dataclasses.replace(config, **settings))
+    assert_message_names(error.value, *named_parts)
     assert not (tmp_path / "run").exists()
 
 
-def small(config, run_dir, **changes):
-    """The smallest run of the config: one seed, one chunk."""
+def test_check_config_converts_strings_to_paths():
+    config = check_config(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
+    assert config.run_dir == Path("runs/two")
+    assert config.scenes == Path("rooms.jsonl.gz")
+
+
+# One arm alone
+
+
+def one_chunk_config(config, run_dir, **changes):
+    """Return the settings of the smallest run: one seed, one chunk."""
     return dataclasses.replace(config, seeds=1, total_steps=256, run_dir=run_dir, **changes)
 
 
 @pytest.mark.slow
 def test_method_without_layout_support_is_trained_as_baseline_alone(config, tmp_path):
-    anonymous = small(config, tmp_path / "run", method="anonymous", method_sizes={})
+    run_dir = tmp_path / "run"
+    anonymous = one_chunk_config(config, run_dir, method="anonymous", method_sizes={})
     run = jaxnav.train(anonymous)
     assert anonymous.arms == ("baseline", "layout")
     assert run.config == dataclasses.replace(anonymous, arms=("baseline",))
-    assert jaxnav.Run.open(tmp_path / "run").config.arms == ("baseline",)
-    assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["baseline-0"]
+    assert jaxnav.Run.open(run_dir).config.arms == ("baseline",)
+
+    # One policy without an estimator, and one row of the log.
+    assert [folder.name for folder in (run_dir / "policies").iterdir()] == ["baseline-0"]
     policies = run.policies()
-    assert (policies.arms, policies.num_seeds, policies.estimator_config) == (("baseline",), 1, None)
-    (row,) = run.log()
-    assert (row["step"], row["arm"], row["seed"], row["env_steps"]) == (2, "baseline", 0, 256)
+    assert policies.arms == ("baseline",)
+    assert policies.num_seeds == 1
+    assert policies.estimator_config is None
+    (log_row,) = run.log()
+    assert (log_row["step"], log_row["arm"], log_row["seed"], log_row["env_steps"]) == (2, "baseline", 0, 256)
 
-    before = contents(tmp_path / "run")
+    # Training it again changes nothing.
+    files_before = contents(run_dir)
     assert jaxnav.train(anonymous) == run
-    assert contents(tmp_path / "run") == before
+    assert contents(run_dir) == files_before
 
-    results = jaxnav.evaluate(run, episodes=EPISODES)
-    baseline = [EvaluationRow("baseline", None, None, decoding) for decoding in ("argmax", "sample")]
+    # An evaluation has no rows of the layout, and so no differences.
+    results = jaxnav.evaluate(run, episodes=NUM_EPISODES)
     assert results.rows == [
-        *baseline,
+        EvaluationRow("baseline", None, None, "argmax"),
+        EvaluationRow("baseline", None, None, "sample"),
         EvaluationRow("random", None, None, "sample"),
         EvaluationRow("oracle", None, None, "argmax"),
     ]
-    assert {leaf.shape for leaf in results.outcome} == {(4, 1, EPISODES)}
+    assert {leaf.shape for leaf in results.outcome} == {(4, 1, NUM_EPISODES)}
     assert results.report["differences"] == []
-    for problem in (lambda: jaxnav.sweep(run, (0.5,)), lambda: run.policies(("layout",))):
-        with pytest.raises(InputError, match="was trained without the arm 'layout'"):
-            problem()
+
+    # What needs the layout is refused.
+    with pytest.raises(InputError, match="without the arm 'layout'"):
+        jaxnav.sweep(run, (0.5,))
+    with pytest.raises(InputError, match="without the arm 'layout'"):
+        run.policies(("layout",))
 
 
 @pytest.mark.slow
 def test_layout_arm_is_trained_and_evaluated_alone(config, tmp_path):
-    run = jaxnav.train(small(config, tmp_path / "run", arms=("layout",)))
+    run = jaxnav.train(one_chunk_config(config, tmp_path / "run", arms=("layout",)))
     assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["layout-0"]
     assert run.policies().estimator_config is not None
-    results = jaxnav.evaluate(run, episodes=EPISODES)
-    one = [("layout", None), ("tde", None), ("stde", 0.5)]
-    assert [(row.variant, row.epsilon) for row in results.rows] == [*one, *one, ("random", None), ("oracle", None)]
-    # The others are compared with the layout's row, which has nothing to be compared with itself.
+
+    # The rows of two decodings, Random and the oracle.
+    results = jaxnav.evaluate(run, episodes=NUM_EPISODES)
+    decoding_rows = [("layout", None), ("tde", None), ("stde", 0.5)]
+    row_settings = [(row.variant, row.epsilon) for row in results.rows]
+    assert row_settings == [*decoding_rows, *decoding_rows, ("random", None), ("oracle", None)]
+
+    # TDE and sTDE are compared with the layout's row, which has no baseline: two decodings, three metrics.
     assert len(results.report["differences"]) == 2 * 2 * 3
-    sweep = jaxnav.sweep(run, (0.5, 1.0), episodes=EPISODES)
+
+    # A sweep from the evaluation's epsilon to 1, where nothing is removed.
+    sweep = jaxnav.sweep(run, (0.5, 1.0), episodes=NUM_EPISODES)
     np.testing.assert_array_equal(sweep.outcome.length, results.outcome.length[[2, 0]])
 
 
-def test_check_config_converts_strings_to_paths():
-    config = check_config(dataclasses.replace(RunConfig(), run_dir="runs/two", scenes="rooms.jsonl.gz"))  # type: ignore[arg-type]
-    assert (config.run_dir, config.scenes) == (Path("runs/two"), Path("rooms.jsonl.gz"))
+# Knowledge from the training scenes
+
+
+def assert_run_can_be_evaluated(run_dir):
+    results = jaxnav.evaluate(jaxnav.Run.open(run_dir), episodes=NUM_EPISODES)
+    assert {leaf.shape[-1] for leaf in results.outcome} == {NUM_EPISODES}
 
 
 @pytest.mark.slow
 def test_hoz_zones_are_learned_from_training_scenes_and_exported(config, tmp_path):
-    hoz = small(config, tmp_path / "run", method="hoz", method_sizes={})
-    exported = jaxnav.train(hoz).policies().knowledge.method
+    hoz_config = one_chunk_config(config, tmp_path / "run", method="hoz", method_sizes={})
+    exported_zones = jaxnav.train(hoz_config).policies().knowledge.method
 
-    def learned(split):
-        scenes = make_generated_scenes(hoz.world, split, getattr(hoz.worlds, f"num_{split}"), hoz.worlds.seed)
-        bank = compile_bank((scenes[i] for i in range(len(scenes))), hoz.task)
-        return learn_zones([bank], np.zeros((NUM_PRIORS, *2 * [len(hoz.task.categories)])))
+    def learn_zones_of_split(split):
+        num_scenes = getattr(hoz_config.worlds, f"num_{split}")
+        scenes = make_generated_scenes(hoz_config.world, split, num_scenes, hoz_config.worlds.seed)
+        bank = compile_bank((scenes[index] for index in range(len(scenes))), hoz_config.task)
+        num_categories = len(hoz_config.task.categories)
+        return learn_zones([bank], np.zeros((NUM_PRIORS, num_categories, num_categories)))
 
-    chex.assert_trees_all_equal(exported, learned("train"))
+    chex.assert_trees_all_equal(exported_zones, learn_zones_of_split("train"))
     for split in ("val", "test"):
-        assert (exported["nodes"] != learned(split)["nodes"]).any()
-    results = jaxnav.evaluate(jaxnav.Run.open(tmp_path / "run"), episodes=EPISODES)
-    assert {leaf.shape[-1] for leaf in results.outcome} == {EPISODES}
-
-
-@pytest.mark.slow
-def test_prior_knowledge_depends_on_training_scenes_alone(config, tmp_path):
-    """Priors, signs, calibration and zones: other training scenes change all of them, other val scenes nothing."""
-
-    def known(name, **worlds):
-        changed = dataclasses.replace(config.worlds, **worlds)
-        policies = jaxnav.train(
-            small(config, tmp_path / name, method="hoz", method_sizes={}, arms=("layout",), worlds=changed)
-        ).policies()
-        return (policies.knowledge, policies.prior_counts), policies.estimator_config
-
-    worlds = config.worlds
-    one, setting = known("one")
-    elsewhere, of_elsewhere = known("val", num_val=worlds.num_val + 3, num_test=worlds.num_test + 3)
-    chex.assert_trees_all_equal(one, elsewhere)
-    assert setting == of_elsewhere
-    same, _ = jax.tree.map(np.array_equal, one, known("train", num_train=worlds.num_train + 3)[0])
-    assert not any(jax.tree.leaves((same.layout, same.cooccurrence, same.method["nodes"])))
+        assert (exported_zones["nodes"] != learn_zones_of_split(split)["nodes"]).any()
+    assert_run_can_be_evaluated(tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_sp_graph_is_learned_from_training_scenes_and_exported(config, tmp_path):
-    sp, console = small(config, tmp_path / "run", method="sp", method_sizes={}), Console(quiet=True)
-    exported = jaxnav.train(sp).policies().knowledge.method
+    sp_config = one_chunk_config(config, tmp_path / "run", method="sp", method_sizes={})
+    console = Console(quiet=True)
+    exported_graph = jaxnav.train(sp_config).policies().knowledge.method
 
-    def learned(world):
-        return learn_graph(world.banks, np.asarray(explore_world(sp, world).counts))
+    def learn_graph_of_world(world):
+        return learn_graph(world.banks, np.asarray(explore_world(sp_config, world).counts))
 
-    chex.assert_trees_all_equal(exported, learned(compile_training_world(sp, console)))
+    chex.assert_trees_all_equal(exported_graph, learn_graph_of_world(compile_training_world(sp_config, console)))
     for split in ("val", "test"):
-        other = learned(compile_evaluation_world(sp, split, None, None, console))
-        assert np.abs(exported["mixing"] - other["mixing"]).max() > 0.01
-    results = jaxnav.evaluate(jaxnav.Run.open(tmp_path / "run"), episodes=EPISODES)
-    assert {leaf.shape[-1] for leaf in results.outcome} == {EPISODES}
+        other_graph = learn_graph_of_world(compile_evaluation_world(sp_config, split, None, None, console))
+        assert np.abs(exported_graph["mixing"] - other_graph["mixing"]).max() > 0.01
+    assert_run_can_be_evaluated(tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_prior_knowledge_depends_on_training_scenes_alone(config, tmp_path):
+    """Other training scenes change priors, evidence and zones; other val and test scenes change nothing."""
+    worlds = config.worlds
+
+    def train_knowledge(name, **changes):
+        run_config = one_chunk_config(
+            config,
+            tmp_path / name,
+            method="hoz",
+            method_sizes={},
+            arms=("layout",),
+            worlds=dataclasses.replace(worlds, **changes),
+        )
+        policies = jaxnav.train(run_config).policies()
+        return policies.knowledge, policies.prior_counts, policies.estimator_config
+
+    knowledge, prior_counts, estimator_config = train_knowledge("one")
+    val_knowledge, val_prior_counts, val_estimator_config = train_knowledge(
+        "val", num_val=worlds.num_val + 3, num_test=worlds.num_test + 3
+    )
+    chex.assert_trees_all_equal((knowledge, prior_counts), (val_knowledge, val_prior_counts))
+    assert estimator_config == val_estimator_config
+
+    train_scene_knowledge, _, _ = train_knowledge("train", num_train=worlds.num_train + 3)
+    is_equal = jax.tree.map(np.array_equal, knowledge, train_scene_knowledge)
+    assert not any(jax.tree.leaves((is_equal.layout, is_equal.cooccurrence, is_equal.method["nodes"])))
