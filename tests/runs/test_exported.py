@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.commands import contents, refusal
+from support.refusals import assert_message_names
 
 import jaxnav
 from jaxnav.__main__ import main
@@ -24,182 +25,221 @@ from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.runs.policy import LoadedPolicy, export_program, input_shapes
 from jaxnav.scenes.tables.observation_row import RowFormat
 
-EPISODES, STEPS = 3, 4
+NUM_EPISODES = 3
+NUM_STEPS = 4
 #: A process that knows JAX alone runs the code of the model card, then the steps of a file.
-ALONE = """
+JAX_ALONE = """
 import sys
 
-class Nothing:
+class RefuseImports:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in ("jaxnav", "flax", "optax", "chex"):
             raise ImportError(name)
 
-sys.meta_path.insert(0, Nothing())
+sys.meta_path.insert(0, RefuseImports())
 {code}
 steps = np.load("steps.npz")
-inputs = jax.tree.map(lambda each: np.zeros((3, *each.shape[1:]), each.dtype), shapes)
-found = {{}}
+inputs = jax.tree.map(lambda leaf: np.zeros((3, *leaf.shape[1:]), leaf.dtype), shapes)
+results = {{}}
 for time in range(4):
     inputs |= {{name: steps[name][time] for name in steps.files}}
     outputs = step.call(inputs, np.float32(0.1))
     inputs["memory"] = outputs.pop("memory")
     for name, value in outputs.items():
-        found.setdefault(name, []).append(value)
-np.savez("found.npz", **found)
+        results.setdefault(name, []).append(value)
+np.savez("results.npz", **results)
 """
 
 
-def walk(policy: LoadedPolicy) -> dict[str, np.ndarray]:
-    """Inputs of steps that are no episode of any world, so that nothing in them is alike; the second begins anew."""
+# The same steps by the policy and by its program
+
+
+def draw_steps(policy: LoadedPolicy) -> dict[str, np.ndarray]:
+    """Return random inputs [NUM_STEPS, NUM_EPISODES, ...] of a program, beside its memory.
+
+    They belong to no world, so no two of them are alike. The second episode begins anew at step 2.
+    """
     rng = np.random.default_rng(0)
-    shapes = input_shapes(policy, EPISODES)
-    del shapes["memory"]
+    shapes = input_shapes(policy, NUM_EPISODES)
     limits = {"detections": 256, "view": 3, "goal": 5, "action": 6, "heading": 8, "horizon": 2, "room": 5, "moved": 2}
-    steps = {
-        name: rng.integers(0, limits[name], (STEPS, *leaf.shape)).astype(leaf.dtype)
-        for name, leaf in shapes.items()
-        if name in limits
-    }
+    steps = {}
+    for name, leaf in shapes.items():
+        if name in limits:
+            steps[name] = rng.integers(0, limits[name], (NUM_STEPS, *leaf.shape)).astype(leaf.dtype)
+
     steps["detections"][..., 0] *= rng.random(steps["detections"].shape[:-1]) < 0.12  # few are detected
     steps["room"][:] = steps["room"][0]
-    steps["first"] = np.zeros((STEPS, EPISODES), bool)
-    steps["first"][0], steps["first"][2, 1] = True, True
+    steps["first"] = np.zeros((NUM_STEPS, NUM_EPISODES), bool)
+    steps["first"][0] = True
+    steps["first"][2, 1] = True
     return steps
 
 
-def acted(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What the policy makes of the same steps, one episode after the other."""
-    decide, result = jax.jit(LoadedPolicy.decide), []
-    for episode in range(EPISODES):
+def stack_results(results: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Return the results of steps as arrays with a leading axis, without those that the method does not have."""
+    return {
+        name: np.stack([result[name] for result in results]) for name, value in results[0].items() if value is not None
+    }
+
+
+def act_by_policy(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the policy's results [NUM_STEPS, NUM_EPISODES, ...], one episode after the other."""
+    decide = jax.jit(LoadedPolicy.decide)
+    row_format = RowFormat(policy.spec.num_categories)
+    episodes = []
+    for episode in range(NUM_EPISODES):
+        results = []
         memory = policy.begin(jnp.int32(0))
-        for time in range(STEPS):
+        for time in range(NUM_STEPS):
             inputs = {name: jnp.asarray(values[time, episode]) for name, values in steps.items()}
             if inputs["first"]:
                 memory = policy.begin(inputs["room"])
             else:
                 memory = memory._replace(policy_state=memory.policy_state._replace(action=inputs["action"]))
-            row = RowFormat(policy.spec.num_categories).pack(inputs["detections"], inputs["view"])
-            observation = Observation(row, inputs["goal"])
-            odometry = {name: inputs[name] for name in ("heading", "moved", "horizon")}
+
+            # Nothing has moved before the first step of an episode.
+            odometry = {name: inputs[name] for name in ("heading", "horizon")}
             odometry["moved"] = inputs["moved"] & ~inputs["first"]
+            observation = Observation(row_format.pack(inputs["detections"], inputs["view"]), inputs["goal"])
             choice = decide(policy, observation, memory, jnp.float32(0.1), **odometry)
-            action, memory = policy.apply_choice(choice, jnp.argmax(choice.logits).astype(jnp.int32), memory.room)
-            names = ("logits", "factual", "counterfactual", "gap", "weights")
-            result.append({"action": action} | {name: getattr(choice, name) for name in names})
-    shape = EPISODES, STEPS
-    return {
-        name: np.stack([step_result[name] for step_result in result]).reshape(*shape, *np.shape(value)).swapaxes(0, 1)
-        for name, value in result[0].items()
-        if value is not None
-    }
+            best_choice = jnp.argmax(choice.logits).astype(jnp.int32)
+            action, memory = policy.apply_choice(choice, best_choice, memory.room)
+            result = {"action": action}
+            for name in ("logits", "factual", "counterfactual", "gap", "weights"):
+                result[name] = getattr(choice, name)
+            results.append(result)
+        episodes.append(stack_results(results))
+    return {name: np.stack([episode[name] for episode in episodes], axis=1) for name in episodes[0]}
 
 
-def assert_same(result, expected, rounding_step=0.0):
-    """Two compiled programs agree; where logits are rounded to a grid, one may take the next step of it."""
+def assert_programs_agree(result, expected, rounding_step=0.0):
+    """Check two compiled programs: where logits are rounded to a grid, one may take the next step of it."""
     assert result.keys() == expected.keys()
     np.testing.assert_array_equal(result["action"], expected["action"])
     # (1 + s) a - s a_bar, with s in [0, 1], moves by at most three steps.
-    num_steps = {"factual": 1, "counterfactual": 1, "logits": 3}
+    num_rounding_steps = {"factual": 1, "counterfactual": 1, "logits": 3}
     for name in result:
-        tolerance = 1e-5 + num_steps.get(name, 0) * rounding_step
+        tolerance = 1e-5 + num_rounding_steps.get(name, 0) * rounding_step
         np.testing.assert_allclose(result[name], expected[name], rtol=1e-4, atol=tolerance, err_msg=name)
 
 
 def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
-    out = tmp_path / "out"
-    options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out)]
+    out_dir = tmp_path / "out"
+    options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out_dir)]
     assert main(["export", str(drawn_run.config.run_dir), *options]) == 0
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1")
-    steps: dict[str, Any] = walk(policy)
-    card = (out / "README.md").read_text()
+
+    # The code of the card, in a process that can import neither jaxnav nor flax.
+    steps: dict[str, Any] = draw_steps(policy)
+    np.savez(out_dir / "steps.npz", **steps)
+    card = (out_dir / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
-    np.savez(out / "steps.npz", **steps)
-    subprocess.run([sys.executable, "-c", ALONE.format(code=code)], cwd=out, check=True, timeout=200)
-    result = np.load(out / "found.npz")
-    assert_same({name: result[name] for name in result.files}, expected := acted(policy, steps))
+    subprocess.run([sys.executable, "-c", JAX_ALONE.format(code=code)], cwd=out_dir, check=True, timeout=200)
+
+    # It acts as the policy does, and removes experience.
+    results = np.load(out_dir / "results.npz")
+    expected = act_by_policy(policy, steps)
+    assert_programs_agree({name: results[name] for name in results.files}, expected)
     assert np.ptp(expected["gap"]) > 0.01
-    assert not np.allclose(expected["logits"], expected["factual"])  # experience was removed
-    named = json.loads((out / "step.json").read_text())
-    assert named["actions"][0] == "MoveAhead"
-    assert named["categories"] == list(drawn_run.config.task.categories)
-    assert "* `detections` uint8 [K, 4]: for each category" in card
-    assert "`counterfactual` float32 [6]" in card
-    assert "**Method**: `org`, decision `fused`, layout weights" in card
-    assert f"**Parameters**: {sum(leaf.size for leaf in jax.tree.leaves(policy.params)):,}" in card
+    assert not np.allclose(expected["logits"], expected["factual"])
+
+    # The names of actions, categories and inputs are those of the policy.
+    description = json.loads((out_dir / "step.json").read_text())
+    assert description["actions"][0] == "MoveAhead"
+    assert description["categories"] == list(drawn_run.config.task.categories)
+    num_params = sum(leaf.size for leaf in jax.tree.leaves(policy.params))
+    for fact in ("`detections` uint8 [K, 4]", "`counterfactual` float32 [6]", "`org`", "`fused`", f"{num_params:,}"):
+        assert fact in card
 
 
 @pytest.mark.parametrize(
-    ("method", "decision"),
+    ("method_name", "decision"),
     [
         ("org", "streams"),
         *(
-            pytest.param(method, "streams" if method in ("savn", "sp", "vtnet") else "fused", marks=pytest.mark.slow)
-            for method in METHODS
+            pytest.param(name, "streams" if name in ("savn", "sp", "vtnet") else "fused", marks=pytest.mark.slow)
+            for name in METHODS
         ),
     ],
 )
-def test_exported_program_acts_as_its_policy(method, decision):
+def test_exported_program_acts_as_its_policy(method_name, decision):
+    method = METHODS[method_name]
     direct = "goal" if decision == "streams" else "all"
-    spec = dataclasses.replace(tiny.SPEC, method=METHODS[method], method_sizes=(), decision=decision, direct=direct)
-    learn, method_knowledge = METHODS[method].learn, tiny.knowledge()
-    if learn is not None:
-        learned = learn([tiny.BANK], np.ones((NUM_PRIORS, spec.num_categories, spec.num_categories)))
-        method_knowledge = method_knowledge._replace(method=jax.tree.map(jnp.asarray, learned))
-    setting = tiny.ESTIMATOR if METHODS[method].hosts_layout else None
-    policy = LoadedPolicy(tiny.random_params(2, spec), method_knowledge, spec, setting, tiny.BANK.task)
-    exported, steps = jax.export.deserialize(bytearray(export_program(policy))), walk(policy)
-    memory = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in input_shapes(policy, 3)["memory"].items()}
-    result = []
-    for time in range(STEPS):
-        outputs: Any = exported.call(
-            {"memory": memory} | {name: values[time] for name, values in steps.items()}, np.float32(0.1)
-        )
+    spec = dataclasses.replace(tiny.SPEC, method=method, method_sizes=(), decision=decision, direct=direct)
+    knowledge = tiny.knowledge()
+    if method.learn is not None:
+        learned = method.learn([tiny.BANK], np.ones((NUM_PRIORS, spec.num_categories, spec.num_categories)))
+        knowledge = knowledge._replace(method=jax.tree.map(jnp.asarray, learned))
+    estimator = tiny.ESTIMATOR if method.hosts_layout else None
+    policy = LoadedPolicy(tiny.random_params(2, spec), knowledge, spec, estimator, tiny.BANK.task)
+
+    # The program, read back from its bytes, step by step.
+    exported = jax.export.deserialize(bytearray(export_program(policy)))
+    steps = draw_steps(policy)
+    memory_shapes = input_shapes(policy, NUM_EPISODES)["memory"]
+    memory = {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in memory_shapes.items()}
+    results = []
+    for time in range(NUM_STEPS):
+        inputs = {name: values[time] for name, values in steps.items()}
+        outputs: Any = exported.call({"memory": memory} | inputs, np.float32(0.1))
         memory = outputs.pop("memory")
-        result.append(outputs)
-    stacked = {name: np.stack([step_result[name] for step_result in result]) for name in result[0]}
-    assert_same(stacked, acted(policy, steps), rounding_step=2.0**-10 if decision == "streams" else 0.0)
+        results.append(outputs)
+
+    rounding_step = 2.0**-10 if decision == "streams" else 0.0
+    assert_programs_agree(stack_results(results), act_by_policy(policy, steps), rounding_step)
+
+
+# The export command
 
 
 def test_export_command_copies_policies_and_replaces_earlier_exports(drawn_run, tmp_path):
-    run, out = drawn_run.config.run_dir, tmp_path / "out"
-    assert main(["export", str(run), "--policy", "baseline-1", "--out", str(out)]) == 0
-    policies = [jaxnav.load_policy(folder) for folder in (out, run / POLICIES_DIR / "baseline-1")]
-    chex.assert_trees_all_equal(*policies)
-    assert "no layout weights" in (out / "README.md").read_text()
-    assert main(["export", str(run), "--policy", "baseline-0", "--out", str(out)]) == 0  # replaced
-    assert main(["export", str(run), "--format", "stablehlo", "--out", str(out)]) == 0
-    assert set(contents(out)) == {"README.md", "step.stablehlo", "step.json"}  # nothing of the other format is left
-    assert main(["export", str(run), "--policy", "baseline-0", "--out", str(out)]) == 0
-    assert contents(out)["params.safetensors"] == contents(run / POLICIES_DIR / "baseline-0")["params.safetensors"]
+    run_dir = drawn_run.config.run_dir
+    out_dir = tmp_path / "out"
+
+    def export(*options):
+        assert main(["export", str(run_dir), *options, "--out", str(out_dir)]) == 0
+
+    export("--policy", "baseline-1")
+    exported, original = (jaxnav.load_policy(folder) for folder in (out_dir, run_dir / POLICIES_DIR / "baseline-1"))
+    chex.assert_trees_all_equal(exported, original)
+    assert "no layout weights" in (out_dir / "README.md").read_text()
+
+    # An export in another format leaves nothing of the one before.
+    export("--policy", "baseline-0")
+    export("--format", "stablehlo")
+    assert set(contents(out_dir)) == {"README.md", "step.stablehlo", "step.json"}
+    export("--policy", "baseline-0")
+    params_name = "params.safetensors"
+    assert contents(out_dir)[params_name] == contents(run_dir / POLICIES_DIR / "baseline-0")[params_name]
 
 
 @pytest.mark.parametrize(
     ("options", "mend"),
     [
         (["--policy", "layout-9"], "has baseline-0, baseline-1, layout-0, layout-1"),
-        (["--out", "."], "is there and holds no export; give another --out"),
-        (["--out", "mine"], "is there and holds no export; give another --out"),
-        (["--out", "file"], "is there and holds no export; give another --out"),
+        (["--out", "."], "give another --out"),
+        (["--out", "mine"], "give another --out"),
+        (["--out", "file"], "give another --out"),
         (["--out", "file/out"], "cannot be written"),
     ],
 )
 def test_export_refuses_unknown_policies_and_foreign_folders(drawn_run, tmp_path, monkeypatch, capsys, options, mend):
+    run_dir = drawn_run.config.run_dir.absolute()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "README.md").write_text("a project of one's own")
-    assert main(["export", str(drawn_run.config.run_dir.absolute()), *options]) == 2
+    assert main(["export", str(run_dir), *options]) == 2
     assert mend in refusal(capsys)
     assert contents(tmp_path) == {"file": b"", "mine/README.md": b"a project of one's own"}
 
 
 def test_export_of_a_program_names_the_extra_without_flatbuffers(drawn_run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(jax.export.Exported, "serialize", nothing_there)
-    out = tmp_path / "out"
-    assert main(["export", str(drawn_run.config.run_dir), "--format", "stablehlo", "--out", str(out)]) == 2
-    assert "needs flatbuffers; install it by: pip install 'jaxnav[export]'" in refusal(capsys)
-    assert not out.exists()
+    def raise_import_error(_):
+        raise ImportError("flatbuffers")
 
-
-def nothing_there(_):
-    raise ImportError("flatbuffers")
+    monkeypatch.setattr(jax.export.Exported, "serialize", raise_import_error)
+    out_dir = tmp_path / "out"
+    assert main(["export", str(drawn_run.config.run_dir), "--format", "stablehlo", "--out", str(out_dir)]) == 2
+    assert_message_names(refusal(capsys), "flatbuffers", "pip install 'jaxnav[export]'")
+    assert not out_dir.exists()
