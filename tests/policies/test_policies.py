@@ -25,29 +25,30 @@ from jaxnav.scenes.lattice import NUM_ACTIONS
 from jaxnav.store.export import export_params
 
 REPOSITORY = Path(__file__).parents[2]
-K = len(CATEGORIES)
-BATCH = 12
+NUM_CATEGORIES = len(CATEGORIES)
+BATCH_SIZE = 12
 #: Weights of the layout that differ from one and from another.
-WEIGHTS = jnp.linspace(0.1, 1.6, BATCH * K).reshape(BATCH, K)
+LAYOUT_WEIGHTS = jnp.linspace(0.1, 1.6, BATCH_SIZE * NUM_CATEGORIES).reshape(BATCH_SIZE, NUM_CATEGORIES)
 
 
-def batch(seed=0):
-    """Observations of random poses, and memories in the middle of an episode."""
-    generator = np.random.default_rng(seed)
-    pose = generator.integers(0, len(BANK.rows), BATCH)
-    observation = Observation(row=jnp.asarray(BANK.rows[pose]), goal=jnp.asarray(generator.integers(0, K, BATCH)))
-    hidden = jnp.asarray(generator.normal(size=(BATCH, SIZES.hidden)), jnp.float32)
-    action = jnp.asarray(generator.integers(0, NUM_ACTIONS + 1, BATCH), jnp.int32)
+def random_batch(seed=0):
+    """Observations of random poses and memories in the middle of an episode, leaves [BATCH_SIZE, ...]."""
+    rng = np.random.default_rng(seed)
+    pose = rng.integers(0, len(BANK.rows), BATCH_SIZE)
+    observation = Observation(
+        row=jnp.asarray(BANK.rows[pose]), goal=jnp.asarray(rng.integers(0, NUM_CATEGORIES, BATCH_SIZE))
+    )
+    hidden = jnp.asarray(rng.normal(size=(BATCH_SIZE, SIZES.hidden)), jnp.float32)
+    action = jnp.asarray(rng.integers(0, NUM_ACTIONS + 1, BATCH_SIZE), jnp.int32)
     return observation, PolicyState(hidden=hidden, action=action)
 
 
-class Compiled:
+class CompiledPolicy:
     """A policy with compiled methods."""
 
-    def __init__(self, method):
-        spec = dataclasses.replace(
-            SPEC, method=find_method(method), method_sizes=SPEC.method_sizes if method == "org" else ()
-        )
+    def __init__(self, method_name):
+        method_sizes = SPEC.method_sizes if method_name == "org" else ()
+        spec = dataclasses.replace(SPEC, method=find_method(method_name), method_sizes=method_sizes)
         policy = bind(spec, random_params(0, spec))
         self.experience_width = policy.method.width
         self.pathways = jax.jit(lambda *inputs: policy.pathways(PolicyInputs(*inputs)))
@@ -57,26 +58,27 @@ class Compiled:
 
 @pytest.fixture(scope="module", params=["rgb", "org"])
 def policy(request):
-    return Compiled(request.param)
+    return CompiledPolicy(request.param)
 
 
 @pytest.fixture(scope="module")
 def org():
-    return Compiled("org")
+    return CompiledPolicy("org")
 
 
 # Pathways and decisions
 
 
 @pytest.mark.parametrize("shape", [(), (3, 4)])
-def test_shapes(policy, shape):
-    observation, memory = jax.tree.map(lambda x: x.reshape(BATCH, -1)[: np.prod(shape, dtype=int)], batch())
+def test_pathways_and_decision_keep_the_batch_shape(policy, shape):
+    num_members = np.prod(shape, dtype=int)
+    observation, memory = jax.tree.map(lambda leaf: leaf.reshape(BATCH_SIZE, -1)[:num_members], random_batch())
     observation = Observation(row=observation.row.reshape(*shape, -1), goal=observation.goal.reshape(shape))
     memory = PolicyState(hidden=memory.hidden.reshape(*shape, -1), action=memory.action.reshape(shape))
-    pathways = policy.pathways(observation, jnp.ones((*shape, K)))
+    pathways = policy.pathways(observation, jnp.ones((*shape, NUM_CATEGORIES)))
     decision = policy.decide(pathways, memory)
     chex.assert_shape(pathways.scene, (*shape, SIZES.view_outputs))
-    chex.assert_shape(pathways.goal, (*shape, K * SIZES.row_outputs + SIZES.appearance))
+    chex.assert_shape(pathways.goal, (*shape, NUM_CATEGORIES * SIZES.row_outputs + SIZES.appearance))
     chex.assert_shape(pathways.experience, (*shape, policy.experience_width))
     chex.assert_shape(decision.logits, (*shape, NUM_ACTIONS))
     chex.assert_shape(decision.value, shape)
@@ -84,42 +86,41 @@ def test_shapes(policy, shape):
     chex.assert_type(jax.tree.leaves((pathways, decision)), jnp.float32)
 
 
-def test_a_batch_is_its_single_members(policy):
-    observation, memory = batch()
-    pathways = policy.pathways(observation, WEIGHTS)
+def test_batch_decides_as_its_single_members(policy):
+    observation, memory = random_batch()
+    pathways = policy.pathways(observation, LAYOUT_WEIGHTS)
     decision = policy.decide(pathways, memory)
     assert float(decision.logits.std()) > 0.1  # lively, so that the comparison says something
-    for i in range(BATCH):
-        own = policy.pathways(leaves_at(observation, i), WEIGHTS[i])
-        chex.assert_trees_all_close(own, leaves_at(pathways, i), rtol=1e-5, atol=1e-6)
-        chex.assert_trees_all_close(
-            policy.decide(own, leaves_at(memory, i)), leaves_at(decision, i), rtol=1e-5, atol=1e-6
-        )
+    for index in range(BATCH_SIZE):
+        single_pathways = policy.pathways(leaves_at(observation, index), LAYOUT_WEIGHTS[index])
+        single_decision = policy.decide(single_pathways, leaves_at(memory, index))
+        chex.assert_trees_all_close(single_pathways, leaves_at(pathways, index), rtol=1e-5, atol=1e-6)
+        chex.assert_trees_all_close(single_decision, leaves_at(decision, index), rtol=1e-5, atol=1e-6)
 
 
-def test_an_episode_begins_with_nothing_remembered_and_no_action(org):
+def test_initial_memory_is_zero_with_no_previous_action(org):
     memory = org.initial_memory((2, 3))
     np.testing.assert_array_equal(memory.hidden, np.zeros((2, 3, SIZES.hidden)))
     np.testing.assert_array_equal(memory.action, np.full((2, 3), NO_ACTION))
     assert NO_ACTION == NUM_ACTIONS  # one past the actions: its one-hot vector is zero
 
 
-def test_the_first_policy_is_close_to_uniform_but_seldom_done():
+def test_fresh_policy_is_close_to_uniform_with_a_rare_done():
     weights = init_params(SPEC, jax.random.key(0))
-    for i, row in enumerate(BANK.rows[::16]):
-        logits = decide(weights, row, i % K, WEIGHTS[0], PolicyState(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION)))[
-            0
-        ].logits
-        assert 0 < np.abs(np.asarray(logits) - [0, 0, 0, 0, 0, INITIAL_DONE_LOGIT]).max() < 0.1
-    assert 1 / 70 < np.exp(INITIAL_DONE_LOGIT) / (5 + np.exp(INITIAL_DONE_LOGIT)) < 1 / 50
+    memory = PolicyState(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION))
+    for index, row in enumerate(BANK.rows[::16]):
+        factual, _ = decide(weights, row, index % NUM_CATEGORIES, LAYOUT_WEIGHTS[0], memory)
+        assert 0 < np.abs(np.asarray(factual.logits) - [0, 0, 0, 0, 0, INITIAL_DONE_LOGIT]).max() < 0.1
+    done_probability = np.exp(INITIAL_DONE_LOGIT) / (5 + np.exp(INITIAL_DONE_LOGIT))
+    assert 1 / 70 < done_probability < 1 / 50
 
 
 # Interventions
 
 
-def test_an_intervention_leaves_experience_factual(org):
-    observation, _ = batch()
-    pathways = org.pathways(observation, WEIGHTS)
+def test_do_zeroes_scene_and_goal_and_keeps_experience(org):
+    observation, _ = random_batch()
+    pathways = org.pathways(observation, LAYOUT_WEIGHTS)
     counterfactual = do(pathways, scene=0.0, goal=0.0)
     assert counterfactual.experience is pathways.experience
     assert not counterfactual.scene.any()
@@ -129,83 +130,91 @@ def test_an_intervention_leaves_experience_factual(org):
 
 
 def test_counterfactual_logits_depend_on_experience_memory_and_previous_action_alone(org):
-    (observation, memory), (another, _) = batch(0), batch(1)
-    here, elsewhere = (org.pathways(o, WEIGHTS) for o in (observation, another))
+    observation, memory = random_batch(0)
+    other_observation, _ = random_batch(1)
+    pathways = org.pathways(observation, LAYOUT_WEIGHTS)
+    other_pathways = org.pathways(other_observation, LAYOUT_WEIGHTS)
 
-    def counterfactual(pathways, memory):
+    def counterfactual_logits(pathways, memory):
         return org.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
 
-    logits = counterfactual(here, memory)
-    # The view, the direct detections and what is sought come from somewhere else: the same bits.
-    same = counterfactual(elsewhere._replace(experience=here.experience), memory)
-    np.testing.assert_array_equal(same, logits)
-    # The factual logits do differ, and so do the counterfactual ones when any of the three is changed.
-    mixed = elsewhere._replace(experience=here.experience)
-    assert np.abs(org.decide(mixed, memory).logits - org.decide(here, memory).logits).max() > 0.01
-    for changed in (
-        counterfactual(elsewhere, memory),
-        counterfactual(here, memory._replace(hidden=-memory.hidden)),
-        counterfactual(here, memory._replace(action=(memory.action + 1) % NUM_ACTIONS)),
+    # With the view, the direct detections and the goal of other poses, the factual logits differ and the
+    # counterfactual ones are equal to the bit.
+    logits = counterfactual_logits(pathways, memory)
+    mixed_pathways = other_pathways._replace(experience=pathways.experience)
+    np.testing.assert_array_equal(counterfactual_logits(mixed_pathways, memory), logits)
+    factual_change = org.decide(mixed_pathways, memory).logits - org.decide(pathways, memory).logits
+    assert np.abs(factual_change).max() > 0.01
+
+    # Another experience, memory or previous action changes them.
+    for changed_logits in (
+        counterfactual_logits(other_pathways, memory),
+        counterfactual_logits(pathways, memory._replace(hidden=-memory.hidden)),
+        counterfactual_logits(pathways, memory._replace(action=(memory.action + 1) % NUM_ACTIONS)),
     ):
-        assert (np.abs(changed - logits).max(axis=-1) > 1e-4).sum() > BATCH / 2
+        assert (np.abs(changed_logits - logits).max(axis=-1) > 1e-4).sum() > BATCH_SIZE / 2
 
 
 def test_layout_weights_change_experience_alone(org):
-    observation, _ = batch()
-    plain, weighted = org.pathways(observation, jnp.ones((BATCH, K))), org.pathways(observation, WEIGHTS)
-    chex.assert_trees_all_equal(weighted[:2], plain[:2])
-    assert np.abs(weighted.experience - plain.experience).max() > 0.01
+    observation, _ = random_batch()
+    pathways = org.pathways(observation, jnp.ones((BATCH_SIZE, NUM_CATEGORIES)))
+    weighted_pathways = org.pathways(observation, LAYOUT_WEIGHTS)
+    chex.assert_trees_all_equal(weighted_pathways[:2], pathways[:2])
+    assert np.abs(weighted_pathways.experience - pathways.experience).max() > 0.01
 
 
-def test_the_weight_of_a_category_changes_its_own_part_of_the_experience(org):
-    observation, _ = batch()
-    before = org.pathways(observation, WEIGHTS).experience.reshape(BATCH, K, SIZES.row_outputs)
-    after = org.pathways(observation, WEIGHTS.at[:, 1].set(3.0)).experience.reshape(BATCH, K, SIZES.row_outputs)
-    np.testing.assert_allclose(after[:, [0, 2]], before[:, [0, 2]], rtol=1e-6, atol=1e-7)
-    assert np.abs(after[:, 1] - before[:, 1]).max() > 0.01
+def test_layout_weight_changes_only_its_category_of_the_experience(org):
+    observation, _ = random_batch()
+    row_shape = (BATCH_SIZE, NUM_CATEGORIES, SIZES.row_outputs)
+    changed_weights = LAYOUT_WEIGHTS.at[:, 1].set(3.0)
+    experience = org.pathways(observation, LAYOUT_WEIGHTS).experience.reshape(row_shape)
+    changed_experience = org.pathways(observation, changed_weights).experience.reshape(row_shape)
+    np.testing.assert_allclose(changed_experience[:, [0, 2]], experience[:, [0, 2]], rtol=1e-6, atol=1e-7)
+    assert np.abs(changed_experience[:, 1] - experience[:, 1]).max() > 0.01
 
 
-def test_no_gradient_flows_into_the_layout(org):
-    observation, memory = batch()
+def test_layout_weights_have_no_gradient(org):
+    observation, memory = random_batch()
 
-    def loss(weights):
-        return org.decide(org.pathways(observation, weights), memory).logits[:, 0].sum()
+    def loss(layout_weights):
+        return org.decide(org.pathways(observation, layout_weights), memory).logits[:, 0].sum()
 
-    np.testing.assert_array_equal(jax.grad(loss)(WEIGHTS), np.zeros((BATCH, K)))
-    assert abs(float(loss(WEIGHTS) - loss(2 * WEIGHTS))) > 1e-3  # though the weights do matter
+    np.testing.assert_array_equal(jax.grad(loss)(LAYOUT_WEIGHTS), np.zeros((BATCH_SIZE, NUM_CATEGORIES)))
+    assert abs(float(loss(LAYOUT_WEIGHTS) - loss(2 * LAYOUT_WEIGHTS))) > 1e-3  # though the weights do matter
 
 
 def test_rgb_has_no_experience():
-    policy, (observation, _) = Compiled("rgb"), batch()
-    plain = policy.pathways(observation, jnp.ones((BATCH, K)))
-    assert plain.experience.shape == (BATCH, 0)
-    chex.assert_trees_all_equal(policy.pathways(observation, WEIGHTS), plain)
+    policy = CompiledPolicy("rgb")
+    observation, _ = random_batch()
+    pathways = policy.pathways(observation, jnp.ones((BATCH_SIZE, NUM_CATEGORIES)))
+    assert pathways.experience.shape == (BATCH_SIZE, 0)
+    chex.assert_trees_all_equal(policy.pathways(observation, LAYOUT_WEIGHTS), pathways)
 
 
 # Parameters
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_parameters_are_plain_data_and_come_back(method):
-    spec = PolicySpec(method=find_method(method), num_categories=K, sizes=SIZES)
+def test_init_params_gives_nested_dicts_that_bind_takes_over(method):
+    spec = PolicySpec(method=find_method(method), num_categories=NUM_CATEGORIES, sizes=SIZES)
     params = init_params(spec, jax.random.key(3))
 
-    def check(node):
+    def assert_plain_data(node):
         assert type(node) is dict
         for name, value in node.items():
             assert type(name) is str
             if isinstance(value, dict):
-                check(value)
+                assert_plain_data(value)
             else:
                 assert isinstance(value, jax.Array)
                 assert value.dtype == jnp.float32
                 assert value.size > 0
 
-    check(params)
+    assert_plain_data(params)
     chex.assert_trees_all_equal(nnx.to_pure_dict(nnx.state(bind(spec, params), nnx.Param)), params)
     chex.assert_trees_all_equal(init_params(spec, jax.random.key(3)), params)
-    other = init_params(spec, jax.random.key(4))
-    assert not np.array_equal(other["fuse"]["kernel"], params["fuse"]["kernel"])
+    other_params = init_params(spec, jax.random.key(4))
+    assert not np.array_equal(other_params["fuse"]["kernel"], params["fuse"]["kernel"])
 
 
 # Says what was imported, then the logits of an exported policy.
@@ -232,13 +241,13 @@ print(json.dumps({"modules": sorted(sys.modules), "logits": decision.logits.toli
 
 
 @pytest.mark.slow
-def test_an_exported_policy_runs_without_the_trainer(tmp_path, org):
-    export_params(tmp_path / "policy", random_params(0), SPEC.to_json() | {"num_categories": K})
-    observation, _ = batch()
-    np.savez(tmp_path / "given.npz", row=observation.row, goal=observation.goal, weights=WEIGHTS)
+def test_exported_policy_decides_without_importing_the_trainer(tmp_path, org):
+    export_params(tmp_path / "policy", random_params(0), SPEC.to_json() | {"num_categories": NUM_CATEGORIES})
+    observation, _ = random_batch()
+    np.savez(tmp_path / "given.npz", row=observation.row, goal=observation.goal, weights=LAYOUT_WEIGHTS)
     command = [sys.executable, "-c", USE_EXPORT, str(tmp_path / "policy"), str(tmp_path / "given.npz")]
     output = json.loads(subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout)
-    expected = org.decide(org.pathways(observation, WEIGHTS), org.initial_memory((BATCH,))).logits
+    expected = org.decide(org.pathways(observation, LAYOUT_WEIGHTS), org.initial_memory((BATCH_SIZE,))).logits
     np.testing.assert_allclose(output["logits"], expected, rtol=1e-5, atol=1e-6)
-    heavy = {"matplotlib", "orbax", "tyro", "PIL", "jaxnav.training", "jaxnav.evaluation", "jaxnav.cli"}
-    assert not heavy & set(output["modules"])
+    heavy_modules = {"matplotlib", "orbax", "tyro", "PIL", "jaxnav.training", "jaxnav.evaluation", "jaxnav.cli"}
+    assert not heavy_modules & set(output["modules"])
