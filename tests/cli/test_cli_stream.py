@@ -64,7 +64,8 @@ def test_streamed_banks_are_padded_to_one_shape(world):
 
 
 def test_draw_bank_order_visits_every_bank_once_per_pass(world):
-    order, other = draw_bank_order(world, 1, 30), draw_bank_order(world, 2, 30)
+    order = draw_bank_order(world, 1, 30)
+    other = draw_bank_order(world, 2, 30)
     passes = [tuple(order[start : start + 3]) for start in range(0, 30, 3)]
     assert all(sorted(one) == [0, 1, 2] for one in passes)
     assert len(set(passes)) > 2
@@ -73,7 +74,8 @@ def test_draw_bank_order_visits_every_bank_once_per_pass(world):
 
 
 def test_prefetch_env_params_reads_one_bank_ahead(world, monkeypatch):
-    asked, params = [], type(world).make_env_params
+    asked = []
+    params = type(world).make_env_params
     monkeypatch.setattr(type(world), "make_env_params", lambda self, bank: asked.append(bank) or params(self, bank))
     order = [2, 0, 0, 1]
     given = prefetch_env_params(world, order)
@@ -106,7 +108,9 @@ def test_trainer_restart_draws_new_episodes_and_keeps_the_learner(world):
 @pytest.mark.slow
 def test_streamed_run_resumes_bit_for_bit(finished, config_file, cache, tmp_path, monkeypatch, capsys):
     """8 updates in chunks of 2 go through four turns of three shards; the second half comes after a stop."""
-    stopped, calls, whole = tmp_path / "stopped", [], Trainer.train
+    stopped = tmp_path / "stopped"
+    calls = []
+    whole = Trainer.train
 
     def train_twice(self, states, params, stage):
         calls.append(1)

@@ -42,7 +42,8 @@ def whole(tmp_path_factory):
 
 @pytest.mark.slow
 def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
-    config_file, ended = write_config(tmp_path), tmp_path / "ended"
+    config_file = write_config(tmp_path)
+    ended = tmp_path / "ended"
     process = run(["train.py", "--config", config_file, "--run-dir", ended, *LONG])
     while process.poll() is None and not (ended / "metrics.jsonl").exists():
         time.sleep(0.02)
@@ -66,8 +67,10 @@ def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
 @pytest.mark.slow
 def test_signal_to_one_process_ends_both_at_the_same_chunk(tmp_path):
     """Both save the same chunk, end with the code of the signal, and go on together."""
-    config_file, ended = write_config(tmp_path), tmp_path / "ended"
-    address, again = free_address(), free_address()
+    config_file = write_config(tmp_path)
+    ended = tmp_path / "ended"
+    address = free_address()
+    again = free_address()
     both = [start(address, index, config_file, ended, *LONG) for index in range(2)]
     while all(process.poll() is None for process in both) and not (ended / "metrics.jsonl").exists():
         time.sleep(0.02)
@@ -107,7 +110,9 @@ def test_interrupts_keep_an_ignored_signal_ignored():
 @pytest.mark.slow
 def test_signal_during_the_last_save_is_reported(tmp_path, capsys, monkeypatch):
     """The run is saved and not exported; the same command exports it."""
-    config_file, run_dir, whole_save = write_config(tmp_path), tmp_path / "run", updates.save_checkpoint
+    config_file = write_config(tmp_path)
+    run_dir = tmp_path / "run"
+    whole_save = updates.save_checkpoint
 
     def interrupted(folder, step, *rest):
         if step == 4:  # the last

@@ -31,7 +31,9 @@ def finish(process):
 def test_killed_run_resumes_bit_for_bit(tmp_path):
     config_file = write_config(tmp_path)
     cache, long = tmp_path / "cache", ("--total-steps", "7680", "--validations", "6")  # 60 updates, 30 chunks
-    whole, killed, other = tmp_path / "whole", tmp_path / "killed", tmp_path / "other"
+    whole = tmp_path / "whole"
+    killed = tmp_path / "killed"
+    other = tmp_path / "other"
     finish(start(config_file, whole, cache, *long))
     generator = random.Random(0)
     for seen in (0, 2, 24):  # the update after whose checkpoint it is killed, at a random moment

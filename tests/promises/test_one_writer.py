@@ -117,7 +117,9 @@ def test_lock_run_dir_reports_a_removed_directory_before_other_errors(tmp_path):
 
 @pytest.mark.slow
 def test_train_refuses_a_second_process_and_ends_when_its_directory_is_removed(tmp_path, capsys):
-    config_file, run_dir, long = write_config(tmp_path), tmp_path / "run", ("--total-steps", 10**6)
+    config_file = write_config(tmp_path)
+    run_dir = tmp_path / "run"
+    long = ("--total-steps", 10**6)
     process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *long, "--save-every", 1000])
     while process.poll() is None and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.05)

@@ -22,7 +22,9 @@ from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, Transition, collect_rollout
 
-GOALS, UPDATES, GAMMA = len(tiny.CATEGORIES), 80, 0.5
+GOALS = len(tiny.CATEGORIES)
+UPDATES = 80
+GAMMA = 0.5
 RIGHT = 3  # the action that pays where one does
 
 
@@ -125,7 +127,8 @@ def values(t: Transition) -> dict[tuple[int, int], np.ndarray]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_ppo_learns_value_and_choice_of_each_probe(rollouts, name):
-    case, t = CASES[name], rollouts[name]
+    case = CASES[name]
+    t = rollouts[name]
     result = values(t)
     assert result.keys() == case.value.keys()
     # A value depends on the recurrent state too, by how much on the rounding of the processor. A missing discount
@@ -156,7 +159,8 @@ def test_training_success_stays_within_stored_bounds(seed):
     """A random policy soon says Done and is right by chance; a trained one finds the goals within 20 steps."""
     params = PARAMS.replace(step_limit=jnp.full(2, 20, jnp.int32))
     train = jax.jit(functools.partial(LEARNER.train, num_updates=20))
-    state, success = jax.jit(LEARNER.init)(jax.random.key(seed), params, KNOWLEDGE), {}
+    state = jax.jit(LEARNER.init)(jax.random.key(seed), params, KNOWLEDGE)
+    success = {}
     for begin in range(0, 400, 20):
         state, metrics = train(state, CONFIG.scalars(400), params, KNOWLEDGE)
         success[begin, begin + 20] = float(metrics["success"])

@@ -8,7 +8,8 @@ import jaxnav
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.run import Run
 
-EPSILON, EPISODES = np.linspace(0, 1, 11), 24
+EPSILON = np.linspace(0, 1, 11)
+EPISODES = 24
 
 
 @pytest.fixture(scope="session")

@@ -20,11 +20,16 @@ def test_account_has_a_lead_per_row_and_metric(evaluated, halved):
     entries = measure_leads(evaluated, halved)
     assert {entry.metric for entry in entries} == {"sr", "spl", "sr@20", "sr@50"}
     assert len(entries) == 28 * 4  # neither Random nor the shortest path
-    rows, metrics, without = evaluated.rows, evaluated.metrics()["sr"], halved.metrics()["sr"]
-    plain = {row.decoding: i for i, row in enumerate(rows) if row.variant == "baseline"}
-    means = [entry.lead.mean for entry in entries if entry.metric == "sr"]
-    expected = [100 * (metrics[i].mean() - without[plain[row.decoding]].mean()) for i, row in enumerate(rows[:28])]
-    np.testing.assert_allclose(means, expected, rtol=1e-12, atol=1e-12)
+    rows = evaluated.rows
+    metrics = evaluated.metrics()["sr"]
+    halved_metrics = halved.metrics()["sr"]
+    baseline_rows = {row.decoding: i for i, row in enumerate(rows) if row.variant == "baseline"}
+    mean_leads = [entry.lead.mean for entry in entries if entry.metric == "sr"]
+    expected_leads = [
+        100 * (metrics[i].mean() - halved_metrics[baseline_rows[row.decoding]].mean())
+        for i, row in enumerate(rows[:28])
+    ]
+    np.testing.assert_allclose(mean_leads, expected_leads, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -43,12 +48,12 @@ def test_account_of_a_run_over_itself_is_zero(evaluated):
 
 @pytest.mark.slow
 def test_account_refuses_runs_that_differ(evaluated):
-    fewer = evaluated._replace(outcome=type(evaluated.outcome)(*(leaf[:, :1] for leaf in evaluated.outcome)))
+    one_seed_results = evaluated._replace(outcome=type(evaluated.outcome)(*(leaf[:, :1] for leaf in evaluated.outcome)))
     with pytest.raises(InputError, match="2 seeds with experience and 1 without"):
-        measure_leads(evaluated, fewer)
-    goals = evaluated.episodes._replace(goal=evaluated.episodes.goal[::-1])
+        measure_leads(evaluated, one_seed_results)
+    reversed_goals = evaluated.episodes._replace(goal=evaluated.episodes.goal[::-1])
     with pytest.raises(InputError, match="do not meet the same episodes"):
-        measure_leads(evaluated, evaluated._replace(episodes=goals))
-    layouts = evaluated._replace(rows=[row for row in evaluated.rows if row.variant != "baseline"])
+        measure_leads(evaluated, evaluated._replace(episodes=reversed_goals))
+    layout_rows = evaluated._replace(rows=[row for row in evaluated.rows if row.variant != "baseline"])
     with pytest.raises(InputError, match="no arm `baseline`"):
-        measure_leads(evaluated, layouts)
+        measure_leads(evaluated, layout_rows)

@@ -85,7 +85,8 @@ def test_staged_run_resumes_between_its_stages(method, config, tmp_path, monkeyp
     sizes = sizes if method == "vtnet" else {"tentative_width": 8}
     options = {"method": method, "method_sizes": sizes, "imitation": 0.5, "arms": ("baseline",), "seeds": 1}
     config = dataclasses.replace(config, **options, validations=2, val_episodes=4, run_dir=tmp_path / "whole")
-    asked, measure = [], Validator.measure
+    asked = []
+    measure = Validator.measure
     with monkeypatch.context() as patch:
         patch.setattr(Validator, "measure", lambda *given: asked.append(given[2]) or measure(*given))
         run = train(config)

@@ -75,10 +75,8 @@ def test_with_estimator_refuses_gaps_without_learned_cooccurrence(drawn_run):
 def test_with_estimator_holds_the_gap_of_every_estimator(drawn_run):
     policies = drawn_run.policies()
     for name in (None, "evidence", "released", "clock"):
-        plain, held = (
-            policies.with_estimator(name).estimator_config,
-            policies.with_estimator(name, hold=True).estimator_config,
-        )
+        plain = policies.with_estimator(name).estimator_config
+        held = policies.with_estimator(name, hold=True).estimator_config
         assert held == dataclasses.replace(plain, hold=True)
     with pytest.raises(InputError, match="--hold: needs policies with the layout"):
         policies._replace(estimator_config=None).with_estimator(None, hold=True)

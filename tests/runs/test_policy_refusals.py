@@ -20,7 +20,7 @@ def export(drawn_run, tmp_path):
     return shutil.copytree(drawn_run.config.run_dir / POLICIES_DIR / "layout-0", tmp_path / "layout-0")
 
 
-def refused(folder):
+def refusal_of(folder):
     """The message of the refusal, one line that begins with the path."""
     with pytest.raises(InputError) as error:
         jaxnav.load_policy(folder)
@@ -30,7 +30,7 @@ def refused(folder):
     return message
 
 
-def respecified(export, **changes):
+def change_spec(export, **changes):
     """The export with something changed in its spec."""
     with resigned(export / "policy.json") as policy:
         policy["spec"] |= changes
@@ -39,18 +39,18 @@ def respecified(export, **changes):
 
 def test_load_policy_refuses_folders_without_an_export(tmp_path, drawn_run):
     for folder in (tmp_path, tmp_path / "none", drawn_run.config.run_dir, str(tmp_path)):
-        assert "not an exported policy (No such file or directory: " in refused(folder)
+        assert "not an exported policy (No such file or directory: " in refusal_of(folder)
 
 
 def test_load_policy_refuses_damaged_exports(export):
     data = bytearray((export / "params.safetensors").read_bytes())
     data[-1] ^= 1
     (export / "params.safetensors").write_bytes(data)
-    assert "does not belong to policy.json or is damaged; export the policy again" in refused(export)
+    assert "does not belong to policy.json or is damaged; export the policy again" in refusal_of(export)
     (export / "policy.json").write_text((export / "policy.json").read_text()[:-9])
-    assert "not JSON" in refused(export)
+    assert "not JSON" in refusal_of(export)
     (export / "policy.json").unlink()
-    assert "not an exported policy" in refused(export)
+    assert "not an exported policy" in refusal_of(export)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_load_policy_refuses_damaged_exports(export):
 )
 def test_load_policy_refuses_exports_of_other_code(export, changes, problem):
     assert jaxnav.load_policy(export).spec.method.name == "org"
-    message = refused(respecified(export, **changes))
+    message = refusal_of(change_spec(export, **changes))
     assert problem in message
     assert any(mend in message for mend in ("install or mend its package", "choose one of", "train the run anew"))
 
@@ -88,12 +88,12 @@ def test_load_policy_refuses_exports_of_other_code(export, changes, problem):
 def test_load_policy_refuses_learned_arrays_that_do_not_fit_the_method(
     drawn_run, export, tmp_path, method, learned, problem
 ):
-    tensors, spec = load_params(export)
+    exported_params, spec = load_params(export)
     config = dataclasses.replace(drawn_run.config, method=method)
     policy = init_params(config.policy_spec(len(spec["categories"])), jax.random.key(0))
     folder = tmp_path / "other"
-    export_params(folder, tensors | {"policy": policy, "knowledge": learned}, spec | {"method": method})
-    message = refused(folder)
+    export_params(folder, exported_params | {"policy": policy, "knowledge": learned}, spec | {"method": method})
+    message = refusal_of(folder)
     assert f"what method {method!r} learned before training does not fit it ({problem}" in message
     assert message.endswith("; train the run anew")
 

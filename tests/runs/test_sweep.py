@@ -28,7 +28,8 @@ def swept(drawn_run):
 
 @pytest.mark.parametrize("decoding", DECODINGS)
 def test_sweep_equals_the_stde_rows_of_an_evaluation(swept, evaluated, decoding):
-    sweep, metrics = swept[decoding], evaluated.metrics()
+    sweep = swept[decoding]
+    metrics = evaluated.metrics()
     assert sweep.compilations == 1
     np.testing.assert_array_equal(sweep.epsilon, EPSILON)
     rows = np.array([evaluated.rows.index(EvaluationRow("stde", epsilon, "residual", decoding)) for epsilon in EPSILON])
@@ -40,9 +41,9 @@ def test_sweep_equals_the_stde_rows_of_an_evaluation(swept, evaluated, decoding)
 
 @pytest.mark.parametrize("decoding", DECODINGS)
 def test_sweep_removes_nothing_from_epsilon_1_on(swept, evaluated, decoding):
-    weights = swept[decoding].outcome.mean_weight.mean((1, 2))
-    assert weights[-1] == 0
-    assert (np.diff(weights) < 0).all()
+    mean_weights = swept[decoding].outcome.mean_weight.mean((1, 2))
+    assert mean_weights[-1] == 0
+    assert (np.diff(mean_weights) < 0).all()
     layout = evaluated.rows.index(EvaluationRow("layout", None, None, decoding))
     row = _row(evaluated.outcome, layout)
     chex.assert_trees_all_equal(_row(swept[decoding].outcome, -1), row)
@@ -52,7 +53,7 @@ def test_sweep_removes_nothing_from_epsilon_1_on(swept, evaluated, decoding):
 @pytest.mark.slow
 def test_sweep_evaluates_the_given_parameters(swept, drawn_run):
     params = drawn_run.policies(("layout",)).params
-    again = {
+    repeated_outcomes = {
         name: jaxnav.sweep(drawn_run, EPSILON, own, episodes=EPISODES).outcome
         for name, own in {
             "same": params,
@@ -61,9 +62,9 @@ def test_sweep_evaluates_the_given_parameters(swept, drawn_run):
         }.items()
     }
     outcome = swept["argmax"].outcome
-    chex.assert_trees_all_equal(again["same"], outcome)
-    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[:, ::-1], again["reversed"]), outcome)
-    assert (again["other"].length != outcome.length).any()
+    chex.assert_trees_all_equal(repeated_outcomes["same"], outcome)
+    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[:, ::-1], repeated_outcomes["reversed"]), outcome)
+    assert (repeated_outcomes["other"].length != outcome.length).any()
 
 
 @pytest.mark.parametrize(
@@ -89,6 +90,6 @@ def test_sweep_refuses_runs_without_the_layout(drawn_run, tmp_path):
     baseline = Run(dataclasses.replace(drawn_run.config, arms=("baseline",)))
     with pytest.raises(InputError, match="was trained without the arm 'layout'; train one with all --arms"):
         jaxnav.sweep(baseline, EPSILON)
-    unfinished = Run(dataclasses.replace(drawn_run.config, run_dir=tmp_path))
+    unfinished_run = Run(dataclasses.replace(drawn_run.config, run_dir=tmp_path))
     with pytest.raises(InputError, match="layout-0: is missing, so training has not finished"):
-        jaxnav.sweep(unfinished, EPSILON)
+        jaxnav.sweep(unfinished_run, EPSILON)

@@ -24,7 +24,8 @@ QUIET = Console(quiet=True)
 @pytest.fixture(scope="module")
 def validated(drawn_run):
     """The validator of a run, and its policies as training holds them."""
-    config, policies = dataclasses.replace(drawn_run.config, val_episodes=12), drawn_run.policies()
+    config = dataclasses.replace(drawn_run.config, val_episodes=12)
+    policies = drawn_run.policies()
     training = compile_training_world(config, QUIET)
     validator = Validator(config, policies.make_agent_loop(training), policies.knowledge, training, QUIET)
     held = {
@@ -57,7 +58,8 @@ def test_validator_equals_evaluation_on_the_same_episodes(validated):
 @pytest.mark.slow
 def test_success_by_budget_grows_to_the_validation_success(validated):
     _, policies, validator, held = validated
-    reach, scores = validator.success_by_budget(held), validator.measure(held)
+    reach = validator.success_by_budget(held)
+    scores = validator.measure(held)
     assert reach["budgets"] == sorted(set(reach["budgets"]))
     for arm in policies.arms:
         for split in ("val", "train"):

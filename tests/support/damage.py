@@ -15,14 +15,14 @@ def _cut(data: bytes, draw: random.Random) -> bytes:
 
 
 def _zeroed(data: bytes, draw: random.Random) -> bytes:
-    first = draw.randrange(len(data))
-    length = min(draw.choice([1, 8, 512]), len(data) - first)
-    return data[:first] + bytes(length) + data[first + length :]
+    first_index = draw.randrange(len(data))
+    length = min(draw.choice([1, 8, 512]), len(data) - first_index)
+    return data[:first_index] + bytes(length) + data[first_index + length :]
 
 
 def _moved(data: bytes, draw: random.Random) -> bytes:
-    first, last = sorted(draw.choices(range(len(data)), k=2))
-    return data[:first] + data[last:] + data[first:last]
+    first_index, last_index = sorted(draw.choices(range(len(data)), k=2))
+    return data[:first_index] + data[last_index:] + data[first_index:last_index]
 
 
 def _line_lost(data: bytes, draw: random.Random) -> bytes:
@@ -50,11 +50,11 @@ KINDS: tuple[Callable[[bytes, random.Random], bytes], ...] = (
 def damage(folder: Path, draw: random.Random) -> Path:
     """Change one file below a folder at random, or remove it; return its path."""
     file = draw.choice(sorted(path for path in folder.rglob("*") if path.is_file() and path.stat().st_size))
-    before = after = file.read_bytes()
+    data_before = data_after = file.read_bytes()
     if draw.random() < 0.1:
         file.unlink()
         return file
-    while after == before:
-        after = draw.choice(KINDS)(before, draw)
-    file.write_bytes(after)
+    while data_after == data_before:
+        data_after = draw.choice(KINDS)(data_before, draw)
+    file.write_bytes(data_after)
     return file

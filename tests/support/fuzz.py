@@ -28,8 +28,8 @@ from support.tiny_world import BEDROOM, KITCHEN
 
 #: Words of a command line, besides options and the names of commands.
 _WORDS = ("", "-1", "0", "7", "1e999", "nan", "10" * 40, "rooms", "val", "none", "a=b", "--", "-h", "[/x]", "\x1b[0m")
-_EVERYWHERE = ("--run-dir", "--seeds", "--config", "--split", "--epsilon", "--episodes", "--seed", "--scenes", "--out")
-_READING = ("eval", "account", "mixture", "report", "export", "episode", "table", "scenes")
+_OPTIONS = ("--run-dir", "--seeds", "--config", "--split", "--epsilon", "--episodes", "--seed", "--scenes", "--out")
+_COMMANDS = ("eval", "account", "mixture", "report", "export", "episode", "table", "scenes")
 
 
 def _scene_file(folder: Path, draw: random.Random) -> int:
@@ -71,41 +71,43 @@ def _config(folder: Path, draw: random.Random) -> int:
 
 def _command_line(folder: Path, draw: random.Random) -> int:
     values = [str(value) for value in NASTY if value != "\ud800"]
-    words = [draw.choice([*_WORDS, *_EVERYWHERE, *values]) for _ in range(draw.randrange(6))]
+    words = [draw.choice([*_WORDS, *_OPTIONS, *values]) for _ in range(draw.randrange(6))]
     if draw.random() < 0.5:
         return run_command(lambda _: check_config(parse_config(RunConfig(), words, "jaxnav train", "")))
     with contextlib.chdir(folder):
-        return main([draw.choice([*_READING, *_WORDS]), *words])
+        return main([draw.choice([*_COMMANDS, *_WORDS]), *words])
 
 
-_MADE: dict[str, Callable[[Path, random.Random], int]] = {
+_RUN_BY_KIND: dict[str, Callable[[Path, random.Random], int]] = {
     "scene file": _scene_file,
     "export": _export,
     "config": _config,
     "command line": _command_line,
 }
-_IMPORTED = {" ".join((form.name, *form.options)): form for form in fuzz_importers.FORMATS}
-KINDS = (*_MADE, *_IMPORTED)
+_FORMAT_BY_KIND = {" ".join((form.name, *form.options)): form for form in fuzz_importers.FORMATS}
+KINDS = (*_RUN_BY_KIND, *_FORMAT_BY_KIND)
 
 
 def fuzz(kind: str, folder: Path, runs: int, seed: int) -> tuple[collections.Counter, float]:
     """Return runs by exit code, or by the error that ended them, and the seconds of the slowest."""
-    if kind in _IMPORTED:
-        return fuzz_importers.fuzz(_IMPORTED[kind], runs, seed)
-    draw, codes, slowest = random.Random(f"{kind} {seed}"), collections.Counter(), 0.0
+    if kind in _FORMAT_BY_KIND:
+        return fuzz_importers.fuzz(_FORMAT_BY_KIND[kind], runs, seed)
+    draw = random.Random(f"{kind} {seed}")
+    codes = collections.Counter()
+    slowest = 0.0
     for number in range(runs):
-        place = folder / str(number)
-        place.mkdir()
-        began = time.perf_counter()
+        run_folder = folder / str(number)
+        run_folder.mkdir()
+        start_time = time.perf_counter()
         try:
-            code = _MADE[kind](place, draw)
+            code = _RUN_BY_KIND[kind](run_folder, draw)
         except SystemExit as end:  # of the parser
             code = end.code
         except Exception as error:
             code = f"{number}: {type(error).__name__}: {error}"
-        slowest = max(slowest, time.perf_counter() - began)
+        slowest = max(slowest, time.perf_counter() - start_time)
         codes[code] += 1
-        shutil.rmtree(place)
+        shutil.rmtree(run_folder)
     return codes, slowest
 
 
@@ -113,7 +115,8 @@ def _alone(kind: str, runs: int, seed: int) -> dict[str, object]:
     """Return the results of `fuzz`, and the peak memory of this process in MiB."""
     with tempfile.TemporaryDirectory() as folder:
         codes, slowest = fuzz(kind, Path(folder), runs, seed)
-    (peak,) = (line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
+    status_lines = Path("/proc/self/status").read_text().splitlines()
+    (peak,) = (line.split()[1] for line in status_lines if "VmHWM" in line)
     return {"codes": list(codes.items()), "slowest": slowest, "peak": int(peak) / 1024}
 
 

@@ -102,17 +102,24 @@ def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, f
     Raises:
       AssertionError: a run that leaves a file without success, or none with it.
     """
-    draw, codes, slowest = random.Random(seed), collections.Counter(), 0.0
+    draw = random.Random(seed)
+    codes = collections.Counter()
+    slowest = 0.0
     for _ in range(runs):
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
+        with tempfile.TemporaryDirectory() as folder_name:
+            folder = Path(folder_name)
             (folder / "in").mkdir()
-            whole = draw.random() < 0.3
-            source = form.write(folder / "in", form.content if whole else mutated(form.content, draw))
-            if whole:
+
+            # Either the bytes of a file are damaged, or values of its content.
+            damages_bytes = draw.random() < 0.3
+            content = form.content if damages_bytes else mutated(form.content, draw)
+            source = form.write(folder / "in", content)
+            if damages_bytes:
                 file = draw.choice(sorted(path for path in folder.rglob("*") if path.is_file()))
                 file.write_bytes(damaged(file.read_bytes(), draw))
-            options = [str(folder / "in" / o) if o.endswith(".pbz2") else o for o in form.options]
+
+            # The command, timed; any exception is a crash.
+            options = [str(folder / "in" / word) if word.endswith(".pbz2") else word for word in form.options]
             target = folder / "out" / "scenes.jsonl.gz"
             began = time.perf_counter()
             try:
@@ -121,6 +128,8 @@ def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, f
                 code = CRASHED
             slowest = max(slowest, time.perf_counter() - began)
             codes[code] += 1
+
+            # A whole scene file after success, and no file otherwise.
             file_names = [path.name for path in target.parent.iterdir()] if target.parent.exists() else []
             assert file_names == ([target.name] if code == 0 else []), (code, file_names)
             if code == 0:

@@ -1,4 +1,4 @@
-"""A run that stops after its first chunk and goes on."""
+"""A run that stops after its first chunk and resumes."""
 
 import pytest
 
@@ -9,17 +9,18 @@ from jaxnav.training.trainer import Trainer
 
 
 def train_in_two(config: RunConfig, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Train a run that is stopped after its first chunk, and start it again."""
-    done, once = [], Trainer.train
+    """Train a run that is stopped after its first chunk, and resume it."""
+    chunks = []
+    train_chunk = Trainer.train
 
-    def stop_after_the_first(self, *arguments):
-        if done:
+    def stop_after_first_chunk(self, *arguments):
+        if chunks:
             raise KeyboardInterrupt
-        done.append(arguments)
-        return once(self, *arguments)
+        chunks.append(arguments)
+        return train_chunk(self, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train", stop_after_the_first)
+        patch.setattr(Trainer, "train", stop_after_first_chunk)
         with pytest.raises(KeyboardInterrupt):
             train(config)
     return train(config)
