@@ -376,10 +376,10 @@ def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
             rows.append(make_row(sr, **{**PAPER_STDE, "epsilon": epsilon}, gap="novelty", shift=0.0))
         tables[split] = ResultTable(rows)
     text = render_page(tmp_path / "page.md", "study", CONFIG, tables, [])
-    chosen = [line for line in text.split("## Test")[1].splitlines() if "chosen)" in line]
-    assert len(chosen) == 2  # at both shifts
-    assert "0.75" in chosen[0]
-    assert "40.0" in chosen[0]
+    chosen_lines = [line for line in text.split("## Test")[1].splitlines() if "chosen)" in line]
+    assert len(chosen_lines) == 2  # at both shifts
+    assert "0.75" in chosen_lines[0]
+    assert "40.0" in chosen_lines[0]
 
 
 # Removal in a mixed population
