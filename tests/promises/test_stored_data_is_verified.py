@@ -268,6 +268,7 @@ def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, da
     # The run can go on and save the second checkpoint again.
     checkpoint.set_aside_checkpoints_after(tmp_path, restored.step)
     assert (tmp_path / "damaged/2").is_dir()
+    assert (tmp_path / "checkpoints/1").is_dir()
     checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
     assert restore_latest(tmp_path).step == 2
 

@@ -91,6 +91,15 @@ def test_report_tables_hold_the_numbers_of_the_evaluation(run, measurements, eva
     assert results_section.notes == tuple(dict.fromkeys(evaluation.report["notes"]))
 
 
+@pytest.mark.slow
+def test_similarity_chart_shows_the_success_of_the_baseline(measurements, evaluation):
+    # Points (scene, goal) partition the episodes that have a similarity, which are all of them here.
+    similarity = measurements.similarity
+    assert similarity.episodes.sum() == len(evaluation.episodes.goal)
+    mean_success = np.average(similarity.success, weights=similarity.episodes)
+    assert mean_success == pytest.approx(np.asarray(evaluation.outcome.success)[0].mean())
+
+
 def evaluated_outcomes(evaluation):
     """Success and length of the first seed of each agent in each episode, [P, E]."""
     success = []
