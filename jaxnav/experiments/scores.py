@@ -24,7 +24,7 @@ from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import ResultRow
 from jaxnav.policies.method import ActionControl
 from jaxnav.policies.methods import find_method
-from jaxnav.runs.evaluate import draw_episode_lists, measure_leads
+from jaxnav.runs.evaluate import draw_episode_lists, has_same_episodes, measure_leads
 from jaxnav.runs.run import Run
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
@@ -58,7 +58,9 @@ def value_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRo
         is_trained = row.variant not in UNTRAINED_VARIANTS
         for metric in METRICS:
             interval = mean_interval(metrics[metric], clusters, trained=is_trained)
-            yield ResultRow(**row_fields(run, shift, row), metric=metric, value=interval, scenes=num_scenes(scores))
+            yield ResultRow(
+                **row_fields(run, shift, row), metric=metric, value=interval, scenes=num_scenes(scores.episodes)
+            )
 
 
 def difference_rows(
@@ -141,7 +143,7 @@ def _compare(
         )
         fields = row_fields(run, shift, compared.row)
         yield ResultRow(
-            **fields, reference=reference_name, metric=metric, value=difference, scenes=len(compared.episodes.scenes)
+            **fields, reference=reference_name, metric=metric, value=difference, scenes=num_scenes(compared.episodes)
         )
 
 
@@ -190,16 +192,13 @@ def check_same_episodes(episodes: EpisodeList, other: EpisodeList) -> None:
     Raises:
       InputError: they did not, or in other scenes.
     """
-    for name in ("scene", "goal", "pose"):
-        if not np.array_equal(getattr(episodes, name), getattr(other, name)):
-            raise InputError("the runs do not meet the same episodes; train both in one world, with equal rules")
-    if episodes.scenes != other.scenes:
-        raise InputError("the runs meet other scenes; train both in one world")
+    if not has_same_episodes(episodes, other):
+        raise InputError("the runs do not meet the same episodes; train both in one world, with equal rules")
 
 
-def num_scenes(scores: Scores) -> int:
+def num_scenes(episodes: EpisodeList) -> int:
     """Number of scenes with episodes."""
-    return len(np.unique(scores.episodes.scene))
+    return len(np.unique(episodes.scene))
 
 
 # Frontier search
@@ -228,7 +227,7 @@ def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
                 shift=shift,
                 metric=metric,
                 value=interval,
-                scenes=len(np.unique(episodes.scene)),
+                scenes=num_scenes(episodes),
             )
 
 
@@ -250,7 +249,7 @@ def measure_account(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         unaware_scores = bench.evaluate(unaware_run, shift)
         for lead in measure_leads(scores.results, unaware_scores.results):
             fields = row_fields(run, shift, scores.results.rows[lead.row_index])
-            fields |= {"reference": unaware_run.agent, "scenes": num_scenes(scores)}
+            fields |= {"reference": unaware_run.agent, "scenes": num_scenes(scores.episodes)}
             yield ResultRow(**fields, metric=lead.metric, value=lead.lead)
             if lead.left is not None:
                 yield ResultRow(**fields, metric=f"{lead.metric} left", value=lead.left)

@@ -417,7 +417,7 @@ def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
 
 def _check_comparable(results: Results, reference: Results) -> None:
     """Refuse results of other episodes or numbers of seeds, or a reference without a baseline."""
-    if not _has_same_episodes(results.episodes, reference.episodes):
+    if not has_same_episodes(results.episodes, reference.episodes):
         raise InputError("account: the runs do not meet the same episodes; train both in one world, with equal rules")
     num_seeds = results.outcome.length.shape[1]
     reference_seeds = reference.outcome.length.shape[1]
@@ -429,7 +429,8 @@ def _check_comparable(results: Results, reference: Results) -> None:
         raise InputError("account: the run without experience has no arm `baseline`; train it with one")
 
 
-def _has_same_episodes(episodes: EpisodeList, other: EpisodeList) -> bool:
+def has_same_episodes(episodes: EpisodeList, other: EpisodeList) -> bool:
+    """True if both lists hold the same episodes of the same scenes."""
     for name in ("scene", "goal", "pose"):
         if not np.array_equal(getattr(episodes, name), getattr(other, name)):
             return False
