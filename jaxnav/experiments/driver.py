@@ -31,34 +31,57 @@ from jaxnav.experiments.trials import measure_growth, measure_trials, measure_va
 from jaxnav.store.files import list_differences
 
 
+def _no_agents(config: ExperimentConfig, run: AgentRun) -> list[str]:
+    """No agents: the measurement compares a run with nothing but itself."""
+    return []
+
+
+def _compared_agents(config: ExperimentConfig, run: AgentRun) -> list[str]:
+    """Agents that an evaluation compares a run with."""
+    return [reference.partition("/")[0] for reference in run.against]
+
+
+def _grouped_agents(config: ExperimentConfig, run: AgentRun) -> list[str]:
+    """Members and references of all groups."""
+    agents = []
+    for group in config.groups.values():
+        agents += [*group["agents"], group["against"].rpartition("/")[0]]
+    return agents
+
+
+def _unaware_agent(config: ExperimentConfig, run: AgentRun) -> list[str]:
+    """The agents that cannot know any layout."""
+    return [config.unaware]
+
+
 class Measurement(NamedTuple):
     """Something that an experiment measures of an agent.
 
     Attributes:
       measure: called with the bench and the run, and with a shift or a decoding if `parts` names either.
       parts: setting of the experiment whose values are measured in parts of their own.
-      uses_unaware: True if the run is compared with the agents that cannot know any layout.
+      references: names of the agents that a run is compared with.
       compares_shifts: True if it compares layout shifts, and so needs several.
     """
 
     measure: Callable[..., Iterator[ResultRow]]
     parts: str | None = None
-    uses_unaware: bool = False
+    references: Callable[[ExperimentConfig, AgentRun], list[str]] = _no_agents
     compares_shifts: bool = False
 
 
 MEASUREMENTS = {
-    "evaluation": Measurement(measure_evaluation),
+    "evaluation": Measurement(measure_evaluation, references=_compared_agents),
     "frontier": Measurement(measure_frontier),
-    "groups": Measurement(measure_groups),
-    "account": Measurement(measure_account, uses_unaware=True),
+    "groups": Measurement(measure_groups, references=_grouped_agents),
+    "account": Measurement(measure_account, references=_unaware_agent),
     "trials": Measurement(measure_trials, parts="shifts"),
     "variants": Measurement(measure_variants, parts="shifts"),
     "growth": Measurement(measure_growth, compares_shifts=True),
-    "instrument": Measurement(measure_instrument, uses_unaware=True, compares_shifts=True),
+    "instrument": Measurement(measure_instrument, references=_unaware_agent, compares_shifts=True),
     "gaps": Measurement(measure_gaps, compares_shifts=True),
-    "mixture": Measurement(measure_mixture, parts="decodings", uses_unaware=True, compares_shifts=True),
-    "handover": Measurement(measure_handover, parts="decodings", uses_unaware=True, compares_shifts=True),
+    "mixture": Measurement(measure_mixture, parts="decodings", references=_unaware_agent, compares_shifts=True),
+    "handover": Measurement(measure_handover, parts="decodings", references=_unaware_agent, compares_shifts=True),
 }
 
 
@@ -153,7 +176,8 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
     for name, measurement in MEASUREMENTS.items():
         runs = measured_runs(config, name) if name in config.measure else []
         for run in runs:
-            settings = part_settings(config, run, _references(bench, run, measurement))
+            references = [bench.find_run(run.world, agent) for agent in measurement.references(config, run)]
+            settings = part_settings(config, run, [reference for reference in references if reference is not None])
             if measurement.measure is measure_evaluation:
                 settings["against"] = list(run.against)
             if measurement.measure is measure_groups:
@@ -167,20 +191,6 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
                 part_name = f"{run.name}-{name}-{value_name}"
                 parts.append(Part(part_name, settings | {measurement.parts: [value]}, partial(measure, value)))
     return parts
-
-
-def _references(bench: Bench, run: AgentRun, measurement: Measurement) -> list[AgentRun]:
-    """Runs that a measurement compares a run with."""
-    agents = []
-    if measurement.measure is measure_evaluation:
-        agents = [reference.partition("/")[0] for reference in run.against]
-    if measurement.measure is measure_groups:
-        for group in bench.config.groups.values():
-            agents += [*group["agents"], group["against"].rpartition("/")[0]]
-    if measurement.uses_unaware:
-        agents.append(bench.config.unaware)
-    references = [bench.find_run(run.world, agent) for agent in agents]
-    return [reference for reference in references if reference is not None]
 
 
 def write_pages(config: ExperimentConfig, parts: list[Part]) -> list[str]:
