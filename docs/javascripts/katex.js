@@ -1,0 +1,11 @@
+// Typeset the equations that pymdownx.arithmatex marks, with the KaTeX of docs/vendor.
+document.addEventListener("DOMContentLoaded", () => {
+  for (const element of document.querySelectorAll(".arithmatex")) {
+    renderMathInElement(element, {
+      delimiters: [
+        { left: "\\[", right: "\\]", display: true },
+        { left: "\\(", right: "\\)", display: false },
+      ],
+    });
+  }
+});
