@@ -6,6 +6,7 @@ from rich.console import Console
 
 from jaxnav.cli.console import parse_config, run_command
 from jaxnav.errors import InputError
+from jaxnav.policies.methods import method_label
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.run import Run
 from jaxnav.runs.train import train
@@ -43,7 +44,7 @@ def _draw_learning_curves(run: Run, console: Console) -> None:
     config = run.config
     scenes_name = Path(config.scene_source).name
     plural = "s" if config.seeds > 1 else ""
-    title = f"{config.method.upper()} in {scenes_name}, {config.seeds} seed{plural}"
+    title = f"{method_label(config.method)} in {scenes_name}, {config.seeds} seed{plural}"
     path = config.run_dir / LEARNING_CURVES_FILE
     save_figure(learning_figure(run.log(), run.success_by_budget(), title), path)
     console.print(f"learning curves: {path}")

@@ -22,19 +22,22 @@ def evaluation_notes(
     has_room_prior: bool,
     random_name: str = "Random",
 ) -> list[str]:
-    """Describe what limits a table, one sentence per note.
+    """Describe the limits of a table, one sentence per note.
 
     Args:
       rows: R rows.
       success: float64 [R, S, E].
       episodes: the E episodes.
-      has_room_prior: True if the layout prior is that of the room's own type, not one for all types.
+      has_room_prior: True if room types have different layout priors.
       random_name: name of the agent that acts at random.
     """
     # Intervals first, then what a row knows in advance, then comparisons with chance.
     notes = _missing_interval_notes(success.shape[1], episodes)
     if has_room_prior and any(row.arm == "layout" for row in rows):
-        notes.append("Rows with w are told the type of the room by their prior, others are not.")
+        notes.append(
+            "Rows with w receive the room type of the scene, because each room type has its own layout prior; "
+            "other rows do not receive the room type."
+        )
     return notes + _chance_notes(rows, success, episodes, random_name)
 
 
@@ -45,8 +48,8 @@ def budget_note(budget: Mapping[str, int]) -> str:
       budget: steps of `exploration`, `imitation` and `learning`.
     """
     return (
-        f"Environment steps behind each policy: {budget['exploration']:,} of exploration for the layout priors, "
-        f"{budget['imitation']:,} of imitation, {budget['learning']:,} of learning."
+        f"Environment steps of each policy: {budget['exploration']:,} of random exploration for the layout priors, "
+        f"{budget['imitation']:,} of imitation learning, {budget['learning']:,} of reinforcement learning."
     )
 
 
@@ -63,7 +66,7 @@ def convergence_note(log: Sequence[Mapping[str, Any]]) -> list[str]:
     if quarter_success is None:
         return []
     start, end = quarter_success
-    return [f"In the last quarter of training val success (best actions) went from {start:.1f} to {end:.1f} %."]
+    return [f"In the last quarter of training, success on val (best actions) went from {start:.1f} to {end:.1f} %."]
 
 
 def last_quarter_success(log: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
@@ -103,12 +106,15 @@ def _missing_interval_notes(num_seeds: int, episodes: EpisodeList) -> list[str]:
     if episodes.clusters().degrees_of_freedom < MIN_SCENE_DEGREES:
         num_plans = len(set(episodes.floor_plans))
         plural_ending = "s" if num_plans > 1 else ""
-        interval_notes.append(f"No intervals: {num_plans} floor plan{plural_ending}; an interval needs at least 3.")
+        interval_notes.append(
+            f"No intervals: the episodes use {num_plans} floor plan{plural_ending}; an interval needs at least 3."
+        )
 
     # A single seed gives no spread between training runs.
     if num_seeds == 1:
         interval_notes.append(
-            "No interval for a single training seed: it says nothing of another training; train more seeds."
+            "No intervals for trained policies: a single training seed does not show how training runs differ; train "
+            "with `--seeds 2` or more."
         )
     return interval_notes
 

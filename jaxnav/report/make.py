@@ -14,6 +14,7 @@ from jaxnav.evaluation.report import accounting_table, difference_table, results
 from jaxnav.experiments.figures import gap_figure, similarity_figure
 from jaxnav.experiments.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
 from jaxnav.experiments.table import Curve
+from jaxnav.policies.methods import method_label
 from jaxnav.report.charts import differences_chart, leads_chart, thresholds_chart, to_svg
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
@@ -82,7 +83,7 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
     }
 
     # The sections compare the shifts; the replays, one player for each shift, follow the first section.
-    page_title = f"{run.config.method.upper()} in {first_row['world']}"
+    page_title = f"{method_label(run.config.method)} in {first_row['world']}"
     sections = make_sections(run, by_shift, config.threshold)
     replays_by_shift = [measurements.replays for measurements in by_shift.values()]
     return render_page(page_title, run_facts, sections, replays_by_shift)
@@ -182,7 +183,7 @@ def _learning_section(run: Run) -> Section | None:
     log_rows = run.log()
     if not log_rows:
         return None
-    figure = learning_figure(log_rows, run.success_by_budget(), run.config.method.upper())
+    figure = learning_figure(log_rows, run.success_by_budget(), method_label(run.config.method))
     chart = Chart(to_svg(figure), "Learning curves: success while training and within a number of actions.")
     return Section("Learning", _LEARNING_TEXT, (chart,))
 

@@ -36,6 +36,7 @@ from jaxnav.evaluation.report import (
 )
 from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
+from jaxnav.policies.methods import method_label
 from jaxnav.runs.policies import EstimatorName, Policies
 from jaxnav.runs.run import Run, run_settings
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, prefetch_env_params
@@ -144,11 +145,9 @@ def evaluate(
 
     # Report: tables, notes, and the settings of run and evaluation.
     steps_by_purpose = config.steps_by_purpose | {"exploration": policies.prior_steps}
-    names = {"method": config.method.upper(), "world": compiled.scenes[0].world, "split": split}
+    names = {"method": method_label(config.method), "world": compiled.scenes[0].world, "split": split}
     report_notes = [
-        *evaluation_notes(
-            rows, results.metrics()["sr"], results.episodes, has_room_prior=config.layout.prior == "room"
-        ),
+        *evaluation_notes(rows, results.metrics()["sr"], results.episodes, has_room_prior=policies.has_room_priors),
         budget_note(steps_by_purpose),
         *convergence_note(run.log()),
     ]

@@ -79,6 +79,12 @@ class Policies(NamedTuple):
         """Number of seeds S of each arm."""
         return len(jax.tree.leaves(self.params)[0]) // len(self.arms)
 
+    @property
+    def has_room_priors(self) -> bool:
+        """True if the layout priors of two room types differ; those of homes are all equal."""
+        priors = np.asarray(self.knowledge.layout)
+        return bool((priors != priors[0]).any())
+
     def arm_params(self, arm: str) -> dict[str, Any]:
         """Parameters of one arm, leaves [S, ...]."""
         start = self.num_seeds * self.arms.index(arm)

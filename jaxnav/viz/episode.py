@@ -21,6 +21,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import table_row
+from jaxnav.policies.methods import method_label
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import find_scene, replay_episodes
 from jaxnav.runs.policies import EstimatorName, Policies, is_policy, load_policies, load_policy_as_run
@@ -238,7 +239,7 @@ def _report_success(
 def _describe_agent(policies: Policies, variant: PlayedVariant, epsilon: float) -> str:
     """Return method and variant of the agent, for a title."""
     name_suffixes = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
-    return f"{policies.spec.method.name.upper()}{name_suffixes[variant]}"
+    return f"{method_label(policies.spec.method.name)}{name_suffixes[variant]}"
 
 
 def _make_played_episode(

@@ -1,4 +1,4 @@
-"""Notes beside a table: what limits it, and when nothing does."""
+"""Notes below a table: the limits of its results, and no note without a limit."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_single_training_seed_is_noted(seeds):
 def test_prior_by_room_type_is_noted(row):
     (note,) = make_notes((BASELINE, row), room_prior=True)
     assert "prior" in note
-    # A pooled prior tells no room type; without rows of the layout there is no prior.
+    # With one prior for all room types, or without rows of the layout, no row receives the room type.
     assert make_notes((BASELINE, row)) == []
     assert make_notes((BASELINE, ORACLE), room_prior=True) == []
 

@@ -22,7 +22,7 @@ from jaxnav.evaluation.playback import play_episodes
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Method
-from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.methods import METHODS, find_method, method_label
 from jaxnav.policies.testing import check_method
 from jaxnav.training.config import PPOConfig, stage_index_at
 from jaxnav.training.ppo import Learner, collect_rollout, ppo_loss, replay_rollout
@@ -99,6 +99,13 @@ ABLATIONS = [
 @pytest.mark.parametrize("name", params_slow_except([*METHODS, *ABLATIONS, *TEST_METHODS], "anonymous"))
 def test_check_method_accepts_every_method_of_the_package(name):
     check_method(name, steps=4)
+
+
+@pytest.mark.parametrize(
+    ("name", "label"), [("org", "ORG"), ("theirs", "THEIRS"), ("pooled:POOLED", "POOLED"), ("a.b:Mine", "MINE")]
+)
+def test_method_label_is_the_name_without_its_module(name, label):
+    assert method_label(name) == label
 
 
 @pytest.mark.parametrize("name", params_slow_except(["BATCH", "WIDTH", "FINITE", "NOTE", "ACTION"], "ACTION"))

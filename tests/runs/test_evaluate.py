@@ -3,13 +3,16 @@
 import csv
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxnav
+from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
 from jaxnav.evaluation.notes import budget_note, evaluation_notes
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.training.calibration import layout_priors
 
 LAYOUT = EvaluationRow("layout", None, None, "argmax")
 TDE = EvaluationRow("tde", None, "paper", "argmax")
@@ -73,8 +76,18 @@ def test_evaluation_notes_describe_the_rows_and_the_run(evaluated):
     success_rates = evaluated.metrics()["sr"]
     expected_notes = evaluation_notes(evaluated.rows, success_rates, evaluated.episodes, has_room_prior=True)
     assert evaluated.report["notes"] == [*expected_notes, budget_note(evaluated.report["run"]["budget"])]
-    assert any("told the type of the room" in note for note in expected_notes)
+    assert any("receive the room type" in note for note in expected_notes)
     assert expected_notes != evaluation_notes(evaluated.rows, success_rates, evaluated.episodes, has_room_prior=False)
+
+
+def test_homes_have_one_prior_for_all_room_types(drawn_run):
+    """Homes belong to none of the room types, so every type has the prior of all training homes."""
+    policies = drawn_run.policies()
+    room_counts = jnp.arange(policies.prior_counts.size, dtype=jnp.float32).reshape(policies.prior_counts.shape)
+    home_counts = jnp.zeros_like(room_counts).at[OTHER_ROOM].set(room_counts[OTHER_ROOM])
+    for counts, is_different in ((room_counts, True), (home_counts, False)):
+        knowledge = policies.knowledge._replace(layout=layout_priors(counts, policies.estimator_config))
+        assert policies._replace(knowledge=knowledge).has_room_priors == is_different
 
 
 def test_results_are_written_as_json_and_csv(evaluated, tmp_path):

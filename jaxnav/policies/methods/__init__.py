@@ -54,6 +54,15 @@ def find_method(name: str) -> Method:
     return dataclasses.replace(method, name=name)
 
 
+def method_label(name: str) -> str:
+    """Return the name of a method as tables and titles print it, for example `ORG`.
+
+    Args:
+      name: a name that `find_method` accepts; of `package.module:NAME` only the last part is printed.
+    """
+    return name.rpartition(":")[2].upper()
+
+
 def _entry_point_path(name: str) -> str:
     """Return the `package.module:NAME` that an entry point announces.
 
