@@ -79,7 +79,7 @@ class ShowConfig(SceneSource):
 
     Attributes:
       scene: name of the scene; default: the first.
-      index: its number instead, from 0.
+      index: its number instead, from 0; a generated world also has scenes beyond its usual number.
       pose: x and z in metres and heading in degrees of the level camera; default: what detects most categories.
       out: PNG to write; default: the scene's name in the working directory.
     """
@@ -174,14 +174,30 @@ def _show(config: ShowConfig, console: Console) -> None:
     require_plotting_packages()
     from jaxnav.viz.scene import draw_scene
 
+    # Pictures of one scene at two layout shifts have different names.
     scene = config.select_scene(config.scene, config.index)
-    path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + ".png")
+    shift_suffix = f"-shift-{config.shift:g}" if config.shift else ""
+    path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + shift_suffix + ".png")
     if path.suffix != ".png":
         raise InputError(f"--out {path}: give a name that ends in .png")
     with refuse_unwritable(f"--out {path}", "name"):
-        draw_scene(scene, config.task, path, config.pose)
-    console.print(f"{scene.name} drawn by the rules of {config.world_name}")
+        draw_scene(scene, config.task, path, config.pose, config.shift)
+    if config.file in WORLDS:
+        _warn_beyond_usual_number(config, console)
+    console.print(f"{scene.name} at layout shift {config.shift:g}, drawn by the rules of {config.world_name}")
     console.print(f"written to {path}")
+
+
+def _warn_beyond_usual_number(config: ShowConfig, console: Console) -> None:
+    """Print a line if the index lies beyond the scenes that training and evaluation use by default."""
+    split = config.split or "val"
+    usual_number = WORLDS[config.file].counts[split]
+    if config.index is not None and config.index >= usual_number:
+        console.print(
+            f"--index {config.index}: {config.file} has {usual_number} scenes of {split} by default; a run uses this "
+            f"scene only with --worlds.num-{split} {config.index + 1} or more",
+            style="yellow",
+        )
 
 
 def _print_statistics(config: StatsConfig, console: Console) -> None:

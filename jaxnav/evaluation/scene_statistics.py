@@ -204,6 +204,8 @@ def summarize_categories(statistics: Sequence[SceneStatistics], task: Task) -> l
 def summarize_pairs(statistics: Sequence[SceneStatistics], task: Task, count: int) -> list[PairSummary]:
     """Find the pairs of categories whose detections correlate most.
 
+    Pairs are among the categories that some scene contains; any other category is detected by false alarms alone.
+
     With P over all poses of all scenes, phi = (P(i, j) - P(i) P(j)) / sqrt(P(i) (1 - P(i)) P(j) (1 - P(j))).
 
     Returns:
@@ -216,17 +218,21 @@ def summarize_pairs(statistics: Sequence[SceneStatistics], task: Task, count: in
     marginal_share = np.sum([scene.num_detected for scene in statistics], axis=0) / num_poses
     joint_share = np.sum([scene.co_detections for scene in statistics], axis=0) / num_poses
 
-    # Correlation [K, K]; 0 for a category that is never, or always, detected.
+    # Categories with an object in some scene, bool [K].
+    is_present = np.sum([scene.num_objects for scene in statistics], axis=0) > 0
+    can_correlate = np.outer(is_present, is_present)
+
+    # Correlation [K, K]; 0 for a category that is never, or always, detected, or only by false alarms.
     spread = np.sqrt(np.outer(marginal_share * (1 - marginal_share), marginal_share * (1 - marginal_share)))
     covariance = joint_share - np.outer(marginal_share, marginal_share)
-    phi = np.divide(covariance, spread, out=np.zeros_like(joint_share), where=spread > 0)
+    phi = np.divide(covariance, spread, out=np.zeros_like(joint_share), where=can_correlate & (spread > 0))
 
     # Rank the pairs i < j by phi.
     row_ids, column_ids = np.triu_indices(len(marginal_share), 1)
     pair_phi = phi[row_ids, column_ids]
     best_pairs = np.argsort(-pair_phi, kind="stable")[:count]
 
-    # P(other | rarer) is the telling direction, so the rarer category of a pair comes first.
+    # P(other | rarer) is the informative direction, so the rarer category of a pair comes first.
     summaries = []
     for pair in best_pairs[pair_phi[best_pairs] > 0]:
         rarer, other = sorted((row_ids[pair], column_ids[pair]), key=lambda category: marginal_share[category])

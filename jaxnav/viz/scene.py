@@ -83,7 +83,9 @@ class PoseView(NamedTuple):
 # The picture of a scene
 
 
-def draw_scene(scene: Scene, task: Task, path: Path, pose: tuple[float, float, float] | None = None) -> None:
+def draw_scene(
+    scene: Scene, task: Task, path: Path, pose: tuple[float, float, float] | None = None, shift: float = 0.0
+) -> None:
     """Write the picture of a scene as a PNG.
 
     Args:
@@ -92,6 +94,7 @@ def draw_scene(scene: Scene, task: Task, path: Path, pose: tuple[float, float, f
       path: file to write.
       pose: x and z in metres and heading in degrees of the level camera; None for the pose that detects most
         categories.
+      shift: layout shift of the scene, for the title.
 
     Raises:
       InputError: the agent cannot stand at the pose, or cannot face that way.
@@ -99,12 +102,19 @@ def draw_scene(scene: Scene, task: Task, path: Path, pose: tuple[float, float, f
     """
     task = dataclasses.replace(task, detector=PERFECT_DETECTOR)
     png_buffer = io.BytesIO()
-    scene_figure(scene, task, view_from_pose(scene, task, pose)).savefig(png_buffer, dpi=SCENE_DPI)
+    scene_figure(scene, task, view_from_pose(scene, task, pose), shift).savefig(png_buffer, dpi=SCENE_DPI)
     write_atomic(path, png_buffer.getvalue())
 
 
-def scene_figure(scene: Scene, task: Task, view: PoseView) -> Figure:
-    """Compose the plan of a scene, a view and a panel with numbers."""
+def scene_figure(scene: Scene, task: Task, view: PoseView, shift: float = 0.0) -> Figure:
+    """Compose the plan of a scene, a view and a panel with numbers.
+
+    Args:
+      scene: scene to draw.
+      task: categories and rules.
+      view: pose to draw, with its detections.
+      shift: layout shift of the scene, for the title.
+    """
     # The figure is as large as the plan, the panel and the list of detections require.
     low_corner, high_corner = scene_extent(scene)
     plan_size = (high_corner - low_corner) * np.min(_LARGEST_PLAN / (high_corner - low_corner))
@@ -133,8 +143,9 @@ def scene_figure(scene: Scene, task: Task, view: PoseView) -> Figure:
         figure.text(*position, text, fontsize=size, color=TEXT_COLOR, va="top", parse_math=False, **style)
 
     panel_left = width - _PANEL_WIDTH
-    name_size = min(14.0, 100 * (width - 2 * _MARGIN) / len(scene.name))
-    write(_MARGIN, 0.2, scene.name, name_size, weight="bold")
+    title = f"{scene.name}, layout shift {shift:g}" if shift else scene.name
+    title_size = min(14.0, 100 * (width - 2 * _MARGIN) / len(title))
+    write(_MARGIN, 0.2, title, title_size, weight="bold")
     write(panel_left, _HEADER_HEIGHT, _describe_scene(scene, task), 9, linespacing=1.6)
     write(panel_left, _HEADER_HEIGHT + _DETECTIONS_OFFSET, detections_text, 9, linespacing=1.5)
 
@@ -219,7 +230,7 @@ def _describe_scene(scene: Scene, task: Task) -> str:
         f"{scene.world}: {scene.room_type.replace('_', ' ')}, {scene.split}",
         f"{width:.1f} x {depth:.1f} m{rooms_text}",
         f"{num_standable} standable cells{unreachable_text}",
-        f"{len(scene.types)} objects, {len(object_categories)} of {len(np.unique(object_categories))} categories",
+        f"{len(scene.types)} objects ({len(object_categories)} in {len(np.unique(object_categories))} categories)",
     ]
     return "\n".join(map(_shorten, text_lines))
 
@@ -231,8 +242,8 @@ def _shorten(line: str) -> str:
 def _describe_detections(view: PoseView) -> str:
     """Return the pose of a view and its detections, a line each."""
     x, z = view.place
-    lines = [f"From x {x:g}, z {z:g}, heading {view.yaw:g}°"]
-    lines.append("is detected:" if view.detections else "nothing is detected.")
+    lines = [f"Pose: x {x:g}, z {z:g}, heading {view.yaw:g}°"]
+    lines.append("Detected from there:" if view.detections else "Nothing is detected from there.")
     for distance, name, _ in view.detections:
         lines.append(f"{name}, {distance:.1f} m")
     return "\n".join(lines)

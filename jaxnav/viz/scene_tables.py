@@ -18,6 +18,13 @@ from jaxnav.scenes.task import Task
 
 _MAX_PAIRS = 15
 
+_ROOM_TITLE = "Room types: scenes of each split, standable cells (minimum, quartiles, maximum), and medians of the rest"
+_CATEGORY_TITLE = (
+    "Categories: share of the scenes; mean number in these scenes; median height of the centre; actions L* to success"
+)
+_PAIR_TITLE = "Detected together: pairs with the strongest correlation phi over all poses; i is the rarer category"
+_PRIOR_TITLE = "Layout priors of the run against the layouts of the scenes: KL divergence in nats, cosine similarity"
+
 #: Columns of names; the other columns have numbers, aligned to the right.
 _NAME_COLUMNS = ("room type", "category", "i", "j")
 
@@ -33,16 +40,12 @@ def scene_tables(
       priors: layout priors to compare the scenes with, see `fit_priors`.
     """
     tables = {
-        "Scenes: standable cells (least, quartiles, most), and medians": _room_table(statistics),
-        "Categories: mean number, median height of the centre, actions from start to success": (
-            _category_table(statistics, task)
-        ),
-        "Detected together: i, the rarer one, and j; the strongest correlations phi over poses": (
-            _pair_table(statistics, task)
-        ),
+        _ROOM_TITLE: _room_table(statistics),
+        _CATEGORY_TITLE: _category_table(statistics, task),
+        _PAIR_TITLE: _pair_table(statistics, task),
     }
     if priors is not None:
-        tables["Layouts against the run's priors: KL in nats and cosine similarity"] = _prior_table(statistics, priors)
+        tables[_PRIOR_TITLE] = _prior_table(statistics, priors)
     return tables
 
 
@@ -77,7 +80,7 @@ def scene_remarks(statistics: Sequence[SceneStatistics], task: Task) -> list[str
 
 
 def _room_table(statistics: Sequence[SceneStatistics]) -> Table:
-    table = _make_table("room type", *SPLITS, "standable cells", "width x depth", "objects", "of categories")
+    table = _make_table("room type", *SPLITS, "standable cells", "width x depth", "objects", "in a category")
     for room in summarize_rooms(statistics):
         width, depth = room.size
         table.add_row(
@@ -92,7 +95,7 @@ def _room_table(statistics: Sequence[SceneStatistics]) -> Table:
 
 
 def _category_table(statistics: Sequence[SceneStatistics], task: Task) -> Table:
-    table = _make_table("category", "in scenes", "number there", "height", "L* median", "L* p95")
+    table = _make_table("category", "scenes", "number", "height", "L* median", "L* 95 %")
     for category in summarize_categories(statistics, task):
         table.add_row(
             category.name,

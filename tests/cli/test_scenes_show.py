@@ -57,6 +57,28 @@ def test_scenes_show_selects_by_name_number_or_the_first(file, tmp_path, monkeyp
     assert (tmp_path / "test-apartment-03-1.png").exists()
 
 
+def test_scenes_show_writes_each_layout_shift_to_its_own_file(file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for shift in (0, 0.5, 1):
+        assert show(file, "--scene", "drawn", "--shift", shift) == 0
+        assert f"drawn at layout shift {shift}, drawn by the rules of rooms" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == [
+        "drawn-shift-0.5.png",
+        "drawn-shift-1.png",
+        "drawn.png",
+    ]
+
+
+def test_scenes_show_warns_beyond_the_usual_number_of_scenes(file, tmp_path, capsys):
+    """A generated world has any number of scenes; training and evaluation use the first of them."""
+    out = ("--out", tmp_path / "scene.png")
+    for arguments, is_beyond in ((("rooms", "--index", 20), True), (("rooms", "--index", 19), False), ((file,), False)):
+        assert show(*arguments, *out) == 0
+        message = " ".join(capsys.readouterr().err.split())
+        assert ("rooms has 20 scenes of val by default" in message) == is_beyond
+        assert ("--worlds.num-val 21" in message) == is_beyond
+
+
 def test_scenes_show_refuses_bad_requests(file, tmp_path, capsys):
     (tmp_path / "folder.png").mkdir()
     out = ("--out", tmp_path / "no.png")

@@ -48,7 +48,7 @@ def find_row(rows, *first_cells):
 
 def gap_rows(rows):
     """Return the rows of the table of layout gaps."""
-    start = next(index for index, cells in enumerate(rows) if cells[0].startswith("Layouts against"))
+    start = next(index for index, cells in enumerate(rows) if cells[0].startswith("Layout priors of the run"))
     return rows[start:]
 
 
@@ -105,6 +105,19 @@ def test_scenes_stats_prints_cooccurring_pairs(scene_file, capsys):
     pair = [("Book", "Chair")[index] for index in (rarer, other)]
     assert find_row(printed_rows, *pair) == [f"{conditional:.2f}", f"{marginal:.2f}", f"{phi:.2f}"]
     assert all(cells[:2] != pair[::-1] for cells in printed_rows)
+
+
+def test_scenes_stats_omits_pairs_of_categories_in_no_scene(tmp_path, capsys):
+    """A category without an object is detected by false alarms alone."""
+    scene_file = tmp_path / "houses.jsonl.gz"
+    houses = make_generated_scenes("houses", "val", 2)
+    write_scenes(scene_file, [houses[0], houses[1]])
+    rows = print_stats(capsys, scene_file, "--world", "rooms")
+    (absent_line,) = (cells[0] for cells in rows if cells[0].startswith("Categories in no scene:"))
+    start = next(index for index, cells in enumerate(rows) if cells[0].startswith("Detected together"))
+    pair_names = {name for cells in rows[start + 2 :] if len(cells) == 5 for name in cells[:2]}
+    assert pair_names
+    assert not {name for name in pair_names if f"{name}," in absent_line or absent_line.endswith(name)}
 
 
 @pytest.mark.slow

@@ -103,12 +103,18 @@ def test_scene_figure_describes_scene_and_view():
         "kitchen, train",
         "1.2 x 3.8 m",
         "9 standable cells, 1 cut off",
-        "4 objects, 3 of 3 categories",
+        "4 objects (3 in 3 categories)",
         "heading 0°",
         "Book, 1.0 m",
         "Bowl, 1.0 m",
     ):
         assert part in text
+
+
+def test_scene_figure_names_the_shift_of_a_shifted_scene():
+    view = view_from_pose(HALL, TASK, (0.0, 1.5, 0.0))
+    assert "layout shift 0.5" in all_text(scene_figure(HALL, TASK, view, 0.5))
+    assert "layout shift" not in all_text(scene_figure(HALL, TASK, view))
 
 
 def test_scene_extent_includes_walls_and_scene_size_does_not():
@@ -121,7 +127,7 @@ def test_scene_figure_of_a_scene_without_objects_has_no_names():
     bare_scene = draw(["..", ".."])
     figure = scene_figure(bare_scene, TASK, view_from_pose(bare_scene, TASK, None))
     assert sorted_labels(figure.axes[0]) == [SCALE_LABEL]
-    assert "nothing is detected" in all_text(figure)
+    assert "Nothing is detected" in all_text(figure)
 
 
 def test_scene_figure_tints_and_names_rooms():
