@@ -1,0 +1,17 @@
+"""Names that several functions and options accept, as types without any import.
+
+The command line reads these types to show its help, so this module must not import JAX.
+"""
+
+from typing import Literal
+
+#: Form in which equation 2 combines the logits, see `jaxnav.causal.stde`.
+Form = Literal["paper", "residual", "switch"]
+#: Reduction over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
+Reduction = Literal["mean_visible", "mean", "sum"]
+#: Layout estimators that an evaluation may use in place of the one from training.
+EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
+#: Ways to use policies in an evaluation, and the two references without training.
+Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
+#: Rule that turns logits into actions: the best action, or a sampled one.
+Decoding = Literal["argmax", "sample"]
