@@ -2,7 +2,7 @@
 
 `evaluate` measures every variant of the run's policies (baseline, layout weights, hard TDE, and sTDE at every epsilon)
 and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many epsilons and all seeds in one
-compiled call. `measure_leads` compares results with those of agents that cannot know any layout, and `replay_episodes`
+compiled call, and `sweep_shifts` does so at several layout shifts. `measure_leads` compares results with those of agents that cannot know any layout, and `replay_episodes`
 plays episodes step by step.
 """
 
@@ -16,16 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
-from jaxnav.causal import Form
+from jaxnav.choices import Decoding, EstimatorName, Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
 from jaxnav.evaluation.notes import budget_note, convergence_note, evaluation_notes
 from jaxnav.evaluation.playback import EpisodeTrace, play_episodes
 from jaxnav.evaluation.report import (
-    Decoding,
     ExperienceLead,
     build_difference,
     build_report,
@@ -35,14 +35,20 @@ from jaxnav.evaluation.report import (
     write_report,
 )
 from jaxnav.evaluation.statistics import paired_difference
+from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
-from jaxnav.policies.methods import method_label
-from jaxnav.runs.policies import EstimatorName, Policies
-from jaxnav.runs.run import Run, run_settings
+from jaxnav.policies.methods import find_method, method_label
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.policies import Policies, config_for_task, is_policy, list_packaged_policies, load_policy_as_run
+from jaxnav.runs.policy import LoadedPolicy
+from jaxnav.runs.run import CONFIG_FILE, Run, run_settings
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, prefetch_env_params
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import write_atomic
+
+#: Usual thresholds of a sweep.
+SWEPT_THRESHOLDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
 class Results(NamedTuple):
@@ -84,7 +90,7 @@ class Results(NamedTuple):
 
 
 def evaluate(
-    run: Run,
+    run: Run | str | Path,
     *,
     split: str = "val",
     scenes: Path | None = None,
@@ -103,7 +109,7 @@ def evaluate(
     """Evaluate a run on fixed episodes, in one compiled call.
 
     Args:
-      run: a finished run.
+      run: a finished run, or its directory.
       split: split of the scenes.
       scenes: scene file to read in place of the run's scenes.
       world: generated world to use in place of the run's scenes, with the categories and rules of the run.
@@ -122,6 +128,7 @@ def evaluate(
     """
     check_seed(seed)
     console = console or Console(quiet=True)
+    run = run if isinstance(run, Run) else Run.open(run)
     config = run.config
     policies = run.policies().with_estimator(setting, hold).with_inner_steps(inner_steps)
 
@@ -169,7 +176,12 @@ def evaluate(
 
 
 def evaluate_rows(
-    rows: Sequence[EvaluationRow], policies: Policies, world: CompiledWorld, num_episodes: int, seed: int
+    rows: Sequence[EvaluationRow],
+    policies: Policies,
+    world: CompiledWorld,
+    num_episodes: int,
+    seed: int,
+    evaluator: Evaluator | None = None,
 ) -> tuple[list[EpisodeList], EpisodeOutcome, int]:
     """Run rows of a table in one compiled call.
 
@@ -179,14 +191,15 @@ def evaluate_rows(
       world: compiled scenes.
       num_episodes: number of episodes in all banks together.
       seed: seed of the episode lists and the sampled actions.
+      evaluator: evaluator with an agent loop of these policies, to share its compilations; None makes one.
 
     Returns:
-      The episodes of each bank, the outcomes with leaves [R, S, E], and the number of compilations.
+      The episodes of each bank, the outcomes with leaves [R, S, E], and the number of compilations of the evaluator.
     """
     # While one bank is evaluated, a thread reads the next.
     episode_lists = draw_episode_lists(world, num_episodes, seed)
     env_params = prefetch_env_params(world, range(len(world.banks)))
-    evaluator = Evaluator(policies.make_agent_loop(world))
+    evaluator = evaluator or Evaluator(policies.make_agent_loop(world))
     outcome = evaluator(
         inference_grid(rows, policies.arms, policies.num_seeds),
         policies.params,
@@ -306,7 +319,7 @@ def _format_csv(results: Results) -> str:
 
 
 class Sweep(NamedTuple):
-    """Results of a sweep over X thresholds, S seeds and E episodes.
+    """Results of a sweep over X thresholds, S seeds and E episodes, at one layout shift.
 
     Attributes:
       epsilon: float64 [X], thresholds.
@@ -314,6 +327,9 @@ class Sweep(NamedTuple):
       dts: float64 [X, S, E], in metres.
       outcome: outcomes of the episodes, leaves [X, S, E].
       compilations: number of compilations; 1 where the scenes are in memory.
+      no_removal: outcomes of the same episodes without removal, leaves [S, E].
+      episodes: the episodes.
+      settings: what was evaluated, as JSON: source, method, split, layout shift, decoding and more.
     """
 
     epsilon: np.ndarray
@@ -322,55 +338,232 @@ class Sweep(NamedTuple):
     dts: np.ndarray
     outcome: EpisodeOutcome
     compilations: int
+    no_removal: EpisodeOutcome
+    episodes: EpisodeList
+    settings: dict[str, Any]
+
+    def rows(self) -> list[ThresholdRow]:
+        """Mean of every metric at every threshold, and its difference to no removal, with 95 % intervals."""
+        return threshold_rows(
+            self.epsilon,
+            {"sr": self.sr, "spl": self.spl, "dts": self.dts},
+            episode_metrics(self.no_removal, self.episodes.best_length),
+            np.asarray(self.outcome.mean_weight, np.float64),
+            self.episodes,
+            self.settings["shift"],
+        )
+
+    def notes(self) -> list[str]:
+        """What the intervals cover, one sentence per note."""
+        return sweep_notes(self.sr.shape[1], self.episodes)
+
+    def table(self) -> Table:
+        """Table of SR and SPL by threshold for a terminal; print it with `rich.print`."""
+        return sweep_table(self.rows())
 
 
 def sweep(
-    run: Run,
-    epsilon: Sequence[float] | np.ndarray,
+    source: Run | LoadedPolicy | str | Path,
+    epsilon: Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
     params: Any = None,
     *,
     split: str = "val",
     scenes: Path | None = None,
+    world: str | None = None,
     shift: float | None = None,
     episodes: int = 1000,
     decoding: Decoding = "argmax",
     form: Form | None = None,
+    setting: EstimatorName | None = None,
+    hold: bool = False,
     seed: int = 0,
+    console: Console | None = None,
 ) -> Sweep:
     """Evaluate sTDE at every threshold and for every seed in one compiled call.
 
     Args:
-      run: a finished run with the arm `layout`.
+      source: a finished run with the arm `layout`, or its directory; or a single policy of that arm, which counts as one
+        seed: a `LoadedPolicy`, the folder of an export, or the name of a packaged policy, such as `rooms-org`.
       epsilon: thresholds [X]; no experience is removed for epsilon >= 1.
-      params: network parameters of your own, leaves [S, ...]; None for those of the run.
-      split, scenes, shift, episodes, form, seed: as in `jaxnav.evaluate`.
+      params: network parameters of your own, leaves [S, ...]; None for those of the source.
+      split, scenes, world, shift, episodes, setting, hold, seed, console: as in `jaxnav.evaluate`. A policy is evaluated
+        in the generated world that it was trained for, unless `scenes` or `world` is given.
       decoding: `argmax` for best actions, `sample` for sampled ones.
+      form: form in which sTDE combines the logits; None for the form of the layout estimator.
 
     Raises:
-      InputError: the run is not finished or has no arm `layout`, or an argument is impossible.
+      InputError: the source is no finished run and no policy, it has no arm `layout`, or an argument is impossible.
+    """
+    (result,) = sweep_shifts(
+        source,
+        epsilon,
+        (shift,),
+        params,
+        split=split,
+        scenes=scenes,
+        world=world,
+        episodes=episodes,
+        decoding=decoding,
+        form=form,
+        setting=setting,
+        hold=hold,
+        seed=seed,
+        console=console,
+    )
+    return result
+
+
+def sweep_shifts(
+    source: Run | LoadedPolicy | str | Path,
+    epsilon: Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
+    shifts: Sequence[float | None] = (0.0, 1.0),
+    params: Any = None,
+    *,
+    split: str = "val",
+    scenes: Path | None = None,
+    world: str | None = None,
+    episodes: int = 1000,
+    decoding: Decoding = "argmax",
+    form: Form | None = None,
+    setting: EstimatorName | None = None,
+    hold: bool = False,
+    seed: int = 0,
+    console: Console | None = None,
+) -> list[Sweep]:
+    """Sweep at several layout shifts; returns a `Sweep` for each.
+
+    Shifts whose scene tables have equal shapes share a compilation, which the first of them counts. For the other
+    arguments and errors see `sweep`.
     """
     check_seed(seed)
-    policies = run.policies(("layout",))
-    estimator_config = policies.estimator_config
-    assert estimator_config is not None  # policies of the arm `layout` have an estimator
+    console = console or Console(quiet=True)
     if not len(epsilon):
         raise InputError("epsilon: give at least one number")
+    config, policies = _load_layout_policies(source, setting, hold)
+    estimator_config = policies.estimator_config
+    assert estimator_config is not None  # policies of the arm `layout` have an estimator
 
     # Random numbers depend on `policy_index`. Repeating the layout parameters for every arm gives them the same index
     # as in `evaluate`, and so both functions sample the same actions.
-    arm_names = run.config.arms
+    arm_names = config.arms
     params = policies.params if params is None else params
     repeated_params = jax.tree.map(lambda leaf: jnp.concatenate([jnp.asarray(leaf)] * len(arm_names)), params)
     policies = policies._replace(params=repeated_params, arms=arm_names)
 
-    # One row for each threshold.
+    # One row for each threshold, and one without removal for the differences.
     form = estimator_config.form if form is None else form
     rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilon]
-    world = compile_evaluation_world(run.config, split, scenes, shift, Console(quiet=True))
-    episode_lists, outcome, compilations = evaluate_rows(rows, policies, world, episodes, seed)
+    rows.append(table_row("layout", None, None, decoding))
 
-    metrics = episode_metrics(outcome, join_episode_lists(episode_lists).best_length)
-    return Sweep(np.asarray(epsilon, np.float64), metrics["sr"], metrics["spl"], metrics["dts"], outcome, compilations)
+    results = []
+    evaluator = None
+    for shift in shifts:
+        applied_shift = evaluation_shift(config, scenes or world, shift)
+        compiled = compile_evaluation_world(config, split, scenes, shift, console, world)
+        num_seeds = policies.num_seeds
+        console.print(f"shift {applied_shift:g}: {len(epsilon)} thresholds x {num_seeds} seeds x {episodes:,} episodes")
+
+        # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
+        evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled))
+        earlier_compilations = evaluator.compilations
+        episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed, evaluator)
+
+        episode_list = join_episode_lists(episode_lists)
+        threshold_outcome = jax.tree.map(lambda leaf: leaf[:-1], outcome)
+        metrics = episode_metrics(threshold_outcome, episode_list.best_length)
+        sweep_settings = {
+            "source": _source_name(source),
+            "method": config.method,
+            "seeds": num_seeds,
+            "scenes": str(scenes or world or config.scene_source),
+            "split": split,
+            "shift": applied_shift,
+            "episodes": len(episode_list.goal),
+            "decoding": decoding,
+            "form": form,
+            "setting": setting,
+            "hold": hold,
+            "seed": seed,
+        }
+        result = Sweep(
+            epsilon=np.asarray(epsilon, np.float64),
+            sr=metrics["sr"],
+            spl=metrics["spl"],
+            dts=metrics["dts"],
+            outcome=threshold_outcome,
+            compilations=compilations - earlier_compilations,
+            no_removal=jax.tree.map(lambda leaf: leaf[-1], outcome),
+            episodes=episode_list,
+            settings=sweep_settings,
+        )
+        results.append(result)
+    return results
+
+
+def _load_layout_policies(
+    source: Run | LoadedPolicy | str | Path, setting: EstimatorName | None, hold: bool
+) -> tuple[RunConfig, Policies]:
+    """Load the policies of the arm `layout` of a run, or a single policy; see `sweep`."""
+    # A single policy, with one seed.
+    if isinstance(source, LoadedPolicy):
+        if setting is not None or hold:
+            raise InputError("setting, hold: give them to jaxnav.load_policy, which loaded this policy")
+        config, policies = _policy_in_memory_as_run(source)
+    elif not isinstance(source, Run) and is_policy(source):
+        config, policies = load_policy_as_run(source)
+    else:
+        run = _open_run(source)
+        config = run.config
+        if not find_method(config.method).hosts_layout:
+            raise InputError(
+                f"{config.run_dir}: method {config.method!r} cannot use the layout, so there is no experience that sTDE "
+                "could remove; give a run of another method"
+            )
+        policies = run.policies(("layout",))
+    if policies.estimator_config is None:
+        raise InputError(
+            f"{_source_name(source)}: a policy of the arm 'baseline', which does not use the layout; give a policy of "
+            "the arm 'layout'"
+        )
+    return config, policies.with_estimator(setting, hold)
+
+
+def _open_run(source: Run | str | Path) -> Run:
+    """Open a run; text that names neither a run nor a policy is refused with the names of packaged policies."""
+    if isinstance(source, Run):
+        return source
+    if not (Path(source) / CONFIG_FILE).exists():
+        packaged_names = ", ".join(list_packaged_policies())
+        raise InputError(
+            f"{source}: neither a run directory ({CONFIG_FILE} is missing) nor an exported policy; train a run, or give "
+            f"a packaged policy: {packaged_names}"
+        )
+    return Run.open(source)
+
+
+def _policy_in_memory_as_run(policy: LoadedPolicy) -> tuple[RunConfig, Policies]:
+    """Treat a loaded policy as if a run had trained it with one seed."""
+    arm = "baseline" if policy.estimator_config is None else "layout"
+    config = config_for_task(policy.task, policy.spec.method.name, arm)
+    if config is None:
+        raise InputError("the policy was trained for a task that no generated world has; give the run that it comes from")
+    policies = Policies(
+        params=jax.tree.map(lambda leaf: leaf[None], policy.params),
+        arms=config.arms,
+        knowledge=policy.knowledge,
+        prior_counts=jnp.zeros_like(policy.knowledge.layout),  # only needed to replace the estimator
+        spec=policy.spec,
+        estimator_config=policy.estimator_config,
+        prior_steps=0,
+        task=policy.task,
+    )
+    return config, policies
+
+
+def _source_name(source: Run | LoadedPolicy | str | Path) -> str:
+    if isinstance(source, Run):
+        return str(source.config.run_dir)
+    return f"{source.spec.method.name} policy" if isinstance(source, LoadedPolicy) else str(source)
 
 
 def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
@@ -417,15 +610,15 @@ def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
 def _check_comparable(results: Results, reference: Results) -> None:
     """Refuse results of other episodes or numbers of seeds, or a reference without a baseline."""
     if not has_same_episodes(results.episodes, reference.episodes):
-        raise InputError("account: the runs do not meet the same episodes; train both in one world, with equal rules")
+        raise InputError("account: the two runs have different episodes; train both in one world with equal rules")
     num_seeds = results.outcome.length.shape[1]
     reference_seeds = reference.outcome.length.shape[1]
     if num_seeds != reference_seeds:
         raise InputError(
-            f"account: {num_seeds} seeds with experience and {reference_seeds} without; train as many of each"
+            f"account: the run has {num_seeds} seeds, but the reference run has {reference_seeds}; train equally many"
         )
     if EvaluationRow("baseline", None, None, "argmax") not in reference.rows:
-        raise InputError("account: the run without experience has no arm `baseline`; train it with one")
+        raise InputError("account: the reference run has no arm `baseline`; train it with --arms baseline")
 
 
 def has_same_episodes(episodes: EpisodeList, other: EpisodeList) -> bool:

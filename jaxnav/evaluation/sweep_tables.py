@@ -1,0 +1,180 @@
+"""Tables of a sweep: the metrics of sTDE at every threshold, and their differences to no removal.
+
+`threshold_rows` computes the rows of one layout shift, `sweep_table` and `change_table` print them in a terminal,
+`sweep_markdown` prints them in Markdown, and `sweep_notes` states what the intervals cover.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.report import METRIC_COLUMNS
+from jaxnav.evaluation.statistics import MIN_SCENE_DEGREES, Interval, mean_interval, paired_difference
+
+#: Metrics that are printed; files hold all metrics of `METRIC_COLUMNS`.
+_PRINTED_METRICS = ("sr", "spl")
+
+
+class ThresholdRow(NamedTuple):
+    """Metrics at one threshold of sTDE and one layout shift.
+
+    SR and SPL are in percent, their changes in percentage points, DTS is in metres.
+
+    Attributes:
+      shift: layout shift of the scenes.
+      epsilon: threshold of sTDE; None for no removal.
+      removed: mean share of experience that is removed, over all steps, in percent.
+      metrics: `sr`, `spl` and `dts`.
+      changes: differences of the metrics to no removal, paired on episodes and seeds.
+    """
+
+    shift: float
+    epsilon: float | None
+    removed: float
+    metrics: dict[str, Interval]
+    changes: dict[str, Interval]
+
+    def to_json(self) -> dict[str, Any]:
+        """Convert to JSON."""
+        row_data: dict[str, Any] = {"shift": self.shift, "epsilon": self.epsilon, "removed": self.removed}
+        for name, interval in self.metrics.items():
+            row_data[name] = interval.to_json()
+        for name, interval in self.changes.items():
+            row_data[f"{name}_change"] = interval.to_json()
+        return row_data
+
+
+def threshold_rows(
+    epsilon: np.ndarray,
+    metrics: Mapping[str, np.ndarray],
+    reference_metrics: Mapping[str, np.ndarray],
+    removal_weight: np.ndarray,
+    episodes: EpisodeList,
+    shift: float,
+) -> list[ThresholdRow]:
+    """Compute the rows of one layout shift, with one more row for no removal unless some epsilon is 1 or more.
+
+    Intervals generalize to other training seeds and scenes; those of a single seed to other scenes only.
+
+    Args:
+      epsilon: float [X], thresholds.
+      metrics: `sr`, `spl` and `dts`, each float [X, S, E].
+      reference_metrics: the same metrics without removal, each float [S, E].
+      removal_weight: float [X, S, E], mean weight of the removed logits in each episode.
+      episodes: the E episodes.
+      shift: layout shift of the scenes.
+    """
+    clusters = episodes.clusters()
+
+    def make_row(threshold: float | None, row_metrics: Mapping[str, np.ndarray], weight: np.ndarray) -> ThresholdRow:
+        # A single seed has no spread between seeds, so its interval covers the scenes alone.
+        intervals = {}
+        changes = {}
+        for name in METRIC_COLUMNS:
+            scale = 1.0 if name == "dts" else 100.0
+            values = scale * row_metrics[name]
+            reference_values = scale * reference_metrics[name]
+            has_seeds = len(values) > 1
+            intervals[name] = mean_interval(values, clusters, trained=has_seeds)
+            changes[name] = paired_difference(reference_values, values, clusters, same_runs=True, trained=has_seeds)
+        return ThresholdRow(shift, threshold, 100.0 * float(np.mean(weight)), intervals, changes)
+
+    rows = []
+    for index, threshold in enumerate(epsilon.tolist()):
+        row_metrics = {name: values[index] for name, values in metrics.items()}
+        rows.append(make_row(threshold, row_metrics, removal_weight[index]))
+    if epsilon.max() < 1.0:
+        rows.append(make_row(None, reference_metrics, np.zeros(())))
+    return rows
+
+
+def sweep_notes(num_seeds: int, episodes: EpisodeList) -> list[str]:
+    """State what the intervals of a sweep cover, one sentence per note."""
+    num_plans = len(set(episodes.floor_plans))
+    if episodes.clusters().degrees_of_freedom < MIN_SCENE_DEGREES:
+        return [f"No intervals: {num_plans} floor plans are too few; an interval needs at least 3."]
+    if num_seeds == 1:
+        return [
+            f"95 % intervals over {num_plans} floor plans. They hold for this one policy: sweep a run with several "
+            "seeds to cover other trainings too."
+        ]
+    return [f"95 % intervals over {num_seeds} training seeds and {num_plans} floor plans."]
+
+
+def sweep_table(rows: Sequence[ThresholdRow]) -> Table:
+    """Make the table of SR and SPL for a terminal, with a section for each layout shift."""
+    titles = [METRIC_COLUMNS[name][0] for name in _PRINTED_METRICS]
+    table = _make_table("Threshold", *titles, "Removed (%)")
+    for shift, shift_rows in _rows_by_shift(rows).items():
+        table.add_section()
+        table.add_row(f"shift {shift:g}", style="bold")
+        for row in shift_rows:
+            table.add_row(_threshold_text(row), *_metric_cells(row), f"{row.removed:.1f}")
+    return table
+
+
+def change_table(rows: Sequence[ThresholdRow]) -> Table:
+    """Make the table of the differences to no removal for a terminal, with a section for each layout shift."""
+    titles = [f"{name.upper()}, change (points)" for name in _PRINTED_METRICS]
+    table = _make_table("Threshold", *titles)
+    for shift, shift_rows in _rows_by_shift(rows).items():
+        table.add_section()
+        table.add_row(f"shift {shift:g}", style="bold")
+        for row in shift_rows:
+            # A row without removal has no difference to itself.
+            if row.epsilon is not None:
+                table.add_row(_threshold_text(row), *_change_cells(row))
+    return table
+
+
+def sweep_markdown(rows: Sequence[ThresholdRow], notes: Sequence[str]) -> str:
+    """Make one table of all columns in Markdown, with the notes below, ending with a newline."""
+    titles = ["Shift", "Threshold", *(METRIC_COLUMNS[name][0] for name in _PRINTED_METRICS)]
+    titles += [f"{name.upper()}, change (points)" for name in _PRINTED_METRICS]
+    titles.append("Removed (%)")
+
+    table_lines = [titles, ["---:"] * len(titles)]
+    for row in rows:
+        change_cells = [""] * len(_PRINTED_METRICS) if row.epsilon is None else _change_cells(row)
+        numbers = [*_metric_cells(row), *change_cells, f"{row.removed:.1f}"]
+        table_lines.append([f"{row.shift:g}", _threshold_text(row), *numbers])
+
+    text_parts = []
+    for cells in table_lines:
+        text_parts.append(f"| {' | '.join(cells)} |\n")
+    for note in notes:
+        text_parts.append(f"\n{note}\n")
+    return "".join(text_parts)
+
+
+def _make_table(*titles: str) -> Table:
+    """Make an empty table whose numbers are aligned to the right."""
+    first_title, *number_titles = titles
+    table = Table(first_title, box=box.SIMPLE_HEAD)
+    for title in number_titles:
+        table.add_column(title, justify="right", no_wrap=True)
+    return table
+
+
+def _rows_by_shift(rows: Sequence[ThresholdRow]) -> dict[float, list[ThresholdRow]]:
+    """Group rows by their layout shift, in order."""
+    shift_rows: dict[float, list[ThresholdRow]] = {}
+    for row in rows:
+        shift_rows.setdefault(row.shift, []).append(row)
+    return shift_rows
+
+
+def _threshold_text(row: ThresholdRow) -> str:
+    return "no removal" if row.epsilon is None else f"{row.epsilon:g}"
+
+
+def _metric_cells(row: ThresholdRow) -> list[str]:
+    return [f"{row.metrics[name]:.{METRIC_COLUMNS[name][1]}f}" for name in _PRINTED_METRICS]
+
+
+def _change_cells(row: ThresholdRow) -> list[str]:
+    return [f"{row.changes[name]:+.{METRIC_COLUMNS[name][1]}f}" for name in _PRINTED_METRICS]
