@@ -8,7 +8,6 @@ found by name (`find_policy_folder`), and `load_policy_as_run` treats a single p
 import dataclasses
 import functools
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -436,12 +435,17 @@ def find_policy_folder(path: str | Path) -> Path:
     """
     folder = _resolve_folder(path)
     if not folder.exists():
-        packaged_names = ", ".join(sorted(os.listdir(PACKAGED_POLICIES)))
+        packaged_names = ", ".join(list_packaged_policies())
         raise InputError(
             f"{path}: not an exported policy (No such file or directory: {path}); export it, "
             f"or load one of the package: {packaged_names}"
         )
     return folder
+
+
+def list_packaged_policies() -> list[str]:
+    """Names of the policies that come with the package, sorted."""
+    return sorted(folder.parent.name for folder in PACKAGED_POLICIES.glob(f"*/{POLICY_FILE}"))
 
 
 def is_policy(path: str | Path) -> bool:
@@ -471,15 +475,33 @@ def config_for_policy(path: str | Path) -> RunConfig:
     Raises:
       InputError: no such policy, or no generated world has its task.
     """
-    # Generated worlds differ in their tasks, so the task identifies the world.
     folder = find_policy_folder(path)
     _, fields = load_params(folder)
     arm = "baseline" if fields["layout"] is None else "layout"
+    config = _config_for_task_fields(fields["task"], fields["method"], arm)
+    if config is None:
+        raise InputError(f"{folder}: was trained for a task that no generated world has; give the run that it comes from")
+    return config
+
+
+def config_for_task(task: Task, method: str, arm: str) -> RunConfig | None:
+    """Run configuration of one seed in the generated world of a task; None if no generated world has the task.
+
+    Args:
+      task: task of the policy.
+      method: name of its method.
+      arm: `baseline` or `layout`.
+    """
+    return _config_for_task_fields(_task_fields(task), method, arm)
+
+
+def _config_for_task_fields(task_fields: Mapping[str, Any], method: str, arm: str) -> RunConfig | None:
+    # Generated worlds differ in their tasks, so the task identifies the world.
     for world in WORLDS:
-        config = dataclasses.replace(RunConfig(), world=world, method=fields["method"], arms=(arm,), seeds=1)
-        if not list_differences(fields["task"], _task_fields(config.task)):
+        config = dataclasses.replace(RunConfig(), world=world, method=method, arms=(arm,), seeds=1)
+        if not list_differences(task_fields, _task_fields(config.task)):
             return config
-    raise InputError(f"{folder}: was trained for a task that no generated world has; give the run that it comes from")
+    return None
 
 
 def _task_fields(task: Task) -> dict[str, Any]:
