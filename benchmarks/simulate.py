@@ -168,7 +168,7 @@ def simulate_run(
 def format_simulation(rows: list[dict]) -> str:
     """Return a Markdown table of updates and runs."""
     parts = ("rollout", "learning", "waiting", "latency", "transfer", "checkpoint")
-    headings = ["hosts", "steps an update", *(f"{part} %" for part in parts), "failures", "days", "efficiency"]
+    headings = ["hosts", "steps per update", *(f"{part} %" for part in parts), "failures", "days", "efficiency"]
     lines = [" | ".join(headings), " | ".join("--:" for _ in headings)]
     for row in rows:
         shares = [f"{row['share_percent'][part]:.1f}" for part in parts]
@@ -201,18 +201,28 @@ def format_measurements(measured: dict) -> str:
     compile_s = update["compile_s"]
     save_s = update["save_s"]
     megabytes = free["bytes_per_s"] / 1e6
+    num_updates = measured["updates_per_call"]
+    free_us = 1e6 * free["latency_s"]
     return "\n".join(
         [
             "| weak scaling | steps/s | efficiency |",
             "| :-- | --: | --: |",
-            row("one process on one core, the other idle", rates["alone"], None),
-            row("two processes apart, to one alone", rates["apart"], to_alone["apart"]),
-            row("two as one run, a seed each, to two apart", rates["shared_seeds"], to_apart["shared_seeds"]),
-            row("two as one run of one seed, to two apart", rates["shared_episodes"], to_apart["shared_episodes"]),
+            row("one process on one core, the other core idle", rates["alone"], None),
+            row("two separate runs, relative to one alone", rates["apart"], to_alone["apart"]),
+            row(
+                "one run, a seed on each core, relative to two separate runs",
+                rates["shared_seeds"],
+                to_apart["shared_seeds"],
+            ),
+            row(
+                "one run of one seed, relative to two separate runs",
+                rates["shared_episodes"],
+                to_apart["shared_episodes"],
+            ),
             row("one device on both cores", simulated["1"]["steps_per_s"], None),
             *(
                 row(
-                    f"{number} simulated devices on both cores, to one",
+                    f"{number} simulated devices on both cores, relative to one device",
                     simulated[number]["steps_per_s"],
                     simulated[number]["efficiency_of_the_same_cores"],
                 )
@@ -221,20 +231,24 @@ def format_measurements(measured: dict) -> str:
             "",
             "| constant | measured |",
             "| :-- | --: |",
-            f"| an update alone: rollout, learning | {update['rollout_s']:.3f} s, {update['learning_s']:.3f} s |",
+            f"| rollout and learning of one update | {update['rollout_s']:.3f} s, {update['learning_s']:.3f} s |",
             f"| parameters | {update['parameter_bytes']:,} bytes |",
-            f"| sums in an update of one seed | {sums['calls']}, of {sums['arrays']} arrays, {sums['bytes']:,} bytes |",
-            f"| exchanges in {measured['updates_per_call']} updates of a seed each | {calls}, of {arrays} arrays |",
-            f"| a sum of an array (gloo), each process held to one core | {1e6 * pinned['latency_s']:,.0f} us |",
-            f"| the same, free to use both; bandwidth | {1e6 * free['latency_s']:.0f} us, {megabytes:,.0f} MB/s |",
+            f"| sums, seed shared, one update | {sums['calls']}, of {sums['arrays']} arrays, {sums['bytes']:,} bytes |",
+            f"| exchanges in {num_updates} updates, a seed on each core | {calls}, of {arrays} arrays |",
+            f"| one sum (gloo), each process held to one core | {1e6 * pinned['latency_s']:,.0f} us |",
+            f"| one sum (gloo), processes free to use both cores | {free_us:.0f} us, {megabytes:,.0f} MB/s |",
             f"| noise between two minibatches, log-normal sigma | {jitter:.3f} |",
-            f"| join, compile, save | {join_s:.1f} s, {compile_s:.1f} s, {save_s:.2f} s |",
+            f"| time to join, to compile, to save | {join_s:.1f} s, {compile_s:.1f} s, {save_s:.2f} s |",
         ]
     )
 
 
 def main() -> None:
-    """Replace every table of the document that a comment names."""
+    DOCUMENT.write_text(fill_page(DOCUMENT.read_text()))
+
+
+def fill_page(text: str) -> str:
+    """Return the page with every table that a comment names taken from the results."""
     measured = json.loads(MEASURED.read_text())
 
     def make_table(match: re.Match) -> str:
@@ -246,7 +260,7 @@ def main() -> None:
         return f"{match[1]}\n{table}\n"
 
     pattern = r"(<!-- (measured|batch_\w+: .+?) -->)\n(?:\|.*\n|\n(?=\| constant))*"
-    DOCUMENT.write_text(re.sub(pattern, make_table, DOCUMENT.read_text()))
+    return re.sub(pattern, make_table, text)
 
 
 if __name__ == "__main__":

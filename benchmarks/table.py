@@ -1,7 +1,11 @@
-"""Tables and chart of docs/performance.md, from the benchmarks' results.
+"""Tables, numbers and chart of the performance pages, from the benchmarks' results.
 
-`python benchmarks/table.py` writes a table between each `<!-- table NAME -->` and `<!-- end -->` of the document: the
-contents of results/performance/NAME.json, or with `NAME.key.key` a part of them.
+`python benchmarks/table.py` fills what stands between a mark and `<!-- end -->` in the pages `DOCUMENTS`:
+
+  <!-- table NAME -->                   the table of results/performance/NAME.json
+  <!-- table NAME.key.key -->           of a part of that file
+  <!-- table NAME: key=heading; key --> these columns only, the first under another heading
+  <!-- value NAME.key.key -->           one number within a line, not at its start
 """
 
 import json
@@ -19,9 +23,10 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results" / "performance"
-DOCUMENT = ROOT / "docs" / "performance.md"
+DOCUMENTS = (ROOT / "docs" / "performance.md", ROOT / "docs" / "performance_details.md")
 GROWTH_CHART = ROOT / "docs" / "images" / "performance" / "growth.png"
-TABLE_MARKS = re.compile(r"<!-- table (\S+) -->\n.*?<!-- end -->", re.DOTALL)
+TABLE_MARKS = re.compile(r"(<!-- table (\S+?)(?:: (.+?))? -->\n).*?(<!-- end -->)", re.DOTALL)
+VALUE_MARKS = re.compile(r"(<!-- value (.+?) -->).*?(<!-- end -->)")
 #: Axes of the growth chart, and programs with their colors.
 GROWTH_AXES = {
     "environments": "parallel episodes",
@@ -33,29 +38,53 @@ GROWTH_PROGRAMS = {"environment": "#d95f02", "training": "#2166ac"}
 
 
 def main() -> None:
-    text = DOCUMENT.read_text()
-    DOCUMENT.write_text(TABLE_MARKS.sub(lambda match: fill_table(match[1]), text))
+    for document in DOCUMENTS:
+        document.write_text(fill_page(document.read_text()))
     draw_growth(json.loads((RESULTS / "growth.json").read_text()), GROWTH_CHART)
 
 
-# Tables
+# Tables and numbers
 
 
-def fill_table(name: str) -> str:
-    """Return one table between its marks."""
+def fill_page(text: str) -> str:
+    """Return a page with its tables and numbers taken from the results."""
+    text = TABLE_MARKS.sub(lambda match: f"{match[1]}{make_table(match[2], match[3])}\n{match[4]}", text)
+    return VALUE_MARKS.sub(lambda match: f"{match[1]}{format_cell(read_result(match[2]))}{match[3]}", text)
+
+
+def make_table(name: str, columns: str | None) -> str:
+    """Return the Markdown table that a mark asks for."""
+    part = read_result(name)
+    if "." not in name:
+        part = {key: value for key, value in part.items() if key != "machine"}
+    if columns is None:
+        return format_table(part)
+
+    # Each column is `key` or `key=heading`.
+    headings = {}
+    for column in columns.split("; "):
+        key, _, heading = column.partition("=")
+        headings[key] = heading or key
+    return format_table(part, headings)
+
+
+def read_result(name: str) -> Any:
+    """Return the contents of a result file, or with `NAME.key.key` a part of them."""
     file, *keys = name.split(".")
     part = json.loads((RESULTS / f"{file}.json").read_text())
     for key in keys:
         part = part[key]
-    if not keys:
-        part = {key: value for key, value in part.items() if key != "machine"}
-    return f"<!-- table {name} -->\n{format_table(part)}\n<!-- end -->"
+    return part
 
 
-def format_table(part: Mapping[str, Any]) -> str:
+def format_table(part: Mapping[str, Any], headings: Mapping[str, str] | None = None) -> str:
     """Return a Markdown table of a result.
 
     If all entries have parts, each is a row with a column for each part; otherwise each leaf is a row.
+
+    Args:
+      part: of a result.
+      headings: of the columns to show, by key; by default all columns, named by their keys.
     """
     if all(isinstance(entry, Mapping) and not is_spread(entry) for entry in part.values()):
         rows = {name: dict(iterate_leaves(entry)) for name, entry in part.items()}
@@ -63,13 +92,12 @@ def format_table(part: Mapping[str, Any]) -> str:
         rows = {name: {"value": value} for name, value in iterate_leaves(part)}
 
     # Columns in the order in which they first occur; a row may lack some.
-    columns = []
-    for row in rows.values():
-        columns += [column for column in row if column not in columns]
+    if headings is None:
+        headings = {column: column for row in rows.values() for column in row}
 
-    lines = [["", *(column.replace("_", " ") for column in columns)], ["---"] + ["---:"] * len(columns)]
+    lines = [["", *(heading.replace("_", " ") for heading in headings.values())], ["---"] + ["---:"] * len(headings)]
     for name, row in rows.items():
-        lines.append([name.replace("_", " "), *(format_cell(row.get(column)) for column in columns)])
+        lines.append([name.replace("_", " "), *(format_cell(row.get(column)) for column in headings)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -94,7 +122,9 @@ def format_cell(value: Any) -> str:
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: ""}[value]
     if isinstance(value, int | float):
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+        if abs(value) >= 1e6:
+            return f"{value / 1e6:.3g} M"
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return str(value).replace("|", "\\|")
 
 
