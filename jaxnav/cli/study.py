@@ -12,7 +12,7 @@ from jaxnav.experiments.driver import check_measurements, run_experiment
 DESCRIPTION = (
     f"Run an experiment: {', '.join(EXPERIMENTS)}, or a YAML file. Trains and measures what is missing, and writes its "
     "pages. The experiments account, mixture, handover and instrument measure a finished run: give --run RUN, and "
-    "--without RUN for agents that cannot know any layout."
+    "--reference RUN for a run of layout-blind agents."
 )
 
 

@@ -64,9 +64,9 @@ class Bench:
         """Run of an agent in a world, or None if the experiment has no such run."""
         return self._runs.get((world, agent))
 
-    def unaware_run(self, world: str) -> AgentRun | None:
-        """Run of the agents that cannot know any layout, or None if the experiment has none."""
-        return self.find_run(world, self.config.unaware)
+    def layout_blind_run(self, world: str) -> AgentRun | None:
+        """Run of the layout-blind agents, or None if the experiment has none."""
+        return self.find_run(world, self.config.reference_agent)
 
     def chosen_epsilon(self, run: AgentRun) -> float:
         """Look up the threshold with the greatest success on `val`, at the first shift and in the residual form.

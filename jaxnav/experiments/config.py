@@ -15,48 +15,55 @@ import re
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-from jaxnav.causal import Form
+from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
-from jaxnav.runs.run import load_run_config, run_settings
 
 #: Experiments that come with jaxnav, by name.
 EXPERIMENTS = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
 
 
+#: Name of the layout-blind agents of a finished run, and their usual name in experiments.
+LAYOUT_BLIND_AGENT = "anonymous"
+
+
 @dataclasses.dataclass(frozen=True)
 class ExperimentConfig:
-    """Settings of an experiment; finished runs and results are reused.
+    """Settings of an experiment. Finished training runs and results are reused.
 
     Attributes:
       title: title of the page.
-      results: folder of the results; those of a split are in a folder of its name. With `run`, the default is in the
-        folder of that run.
-      runs: folder of the training runs.
-      pages: pages to write, as document: template. A template is a file, or the name of a packaged one.
-      worlds: worlds by name, with the settings that all runs in it change.
-      agents: agents by name, with the settings that their runs change. `against` lists what an agent is compared
-        with: AGENT, or one of its variants as AGENT/VARIANT; `run` names a finished run to use in place of training.
-      left_out: patterns of WORLD-AGENT that do not exist.
-      only: patterns of WORLD-AGENT that are measured now; pages show all that have results.
-      measure: measurements by name (see `jaxnav.experiments.driver.MEASUREMENTS`), each with patterns of AGENT or
+      results: folder of the result files, with one subfolder per split. With `run`, the default is the subfolder
+        `results` of the run directory.
+      runs: folder of the training runs of the experiment.
+      pages: pages to write, as a mapping from a Markdown document to its template. A template is a file, or the name of
+        a packaged template.
+      worlds: worlds by name. Each maps settings of `jaxnav train` to the values of all runs in that world.
+      agents: agents by name. Each maps settings of `jaxnav train` to the values of its runs. The key `against` lists
+        the agents that it is compared with, as AGENT or AGENT/VARIANT; the key `run` names a finished run to use
+        instead of training one.
+      left_out: patterns of WORLD-AGENT, such as `rooms-*`, of which no run is trained or measured.
+      only: patterns of WORLD-AGENT that are measured in this call. The pages show every agent that has results.
+      measure: measurements by name (docs/experiments.md lists them). Each maps to a list of patterns of AGENT or
         WORLD-AGENT that are measured.
-      groups: groups of agents whose mean success, with best actions and at the first shift, is compared with an agent
-        or with another variant of the group.
-      unaware: agent that cannot know any layout; the reference for the value and cost of experience.
-      run: finished run to measure in place of the agents; the results are kept in its folder.
-      without: finished run of agents that cannot know any layout, next to `run`.
+      groups: groups of agents by name. The mean success of a group, with best actions and at the first layout shift, is
+        compared with an agent or with another variant of the group.
+      reference: layout-blind agents, against which the value and the cost of experience are measured. With `run`, the
+        run directory of such agents (a run of `--method anonymous`); otherwise the name of one of the agents, by
+        default `anonymous`.
+      run: run directory of a finished run to measure. The experiment then trains nothing, and its results and pages are
+        written to that directory.
       split: scenes to evaluate on.
-      shifts: layout shifts, rising; the first is the reference.
-      episodes: number of episodes in each world, or at each shift.
-      epsilon: thresholds of sTDE; the first is the one that is compared.
-      form: how sTDE combines the logits.
-      decodings: rules that turn logits into actions, of which a mixture is measured with each.
-      steps: length of the curves of the layout gap.
-      seed: seed of episode lists and sampled actions.
-      base: settings shared by all runs.
+      shifts: layout shifts, rising, each from 0 (as in training) to 1. The first is the reference of all changes.
+      episodes: number of episodes, at least 1, at each layout shift.
+      epsilon: thresholds of sTDE, each at least 0. The first is the one that is compared.
+      form: rule by which sTDE combines factual and counterfactual logits.
+      decodings: rules that turn logits into actions, `argmax` (best actions) and `sample` (sampled actions); removal in
+        a mixed population is measured with each.
+      steps: number of steps, at least 1, over which the curves of the layout gap are recorded.
+      seed: random seed of the episode lists and the sampled actions, from 0 to 2**32 - 1.
+      base: settings of `jaxnav train` that all runs of the experiment share.
     """
 
     title: str = "Experiment"
@@ -69,9 +76,8 @@ class ExperimentConfig:
     only: tuple[str, ...] = ("*",)
     measure: dict[str, Any] = dataclasses.field(default_factory=lambda: {"evaluation": ["*"]})
     groups: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
-    unaware: str = "anonymous"
+    reference: str | None = None
     run: Path | None = None
-    without: Path | None = None
     split: Literal["train", "val", "test"] = "val"
     shifts: tuple[float, ...] = (0.0, 1.0)
     episodes: int = 1000
@@ -81,6 +87,11 @@ class ExperimentConfig:
     steps: int = 80
     seed: int = 0
     base: RunConfig = RunConfig()
+
+    @property
+    def reference_agent(self) -> str:
+        """Name of the layout-blind agents in an experiment that `check_experiment` completed."""
+        return LAYOUT_BLIND_AGENT if self.reference is None else self.reference
 
 
 #: Settings of the evaluation, which all results of an experiment share.
@@ -113,7 +124,7 @@ class AgentRun(NamedTuple):
 
 
 def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
-    """Return the experiment if every setting is valid, with the agents of `run` and `without` filled in.
+    """Return the experiment if every setting is valid, with the agents of `run` and `reference` filled in.
 
     Raises:
       InputError: names the first invalid setting.
@@ -122,6 +133,11 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
 
     if not config.agents:
         raise InputError("agents: none; give --run RUN, a finished run, or agents to train")
+    if config.reference_agent not in config.agents and config.reference is not None:
+        raise InputError(
+            f"reference: {config.reference!r} is none of the agents; next to --run RUN, give the run directory of "
+            "layout-blind agents"
+        )
 
     # Numbers of the evaluation; the first shift is the reference of every comparison, so it must be the smallest.
     shifts = config.shifts
@@ -210,28 +226,27 @@ def _check_group(config: ExperimentConfig, key: str, group: dict[str, Any]) -> N
 
 
 def _with_finished_runs(config: ExperimentConfig) -> ExperimentConfig:
-    """Replace the agents by those of `run` and `without`, if these are given."""
+    """Replace the agents by the finished run, and by the layout-blind run `reference`, if `run` is given."""
+    from jaxnav.runs.run import load_run_config
+
     if config.run is None:
-        if config.without is not None:
-            raise InputError(f"without: {config.without}: give the run that it is compared with, as `run`")
         return config
 
-    # Agents of the experiment, and a run without its own name, would be lost silently.
+    # Agents of the experiment would be lost silently.
     default = ExperimentConfig()
     if config.agents and config.agents != default.agents:
-        raise InputError(f"run: {config.run}: the experiment has agents of its own; leave them out")
-    if config.unaware == "main":
-        raise InputError("unaware: with `run`, main is the measured run; give another name")
+        raise InputError(f"run: {config.run}: the experiment already has agents; give an experiment without agents")
 
     # The world is that of the run, unless it is changed; results and page are kept in the run's folder.
     base = load_run_config(config.run)
     agents: dict[str, dict[str, Any]] = {"main": {"run": str(config.run)}}
-    if config.without is not None:
-        agents[config.unaware] = {"run": str(config.without)}
+    if config.reference is not None:
+        agents[LAYOUT_BLIND_AGENT] = {"run": config.reference}
     run_world = {base.scenes.stem.partition(".")[0] if base.scenes else base.world: {}}
     return dataclasses.replace(
         config,
         agents=agents,
+        reference=None,
         worlds=run_world if config.worlds == default.worlds else config.worlds,
         base=dataclasses.replace(base, devices=None),
         results=config.run / "results" if config.results == default.results else config.results,
@@ -266,8 +281,10 @@ def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, An
 
     # The settings of a finished run are fixed, but for its world.
     if "run" in agent_settings:
+        from jaxnav.runs.run import load_run_config
+
         if changes:
-            raise InputError(f"agents.{agent}: is a finished run; leave out {', '.join(changes)}")
+            raise InputError(f"agents.{agent}: is a finished run; remove its settings {', '.join(changes)}")
         run_config = load_run_config(Path(agent_settings["run"]))
         run_config = apply_values(run_config, world_changes, Path(f"worlds.{world}"))
         return AgentRun(world, agent, run_config, against, is_external=True)
@@ -314,6 +331,8 @@ def part_settings(config: ExperimentConfig, run: AgentRun, references: list[Agen
       run: the measured run.
       references: the runs with which it is compared.
     """
+    from jaxnav.runs.run import run_settings
+
     settings = evaluation_settings(config) | {"run": run_settings(run.config)}
     if references:
         settings["references"] = {reference.agent: _digest(run_settings(reference.config)) for reference in references}

@@ -49,9 +49,9 @@ def _grouped_agents(config: ExperimentConfig, run: AgentRun) -> list[str]:
     return agents
 
 
-def _unaware_agent(config: ExperimentConfig, run: AgentRun) -> list[str]:
-    """The agents that cannot know any layout."""
-    return [config.unaware]
+def _layout_blind_agent(config: ExperimentConfig, run: AgentRun) -> list[str]:
+    """The layout-blind agents."""
+    return [config.reference_agent]
 
 
 class Measurement(NamedTuple):
@@ -74,14 +74,14 @@ MEASUREMENTS = {
     "evaluation": Measurement(measure_evaluation, references=_compared_agents),
     "frontier": Measurement(measure_frontier),
     "groups": Measurement(measure_groups, references=_grouped_agents),
-    "account": Measurement(measure_account, references=_unaware_agent),
+    "account": Measurement(measure_account, references=_layout_blind_agent),
     "trials": Measurement(measure_trials, parts="shifts"),
     "variants": Measurement(measure_variants, parts="shifts"),
     "growth": Measurement(measure_growth, compares_shifts=True),
-    "instrument": Measurement(measure_instrument, references=_unaware_agent, compares_shifts=True),
+    "instrument": Measurement(measure_instrument, references=_layout_blind_agent, compares_shifts=True),
     "gaps": Measurement(measure_gaps, compares_shifts=True),
-    "mixture": Measurement(measure_mixture, parts="decodings", references=_unaware_agent, compares_shifts=True),
-    "handover": Measurement(measure_handover, parts="decodings", references=_unaware_agent, compares_shifts=True),
+    "mixture": Measurement(measure_mixture, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
+    "handover": Measurement(measure_handover, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
 }
 
 

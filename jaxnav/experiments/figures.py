@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxnav.causal import Form
+from jaxnav.choices import Form
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.gap_traces import Belief
 from jaxnav.experiments.similarity import GainBySimilarity, SuccessBySimilarity, gain_of_table, success_of_table

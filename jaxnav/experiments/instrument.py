@@ -1,7 +1,7 @@
 """The layout shift as an instrument: which properties of scenes and agents it changes.
 
 A valid shift leaves the difficulty of the scenes unchanged, costs agents that rely on the training layout, and costs
-nothing to agents that cannot know any layout. `measure_scenes` measures a world at one shift, scene by scene;
+nothing to layout-blind agents. `measure_scenes` measures a world at one shift, scene by scene;
 `compare_shifts` turns the measures of several shifts into rows of results.
 """
 
@@ -21,7 +21,7 @@ from jaxnav.evaluation.statistics import Interval, SharedDesign, divide_or_nan
 from jaxnav.evaluation.variants import table_row
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import AgentRun
-from jaxnav.experiments.scores import require_unaware_run
+from jaxnav.experiments.scores import require_layout_blind_run
 from jaxnav.experiments.table import ResultRow
 from jaxnav.runs.evaluate import evaluate_rows
 from jaxnav.runs.policies import Policies, load_policies
@@ -35,31 +35,31 @@ DIFFICULTY_MEASURES = ("best_length", "random_sr", "frontier_sr", "start_distanc
 #: Measures that may differ between categories, but that the shift must not change in any of them.
 CATEGORY_MEASURES = ("goal_detected", "done_succeeds")
 BASELINE_MEASURES = ("baseline_argmax_sr", "baseline_sample_sr")
-#: Measures of agents that cannot know any layout, and that a shift therefore cannot mislead.
-NO_EXPERIENCE_MEASURES = (
-    "without_argmax_sr",
-    "without_sample_sr",
-    "without_argmax_wrong",
-    "without_sample_wrong",
+#: Measures of layout-blind agents, which a shift cannot mislead.
+LAYOUT_BLIND_MEASURES = (
+    "layout_blind_argmax_sr",
+    "layout_blind_sample_sr",
+    "layout_blind_argmax_wrong",
+    "layout_blind_sample_wrong",
 )
 
 
 def measure_instrument(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
-    """Measure a run at every shift and compare the shifts, next to agents without experience if there are any."""
+    """Measure a run at every shift and compare the shifts, together with layout-blind agents if there are any."""
     bench.train(run)
     policies = load_policies(run.config)
-    unaware_policies = None
-    if bench.unaware_run(run.world) is not None:
-        unaware_run = require_unaware_run(bench, run)
-        bench.train(unaware_run)
-        unaware_policies = load_policies(unaware_run.config, ("baseline",))
+    layout_blind_policies = None
+    if bench.layout_blind_run(run.world) is not None:
+        layout_blind_run = require_layout_blind_run(bench, run)
+        bench.train(layout_blind_run)
+        layout_blind_policies = load_policies(layout_blind_run.config, ("baseline",))
 
     shifts = bench.config.shifts
     totals_by_shift = []
     for shift in shifts:
         world = bench.compile_world(run, shift)
         episodes = bench.config.episodes
-        totals_by_shift.append(measure_scenes(world, policies, unaware_policies, episodes, bench.config.seed))
+        totals_by_shift.append(measure_scenes(world, policies, layout_blind_policies, episodes, bench.config.seed))
     yield from compare_shifts({"world": run.world, "run": run.agent}, shifts, totals_by_shift)
 
 
@@ -85,7 +85,7 @@ class SceneTotals(NamedTuple):
 
 
 def measure_scenes(
-    world: CompiledWorld, policies: Policies, unaware_policies: Policies | None, num_episodes: int, seed: int
+    world: CompiledWorld, policies: Policies, layout_blind_policies: Policies | None, num_episodes: int, seed: int
 ) -> SceneTotals:
     """Measure the scenes of a world at one shift.
 
@@ -94,7 +94,7 @@ def measure_scenes(
     Args:
       world: the scenes.
       policies: policies with the baseline among their arms.
-      unaware_policies: policies of agents that cannot know any layout, with as many seeds.
+      layout_blind_policies: policies of layout-blind agents, with as many seeds.
       num_episodes: number of episodes in all scenes together.
       seed: seed of the episode lists and the sampled actions.
     """
@@ -136,16 +136,16 @@ def measure_scenes(
         "baseline_sample_sr": sum_by_scene(baseline_sample),
     }
 
-    # Agents without experience meet the same episodes.
-    if unaware_policies is not None:
-        _, unaware_outcome, _ = evaluate_rows(rows, unaware_policies, world, num_episodes, seed)
-        unaware_metrics = episode_metrics(unaware_outcome, episodes.best_length)
-        argmax_success, sample_success = 100.0 * unaware_metrics["sr"]
-        argmax_wrong, sample_wrong = 100.0 * unaware_metrics["wrong_done"]
-        values["without_argmax_sr"] = sum_by_scene(argmax_success)
-        values["without_sample_sr"] = sum_by_scene(sample_success)
-        values["without_argmax_wrong"] = sum_by_scene(argmax_wrong)
-        values["without_sample_wrong"] = sum_by_scene(sample_wrong)
+    # Layout-blind agents meet the same episodes.
+    if layout_blind_policies is not None:
+        _, layout_blind_outcome, _ = evaluate_rows(rows, layout_blind_policies, world, num_episodes, seed)
+        layout_blind_metrics = episode_metrics(layout_blind_outcome, episodes.best_length)
+        argmax_success, sample_success = 100.0 * layout_blind_metrics["sr"]
+        argmax_wrong, sample_wrong = 100.0 * layout_blind_metrics["wrong_done"]
+        values["layout_blind_argmax_sr"] = sum_by_scene(argmax_success)
+        values["layout_blind_sample_sr"] = sum_by_scene(sample_success)
+        values["layout_blind_argmax_wrong"] = sum_by_scene(argmax_wrong)
+        values["layout_blind_sample_wrong"] = sum_by_scene(sample_wrong)
 
     # Layout measures weigh every scene with co-occurrence once, all others weigh scenes by their episodes.
     has_cooccurrence = (~np.isnan(scenes.gap)).astype(np.float64)
@@ -295,7 +295,7 @@ def compare_shifts(
         # Leave-one-out means at every shift.
         means = []
         for shift, total in zip(shifts, totals, strict=True):
-            is_trained = measure in BASELINE_MEASURES + NO_EXPERIENCE_MEASURES
+            is_trained = measure in BASELINE_MEASURES + LAYOUT_BLIND_MEASURES
             values = total.values[measure]
             mean = design.jackknife_means(values, total.weights[measure], total.names, trained=is_trained)
             means.append(mean)
@@ -306,7 +306,7 @@ def compare_shifts(
         changes: dict[float, np.ndarray] = {}
         if measure in DIFFICULTY_MEASURES:
             changes = _percent_changes(measure, shifts, means)
-        elif measure in BASELINE_MEASURES + NO_EXPERIENCE_MEASURES:
+        elif measure in BASELINE_MEASURES + LAYOUT_BLIND_MEASURES:
             sign = -1.0 if measure.endswith("wrong") else 1.0  # more wrong Dones are a loss
             changes = {shifts[-1]: sign * (means[0] - means[-1])}
         for shift, change in changes.items():

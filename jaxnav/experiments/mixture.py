@@ -1,8 +1,8 @@
 """Removal in a mixed population: how much value of experience it keeps, and how much of the cost it recovers.
 
-Half of the episodes are in scenes laid out as in training, half in shifted ones, and no agent knows which. A removal is
-worth its gain over the whole mixture. A gap is worth its gain over controls: the gap of another episode of the mixture,
-the mean gap of all episodes at the same time, and clocks.
+Half of the episodes are in scenes with the training layout, half in shifted scenes, and no agent knows which. A removal
+is worth its gain over the whole mixture. A gap is worth its gain over controls: the gap of another episode of the
+mixture, the mean gap of all episodes at the same time, and clocks.
 
 `measure_mixture` evaluates the removals of a run and their controls, `measure_handover` those that hand over to agents
 without experience. `PopulationMetrics` compares outcomes, at each shift and over the mixture.
@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxnav.causal import Form
+from jaxnav.choices import Decoding, Form
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
-from jaxnav.evaluation.report import Decoding, remaining_share
+from jaxnav.evaluation.report import remaining_share
 from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import AgentRun
-from jaxnav.experiments.scores import require_unaware_run
+from jaxnav.experiments.scores import require_layout_blind_run
 from jaxnav.experiments.table import ResultRow
 from jaxnav.experiments.trials import (
     EvaluatedRun,
@@ -39,15 +39,15 @@ from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
 
 #: Variants of the agents that removals are compared with.
-WITHOUT_EXPERIENCE = "without experience"
+LAYOUT_BLIND = "layout-blind agents"
 WITHOUT_REMOVAL = "without removal"
 #: Gaps of the constant controls.
 CONSTANT_GAPS = (0.25, 0.5, 0.75)
 #: Times of the clocks, as shares of the world's second action budget: all experience is removed after, or until, that
 #: time. They are below 1, because a later removal cannot change success within the budget.
 CLOCK_TIMES = (0.1, 0.25, 0.5)
-#: Name of the removal that knows the shift: all experience is removed at every shift but the first.
-ORACLE_NAME = "told the shift"
+#: Name of the removal that is given the shift: all experience is removed at every shift but the first.
+ORACLE_NAME = "oracle removal"
 
 
 class RemovalRule(NamedTuple):
@@ -99,7 +99,7 @@ def measure_mixture(
       rules: rules of soft removal, in addition to TDE and clocks.
 
     Raises:
-      InputError: there are no agents without experience, or they differ in world, goals or number of seeds.
+      InputError: there are no layout-blind agents, or they differ in world, goals or number of seeds.
     """
     return _measure_removals(bench, run, decoding, rules, hand_over=False)
 
@@ -107,7 +107,7 @@ def measure_mixture(
 def measure_handover(
     bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
 ) -> Iterator[ResultRow]:
-    """Evaluate removals that hand over to the agents without experience; see `measure_mixture`."""
+    """Evaluate removals that hand over to the layout-blind agents; see `measure_mixture`."""
     return _measure_removals(bench, run, decoding, rules, hand_over=True)
 
 
@@ -115,25 +115,25 @@ def _measure_removals(
     bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule], *, hand_over: bool
 ) -> Iterator[ResultRow]:
     # Paired comparisons need the same episodes and as many training runs on both sides.
-    unaware_run = require_unaware_run(bench, run)
+    layout_blind_run = require_layout_blind_run(bench, run)
     bench.train(run)
-    bench.train(unaware_run)
+    bench.train(layout_blind_run)
     budgets = WORLDS[run.config.world].budgets
     shifts = (bench.config.shifts[0], bench.config.shifts[-1])
     runner = TrialRunner(bench.config.seed)
 
     # Both runs meet the same episodes.
     world, episodes, shift_index = draw_mixed_population(bench, run, shifts)
-    unaware = EvaluatedRun(load_policies(unaware_run.config, ("baseline",)), world, episodes)
+    layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
     policies = load_policies(run.config, ("layout",))
     if hand_over:
-        policies = policies.with_handover_to(unaware.policies)
+        policies = policies.with_handover_to(layout_blind.policies)
     evaluated_run = EvaluatedRun(policies, world, episodes)
     estimator = require_estimator_config(policies)
 
     # References and clocks are evaluated once, for all rules.
     baseline_trial = Trial("baseline", decoding)
-    unaware_outcome = runner.run_trials(unaware, None, [baseline_trial])[baseline_trial]
+    layout_blind_outcome = runner.run_trials(layout_blind, None, [baseline_trial])[baseline_trial]
     bench.console.print("TDE and clocks")
     clocks = clock_trials(decoding, budgets[-1])
     plain_trial = Trial("layout", decoding)
@@ -143,12 +143,12 @@ def _measure_removals(
 
     # Values of the agents themselves.
     metrics = PopulationMetrics(episodes, shift_index, budgets)
-    agent_name = f"{run.agent}, handed over to {unaware_run.agent}" if hand_over else run.agent
+    agent_name = f"{run.agent}, handed over to {layout_blind_run.agent}" if hand_over else run.agent
     report = _RemovalReport(
         fields={"world": run.world, "run": agent_name, "decoding": decoding},
         shifts=shifts,
         metrics=metrics,
-        unaware=metrics.percent_metrics(unaware_outcome),
+        layout_blind=metrics.percent_metrics(layout_blind_outcome),
         agent=metrics.percent_metrics(outcomes[plain_trial]),
         num_scenes=len(episodes.scenes) // len(shifts),
     )
@@ -326,10 +326,10 @@ class PopulationMetrics:
         return self._for_each_shift(difference, reference, compared)
 
     def remaining_shares(
-        self, unaware: MetricValues, agent: MetricValues, removed: MetricValues
+        self, layout_blind: MetricValues, agent: MetricValues, removed: MetricValues
     ) -> dict[str, tuple[Interval, ...]]:
         """Compute the share of the lead that remains after removal, for each metric at each shift."""
-        return self._for_each_shift(remaining_share, unaware, agent, removed)
+        return self._for_each_shift(remaining_share, layout_blind, agent, removed)
 
     def overall_differences(self, reference: MetricValues, compared: MetricValues) -> dict[str, Interval]:
         """Compute `compared - reference` of the same policies over all episodes, for each metric."""
@@ -360,7 +360,7 @@ class _RemovalReport(NamedTuple):
       fields: fields of all rows.
       shifts: layout shifts of the population.
       metrics: computes and compares metrics.
-      unaware: results of the agent without experience.
+      layout_blind: results of the layout-blind agent.
       agent: results of the agent with experience, without removal.
       num_scenes: number of scenes at each shift.
     """
@@ -368,7 +368,7 @@ class _RemovalReport(NamedTuple):
     fields: Mapping[str, Any]
     shifts: tuple[float, ...]
     metrics: PopulationMetrics
-    unaware: MetricValues
+    layout_blind: MetricValues
     agent: MetricValues
     num_scenes: int
 
@@ -378,10 +378,10 @@ class _RemovalReport(NamedTuple):
 
     def agent_rows(self) -> Iterator[ResultRow]:
         """Make the rows of both agents without removal, and of the lead of one over the other."""
-        lead = self.metrics.differences(self.unaware, self.agent, same_runs=False)
-        yield from self._shift_rows(self.metrics.means(self.unaware), variant=WITHOUT_EXPERIENCE)
+        lead = self.metrics.differences(self.layout_blind, self.agent, same_runs=False)
+        yield from self._shift_rows(self.metrics.means(self.layout_blind), variant=LAYOUT_BLIND)
         yield from self._shift_rows(self.metrics.means(self.agent), variant=WITHOUT_REMOVAL)
-        yield from self._shift_rows(lead, variant=WITHOUT_REMOVAL, reference=WITHOUT_EXPERIENCE)
+        yield from self._shift_rows(lead, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND)
 
     def removal_rows(
         self, name: str, outcome: EpisodeOutcome, controls: Mapping[str, EpisodeOutcome] | None = None
@@ -403,8 +403,9 @@ class _RemovalReport(NamedTuple):
             yield self.row(metric, difference, **fields)
 
         # The share of the lead that remains, of a value or a cost.
-        shares = metrics.remaining_shares(self.unaware, self.agent, removed)
-        yield from self._shift_rows({f"{metric} left": by_shift for metric, by_shift in shares.items()}, variant=name)
+        shares = metrics.remaining_shares(self.layout_blind, self.agent, removed)
+        share_rows = {f"{metric} remaining": by_shift for metric, by_shift in shares.items()}
+        yield from self._shift_rows(share_rows, variant=name)
 
         # The gain over each control is measured over the whole mixture.
         for control, control_outcome in (controls or {}).items():

@@ -218,7 +218,7 @@ def verdict(effect: Interval, min_effect: float) -> str:
         return "refuted"
     if effect.high < min_effect:
         return "too small to matter"
-    return "holds" if effect.low > 0 else "cannot be told"
+    return "holds" if effect.low > 0 else "inconclusive"
 
 
 def difference_of_worlds(first: Interval, second: Interval) -> Interval:

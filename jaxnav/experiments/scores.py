@@ -12,11 +12,12 @@ import jax
 import numpy as np
 
 from jaxnav.baselines.frontier import run_frontier_search
+from jaxnav.choices import Decoding
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import episode_metrics
 from jaxnav.evaluation.notes import last_quarter_success
-from jaxnav.evaluation.report import UNTRAINED_VARIANTS, Decoding
+from jaxnav.evaluation.report import UNTRAINED_VARIANTS
 from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.bench import Bench, Scores
@@ -235,42 +236,46 @@ def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
 
 
 def measure_account(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
-    """Compare every variant of a run with agents that cannot know any layout, at every shift.
+    """Compare every variant of a run with the layout-blind agents, at every shift.
 
-    The metric `sr left` is the share of the lead that remains after a removal: of a value the share kept, of a cost 100
-    minus the share recovered.
+    The metric `sr remaining` is the share (%) of the lead that remains after a removal: of a value the share kept, of a
+    cost 100 minus the share recovered.
 
     Raises:
-      InputError: the experiment has no agents without experience, or as many seeds of neither.
+      InputError: the experiment has no layout-blind agents, or they differ in world, goals or number of seeds.
     """
-    unaware_run = require_unaware_run(bench, run)
+    layout_blind_run = require_layout_blind_run(bench, run)
     for shift in bench.config.shifts:
         scores = bench.evaluate(run, shift)
-        unaware_scores = bench.evaluate(unaware_run, shift)
-        for lead in measure_leads(scores.results, unaware_scores.results):
+        layout_blind_scores = bench.evaluate(layout_blind_run, shift)
+        for lead in measure_leads(scores.results, layout_blind_scores.results):
             fields = row_fields(run, shift, scores.results.rows[lead.row_index])
-            fields |= {"reference": unaware_run.agent, "scenes": num_scenes(scores.episodes)}
+            fields |= {"reference": layout_blind_run.agent, "scenes": num_scenes(scores.episodes)}
             yield ResultRow(**fields, metric=lead.metric, value=lead.lead)
             if lead.left is not None:
-                yield ResultRow(**fields, metric=f"{lead.metric} left", value=lead.left)
+                yield ResultRow(**fields, metric=f"{lead.metric} remaining", value=lead.left)
 
 
-def require_unaware_run(bench: Bench, run: AgentRun) -> AgentRun:
-    """Return the run of agents that cannot know any layout, in the world of a run.
+def require_layout_blind_run(bench: Bench, run: AgentRun) -> AgentRun:
+    """Return the run of layout-blind agents, in the world of a run.
 
     Raises:
       InputError: there is none, or it differs from the run in world, goals or number of seeds.
     """
-    unaware_run = bench.unaware_run(run.world)
-    if unaware_run is None:
-        raise InputError(f"{run.name}: there are no agents without experience to compare with; give --without RUN")
+    layout_blind_run = bench.layout_blind_run(run.world)
+    if layout_blind_run is None:
+        raise InputError(
+            f"{run.name}: has no layout-blind agents to compare with; train a run of --method anonymous in the same "
+            "world, and give its directory as --reference RUN"
+        )
     for name in ("world", "scenes", "worlds", "task", "seeds"):
-        if getattr(run.config, name) != getattr(unaware_run.config, name):
-            directories = f"{run.config.run_dir} and {unaware_run.config.run_dir}"
+        if getattr(run.config, name) != getattr(layout_blind_run.config, name):
+            directories = f"{run.config.run_dir} and {layout_blind_run.config.run_dir}"
             raise InputError(f"{directories} differ in {name}; train both alike")
-    if "baseline" not in unaware_run.config.arms:
-        raise InputError(f"{unaware_run.config.run_dir}: was trained without the arm `baseline`; train one with it")
-    return unaware_run
+    if "baseline" not in layout_blind_run.config.arms:
+        run_dir = layout_blind_run.config.run_dir
+        raise InputError(f"{run_dir}: has no arm `baseline`; train the layout-blind agents with --arms baseline")
+    return layout_blind_run
 
 
 # Groups of agents

@@ -21,7 +21,7 @@ from jaxnav.evaluation.statistics import Interval
 from jaxnav.store.files import write_atomic
 
 #: Version of the files of results.
-RESULTS_FORMAT = 3
+RESULTS_FORMAT = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

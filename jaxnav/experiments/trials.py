@@ -14,12 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.causal import Form
+from jaxnav.choices import Decoding, Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
-from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.evaluation.statistics import Interval, SharedDesign, mean_interval, paired_difference
 from jaxnav.evaluation.variants import inference_grid, table_row

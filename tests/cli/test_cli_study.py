@@ -52,7 +52,7 @@ def test_study_help_lists_experiments_and_settings(capsys):
     with pytest.raises(SystemExit, match="0"):
         study("--help")
     words = capsys.readouterr().out.replace(",", " ").split()
-    assert {*EXPERIMENTS, "--run", "--without", "--split", "--episodes"} <= set(words)
+    assert {*EXPERIMENTS, "--run", "--reference", "--split", "--episodes"} <= set(words)
 
 
 def test_study_lists_the_experiments_for_an_unknown_one(capsys):
@@ -78,7 +78,7 @@ def test_study_lists_the_experiments_for_an_unknown_one(capsys):
         (["--measure", "{mixture: ['*']}"], "shifts"),
         (["--pages", "{page.md: no_such_page}"], "no_such_page"),
         (["--run", "nowhere"], "nowhere"),
-        (["--without", "nowhere"], "without"),
+        (["--reference", "nowhere"], "reference"),
     ],
 )
 def test_study_refuses_bad_settings_in_one_line_and_writes_nothing(
@@ -140,9 +140,9 @@ def test_study_of_a_run_prints_and_stores_the_results(experiment, drawn_run, cap
 
 @pytest.mark.slow
 def test_study_account_of_a_run_over_itself_is_zero_for_the_baseline(drawn_run, capsys):
-    # The run itself stands in for agents without experience, so that its baseline has no lead.
+    # The run itself stands in for layout-blind agents, so that its baseline has no lead.
     run_dir = drawn_run.config.run_dir
-    assert study("account", "--run", run_dir, "--without", run_dir, "--episodes", 24) == 0
+    assert study("account", "--run", run_dir, "--reference", run_dir, "--episodes", 24) == 0
     printed = capsys.readouterr().out
     assert printed.strip() == (run_dir / "account.md").read_text().strip()
     for shift in (0, 1):

@@ -106,7 +106,7 @@ def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
 
 
 def test_table_2_has_the_methods_of_the_paper():
-    # Beside them are agents without experience, and EOTP adapted to ever changing scenes.
+    # Beside them are layout-blind agents, and EOTP adapted to ever changing scenes.
     methods = set(COMMITTED["table2"].agents) - {"anonymous", "eotp:ADAPTED"}
     hosts = {method for method in methods if not method.endswith("-streams")}
     assert hosts == {"rgb", "sp", "savn", "eotp", "org", "tpn", "vtnet", "hoz"}

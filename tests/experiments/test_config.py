@@ -121,7 +121,7 @@ def test_part_settings_tell_the_runs_and_evaluations_apart_that_differ():
 def test_finished_runs_replace_the_agents(drawn_run):
     run_dir = drawn_run.config.run_dir
     config = check_experiment(
-        ExperimentConfig(run=run_dir, without=run_dir, agents={}, pages={"docs/account.md": "account"})
+        ExperimentConfig(run=run_dir, reference=str(run_dir), agents={}, pages={"docs/account.md": "account"})
     )
     # The world is that of the run, and everything that is written goes to its folder.
     runs = agent_runs(config)
@@ -200,7 +200,7 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         ),
         # Finished runs.
         ({"run": Path("nowhere")}, "nowhere"),
-        ({"without": Path("nowhere")}, "without"),
+        ({"reference": "nowhere"}, "reference.*nowhere"),
         ({"run": Path("nowhere"), "agents": {"plain": {}}}, "nowhere"),
     ],
 )
@@ -211,7 +211,7 @@ def test_invalid_settings_are_refused_by_name(changes, named):
 
 
 def test_finished_runs_take_no_place_of_other_agents(drawn_run):
-    with pytest.raises(InputError, match=r"run: .*agents of its own"):
+    with pytest.raises(InputError, match=r"run: .*already has agents"):
         check_experiment(make_config(run=drawn_run.config.run_dir))
 
 
@@ -243,7 +243,7 @@ def test_packaged_experiments_are_valid(name, drawn_run, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
     config = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
     if name in OF_FINISHED_RUNS:
-        config = dataclasses.replace(config, run=drawn_run.config.run_dir, without=drawn_run.config.run_dir)
+        config = dataclasses.replace(config, run=drawn_run.config.run_dir, reference=str(drawn_run.config.run_dir))
     config = check_measurements(config)
 
     # Every page can be written, and no result has the file of another.

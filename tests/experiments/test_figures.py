@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from jaxnav.causal import Form
+from jaxnav.choices import Form
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments import figures
 from jaxnav.experiments.gap_traces import Belief

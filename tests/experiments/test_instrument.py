@@ -15,7 +15,7 @@ from jaxnav.experiments.instrument import (
     BASELINE_MEASURES,
     CATEGORY_MEASURES,
     DIFFICULTY_MEASURES,
-    NO_EXPERIENCE_MEASURES,
+    LAYOUT_BLIND_MEASURES,
     SceneTotals,
     compare_shifts,
     measure_detection,
@@ -28,7 +28,7 @@ from jaxnav.scenes.task import Rules, Task
 
 # Comparison of shifts
 
-TRAINED_MEASURES = BASELINE_MEASURES + NO_EXPERIENCE_MEASURES
+TRAINED_MEASURES = BASELINE_MEASURES + LAYOUT_BLIND_MEASURES
 MEASURES = (*DIFFICULTY_MEASURES, "frontier_steps", *CATEGORY_MEASURES, *TRAINED_MEASURES)
 ROOMS = ("kitchen", "kitchen", "bedroom")  # a single bedroom shows no variance, so all scenes are one stratum
 NAMES = ("a", "b", "c")
@@ -152,11 +152,11 @@ def test_changes_of_categories_do_not_cancel():
 
 
 def test_more_wrong_dones_are_a_loss():
-    first = make_totals(without_argmax_sr=[[80.0] * 3] * 2, without_argmax_wrong=[[3.0] * 3] * 2)
-    last = make_totals(without_argmax_sr=[[78.0] * 3] * 2, without_argmax_wrong=[[4.5] * 3] * 2)
+    first = make_totals(layout_blind_argmax_sr=[[80.0] * 3] * 2, layout_blind_argmax_wrong=[[3.0] * 3] * 2)
+    last = make_totals(layout_blind_argmax_sr=[[78.0] * 3] * 2, layout_blind_argmax_wrong=[[4.5] * 3] * 2)
     table = compare(first, last)
-    assert find_change(table, "without_argmax_sr").mean == pytest.approx(2.0)
-    assert find_change(table, "without_argmax_wrong").mean == pytest.approx(1.5)
+    assert find_change(table, "layout_blind_argmax_sr").mean == pytest.approx(2.0)
+    assert find_change(table, "layout_blind_argmax_wrong").mean == pytest.approx(1.5)
 
 
 def test_a_difficulty_of_zero_cannot_change_by_percents():
@@ -223,16 +223,16 @@ def test_a_single_training_run_shows_no_loss(tmp_path):
 
 
 @pytest.mark.parametrize(("loss", "is_small"), [(1.9, True), (2.1, False), (-5.0, True)])
-def test_agents_without_experience_must_lose_little(tmp_path, loss, is_small):
-    first = make_totals(without_argmax_sr=[[80.0] * 3] * 2, without_argmax_wrong=[[3.0] * 3] * 2)
-    last = make_totals(without_argmax_sr=[[80.0 - loss] * 3] * 2, without_argmax_wrong=[[3.0 + loss] * 3] * 2)
+def test_layout_blind_agents_must_lose_little(tmp_path, loss, is_small):
+    first = make_totals(layout_blind_argmax_sr=[[80.0] * 3] * 2, layout_blind_argmax_wrong=[[3.0] * 3] * 2)
+    last = make_totals(layout_blind_argmax_sr=[[80.0 - loss] * 3] * 2, layout_blind_argmax_wrong=[[3.0 + loss] * 3] * 2)
     assert read_verdicts(tmp_path, first, last)["No loss"] == [is_small, True, is_small, True]
 
 
 def test_without_such_agents_there_is_no_verdict_on_them(tmp_path):
     totals = []
     for results in (make_totals(), make_totals()):
-        values = {name: value for name, value in results.values.items() if name not in NO_EXPERIENCE_MEASURES}
+        values = {name: value for name, value in results.values.items() if name not in LAYOUT_BLIND_MEASURES}
         totals.append(results._replace(values=values))
     assert set(read_verdicts(tmp_path, *totals)) == {"Difficulty", "Categories", "Discriminating"}
 

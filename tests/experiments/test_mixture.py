@@ -9,9 +9,9 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.mixture import (
+    LAYOUT_BLIND,
     ORACLE_NAME,
     REMOVAL_RULES,
-    WITHOUT_EXPERIENCE,
     WITHOUT_REMOVAL,
     PopulationMetrics,
     clock_trials,
@@ -66,7 +66,7 @@ def make_outcome(success: tuple[float, float], weight: float = 0.0) -> EpisodeOu
 
 POPULATION = PopulationMetrics(population_episodes(), SHIFT, (15, 30))
 #: Without experience half of the goals are found. With it three of four where the layout holds, and else one of four.
-UNAWARE = make_outcome((0.5, 0.5))
+LAYOUT_BLIND_OUTCOME = make_outcome((0.5, 0.5))
 AGENT = make_outcome((0.75, 0.25))
 #: Hard removal makes the agent as good as one without experience.
 HARD = make_outcome((0.5, 0.5), weight=1.0)
@@ -87,9 +87,9 @@ def test_population_metrics_are_means_at_each_shift():
     }
 
 
-def test_value_and_cost_are_differences_to_the_agent_without_experience():
-    unaware, agent = POPULATION.percent_metrics(UNAWARE), POPULATION.percent_metrics(AGENT)
-    assert means_of(POPULATION.differences(unaware, agent, same_runs=False)["sr"]) == [25.0, -25.0]
+def test_value_and_cost_are_differences_to_the_layout_blind_agent():
+    layout_blind, agent = POPULATION.percent_metrics(LAYOUT_BLIND_OUTCOME), POPULATION.percent_metrics(AGENT)
+    assert means_of(POPULATION.differences(layout_blind, agent, same_runs=False)["sr"]) == [25.0, -25.0]
 
 
 def test_overall_differences_weigh_both_shifts():
@@ -101,9 +101,11 @@ def test_overall_differences_weigh_both_shifts():
 def test_oracle_keeps_the_value_and_recovers_the_cost():
     oracle = POPULATION.oracle_removal(AGENT, HARD)
     assert POPULATION.removal_weights(oracle) == (0.0, 1.0)
-    unaware, agent, removed = (POPULATION.percent_metrics(outcome) for outcome in (UNAWARE, AGENT, oracle))
+    layout_blind, agent, removed = (
+        POPULATION.percent_metrics(outcome) for outcome in (LAYOUT_BLIND_OUTCOME, AGENT, oracle)
+    )
     # Of the value all is left, of the cost nothing. All scenes are alike, so that the leads are clear of 0.
-    assert means_of(POPULATION.remaining_shares(unaware, agent, removed)["sr"]) == [100.0, 0.0]
+    assert means_of(POPULATION.remaining_shares(layout_blind, agent, removed)["sr"]) == [100.0, 0.0]
     # Nothing at the first shift, 25 points at the second.
     assert POPULATION.overall_differences(agent, removed)["sr"].mean == 12.5
 
@@ -143,7 +145,7 @@ def test_joined_lists_number_the_poses_and_scenes_of_all_banks():
     assert joined.clusters().degrees_of_freedom == second_list.clusters().degrees_of_freedom == NUM_SCENES - 1
 
 
-# Measurements. The run's own baseline stands in for agents without experience.
+# Measurements. The run's own baseline stands in for layout-blind agents.
 
 
 @pytest.fixture
@@ -179,12 +181,10 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
     for metric in METRICS:
         for shift in (0.0, 1.0):
             values = {}
-            for variant in (WITHOUT_EXPERIENCE, WITHOUT_REMOVAL):
+            for variant in (LAYOUT_BLIND, WITHOUT_REMOVAL):
                 values[variant] = table.find(row_fields, variant=variant, shift=shift, metric=metric).mean
-            lead = table.find(
-                row_fields, variant=WITHOUT_REMOVAL, reference=WITHOUT_EXPERIENCE, shift=shift, metric=metric
-            )
-            assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[WITHOUT_EXPERIENCE])
+            lead = table.find(row_fields, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND, shift=shift, metric=metric)
+            assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[LAYOUT_BLIND])
         for removal in removals:
             changes = []
             for shift in (0.0, 1.0):
@@ -202,17 +202,17 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
 
 
 @pytest.mark.slow
-def test_handover_leaves_the_agents_without_experience(bench):
+def test_handover_leaves_the_layout_blind_agents(bench):
     table = ResultTable(measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ()))
     (name,) = table.distinct("run")
     row_fields = {"world": "rooms", "run": name, "decoding": "argmax"}
-    # An agent that hands over at once is worth as much as the agents without experience.
+    # An agent that hands over at once is worth as much as the layout-blind agents.
     for metric in METRICS:
         for shift in (0.0, 1.0):
             agent = table.find(row_fields, variant=WITHOUT_REMOVAL, shift=shift, metric=metric)
             change = table.find(row_fields, variant="TDE", reference=WITHOUT_REMOVAL, shift=shift, metric=metric)
-            unaware = table.find(row_fields, variant=WITHOUT_EXPERIENCE, shift=shift, metric=metric)
-            assert agent.mean + change.mean == pytest.approx(unaware.mean)
+            layout_blind = table.find(row_fields, variant=LAYOUT_BLIND, shift=shift, metric=metric)
+            assert agent.mean + change.mean == pytest.approx(layout_blind.mean)
 
 
 @pytest.mark.parametrize("measure", [measure_mixture, measure_handover])

@@ -75,10 +75,10 @@ def read_lines(text: str) -> dict[str, list[str]]:
         (-1.0, 1.5, "too small to matter"),
         (-4.0, -1.0, "refuted"),
         (-4.0, 0.0, "too small to matter"),  # 0 is within the interval
-        (-1.0, 2.5, "cannot be told"),
-        (0.0, 2.5, "cannot be told"),
-        (-1.0, 2.0, "cannot be told"),  # what would matter is within the interval, too
-        (math.nan, math.nan, "cannot be told"),
+        (-1.0, 2.5, "inconclusive"),
+        (0.0, 2.5, "inconclusive"),
+        (-1.0, 2.0, "inconclusive"),  # what would matter is within the interval, too
+        (math.nan, math.nan, "inconclusive"),
     ],
 )
 def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(low, high, expected):
@@ -291,12 +291,12 @@ def study_rows() -> list[ResultRow]:
 
     # Experience is worth 8 points as trained and costs 7 if shifted, of which removal recovers 3.
     sampled = {"decoding": "sample"}
-    lead = {"variant": "without removal", "reference": "without experience"}
+    lead = {"variant": "without removal", "reference": "layout-blind agents"}
     rows.append(make_row(make_interval(8.0), **sampled, **lead, shift=0.0))
     rows.append(make_row(make_interval(-7.0), **sampled, **lead, shift=1.0))
     rows.append(make_row(make_interval(3.0), **sampled, variant="TDE", reference="without removal", shift=1.0))
     for shift in (0.0, 1.0):
-        rows.append(make_row(50.0, **sampled, variant="without experience", shift=shift))
+        rows.append(make_row(50.0, **sampled, variant="layout-blind agents", shift=shift))
         rows.append(make_row(50.0, **sampled, variant="without removal", shift=shift))
         rows.append(make_row(20.0, **sampled, variant="without removal", shift=shift, metric="length"))
     return rows
@@ -306,7 +306,7 @@ def study_rows() -> list[ResultRow]:
 CLAIMS = [
     ("baseline loses", 9.0, 1.0, "holds"),
     ("weights help where the layout is as trained", 3.0, 1.0, "holds"),
-    ("weights help at shift 1", 1.0, 1.0, "cannot be told"),  # from 0 to 2
+    ("weights help at shift 1", 1.0, 1.0, "inconclusive"),  # from 0 to 2
     ("sTDE (epsilon 0.5) gains on the weights", 2.0, 1.0, "holds"),
     ("sTDE (paper's form, epsilon 0) gains", 5.0, 1.0, "holds"),
     ("sTDE with the `evidence` gap", 4.0, 1.0, "holds"),
@@ -392,9 +392,9 @@ def mixture_rows(world: str) -> list[ResultRow]:
     for shift, lead in ((0.0, 6.0), (1.0, -4.0)):
         for metric in ("sr", "spl", "sr@40"):
             fields = {**sampled, "shift": shift, "metric": metric}
-            rows.append(make_row(50.0, **fields, variant="without experience"))
+            rows.append(make_row(50.0, **fields, variant="layout-blind agents"))
             rows.append(make_row(50.0 + lead, **fields, variant="without removal"))
-            lead_fields = {"variant": "without removal", "reference": "without experience"}
+            lead_fields = {"variant": "without removal", "reference": "layout-blind agents"}
             rows.append(make_row(lead, **fields, **lead_fields))
         rows.append(make_row(20.0, **sampled, shift=shift, variant="without removal", metric="length"))
 
@@ -404,7 +404,7 @@ def mixture_rows(world: str) -> list[ResultRow]:
         for metric in ("sr", "spl", "sr@40"):
             tde = {**sampled, "variant": "TDE", "shift": shift}
             rows.append(make_row(lead * (share / 100 - 1), **tde, reference="without removal", metric=metric))
-            rows.append(make_row(share, **tde, metric=f"{metric} left"))
+            rows.append(make_row(share, **tde, metric=f"{metric} remaining"))
     return rows
 
 
@@ -477,7 +477,7 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
     assert cells["rooms: `org` + w over `org`"] == ["+4.9", "+5.0 [+4.0, +6.0]", "holds"]
     assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "too small to matter"]
     assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "refuted"]
-    assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "cannot be told"]
+    assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "inconclusive"]
 
     # What has no results is not judged.
     assert cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "not run"]

@@ -12,10 +12,10 @@ from support.intervals import around, bounds
 
 import jaxnav
 from jaxnav.baselines.frontier import run_frontier_search
+from jaxnav.choices import Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome
-from jaxnav.evaluation.report import Variant
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.evaluation.variants import EvaluationRow, table_row
 from jaxnav.experiments.bench import Scores
@@ -59,7 +59,7 @@ def bench(make_bench, drawn_run, evaluated, monkeypatch):
             "main": {"run": str(drawn_run.config.run_dir), "against": ["other", "other/baseline"]},
             "other": {"run": str(other_dir)},
         },
-        unaware="other",
+        reference="other",
     )
 
 
@@ -250,15 +250,15 @@ def test_groups_without_agents_or_reference_have_no_rows(measured_groups):
 # Value and cost of experience
 
 
-def test_accounts_are_leads_over_the_agents_without_experience(bench, evaluated):
+def test_accounts_are_leads_over_the_layout_blind_agents(bench, evaluated):
     table = ResultTable(measure_account(bench, bench.find_run("rooms", "main")))
     metrics = evaluated.metrics()
-    unaware_metrics = without_every_other_success(evaluated).metrics()
+    layout_blind_metrics = without_every_other_success(evaluated).metrics()
     for index, row in enumerate(evaluated.rows[:-2]):  # neither Random nor the shortest path
-        unaware = evaluated.rows.index(table_row("baseline", None, None, row.decoding))
+        layout_blind = evaluated.rows.index(table_row("baseline", None, None, row.decoding))
         for metric in ("sr", "spl", "sr@20", "sr@50"):
             lead = table.find(fields_of(row), reference="other", metric=metric)
-            expected = 100.0 * (metrics[metric][index].mean() - unaware_metrics[metric][unaware].mean())
+            expected = 100.0 * (metrics[metric][index].mean() - layout_blind_metrics[metric][layout_blind].mean())
             assert lead.mean == pytest.approx(expected)
     assert not table.where(variant="random").rows
 
@@ -272,15 +272,17 @@ def test_accounts_agree_with_the_leads_of_two_evaluations(bench, evaluated):
         assert bounds(table.find(fields, metric=lead.metric)) == pytest.approx(bounds(lead.lead), nan_ok=True)
         # Only what removes experience has a share.
         share = Interval(float("nan")) if lead.left is None else lead.left
-        num_shares += table.has(fields, metric=f"{lead.metric} left")
-        assert bounds(table.find(fields, metric=f"{lead.metric} left")) == pytest.approx(bounds(share), nan_ok=True)
+        num_shares += table.has(fields, metric=f"{lead.metric} remaining")
+        assert bounds(table.find(fields, metric=f"{lead.metric} remaining")) == pytest.approx(
+            bounds(share), nan_ok=True
+        )
     # TDE and sTDE, with two decodings, in four metrics.
     assert num_shares == 2 * 2 * 4
 
 
-def test_accounts_need_agents_without_experience(make_bench):
+def test_accounts_need_layout_blind_agents(make_bench):
     bench = make_bench()
-    with pytest.raises(InputError, match="--without"):
+    with pytest.raises(InputError, match="--reference"):
         next(measure_account(bench, bench.find_run("rooms", "main")))
 
 

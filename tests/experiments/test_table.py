@@ -178,7 +178,7 @@ def test_a_file_holds_the_results_of_its_settings_alone(tmp_path):
     assert read_part(path, {"episodes": 1}) == []
 
 
-GOOD_HEAD = '{"settings": {}, "versions": {}, "format": 3, "shared": {"world": "rooms", "run": "org"}}\n'
+GOOD_HEAD = '{"settings": {}, "versions": {}, "format": 4, "shared": {"world": "rooms", "run": "org"}}\n'
 
 
 @pytest.mark.parametrize(
@@ -189,14 +189,14 @@ GOOD_HEAD = '{"settings": {}, "versions": {}, "format": 3, "shared": {"world": "
         b"\xff\xfe\x00",
         b"[]\n",
         b"3\n",
-        b'{"format": 3}\n',
-        b'{"settings": 3, "versions": {}, "format": 3, "shared": {}}\n',
+        b'{"format": 4}\n',
+        b'{"settings": 3, "versions": {}, "format": 4, "shared": {}}\n',
         GOOD_HEAD[:-4].encode(),
         *(GOOD_HEAD.encode() + line for line in (b"{", b"7", b"[]", b'{"metric": "sr"}', b'{"mean": 5}')),
         *(GOOD_HEAD.encode() + line for line in (b'{"metric": "sr", "mean": "x"}', b'{"metric": "sr", "mean": [1]}')),
         GOOD_HEAD.encode() + b'{"metric": "gap", "positions": [0, 1], "mean": ["x", "y"]}',
         GOOD_HEAD.encode() + b'{"metric": "gap", "positions": 0, "mean": 1}',
-        GOOD_HEAD.replace(": 3", ": 2").encode(),
+        GOOD_HEAD.replace(": 4", ": 3").encode(),
     ],
 )
 def test_a_damaged_file_is_refused_by_its_name(tmp_path, content):
