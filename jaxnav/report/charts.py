@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from jaxnav.causal import Form
+from jaxnav.choices import Form
 from jaxnav.evaluation.report import ExperienceLead, difference_label
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.figures import effects_figure, epsilon_figure
@@ -40,11 +40,11 @@ def thresholds_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
             if (report_row["variant"], report_row["decoding"]) == ("stde", "argmax"):
                 metrics = {name: Interval.from_json(report_row[name]) for name in ("sr", "spl", "dts")}
                 sweeps.setdefault((shift, report_row["form"]), {})[report_row["epsilon"]] = metrics
-    return Chart(to_svg(epsilon_figure(sweeps)), "Success, path length and distance by threshold.")
+    return Chart(to_svg(epsilon_figure(sweeps)), "SR, SPL and DTS by threshold, best actions.")
 
 
 def leads_chart(accounts: Mapping[float, Sequence[ExperienceLead]]) -> Chart:
-    """Draw the leads in success over agents without experience.
+    """Draw the leads in success over layout-blind agents.
 
     Args:
       accounts: leads of a run, by shift.
@@ -57,7 +57,7 @@ def leads_chart(accounts: Mapping[float, Sequence[ExperienceLead]]) -> Chart:
             if (lead.metric, lead.decoding) == ("sr", "argmax"):
                 lead_by_variant[lead.variant] = lead.lead
         leads_by_shift[f"Shift {shift:g}"] = lead_by_variant
-    return Chart(to_svg(effects_figure(leads_by_shift)), "Lead in success over agents that cannot know any layout.")
+    return Chart(to_svg(effects_figure(leads_by_shift)), "Lead in success over layout-blind agents, best actions.")
 
 
 def differences_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:

@@ -85,7 +85,7 @@ function drawView(view, optics, categories, unit, goal) {
   return [shape("polygon", { class: "cone", points: `${view.x},${-view.z} ${outline.join(" ")}` }), ...rings, arrow];
 }
 
-// An episode's course
+// The course of an episode
 
 function bar(name, shares, kinds, emphasis, whole = 1) {
   const strips = shares.map((share, i) => {
@@ -104,13 +104,13 @@ function drawCourse(gap, weight, threshold, cursor, length) {
   cursor.setAttribute("y1", 0);
   cursor.setAttribute("y2", 1);
   return shape("svg", { class: "course", viewBox: `0 0 ${length} 1`, preserveAspectRatio: "none", role: "img",
-    "aria-label": "Layout gap, and weight of what is removed, by step" },
+    "aria-label": "Layout gap, and share of experience that is removed, by step" },
   shape("polygon", { class: "weight", points: `0,1 ${steps(weight)} ${weight.length},1` }),
   ...lines, shape("polyline", { class: "gap", points: steps(gap) }), cursor);
 }
 
-function ending({ success, actions }, told = true) {
+function ending({ success, actions }, withWord = true) {
   const count = actions.length, word = success ? "found" : actions[count - 1] === DONE ? "wrong Done" : "out of time";
   const properties = { className: success ? "good" : "bad", title: `${word} after ${count} actions` };
-  return element("span", properties, `${success ? "✓" : "✕"} ${told ? `${word}, ` : ""}${count}`);
+  return element("span", properties, `${success ? "✓" : "✕"} ${withWord ? `${word}, ` : ""}${count}`);
 }

@@ -26,27 +26,27 @@ from jaxnav.viz.learning import learning_figure
 _Report = dict[str, Any]
 
 _RESULTS_TEXT = (
-    "SR is the share of episodes that end with Done where it succeeds, SPL weighs success by the shortest path, DTS is "
-    "the distance to the goal at the end. Brackets are 95 % intervals over training runs and scenes. At "
-    "shift 1 all categories have exchanged their places."
+    "SR is the success rate, SPL weights success by the shortest path, and DTS is the distance to success at the end. "
+    "Brackets hold 95 % intervals over training runs and scenes. At layout shift 1 all categories of a scene have "
+    "exchanged places. The end of the page explains all terms."
 )
 _ACCOUNT_TEXT = (
-    "The lead over agents that cannot know any layout, on the same episodes. Where the layout holds it is the value of "
-    "experience; where it is shifted, a negative lead is its cost. “Left” is the share of a lead that a removal "
-    "leaves."
+    "The lead of the run over layout-blind agents, on the same episodes. At shift 0 the lead is the value of "
+    "experience; at shift 1 a negative lead is the cost of experience. A removal of experience leaves a share of the "
+    "lead (“left”): the kept share of the value, or 100 % minus the recovered share of the cost."
 )
-_LEARNING_TEXT = "Success while training, in training scenes and in val scenes, and of the exported policies."
+_LEARNING_TEXT = "Success during training, in training scenes and in val scenes, and success of the exported policies."
 _THRESHOLDS_TEXT = (
-    "sTDE removes experience where the layout gap exceeds the threshold ε. From ε = 1 on nothing is removed. Best "
+    "sTDE removes experience where the layout gap exceeds the threshold ε. For ε ≥ 1 no experience is removed. Best "
     "actions; bands are 95 % intervals."
 )
 _GAP_TEXT = (
-    "The gap D after each action, over the episodes that still run, with the belief updated by what is seen, "
-    "and frozen at the prior. Sampled actions; nothing is removed."
+    "The mean layout gap D after each action, over the episodes that still run. For one curve detections update the "
+    "belief, for the other curve the belief stays at the prior. Sampled actions; no experience is removed."
 )
 _SIMILARITY_TEXT = (
-    "Success of {row} against the similarity of the goal's surroundings to those in training: the cosine of its "
-    "expected co-occurrence in the scene and in the prior."
+    "Success of {row} against the layout similarity of scene and goal: the cosine similarity between the expected "
+    "co-occurrences of the goal in the scene and in the prior from training."
 )
 
 
@@ -55,7 +55,7 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
 
     Args:
       run: a finished run.
-      reference_run: a finished run of agents that cannot know any layout, in the same world; None for none.
+      reference_run: a finished run of layout-blind agents in the same world; None for none.
       config: options of the measurements.
       console: receives messages about the progress.
 
@@ -164,7 +164,7 @@ def _at_threshold(report: _Report, threshold: float) -> _Report:
 
 
 def _account_section(by_shift: Mapping[float, ShiftMeasurements], threshold: float) -> Section | None:
-    # The section needs a run of agents without experience, which was measured at all shifts or at none.
+    # The section needs a run of layout-blind agents, which was measured at all shifts or at none.
     accounts = {}
     text_tables = []
     for shift, measurements in by_shift.items():
@@ -176,7 +176,7 @@ def _account_section(by_shift: Mapping[float, ShiftMeasurements], threshold: flo
         leads = [lead for lead in measurements.account if lead.variant in row_labels]
         accounts[shift] = leads
         text_tables.append(to_text_table(f"Shift {shift:g}", accounting_table(leads)))
-    return Section("What experience is worth", _ACCOUNT_TEXT, (leads_chart(accounts),), tuple(text_tables))
+    return Section("Value and cost of experience", _ACCOUNT_TEXT, (leads_chart(accounts),), tuple(text_tables))
 
 
 def _learning_section(run: Run) -> Section | None:
@@ -184,7 +184,7 @@ def _learning_section(run: Run) -> Section | None:
     if not log_rows:
         return None
     figure = learning_figure(log_rows, run.success_by_budget(), method_label(run.config.method))
-    chart = Chart(to_svg(figure), "Learning curves: success while training and within a number of actions.")
+    chart = Chart(to_svg(figure), "Learning curves: success during training, and success within a number of actions.")
     return Section("Learning", _LEARNING_TEXT, (chart,))
 
 
@@ -214,7 +214,7 @@ def _gap_section(run: Run, by_shift: Mapping[float, ShiftMeasurements]) -> Secti
         for belief, belief_index in BELIEFS.items():
             curve_by_line[shift, belief] = Curve(steps, *gap_bounds[:, belief_index])
     figure = gap_figure({run.config.layout.setting: curve_by_line})
-    return Section("The gap", _GAP_TEXT, (Chart(to_svg(figure), "Mean layout gap by step."),))
+    return Section("Layout gap", _GAP_TEXT, (Chart(to_svg(figure), "Mean layout gap by step."),))
 
 
 def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:
@@ -230,4 +230,4 @@ def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section 
     first_report = next(iter(by_shift.values())).results.report
     section_text = _SIMILARITY_TEXT.format(row=row_label(first_report["rows"][0]))
     chart = Chart(to_svg(similarity_figure(similarity_by_shift)), "Success against layout similarity.")
-    return Section("Success and similarity", section_text, (chart,))
+    return Section("Success and layout similarity", section_text, (chart,))

@@ -28,9 +28,9 @@ class ShiftMeasurements(NamedTuple):
 
     Attributes:
       results: evaluation of the run.
-      account: leads of the run over agents without experience; None without a run of such agents.
-      similarity: success by layout similarity; None where scenes are streamed.
-      gaps: layout gap along the episodes; None where scenes are streamed, or without the layout.
+      account: leads of the run over layout-blind agents; None without a run of such agents.
+      similarity: success by layout similarity; None if scenes are streamed.
+      gaps: layout gap along the episodes; None if scenes are streamed, or without the layout.
       replays: episodes, step by step.
     """
 
@@ -48,7 +48,7 @@ def measure_shift(
 
     Args:
       run: a finished run.
-      reference_run: a finished run of agents that cannot know any layout, in the same world; None for none.
+      reference_run: a finished run of layout-blind agents in the same world; None for none.
       shift: layout shift.
       config: options of the measurements.
       console: receives messages about the progress.
@@ -62,7 +62,7 @@ def measure_shift(
     policies = run.policies()
     agents = _select_agents(results, policies, world, config.threshold)
 
-    # Compare with agents without experience, and replay the best of them, too.
+    # Compare with layout-blind agents, and replay them with best actions, too.
     account = None
     if reference_run is not None:
         quiet_console = Console(quiet=True)
@@ -74,7 +74,7 @@ def measure_shift(
         reference_policies = reference_run.policies()
         for agent in _select_agents(reference_results, reference_policies, reference_world, config.threshold):
             if agent.role == "baseline":
-                agents.append(agent._replace(role="without"))
+                agents.append(agent._replace(role="reference"))
 
     # Similarity and gap need all scenes in one bank.
     episodes = _episodes_of_first_bank(results.episodes, world)

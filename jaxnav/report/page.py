@@ -99,11 +99,12 @@ def render_page(title: str, facts: Mapping[str, str], sections: Sequence[Section
         fact_items.append(f"<div>{_tag('dt', html.escape(fact_name))}{_tag('dd', html.escape(fact_text))}</div>")
     section_titles = [section.title for section in sections]
     section_titles.insert(1, "Replays")
+    section_titles.append("Terms")
     section_links = []
     for section_title in section_titles:
         section_links.append(f'<a href="#{_anchor(section_title)}">{html.escape(section_title)}</a>')
 
-    # The template puts the replays between the first section and the rest.
+    # The template puts the replays between the first section and the rest, and a glossary at the end.
     rendered_sections = list(map(_render_section, sections))
     return Template(_read_resource("page.html")).substitute(
         title=html.escape(title),

@@ -1,4 +1,4 @@
-// The replays: two agents in the same episode, and what moves them.
+// The replays: two agents in the same episode, and the controls that move them.
 
 const DELAY = 220, MOST = 6; // milliseconds a step; bars in a list
 const shifts = JSON.parse(document.getElementById("data").textContent);
@@ -29,7 +29,7 @@ function makeSide(number) {
     element("h3", {}, "Action", key), actions,
     element("div", { className: "pair" },
       element("div", {}, element("h3", {}, "Detected now"), seen),
-      element("div", {}, element("h3", {}, "Goal expected beside"), layouts)));
+      element("div", {}, element("h3", {}, "Goal expected near"), layouts)));
 
   function update(step) {
     const at = Math.min(step, course.actions.length - 1), view = plan.views[course.views[at]];
@@ -41,17 +41,17 @@ function makeSide(number) {
       ...drawView(view, shown(), categories, unit, episode.goal));
     const action = course.actions[at], ended = step >= course.actions.length;
     doing.textContent = ended ? `ended at step ${at + 1}` : `step ${at + 1}: ${ACTIONS[action]}`;
-    level.textContent = `D ${gap[at].toFixed(2)}, removed with weight ${weight[at].toFixed(2)}`;
+    level.textContent = `D ${gap[at].toFixed(2)}, removed share ${weight[at].toFixed(2)}`;
     for (const end of ["x1", "x2"]) cursor.setAttribute(end, at + 0.5);
-    if (!chances.length) actions.replaceChildren(element("span", { className: "none" }, "the policy chooses places, not actions"));
+    if (!chances.length) actions.replaceChildren(element("span", { className: "none" }, "This policy chooses places, not actions."));
     else actions.replaceChildren(...ACTIONS.flatMap((name, i) => {
       const three = KINDS.map((_, kind) => chances[(at * 3 + kind) * ACTIONS.length + i]);
       return bar(name, three, KINDS, i === action ? "chosen" : "");
     }));
-    list(seen, view.seen.map(([category, , , sure]) => [sure / 100, category]), 1, "nothing");
-    const known = Array.from(layout.slice(at * categories.length, (at + 1) * categories.length), (w, i) => [w, i]);
-    const others = known.filter(([w, i]) => w > 0 && i !== episode.goal).sort((a, b) => b[0] - a[0]);
-    list(layouts, others, others.length ? others[0][0] : 1, "no layout");
+    list(seen, view.seen.map(([category, , , sure]) => [sure / 100, category]), 1, "no detections");
+    const weights = Array.from(layout.slice(at * categories.length, (at + 1) * categories.length), (w, i) => [w, i]);
+    const otherWeights = weights.filter(([w, i]) => w > 0 && i !== episode.goal).sort((a, b) => b[0] - a[0]);
+    list(layouts, otherWeights, otherWeights.length ? otherWeights[0][0] : 1, "no layout weights");
   }
   function list(where, shares, whole, none) {
     const bars = shares.slice(0, MOST).flatMap(([share, category]) =>
@@ -75,9 +75,9 @@ function order() {
 function listEpisodes() {
   const { episodes, plans, categories, differ, evaluated, players, split } = shown();
   const [left, right] = state.players, whole = evaluated.toLocaleString("en");
-  part("count").textContent = left === right ? `${episodes.length} of ${whole} episodes, ${split}.`
-    : `“${players[left]}” and “${players[right]}” end differently, or at another step, in ${differ[left][right]} of `
-      + `${whole} episodes (${split}). ${episodes.length} can be replayed, those that differ first.`;
+  part("count").textContent = left === right ? `${episodes.length} of ${whole} ${split} episodes can be replayed.`
+    : `“${players[left]}” and “${players[right]}” differ in success or in the number of actions in ${differ[left][right]} `
+      + `of ${whole} episodes (${split}). ${episodes.length} episodes can be replayed; those with a difference come first.`;
   part("episodes").replaceChildren(...order().map((index) => {
     const episode = episodes[index], button = element("button", { type: "button" },
       element("strong", {}, categories[episode.goal]), element("small", {}, plans[episode.plan].name),

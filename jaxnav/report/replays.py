@@ -16,9 +16,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.special import softmax
 
+from jaxnav.choices import Variant
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.playback import EpisodeTrace
-from jaxnav.evaluation.report import Variant
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.runs.evaluate import find_scene, replay_episodes
 from jaxnav.runs.policies import Policies
@@ -35,7 +35,7 @@ from jaxnav.viz.scene import FULL_SHADE_HEIGHT, view_cone
 #: Pairs of roles to show side by side, by the difference between them.
 ROLE_PAIRS = {
     "Removal": ("layout", "stde"),
-    "Experience": ("layout", "without"),
+    "Experience": ("layout", "reference"),
     "Layout weights": ("layout", "baseline"),
 }
 
@@ -46,7 +46,7 @@ class ReplayAgent(NamedTuple):
     """Agent of the replays, with its results in E episodes of the evaluation.
 
     Attributes:
-      role: the variant of its row, or `without` for agents without experience.
+      role: the variant of its row, or `reference` for layout-blind agents.
       name: name of the row in tables.
       policies: policies of its run.
       world: compiled scenes, equal for all agents.
@@ -55,7 +55,7 @@ class ReplayAgent(NamedTuple):
       length: int [E], actions of the first seed.
     """
 
-    role: Variant | Literal["without"]
+    role: Variant | Literal["reference"]
     name: str
     policies: Policies
     world: CompiledWorld
@@ -170,7 +170,7 @@ class Replays:
       split: split of the scenes.
       categories: names of the categories.
       players: names of the agents, as in tables.
-      comparisons: pairs of agents by the difference between them, with it and without; the page shows the first pair.
+      comparisons: pairs of agents by the difference between them; the page shows the first pair.
       thresholds: threshold of sTDE of each agent; None where nothing is removed.
       differ: [P, P], number of evaluated episodes in which two agents differ in result or length.
       evaluated: number of evaluated episodes.
@@ -207,7 +207,7 @@ def make_replays(agents: Sequence[ReplayAgent], episodes: EpisodeList, count: in
     world = agents[0].world
     bank = world.banks[0]
 
-    # Play the selected episodes anew, since the evaluation stores results, not traces.
+    # Play the selected episodes again, because the evaluation stores results, not traces.
     selected_episodes = episodes.take(select_episodes(agents, count))
     traces_by_agent = []
     for agent in agents:

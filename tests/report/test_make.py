@@ -84,7 +84,7 @@ def test_report_tables_hold_the_numbers_of_the_evaluation(run, measurements, eva
     assert "+ w + sTDE (eps=0.2)" in row_names
     assert "+ w + sTDE (eps=0)" not in row_names
 
-    # What experience is worth, without the other threshold.
+    # Value and cost of experience, without the other threshold.
     leads = [lead for lead in measure_leads(evaluation, evaluation) if "eps=0)" not in lead.variant]
     assert decimal_numbers(str(experience_section.tables[0].rows)) == printed_numbers(accounting_table(leads))
 
@@ -185,7 +185,13 @@ def test_report_of_sixty_replays_is_below_eight_megabytes(run, measurements):
     assert player_data["players"] == measurements.replays.players
 
     # All sections but the learning curves: a drawn run has no log.
-    for title in ("Results", "What experience is worth", "Thresholds", "The gap", "Success and similarity"):
+    for title in (
+        "Results",
+        "Value and cost of experience",
+        "Thresholds",
+        "Layout gap",
+        "Success and layout similarity",
+    ):
         assert f"<h2>{html.escape(title)}</h2>" in page_text
     assert "<h2>Learning</h2>" not in page_text
 

@@ -123,6 +123,14 @@ def test_page_links_lead_to_its_sections(hostile_reader):
     assert "replays" in link_targets
 
 
+@pytest.mark.parametrize(
+    "term", ["Layout weights, w", "TDE", "sTDE, ε (eps)", "Removal", "Layout gap, D", "[a, b] and [-]"]
+)
+def test_page_explains_the_terms_of_its_tables(plain_reader, term):
+    assert term in plain_reader.texts["dt"]
+    assert {"href": "#terms"} in plain_reader.attributes_of("a")
+
+
 def test_to_text_table_copies_the_cells_of_a_console_table():
     table = ConsoleTable("Variant", "SR (%)")
     table.add_row(Text("rooms val", style="bold"))
