@@ -1,4 +1,4 @@
-# Everything a newcomer needs is `make run` and `make test`; both set up .venv from requirements.lock first.
+# A newcomer needs `make run` and `make test`; both first install .venv from requirements.lock.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -6,24 +6,29 @@ READY := .venv/.ready
 # Benchmarks whose report is stored in results/performance, for docs/performance.md and docs/scaling.md.
 BENCHMARKS := compile_time compiling environment estimator growth inference methods peers scaling seeds streaming sweep \
   training training_peers utilisation
+VERSION = $(shell sed -n 's/^version = "\(.*\)"$$/\1/p' pyproject.toml)
+# Version of the topmost section of the changelog.
+CHANGES = $(shell sed -n 's/^\#\# \[\([^]]*\)\].*/\1/p' CHANGELOG.md | head -n 1)
 
-.PHONY: help setup run test lint docs test-slow coverage mutants gate versions bench lock clean
+.PHONY: help setup run test lint docs test-slow coverage mutants gate versions bench package release lock clean
 
 help:
-	@echo 'make run        train on procedural rooms, then evaluate the run (runs/rooms)'
-	@echo 'make test       lint, import layers, types and the fast tests'
+	@echo 'make run        train on generated rooms, then evaluate the run (runs/rooms)'
+	@echo 'make test       linter, import layers, types, documentation and the fast tests'
 	@echo 'make test-slow  the slow tests'
-	@echo 'make coverage   the fast tests, and which branches of the package they take'
-	@echo 'make mutants    planted mistakes and drawn mutants, which the tests have to notice'
-	@echo 'make gate       fails where the environment is far slower than the stored result'
+	@echo 'make coverage   the fast tests, with the branch coverage of the package'
+	@echo 'make mutants    change the code in many ways, and list the changes that no test detects'
+	@echo 'make gate       fail if the environment is much slower than the stored result'
 	@echo 'make versions   the fast tests on every Python, with the oldest and the newest packages'
-	@echo 'make docs       the documentation as a site, in site/'
-	@echo 'make bench      every benchmark into results/performance, then the tables of the documentation'
-	@echo 'make setup      only build .venv;  make lock  pin anew;  make clean  remove what was built'
+	@echo 'make docs       build the documentation, site/index.html'
+	@echo 'make bench      run every benchmark, and update results/performance and the tables of the documentation'
+	@echo 'make package    build the wheel and the source archive in dist/, and try the wheel in a new environment'
+	@echo 'make release    make package for a committed version with a changelog; uploads and tags nothing'
+	@echo 'make setup      only install .venv;  make lock  pin newer versions;  make clean  remove what was built'
 
 setup: $(READY)
 
-# The stamp is written last: an interrupted or failed set-up starts over from an empty .venv.
+# The stamp is written last, so an interrupted or failed installation starts again with an empty .venv.
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "jaxnav needs Python 3.11 or newer; '$(PYTHON)' is not: try 'make $(or $(MAKECMDGOALS),setup) PYTHON=python3.11'" >&2; \
@@ -43,7 +48,7 @@ lint: $(READY)
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# What is not as it should be, a broken link for one, is an error.
+# Every warning, such as a broken link, is an error.
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
@@ -62,7 +67,7 @@ mutants: $(READY)
 gate: $(READY)
 	$(BIN)/python benchmarks/environment.py | $(BIN)/python benchmarks/gate.py results/performance/environment.json
 
-# Needs uv and each Python, which uv can get.
+# Needs uv, which downloads each Python.
 PYTHONS := 3.11 3.12 3.13
 RESOLUTIONS := lowest-direct highest
 TESTS :=
@@ -75,7 +80,7 @@ versions:
 	  $$venv/bin/python -m pytest -n 2 $(TESTS) || failed="$$failed $$name"; \
 	done; done; test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
 
-# A benchmark that fails leaves its last result as it is, and the others go on.
+# A benchmark that fails keeps its last result, and the other benchmarks still run.
 bench: $(READY)
 	@failed=; for name in $(BENCHMARKS); do \
 	  echo "== $$name"; result=results/performance/$$name.json; \
@@ -83,6 +88,28 @@ bench: $(READY)
 	  else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
 	$(BIN)/python benchmarks/table.py && $(BIN)/python benchmarks/simulate.py || exit 1; \
 	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+
+# Builds the source archive, and the wheel from it. The wheel is tried where there are no sources.
+TRIAL := .cache/release
+JAXNAV = ../bin/jaxnav
+
+package: $(READY)
+	rm -rf build dist *.egg-info $(TRIAL)
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python -m venv $(TRIAL)
+	$(TRIAL)/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	mkdir $(TRIAL)/smoke
+	cd $(TRIAL)/smoke && $(JAXNAV) --version | grep -Fx 'jaxnav $(VERSION)' && \
+	  $(JAXNAV) train --config smoke --total-steps 61_440 --run-dir run && $(JAXNAV) eval run --episodes 40
+
+# Needs a committed version with a section of the changelog. CONTRIBUTING.md lists the commands that publish it.
+release: $(READY)
+	@test -z "$$(git status --porcelain)" || { echo 'release: there are uncommitted changes; commit them' >&2; exit 1; }
+	@test '$(VERSION)' = '$(CHANGES)' || { \
+	  echo 'release: pyproject.toml has version $(VERSION), but CHANGELOG.md begins with $(CHANGES)' >&2; exit 1; }
+	@$(MAKE) --no-print-directory package
+	@echo 'jaxnav $(VERSION) is ready in dist/; CONTRIBUTING.md lists the commands that publish it'
 
 # For maintainers; needs uv.
 lock:

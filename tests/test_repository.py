@@ -63,6 +63,11 @@ def test_citation_carries_the_version() -> None:
     assert citation["license"] == PROJECT["project"]["license"]
 
 
+def test_changelog_begins_with_the_version() -> None:
+    sections = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert sections[0] == PROJECT["project"]["version"]
+
+
 @pytest.mark.parametrize(
     ("text", "matches"),
     [("see /root/notes", True), ("'/home/ann/x'", True), ("https://site.org/home/x", False), ("runs/work/x", False)],
