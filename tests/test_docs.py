@@ -18,6 +18,7 @@ from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import bind, init_params
 from jaxnav.policies.pathways import PolicyInputs
+from jaxnav.scenes.files.scene_file import read_scenes
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -53,6 +54,15 @@ def test_python_blocks_of_use_run(tmp_path, monkeypatch, capsys):
             )
     assert "['detections', 'goal', 'heading', 'horizon', 'moved', 'view']" in capsys.readouterr().out
     assert jaxnav.Run.open("runs/org").config.seeds == 2
+
+
+def test_python_block_of_scene_format_writes_a_scene_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = re.findall(r"```python\n(.*?)```", (DOCS / "scene_format.md").read_text(), re.DOTALL)
+    exec(block, {"__name__": "scene_format"})
+    (scene,) = read_scenes("my_scenes.jsonl.gz")
+    assert scene.reach.tolist()[2] == [True, True, False, False, True, True]
+    assert scene.types[scene.parents[1]] == "Desk"
 
 
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
