@@ -1,6 +1,6 @@
 """The perception of an agent in plain NumPy: features, the belief about the layout, the map of visited places.
 
-From docs/environment.md and docs/methods.md; float64 throughout, and no arithmetic of the package.
+From docs/environment.md and docs/specification.md; float64 throughout, and no arithmetic of the package.
 """
 
 import math
