@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 import jaxnav
 from jaxnav.causal import removal_weight
+from jaxnav.choices import EstimatorName
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.layout import EstimatorConfig, LayoutEstimator, prior_from_counts
 from jaxnav.viz.style import (
@@ -34,8 +35,11 @@ NUM_STEPS = 41
 EPSILON = 0.5
 #: Colour of each layout shift.
 SHIFT_COLORS = {0: AGENT_COLOR, 1: GOAL_COLOR}
-#: Title of the panels for each setting of the layout estimator.
-GAP_TITLES = {"calibrated": "Equation 5: change of the belief", "learned": "Gap learned: probability of another layout"}
+#: Title of the panels for each setting of the layout estimator; None is the calibrated one of the policy.
+GAP_TITLES: dict[EstimatorName | None, str] = {
+    None: "Equation 5: change of the belief",
+    "learned": "Gap learned: probability of another layout",
+}
 
 
 def draw_belief() -> Figure:
@@ -85,16 +89,15 @@ class GapMeans(NamedTuple):
     num_running: np.ndarray
 
 
-def measure_gap(setting: str, shift: int) -> GapMeans:
-    """Let the packaged policy act, and measure its gap; no experience is removed.
+def measure_gap(setting: EstimatorName | None, shift: int) -> GapMeans:
+    """Measure the gap of the packaged policy, from whose decisions no experience is removed.
 
     Args:
-      setting: of the layout estimator; None of them changes the actions, because nothing is removed.
+      setting: of the layout estimator; None for the policy's own. The actions do not depend on it.
       shift: layout shift of the rooms.
     """
     env, params = jaxnav.make("rooms", split="val", shift=shift)
-    gap_setting = None if setting == "calibrated" else setting
-    policy = jaxnav.load_policy("rooms-org", gap_setting, env=env)
+    policy = jaxnav.load_policy("rooms-org", setting, env=env)
 
     def run_episode(key: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
         """Act until Done; return gap and whether the episode still runs, by step."""
@@ -105,6 +108,7 @@ def measure_gap(setting: str, shift: int) -> GapMeans:
             observation = env.observe(state, params)
             # With a threshold of 1 no experience is removed.
             output = policy.decide(observation, memory, 1.0, heading=heading, moved=moved, horizon=horizon)
+            assert output.gap is not None
             choice = jnp.argmax(output.logits).astype(jnp.int32)
             action, memory = policy.apply_choice(output, choice, memory.room)
 
@@ -136,8 +140,7 @@ def draw_gap() -> Figure:
             means = measure_gap(setting, shift)
             gap_axes.plot(means.gap, color=color, lw=1.6, label=f"shift {shift}")
             weight_axes.plot(means.weight, color=color, lw=1.6)
-            running = means.num_running[[0, -1]]
-            print(f"{setting}, shift {shift}: {running[0]} episodes at step 0, {running[1]} still run at step 40")
+            print(f"{setting or 'calibrated'}, shift {shift}: {means.num_running[-1]} episodes run at the last step")
         gap_axes.axhline(EPSILON, color=MUTED_COLOR, lw=0.8, ls="--")
         set_panel_title(gap_axes, title)
         weight_axes.set_xlabel("step of the episode")
