@@ -1,7 +1,9 @@
 """What the documentation shows is what happens."""
 
+import ast
 import dataclasses
 import doctest
+import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -63,6 +65,64 @@ def test_python_block_of_scene_format_writes_a_scene_file(tmp_path, monkeypatch)
     (scene,) = read_scenes("my_scenes.jsonl.gz")
     assert scene.reach.tolist()[2] == [True, True, False, False, True, True]
     assert scene.types[scene.parents[1]] == "Desk"
+
+
+def load_script(name):
+    """A script of the documentation as a module."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+@pytest.mark.parametrize("name", ["commands.md", "commands_train.md"])
+def test_pages_of_commands_are_up_to_date(name):
+    assert (DOCS / name).read_text() == load_script("write_commands").write_pages()[name], (
+        "run: python docs/write_commands.py"
+    )
+
+
+def public_names_with_links():
+    """The names in the tables of the overview, and where each links to."""
+    return dict(re.findall(r"^\| \[`(\w+)`\]\(([^)]+)\)", (DOCS / "reference.md").read_text(), re.MULTILINE))
+
+
+def test_reference_lists_every_public_name():
+    assert sorted(public_names_with_links()) == sorted(jaxnav.__all__)
+
+
+def test_every_public_name_is_on_the_page_it_links_to():
+    """Functions and classes by the directive that renders their docstring, everything else by its name."""
+    for name, link in public_names_with_links().items():
+        page, _, anchor = link.partition("#")
+        text = (DOCS / page).read_text()
+        if anchor.startswith("jaxnav."):
+            assert f"::: {anchor}\n" in text, name
+            module, _, attribute = anchor.rpartition(".")
+            assert getattr(importlib.import_module(module), attribute) is getattr(jaxnav, name)
+        else:
+            assert re.search(rf"`(jaxnav\.)?{name}`", text), name
+
+
+def test_constants_of_the_reference_have_their_values():
+    rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", (DOCS / "reference_environment.md").read_text(), re.MULTILINE)
+    assert len(rows) == 11
+    for name, value in rows:
+        assert ast.literal_eval(value) == getattr(jaxnav, name)
+    assert f"`NUM_FEATURES` is {jaxnav.NUM_FEATURES}" in (DOCS / "reference_networks.md").read_text()
+    assert all(f"`{name}`" in (DOCS / "reference_parts.md").read_text() for name in jaxnav.METHODS)
+
+
+def run_python_blocks(path):
+    """Execute the Python blocks of a page in order, under the rules of promotion of a user."""
+    blocks = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
+    assert blocks
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        exec(compile("\n".join(blocks), str(path), "exec"), {"__name__": "page"})
+
+
+def test_python_blocks_of_own_detections_run():
+    run_python_blocks(DOCS / "own_detections.md")
 
 
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
