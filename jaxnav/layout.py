@@ -12,6 +12,12 @@ layout gap D (eq. 5, or a gap of `jaxnav.gaps`), and `LayoutEstimator.expectatio
     weights = LayoutEstimator.goal_weights(state, goal)
 
 The estimator handles one episode; use `jax.vmap` for batches.
+
+`ESTIMATORS` holds the configurations that have a name:
+  `calibrated`: the default, with a rescaled prior and updates only where a gate is open.
+  `paper`: equations 3 to 6 as printed, with 0/1 visibility as the counts n.
+  `released`: the estimator of the authors' released code.
+  `evidence`: `calibrated` with a gap that measures the misfit between the counts of the episode and the prior.
 """
 
 import dataclasses
@@ -97,8 +103,7 @@ class EstimatorConfig:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give {requirement}")
 
 
-#: `paper`: equations 3 to 6, with 0/1 visibility as the counts n. `released`: the estimator of the authors' code.
-#: `evidence`: `calibrated` with `gap="evidence"`; priors and weights w are unchanged.
+#: Configurations by name, see the docstring of the module. `evidence` leaves priors and weights w as in `calibrated`.
 ESTIMATORS = {
     "paper": EstimatorConfig(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
     "released": EstimatorConfig(

@@ -27,6 +27,7 @@ class World:
     """Scenes, task and usual limits of a world.
 
     Attributes:
+      summary: description of the scenes in one line.
       generate: function from (split, index, seed) to a scene.
       counts: usual number of scenes of each split.
       task: categories, goals and rules.
@@ -41,6 +42,7 @@ class World:
         later.
     """
 
+    summary: str
     generate: Callable[[str, int, int], Scene]
     counts: dict[str, int]
     task: Task
@@ -56,6 +58,7 @@ class World:
 #: AI2-THOR, RoboTHOR and Gibson in the paper.
 WORLDS = {
     "rooms": World(
+        summary="Single rooms, after AI2-THOR.",
         generate=generate_room,
         counts={"train": 80, "val": 20, "test": 20},
         task=ROOMS,
@@ -68,6 +71,7 @@ WORLDS = {
         budgets=(20, 50),
     ),
     "apartments": World(
+        summary="Apartments with partitions, after RoboTHOR.",
         generate=generate_apartment,
         counts={"train": 120, "val": 15, "test": 15},
         task=APARTMENTS,
@@ -80,6 +84,7 @@ WORLDS = {
         budgets=(50, 150),
     ),
     "houses": World(
+        summary="Houses of four to ten rooms, after ProcTHOR and Gibson.",
         generate=generate_house,
         counts={"train": 100, "val": 10, "test": 10},
         task=HOUSES,

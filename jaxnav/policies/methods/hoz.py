@@ -1,4 +1,4 @@
-"""HOZ: the hierarchical object-to-zone graph.
+"""HOZ: the hierarchical object-to-zone graph, which plans the next zone on the way to the goal.
 
 Source: S. Zhang et al., *Hierarchical Object-to-Zone Graph for Object Navigation*, ICCV 2021, and its released code; a
 host of L-sTDE in the paper.

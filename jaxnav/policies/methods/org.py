@@ -1,4 +1,4 @@
-"""ORG: the object relation graph.
+"""ORG: the object relation graph, which relates the detected categories to one another.
 
 Source: H. Du, X. Yu and L. Zheng, *Learning Object Relation Graph and Tentative Policy for Visual Navigation*, ECCV
 2020; a host of L-sTDE in the paper. (`jaxnav.policies.methods.tpn` adds its tentative policy.)

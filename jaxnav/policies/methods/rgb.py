@@ -1,4 +1,7 @@
-"""RGB+RL: reinforcement learning on detections without a model of experience, and `anonymous`, which knows no layout.
+"""RGB+RL: reinforcement learning on detections, without a model of experience.
+
+The module also defines the method of layout-blind agents:
+  `anonymous`: a layout-blind agent, which sees free and blocked cells and the detection of its goal alone.
 
 Source: the baseline *RGB+RL* of Zhang et al., *Layout-based Causal Inference for Object Navigation*, CVPR 2023.
 

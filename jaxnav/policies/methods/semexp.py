@@ -1,4 +1,4 @@
-"""SemExp: goal-oriented semantic exploration.
+"""SemExp: goal-oriented semantic exploration, a search with a map of the categories seen so far.
 
 Source: D. S. Chaplot et al., *Object Goal Navigation using Goal-Oriented Semantic Exploration*, NeurIPS 2020, and its
 released code; a host of L-sTDE in the paper (Table 3).

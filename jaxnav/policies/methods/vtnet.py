@@ -1,4 +1,4 @@
-"""VTNet: the visual transformer network.
+"""VTNet: the visual transformer network, over detections and squares of the view.
 
 Source: H. Du, X. Yu and L. Zheng, *VTNet: Visual Transformer Network for Object Goal Navigation*, ICLR 2021, and its
 released code; a host of L-sTDE in the paper.
