@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxnav.policies.pathways import Decision, Pathways, PolicyState
     from jaxnav.policies.spec import PolicySpec
     from jaxnav.policies.testing import check_method
+    from jaxnav.registry import registered
     from jaxnav.runs.config import RunConfig
     from jaxnav.runs.evaluate import Results, Sweep, evaluate, sweep
     from jaxnav.runs.policies import Policies
@@ -118,6 +119,7 @@ __all__ = [
     "make",
     "make_generated_scenes",
     "prior_from_counts",
+    "registered",
     "shift_scenes",
     "standable_cells",
     "sweep",
@@ -139,6 +141,7 @@ _NAMES_BY_MODULE = {
     "policies.pathways": ("Decision", "Pathways", "PolicyState"),
     "policies.spec": ("PolicySpec",),
     "policies.testing": ("check_method",),
+    "registry": ("registered",),
     "runs.config": ("RunConfig",),
     "runs.evaluate": ("Results", "Sweep", "evaluate", "sweep"),
     "runs.policies": ("Policies",),
