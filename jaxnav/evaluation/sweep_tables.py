@@ -1,14 +1,13 @@
 """Tables of a sweep: the metrics of sTDE at every threshold, and their differences to no removal.
 
-`threshold_rows` computes the rows of one layout shift, `sweep_table` and `change_table` print them in a terminal,
-`sweep_markdown` prints them in Markdown, and `sweep_notes` states what the intervals cover.
+`threshold_rows` computes the rows of one layout shift, `sweep_table` and `sweep_markdown` print them in a terminal and
+in Markdown, and `sweep_notes` states what the columns and the intervals mean.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from jaxnav.evaluation.episodes import EpisodeList
@@ -93,55 +92,47 @@ def threshold_rows(
 
 
 def sweep_notes(num_seeds: int, episodes: EpisodeList) -> list[str]:
-    """State what the intervals of a sweep cover, one sentence per note."""
+    """State what the intervals and columns of a sweep mean, one sentence or two per note.
+
+    The first sentence of the first note states what the intervals cover.
+    """
+    # Floor plans are the units of the interval over scenes.
     num_plans = len(set(episodes.floor_plans))
     if episodes.clusters().degrees_of_freedom < MIN_SCENE_DEGREES:
-        return [f"No intervals: {num_plans} floor plans are too few; an interval needs at least 3."]
-    if num_seeds == 1:
-        return [
-            f"95 % intervals over {num_plans} floor plans. They hold for this one policy: sweep a run with several "
+        interval_note = f"No intervals: {num_plans} floor plans are too few. An interval needs at least three."
+    elif num_seeds == 1:
+        interval_note = (
+            f"95 % intervals over {num_plans} floor plans. They hold for this policy alone: sweep a run with several "
             "seeds to cover other trainings too."
-        ]
-    return [f"95 % intervals over {num_seeds} training seeds and {num_plans} floor plans."]
+        )
+    else:
+        interval_note = f"95 % intervals over {num_seeds} training seeds and {num_plans} floor plans."
+    return [
+        interval_note,
+        "Removed: mean share of experience that sTDE removes, over all steps.",
+        "Change: difference to no removal in percentage points, paired on episodes and seeds.",
+    ]
 
 
 def sweep_table(rows: Sequence[ThresholdRow]) -> Table:
-    """Make the table of SR and SPL for a terminal, with a section for each layout shift."""
-    titles = [METRIC_COLUMNS[name][0] for name in _PRINTED_METRICS]
-    table = _make_table("Threshold", *titles, "Removed (%)")
+    """Make the table of SR, SPL and their changes for a terminal, with a section for each layout shift."""
+    table = Table("Threshold")
+    for title in _number_titles():
+        table.add_column(title, justify="right")
     for shift, shift_rows in _rows_by_shift(rows).items():
         table.add_section()
         table.add_row(f"shift {shift:g}", style="bold")
         for row in shift_rows:
-            table.add_row(_threshold_text(row), *_metric_cells(row), f"{row.removed:.1f}")
-    return table
-
-
-def change_table(rows: Sequence[ThresholdRow]) -> Table:
-    """Make the table of the differences to no removal for a terminal, with a section for each layout shift."""
-    titles = [f"{name.upper()}, change (points)" for name in _PRINTED_METRICS]
-    table = _make_table("Threshold", *titles)
-    for shift, shift_rows in _rows_by_shift(rows).items():
-        table.add_section()
-        table.add_row(f"shift {shift:g}", style="bold")
-        for row in shift_rows:
-            # A row without removal has no difference to itself.
-            if row.epsilon is not None:
-                table.add_row(_threshold_text(row), *_change_cells(row))
+            table.add_row(_threshold_text(row), *_number_cells(row))
     return table
 
 
 def sweep_markdown(rows: Sequence[ThresholdRow], notes: Sequence[str]) -> str:
     """Make one table of all columns in Markdown, with the notes below, ending with a newline."""
-    titles = ["Shift", "Threshold", *(METRIC_COLUMNS[name][0] for name in _PRINTED_METRICS)]
-    titles += [f"{name.upper()}, change (points)" for name in _PRINTED_METRICS]
-    titles.append("Removed (%)")
-
+    titles = ["Shift", "Threshold", *_number_titles()]
     table_lines = [titles, ["---:"] * len(titles)]
     for row in rows:
-        change_cells = [""] * len(_PRINTED_METRICS) if row.epsilon is None else _change_cells(row)
-        numbers = [*_metric_cells(row), *change_cells, f"{row.removed:.1f}"]
-        table_lines.append([f"{row.shift:g}", _threshold_text(row), *numbers])
+        table_lines.append([f"{row.shift:g}", _threshold_text(row), *_number_cells(row)])
 
     text_parts = []
     for cells in table_lines:
@@ -149,15 +140,6 @@ def sweep_markdown(rows: Sequence[ThresholdRow], notes: Sequence[str]) -> str:
     for note in notes:
         text_parts.append(f"\n{note}\n")
     return "".join(text_parts)
-
-
-def _make_table(*titles: str) -> Table:
-    """Make an empty table whose numbers are aligned to the right."""
-    first_title, *number_titles = titles
-    table = Table(first_title, box=box.SIMPLE_HEAD)
-    for title in number_titles:
-        table.add_column(title, justify="right", no_wrap=True)
-    return table
 
 
 def _rows_by_shift(rows: Sequence[ThresholdRow]) -> dict[float, list[ThresholdRow]]:
@@ -172,9 +154,20 @@ def _threshold_text(row: ThresholdRow) -> str:
     return "no removal" if row.epsilon is None else f"{row.epsilon:g}"
 
 
-def _metric_cells(row: ThresholdRow) -> list[str]:
-    return [f"{row.metrics[name]:.{METRIC_COLUMNS[name][1]}f}" for name in _PRINTED_METRICS]
+def _number_titles() -> list[str]:
+    """Titles of all columns with numbers."""
+    titles = [METRIC_COLUMNS[name][0] for name in _PRINTED_METRICS]
+    change_titles = [f"Change in {name.upper()}" for name in _PRINTED_METRICS]
+    return [*titles, "Removed (%)", *change_titles]
 
 
-def _change_cells(row: ThresholdRow) -> list[str]:
-    return [f"{row.changes[name]:+.{METRIC_COLUMNS[name][1]}f}" for name in _PRINTED_METRICS]
+def _number_cells(row: ThresholdRow) -> list[str]:
+    """Cells of all columns with numbers."""
+    metric_cells = []
+    change_cells = []
+    for name in _PRINTED_METRICS:
+        digits = METRIC_COLUMNS[name][1]
+        metric_cells.append(f"{row.metrics[name]:.{digits}f}")
+        # A row without removal has no difference to itself.
+        change_cells.append("" if row.epsilon is None else f"{row.changes[name]:+.{digits}f}")
+    return [*metric_cells, f"{row.removed:.1f}", *change_cells]

@@ -2,8 +2,8 @@
 
 `evaluate` measures every variant of the run's policies (baseline, layout weights, hard TDE, and sTDE at every epsilon)
 and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many epsilons and all seeds in one
-compiled call, and `sweep_shifts` does so at several layout shifts. `measure_leads` compares results with those of agents that cannot know any layout, and `replay_episodes`
-plays episodes step by step.
+compiled call, and `sweep_shifts` does so at several layout shifts. `measure_leads` compares results with those of
+layout-blind agents, and `replay_episodes` plays episodes step by step.
 """
 
 import csv
@@ -78,7 +78,7 @@ class Results(NamedTuple):
         return episode_metrics(self.outcome, self.episodes.best_length, self.budgets)
 
     def write(self, path: Path) -> None:
-        """Write the report, and beside it a CSV file with a line per row, seed and episode.
+        """Write the report, and next to it a CSV file with a line per row, seed and episode.
 
         Raises:
           OSError: a file cannot be written.
@@ -382,12 +382,12 @@ def sweep(
     """Evaluate sTDE at every threshold and for every seed in one compiled call.
 
     Args:
-      source: a finished run with the arm `layout`, or its directory; or a single policy of that arm, which counts as one
-        seed: a `LoadedPolicy`, the folder of an export, or the name of a packaged policy, such as `rooms-org`.
+      source: a finished run with the arm `layout`, or its directory; or a single policy of that arm, which counts as
+        one seed: a `LoadedPolicy`, the folder of an export, or the name of a packaged policy, such as `rooms-org`.
       epsilon: thresholds [X]; no experience is removed for epsilon >= 1.
       params: network parameters of your own, leaves [S, ...]; None for those of the source.
-      split, scenes, world, shift, episodes, setting, hold, seed, console: as in `jaxnav.evaluate`. A policy is evaluated
-        in the generated world that it was trained for, unless `scenes` or `world` is given.
+      split, scenes, world, shift, episodes, setting, hold, seed, console: as in `jaxnav.evaluate`. A policy is
+        evaluated in the generated world that it was trained for, unless `scenes` or `world` is given.
       decoding: `argmax` for best actions, `sample` for sampled ones.
       form: form in which sTDE combines the logits; None for the form of the layout estimator.
 
@@ -438,7 +438,7 @@ def sweep_shifts(
     check_seed(seed)
     console = console or Console(quiet=True)
     if not len(epsilon):
-        raise InputError("epsilon: give at least one number")
+        raise InputError("--epsilon: give at least one number")
     config, policies = _load_layout_policies(source, setting, hold)
     estimator_config = policies.estimator_config
     assert estimator_config is not None  # policies of the arm `layout` have an estimator
@@ -461,7 +461,8 @@ def sweep_shifts(
         applied_shift = evaluation_shift(config, scenes or world, shift)
         compiled = compile_evaluation_world(config, split, scenes, shift, console, world)
         num_seeds = policies.num_seeds
-        console.print(f"shift {applied_shift:g}: {len(epsilon)} thresholds x {num_seeds} seeds x {episodes:,} episodes")
+        seed_text = "1 seed" if num_seeds == 1 else f"{num_seeds} seeds"
+        console.print(f"shift {applied_shift:g}: {len(epsilon)} thresholds x {seed_text} x {episodes:,} episodes")
 
         # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
         evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled))
@@ -516,8 +517,8 @@ def _load_layout_policies(
         config = run.config
         if not find_method(config.method).hosts_layout:
             raise InputError(
-                f"{config.run_dir}: method {config.method!r} cannot use the layout, so there is no experience that sTDE "
-                "could remove; give a run of another method"
+                f"{config.run_dir}: method {config.method!r} cannot use the layout, which sTDE needs; give a run of "
+                "another method (`jaxnav list methods`)"
             )
         policies = run.policies(("layout",))
     if policies.estimator_config is None:
@@ -535,8 +536,8 @@ def _open_run(source: Run | str | Path) -> Run:
     if not (Path(source) / CONFIG_FILE).exists():
         packaged_names = ", ".join(list_packaged_policies())
         raise InputError(
-            f"{source}: neither a run directory ({CONFIG_FILE} is missing) nor an exported policy; train a run, or give "
-            f"a packaged policy: {packaged_names}"
+            f"{source}: neither a run directory ({CONFIG_FILE} is missing) nor an exported policy; train a run, or "
+            f"give a packaged policy: {packaged_names}"
         )
     return Run.open(source)
 
@@ -546,7 +547,9 @@ def _policy_in_memory_as_run(policy: LoadedPolicy) -> tuple[RunConfig, Policies]
     arm = "baseline" if policy.estimator_config is None else "layout"
     config = config_for_task(policy.task, policy.spec.method.name, arm)
     if config is None:
-        raise InputError("the policy was trained for a task that no generated world has; give the run that it comes from")
+        raise InputError(
+            "the policy was trained for a task that no generated world has; give the run that it comes from"
+        )
     policies = Policies(
         params=jax.tree.map(lambda leaf: leaf[None], policy.params),
         arms=config.arms,
@@ -567,13 +570,13 @@ def _source_name(source: Run | LoadedPolicy | str | Path) -> str:
 
 
 def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
-    """Lead of every row over agents without experience.
+    """Lead of every row over the layout-blind agents.
 
     Leads are measured in success, in SPL, and in success within the world's budgets; see `ExperienceLead`.
 
     Args:
       results: results of the agents with experience.
-      reference: results of agents that cannot know any layout. Their baseline is the reference.
+      reference: results of a run of layout-blind agents. Their arm `baseline` is the reference.
 
     Raises:
       InputError: episodes or numbers of seeds differ, or `reference` has no baseline.

@@ -1,14 +1,16 @@
 """Figure of a sweep: SR and SPL over the threshold of sTDE, and their differences to no removal."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.evaluation.sweep_tables import ThresholdRow
 from jaxnav.runs.evaluate import Sweep
 from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, freeze_axes_positions, make_panels, set_panel_title
 
@@ -23,7 +25,7 @@ _SHIFT_STYLES: tuple[dict[str, Any], ...] = (
 _METRIC_TITLES = {"sr": "SR", "spl": "SPL"}
 
 
-def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str = "") -> Figure:
+def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str | None = None) -> Figure:
     """Draw SR and SPL over the threshold, with a curve for each layout shift.
 
     The upper panels show the means on axes that start at 0, with a thin line for each training seed. The lower panels
@@ -31,7 +33,7 @@ def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str = "") -> Figure:
 
     Args:
       sweeps: results of `jaxnav.sweep`, one for each layout shift.
-      title: title of the figure.
+      title: title of the figure; None for method, source and episodes.
     """
     sweeps = [sweeps] if isinstance(sweeps, Sweep) else list(sweeps)
     figure, panels = make_panels(2, 2, height=5.2, sharex=True)
@@ -39,14 +41,16 @@ def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str = "") -> Figure:
     max_percent = 0.0
     for sweep, style in zip(sweeps, _repeat_styles(len(sweeps)), strict=True):
         # Rows in rising order of their thresholds; no removal is no point of the curve.
-        rows = [row for row in sweep.rows() if row.epsilon is not None]
-        rows.sort(key=lambda row: row.epsilon or 0.0)
+        row_by_threshold = {row.epsilon: row for row in sweep.rows() if row.epsilon is not None}
+        thresholds = sorted(row_by_threshold)
+        rows = [row_by_threshold[threshold] for threshold in thresholds]
         for column, metric in enumerate(_METRIC_TITLES):
             intervals = [row.metrics[metric] for row in rows]
-            _draw_curve(panels[0, column], rows, intervals, style)
-            _draw_curve(panels[1, column], rows, [row.changes[metric] for row in rows], style)
             if len(intervals[0].seeds) > 1:
-                _draw_seeds(panels[0, column], rows, intervals, style)
+                seed_means = [interval.seeds for interval in intervals]
+                panels[0, column].plot(thresholds, seed_means, color=style["color"], lw=0.6, alpha=0.5)
+            _draw_curve(panels[0, column], thresholds, intervals, style)
+            _draw_curve(panels[1, column], thresholds, [row.changes[metric] for row in rows], style)
             max_percent = max(max_percent, *(_upper_bound(interval) for interval in intervals))
 
     # Percent from 0, equally for both metrics; differences around 0, with at least one point on either side.
@@ -57,27 +61,20 @@ def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str = "") -> Figure:
         axes.axhline(0, color=TEXT_COLOR, lw=0.8, zorder=0)
         axes.set(ylabel=f"change in {metric_title} (points)", ylim=(-change_limit, change_limit))
         axes.set_xlabel("threshold ε of sTDE; no removal from 1 on")
-    set_panel_title(panels[0, 0], *([title] if title else []), "success and path length")
-    set_panel_title(panels[1, 0], "difference to no removal, paired on episodes")
+    set_panel_title(panels[0, 0], _describe_evaluation(sweeps[0]) if title is None else title)
+    set_panel_title(panels[1, 0], "Difference to no removal, paired on episodes")
 
     _add_legend(figure, sweeps)
     return freeze_axes_positions(figure)
 
 
-def _draw_curve(axes: Axes, rows: Sequence[ThresholdRow], intervals: Sequence[Interval], style: dict[str, Any]) -> None:
+def _draw_curve(axes: Axes, thresholds: Sequence[float], intervals: Sequence[Interval], style: dict[str, Any]) -> None:
     """Draw means with their band; intervals without bounds have no band."""
-    thresholds = [row.epsilon for row in rows]
     axes.plot(thresholds, [interval.mean for interval in intervals], lw=1.4, ms=3.5, **style)
     if all(interval.has_bounds for interval in intervals):
         low = [interval.low for interval in intervals]
         high = [interval.high for interval in intervals]
         axes.fill_between(thresholds, low, high, color=style["color"], alpha=0.15, lw=0)
-
-
-def _draw_seeds(axes: Axes, rows: Sequence[ThresholdRow], intervals: Sequence[Interval], style: dict[str, Any]) -> None:
-    """Draw a thin line for each training seed."""
-    thresholds = [row.epsilon for row in rows]
-    axes.plot(thresholds, [interval.seeds for interval in intervals], color=style["color"], lw=0.6, alpha=0.5)
 
 
 def _upper_bound(interval: Interval) -> float:
@@ -89,12 +86,23 @@ def _repeat_styles(count: int) -> list[dict[str, Any]]:
     return [_SHIFT_STYLES[index % len(_SHIFT_STYLES)] for index in range(count)]
 
 
+def _describe_evaluation(sweep: Sweep) -> str:
+    """Method, source and episodes, for a title."""
+    settings = sweep.settings
+    decoding = {"argmax": "best actions", "sample": "sampled actions"}[settings["decoding"]]
+    source_name = Path(settings["source"]).name
+    episodes = f"{settings['episodes']:,} {settings['split']} episodes"
+    return f"{settings['method'].upper()}, {source_name}: {episodes}, {decoding}"
+
+
 def _add_legend(figure: Figure, sweeps: Sequence[Sweep]) -> None:
-    handles = []
+    handles: list[Artist] = []
     for sweep, style in zip(sweeps, _repeat_styles(len(sweeps)), strict=True):
         handles.append(Line2D([], [], label=f"shift {sweep.settings['shift']:g}", lw=1.4, ms=4, **style))
     if sweeps[0].sr.shape[1] > 1:
         handles.append(Line2D([], [], label="one training seed", color=MUTED_COLOR, lw=0.6))
+
+    # The first sentence of the first note states what the bands cover, or that there are none.
+    band_label = sweeps[0].notes()[0].partition(".")[0]
+    handles.append(Patch(label=band_label, color=MUTED_COLOR, alpha=0.3, lw=0))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
-    notes = sweeps[0].notes()
-    figure.supxlabel(notes[0].split(". ")[0], fontsize=8, color=MUTED_COLOR)

@@ -10,7 +10,11 @@ from support.tiny_run import NUM_SEEDS
 
 import jaxnav
 from jaxnav.errors import InputError
+from jaxnav.evaluation.statistics import Interval
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.evaluate import sweep_shifts
+from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.runs.run import Run
 
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
@@ -72,9 +76,9 @@ def test_sweep_evaluates_the_given_parameters(swept, drawn_run):
     [
         ({"epsilon": ()}, "epsilon: give at least one number"),
         ({"epsilon": np.zeros(0)}, "epsilon: give at least one number"),
-        ({"epsilon": (0.5, -0.1)}, "epsilon -0.1: give numbers from 0"),
-        ({"epsilon": (float("nan"),)}, "epsilon nan: give numbers from 0"),
-        ({"epsilon": (float("inf"),)}, "epsilon inf: give numbers from 0"),
+        ({"epsilon": (0.5, -0.1)}, "epsilon -0.1: give finite numbers of at least 0"),
+        ({"epsilon": (float("nan"),)}, "epsilon nan: give finite numbers of at least 0"),
+        ({"epsilon": (float("inf"),)}, "epsilon inf: give finite numbers of at least 0"),
         ({"epsilon": (0.5,), "episodes": 0}, "episodes 0: give at least 1"),
         ({"epsilon": (0.5,), "seed": -1}, "seed -1: give a whole number from 0"),
         ({"epsilon": (0.5,), "seed": 2**32}, "seed 4294967296: give a whole number from 0"),
@@ -88,8 +92,109 @@ def test_sweep_refuses_impossible_arguments(drawn_run, arguments, problem):
 
 def test_sweep_refuses_runs_without_the_layout(drawn_run, tmp_path):
     baseline = Run(dataclasses.replace(drawn_run.config, arms=("baseline",)))
-    with pytest.raises(InputError, match="was trained without the arm 'layout'; train one with all --arms"):
+    with pytest.raises(InputError, match="was trained without the arm 'layout'; train a run with both --arms"):
         jaxnav.sweep(baseline, EPSILON)
     unfinished_run = Run(dataclasses.replace(drawn_run.config, run_dir=tmp_path))
     with pytest.raises(InputError, match="layout-0: is missing, so training has not finished"):
         jaxnav.sweep(unfinished_run, EPSILON)
+
+
+def test_sweep_refuses_methods_that_cannot_use_the_layout(drawn_run):
+    anonymous = Run(dataclasses.replace(drawn_run.config, method="anonymous", arms=("baseline",)))
+    with pytest.raises(InputError, match=r"method 'anonymous' cannot use the layout, .* give a run of another method"):
+        jaxnav.sweep(anonymous, EPSILON)
+
+
+# Tables
+
+
+@pytest.mark.parametrize("decoding", DECODINGS)
+def test_rows_of_a_sweep_equal_the_report_of_an_evaluation(swept, evaluated, decoding):
+    rows = swept[decoding].rows()
+    assert [row.epsilon for row in rows] == EPSILON.tolist()
+
+    for row in rows:
+        fields = {"epsilon": row.epsilon, "decoding": decoding}
+        (report_row,) = select_rows(evaluated.report["rows"], variant="stde", **fields)
+        for metric in ("sr", "spl", "dts"):
+            assert row.metrics[metric] == Interval.from_json(report_row[metric])
+            (difference,) = select_rows(evaluated.report["differences"], to="stde", metric=metric, **fields)
+            assert row.changes[metric] == Interval.from_json(difference)
+
+
+def select_rows(rows, **fields):
+    """Return the rows of a report that have the given values."""
+    return [row for row in rows if fields.items() <= row.items()]
+
+
+def test_no_removal_has_a_row_unless_a_threshold_is_1(drawn_run, swept, evaluated):
+    full = swept["argmax"]
+    layout = evaluated.rows.index(EvaluationRow("layout", None, None, "argmax"))
+    chex.assert_trees_all_equal(full.no_removal, _row(evaluated.outcome, layout))
+
+    sweep = jaxnav.sweep(drawn_run, (0.0, 0.5), episodes=EPISODES)
+    *_, last_row = sweep.rows()
+    assert (last_row.epsilon, last_row.removed) == (None, 0.0)
+    assert last_row.metrics == full.rows()[-1].metrics
+    assert last_row.changes["sr"].mean == 0.0
+
+
+def test_table_of_a_sweep_has_a_line_for_every_threshold(swept):
+    table = swept["argmax"].table()
+    assert table.row_count == 1 + len(EPSILON)  # the heading of the shift, and the thresholds
+    assert [*table.columns[0].cells][:3] == ["shift 0", "0", "0.1"]
+    assert [note.partition(" ")[0] for note in swept["argmax"].notes()] == ["95", "Removed:", "Change:"]
+
+
+# Several shifts
+
+
+def test_shifts_share_a_compilation_and_equal_evaluations(drawn_run):
+    results = sweep_shifts(drawn_run, (0.0, 0.5), (0.0, 1.0), episodes=EPISODES)
+    assert [result.compilations for result in results] == [1, 0]
+    for shift, result in zip((0.0, 1.0), results, strict=True):
+        assert result.settings["shift"] == shift
+        evaluation = jaxnav.evaluate(drawn_run, shift=shift, epsilon=(0.0, 0.5), episodes=EPISODES)
+        rows = [evaluation.rows.index(EvaluationRow("stde", epsilon, "residual", "argmax")) for epsilon in (0.0, 0.5)]
+        chex.assert_trees_all_equal(result.outcome, _row(evaluation.outcome, np.array(rows)))
+    assert (results[0].outcome.length != results[1].outcome.length).any()
+
+
+# Directories and policies
+
+
+def test_run_directory_stands_for_its_run(drawn_run, swept, evaluated):
+    path = str(drawn_run.config.run_dir)
+    chex.assert_trees_all_equal(jaxnav.sweep(path, EPSILON, episodes=EPISODES).outcome, swept["argmax"].outcome)
+    evaluation = jaxnav.evaluate(path, epsilon=EPSILON, episodes=EPISODES)
+    chex.assert_trees_all_equal(evaluation.outcome, evaluated.outcome)
+
+
+@pytest.mark.slow
+def test_policy_equals_the_run_that_exported_it(drawn_run):
+    # A policy is evaluated in the usual scenes of its world.
+    run = Run(dataclasses.replace(drawn_run.config, worlds=RunConfig().worlds))
+    run_outcome = jaxnav.sweep(run, (0.0, 0.5), episodes=EPISODES).outcome
+    folder = run.config.run_dir / POLICIES_DIR / "layout-1"
+    for source in (folder, str(folder), jaxnav.load_policy(folder)):
+        sweep = jaxnav.sweep(source, (0.0, 0.5), episodes=EPISODES)
+        assert sweep.sr.shape == (2, 1, EPISODES)
+        chex.assert_trees_all_equal(sweep.outcome, jax.tree.map(lambda leaf: leaf[:, 1:2], run_outcome))
+
+    # A single policy has intervals over scenes.
+    interval = sweep.rows()[0].metrics["sr"]
+    assert interval.has_bounds
+    assert "hold for this policy alone" in sweep.notes()[0]
+
+
+def test_sweep_refuses_what_is_no_run_and_no_layout_policy(drawn_run, tmp_path):
+    with pytest.raises(InputError, match=r"nowhere: neither a run directory .* a packaged policy: rooms-org$"):
+        jaxnav.sweep("nowhere")
+    with pytest.raises(InputError, match="neither a run directory"):
+        jaxnav.sweep(tmp_path)
+    baseline_folder = drawn_run.config.run_dir / POLICIES_DIR / "baseline-0"
+    for baseline in (baseline_folder, jaxnav.load_policy(baseline_folder)):
+        with pytest.raises(InputError, match="a policy of the arm 'baseline', which does not use the layout"):
+            jaxnav.sweep(baseline)
+    with pytest.raises(InputError, match=r"give them to jaxnav\.load_policy"):
+        jaxnav.sweep(jaxnav.load_policy("rooms-org"), setting="evidence")
