@@ -86,6 +86,11 @@ class EnvParams(struct.PyTreeNode):
     success_reward: jax.Array
     step_reward: jax.Array
 
+    @property
+    def max_steps_in_episode(self) -> jax.Array:
+        """Largest step limit of all scenes, int32 []; trainers for gymnax evaluate with it."""
+        return self.step_limit.max()
+
 
 class State(struct.PyTreeNode):
     """State of one episode.
@@ -316,7 +321,7 @@ class ObjectNav:
           ValueError: the environment was not made by `jaxnav.make`.
         """
         if self.bundled_params is None:
-            raise ValueError("default_params: this ObjectNav has no bundled parameters; jaxnav.make returns both")
+            raise ValueError("default_params: this ObjectNav has no bundled parameters; use those of jaxnav.make")
         return self.bundled_params
 
 

@@ -54,6 +54,7 @@ def test_make_sets_the_documented_step_limits(tmp_path, world, room_types, room_
         env, params = make(world, split, path)
         assert env.task == WORLDS[world].task
         assert params.step_limit.tolist() == expected_limits
+        assert params.max_steps_in_episode == max(expected_limits)
         assert params.room.tolist() == room_indices
 
 

@@ -167,5 +167,5 @@ def test_environment_of_make_has_default_params(tmp_path):
 
 
 def test_environment_built_by_hand_has_no_default_params():
-    with pytest.raises(ValueError, match=r"no bundled parameters; jaxnav\.make returns both"):
+    with pytest.raises(ValueError, match=r"no bundled parameters; use those of jaxnav\.make"):
         _ = ENV.default_params
