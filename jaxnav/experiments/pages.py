@@ -66,7 +66,7 @@ def render_page(
     """Fill a template, write the document, and return its text.
 
     Args:
-      document: the Markdown file; its summary is kept, and its figures are in the folder `images` beside it.
+      document: the Markdown file; its summary is kept, and its figures are in the folder `images` next to it.
       template: name of a packaged template, or a file.
       config: the experiment.
       tables: results by split.
@@ -165,7 +165,7 @@ def _runs_with_results(config: ExperimentConfig, table: ResultTable) -> dict[str
 
 
 def _draw_figure(document: Path, name: str, table: ResultTable, shifts: Sequence[float], fields: dict[str, Any]) -> str:
-    """Draw a figure into the folder `images/DOCUMENT` beside a document, and return its path there."""
+    """Draw a figure into the folder `images/DOCUMENT` next to a document, and return its path there."""
     from jaxnav.experiments.figures import FIGURES
     from jaxnav.viz.style import save_figure
 

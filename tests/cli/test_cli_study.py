@@ -146,8 +146,8 @@ def test_study_account_of_a_run_over_itself_is_zero_for_the_baseline(drawn_run, 
     printed = capsys.readouterr().out
     assert printed.strip() == (run_dir / "account.md").read_text().strip()
     for shift in (0, 1):
-        section = printed.partition(f"Shift {shift}:")[2]
+        section = printed.partition(f"Leads at shift {shift}")[2]
         (baseline,) = [
-            line for line in section.partition("Shift")[0].splitlines() if line.startswith("| `main` | best")
+            line for line in section.partition("Leads at")[0].splitlines() if line.startswith("| `main` | best")
         ]
         assert baseline.count("+0.0") >= 4

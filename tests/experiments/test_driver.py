@@ -338,7 +338,7 @@ base:
     assert table.find(world="near", run="main", metric="training (s)").mean == pytest.approx(
         run.times()[-1]["wall_s"], rel=1e-6
     )
-    assert "## near: `main`" in document.read_text()
+    assert "near: main, val" in document.read_text()
 
     # Nothing is done again.
     before = contents(tmp_path)

@@ -168,16 +168,16 @@ def test_a_difficulty_of_zero_cannot_change_by_percents():
 
 
 def read_verdicts(tmp_path, *totals: SceneTotals) -> dict[str, list[bool]]:
-    """Verdicts of the page, in the order of its lines, by its four questions."""
+    """Verdicts of the page, in the order of its lines, by its four criteria."""
     config = ExperimentConfig(shifts=(0.0, 1.0))
     text = render_page(tmp_path / "page.md", "instrument", config, {"val": compare(*totals)}, [])
     verdicts: dict[str, list[bool]] = {}
-    for line in text.split("```")[1].splitlines():
-        question = re.match(r"(Difficulty|Categories|Discriminating|No loss)", line)
-        if question:
-            verdicts[question[0]] = []
-        elif line.startswith(("  yes", "  NO")):
-            verdicts[list(verdicts)[-1]].append(line.startswith("  yes"))
+    for line in text.splitlines():
+        criterion = re.match(r"\| (Difficulty|Categories|Discriminating|No loss)", line)
+        if criterion:
+            is_met = line.strip("| ").rsplit("| ", 1)[1]
+            assert is_met in ("yes", "**no**")
+            verdicts.setdefault(criterion[1], []).append(is_met == "yes")
     return verdicts
 
 

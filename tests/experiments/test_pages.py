@@ -305,23 +305,23 @@ def study_rows() -> list[ResultRow]:
 #: Words of a claim, its effect with the half width of its interval, and its verdict.
 CLAIMS = [
     ("baseline loses", 9.0, 1.0, "holds"),
-    ("weights help where the layout is as trained", 3.0, 1.0, "holds"),
-    ("weights help at shift 1", 1.0, 1.0, "inconclusive"),  # from 0 to 2
-    ("sTDE (epsilon 0.5) gains on the weights", 2.0, 1.0, "holds"),
-    ("sTDE (paper's form, epsilon 0) gains", 5.0, 1.0, "holds"),
+    ("w improves the baseline at shift 0", 3.0, 1.0, "holds"),
+    ("w improves the baseline at shift 1", 1.0, 1.0, "inconclusive"),  # from 0 to 2
+    ("sTDE (epsilon 0.5) improves w", 2.0, 1.0, "holds"),
+    ("sTDE (paper's form, epsilon 0) improves", 5.0, 1.0, "holds"),
     ("sTDE with the `evidence` gap", 4.0, 1.0, "holds"),
     ("grows with the shift", 2.0, 0.5, "holds"),
     ("Hard TDE loses", 6.0, 1.0, "holds"),  # the effect is -6: losing is what is claimed
-    ("Success follows", 0.3, 0.1, "holds"),
-    ("larger where similarity is low", 2.5, 0.25, "holds"),  # -2.5 points per 0.1 more similarity
+    ("Success rises", 0.3, 0.1, "holds"),
+    ("where the similarity is low", 2.5, 0.25, "holds"),  # -2.5 points per 0.1 more similarity
     ("gap is below 0.5", 0.3, 0.01, "holds"),  # 0.5 - 0.2
-    ("Without updates", 0.3, 0.01, "holds"),  # 0.8 - 0.5
-    ("none at step 0", 0.0, 0.01, "too small to matter"),  # an AUC of 0.5 is chance
-    ("none at step 20", 0.0, 0.01, "too small to matter"),
-    ("The `evidence` gap does", 0.25, 0.01, "holds"),
-    ("Experience pays", 8.0, 1.0, "holds"),
-    ("Experience costs", 7.0, 1.0, "holds"),
-    ("Hard TDE gains", 3.0, 1.0, "holds"),
+    ("Without updates of the belief", 0.3, 0.01, "holds"),  # 0.8 - 0.5
+    ("eq. 5 detects shift 1 at step 0", 0.0, 0.01, "too small to matter"),  # an AUC of 0.5 is chance
+    ("eq. 5 detects shift 1 at step 20", 0.0, 0.01, "too small to matter"),
+    ("The `evidence` gap detects", 0.25, 0.01, "holds"),
+    ("Experience has a value", 8.0, 1.0, "holds"),
+    ("Experience has a cost", 7.0, 1.0, "holds"),
+    ("Hard TDE gains success", 3.0, 1.0, "holds"),
 ]
 
 
@@ -360,9 +360,9 @@ def test_a_claim_without_results_has_the_verdict_of_no_effect(tmp_path):
 
 
 def test_the_gap_is_shown_at_the_steps_that_episodes_reach(study_page):
-    gaps = study_page.split("### Does the gap track the layout?")[1].split("###")[0]
+    gaps = study_page.split("### Does the gap detect the shift?")[1].split("###")[0]
     cells = read_lines(gaps)
-    assert cells["setting"] == ["0", "1", "5", "10", "20"]  # 30 steps
+    assert cells["setting"] == ["step 0", "step 1", "step 5", "step 10", "step 20"]  # 30 steps
     assert cells["`evidence`"][-1] == "0.75 [0.74, 0.76]"
     assert "100, 97, 83, 67, 33 %" in gaps  # 1 - step / 30
 
@@ -376,7 +376,7 @@ def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
             rows.append(make_row(sr, **{**PAPER_STDE, "epsilon": epsilon}, gap="novelty", shift=0.0))
         tables[split] = ResultTable(rows)
     text = render_page(tmp_path / "page.md", "study", CONFIG, tables, [])
-    chosen_lines = [line for line in text.split("## Test")[1].splitlines() if "chosen)" in line]
+    chosen_lines = [line for line in text.split("## Split `test`")[1].splitlines() if "chosen)" in line]
     assert len(chosen_lines) == 2  # at both shifts
     assert "0.75" in chosen_lines[0]
     assert "40.0" in chosen_lines[0]
@@ -410,7 +410,7 @@ def mixture_rows(world: str) -> list[ResultRow]:
 
 def test_removal_keeps_value_and_recovers_cost(tmp_path):
     text = render(tmp_path, "mixture", *mixture_rows("rooms"))
-    value = read_lines(text.split("### What experience is worth")[1])["its value (or cost)"]
+    value = read_lines(text.split("### Value and cost of experience")[1])["its value (or cost)"]
     assert value == ["+6.0 [-]"] * 3 + ["-4.0 [-]"] * 3
 
     # Weights, then changes at both shifts and over the mixture, then value kept and cost recovered.
@@ -507,7 +507,7 @@ def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
     ],
 )
 def test_the_papers_numbers_add_up_to_the_gains_that_it_prints(tmp_path, title, num_lines, gains):
-    section = render_paper(tmp_path).split(f"## {title}")[1].split("##")[0]
+    section = render_paper(tmp_path).split(f"### {title}")[1].split("##")[0]
     cells = read_lines(section)
     assert len(cells) == num_lines + 2  # header and rule
     for host, gain in gains.items():
