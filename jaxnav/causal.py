@@ -43,7 +43,7 @@ def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
     replaced = {}
     for name, value in interventions.items():
         if name not in pathways._fields:
-            raise ValueError(f"do({name}=...): no such pathway; choose from {', '.join(pathways._fields)}")
+            raise ValueError(f"do({name}=...): unknown pathway; choose one of {', '.join(pathways._fields)}")
         replaced[name] = jnp.full_like(getattr(pathways, name), value)
     return pathways._replace(**replaced)
 

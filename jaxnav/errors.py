@@ -1,10 +1,10 @@
-"""Exceptions for input that a user can mend, and for runs that a user ends."""
+"""Exceptions for input that a user can fix, and for runs that a user ends."""
 
 
 class InputError(ValueError):
-    """Bad input that a user can mend: a config, a scene file, a checkpoint or an argument.
+    """Bad input that a user can fix: a configuration, a scene file, a checkpoint or an argument.
 
-    The message names the place and the mend.
+    The message names the place of the problem and the remedy.
     """
 
 
@@ -16,7 +16,7 @@ class Interrupted(KeyboardInterrupt):
     """End of a run that was asked to end; its state is saved.
 
     Attributes:
-      signal: number of the signal that asked for the end.
+      signal: number of the signal that ended the run.
     """
 
     def __init__(self, signal: int, message: str) -> None:

@@ -144,7 +144,7 @@ def prior_from_counts(counts: jax.Array, setting: str | EstimatorConfig = "calib
       ValueError: K is less than 2.
     """
     if counts.shape[-1] < 2:
-        raise ValueError(f"counts has shape {counts.shape}: co-occurrence takes two or more categories")
+        raise ValueError(f"counts has shape {counts.shape}: give counts of at least two categories")
     config = resolve_estimator(setting)
 
     # Off-diagonal counts; a category that was never seen with any other has a uniform row.
@@ -308,9 +308,9 @@ class LayoutEstimator(struct.PyTreeNode):
         config = resolve_estimator(self.config)
         assert state.co_seen is not None
         if self.cooccurrence is None:
-            raise ValueError(f"gap={config.gap!r}: needs `cooccurrence`, learned before training")
+            raise ValueError(f"gap={config.gap!r}: needs `cooccurrence`, the evidence that is learned before training")
         if config.gap == "learned":
             return learned_gap(state.co_seen, self.cooccurrence.log_odds)
         if goal is None:
-            raise ValueError("gap='overdue': needs the goal; give it to `update`")
+            raise ValueError("gap='overdue': needs the goal; pass it to `update`")
         return overdue_gap(state.co_seen, self.cooccurrence.co_visibility, goal)

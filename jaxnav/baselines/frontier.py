@@ -125,7 +125,7 @@ class _GoalPlace:
 
     Attributes:
       position: float64 [2], (x, z) from the start, metres.
-      viewpoints: by heading, the cells from which the place is in view and near enough.
+      viewpoints: cells from which the place is in view and near enough, by heading.
       sightings: poses from which the goal was detected at this place.
       misses: number of viewpoints without a detection since the last sighting.
     """

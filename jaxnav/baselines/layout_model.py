@@ -5,8 +5,8 @@ are the surroundings of the site, and f is 1 if category j was detected at a sit
 softmax over the sites.
 
 `fit_layout_model` fits W and b to snapshots of searches by conditional likelihood: together with the looks in vain so
-far, the prior should predict the sites of the goals. `detection_counts` and `detection_rates` tell how often a look at
-an object detects it.
+far, the prior should predict the sites of the goals. `detection_counts` and `detection_rates` measure how often a look
+at an object detects it.
 
 Symbols in shapes: K categories, N sites, L kinds of looks, G snapshots.
 """
@@ -190,7 +190,7 @@ def _optimize(
     def train_step(carry: tuple[_Weights, optax.OptState], batch: jax.Array) -> tuple[tuple, None]:
         weights, opt_state = carry
         gradient = jax.grad(loss_fn)(weights, batch)
-        with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 counts with float32
             updates, opt_state = optimizer.update(gradient, opt_state)
         return (optax.apply_updates(weights, updates), opt_state), None
 

@@ -42,7 +42,7 @@ def make(
       InputError: unknown world or split, bad scene file, or no scene with a reachable goal.
     """
     if world not in WORLDS:
-        raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}; a scene file goes to `scenes`")
+        raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}, or give a scene file as `scenes`")
     world_config = WORLDS[world]
     task = task or world_config.task
 

@@ -63,17 +63,17 @@ def check_environment(
         # Endings, and the new episodes that follow them.
         has_ended = np.asarray(terminated | truncated)
         _promise(not bool(np.any(terminated & truncated)), "an episode is terminated and truncated at once")
-        _promise(not bool(np.any(step_info["success"] & ~terminated)), "a success that is not an ending")
-        _promise(bool(np.all(step_info["final_state"].time == last_state.time + 1)), "a step that takes no time")
+        _promise(not bool(np.any(step_info["success"] & ~terminated)), "an episode succeeds without being terminated")
+        _promise(bool(np.all(step_info["final_state"].time == last_state.time + 1)), "a step does not add 1 to `time`")
         _promise(
-            bool(np.all(np.asarray(state.time)[has_ended] == 0)), "an ending that is not followed by a new episode"
+            bool(np.all(np.asarray(state.time)[has_ended] == 0)), "no new episode begins after an episode has ended"
         )
         for state_leaf, final_leaf in zip(
             jax.tree.leaves(state), jax.tree.leaves(step_info["final_state"]), strict=True
         ):
             _promise(
                 bool(np.all((state_leaf == final_leaf) | has_ended)),
-                "a state that changes after a step without an ending",
+                "the state is reset although the episode has not ended",
             )
 
 
@@ -81,7 +81,7 @@ def _check_observation(env: ObjectNav, observation: Observation, num_envs: int) 
     chex.assert_shape(observation.row, (num_envs, env.row_format.num_bytes))
     chex.assert_type([observation.row, observation.goal], [jnp.uint8, jnp.int32])
     goal = np.asarray(observation.goal)
-    _promise(bool(np.all((goal >= 0) & (goal < len(env.categories)))), "a goal that is no category")
+    _promise(bool(np.all((goal >= 0) & (goal < len(env.categories)))), "a goal is not the index of a category")
 
 
 def _promise(is_kept: bool, violation: str) -> None:

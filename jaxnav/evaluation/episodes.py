@@ -136,7 +136,7 @@ def join_episode_lists(lists: Sequence[EpisodeList]) -> EpisodeList:
 def joint_clusters(lists: Sequence[EpisodeList]) -> list[Clusters]:
     """Cluster the episodes of several lists, one result per list.
 
-    A floor plan that occurs in several lists is left out of all of them at once.
+    A floor plan that occurs in several lists is omitted from all of them at once.
     """
     clusters = join_episode_lists(lists).clusters()
 

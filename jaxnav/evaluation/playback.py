@@ -25,7 +25,7 @@ class EpisodeTrace(NamedTuple):
     Attributes:
       pose: int32 [T], pose at which each action was chosen.
       action: int32 [T]; only the last can be Done.
-      inferred: how each action was inferred, leaves [T, ...].
+      inferred: removal of experience and probabilities behind each action, leaves [T, ...].
       success: True if the episode ended with a successful Done.
     """
 

@@ -4,7 +4,7 @@ A report is a plain dictionary that JSON represents exactly; SR, SPL and SAE are
 `build_report` assembles a report from `build_row` and `build_difference`; `results_table`, `difference_table` and
 `markdown_table` print it.
 
-The accounting compares an agent with one that cannot know any layout, on the same episodes. The lead of the agent is
+The accounting compares an agent with a layout-blind agent on the same episodes. The lead of the agent is
 the difference of their results. If the layout matches training, the lead is the value of experience; under a layout
 shift, a negative lead is its cost. `remaining_share` is the part of the lead that remains after a removal.
 """
@@ -70,7 +70,7 @@ def build_row(
       epsilon: threshold of sTDE; None for other variants.
       decoding: rule that turns logits into actions.
       form: how counterfactual logits are combined; None for variants without counterfactual.
-      metrics: as returned by `episode_metrics`, each [S, E].
+      metrics: metrics of `episode_metrics` by name, each [S, E].
       episodes: the E episodes.
 
     Raises:
@@ -205,7 +205,7 @@ def _to_report_units(metric: str, metric_values: np.ndarray) -> np.ndarray:
     # Comparisons with NaN are false; `isfinite` also refuses an infinite distance.
     if not ((metric_values >= 0) & (metric_values <= upper_bound) & np.isfinite(metric_values)).all():
         valid_range = "metres, at least 0" if is_distance else "fractions from 0 to 1"
-        raise InputError(f"{metric} holds NaN or values out of range; give {valid_range}")
+        raise InputError(f"{metric} contains NaN or values out of range; give {valid_range}")
     return metric_values * (1.0 if is_distance else 100.0)
 
 
@@ -362,7 +362,7 @@ def remaining_share(unaware: np.ndarray, agent: np.ndarray, removed: np.ndarray,
     The share is (removed - unaware) / (agent - unaware), of means over the same episodes.
 
     Args:
-      unaware: bool, int or float [S, E], results of the agent without experience.
+      unaware: bool, int or float [S, E], results of the layout-blind agent.
       agent: [S, E], results of the agent with experience, trained separately.
       removed: [S, E], results of the policies of `agent`, with removal.
       scenes: clusters of the E episodes.

@@ -147,13 +147,14 @@ def paired_difference(
       trained: True to generalize to other training runs; False for the interval of these policies in other scenes.
 
     Raises:
-      InputError: as in `mean_interval`, or the shapes of `reference` and `compared` differ.
+      InputError: see `mean_interval`; or the shapes of `reference` and `compared` differ.
     """
     reference = _as_finite_results("a", reference, scenes)
     compared = _as_finite_results("b", compared, scenes)
     if reference.shape != compared.shape:
         raise InputError(
-            f"a {reference.shape} and b {compared.shape} differ in shape; evaluate both on the same runs and episodes"
+            f"reference has shape {reference.shape} and compared has shape {compared.shape}; evaluate both on equal "
+            "runs and episodes"
         )
 
     # With the same networks, or with fixed policies, the differences themselves are results [S, E].
@@ -246,7 +247,7 @@ def leave_one_out(labels: np.ndarray, strata: np.ndarray | None = None, counts: 
       strata: [N], stratum of each item, equal within a cluster; None for a single stratum.
       counts: [N], weight of each item; None for equal weights.
     """
-    # Number clusters and strata; the first item of a cluster tells the stratum of the cluster.
+    # Number clusters and strata; the stratum of a cluster is that of its first item.
     labels = np.asarray(labels)
     counts = np.ones(len(labels)) if counts is None else counts
     strata = np.zeros(len(labels), int) if strata is None else np.unique(strata, return_inverse=True)[1]
@@ -288,10 +289,10 @@ def _as_finite_results(name: str, values: np.ndarray, scenes: Clusters) -> np.nd
         raise InputError(f"{name} has shape {values.shape}; give [runs, episodes] with at least one of each")
     if values.shape[1] != len(scenes.weights):
         raise InputError(
-            f"{name} has {values.shape[1]} episodes and scenes {len(scenes.weights)}; give as many of each"
+            f"{name} has {values.shape[1]} episodes, but `scenes` has {len(scenes.weights)}; give equally many"
         )
     if not np.isfinite(values).all():
-        raise InputError(f"{name} holds NaN or infinite results; give every episode a finite value")
+        raise InputError(f"{name} contains NaN or infinite values; give every episode a finite value")
     return values
 
 

@@ -44,7 +44,7 @@ def table_rows(epsilons: Sequence[float], forms: Sequence[Form], arms: Sequence[
     """List the rows of an evaluation.
 
     The rows are baseline, layout, hard TDE, and sTDE for every epsilon and form, first with argmax and then with
-    sampled actions; Random comes last. Rows of arms that were not trained are left out.
+    sampled actions; Random comes last. Rows of arms that were not trained are omitted.
 
     Raises:
       InputError: no epsilon, or one outside [0, inf), or NaN.
@@ -76,7 +76,7 @@ def table_row(variant: Variant, epsilon: float | None, form: Form | None, decodi
     if variant != "stde":
         return EvaluationRow(variant, None, None, decoding)
     if epsilon is None or not 0.0 <= epsilon < float("inf"):
-        raise InputError(f"--epsilon {epsilon}: give numbers from 0 to below infinity")
+        raise InputError(f"--epsilon {epsilon}: give finite numbers of at least 0")
     return EvaluationRow(variant, epsilon, form, decoding)
 
 

@@ -50,7 +50,7 @@ class PlayConfig:
       scenes: scene file to read instead of the world's scenes.
       split: scenes to play in.
       goal: category to look for; default: any.
-      seed: of the scenes and of the episode.
+      seed: seed of the scenes and of the episode.
       shift: layout shift of the scenes, from 0 to 1.
       policy: folder of an exported policy, or one of the package (`rooms-org`): its advice and its belief are shown.
         Without, the belief begins with what random walks in training scenes see together.
@@ -122,7 +122,7 @@ class GameResult(NamedTuple):
 
     Attributes:
       poses: int [T + 1], indices of the poses in the bank, from the start on.
-      ending: how the game ended, to be followed by the number of actions.
+      ending: `found in`, `out of time after` or `wrong Done after`, which the number of actions follows.
     """
 
     poses: list[int]
@@ -149,7 +149,7 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
         if policy_world != config.world:
             raise InputError(f"--policy {policy}: was trained for {policy_world}; play with --world {policy_world}")
         if not isinstance(method.control, ActionControl):
-            raise InputError(f"--policy {policy}: method {method.name!r} chooses no single actions; take another")
+            raise InputError(f"--policy {policy}: method {method.name!r} does not choose actions; give another policy")
 
     # The game takes one episode of the list that an evaluation with this seed would play.
     run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed))

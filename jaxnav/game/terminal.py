@@ -48,14 +48,14 @@ def read_keys(stream: TextIO) -> Iterator[Iterator[str]]:
     Raises:
       InputError: the stream is no terminal, or the system has no Unix terminals.
     """
-    # These modules are missing on other systems, where the package can be imported all the same.
+    # These modules are missing on other systems, where the package can still be imported.
     try:
         import termios
         import tty
     except ImportError as error:
-        raise InputError("play: needs a terminal of a Unix system; there is none here") from error
+        raise InputError("play: needs a Unix terminal, which this system does not have") from error
     if not stream.isatty():
-        raise InputError("play: the input is no terminal; start it in one, without a pipe or a file as input")
+        raise InputError("play: the input is not a terminal; start the command in a terminal, without piped input")
 
     # Without line buffering and echo, each key arrives as it is pressed.
     descriptor = stream.fileno()

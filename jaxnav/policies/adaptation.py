@@ -111,7 +111,7 @@ class LearnedLossAdaptation:
 
     The experience of the method holds the loss, as `learned_loss`. The fusing layer, the recurrent core and the actor
     change; with streams, those of the direct stream, by the decisions that it would make alone. The layers before them
-    and experience are inputs and stay as they are.
+    and experience are inputs and do not change.
 
     The gradient of a kernel over a window is a sum of `WINDOW` outer products. An episode stores these factors, and the
     batch shares the kernels. Gradients of training reach the learned loss and the kernels through every inner step of
@@ -119,7 +119,7 @@ class LearnedLossAdaptation:
 
     Attributes:
       inner_steps: largest number of inner steps in an episode.
-      learning_rate: of an inner step.
+      learning_rate: learning rate of an inner step.
       second_order: True to pass gradients of training through the inner gradient; otherwise they only reach the
         learned loss.
     """
@@ -131,7 +131,7 @@ class LearnedLossAdaptation:
     def __post_init__(self) -> None:
         if self.inner_steps < 1:
             raise InputError(
-                f"LearnedLossAdaptation: inner_steps is {self.inner_steps}; give 1 or more, or no adaptation"
+                f"LearnedLossAdaptation: inner_steps is {self.inner_steps}; give 1 or more, or omit the adaptation"
             )
 
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> FastWeights:
@@ -216,10 +216,10 @@ def limit_inner_steps(adaptation: "Adaptation | None", inner_steps: int) -> "Ada
     if inner_steps == 0:
         return None
     if not isinstance(adaptation, LearnedLossAdaptation):
-        raise InputError(f"inner_steps is {inner_steps}; the method adapts in another way: give 0, or leave it out")
+        raise InputError(f"inner_steps is {inner_steps}, but the method adapts without inner steps; give 0 or omit it")
     if not 0 < inner_steps <= adaptation.inner_steps:
-        capacity = f"an episode remembers {adaptation.inner_steps} windows of {WINDOW} actions"
-        raise InputError(f"inner_steps is {inner_steps}; {capacity}: give 0 to {adaptation.inner_steps}")
+        capacity = f"an episode stores {adaptation.inner_steps} windows of {WINDOW} actions"
+        raise InputError(f"inner_steps is {inner_steps}, but {capacity}; give 0 to {adaptation.inner_steps}")
     return dataclasses.replace(adaptation, inner_steps=inner_steps)
 
 
@@ -231,7 +231,7 @@ def replay_window(
     Args:
       policy: the policy that decided.
       fast: leaves without a batch.
-      output_changes: float32 [W, N] for each layer, added to its outputs besides its change.
+      output_changes: float32 [W, N] for each layer, added to its outputs in addition to its change.
 
     Returns:
       Rows float32 [W, H + A] of hidden state and action probabilities, and the inputs [W, M] of each layer.
@@ -268,7 +268,7 @@ def replay_window(
 def _append_decision(fast: FastWeights, pathways: Pathways, memory: PolicyState) -> FastWeights:
     """Append the inputs of a decision to the window.
 
-    With streams experience is left out of the window: the direct stream adapts as if it acted alone.
+    With streams, the window contains no experience: the direct stream adapts as if it acted alone.
     """
     no_experience = jax.tree.map(jnp.zeros_like, memory.use_experience)
     direct_pathways = mask_experience(pathways, no_experience)

@@ -55,7 +55,7 @@ class Perception:
 
     Attributes:
       row_format: format of the observation rows.
-      spec: of the policy; None where actions are given.
+      spec: spec of the policy; None where actions are given.
       estimator_config: configuration of the layout estimator; None leaves the layout out.
     """
 
@@ -216,10 +216,10 @@ class AgentLoop:
 
     Attributes:
       env: the environment.
-      spec: of the policy; None where actions are given.
+      spec: spec of the policy; None where actions are given.
       estimator_config: configuration of the layout estimator; None leaves the layout out.
       inner_steps: adaptation steps that the method may take in an episode; 0 for none, None for its default.
-      fallback_spec: of a policy without experience that decisions are handed over to; None without one.
+      fallback_spec: spec of a layout-blind policy that acts after a hand-over; None without one.
     """
 
     env: ObjectNav
@@ -236,7 +236,7 @@ class AgentLoop:
     def bind(self, params: Params) -> Policy:
         """Bind parameters to the policy, with its adaptation limited to `inner_steps`."""
         if self.spec is None:
-            raise ValueError("AgentLoop without a spec has no policy to bind; give one")
+            raise ValueError("bind: this AgentLoop was created without a policy spec; give `spec`")
         policy = bind(self.spec, params)
         if self.inner_steps is not None:
             policy.adaptation = limit_inner_steps(policy.adaptation, self.inner_steps)
@@ -260,9 +260,9 @@ class AgentLoop:
         Args:
           key: typed PRNG key; consumed.
           num_envs: B.
-          memory: at the start, leaves [B, ...]; see `Policy.initial_memory`.
+          memory: memory at the start, leaves [B, ...]; see `Policy.initial_memory`.
           knowledge: learned before training; None where neither layout nor tracker is used.
-          env_params: of the environment.
+          env_params: parameters of the environment.
         """
         # Every episode has a key of its own.
         _, state = jax.vmap(self.env.reset, (0, None))(jax.random.split(key, num_envs), env_params)
@@ -307,7 +307,7 @@ class AgentLoop:
           agent: the episodes, [B].
           choice: int32 [B], sampled from the decision; an action unless the method has a control of its own.
           knowledge: learned before training; None where neither layout nor tracker is used.
-          env_params: of the environment.
+          env_params: parameters of the environment.
           policy, decision: the policy, which gives new episodes their initial memory, and its decision; None where
             actions are given.
           reset_keys: PRNG keys [B] of new episodes; ended episodes then reset in the same step. None disables the
@@ -336,7 +336,7 @@ class AgentLoop:
             agent=before_reset,
         )
 
-        # Without auto-reset the episodes go on.
+        # Without auto-reset the episodes continue.
         if reset_keys is None:
             return self.perceive(before_reset, action, moved, knowledge, env_params), result
 
@@ -394,7 +394,7 @@ class AgentLoop:
         """Step the environment, with auto-reset if keys are given.
 
         Returns:
-          The state after the action, reward, terminated, truncated, success, and the state to go on with.
+          The state after the action, reward, terminated, truncated, success, and the state of the next step.
         """
         if reset_keys is None:
             # Without a reset the final state is also the next one. Done keeps the pose, so success may be read before.

@@ -62,7 +62,7 @@ class HandoverPolicy:
         experience_logits = round_to_grid(output_with.logits) - direct_logits
         logits = pathways.scene * direct_logits + experience_logits
 
-        # Both hidden states go on, joined in the order of `initial_memory`.
+        # Both hidden states continue, joined in the order of `initial_memory`.
         hidden = jnp.concatenate([output_with.hidden, output_without.hidden], axis=-1)
         return output_with._replace(logits=logits, hidden=hidden)
 

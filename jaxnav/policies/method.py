@@ -248,4 +248,4 @@ class Method:
     def __post_init__(self) -> None:
         shares = [stage.share for stage in self.stages]
         if not shares or min(shares) <= 0.0 or abs(sum(shares) - 1.0) > 1e-6:
-            raise ValueError(f"the shares of its stages are {shares}; give shares above 0 that add up to 1")
+            raise ValueError(f"the shares of the stages are {shares}; give shares above 0 that add up to 1")

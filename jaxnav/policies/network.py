@@ -248,7 +248,7 @@ class Policy(Stream):
         if not self.method.reads_memory:
             return encoded
         if memory is None:
-            raise ValueError("pathways: the experience of the method reads the memory; give it")
+            raise ValueError("pathways: the experience of the method reads the memory; pass `memory`")
         return self.attend(encoded, memory)
 
     def encode(self, inputs: PolicyInputs) -> Pathways:

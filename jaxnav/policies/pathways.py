@@ -48,8 +48,8 @@ class Pathways(NamedTuple):
       goal: float32 [..., G], the direct pathway G -> A: detections and the goal, without experience.
       experience: float32 [..., Z], the mediator Z: what the method makes of scene and goal by experience; with streams
         followed by a second embedding of the view.
-      gate: float32 [..., 1], factor on the logit of Done; no pathway, so interventions leave it as it is.
-      reading: what the method's tracker read, for its adaptation, leaves [...]; no pathway either.
+      gate: float32 [..., 1], factor on the logit of Done; not a pathway, so interventions do not change it.
+      reading: reading of the method's tracker, for its adaptation, leaves [...]; also not a pathway.
     """
 
     scene: jax.Array
@@ -85,7 +85,7 @@ class Decision(NamedTuple):
       value: float32 [...], estimated return.
       hidden: float32 [..., H], recurrent state after the decision; with streams [..., 2 H].
       fast: fast weights after the decision; None without adaptation.
-      use_experience: that of the memory.
+      use_experience: `use_experience` of the memory.
     """
 
     logits: jax.Array

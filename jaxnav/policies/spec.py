@@ -38,12 +38,12 @@ class PolicySpec:
     """Specification of a policy; hashable.
 
     Attributes:
-      method: as `jaxnav.policies.methods.find_method` returns it.
+      method: method of the policy, see `jaxnav.policies.methods.find_method`.
       num_categories: K.
       sizes: widths that all methods share.
       method_sizes: (name, value) of the method's own sizes, where they differ from the defaults.
       direct: detections that the direct pathway sees; the number of parameters does not depend on it.
-      spatial_memory: map that the scene's direct pathway reads beside the view; None in the paper.
+      spatial_memory: map that the scene's direct pathway reads in addition to the view; None in the paper.
       done_gate: multiply the logit of Done by 0.58 times the confidence with which the goal is detected, 0 where it is
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
       decision: network from pathways to logits.
@@ -81,7 +81,7 @@ class PolicySpec:
         """Return the spec of which `to_json` returned `fields`; other keys are ignored.
 
         Args:
-          fields: as read from JSON.
+          fields: fields of the spec as read from JSON.
           method: found by the name `fields["method"]`.
           num_categories: K.
 

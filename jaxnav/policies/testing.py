@@ -49,11 +49,11 @@ def check_method(
     * A choice becomes a legal action.
 
     Args:
-      name: of the method, see `jaxnav.policies.methods.find_method`.
+      name: name of the method, see `jaxnav.policies.methods.find_method`.
       method_sizes: sizes of the method that differ from their defaults.
       steps: number of environment steps.
-      seed: of parameters, episodes and actions.
-      bank: of the scenes; None for two generated rooms.
+      seed: seed of parameters, episodes and actions.
+      bank: compiled scenes; None for two generated rooms.
 
     Raises:
       InputError: there is no such method.
@@ -76,7 +76,7 @@ def check_method(
 
     # Rollouts and histories rely on a bound on how long a choice lasts.
     interval = getattr(method.control, "interval", 0)
-    _require(isinstance(interval, int) and interval >= 1, "a control that does not say how long a choice lasts")
+    _require(isinstance(interval, int) and interval >= 1, "control.interval is not a whole number of 1 or more")
 
     # Act, and keep all agents and choices.
     @jax.jit
@@ -102,7 +102,7 @@ def check_method(
         choices.append(choice)
         action = policy_memory(agent).action
         is_legal = (action >= 0) & (action < env.num_actions)
-        _require(bool(is_legal.all()), "a choice that becomes no action")
+        _require(bool(is_legal.all()), "a choice does not become the index of an action")
 
     # The tracker is checked against the whole history, decisions in the last step.
     _check_tracker_states(method, agents, choices, env, knowledge, env_params)

@@ -163,7 +163,7 @@ class RunConfig:
         """Task of the world, with the categories, goals and detector of this configuration."""
         task = WORLDS[self.world].task
 
-        # The world's goals may be missing from a set of categories of one's own: by default all of these are goals.
+        # Your own categories may lack the goals of the world; by default all of them are goals.
         if self.worlds.categories is not None:
             task = dataclasses.replace(task, categories=self.worlds.categories, goals=())
 
@@ -339,20 +339,21 @@ def check_config(config: RunConfig) -> RunConfig:
 
 def _check_method(config: RunConfig, method: Method) -> None:
     arms = config.arms
-    _require(len(set(arms)) == len(arms) > 0, "arms", arms, f"give some of {', '.join(ARMS)}, each once")
+    _require(len(set(arms)) == len(arms) > 0, "arms", arms, f"give {' and '.join(ARMS)}, or one of them")
     has_host = method.hosts_layout or "layout" not in arms
-    _require(has_host, "arms", arms, f"method {config.method!r} cannot host the layout; give baseline alone")
+    _require(has_host, "arms", arms, f"method {config.method!r} cannot use layout weights; give only baseline")
 
     # The gate multiplies the logit of Done, which exists only where the method chooses actions.
     can_gate = not config.done_gate or method.control.num_choices == NUM_ACTIONS
-    _require(can_gate, "done_gate", True, f"what method {config.method!r} chooses are no actions; leave it out")
+    advice = f"method {config.method!r} does not choose actions, so there is no Done to gate; omit the option"
+    _require(can_gate, "done_gate", True, advice)
 
-    # Sizes of the method's own.
+    # Sizes of the method's networks.
     size_names = method.experience.sizes
     if size_names:
         known_sizes = f"{config.method!r} has {', '.join(size_names)}"
     else:
-        known_sizes = f"{config.method!r} has no sizes of its own"
+        known_sizes = f"{config.method!r} has no such sizes"
     for name, value in config.method_sizes.items():
         _require(name in size_names, f"method_sizes.{name}", value, f"is unknown; {known_sizes}")
         _require(value >= 1, f"method_sizes.{name}", value, "give at least 1")
@@ -393,7 +394,7 @@ def _check_numbers(config: RunConfig) -> None:
     for name, num_steps in step_products.items():
         _require(num_steps <= _MAX_STEPS_IN_MEMORY, name, num_steps, f"give at most {_MAX_STEPS_IN_MEMORY:,}")
     num_chunks = config.total_updates // config.chunk
-    advice = f"makes {num_chunks:,} chunks; give a larger chunk"
+    advice = f"this makes {num_chunks:,} chunks; give a larger chunk"
     _require(num_chunks <= _MAX_CHUNKS, "total_steps", config.total_steps, advice)
 
 
@@ -403,7 +404,7 @@ def _check_stages(config: RunConfig, method: Method) -> None:
         advice = "give a share between 0 and 1, both excluded"
         _require(0.0 < imitation < 1.0, "imitation", imitation, advice)
         stage_kinds = {stage.uses_expert for stage in method.stages}
-        advice = f"{config.method!r} has no stages of both kinds; leave it out"
+        advice = f"method {config.method!r} does not have stages both with and without imitation; omit the option"
         _require(len(stage_kinds) == 2, "imitation", imitation, advice)
 
     # Every stage needs a chunk of its own.
@@ -484,7 +485,7 @@ def _check_world(config: RunConfig) -> None:
     for goal_category in task.goals:
         if goal_category not in task.categories:
             unknown_goals.append(goal_category)
-    advice = f"give some of the categories {', '.join(task.categories)}"
+    advice = f"choose from the categories {', '.join(task.categories)}"
     _require(not unknown_goals, "worlds.goals", unknown_goals, advice)
 
 

@@ -79,14 +79,14 @@ def _load_yaml(path: Path, configs: Mapping[str, Path]) -> Any:
     try:
         return yaml.load(path.read_text(encoding="utf-8"), _UniqueKeyLoader)
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such configuration; choose from {', '.join(configs)}, or give a file") from error
+        raise InputError(f"{path}: no such configuration; give {', '.join(configs)} or a file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except yaml.MarkedYAMLError as error:
         line_note = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise InputError(f"{path}{line_note}: not valid YAML ({error.problem}); mend the line") from error
+        raise InputError(f"{path}{line_note}: not valid YAML ({error.problem}); fix the line") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # no text, impossible dates, deep nesting
-        raise InputError(f"{path}: not valid YAML ({error}); mend the file") from error
+        raise InputError(f"{path}: not valid YAML ({error}); fix the file") from error
 
 
 def apply_values(default: Config, values: Any, path: Path, prefix: str = "") -> Config:

@@ -107,9 +107,9 @@ class Policies(NamedTuple):
         # Refuse an estimator for which the run has no data.
         if self.estimator_config is None:
             option = "--hold" if name is None else f"--setting {name}"
-            raise InputError(f"{option}: needs policies with the layout; train a run with the arm `layout`")
+            raise InputError(f"{option}: needs policies with the layout estimator; train a run with the arm `layout`")
         if name in ("learned", "overdue") and self.knowledge.cooccurrence is None:
-            raise InputError(f"--setting {name}: the run learned no signs of another layout; train it anew")
+            raise InputError(f"--setting {name}: the run has no evidence from co-occurrence; train the run again")
 
         # `paper` and `released` also build the priors in their own way.
         estimator_config = self.estimator_config
@@ -137,7 +137,7 @@ class Policies(NamedTuple):
         method = self.spec.method
         if method.adaptation is None:
             raise InputError(
-                f"inner_steps is {inner_steps}; method {method.name!r} does not adapt in an episode, leave it out"
+                f"inner_steps is {inner_steps}, but method {method.name!r} does not adapt within an episode; omit it"
             )
         limit_inner_steps(method.adaptation, inner_steps)  # raises for an impossible number
         return self._replace(inner_steps=inner_steps)
@@ -159,11 +159,11 @@ class Policies(NamedTuple):
         fallback_method = fallback_policies.spec.method
         if fallback_method.tracker is not None or method.control.num_choices != fallback_method.control.num_choices:
             raise InputError(
-                f"handing over: {method.name!r} cannot hand over to {fallback_method.name!r}; train a run with "
-                "--method anonymous, and let a method that chooses actions hand over to it"
+                f"hand-over: method {method.name!r} cannot hand over to {fallback_method.name!r}; train the reference "
+                "run with --method anonymous, and the other run with a method that chooses actions"
             )
         if self.spec.spatial_memory != fallback_policies.spec.spatial_memory:
-            raise InputError("handing over: one of the runs has no spatial memory; train both alike")
+            raise InputError("hand-over: the runs have different spatial memories; train both with the same settings")
         paired_params = {"agent": self.params, "without": fallback_policies.params}
         return self._replace(params=paired_params, fallback_spec=fallback_policies.spec)
 
@@ -246,7 +246,7 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
     arms = tuple(config.arms if arms is None else arms)
     for arm in arms:
         if arm not in config.arms:
-            raise InputError(f"{config.run_dir}: was trained without the arm {arm!r}; train one with all --arms")
+            raise InputError(f"{config.run_dir}: was trained without the arm {arm!r}; train a run with both --arms")
 
     # Look for all folders before reading any.
     export_folders = []
@@ -255,7 +255,7 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
             export_folders.append((arm, config.run_dir / POLICIES_DIR / f"{arm}-{seed}"))
     for _, folder in export_folders:
         if not folder.exists():
-            raise InputError(f"{folder}: is missing, so training has not finished; train again with this --run-dir")
+            raise InputError(f"{folder}: is missing, so training has not finished; resume it by jaxnav train")
     loaded_exports = [load_params(folder) for _, folder in export_folders]
 
     # The last seed of the layout arm (else of the last arm) is the reference: its settings hold for all.
@@ -273,14 +273,15 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
         field_differences = list_differences(fields, reference_fields)
         if field_differences:
             raise InputError(
-                f"{folder}: is not of the run of {reference_folder}: {'; '.join(field_differences)}; train the run anew"
+                f"{folder}: was not trained in the run of {reference_folder}: {'; '.join(field_differences)}; "
+                "train the run again"
             )
 
     # The task may have changed with the version of jaxnav.
     field_differences = list_differences(reference_fields["task"], _task_fields(config.task))
     if field_differences:
         raise InputError(
-            f"{reference_folder}: was trained for another task than its run says (there != here): "
+            f"{reference_folder}: its task differs from that of its run (policy != run): "
             f"{'; '.join(field_differences)}; use the version that trained the run"
         )
 
@@ -304,7 +305,7 @@ def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) 
         # The specification decides which arrays there must be.
         method = find_method(fields["method"])
         if method.learn is not None and "knowledge" not in arrays:
-            raise InputError(f"what method {fields['method']!r} learns before training is missing; train the run anew")
+            raise InputError(f"the statistics of method {fields['method']!r} are missing; train the run again")
         policy_spec = PolicySpec.from_json(fields, method, len(fields["categories"]))
         check_arrays(folder, arrays, policy_spec)
 
@@ -342,7 +343,7 @@ def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) 
         raise InputError(f"{folder}: {str(error).removeprefix(f'{folder}: ')}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{folder}: its spec does not fit this code ({type(error).__name__}: {error}); train the run anew"
+            f"{folder}: its spec does not fit this code ({type(error).__name__}: {error}); train the run again"
         ) from error
 
 
@@ -365,15 +366,15 @@ def check_arrays(folder: Path, arrays: Mapping[str, Any], spec: PolicySpec) -> N
     field_differences = list_differences(describe_arrays(present_arrays), describe_arrays(expected_arrays))
     if field_differences:
         raise InputError(
-            f"{folder}: its arrays do not fit its spec (there != expected): {'; '.join(field_differences)}; "
-            "train the run anew"
+            f"{folder}: its arrays do not fit its spec (found != expected): {'; '.join(field_differences)}; "
+            "train the run again"
         )
 
     # Refuse NaN and infinities.
     for path, leaf in jax.tree_util.tree_leaves_with_path(arrays):
         if not np.isfinite(leaf).all():
             array_name = jax.tree_util.keystr(path, simple=True, separator="/")
-            raise InputError(f"{folder}: {array_name} holds numbers that are not finite; train the run anew")
+            raise InputError(f"{folder}: {array_name} contains numbers that are not finite; train the run again")
 
 
 @functools.lru_cache(maxsize=16)
@@ -419,8 +420,8 @@ def check_knowledge(params: Params, spec: PolicySpec, knowledge: Knowledge) -> N
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         error_line = str(error).split("\n", maxsplit=1)[0]
         raise InputError(
-            f"what method {spec.method.name!r} learned before training does not fit it "
-            f"({type(error).__name__}: {error_line}); train the run anew"
+            f"the statistics of method {spec.method.name!r} do not fit the method "
+            f"({type(error).__name__}: {error_line}); train the run again"
         ) from error
 
 
@@ -461,7 +462,7 @@ def load_policy_as_run(path: str | Path) -> tuple[RunConfig, Policies]:
     """Load one exported policy as if a run had trained it with one seed.
 
     Raises:
-      InputError: as `config_for_policy`.
+      InputError: see `config_for_policy`.
     """
     config = config_for_policy(path)
     policies = read_exported_policy(find_policy_folder(path))
@@ -480,7 +481,7 @@ def config_for_policy(path: str | Path) -> RunConfig:
     arm = "baseline" if fields["layout"] is None else "layout"
     config = _config_for_task_fields(fields["task"], fields["method"], arm)
     if config is None:
-        raise InputError(f"{folder}: was trained for a task that no generated world has; give the run that it comes from")
+        raise InputError(f"{folder}: was trained for a task that no generated world has; give its run")
     return config
 
 

@@ -166,9 +166,9 @@ class LoadedPolicy(struct.PyTreeNode):
         # Refuse observations without the odometry that this policy reads.
         perception = self._perception
         if perception.uses_odometry and (heading is None or moved is None):
-            raise InputError("act: this policy goes by compass and odometry; give `heading` and `moved`")
+            raise InputError("act: this policy reads compass and odometry; give `heading` and `moved`")
         if perception.tracker is not None and horizon is None:
-            raise InputError("act: this policy's method follows the camera too; give `horizon`")
+            raise InputError("act: this policy reads the tilt of the camera; give `horizon`")
 
         # Update belief, map and tracker with the observation.
         percept = Percept(
@@ -259,8 +259,8 @@ def _check_task(path: str | Path, trained_task: Task, env_task: Task) -> None:
     task_differences = list_differences(compared_fields(trained_task), compared_fields(env_task))
     if task_differences:
         raise InputError(
-            f"{path}: was trained for another task than that of env (there != here): {'; '.join(task_differences)}; "
-            "make one for this task: jaxnav.make(..., task=jaxnav.load_policy(...).task)"
+            f"{path}: was trained for another task than that of `env` (policy != env): {'; '.join(task_differences)}; "
+            "make an environment with the task of the policy: jaxnav.make(..., task=jaxnav.load_policy(...).task)"
         )
 
 
@@ -284,7 +284,7 @@ def export_program(policy: LoadedPolicy) -> bytes:
     try:
         return bytes(exported_program.serialize())
     except ImportError as error:
-        raise InputError("stablehlo: needs flatbuffers; install it by: pip install 'jaxnav[export]'") from error
+        raise InputError("stablehlo: needs flatbuffers; install it with: pip install 'jaxnav[export]'") from error
 
 
 def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Array) -> dict[str, Any]:

@@ -83,7 +83,7 @@ class Run:
 def run_settings(config: RunConfig) -> dict[str, Any]:
     """Settings that identify a run, as JSON.
 
-    Paths, devices and the number of calls between checkpoints are left out, because they may change when a run resumes.
+    Paths, devices and the number of calls between checkpoints are omitted, because they may change when a run resumes.
     """
     setting_fields = dataclasses.asdict(config)
     setting_fields = json.loads(json.dumps(setting_fields, default=str))  # tuples become lists, as in the file
@@ -109,7 +109,7 @@ def load_run_config(run_dir: Path) -> RunConfig:
     setting_differences = list_differences(saved_settings, run_settings(config))
     if setting_differences:
         raise InputError(
-            f"{path}: lacks settings ({'; '.join(setting_differences)}); restore the file or train the run anew"
+            f"{path}: lacks settings ({'; '.join(setting_differences)}); restore the file or train the run again"
         )
     return check_config(dataclasses.replace(config, run_dir=run_dir))
 
@@ -154,8 +154,8 @@ def claim_run_dir(config: RunConfig) -> None:
         setting_differences = list_differences(run_settings(load_run_config(run_dir)), run_settings(config))
         if setting_differences:
             raise InputError(
-                f"{run_dir}: holds another run (there != asked for): {'; '.join(setting_differences)}; "
-                "choose another --run-dir or the same settings"
+                f"{run_dir}: holds another run (stored != requested): {'; '.join(setting_differences)}; "
+                "choose another --run-dir or use the settings of the stored run"
             )
         return
 

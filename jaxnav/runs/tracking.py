@@ -33,7 +33,7 @@ def send_log(run: Run, to: Sequence[str], follow: bool = False, project: str = "
       InputError: no sink is named, the library of a sink is not installed, or the log is damaged.
     """
     if not to:
-        raise InputError(f"--to: names no sink; give {' or '.join(SINKS)}")
+        raise InputError(f"--to: no service is named; give {' or '.join(SINKS)}")
 
     settings = run_settings(run.config)
     sinks_by_series: dict[str, list[Sink]] = {}
@@ -68,7 +68,7 @@ def _new_rows(run: Run, follow: bool) -> Iterator[dict[str, Any]]:
     num_series = len(run.config.arms) * run.config.seeds
     last_step: dict[tuple[str, int], int] = {}
     while True:
-        # The whole log is read anew; rows up to the last step of their series are known.
+        # The whole log is read again; rows up to the last step of their series were sent before.
         for row in run.log():
             series_key = (row["arm"], row["seed"])
             if row["step"] > last_step.get(series_key, 0):

@@ -128,19 +128,23 @@ def _train_in_run_dir(
     """Train in a run directory whose lock is held; see `train`."""
     # Prepare the knowledge from before training: layout prior, estimator, and the method's own statistics.
     warn_if_rollout_too_short(config, console)
-    exploration = explore_world(config, world)
-    console.print(
-        f"layout prior from {int(exploration.steps):,} random steps, {int(exploration.poses):,} distinct poses"
-    )
-    estimator_config = calibrate_estimator(config, world, exploration, console)
-    knowledge = learn_knowledge(config, world, exploration, estimator_config)
+    with console.status("random walks for the layout prior"):
+        exploration = explore_world(config, world)
+        num_steps = int(exploration.steps)
+        num_poses = int(exploration.poses)
+    console.print(f"layout prior from {num_steps:,} random steps, {num_poses:,} distinct poses")
+    with console.status("calibrating the layout estimator"):
+        estimator_config = calibrate_estimator(config, world, exploration, console)
+    with console.status("learning statistics of the training scenes"):
+        knowledge = learn_knowledge(config, world, exploration, estimator_config)
 
     # Draw the bank of scenes in which each chunk trains.
     trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
     bank_order = draw_bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
         num_used = len(set(bank_order))
-        console.print(f"one shard after the other: {len(bank_order)} turns in {num_used} of {len(world.banks)} shards")
+        shard_counts = f"{len(bank_order)} turns in {num_used} of {len(world.banks)} shards"
+        console.print(f"training in one shard of scenes at a time: {shard_counts}")
 
     # Resume from the last checkpoint. A finished run needs no validator.
     env_params = world.make_env_params(bank_order[0])
@@ -158,7 +162,8 @@ def _train_in_run_dir(
         policies[arm] = [_best_params(state) for state in seed_states]
     run_on_first_process(lambda: _export_policies(config, policies, estimator_config, knowledge, exploration))
     if validator is not None:
-        success_by_budget = validator.success_by_budget(policies)
+        with console.status("measuring the exported policies"):
+            success_by_budget = validator.success_by_budget(policies)
         run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
@@ -176,7 +181,7 @@ def _check_config_and_method(config: RunConfig) -> RunConfig:
             check_method(config.method, method_sizes=config.method_sizes, bank=bank)
         except Exception as error:  # code of another package may raise anything
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            raise InputError(f"method {config.method!r}: fails check_method ({reason}); mend it") from error
+            raise InputError(f"method {config.method!r}: fails check_method ({reason}); fix the method") from error
     return config
 
 
@@ -252,8 +257,8 @@ def calibrate_estimator(
 
     estimator_config = calibration.estimator_config
     console.print(
-        f"layout estimator: prior rows of {estimator_config.strength:g}, reduction {estimator_config.reduction}; "
-        f"gap {calibration.early:.2f} in the first views, {calibration.late:.2f} after twenty steps"
+        f"layout estimator: prior strength {estimator_config.strength:g}, reduction {estimator_config.reduction}; "
+        f"layout gap {calibration.early:.2f} in the first views, {calibration.late:.2f} after twenty steps"
     )
     return estimator_config
 
@@ -355,7 +360,7 @@ def _make_validator(
     try:
         return Validator(config, agent_loop, knowledge, world, console)
     except MissingSplitError as error:
-        console.print(f"no val scenes, so the last policies are exported ({error})")
+        console.print(f"no val scenes, so the policies of the last update are exported ({error})")
         return None
 
 
@@ -413,6 +418,7 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
             update += config.chunk
             progress.stop_timing()
             if session.validator is not None and update in validation_updates:
+                progress.show_activity("measuring the policies in val scenes")
                 states, metrics = _validate(session, session.validator, states, metrics, stage_index)
 
             # All processes agree on a signal before process 0 writes. The check of the lock stops the run if its
@@ -576,7 +582,8 @@ class ProgressDisplay:
         self._config = config
         self._console = console
         self._bar = Progress(*progress_columns, console=console, disable=not console.is_terminal)
-        self._task = self._bar.add_task("compiling", total=config.total_updates, completed=update)
+        first_activity = f"compiling, then updates {update + 1} to {update + config.chunk}"
+        self._task = self._bar.add_task(first_activity, total=config.total_updates, completed=update)
 
     def __enter__(self) -> "ProgressDisplay":
         self._bar.start()
@@ -586,6 +593,10 @@ class ProgressDisplay:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+
+    def show_activity(self, activity: str) -> None:
+        """Show on the bar what happens between two chunks."""
+        self._bar.update(self._task, description=activity)
 
     def stop_timing(self) -> None:
         """Mark the end of a chunk's training, so that its speed excludes validation and saving."""
@@ -612,8 +623,8 @@ class ProgressDisplay:
             f"{', '.join(success_rates)}{skip_note}"
         )
         self._bar.update(self._task, completed=update, description=progress_line)
-        # A log file gets a line only every few chunks.
-        is_line_due = (update // config.chunk) % _CHUNKS_PER_LINE == 0
+        # A log file gets a line only every few chunks, and after the last one.
+        is_line_due = (update // config.chunk) % _CHUNKS_PER_LINE == 0 or update == config.total_updates
         if not self._console.is_terminal and is_line_due:
             self._console.print(progress_line)
         self._chunk_start = time.monotonic()

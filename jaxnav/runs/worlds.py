@@ -126,7 +126,7 @@ def compile_evaluation_world(
     if world_name not in WORLDS:
         raise InputError(f"--world {world_name}: choose one of {', '.join(WORLDS)}")
     if scenes and world:
-        raise InputError(f"--scenes, --world: both are given ({scenes}, {world}); leave one out")
+        raise InputError(f"--scenes, --world: both are given ({scenes}, {world}); give only one")
 
     # Another file or world replaces the scenes of the run.
     path = scenes
@@ -165,7 +165,7 @@ def _load_scenes(
     unknown_types = count_unknown_types(scenes.scenes, config.task.categories)
     if unknown_types:
         type_names = format_most_common(unknown_types)
-        console.print(f"{path}: types that are no category and only block the sight: {type_names}")
+        console.print(f"{path}: these object types are not categories and only block the view: {type_names}")
     return shift_scenes(scenes, config.task, shift, seed)
 
 
@@ -217,14 +217,15 @@ def _compile_to_cache(config: RunConfig, scenes: Scenes, console: Console) -> Sh
             cache = config.cache.expanduser()
             shards = compile_shards(scenes, config.task, config.worlds.shard_scenes, cache, report_progress)
         except OSError as error:
-            raise InputError(f"--cache {config.cache}: {error.strerror}; give another folder, or make room") from error
+            remedy = "give another folder or free disk space"
+            raise InputError(f"--cache {config.cache}: {error.strerror}; {remedy}") from error
 
-    # Episodes start anew with every shard, so a chunk in one shard must last for a whole episode.
+    # Every shard begins with new episodes, so a chunk in one shard must last for a whole episode.
     if config.chunk * config.ppo.rollout < config.train_step_limit:
         min_chunk = -(-config.train_step_limit // config.ppo.rollout)  # rounded up
         raise InputError(
-            f"config: chunk is {config.chunk}; where scenes are streamed it must last for a whole episode: give at "
-            f"least {min_chunk}"
+            f"config: chunk is {config.chunk}; with streamed scenes a chunk must be at least as long as an episode: "
+            f"give at least {min_chunk}"
         )
 
     # Say how much of the disk the shards fill.
@@ -237,7 +238,7 @@ def _compile_to_cache(config: RunConfig, scenes: Scenes, console: Console) -> Sh
 
 
 def _skipped_note(skipped: Sequence[str]) -> str:
-    return f" ({len(skipped)} scenes without a goal left out)" if skipped else ""
+    return f" ({len(skipped)} scenes without a goal skipped)" if skipped else ""
 
 
 def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
@@ -247,7 +248,7 @@ def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
       InputError: the scenes of a world fill more than one shard.
     """
     if any(len(world.banks) > 1 for world in worlds):
-        raise InputError("scenes fill more than one shard; give more --shard-scenes, or fewer scenes")
+        raise InputError("the scenes fill more than one shard; give a larger --shard-scenes or fewer scenes")
     # Banks in memory are joined; settings are those of the first world.
     bank = concatenate_banks([world.banks[0] for world in worlds])
     return dataclasses.replace(

@@ -32,9 +32,9 @@ def exchange_places(scene: Scene, task: Task, shift: float, seed: int) -> Scene:
 
     Args:
       scene: the scene.
-      task: its categories and goals.
+      task: task whose categories and goals are exchanged.
       shift: share of the groups, from 0 to 1.
-      seed: at least 0; with the scene's name it fixes the order of the groups.
+      seed: seed of at least 0, which fixes the order of the groups together with the scene's name.
 
     Returns:
       The shifted scene; `scene` itself if `shift` is 0 or nothing can be exchanged.

@@ -139,7 +139,7 @@ class GeneratedScenes:
       world: name of the world, a key of `WORLDS`.
       split: `train`, `val` or `test`.
       count: number of scenes.
-      seed: of the generator, at least 0.
+      seed: seed of the generator, at least 0.
     """
 
     world: str
@@ -188,7 +188,7 @@ class ShiftedScenes:
       scenes: the scenes without a shift.
       task: task whose categories exchange their places.
       shift: share of the categories, from 0 to 1; see `exchange_places`.
-      seed: of the exchange.
+      seed: seed of the exchange.
     """
 
     scenes: Scenes
@@ -216,13 +216,13 @@ def shift_scenes(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Sce
       scenes: scenes of a file or of a generated world.
       task: task whose categories exchange their places; see `exchange_places`.
       shift: layout shift, from 0 (the scenes themselves) to 1.
-      seed: of the exchange, at least 0.
+      seed: seed of the exchange, at least 0.
 
     Raises:
       InputError: an impossible number.
     """
     if seed < 0 or not 0.0 <= shift <= 1.0:  # also rejects NaN
-        raise InputError(f"layout shift: seed {seed}, shift {shift}; give a seed of at least 0, a shift from 0 to 1")
+        raise InputError(f"layout shift: seed {seed}, shift {shift}; give a seed of at least 0 and a shift from 0 to 1")
     return ShiftedScenes(scenes, task, shift, seed) if shift else scenes
 
 
@@ -233,7 +233,7 @@ def make_generated_scenes(world: str, split: str, count: int | None = None, seed
       world: a key of `WORLDS`.
       split: `train`, `val` or `test`.
       count: number of scenes; None for the world's usual number.
-      seed: of the generator, at least 0.
+      seed: seed of the generator, at least 0.
 
     Raises:
       InputError: an unknown name, or an impossible number.
@@ -244,7 +244,7 @@ def make_generated_scenes(world: str, split: str, count: int | None = None, seed
     _check_split(split)
     count = WORLDS[world].counts[split] if count is None else count
     if count < 1:
-        raise InputError(f"world {world!r}: {count} scenes of split {split!r}; ask for at least one")
+        raise InputError(f"world {world!r}: {count} scenes of split {split!r}; request at least one")
     if seed < 0:
         raise InputError(f"world {world!r}: seed {seed}; give a number of at least 0")
     return GeneratedScenes(world, split, count, seed)
@@ -286,8 +286,8 @@ class SceneSource:
 
     Attributes:
       file: scene file, or the name of a generated world: `rooms`, `apartments` or `houses`.
-      split: of the scenes; default: all of a file, `val` of a generated world.
-      seed: of a generated world, and of the shift.
+      split: split of the scenes; default: all scenes of a file, or `val` of a generated world.
+      seed: seed of a generated world and of the layout shift.
       shift: layout shift, from 0 to 1: the share of the categories that exchange their places.
       world: world whose categories and rules count; default: the generated one, or what the scenes of a file stand for.
     """
@@ -374,4 +374,4 @@ class SceneSource:
             name_hint = f"did you mean {' or '.join(similar_names)}?"
         else:
             name_hint = f"it holds {', '.join(list(scene_by_name)[:3])}, ..."
-        raise InputError(f"--scene {name!r}: is none of the {len(scene_by_name)} scenes of {self.file}; {name_hint}")
+        raise InputError(f"--scene {name!r}: is not one of the {len(scene_by_name)} scenes of {self.file}; {name_hint}")

@@ -127,7 +127,7 @@ def restore_checkpoint(
                 return RestoredState(state, step, tuple(damage_messages))
             gc.collect()  # asyncio logs the error of a task when it is collected
 
-    # Without any checkpoint the run starts anew; with damaged ones alone it must not.
+    # A run without any checkpoint starts from the beginning; a run with only damaged checkpoints must not.
     if damage_messages:
         raise InputError(
             f"{'; '.join(damage_messages)}: no checkpoint is left; restore one or choose another run directory"
@@ -172,7 +172,7 @@ def _load_step(
     mismatches = list_differences(saved["leaves"], describe_arrays(abstract_state))
     if mismatches:
         raise InputError(
-            f"{folder}: its state has other arrays than this code's (saved != asked for): {'; '.join(mismatches)}; "
+            f"{folder}: its arrays differ from those of this code (saved != expected): {'; '.join(mismatches)}; "
             f"use the versions that wrote it ({saved['manifest']['versions']}) or choose another run directory"
         )
 
@@ -182,7 +182,7 @@ def _load_step(
         mismatches = list_differences(saved["digests"], array_digests(state))
         if mismatches:
             leaf_paths = [mismatch.split(":")[0] for mismatch in mismatches]
-            raise ValueError(f"digests differ of {', '.join(leaf_paths)}")
+            raise ValueError(f"wrong digests of {', '.join(leaf_paths)}")
     return state
 
 
@@ -202,7 +202,7 @@ def _check_files(folder: Path) -> None:
     file_digests = _file_digests(folder)
     damaged_files = [file_name for file_name, digest in saved_digests.items() if file_digests.get(file_name) != digest]
     if damaged_files:
-        raise ValueError(f"missing or other than saved: {', '.join(damaged_files)}")
+        raise ValueError(f"missing or changed since saving: {', '.join(damaged_files)}")
 
 
 def _file_digests(folder: Path) -> dict[str, str]:

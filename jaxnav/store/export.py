@@ -65,7 +65,7 @@ def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, 
 
     # Compare as JSON, in which tuples are lists.
     if existing_policy != json.loads(json.dumps(policy)):
-        raise InputError(f"{folder}: holds another policy than would be exported; keep it elsewhere or remove it")
+        raise InputError(f"{folder}: holds another policy, which is not overwritten; move or remove the folder")
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -82,7 +82,7 @@ def _read_policy(folder: Path) -> dict[str, Any]:
     """Read `policy.json` and verify that the arrays belong to it.
 
     Raises:
-      InputError: as `load_params`.
+      InputError: see `load_params`.
     """
     # Read the description, and compute the digest of the arrays.
     policy_path = folder / POLICY_FILE

@@ -80,7 +80,7 @@ def verify_digest(source: object, record: Mapping[str, Any], remedy: str) -> dic
         raise InputError(f"{source}: has no digest, so it is damaged ({remedy}) or {WRITTEN_BY_0_1}")
     plain_record = {name: value for name, value in record.items() if name != DIGEST_KEY}
     if record[DIGEST_KEY] != _record_digest(plain_record):
-        raise InputError(f"{source}: is damaged or was changed by hand (its digest is another); {remedy}")
+        raise InputError(f"{source}: is damaged or was edited (its digest does not match); {remedy}")
     return plain_record
 
 
@@ -113,7 +113,7 @@ def read_json_with_digest(path: Path, remedy: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}); {remedy}") from error
     if not isinstance(record, dict):
-        raise InputError(f"{path}: holds no JSON object; {remedy}")
+        raise InputError(f"{path}: does not contain a JSON object; {remedy}")
     return verify_digest(path, record, remedy)
 
 
@@ -157,8 +157,8 @@ class FolderLock:
             holder_name = os.read(descriptor, 200).decode(errors="replace") or "another process"
             os.close(descriptor)
             raise InputError(
-                f"{self._path.parent}: {holder_name} writes to it; wait for that, end it, or choose another run "
-                "directory"
+                f"{self._path.parent}: {holder_name} is writing to it; wait until it ends, stop it, or choose another "
+                "run directory"
             ) from error
         except OSError:  # a file system without locks
             pass
@@ -183,7 +183,7 @@ class FolderLock:
         if not is_same_file:
             raise InputError(
                 f"{self._path.parent}: was removed or replaced, or its {LOCK_FILE} was, while this run wrote to it; "
-                "restore it, or train anew"
+                "restore it, or train again"
             )
 
     def release(self) -> None:
@@ -239,7 +239,7 @@ def truncate_log_after(path: Path, step: int) -> None:
     An incomplete last line is dropped too; a missing log stays missing.
 
     Raises:
-      InputError: as `read_log_rows`; the log is then unchanged.
+      InputError: see `read_log_rows`; the log is then unchanged.
     """
     if path.exists():
         remaining_rows = [row for row in read_log_rows(path) if row["step"] <= step]
@@ -316,7 +316,7 @@ def check_manifest(source: object, saved: Mapping[str, Any], expected: Mapping[s
     mismatches = list_differences(saved["config"], expected["config"])
     if mismatches:
         raise InputError(
-            f"{source}: was saved under another config (saved != asked for): {'; '.join(mismatches)}; "
+            f"{source}: was saved with another configuration (saved != requested): {'; '.join(mismatches)}; "
             "restore these values or choose another run directory"
         )
 

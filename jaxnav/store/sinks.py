@@ -87,4 +87,4 @@ def _import_library(module: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(f"--to {extra}: needs {module}; install it by: pip install 'jaxnav[{extra}]'") from error
+        raise InputError(f"--to {extra}: needs {module}; install it with: pip install 'jaxnav[{extra}]'") from error

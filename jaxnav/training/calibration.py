@@ -76,7 +76,7 @@ def explore(
 
     Args:
       env: the environment.
-      env_params: of the training scenes.
+      env_params: parameters of the training environment.
       key: consumed.
       num_walks: parallel walks.
       num_steps: steps of each walk.
@@ -194,7 +194,7 @@ def calibrate(
 
     Args:
       env: the environment.
-      env_params: of the training scenes.
+      env_params: parameters of the training environment.
       counts: float32 [rooms, K, K], from `explore`.
       estimator_config: all other settings of the estimator.
       key: consumed.
@@ -222,7 +222,10 @@ def calibrate(
 
     # Take the pair nearest to the targets.
     if all(np.isnan(calibration.early) for calibration in calibrations):
-        raise InputError("layout: no random walk shows two categories together, so nothing can be calibrated")
+        raise InputError(
+            "layout: no random walk shows two categories together, so the estimator cannot be calibrated; give scenes "
+            "with objects of more categories, or more layout.steps"
+        )
     return min(calibrations, key=_distance_to_targets)
 
 
@@ -299,7 +302,7 @@ def fit_shift_classifier(
 
     Args:
       env: the environment.
-      env_params: of the training scenes.
+      env_params: parameters of the training environment.
       counts: float32 [rooms, K, K], from `explore`.
       key: consumed.
       num_walks: W, parallel walks.
@@ -444,7 +447,7 @@ def _minimize(loss: Callable[[jax.Array], jax.Array], start: jax.Array) -> jax.A
     def descend(carry: tuple[Any, optax.OptState], _: None) -> tuple[tuple[Any, optax.OptState], None]:
         weights, optimizer_state = carry
         gradient = jax.grad(loss)(weights)
-        with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 counts with float32
             updates, optimizer_state = optimizer.update(gradient, optimizer_state)
         return (optax.apply_updates(weights, updates), optimizer_state), None
 

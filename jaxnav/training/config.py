@@ -1,7 +1,7 @@
 """Settings of PPO, and the schedule of training stages.
 
 `PPOConfig` holds what a user can set. `PPOScalars` is its traced part, whose values may change without a new
-compilation. `stage_index_at` tells which stage of a method a part of training belongs to.
+compilation. `stage_index_at` returns the stage of a method to which a part of training belongs.
 """
 
 import dataclasses

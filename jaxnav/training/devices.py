@@ -96,7 +96,7 @@ class Devices:
         except (ValueError, RuntimeError) as error:
             raise InputError(
                 f"config: devices: the processes cannot be joined ({error}); give HOST:PORT,INDEX,PROCESSES to each, "
-                "with an address of process 0"
+                "with the address of process 0"
             ) from error
 
     def mesh(self, num_seeds: int, num_envs: int, minibatches: int) -> Mesh:
@@ -112,16 +112,16 @@ class Devices:
         count = self.count or len(devices)
         if count > len(devices):
             raise InputError(
-                f"config: devices is {count}; there are {len(devices)} (on a CPU as many as "
-                f"XLA_FLAGS=--xla_force_host_platform_device_count={count} makes)"
+                f"config: devices is {count}, but JAX has {len(devices)}; give fewer, or divide a CPU by "
+                f"XLA_FLAGS=--xla_force_host_platform_device_count={count}"
             )
 
         num_groups = math.gcd(count, num_seeds)
         group_size = count // num_groups
         if num_envs % (group_size * minibatches):
             raise InputError(
-                f"config: ppo.num_envs is {num_envs}; with {count} devices for {num_seeds} seeds the episodes of each "
-                f"are shared by {group_size}: give a multiple of {group_size} x ppo.minibatches ({minibatches})"
+                f"config: ppo.num_envs is {num_envs}; with {count} devices and {num_seeds} seeds, {group_size} devices "
+                f"share the episodes of a seed: give a multiple of {group_size} x ppo.minibatches ({minibatches})"
             )
         return Mesh(np.array(devices[:count]).reshape(num_groups, group_size), (SEED_AXIS, ENV_AXIS))
 
@@ -138,7 +138,7 @@ def state_sharding(mesh: Mesh, stacked: bool = False) -> LearnerState:
     """Sharding of a seed's state, a pytree prefix: episodes are divided, all else is copied to all devices.
 
     Args:
-      mesh: of devices.
+      mesh: mesh of the devices of the run.
       stacked: for the stacked states of several seeds, whose seeds are divided among the groups of devices too.
     """
     seed_axes = (SEED_AXIS,) if stacked else ()
@@ -168,7 +168,7 @@ def run_on_first_process(action: Callable[[], Any]) -> None:
     """Run an action in the first process while the rest wait.
 
     Raises:
-      InputError: in every process, if the action raised one in the first.
+      InputError: the action raised one in the first process; then every process raises it.
     """
     error = None
     if is_first_process():
@@ -182,7 +182,7 @@ def run_on_first_process(action: Callable[[], Any]) -> None:
     if jax.process_count() > 1:
         has_failed = bool(multihost_utils.broadcast_one_to_all(np.bool_(has_failed)))
     if has_failed:
-        raise error or InputError("process 0 was refused; it says why")
+        raise error or InputError("process 0 stopped with an error; read its output")
 
 
 def check_agreement(text: str) -> None:
@@ -199,7 +199,8 @@ def check_agreement(text: str) -> None:
     others = np.flatnonzero((digests != digests[0]).any(axis=1)).tolist()
     if others:
         raise InputError(
-            f"config: processes {others} have other settings, scenes or versions than process 0; give all the same"
+            f"config: processes {others} have other settings, scenes or versions than process 0; start all processes "
+            "with the same settings"
         )
 
 
@@ -244,7 +245,7 @@ def _exit_with_message() -> None:
     """Exit at once with the code of invalid input; JAX's own exit would wait for the lost process."""
     sys.stderr.write(
         "error: config: devices: another process of this run ended, cannot be reached or has other versions "
-        f"(details: {_crash_log}); start all again, the run goes on from its last checkpoint\n"
+        f"(details: {_crash_log}); start all processes again, and the run resumes from its last checkpoint\n"
     )
     sys.stderr.flush()
     os._exit(2)

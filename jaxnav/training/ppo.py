@@ -11,7 +11,7 @@
             apply_gradient(...)
 
 Replay starts from the stored memory (`PolicyState`: recurrent state, previous action, ...) of the rollout's first step,
-and unrolls it anew under the current parameters. There is no value clipping.
+and unrolls it again under the current parameters. There is no value clipping.
 
 Extensions of plain PPO:
 
@@ -571,7 +571,7 @@ def apply_gradient(
     if lr_scale_by_path is not None:
         gradient = _scale_by_path(gradient, lambda path: float(lr_scale_by_path(path) > 0))
 
-    with jax.numpy_dtype_promotion("standard"):  # optax counts in int32 beside float32
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 counts with float32
         param_updates, opt_state = make_optimizer(config).update(gradient, opt_state, policy_params)
 
     # Scale Adam's step, not the gradient: Adam is invariant to the scale of gradients, and momentum would still move

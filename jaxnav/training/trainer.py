@@ -121,8 +121,8 @@ class Trainer:
         """Keep each seed's present policy as its best one, unless an earlier one scored higher; donates the states.
 
         Args:
-          states: of all seeds.
-          scores: of the present policies, by arm and seed.
+          states: training states of all seeds.
+          scores: score of each present policy, by arm and seed.
         """
         new_states: TrainerStates = {}
         for arm, arm_states in states.items():
@@ -137,8 +137,8 @@ class Trainer:
         """Do a chunk of updates in all seeds; donates the states.
 
         Args:
-          states: of all seeds.
-          env_params: of the training scenes.
+          states: training states of all seeds.
+          env_params: parameters of the training environment.
           stage_index: index of the stage, see `training.config.stage_index_at`.
 
         Returns:
@@ -187,7 +187,7 @@ class Trainer:
         return jax.jit(learner.init)
 
     def _jit_update(self, function: Callable[..., LearnerState], seed_axes: tuple[int | None, ...]) -> Any:
-        """Jit a function of states, which it donates; `seed_axes` tells the arguments that have an axis of seeds."""
+        """Jit a function of states, which it donates; `seed_axes` lists the arguments that have an axis of seeds."""
         return jax.jit(function, donate_argnums=0)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:

@@ -15,4 +15,4 @@ def require_plotting_packages() -> None:
         for module in ("matplotlib.figure", "PIL.Image"):
             importlib.import_module(module)
     except ImportError as error:
-        raise InputError("pictures need matplotlib and pillow; install them by: pip install 'jaxnav[viz]'") from error
+        raise InputError("pictures need matplotlib and pillow; install them with: pip install 'jaxnav[viz]'") from error

@@ -216,7 +216,7 @@ def _check_index(index: int, episodes_by_shift: Sequence[ShiftedEpisodes]) -> np
     best_lengths = np.stack([shifted.episodes.best_length for shifted in episodes_by_shift])  # [shifts, E]
     is_reachable = best_lengths.min(axis=0) > 0
     if not is_reachable[index]:
-        raise InputError(f"--index {index}: at some --shift the goal cannot be reached; give another")
+        raise InputError(f"--index {index}: the goal cannot be reached at every --shift; give another --index")
     return is_reachable
 
 
@@ -233,7 +233,10 @@ def _report_success(
     for i, shift in enumerate(shifts):
         success_elsewhere = np.delete(success, i, axis=0).any(axis=0)
         only_here = success[i] & ~success_elsewhere
-        console.print(f"shift {shift:g}: {success[i].sum()} of {success.shape[1]} found, {only_here.sum()} only there")
+        console.print(
+            f"shift {shift:g}: goal found in {success[i].sum()} of {success.shape[1]} episodes, "
+            f"in {only_here.sum()} only at this shift"
+        )
 
 
 def _describe_agent(policies: Policies, variant: PlayedVariant, epsilon: float) -> str:
@@ -284,7 +287,7 @@ def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
     an episode with more than 60 steps; another path gets the last frame.
 
     Args:
-      episodes: at least one; equal room, goal and start at several layout shifts.
+      episodes: one or more episodes with equal room, goal and start at several layout shifts.
       path: file to write.
     """
     # Texts above and below the panels.
@@ -337,7 +340,7 @@ def _write_gif(frames: list[Image.Image], path: Path) -> None:
     for frame in frames:
         palette_frames.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
 
-    # The end stays longer, before the GIF starts anew.
+    # The end stays longer, before the GIF starts again.
     frame_durations = [STEP_MILLISECONDS] * (len(frames) - 1) + [LAST_MILLISECONDS]
     first_frame, *next_frames = palette_frames
     first_frame.save(path, save_all=True, append_images=next_frames, duration=frame_durations, loop=0, optimize=True)
@@ -484,7 +487,7 @@ def _draw_gap(axes: Axes, episode: PlayedEpisode, step: int, gap_steps: int) -> 
     # Equal axes at every step.
     axes.set(xlim=(0.5, gap_steps + 0.5), ylim=(0, 1.02), yticks=(0, 0.5, 1))
     axes.set_title("Layout gap D", loc="right", fontsize=10, color=TEXT_COLOR)
-    axis_label = "step" if epsilon > 1 else "step; filled: experience taken out"
+    axis_label = "step" if epsilon > 1 else "step; filled: experience removed"
     axes.set_xlabel(axis_label, fontsize=8.5, color=MUTED_COLOR)
     axes.locator_params(axis="x", integer=True, nbins=6)
     style_axes(axes, label_size=8.5)

@@ -298,7 +298,7 @@ def _find_level_pose(centres: np.ndarray, rules: Rules, x: float, z: float, yaw:
     cell = int(np.argmin(distance))
     if not np.abs(centres[cell] - (x, z)).max() <= CELL_SIZE / 2:
         raise InputError(
-            f"--pose {x:g} {z:g} {yaw:g}: nobody can stand there; the nearest place is {centres[cell, 0]:g} "
+            f"--pose {x:g} {z:g} {yaw:g}: no agent can stand there; the nearest place is {centres[cell, 0]:g} "
             f"{centres[cell, 1]:g}"
         )
     turn_angle = 360.0 / rules.headings

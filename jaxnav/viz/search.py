@@ -76,7 +76,7 @@ def take_snapshot(episode: PlayedEpisode, step: int) -> SearchSnapshot:
     tracker = method.tracker
     num_steps = len(episode.trace.pose)
     if not isinstance(control, LocalPolicy) or tracker is None:
-        raise InputError(f"--map: method {method.name!r} keeps no map to plan on; give a run of semexp")
+        raise InputError(f"--map: method {method.name!r} has no map; give a run of method semexp")
     if not 0 <= step < num_steps:
         raise InputError(f"--step {step + 1}: give a number from 1 to {num_steps}")
 
@@ -293,5 +293,5 @@ def _legend_handles(goal_name: str, is_searching: bool) -> list[Patch | Line2D]:
         *(block_handles if is_searching else []),
         Line2D([], [], color=AGENT_COLOR, lw=2, label="way so far"),
         Line2D([], [], color=AGENT_COLOR, lw=2, ls=":", label="way planned"),
-        Patch(facecolor=BACKGROUND_COLOR, edgecolor=MUTED_COLOR, label="faint: the home as it is"),
+        Patch(facecolor=BACKGROUND_COLOR, edgecolor=MUTED_COLOR, label="faint: the true home"),
     ]

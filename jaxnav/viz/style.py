@@ -28,7 +28,7 @@ def make_panels(rows: int, columns: int, *, height: float, **sharing: Any) -> tu
     Args:
       rows: number of rows.
       columns: number of columns.
-      height: of the figure, inches.
+      height: height of the figure in inches.
       **sharing: further arguments of `Figure.subplots`.
     """
     figure = Figure(figsize=(FIGURE_WIDTH, height), dpi=FIGURE_DPI, layout="constrained")

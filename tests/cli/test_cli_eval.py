@@ -216,7 +216,7 @@ def test_eval_of_a_run_on_a_file_accepts_a_generated_world(run_dir, tmp_path, ca
 
     capsys.readouterr()
     assert evaluate(copied_run, "--world", "rooms", "--scenes", scene_file) == 2
-    assert_message_names(refusal(capsys), "--scenes, --world", f"{scene_file}, rooms", "leave one out")
+    assert_message_names(refusal(capsys), "--scenes, --world", f"{scene_file}, rooms", "give only one")
 
 
 # Refusals
@@ -225,7 +225,7 @@ def test_eval_of_a_run_on_a_file_accepts_a_generated_world(run_dir, tmp_path, ca
 @pytest.mark.parametrize(
     ("options", "named_parts"),
     [
-        (["--epsilon", "nan"], ["--epsilon nan", "give numbers from 0"]),
+        (["--epsilon", "nan"], ["--epsilon nan", "give finite numbers of at least 0"]),
         (["--epsilon", "0.5", "-0.5"], ["--epsilon -0.5", "give"]),
         (["--epsilon", "inf"], ["--epsilon inf", "give"]),
         (["--episodes", "0"], ["--episodes 0", "give at least 1"]),
@@ -291,4 +291,4 @@ def test_eval_refuses_an_export_of_another_task(run_dir, tmp_path, capsys):
     with resigned(copied_run / "config.json") as config:
         config["detector"]["false_alarm"] = 0.25
     assert evaluate(copied_run) == 2
-    assert "another task than its run" in refusal(capsys)
+    assert "its task differs from that of its run" in refusal(capsys)

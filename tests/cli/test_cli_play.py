@@ -44,5 +44,5 @@ def test_play_runs_an_episode_in_a_terminal():
 def test_play_is_refused_without_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", open(os.devnull))  # noqa: SIM115
     assert main(["play"]) == 2
-    assert "play: the input is no terminal; start it in one" in " ".join(capsys.readouterr().err.split())
+    assert "play: the input is not a terminal; start the command" in " ".join(capsys.readouterr().err.split())
     sys.stdin.close()

@@ -76,7 +76,7 @@ def test_import_selects_homes_by_room_type_and_size(tmp_path, capsys):
     assert import_scenes("procthor", source, target, "--room-types", "house", "--largest", "27") == 0
     output = capsys.readouterr().err
     assert [scene.name for scene in read_scenes(target)] == ["houses-0", "houses-1"]
-    assert_message_names(output, "1 scenes are left out", "room type", "house\n")
+    assert_message_names(output, "1 scenes are skipped", "room type", "house\n")
     assert "2 scenes imported, 0 refused" in output
 
     assert import_scenes("procthor", source, target, "--room-types", "kitchen") == 0
@@ -119,7 +119,7 @@ def test_import_counts_unconnected_cells(tmp_path, capsys):
     # The agent stands in the smaller room.
     assert import_scenes("procthor", source, target, "--assets", assets_file, "--agent-part") == 0
     output = capsys.readouterr().err
-    assert_message_names(output, "121 cells are not connected with the agent")
+    assert_message_names(output, "121 cells are skipped")
     assert "largest" not in output
 
 
@@ -153,7 +153,7 @@ def test_import_skips_bad_lines_of_a_scene_file(tmp_path, capsys):
     assert import_scenes("scenes", mixed_file, tmp_path / "o.jsonl.gz") == 0
     output = capsys.readouterr().err
     assert "1 scenes imported, 3 refused" in output
-    assert_message_names(output, "line 2", "line 3: not JSON", "name is that of line 1 too")
+    assert_message_names(output, "line 2", "line 3: not JSON", "name is also that of line 1")
 
 
 # Refusals
@@ -177,7 +177,7 @@ def test_import_refuses_a_selection_without_scenes(tmp_path, capsys, options, pr
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        (["room.json", "out.jsonl.gz", "--categories", "Unicorn", "Dragon"], "objects are of no known type"),
+        (["room.json", "out.jsonl.gz", "--categories", "Unicorn", "Dragon"], "no object has a known type"),
         (["room.json", "out.json"], "out.json: give a name that ends in .jsonl.gz"),
         (["gone.json", "out.jsonl.gz"], "gone.json"),
         (["cut.json.gz", "out.jsonl.gz"], "is cut short or damaged"),

@@ -99,7 +99,7 @@ def test_train_refuses_another_config_in_the_same_directory(run_dir, config_file
     assert contents(run_dir) == files_before
 
 
-#: Settings, and the parts of their refusal, divided by "; ": field, value and mend.
+#: Settings, and the parts of their refusal, divided by "; ": field, value and remedy.
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
@@ -116,10 +116,10 @@ def test_train_refuses_another_config_in_the_same_directory(run_dir, config_file
         ("method: orgy", "method 'orgy': is unknown; did you mean 'org'?"),
         ("method: no_such_package:MINE", "method 'no_such_package:MINE': cannot be imported (ModuleNotFoundError: "),
         ("method: jaxnav.layout:MINE", "method 'jaxnav.layout:MINE': cannot be imported (AttributeError: "),
-        ("method: jaxnav.layout:ESTIMATORS", "method 'jaxnav.layout:ESTIMATORS': is dict, no jaxnav Method"),
-        ("{method: anonymous, arms: [layout]}", "method 'anonymous' cannot host the layout; give baseline alone"),
+        ("method: jaxnav.layout:ESTIMATORS", "method 'jaxnav.layout:ESTIMATORS': is of type dict, not jaxnav.Method"),
+        ("{method: anonymous, arms: [layout]}", "method 'anonymous' cannot use layout weights; give only baseline"),
         ("method_sizes: {layers: 2}", "method_sizes.layers is 2; is unknown; 'org' has relation_layers"),
-        ("{method: rgb, method_sizes: {layers: 2}}", "'rgb' has no sizes of its own"),
+        ("{method: rgb, method_sizes: {layers: 2}}", "'rgb' has no such sizes"),
         ("method_sizes: {relation_layers: 0}", "method_sizes.relation_layers is 0; give at least 1"),
         ("method_sizes: {relation_layers: two}", "method_sizes; mapping of str to int"),
         ("sizes: {relation_layers: 2}", "sizes.relation_layers; method_sizes.relation_layers"),
@@ -145,11 +145,11 @@ def test_train_refuses_another_config_in_the_same_directory(run_dir, config_file
             "worlds: {categories: [Chair, Sink, Chair]}",
             "worlds.categories is ('Chair', 'Sink', 'Chair'); give each once",
         ),
-        ("worlds: {goals: [Chair, Unicorn]}", "worlds.goals is ['Unicorn']; give some of the categories AlarmClock,"),
+        ("worlds: {goals: [Chair, Unicorn]}", "worlds.goals is ['Unicorn']; choose from the categories AlarmClock,"),
         ("{world: houses, scenes: none.jsonl.gz}", "none.jsonl.gz: cannot be read"),
         (
             "{world: houses, worlds: {num_train: 9, shard_scenes: 8}, chunk: 1}",
-            "chunk is 1; where scenes are streamed it",
+            "chunk is 1; with streamed scenes a chunk must be at least as long as an episode",
         ),
         ("seeds: 1\nseeds: 2", "line 2: not valid YAML (seeds is given twice)"),
     ],
@@ -190,7 +190,9 @@ def test_train_refuses_methods_that_fail_check_method(tmp_path, monkeypatch, cap
     options = ["--method", f"broken_method:{method_name}", "--run-dir", str(tmp_path / "run")]
     assert train_command.main(options) == 2
     error = capsys.readouterr().err
-    assert_message_names(error, f"error: method 'broken_method:{method_name}'", "check_method", reason, "mend it")
+    assert_message_names(
+        error, f"error: method 'broken_method:{method_name}'", "check_method", reason, "fix the method"
+    )
     assert error.count("\n") == 1
     assert not (tmp_path / "run").exists()
 

@@ -69,8 +69,8 @@ def test_train_help_names_every_setting(capsys):
 def test_train_lists_the_packaged_configs_for_a_missing_one(tmp_path, capsys):
     for missing in (tmp_path / "none.yaml", "smoek"):
         assert train(missing, tmp_path / "run") == 2
-        mend = f"choose from {', '.join(PRESETS)}, or give a file"
-        assert refusal(capsys) == f"error: {missing}: no such configuration; {mend}"
+        remedy = f"give {', '.join(PRESETS)} or a file"
+        assert refusal(capsys) == f"error: {missing}: no such configuration; {remedy}"
     assert not (tmp_path / "run").exists()
 
 

@@ -107,15 +107,18 @@ def test_parameters_stand_side_by_side():
 
 
 @pytest.mark.parametrize(
-    ("changes", "mend"),
+    ("changes", "remedy"),
     [
-        ({"method": find_method("hoz")}, "'org' cannot hand over to 'hoz'; train a run with --method anonymous"),
+        (
+            {"method": find_method("hoz")},
+            "method 'org' cannot hand over to 'hoz'; train the reference run with --method anonymous",
+        ),
         ({"method": find_method("semexp")}, "'org' cannot hand over to 'semexp'"),
-        ({"spatial_memory": None}, "one of the runs has no spatial memory; train both alike"),
+        ({"spatial_memory": None}, "the runs have different spatial memories; train both"),
     ],
 )
-def test_what_cannot_be_handed_over_to_is_refused(changes, mend):
+def test_what_cannot_be_handed_over_to_is_refused(changes, remedy):
     own = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
     other = dataclasses.replace(ANONYMOUS, **{"spatial_memory": own.spatial_memory} | changes)
-    with pytest.raises(InputError, match=mend):
+    with pytest.raises(InputError, match=remedy):
         policies(own, AGENT).with_handover_to(policies(other, WITHOUT))

@@ -121,7 +121,7 @@ def test_check_method_rejects_a_method_that_breaks_one_promise(name):
         ("orgg", ("'orgg'", "did you mean 'org'")),
         ("no.such.module:MINE", ("no.such.module", "ModuleNotFoundError")),
         ("support.methods:MISSING", ("MISSING", "AttributeError")),
-        ("support.methods:NO_METHOD", ("NO_METHOD", "no jaxnav Method")),
+        ("support.methods:NO_METHOD", ("NO_METHOD", "not jaxnav.Method")),
     ],
 )
 def test_find_method_refuses_a_name_without_a_method(name, parts):

@@ -321,7 +321,7 @@ def test_learn_search_setup_refuses_headings_without_eight_neighbours(num_headin
 
 def test_learn_search_setup_refuses_more_categories_than_map_bits():
     crowded_bank = BANK._replace(task=Task(tuple(f"Thing{number}" for number in range(28))))
-    with pytest.raises(InputError, match=r"28 categories.*\b27\b.*leave some out"):
+    with pytest.raises(InputError, match=r"28 categories.*\b27\b.*give fewer categories"):
         learn_search_setup([crowded_bank], np.zeros(0))
 
 

@@ -102,21 +102,21 @@ def test_graph_from_file_reads_weights_and_skips_comments(tmp_path):
     ("text", "parts"),
     [
         ("Book,Chair\nBook,Chiar", (":2: ", "'Chiar'", "did you mean 'Chair'")),
-        ("Zebra,Book", (":1: ", "'Zebra'", "choose of Book, Chair, Fridge")),
-        ("\nBook", (":2: ", "'Book'", "name two categories")),
-        ("Book,Book", (":1: ", "'Book,Book'", "name two categories")),
-        ("Book,Chair,1,1", (":1: ", "'Book,Chair,1,1'", "name two categories")),
+        ("Zebra,Book", (":1: ", "'Zebra'", "choose one of Book, Chair, Fridge")),
+        ("\nBook", (":2: ", "'Book'", "write two categories")),
+        ("Book,Book", (":1: ", "'Book,Book'", "write two categories")),
+        ("Book,Chair,1,1", (":1: ", "'Book,Chair,1,1'", "write two categories")),
         ("Book,Chair,0", (":1: weight '0'", "above 0 and at most 1")),
         ("Book,Chair,-1", (":1: weight '-1'", "above 0 and at most 1")),
         ("Book,Chair,2", (":1: weight '2'", "above 0 and at most 1")),
         ("Book,Chair,nan", (":1: weight 'nan'", "above 0 and at most 1")),
         ("Book,Chair,much", (":1: weight 'much'", "above 0 and at most 1")),
         ("Book,Chair,", (":1: weight ''", "above 0 and at most 1")),
-        ("# none\n", (": ", "no edges", "write one a line")),
+        ("# none\n", (": ", "no edges", "write one edge per line")),
         (None, (": ", "No such file or directory", "check the path")),
     ],
 )
-def test_graph_from_file_refuses_bad_edges_by_file_line_and_mend(text, parts, tmp_path):
+def test_graph_from_file_refuses_bad_edges_by_file_line_and_remedy(text, parts, tmp_path):
     path = tmp_path / "edges.csv"
     if text is not None:
         path.write_text(text)

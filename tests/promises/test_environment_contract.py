@@ -59,9 +59,9 @@ class Lies(ObjectNav):
     ("broken", "promise"),
     [
         (EndsTwice, "terminated and truncated at once"),
-        (NeverStartsAnew, "not followed by a new episode"),
-        (AsksForTooMuch, "a goal that is no category"),
-        (Lies, "a success that is not an ending"),
+        (NeverStartsAnew, "no new episode begins after an episode has ended"),
+        (AsksForTooMuch, "a goal is not the index of a category"),
+        (Lies, "an episode succeeds without being terminated"),
     ],
 )
 def test_check_environment_refuses_broken_environments(broken, promise):

@@ -50,7 +50,7 @@ def test_folder_lock_names_the_process_that_holds_it(tmp_path, holder):
     with pytest.raises(InputError) as error:
         FolderLock(tmp_path).acquire()
     named = re.escape(f"process {holder.pid} on {socket.gethostname()}")
-    assert re.fullmatch(f"{tmp_path}: {named} writes to it; wait for that, end it, or choose .*", str(error.value))
+    assert re.fullmatch(f"{tmp_path}: {named} is writing to it; wait until it ends, .*", str(error.value))
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
@@ -88,7 +88,7 @@ def test_lock_run_dir_refuses_a_second_run_until_released(tmp_path):
     config = tiny_config(tmp_path)
     with lock_run_dir(config):
         before = (config.run_dir / "config.json").read_bytes()
-        with pytest.raises(InputError, match=f"process {os.getpid()} on .* writes to it"), lock_run_dir(config):
+        with pytest.raises(InputError, match=f"process {os.getpid()} on .* is writing to it"), lock_run_dir(config):
             pass
         with pytest.raises(InputError, match="holds another run"), lock_run_dir(dataclasses.replace(config, seed=5)):
             pass

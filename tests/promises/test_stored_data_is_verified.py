@@ -263,7 +263,7 @@ def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, da
     restored = restore_latest(tmp_path)
     assert restored.step == 1
     (problem,) = restored.damaged
-    assert problem.startswith(f"{tmp_path}/checkpoints/2: is damaged (ValueError: missing or other than saved: ")
+    assert problem.startswith(f"{tmp_path}/checkpoints/2: is damaged (ValueError: missing or changed since saving: ")
 
     # The run can go on and save the second checkpoint again.
     checkpoint.set_aside_checkpoints_after(tmp_path, restored.step)

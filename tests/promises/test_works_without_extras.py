@@ -9,7 +9,7 @@ import pytest
 from jaxnav.__main__ import COMMANDS
 
 WITHOUT = "import sys; sys.modules['matplotlib'] = sys.modules['PIL'] = None\n"
-REFUSAL = "error: pictures need matplotlib and pillow; install them by: pip install 'jaxnav[viz]'\n"
+REFUSAL = "error: pictures need matplotlib and pillow; install them with: pip install 'jaxnav[viz]'\n"
 
 HELP = """
 from jaxnav.__main__ import main

@@ -61,7 +61,7 @@ def test_stage_share_is_rounded_to_whole_chunks(share, chunks):
             {"method": "tpn", "imitation": 0.01, "total_steps": 1280},
             "config: imitation is 0.01; stage 2 of method 'tpn', a share of 0.01, gets none of the 1 chunks",
         ),
-        ({"method": "org", "imitation": 0.2}, "config: imitation is 0.2; 'org' has no stages of both kinds; leave"),
+        ({"method": "org", "imitation": 0.2}, "config: imitation is 0.2; method 'org' does not have stages both"),
     ],
 )
 def test_config_refuses_impossible_stage_shares(options, message):

@@ -162,7 +162,7 @@ def test_apply_yaml_names_the_line_of_broken_yaml(overlay, text, place):
 
 
 def test_apply_yaml_refuses_missing_files_and_folders(tmp_path):
-    for path, problem in ((tmp_path / "none.yaml", "no such configuration; choose"), (tmp_path, "cannot be read")):
+    for path, problem in ((tmp_path / "none.yaml", "no such configuration; give"), (tmp_path, "cannot be read")):
         with pytest.raises(InputError, match=f"{path}: {problem}"):
             apply_yaml(Config(), path)
 

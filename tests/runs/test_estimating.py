@@ -68,7 +68,7 @@ def test_with_estimator_refuses_gaps_without_learned_cooccurrence(drawn_run):
         assert policies.with_estimator(name).estimator_config == dataclasses.replace(
             policies.estimator_config, gap=name
         )
-        with pytest.raises(InputError, match=f"--setting {name}: the run learned no signs of another layout"):
+        with pytest.raises(InputError, match=f"--setting {name}: the run has no evidence from co-occurrence"):
             without.with_estimator(name)
 
 
@@ -91,12 +91,12 @@ def test_with_inner_steps_refuses_more_steps_than_the_method_adapts(drawn_run):
     policies = drawn_run.policies()
     assert policies.with_inner_steps(None) is policies
     with pytest.raises(
-        InputError, match=r"^inner_steps is 0; method 'org' does not adapt in an episode, leave it out$"
+        InputError, match=r"^inner_steps is 0, but method 'org' does not adapt within an episode; omit it$"
     ):
         policies.with_inner_steps(0)
     adaptive = policies._replace(spec=dataclasses.replace(policies.spec, method=METHODS["savn"]))
     with pytest.raises(
-        InputError, match=r"^inner_steps is 5; an episode remembers 4 windows of 6 actions: give 0 to 4$"
+        InputError, match=r"^inner_steps is 5, but an episode stores 4 windows of 6 actions; give 0 to 4$"
     ):
         adaptive.with_inner_steps(5)
     world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
@@ -120,7 +120,7 @@ def test_semexp_refuses_scenes_larger_than_its_map_at_every_entry_point(drawn_ru
         lambda: replay_episodes(searching, world, subject.episodes, row),
         lambda: TrialRunner(seed=0).run_trials(subject, None, [Trial("baseline", "argmax")]),
     ):
-        with pytest.raises(InputError, match=r"needs a map of .* cells, and that of the training homes has 12"):
+        with pytest.raises(InputError, match=r"needs a map of .* cells, but the map of the training homes has 12"):
             act()
 
 

@@ -62,7 +62,7 @@ def test_load_policy_refuses_damaged_exports(export):
         ),
         ({"method": "jaxnav.layout:MINE"}, "cannot be imported (AttributeError: module 'jaxnav.layout' "),
         ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, eotp, hoz, org, rgb, savn, "),
-        ({"method": "sp"}, "what method 'sp' learns before training is missing; train the run anew"),
+        ({"method": "sp"}, "the statistics of method 'sp' are missing; train the run again"),
         ({"sizes": {"depth": 3}}, "its spec does not fit this code (TypeError: "),
         ({"layout": {"rows": "some"}}, "its spec does not fit this code (ValueError: rows is 'some'"),
         ({"decision": "both"}, "its spec does not fit this code (ValueError: decision is 'both'; choose one of fused"),
@@ -73,7 +73,7 @@ def test_load_policy_refuses_exports_of_other_code(export, changes, problem):
     assert jaxnav.load_policy(export).spec.method.name == "org"
     message = refusal_of(change_spec(export, **changes))
     assert problem in message
-    assert any(mend in message for mend in ("install or mend its package", "choose one of", "train the run anew"))
+    assert any(advice in message for advice in ("install or fix its package", "choose one of", "train the run again"))
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,8 @@ def test_load_policy_refuses_learned_arrays_that_do_not_fit_the_method(
     folder = tmp_path / "other"
     export_params(folder, exported_params | {"policy": policy, "knowledge": learned}, spec | {"method": method})
     message = refusal_of(folder)
-    assert f"what method {method!r} learned before training does not fit it ({problem}" in message
-    assert message.endswith("; train the run anew")
+    assert f"the statistics of method {method!r} do not fit the method ({problem}" in message
+    assert message.endswith("; train the run again")
 
 
 def test_load_policy_lists_packaged_policies_for_an_unknown_name(tmp_path, monkeypatch):

@@ -97,9 +97,9 @@ def test_run_log_has_a_row_per_chunk_arm_and_seed(finished_config):
 @pytest.mark.parametrize(
     ("changes", "named_parts"),
     [
-        ({"method": "anonymous", "arms": ("layout", "baseline")}, ["method 'anonymous'", "layout; give"]),
-        ({"arms": ()}, ["config: arms is ()", "give some of baseline, layout"]),
-        ({"arms": ("layout", "layout")}, ["give some of baseline, layout, each once"]),
+        ({"method": "anonymous", "arms": ("layout", "baseline")}, ["method 'anonymous'", "layout weights; give"]),
+        ({"arms": ()}, ["config: arms is ()", "give baseline and layout, or one of them"]),
+        ({"arms": ("layout", "layout")}, ["give baseline and layout, or one of them"]),
     ],
 )
 def test_train_refuses_invalid_settings_before_writing(config, tmp_path, changes, named_parts):

@@ -127,6 +127,6 @@ def test_train_without_val_scenes_exports_the_last_policy(config, tmp_path):
     output = io.StringIO()
     console = Console(file=output, width=400)
     run = train(dataclasses.replace(config, run_dir=tmp_path / "run", scenes=scenes, validations=1), console)
-    assert "no val scenes, so the last policies are exported" in output.getvalue()
+    assert "no val scenes, so the policies of the last update are exported" in output.getvalue()
     assert run.success_by_budget() is None
     assert not any("val_success" in row for row in run.log())

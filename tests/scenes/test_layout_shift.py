@@ -233,7 +233,7 @@ def test_exchange_places_depends_on_scene_name_and_seed_alone():
 
 @pytest.mark.parametrize(("shift", "seed"), [(-0.1, 0), (1.1, 0), (float("nan"), 0), (0.5, -1)])
 def test_shift_scenes_refuses_impossible_shifts_and_seeds(shift, seed):
-    with pytest.raises(InputError, match="seed of at least 0, a shift from 0 to 1"):
+    with pytest.raises(InputError, match="seed of at least 0 and a shift from 0 to 1"):
         shift_scenes(make_generated_scenes("rooms", "val"), TASK, shift, seed)
 
 

@@ -185,7 +185,7 @@ def main(count: int, seed: int) -> bool:
     with project() as folder:
         for module in num_drawn:
             if not passes(folder, TESTS[module]):
-                raise SystemExit(f"the tests of {module} fail without a mutant; mend them first")
+                raise SystemExit(f"the tests of {module} fail without a mutant; fix them first")
         for mutant in drawn:
             alive = survives(folder, mutant.module, mutant.source, TESTS[mutant.module])
             killed[mutant.module] += not alive

@@ -67,7 +67,7 @@ def main() -> bool:
     with project() as folder:
         for tests in dict.fromkeys(mistake.tests for mistake in MISTAKES):
             if not passes(folder, tests):
-                raise SystemExit(f"{tests} fails without a mistake; mend it first")
+                raise SystemExit(f"{tests} fails without a mistake; fix it first")
         for mistake in MISTAKES:
             source = (ROOT / "jaxnav" / mistake.module).read_text()
             if mistake.before not in source:

@@ -110,7 +110,7 @@ def test_devices_exchange_a_few_single_arrays():
 @pytest.mark.slow
 def test_devices_that_cannot_be_shared_out_are_refused():
     assert trained(1, 4)["refused"] == (
-        "config: ppo.num_envs is 18; with 4 devices for 2 seeds the episodes of each are shared by 2: "
+        "config: ppo.num_envs is 18; with 4 devices and 2 seeds, 2 devices share the episodes of a seed: "
         "give a multiple of 2 x ppo.minibatches (2)"
     )
 
@@ -136,5 +136,5 @@ def test_other_devices_are_refused(text, tmp_path, capsys):
 
 def test_more_devices_than_there_are_are_refused(tmp_path, capsys):
     assert train(write_config(tmp_path), tmp_path / "run", "--devices", 99) == 2
-    assert "devices is 99; there are 1 (on a CPU as many as XLA_FLAGS=" in refusal(capsys)
+    assert "devices is 99, but JAX has 1; give fewer, or divide a CPU by XLA_FLAGS=" in refusal(capsys)
     assert not (tmp_path / "run").exists()

@@ -60,7 +60,7 @@ def test_two_processes_go_on_before_a_damaged_checkpoint(tmp_path):
         path.write_bytes(bytes(path.stat().st_size))
     codes, messages = two_processes(config_file, run_dir)
     assert codes == [0, 0], messages
-    assert "is damaged (ValueError: missing or other than saved: " in messages[0]
+    assert "is damaged (ValueError: missing or changed since saving: " in messages[0]
     assert "resumed after update 2 of 4" in messages[0]
 
 

@@ -172,5 +172,5 @@ def test_snapshot_refuses_a_step_after_the_end(corridor_walk):
 
 def test_snapshot_refuses_a_method_without_a_map(corridor_walk):
     episode, _ = corridor_walk
-    with pytest.raises(InputError, match=r"--map: method 'org' .*; give a run of semexp"):
+    with pytest.raises(InputError, match=r"--map: method 'org' .*; give a run of method semexp"):
         take_snapshot(episode._replace(policies=tiny.make_untrained_policies()), 0)

@@ -46,9 +46,10 @@ def find_method(name: str) -> Method:
         method = getattr(importlib.import_module(module_name), attribute)
     except Exception as error:  # any exception that the foreign module raises
         reason = f"{type(error).__name__}: {error}"
-        raise InputError(f"method {name!r}: cannot be imported ({reason}); install or mend its package") from error
+        raise InputError(f"method {name!r}: cannot be imported ({reason}); install or fix its package") from error
     if not isinstance(method, Method):
-        raise InputError(f"method {name!r}: is {type(method).__name__}, no jaxnav Method; make it Method(Experience)")
+        problem = f"is of type {type(method).__name__}, not jaxnav.Method"
+        raise InputError(f"method {name!r}: {problem}; name a jaxnav.Method(Experience)")
 
     # Runs and exports store this name, so that the method is found again.
     return dataclasses.replace(method, name=name)
@@ -77,4 +78,4 @@ def _entry_point_path(name: str) -> str:
     method_names = [*METHODS, *entry_points]
     close_matches = difflib.get_close_matches(name, method_names, n=1)
     hint = f"did you mean {close_matches[0]!r}?" if close_matches else f"choose one of {', '.join(method_names)}"
-    raise InputError(f"method {name!r}: is unknown; {hint} (others go by package.module:NAME)")
+    raise InputError(f"method {name!r}: is unknown; {hint} (give your own method as package.module:NAME)")

@@ -299,7 +299,7 @@ class ZoneTracker:
         graph = knowledge.method
         presence = RowFormat(len(state.seen_categories)).presence(percept.row)
 
-        # The nodes start anew when the room type changes.
+        # The nodes are reset when the room type changes.
         seen_categories = state.seen_categories | presence
         room_type = _room_logits(seen_categories, graph).argmax()
         nodes = jnp.where(room_type == state.room_type, state.nodes, graph["nodes"][room_type])

@@ -65,7 +65,7 @@ class LocalPolicy:
 
     def __post_init__(self) -> None:
         if self.interval < 1:
-            raise InputError(f"LocalPolicy: interval is {self.interval}; give 1 action or more from choice to choice")
+            raise InputError(f"LocalPolicy: interval is {self.interval}; give 1 or more actions between two choices")
 
     @property
     def num_choices(self) -> int:

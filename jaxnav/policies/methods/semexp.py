@@ -114,11 +114,11 @@ def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, n
     task = banks[0].task
     rules = task.rules
     if len(task.categories) > MAX_CATEGORIES:
-        problem = f"the task has {len(task.categories)} categories, and a map holds {MAX_CATEGORIES}"
-        raise InputError(f"method semexp: {problem}; leave some out")
+        problem = f"the task has {len(task.categories)} categories, but a map holds at most {MAX_CATEGORIES}"
+        raise InputError(f"method semexp: {problem}; give fewer categories")
     if len(np.unique(rules.move_steps(), axis=0)) < len(NEIGHBOURS):
-        problem = f"the task has {rules.headings} headings, and its ways lead to eight neighbours"
-        raise InputError(f"method semexp: {problem}; give 8 or 12")
+        problem = f"the task has {rules.headings} headings, but paths lead to eight neighbours"
+        raise InputError(f"method semexp: {problem}; give 8 or 12 headings")
 
     # The map holds the largest home; its size is rounded up to whole words.
     required_size = WORD_BITS
@@ -145,8 +145,8 @@ def check_map_size(knowledge: Knowledge, bank: Bank) -> None:
     for scene_name, required_size in required_map_sizes(bank).items():
         if required_size > map_size:
             raise InputError(
-                f"method semexp: scene {scene_name} needs a map of {required_size} cells, and that of the training "
-                f"homes has {map_size}; train in homes as large"
+                f"method semexp: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the "
+                f"map of the training homes has {map_size} x {map_size}; train in homes of that size"
             )
 
 

@@ -90,7 +90,7 @@ def graph_from_file(path: str | Path, banks: Iterable[Bank], counts: np.ndarray)
 
     # A file without any edge is probably the wrong file.
     if not edges.any():
-        raise InputError(f"{path}: has no edges; write one a line, such as {','.join(categories[:2])}")
+        raise InputError(f"{path}: has no edges; write one edge per line, such as {','.join(categories[:2])}")
     return {"mixing": normalize_adjacency(edges).astype(np.float32)}
 
 
@@ -122,14 +122,15 @@ def _parse_edge(source: str, edge_text: str, categories: tuple[str, ...]) -> tup
     fields = [field.strip() for field in edge_text.split(",")]
     names = tuple(fields[:2])
     if len(fields) not in (2, 3) or names[0] == names[-1]:
-        raise InputError(f"{source}: {edge_text!r} is no edge; name two categories, such as {','.join(categories[:2])}")
+        example = ",".join(categories[:2])
+        raise InputError(f"{source}: {edge_text!r} is not an edge; write two categories, such as {example}")
 
     # Unknown categories have a negative index.
     first_category, second_category = category_ids(names, categories)
     for name, category in zip(names, (first_category, second_category), strict=True):
         if category < 0:
             close_matches = difflib.get_close_matches(name, categories, n=1)
-            hint = f"choose of {', '.join(categories)}, or take the line out"
+            hint = f"choose one of {', '.join(categories)}, or remove the line"
             if close_matches:
                 hint = f"did you mean {close_matches[0]!r}?"
             raise InputError(f"{source}: category {name!r} is unknown; {hint}")
@@ -140,7 +141,7 @@ def _parse_edge(source: str, edge_text: str, categories: tuple[str, ...]) -> tup
     except ValueError:
         weight = np.nan
     if not 0.0 < weight <= 1.0:
-        raise InputError(f"{source}: weight {fields[2]!r} is not above 0 and at most 1; mend it or leave it out")
+        raise InputError(f"{source}: weight {fields[2]!r} is not a number above 0 and at most 1; change or omit it")
     return first_category, second_category, weight
 
 

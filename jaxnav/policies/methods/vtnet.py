@@ -66,7 +66,7 @@ class Transformer(Experience):
             )
         if self.side > self.view:
             raise InputError(
-                f"config: method_sizes.queries is {self.side}; give at most {self.view}, the cells along the view"
+                f"config: method_sizes.queries is {self.side}; give at most {self.view}, the side of the view in cells"
             )
 
         def build_layer(*attention_names: str) -> nnx.Dict:

@@ -76,7 +76,7 @@ def read_source(
       maps: semantic floor maps for Habitat episodes.
       from_controller: whether to read from an installed AI2-THOR simulator.
       base: scene file with the rooms that re-placements are of.
-      agent_part: of ProcTHOR houses only the cells that are connected with the agent's place in the file.
+      agent_part: use only the cells of a ProcTHOR house that are connected with the agent's place in the file.
 
     Yields:
       A scene, or why it cannot be used; also notes of guesses and other changes.
@@ -124,16 +124,16 @@ def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_si
 
     Args:
       scenes: see `read_source`.
-      room_types: of the scenes to keep; empty for all.
+      room_types: room types of the scenes to keep; empty for all.
       max_side: cells along the longer side of the largest scene to keep; None for any.
 
     Yields:
-      Scenes to keep, a note for each scene that is left out, and all errors and notes.
+      Scenes to keep, a note for each skipped scene, and all errors and notes.
 
     Raises:
       InputError: no scene remains.
     """
-    # Remember why scenes are left out, for the error where none remains.
+    # Remember why scenes are skipped, for the error where none remains.
     num_scenes = 0
     other_room_types: set[str] = set()
     excessive_sides: set[int] = set()
@@ -142,10 +142,10 @@ def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_si
             yield scene
         elif room_types and scene.room_type not in room_types:
             other_room_types.add(scene.room_type)
-            yield ImportNote(f"scenes are left out, for their room type is not {' or '.join(room_types)}", 1)
+            yield ImportNote(f"scenes are skipped, because their room type is not {' or '.join(room_types)}", 1)
         elif max_side is not None and max(scene.reach.shape) > max_side:
             excessive_sides.add(max(scene.reach.shape))
-            yield ImportNote(f"scenes are left out, for they are longer than {max_side} cells", 1)
+            yield ImportNote(f"scenes are skipped, because they are longer than {max_side} cells", 1)
         else:
             num_scenes += 1
             yield scene
@@ -173,15 +173,15 @@ def import_scenes(
 
     Args:
       scenes: see `read_source`.
-      source: what they were read from, for error messages.
+      source: file or folder that the scenes were read from, for error messages.
       out: scene file to write (`*.jsonl.gz`).
-      split: of the scenes whose names no pattern fits.
+      split: split of the scenes whose names match no pattern.
       val, test: patterns of scene names, such as `FloorPlan_Train11_*`, of these splits.
       categories: vocabulary that the types are compared with; None for that of the world that a scene stands for.
       report: called with the reason why a scene is refused.
 
     Raises:
-      InputError: no scene can be used, a pattern fits none, or the file cannot be written.
+      InputError: no scene can be used, a pattern matches none, or the file cannot be written.
     """
     if not out.name.endswith(".jsonl.gz"):
         raise InputError(f"{out}: give a name that ends in .jsonl.gz")
@@ -189,14 +189,14 @@ def import_scenes(
     # Read all scenes before anything is written.
     summary = _collect_usable_scenes(scenes, source, categories, report)
     if not summary.scenes:
-        problem = f"none of its {summary.num_refused} scenes can be used; mend what is said of them above"
+        problem = f"none of its {summary.num_refused} scenes can be used; fix the errors above"
         raise InputError(f"{source}: {problem}")
 
-    # A pattern that fits no scene is a typing error.
+    # A pattern that matches no scene is a typing error.
     for name_pattern in (*val, *test):
         if not fnmatch.filter(summary.scenes, name_pattern):
             scene_names = reprlib.repr(sorted(summary.scenes))
-            raise InputError(f"pattern {name_pattern!r}: fits no scene; there are {scene_names}")
+            raise InputError(f"pattern {name_pattern!r}: matches no scene; the names are {scene_names}")
 
     # Assign the splits by name; `val` comes before `test`.
     divided_scenes: list[Scene] = []
@@ -253,13 +253,13 @@ def _check_scene(scene: Scene, earlier_scenes: dict[str, Scene], categories: tup
     """Refuse a scene without categories, or of an earlier name."""
     location = f"{source}, scene {scene.name!r}"
     if scene.name in earlier_scenes:
-        raise InputError(f"{location}: name is that of an earlier scene; import them to two files")
+        raise InputError(f"{location}: name is that of an earlier scene; import the two scenes into separate files")
 
     # Without an object of the vocabulary there is neither a goal nor anything to detect.
     if max(category_ids(scene.types, categories), default=-1) < 0:
         known_names = ", ".join(categories)
         raise InputError(
-            f"{location}: objects are of no known type; known are {known_names} (see --world and --categories)"
+            f"{location}: no object has a known type; known types are {known_names} (see --world and --categories)"
         )
 
 

@@ -3,7 +3,7 @@
 `read_scenes` and `write_scenes` convert between files `*.jsonl.gz` (docs/scene_format.md) and `Scene`s;
 `iterate_scenes` reads line by line and reports bad scenes instead of raising. `derive_walls` gives scenes walls where
 their file has none. The importers of other formats use `read_bytes`, `parse_json` and `JsonRecord` too: every error
-names the place of the bad value and how to mend it.
+names the place of the bad value and how to fix it.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ def read_scenes(path: str | Path) -> list[Scene]:
     """Read a scene file.
 
     Cells of `episode_starts` count as standable; `walls` are derived where the file has none (`derive_walls`). An
-    object whose x and z are both null is left out, and what rests on it rests on nothing.
+    object whose x and z are both null is omitted, and objects that rest on it then rest on nothing.
 
     Args:
       path: a `*.jsonl.gz` file (or the same without gzip).
@@ -54,8 +54,8 @@ def read_scenes(path: str | Path) -> list[Scene]:
       The scenes in the order of the file, at least one.
 
     Raises:
-      InputError: the file is missing, damaged or empty, or a field is missing or wrong; names file, line, scene, field
-        and mend.
+      InputError: the file is missing, damaged or empty, or a field is missing or wrong; names file, line, scene,
+        field and remedy.
     """
     path = Path(path)
     scenes: list[Scene] = []
@@ -85,7 +85,7 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
 
             # Names must be unique, because results and shifts refer to scenes by name.
             if scene.name in line_by_name:
-                raise record.error("name", f"is that of line {line_by_name[scene.name]} too; make it unique")
+                raise record.error("name", f"is also that of line {line_by_name[scene.name]}; make it unique")
         except InputError as error:
             yield error
         else:
@@ -159,10 +159,13 @@ class JsonRecord:
     def check_text(self, field: str, value: Any) -> str:
         """Return a value that must be a text, not empty."""
         if not isinstance(value, str) or not value:
-            raise self.error(field, f"is {reprlib.repr(value)}; give a text")
+            raise self.error(field, f"is {reprlib.repr(value)}; give a string")
         # Half of a surrogate pair can be read but not written.
         if _HALF_CHARACTER.search(value):
-            raise self.error(field, f"is {reprlib.repr(value)}, which holds half a character; write the whole one")
+            raise self.error(
+                field,
+                f"is {reprlib.repr(value)}, which contains half a character; write the whole character",
+            )
         return value
 
     def check_number(self, field: str, value: Any) -> float:
@@ -183,7 +186,7 @@ class JsonRecord:
     def check_record(self, field: str, value: Any) -> "JsonRecord":
         """Return a value that must be an object; its errors name `field` too."""
         if not isinstance(value, dict):
-            raise self.error(field, f"is {reprlib.repr(value)}; give an object")
+            raise self.error(field, f"is {reprlib.repr(value)}; give a JSON object")
         return JsonRecord(f"{self.location}: {field}", value)
 
     def check_numbers(self, field: str, values: Iterable[Any]) -> list[float]:
@@ -211,7 +214,7 @@ def read_bytes(path: Path) -> bytes:
         with gzip.open(io.BytesIO(content)) as file:
             content = file.read(max_size + 1)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise InputError(f"{path}: is cut short or damaged ({error}); fetch or write it again") from error
+        raise InputError(f"{path}: is cut short or damaged ({error}); download or write it again") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if len(content) > max_size:
@@ -246,7 +249,7 @@ def _parse_line(path: Path, line_number: int, line_bytes: bytes) -> JsonRecord:
     location = f"{path}, line {line_number}"
     fields = parse_json(location, line_bytes)
     if not isinstance(fields, dict):
-        raise InputError(f"{location}: {reprlib.repr(fields)} is no scene; write one JSON object per line")
+        raise InputError(f"{location}: {reprlib.repr(fields)} is not a scene; write one JSON object per line")
     return JsonRecord(f"{location}, scene {reprlib.repr(fields.get('name', '(no name)'))}", fields)
 
 
@@ -262,7 +265,7 @@ def _decode_scene(record: JsonRecord) -> Scene:
 
     # The lattice has one spacing, and its sides are limited.
     if record.get("cell") != CELL_SIZE:
-        raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL_SIZE} is known")
+        raise record.error("cell", f"is {reprlib.repr(record.get('cell'))}; only {CELL_SIZE} is supported")
     origin = _decode_origin(record)
     shape = record.get_list("shape", 2)
     for side in shape:
@@ -270,7 +273,7 @@ def _decode_scene(record: JsonRecord) -> Scene:
             expected = f"give two whole numbers [nz, nx] from 1 to {MAX_SIDE_CELLS}"
             raise record.error("shape", f"is {reprlib.repr(shape)}; {expected}")
 
-    # Episodes may start beside the reachable cells, so the agent can stand there too.
+    # Episodes may start next to the reachable cells, so the agent can stand there too.
     reach = _decode_mask(record, "reach", shape)
     if "episode_starts" in record.fields:
         reach |= _decode_mask(record, "episode_starts", shape)
@@ -338,7 +341,7 @@ def _decode_objects(record: JsonRecord) -> tuple[tuple[str, ...], np.ndarray, np
         raise record.error("columns", f"is {reprlib.repr(column_names)}; give names, each once")
     missing_columns = [column for column in _REQUIRED_COLUMNS if column not in column_names]
     if missing_columns:
-        raise record.error("columns", f"lacks {', '.join(missing_columns)}; add it")
+        raise record.error("columns", f"lacks {', '.join(missing_columns)}; add the missing names")
 
     # One dict per object, by column.
     object_rows: list[dict[str, Any]] = []
@@ -346,7 +349,7 @@ def _decode_objects(record: JsonRecord) -> tuple[tuple[str, ...], np.ndarray, np
         cell_values = record.check_list(f"objects[{object_index}]", row_values, len(column_names))
         object_rows.append(dict(zip(column_names, cell_values, strict=True)))
 
-    # Objects without a place are left out, so the others get new indices; parents refer to the old ones.
+    # Objects without a place are omitted, so other objects get new indices; parents refer to the old ones.
     new_index: dict[int, int] = {}
     for object_index, object_row in enumerate(object_rows):
         if object_row["x"] is not None or object_row["z"] is not None:
@@ -389,7 +392,7 @@ def _decode_box(record: JsonRecord, object_index: int, object_type: str, object_
         box.append(record.check_number(f"objects[{object_index}].{column_name}", object_row.get(column_name)))
     for column_name, side_length in zip(_SIZE_COLUMNS, box[3:], strict=True):
         if side_length < 0:
-            raise record.error(f"objects[{object_index}].{column_name}", f"is {side_length}; a size is at least 0")
+            raise record.error(f"objects[{object_index}].{column_name}", f"is {side_length}; give a size of at least 0")
     return box
 
 

@@ -82,8 +82,8 @@ def generate_apartment(split: str, index: int, seed: int) -> Scene:
 
     Args:
       split: `train`, `val` or `test`.
-      index: at least 0; 60 training and 15 validation scenes have twelve and three floor plans.
-      seed: at least 0.
+      index: index of at least 0; 60 training and 15 validation scenes have twelve and three floor plans.
+      seed: seed of at least 0.
 
     Returns:
       The scene, named like `train-apartment-03-2`; it depends on the arguments alone.
@@ -116,8 +116,8 @@ def generate_house(split: str, index: int, seed: int) -> Scene:
 
     Args:
       split: `train`, `val` or `test`.
-      index: at least 0.
-      seed: at least 0.
+      index: index of at least 0.
+      seed: seed of at least 0.
 
     Returns:
       The scene, named like `train-house-00017`; it depends on the arguments alone.
@@ -534,7 +534,7 @@ class HomeBuilder:
         """Return the furniture of all rooms in the frame of the home."""
         home = FurnishedRoom(self.bare_rooms[0].shape)
         for floor, room in zip(self.plan.rooms, rooms, strict=True):
-            # Fixtures are the first objects of a room; they are left out.
+            # Fixtures are the first objects of a room; they are omitted.
             num_fixtures = sum(object_type in _FIXTURES for object_type in room.types)
             index_shift = len(home.types) - num_fixtures
 

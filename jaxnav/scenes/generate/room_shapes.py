@@ -82,7 +82,7 @@ def sample_room_shape(
     Args:
       num_cells: target number of standable cells.
       fill: standable share of the rectangle around the standable cells.
-      margin: how much wider and deeper the room is than this rectangle, metres.
+      margin: metres by which the room is wider and deeper than this rectangle.
       aspect: the longest possible side of this rectangle, relative to the shorter side.
       has_notch: True for an L-shaped room.
       rng: source of randomness.

@@ -88,7 +88,7 @@ class RoomStatistics:
     Attributes:
       cells: minimum, quartiles and maximum of the number of standable cells.
       fill: standable share of the rectangle around the standable cells.
-      margin: how much wider the room is than this rectangle, metres.
+      margin: metres by which the room is wider and deeper than this rectangle.
       aspect: the longest possible side of this rectangle, relative to the shorter side.
       l_shape: share of L-shaped rooms.
       items: the objects of the room by type, in the order in which they are placed.
@@ -254,8 +254,8 @@ def generate_room(split: str, index: int, seed: int) -> Scene:
 
     Args:
       split: `train`, `val` or `test`.
-      index: at least 0; room types take turns.
-      seed: at least 0.
+      index: index of at least 0; room types take turns.
+      seed: seed of at least 0.
 
     Returns:
       The scene, named like `train-kitchen-003`; it depends on the arguments alone.

@@ -179,7 +179,7 @@ def join_scenes(scene_banks: Sequence[Bank], task: Task) -> Bank:
 
 
 def concatenate_banks(banks: Sequence[Bank]) -> Bank:
-    """Concatenate banks of one task, and number their cells anew."""
+    """Concatenate banks of one task, and renumber their cells."""
     # Cells are numbered over all banks, so the cells of a bank begin after the cells of earlier banks.
     cell_offsets = np.cumsum([0] + [len(bank.ahead) for bank in banks[:-1]], dtype=np.int32)
     renumbered_banks = []

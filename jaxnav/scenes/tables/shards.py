@@ -37,14 +37,14 @@ TEXT_FIELDS = ("names", "room_types", "skipped")
 #: Fields of a `Bank` that a shard stores as arrays.
 ARRAY_FIELDS = tuple(field for field in Bank._fields if field not in ("task", *TEXT_FIELDS))
 
-#: The code that determines shards, below `_SOURCE`. Importers are left out, because scene files have checksums.
+#: The code that determines shards, below `_SOURCE`. Importers are excluded, because scene files have checksums.
 _CODE = (
     *("categories.py", "lattice.py", "layout_shift.py", "scene.py", "task.py", "worlds.py"),
     *("generate/*.py", "generate/*.yaml", "tables/*.py"),
     "files/scene_file.py",
 )
 _SOURCE = Path(__file__).parents[1]
-_REPAIR_HINT = "delete the folder {}, then it is compiled again"
+_REPAIR_HINT = "delete the folder {}, and the next command compiles it again"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,7 +287,7 @@ def _open_shards(folder: Path, job: ShardJob) -> Shards:
     # Compare the arrays on disk with the checksums of the written arrays.
     for bank, (path, metadata) in zip(shards, usable_metadata.items(), strict=True):
         if (len(bank.ahead), bank_checksum(bank)) != (metadata["cells"], metadata["checksum"]):
-            raise InputError(f"{path}: is damaged (its checksum is another); {_REPAIR_HINT.format(path)}")
+            raise InputError(f"{path}: is damaged (its checksum does not match); {_REPAIR_HINT.format(path)}")
     return shards
 
 

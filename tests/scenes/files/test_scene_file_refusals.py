@@ -17,11 +17,11 @@ from jaxnav.scenes.scene import Scene
 
 
 @pytest.mark.parametrize(
-    ("record", "field_name", "mend"),
+    ("record", "field_name", "remedy"),
     [
         *[(without(RECORD, field_name), field_name, "add it") for field_name in RECORD],
-        (changed(RECORD, "name", ""), "name", "give a text"),
-        (changed(RECORD, "room_type", 3), "room_type", "give a text"),
+        (changed(RECORD, "name", ""), "name", "give a string"),
+        (changed(RECORD, "room_type", 3), "room_type", "give a string"),
         (changed(RECORD, "split", "training"), "split", "give one of train, val, test"),
         (changed(RECORD, "cell", 0.5), "cell", "only 0.25"),
         (changed(RECORD, "origin", [0.1, 0]), "origin", "both must be multiples of 0.25"),
@@ -37,11 +37,11 @@ from jaxnav.scenes.scene import Scene
         (changed(RECORD, "walls", ["...", "??."]), "walls[1]", "give 3 characters '.' or '#'"),
         (changed(RECORD, "walls", None), "walls", "give a list of 2"),
         (changed(RECORD, "episode_starts", [".."] * 2), "episode_starts[0]", "give 3 characters '.' or '#'"),
-        (changed(RECORD, "columns", ["type", "x"]), "columns", "add it"),
+        (changed(RECORD, "columns", ["type", "x"]), "columns", "add the missing names"),
         (changed(RECORD, "columns", ["type"] * 10), "columns", "give names, each once"),
         (changed(RECORD, "columns", [["type"]]), "columns", "give names, each once"),
         (changed(RECORD, "objects", 1, ["Cup"]), "objects[1]", "give a list of 10"),
-        (changed(RECORD, "objects", 1, 0, None), "objects[1].type", "give a text"),
+        (changed(RECORD, "objects", 1, 0, None), "objects[1].type", "give a string"),
         (changed(RECORD, "objects", 1, 1, float("nan")), "objects[1].x", "finite number"),
         (changed(RECORD, "objects", 1, 2, float("-inf")), "objects[1].y", "finite number"),
         (changed(RECORD, "objects", 1, 3, 10**400), "objects[1].z", "finite number"),
@@ -51,18 +51,18 @@ from jaxnav.scenes.scene import Scene
             "objects[0].x",
             "give the number or leave the object out",
         ),  # z is there, so the object is not left out
-        (changed(RECORD, "objects", 0, 4, -0.1), "objects[0].sx", "a size is at least 0"),
+        (changed(RECORD, "objects", 0, 4, -0.1), "objects[0].sx", "of at least 0"),
         (changed(RECORD, "objects", 0, 7, "north"), "objects[0].yaw", "finite number"),
         (changed(RECORD, "objects", 1, 8, 2), "objects[1].parent", "give the index of another object or -1"),
         (changed(RECORD, "objects", 1, 8, 1), "objects[1].parent", "give the index of another object or -1"),
         (changed(RECORD, "objects", 1, 8, 0.0), "objects[1].parent", "give the index of another object or -1"),
     ],
 )
-def test_read_scenes_refuses_bad_fields_naming_line_scene_and_mend(tmp_path, record, field_name, mend):
+def test_read_scenes_refuses_bad_fields_naming_line_scene_and_remedy(tmp_path, record, field_name, remedy):
     with pytest.raises(InputError) as error:
         read_scenes(write_records(tmp_path / "scenes.jsonl.gz", RECORD | {"name": "first"}, record))
     scene_name = "'den': " if record.get("name") == "den" else ": "
-    assert_message_names(error.value, "scenes.jsonl.gz, line 2, scene ", scene_name, f"{field_name} ", mend)
+    assert_message_names(error.value, "scenes.jsonl.gz, line 2, scene ", scene_name, f"{field_name} ", remedy)
 
 
 def test_read_scenes_refuses_a_repeated_name(tmp_path):

@@ -260,12 +260,12 @@ def test_damaged_shard_is_refused_until_its_folder_is_deleted(tmp_path, file_nam
     if damage != "missing":
         path.write_bytes(damaged_contents[damage])
 
-    # Other shards are read; this one is refused with its file and the mend.
+    # Other shards are read; this one is refused with its file and the remedy.
     shards[1]
     with pytest.raises(InputError) as caught:
         shards[2]
     assert str(caught.value).startswith(f"{path}: ")
-    assert f"delete the folder {path.parent}, then" in str(caught.value)
+    assert f"delete the folder {path.parent}, and" in str(caught.value)
 
     # Without the folder the shard is built anew.
     shutil.rmtree(path.parent)

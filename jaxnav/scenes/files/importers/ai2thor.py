@@ -139,7 +139,7 @@ def build_scene_from_metadata(location: str, value: Any, split: str) -> Scene:
       split: split of the scene.
 
     Raises:
-      InputError: the record cannot be used; names the scene, the field and how to mend it.
+      InputError: the record cannot be used; names the scene, the field and how to fix it.
     """
     # The members of `metadata`, if there is such an object, and those beside it.
     outer_record = JsonRecord(location, {}).check_record("record", value)
@@ -196,7 +196,7 @@ def _parse_objects(record: JsonRecord, floor_height: float) -> list[SceneObject]
         all_rows.append(record.check_record(f"objects[{reprlib.repr(object_key)}]", object_value))
     object_rows = [object_row for object_row in all_rows if object_row.get_text("objectType") not in STRUCTURE_TYPES]
     if not object_rows:
-        raise record.error("objects", "holds no object; give at least one")
+        raise record.error("objects", "holds no object except walls and floors; give at least one")
 
     # Receptacles are named by id, and the smallest of them counts.
     index_by_id: dict[str, int] = {}
@@ -234,7 +234,7 @@ def _parse_box(object_row: JsonRecord, floor_height: float) -> list[float]:
         box_size = (high_corner - low_corner).tolist()
 
     if min(box_size) < 0:
-        raise object_row.error(box_field, f"has the size {box_size}; a size is at least 0")
+        raise object_row.error(box_field, f"has the size {box_size}; give sizes of at least 0")
     if max(box_size) == 0:  # the object has no renderer
         x, y, z = object_row.get_record("position").get_numbers()
         return box_at_pivot(object_row.get_text("objectType"), x, y - floor_height, z)
@@ -250,7 +250,7 @@ def _smallest_receptacle(
       object_row: the object.
       object_index: its index.
       index_by_id: index of each object.
-      box_volumes: of the objects' boxes.
+      box_volumes: volumes of the objects' boxes.
     """
     receptacle_ids = object_row.fields.get("parentReceptacles")
     if receptacle_ids is None:
@@ -354,12 +354,14 @@ def read_scene_data(path: Path, split: str) -> Iterator[Scene | InputError]:
       InputError: `path` is no folder, or no folder of scenes.
     """
     if not path.is_dir():
-        raise InputError(f"{path}: is no folder; give Scene_Data or the folder of one scene")
+        raise InputError(f"{path}: is not a folder; give Scene_Data or the folder of one scene")
     scene_folders = [path]
     if not _is_scene_folder(path):
         scene_folders = sorted(scene_folder for scene_folder in path.iterdir() if _is_scene_folder(scene_folder))
     if not scene_folders:
-        raise InputError(f"{path}: holds no scene; give the folder whose folders have {_GRID_FILE} and {_MAP_FILES[0]}")
+        raise InputError(
+            f"{path}: holds no scene; give a folder with subfolders that have {_GRID_FILE} and {_MAP_FILES[0]}"
+        )
     for scene_folder in scene_folders:
         yield scene_or_error(_build_scene_of_folder, scene_folder, split)
 
@@ -414,7 +416,8 @@ def _parse_graph(record: JsonRecord, value: Any) -> np.ndarray:
         state_id = graph_node.get_text("id")
         id_match = _STATE_ID.fullmatch(state_id)
         if id_match is None:
-            raise graph_node.error("id", f"is {reprlib.repr(state_id)}; give x|z|rotation|horizon, x and z as 0.25")
+            problem = f"is {reprlib.repr(state_id)}; give x|z|rotation|horizon, such as 0.25|-1.50|90|0"
+            raise graph_node.error("id", problem)
         node_points.append(graph_node.check_numbers("id", map(float, id_match.groups())))
     return lattice_cells(graph, "nodes", node_points)
 
@@ -435,7 +438,7 @@ def _read_visible_objects(folder: Path, name: str, floor_height: float) -> list[
             continue
         id_match = _OBJECT_ID.fullmatch(object_id)
         if id_match is None:
-            raise record.error(id_label, "is no id; give Type|x|y|z or leave the object out")
+            raise record.error(id_label, "is not an id; give Type|x|y|z or remove the object")
         # Parts such as the basin of a sink have a type of their own.
         object_type = id_match[5] or id_match[1]
         if object_type not in STRUCTURE_TYPES:
@@ -455,7 +458,7 @@ def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
     Scenes are in the order of the file and named `<room>-replaced-<number of the set>`. The rows of a type go to the
     objects of this type in the order of the base scene; those that are left over stay where they are. Sizes, yaws,
     cells and walls are those of the base scene. The pivot is the middle of the underside, unless the object's `id` in
-    the base file tells that it is higher up in the box. Moved objects, and what rested on them, rest on nothing.
+    the base file shows that it is higher up in the box. Moved objects, and those that rested on them, rest on nothing.
 
     Args:
       path: the re-placements, one JSON object per line, plain or gzip.
@@ -478,7 +481,7 @@ def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
             record = line_record.check_record("record", parse_json(line_record.location, line_bytes))
             name = record.get_text("name")
             if name not in base_rooms:
-                raise record.error("name", f"is {reprlib.repr(name)}, which is no scene of {base}; give its scene file")
+                raise record.error("name", f"is {reprlib.repr(name)}, which is not in {base}; give its scene file")
             if record.get("columns") != _REPLACEMENT_COLUMNS:
                 problem = f"is {reprlib.repr(record.get('columns'))}; give {_REPLACEMENT_COLUMNS}"
                 raise record.error("columns", problem)
@@ -537,7 +540,7 @@ def _replace_objects(record: JsonRecord, set_index: int, scene: Scene, pivot_off
         object_type, *pivot_values = record.check_list(field, set_row, len(_REPLACEMENT_COLUMNS))
         candidates = waiting_objects.get(record.check_text(field, object_type))
         if not candidates:
-            raise record.error(field, f"is one {reprlib.repr(object_type)} more than the room has; leave it out")
+            raise record.error(field, f"is one {reprlib.repr(object_type)} more than the room has; remove it")
         object_index = candidates.pop(0)
         x, y, z = record.check_numbers(field, pivot_values)
         moved_boxes[object_index, :3] = (x, y + pivot_offsets[object_index], z)

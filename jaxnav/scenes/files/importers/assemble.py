@@ -24,8 +24,8 @@ class ImportNote(NamedTuple):
     """A remark about what an importer did to scenes, printed once after an import.
 
     Attributes:
-      text: what was done, in words that follow a number.
-      number: of what it was done to.
+      text: sentence without its first word, a number, such as `agents are moved to the nearest free cell`.
+      number: number of scenes, objects or cells that the remark counts.
     """
 
     text: str
@@ -73,7 +73,7 @@ def lattice_cells(record: JsonRecord, field: str, points: Sequence[Sequence[floa
       InputError: there is no point, one is not on the lattice, or they lie too far apart.
     """
     if not len(points):
-        raise record.error(field, "holds no point to stand on; give at least one")
+        raise record.error(field, "contains no point to stand on; give at least one")
 
     # Index = metres / 0.25, to the nearest whole number, [N, 2].
     point_positions = np.asarray(points, np.float64)

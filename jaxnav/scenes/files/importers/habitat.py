@@ -57,7 +57,7 @@ class SceneEpisodes(NamedTuple):
 
     Attributes:
       record: the whole file; its errors name file and scene.
-      name: of the scene, for example `Collierville`.
+      name: name of the scene, for example `Collierville`.
       mesh: name of the scene's file, for example `Collierville.glb`.
       episodes: at least one.
     """
@@ -72,7 +72,7 @@ class FloorMap(NamedTuple):
     """The map of one floor.
 
     Attributes:
-      height: of the floor, metres, Habitat's y.
+      height: height of the floor in metres, Habitat's y.
       origin: Habitat's (x, z) of the low corner of pixel [0, 0], whole centimetres.
       layers: bool [16, nx, nz], the navigable floor and then `GIBSON_CATEGORIES`.
     """
@@ -90,7 +90,7 @@ def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[S
     (`collect_standable_points`), and the objects are the goals, in typical sizes. Few files have enough such places.
 
     Args:
-      path: the folder of a split, its `<split>.json.gz` beside `content/`, or one file of `content/`.
+      path: the folder of a split, its `<split>.json.gz` next to `content/`, or one file of `content/`.
       split: `train`, `val` or `test`.
       maps: a semantic floor map `*_info.pbz2`; all of its scenes are read if there is no episode.
 
@@ -121,7 +121,7 @@ def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[S
             elif scene.name in floor_maps:
                 yield from _floors_with_map(scene.name, split, floor_maps[scene.name], scene.episodes)
             else:
-                yield InputError(f"{scene.record.location}: is not in {maps}; give the map of this split")
+                yield InputError(f"{scene.record.location}: has no map in {maps}; give the maps of this split")
 
     # Without any episode, all scenes of the map are built.
     if has_episodes:
@@ -147,7 +147,7 @@ def list_episode_files(path: Path) -> list[Path]:
         return [path]
     folder_files = sorted(folder.glob("*.json.gz"))
 
-    # SemExp keeps `X_episodes.json.gz` beside Habitat's `X.json.gz` or `X.glb.json.gz`, which it does not use.
+    # SemExp keeps `X_episodes.json.gz` next to Habitat's `X.json.gz` or `X.glb.json.gz`, which it does not use.
     file_stems = {file.name.split(".")[0] for file in folder_files}
     episode_files: list[Path] = []
     for file in folder_files:
@@ -164,7 +164,7 @@ def read_episodes(file: Path) -> list[SceneEpisodes]:
     """
     file_content = parse_json(str(file), read_bytes(file))
     if not isinstance(file_content, dict):
-        raise InputError(f"{file}: is no object with episodes; give an ObjectNav episode file")
+        raise InputError(f"{file}: is not a JSON object with `episodes`; give an ObjectNav episode file")
     file_record = JsonRecord(str(file), file_content)
     scene_by_name: dict[str, SceneEpisodes] = {}
     for index, episode in enumerate(file_record.iterate_records("episodes", file_record.get("episodes"))):
@@ -199,7 +199,7 @@ def collect_goals(scene: SceneEpisodes) -> list[JsonRecord]:
             if list_field.startswith(f"{scene.mesh}_"):
                 goal_lists.append((category_record, list_field, goals))
 
-    # Goals without an id are told apart by their positions.
+    # Goals without an id are distinguished by their positions.
     goal_by_id: dict[Any, JsonRecord] = {}
     for record, list_field, goals in goal_lists:
         for goal in record.iterate_records(list_field, goals):
@@ -318,7 +318,7 @@ def read_floor_maps(path: Path) -> dict[str, dict[int, JsonRecord]]:
         or not map_by_name
         or not all(isinstance(name, str) and name for name in map_by_name)
     ):
-        raise InputError(f"{path}: holds no maps by name of scene; give a file like val_info.pbz2")
+        raise InputError(f"{path}: contains no maps by scene name; give a file such as val_info.pbz2")
     floor_maps: dict[str, dict[int, JsonRecord]] = {}
     for name, floor_by_number in map_by_name.items():
         location = f"{path}, scene {reprlib.repr(name)}"
@@ -327,7 +327,7 @@ def read_floor_maps(path: Path) -> dict[str, dict[int, JsonRecord]]:
             or not floor_by_number
             or not all(map(_is_floor_number, floor_by_number))
         ):
-            raise InputError(f"{location}: has no floors by number; give 0, 1, ...")
+            raise InputError(f"{location}: has no floors with the numbers 0, 1, ...; give a file such as val_info.pbz2")
         floor_maps[name] = {}
         for floor_number, floor_content in floor_by_number.items():
             floor_fields = floor_content if isinstance(floor_content, dict) else {}
@@ -350,11 +350,11 @@ def parse_floor_map(record: JsonRecord) -> FloorMap:
     origin = record.get("origin")
     layers = record.get("sem_map")
     if type(height) not in (int, float) or not abs(height) < _FAR:
-        raise record.error("floor_height", "is no finite number; give metres")
+        raise record.error("floor_height", "is not a finite number; give metres")
 
     low_corner = origin.values.astype(float) if isinstance(origin, PickledArray) else np.zeros(0)
     if low_corner.shape != (2,) or not (np.abs(low_corner) < _FAR).all():
-        raise record.error("origin", "is no array of two finite numbers; give (z, x) in centimetres")
+        raise record.error("origin", "is not an array of two finite numbers; give (z, x) in centimetres")
 
     layers_shape = layers.values.shape if isinstance(layers, PickledArray) else ()
     if (
@@ -363,9 +363,9 @@ def parse_floor_map(record: JsonRecord) -> FloorMap:
         or not 0 < min(layers_shape) <= max(layers_shape) <= _MAX_SIDE_PIXELS
     ):
         expected = f"[{_NUM_LAYERS}, H, W] with sides up to {_MAX_SIDE_PIXELS}"
-        raise record.error("sem_map", f"is no array {expected}; give the floor and {_NUM_LAYERS - 1} categories")
+        raise record.error("sem_map", f"is not an array {expected}; give the floor and {_NUM_LAYERS - 1} categories")
     if not ((layers.values == 0) | (layers.values == 1)).all():
-        raise record.error("sem_map", "holds other values than 0 and 1; give layers of 0 and 1")
+        raise record.error("sem_map", "contains values other than 0 and 1; give layers of 0 and 1")
 
     # The file orders the axes as z, x.
     z_cm, x_cm = np.rint(low_corner).astype(int).tolist()
@@ -449,7 +449,7 @@ def _starts_on_floor(number: int, floors: dict[int, FloorMap], episodes: Sequenc
 def _check_starts(record: JsonRecord, scene: Scene, starts: np.ndarray) -> None:
     """Refuse a map that does not fit its episodes.
 
-    A start must lie on a standable cell or beside one.
+    A start must lie on a standable cell or next to one.
     """
     near_cells: set[tuple[int, int]] = set()
     for iz, ix in np.argwhere(scene.reach).tolist():

@@ -60,8 +60,8 @@ def read_pickle(path: Path) -> Any:
         except InputError:
             raise
         except Exception as error:  # on damaged bytes, bz2 and the unpickler raise errors of almost any type
-            problem = f"is cut short, damaged or no bz2 pickle ({type(error).__name__})"
-            raise InputError(f"{path}: {problem}; fetch or write it again") from error
+            problem = f"is cut short, damaged or not a bz2 pickle ({type(error).__name__})"
+            raise InputError(f"{path}: {problem}; download or write it again") from error
 
 
 class _NumberUnpickler(pickle._Unpickler):
@@ -92,8 +92,8 @@ class _NumberUnpickler(pickle._Unpickler):
         }
         stand_in = stand_ins.get(f"{_NUMPY_CORE.sub('numpy.', module)}.{name}")
         if stand_in is None:
-            problem = f"asks for {reprlib.repr(f'{module}.{name}')}, which could run code"
-            raise InputError(f"{self._path}: {problem}; give NumPy arrays of numbers alone")
+            problem = f"refers to {reprlib.repr(f'{module}.{name}')}, which could run code"
+            raise InputError(f"{self._path}: {problem}; give only NumPy arrays of numbers")
         return stand_in
 
     def _dtype(self, code: str, *_: object) -> "_NumberDtype":

@@ -95,8 +95,8 @@ class FloorPolygon(NamedTuple):
     """The floor of a room.
 
     Attributes:
-      id: of the room.
-      type: of the room, for example `living_room`.
+      id: id of the room.
+      type: type of the room, for example `living_room`.
       corners: float64 [P, 2], (x, z), metres.
     """
 
@@ -130,7 +130,7 @@ def read_procthor(
       InputError: a file is missing or damaged, or holds no house.
     """
     asset_database = read_assets(assets) if assets else {}
-    hint = "" if assets else f"; --assets tells them, {_ASSET_DATABASE}"
+    hint = "" if assets else f"; give them by --assets, {_ASSET_DATABASE}"
     file_stem = re.sub(r"\.jsonl?(\.gz)?$", "", path.name)
 
     num_houses = 0
@@ -156,7 +156,7 @@ def read_procthor(
             f"types of objects are guessed from the names of their assets{hint}": house_objects.num_guessed_types,
             f"sizes of objects are the typical ones of their types{hint}": house_objects.num_guessed_sizes,
             "agents are moved to the nearest free cell": int(agent_moved),
-            "cells are not connected with the agent and left out": int((scene.reach & ~reach_mask).sum()),
+            "cells are skipped, because they are not connected with the agent": int((scene.reach & ~reach_mask).sum()),
         }
         for note_text, count in count_by_note.items():
             if count:
@@ -230,7 +230,7 @@ def _build_house(house: JsonRecord, name: str, split: str, objects: Sequence[Sce
     indoor_cells = np.any([room.cells for room in rooms], axis=0)
     free_cells = indoor_cells & ~cells_near_boxes(barriers, x, z, AGENT_RADIUS - TOLERANCE)
     if not free_cells.any():
-        raise house.error("rooms", f"have no floor {AGENT_RADIUS} m from walls and objects; leave the house out")
+        raise house.error("rooms", f"have no floor {AGENT_RADIUS} m away from walls and objects; leave the house out")
     return build_scene(
         name,
         "procthor",
@@ -393,7 +393,7 @@ def read_assets(path: Path) -> dict[str, AssetInfo]:
             if asset_size is not None:
                 asset_size = asset.check_record("boundingBox", asset_size).get_numbers()
             if asset_size and min(asset_size) < 0:
-                raise asset.error("boundingBox", f"is {asset_size}; a size is at least 0")
+                raise asset.error("boundingBox", f"is {asset_size}; give sizes of at least 0")
             asset_by_id[asset.check_text("assetId", asset_id)] = AssetInfo(type_name, asset_size)
     return asset_by_id
 

@@ -19,7 +19,7 @@ from jaxnav.scenes.scene import Scene
 
 
 @pytest.mark.parametrize(
-    ("record", "field_name", "mend"),
+    ("record", "field_name", "remedy"),
     [
         (without(METADATA, "sceneName"), "sceneName", "add it"),
         (without(METADATA, "objects"), "objects", "add it"),
@@ -34,7 +34,7 @@ from jaxnav.scenes.scene import Scene
             "save event.metadata right after GetReachablePositions",
         ),
         (changed(METADATA, "actionReturn", True), "actionReturn", "give a list"),
-        (changed(METADATA, "actionReturn", 4, 7), "actionReturn[4]", "give an object"),
+        (changed(METADATA, "actionReturn", 4, 7), "actionReturn[4]", "give a JSON object"),
         (changed(METADATA, "actionReturn", 4, "x", float("nan")), "actionReturn[4]: x", "finite number"),
         (
             changed(METADATA, "actionReturn", 4, "z", 0.1),
@@ -45,7 +45,7 @@ from jaxnav.scenes.scene import Scene
         (changed(METADATA, "objects", []), "objects", "give at least one"),
         (changed(METADATA, "objects", METADATA["objects"][:1]), "objects", "give at least one"),  # the floor is none
         (changed(METADATA, "objects", "none"), "objects", "give a list"),
-        (changed(METADATA, "objects", 1, None), "objects[1]", "give an object"),
+        (changed(METADATA, "objects", 1, None), "objects[1]", "give a JSON object"),
         (without(METADATA, "objects", 1, "objectId"), "objects[1]: objectId", "add it"),
         (without(METADATA, "objects", 1, "objectType"), "objects[1]: objectType", "add it"),
         (without(METADATA, "objects", 1, "rotation"), "objects[1]: rotation", "add it"),
@@ -64,7 +64,7 @@ from jaxnav.scenes.scene import Scene
         (
             changed(METADATA, "objects", 1, "axisAlignedBoundingBox", "size", "x", -1.0),
             "objects[1]: axisAlignedBoundingBox",
-            "a size is at least 0",
+            "of at least 0",
         ),
         (
             changed(METADATA, "objects", 3, "bounds3D", [0.0, 1.0]),
@@ -74,25 +74,25 @@ from jaxnav.scenes.scene import Scene
         (
             changed(METADATA, "objects", 3, "bounds3D", [0, 0, 0, -1, 1, 1]),
             "objects[3]: bounds3D",
-            "a size is at least 0",
+            "of at least 0",
         ),
         (
             changed(METADATA, "objects", 3, "parentReceptacles", "Shelf"),
             "objects[3]: parentReceptacles",
             "give a list",
         ),
-        ({"metadata": 3}, "metadata", "give an object"),
-        ([METADATA], "record", "give an object"),
+        ({"metadata": 3}, "metadata", "give a JSON object"),
+        ([METADATA], "record", "give a JSON object"),
     ],
 )
-def test_read_ai2thor_refuses_bad_records_naming_scene_field_and_mend(
-    tmp_path, read_metadata, record, field_name, mend
+def test_read_ai2thor_refuses_bad_records_naming_scene_field_and_remedy(
+    tmp_path, read_metadata, record, field_name, remedy
 ):
     error = read_metadata(record)
     assert isinstance(error, InputError)
     assert str(error).startswith(str(tmp_path / "room.json"))
     scene_name = "scene 'FloorPlan201_physics'" if "sceneName" in record else ""
-    assert_message_names(error, scene_name, f"{field_name} ", mend)
+    assert_message_names(error, scene_name, f"{field_name} ", remedy)
 
 
 def test_read_ai2thor_imports_all_good_records_of_a_file(tmp_path):

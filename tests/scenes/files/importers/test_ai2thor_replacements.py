@@ -99,25 +99,25 @@ def test_read_replacements_moves_the_objects_of_every_set(tmp_path, base_file):
 
 
 @pytest.mark.parametrize(
-    ("changed_fields", "field_name", "mend"),
+    ("changed_fields", "field_name", "remedy"),
     [
         ({"name": "attic"}, "name", "give its scene file"),
         ({"columns": ["type", "x", "z", "y"]}, "columns", "give ['type', 'x', 'y', 'z']"),
         ({"sets": {}}, "sets", "give a list"),
         ({"sets": [[["Book", 0, 0]]]}, "sets[0][0]", "give a list of 4"),
         ({"sets": [[["Cup", 0, None, 0]]]}, "sets[0][0]", "give the number or leave the object out"),
-        ({"sets": [[["Sofa", 0, 0, 0]]]}, "sets[0][0]", "leave it out"),
-        ({"sets": [[["Cup", 0, 0, 0], ["Cup", 1, 0, 0]]]}, "sets[0][1]", "leave it out"),
+        ({"sets": [[["Sofa", 0, 0, 0]]]}, "sets[0][0]", "remove it"),
+        ({"sets": [[["Cup", 0, 0, 0], ["Cup", 1, 0, 0]]]}, "sets[0][1]", "remove it"),
     ],
 )
 def test_read_replacements_refuses_bad_rooms_and_imports_the_rest(
-    tmp_path, base_file, changed_fields, field_name, mend
+    tmp_path, base_file, changed_fields, field_name, remedy
 ):
     sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS | changed_fields, SETS)
     error, *scenes = read_replacements(sets_file, base_file)
     assert isinstance(error, InputError)
     assert str(error).startswith(f"{sets_file}, line 1: record")
-    assert_message_names(error, f"{field_name} ", mend)
+    assert_message_names(error, f"{field_name} ", remedy)
     assert [as_scene(scene).name for scene in scenes] == ["den-replaced-0", "den-replaced-1"]
 
 

@@ -93,7 +93,7 @@ def test_read_scene_data_imports_all_good_scenes_of_a_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changed_files", "field_name", "mend"),
+    ("changed_files", "field_name", "remedy"),
     [
         ({"grid": None, "graph": None}, "grid.json", "check the path"),
         ({"visible_object_map_1.5": None}, "visible_object_map_1.5.json", "check the path"),
@@ -103,14 +103,14 @@ def test_read_scene_data_imports_all_good_scenes_of_a_folder(tmp_path):
         ({"grid": [*GRID, {"x": float("nan"), "y": 0.9, "z": 0.0}]}, "grid[9]: x", "finite number"),
         ({"grid": [*GRID, {"x": 0.3, "y": 0.9, "z": 0.0}]}, "grid", "multiples of 0.25"),
         ({"grid": GRID[1:]}, "grid", "take both files from one release"),
-        ({"graph": []}, "graph", "give an object"),
+        ({"graph": []}, "graph", "give a JSON object"),
         ({"graph": {"links": []}}, "graph: nodes", "add it"),
         ({"graph": {"nodes": []}}, "nodes", "give at least one"),
-        ({"graph": {"nodes": [3]}}, "nodes[0]", "give an object"),
-        ({"graph": {"nodes": [{"id": 3}]}}, "nodes[0]: id", "give a text"),
+        ({"graph": {"nodes": [3]}}, "nodes[0]", "give a JSON object"),
+        ({"graph": {"nodes": [{"id": 3}]}}, "nodes[0]: id", "give a string"),
         ({"graph": {"nodes": [{"id": "0.00|nan|0|0"}]}}, "nodes[0]: id", "give x|z|rotation|horizon"),
         ({"graph": {"nodes": [{"id": f"{'9' * 400}.0|0.00|0|0"}]}}, "nodes[0]: id", "finite number"),
-        ({"visible_object_map_1.5": [1]}, "map", "give an object"),
+        ({"visible_object_map_1.5": [1]}, "map", "give a JSON object"),
         ({"visible_object_map_1.5": {"Cup|+00.10|+00.20|+00.30": 3}}, "'Cup|+00.10|+00.20|+00.30'", "give a list"),
         ({"visible_object_map_1.5": {"Cup|surface|3": ["a"]}}, "'Cup|surface|3'", "give Type|x|y|z"),
         ({"visible_object_map_1.5": {"Cup|+00.10|+nan|+00.30": ["a"]}}, "'Cup|+00.10|+nan|+00.30'", "give Type|x|y|z"),
@@ -119,18 +119,18 @@ def test_read_scene_data_imports_all_good_scenes_of_a_folder(tmp_path):
         ({"visible_object_map_1.5": {"Cup|+00.10|+00.20|+00.30": []}}, "map", "give at least one"),
     ],
 )
-def test_read_scene_data_refuses_bad_files_naming_folder_field_and_mend(
-    tmp_path, read_folder, changed_files, field_name, mend
+def test_read_scene_data_refuses_bad_files_naming_folder_field_and_remedy(
+    tmp_path, read_folder, changed_files, field_name, remedy
 ):
     error = read_folder(**changed_files)
     assert isinstance(error, InputError)
     assert str(error).startswith(str(tmp_path / "FloorPlan401"))
-    assert_message_names(error, field_name, mend)
+    assert_message_names(error, field_name, remedy)
 
 
 def test_read_scene_data_refuses_paths_without_a_scene(tmp_path):
     (tmp_path / "notes").mkdir()
-    for path, expected_part in ((tmp_path, "no scene"), (tmp_path / "none", "no folder")):
+    for path, expected_part in ((tmp_path, "no scene"), (tmp_path / "none", "not a folder")):
         with pytest.raises(InputError, match=expected_part):
             list(read_scene_data(path, "train"))
 

@@ -29,7 +29,7 @@ def test_read_habitat_reports_bad_scenes_and_floors_and_imports_the_rest(tmp_pat
     scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val", map_file))
     assert [scene.name for scene in scenes] == ["Home_floor0"]
     missing_map, cut_file, first_floor, second_floor = errors
-    assert_message_names(missing_map, "'Away': ", "give the map of this split")
+    assert_message_names(missing_map, "'Away': ", "give the maps of this split")
     assert_message_names(cut_file, "B.json.gz: ", "cut short")
     assert_message_names(first_floor, "floor 1: origin ", "add it")
     assert_message_names(second_floor, "floor 2: floor_height ", "add it")
@@ -39,7 +39,7 @@ CHAIR_GOAL = ("goals_by_category", "Home.glb_chair", 0)
 
 
 @pytest.mark.parametrize(
-    ("file_content", "field_name", "mend"),
+    ("file_content", "field_name", "remedy"),
     [
         (
             changed(EPISODES, "episodes", 1, "start_position", [0, float("nan"), 0]),
@@ -52,13 +52,13 @@ CHAIR_GOAL = ("goals_by_category", "Home.glb_chair", 0)
             "give a list of 3",
         ),
         (changed(EPISODES, "goals_by_category", {}), "floor 0: goals", "give a semantic"),
-        (changed(EPISODES, "goals_by_category", 3), "goals_by_category", "give an object"),
+        (changed(EPISODES, "goals_by_category", 3), "goals_by_category", "give a JSON object"),
         (
             changed(EPISODES, *CHAIR_GOAL, "position", None),
             "goals_by_category: Home.glb_chair[0]: position",
             "give a list of 3",
         ),
-        (changed(EPISODES, *CHAIR_GOAL, "object_category", ""), "object_category", "give a text"),
+        (changed(EPISODES, *CHAIR_GOAL, "object_category", ""), "object_category", "give a string"),
         (changed(EPISODES, *CHAIR_GOAL, "view_points", [{}]), "view_points[0]: agent_state", "add it"),
         (
             changed(EPISODES, "episodes", EPISODES["episodes"][:9:3]),
@@ -72,24 +72,24 @@ CHAIR_GOAL = ("goals_by_category", "Home.glb_chair", 0)
         ),
     ],
 )
-def test_read_habitat_refuses_bad_scenes_naming_field_and_mend(tmp_path, file_content, field_name, mend):
+def test_read_habitat_refuses_bad_scenes_naming_field_and_remedy(tmp_path, file_content, field_name, remedy):
     _, errors = scenes_and_errors(read_habitat(write_json(tmp_path / "Home.json.gz", file_content), "val"))
-    assert_message_names(errors[0], "Home.json.gz, scene 'Home': ", field_name, mend)
+    assert_message_names(errors[0], "Home.json.gz, scene 'Home': ", field_name, remedy)
 
 
 @pytest.mark.parametrize(
-    ("file_content", "field_name", "mend"),
+    ("file_content", "field_name", "remedy"),
     [
         ([], "Home.json.gz", "give an ObjectNav episode file"),
         ({}, "episodes", "add it"),
-        ({"episodes": [3]}, "episodes[0]", "give an object"),
-        ({"episodes": [{"scene_id": 3}]}, "episodes[0]: scene_id", "give a text"),
+        ({"episodes": [3]}, "episodes[0]", "give a JSON object"),
+        ({"episodes": [{"scene_id": 3}]}, "episodes[0]: scene_id", "give a string"),
     ],
 )
-def test_read_habitat_refuses_bad_files_naming_field_and_mend(tmp_path, file_content, field_name, mend):
+def test_read_habitat_refuses_bad_files_naming_field_and_remedy(tmp_path, file_content, field_name, remedy):
     with pytest.raises(InputError) as error:
         list(read_habitat(write_json(tmp_path / "Home.json.gz", file_content), "val"))
-    assert_message_names(error.value, field_name, mend)
+    assert_message_names(error.value, field_name, remedy)
 
 
 def test_read_habitat_refuses_a_missing_file(tmp_path):

@@ -146,7 +146,7 @@ def test_wide_short_or_narrow_strips_become_no_walls(tmp_path, wall_pixels, door
 
 
 @pytest.mark.parametrize(
-    ("changed_fields", "field_name", "mend"),
+    ("changed_fields", "field_name", "remedy"),
     [
         ({"floor_height": np.float64("nan")}, "floor_height", "give metres"),
         ({"floor_height": 10**5000}, "floor_height", "give metres"),
@@ -162,10 +162,10 @@ def test_wide_short_or_narrow_strips_become_no_walls(tmp_path, wall_pixels, door
         ({"sem_map": np.pad(np.ones((1, 40, 40)), ((0, 15), (0, 0), (0, 0)))}, "sem_map", "up; leave the floor out"),
     ],
 )
-def test_parse_floor_map_refuses_bad_floors_naming_field_and_mend(tmp_path, changed_fields, field_name, mend):
+def test_parse_floor_map_refuses_bad_floors_naming_field_and_remedy(tmp_path, changed_fields, field_name, remedy):
     with pytest.raises(InputError) as error:
         scene_from_map(tmp_path, l_shaped_floor(**changed_fields))
-    assert_message_names(error.value, "maps.pbz2, scene 'Home': floor 0: ", f"{field_name} ", mend)
+    assert_message_names(error.value, "maps.pbz2, scene 'Home': floor 0: ", f"{field_name} ", remedy)
 
 
 FLOOR = {

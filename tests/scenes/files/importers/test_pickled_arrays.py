@@ -108,7 +108,7 @@ def test_read_pickle_refuses_a_file_cut_short(tmp_path, end):
 def test_read_pickle_refuses_other_formats_and_missing_files(tmp_path):
     pickle_file = tmp_path / "a.pbz2"
     pickle_file.write_bytes(b"no bz2")
-    with pytest.raises(InputError, match="no bz2 pickle"):
+    with pytest.raises(InputError, match="not a bz2 pickle"):
         read_pickle(pickle_file)
     with pytest.raises(InputError, match="cannot be read"):
         read_pickle(tmp_path / "none.pbz2")

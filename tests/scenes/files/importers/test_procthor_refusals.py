@@ -29,7 +29,7 @@ def with_agent_at(position):
 
 
 BAD = [
-    (3, "'house-0'", "give an object"),
+    (3, "'house-0'", "give a JSON object"),
     (without(HOUSE, "rooms"), "rooms", "add it"),
     (without(HOUSE, "walls"), "walls", "add it"),
     (without(HOUSE, "doors"), "doors", "add it"),
@@ -55,7 +55,7 @@ BAD = [
     (changed(HOUSE, "doors", 0, "holePolygon", 0, "x", 2.0), "doors[0]: holePolygon", "in its wall, 0 to 3"),
     (changed(HOUSE, "doors", 0, "openness", "wide"), "doors[0]: openness", "finite number"),
     (changed(HOUSE, "objects", 0, "position", "y", NAN), "objects[0]: position: y", "finite number"),
-    (changed(HOUSE, "objects", 0, "children", 0, BOWL | {"objectType": 5}), "objectType", "give a text"),
+    (changed(HOUSE, "objects", 0, "children", 0, BOWL | {"objectType": 5}), "objectType", "give a string"),
     (changed(HOUSE, "objects", 0, HUGE_TABLE), "rooms", "leave the house out"),
 ]
 BAD_AGENTS = [
@@ -67,12 +67,12 @@ BAD_AGENTS = [
 ]
 
 
-@pytest.mark.parametrize(("house", "field_name", "mend"), BAD)
-def test_read_procthor_refuses_bad_houses_naming_house_field_and_mend(tmp_path, read_house, house, field_name, mend):
+@pytest.mark.parametrize(("house", "field_name", "remedy"), BAD)
+def test_read_procthor_refuses_bad_houses_naming_field_and_remedy(tmp_path, read_house, house, field_name, remedy):
     error = read_house(house, ASSETS | {"Hall": {"boundingBox": point(6, 2, 6)}})
     assert isinstance(error, InputError)
     assert str(error).startswith(f"{tmp_path / 'house.json'}, line 1: house 'house-0'")
-    assert_message_names(error, f"{field_name} ", mend)
+    assert_message_names(error, f"{field_name} ", remedy)
 
 
 def test_read_procthor_refuses_a_list_without_houses(read_house):
@@ -80,11 +80,11 @@ def test_read_procthor_refuses_a_list_without_houses(read_house):
         read_house([])
 
 
-@pytest.mark.parametrize(("house", "field_name", "mend"), BAD_AGENTS)
-def test_read_procthor_refuses_a_bad_agent_only_if_its_part_is_requested(read_house, house, field_name, mend):
+@pytest.mark.parametrize(("house", "field_name", "remedy"), BAD_AGENTS)
+def test_read_procthor_refuses_a_bad_agent_only_if_its_part_is_requested(read_house, house, field_name, remedy):
     error = read_house(house, agent_part=True)
     assert isinstance(error, InputError)
-    assert_message_names(error, f"{field_name} ", mend)
+    assert_message_names(error, f"{field_name} ", remedy)
     assert_scenes_equal(read_house(house), read_house(HOUSE))
 
 
