@@ -95,7 +95,7 @@ JAXNAV = ../bin/jaxnav
 
 package: $(READY)
 	rm -rf build dist *.egg-info $(TRIAL)
-	$(BIN)/python -m build --no-isolation
+	$(BIN)/python -m build --no-isolation --quiet
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/python -m venv $(TRIAL)
 	$(TRIAL)/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
