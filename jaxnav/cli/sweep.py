@@ -1,0 +1,190 @@
+"""The sweep command: evaluate sTDE at many thresholds in one compiled call; prints tables, draws them, writes them."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from jaxnav.choices import Decoding, EstimatorName, Form
+from jaxnav.cli.console import (
+    escape_control_chars,
+    make_result_console,
+    parse_arguments,
+    print_table,
+    refuse_unwritable,
+    run_command,
+)
+from jaxnav.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxnav.evaluation.sweep_tables import ThresholdRow
+    from jaxnav.runs.evaluate import Sweep
+
+DESCRIPTION = "Evaluate sTDE at many thresholds, for all seeds in one compiled call, and draw the result."
+#: Version of the JSON layout.
+_FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepConfig:
+    """Options of the sweep command.
+
+    Attributes:
+      source: a run directory, of which all seeds of the arm `layout` are evaluated; or one policy, as the folder of an
+        export or the name of a packaged policy, such as `rooms-org`.
+      epsilon: thresholds of sTDE, at least 0. Experience is removed where the layout gap exceeds the threshold; for
+        thresholds of 1 and more nothing is removed.
+      shift: layout shifts of the scenes, from 0 (as in training) to 1; each gets a section of the table and a curve.
+      split: scenes to evaluate on.
+      scenes: scene file to use instead of the scenes of the run or policy.
+      world: generated world to use instead of the scenes of the run or policy.
+      episodes: number of fixed episodes, balanced over room types and scenes.
+      decoding: `argmax` for best actions, `sample` for sampled actions.
+      form: rule by which sTDE combines factual and counterfactual logits. The default is that of the layout estimator.
+      setting: layout estimator to use instead of that of the run or policy; `jaxnav list settings` describes them.
+      hold: keep the gap from falling within an episode. With `--form switch`, experience then stays removed for the
+        rest of the episode once the gap exceeds the threshold.
+      seed: random seed of the episode list and of sampled actions.
+      out: PNG to write the figure to; the numbers are written next to it as JSON. The default is a name such as
+        `sweep-val.png` in the run directory or, for a policy, in the working directory.
+      format: format of the printed table.
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    epsilon: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    shift: tuple[float, ...] = (0.0, 1.0)
+    split: Literal["train", "val", "test"] = "val"
+    scenes: Path | None = None
+    world: Literal["rooms", "apartments", "houses"] | None = None
+    episodes: int = 1000
+    decoding: Decoding = "argmax"
+    form: Form | None = None
+    setting: EstimatorName | None = None
+    hold: bool = False
+    seed: int = 0
+    out: Path | None = None
+    format: Literal["table", "markdown"] = "table"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return run_command(_run_sweep, lambda: parse_arguments(SweepConfig, arguments, "jaxnav sweep", DESCRIPTION))
+
+
+def _run_sweep(config: SweepConfig, console: Console) -> None:
+    """Evaluate, print the tables and write the files."""
+    from jaxnav.runs.evaluate import sweep_shifts
+
+    # Check the options before anything is evaluated: an evaluation takes minutes.
+    if not config.shift:
+        raise InputError("--shift: give at least one number")
+    figure_path = _find_figure_path(config)
+    numbers_path = figure_path.with_suffix(".json")
+
+    results = sweep_shifts(
+        config.source,
+        config.epsilon,
+        config.shift,
+        split=config.split,
+        scenes=config.scenes,
+        world=config.world,
+        episodes=config.episodes,
+        decoding=config.decoding,
+        form=config.form,
+        setting=config.setting,
+        hold=config.hold,
+        seed=config.seed,
+        console=console,
+    )
+    rows = [row for result in results for row in result.rows()]
+    _print_tables(rows, results[0].notes(), config.format)
+
+    # Write the numbers first: drawing them needs optional packages.
+    compilations = sum(result.compilations for result in results)
+    plural = "" if compilations == 1 else "s"
+    console.print(f"{compilations} compilation{plural} for all thresholds, seeds and shifts")
+    with refuse_unwritable(numbers_path, "--out"):
+        _write_numbers(results, rows, numbers_path)
+    console.print(f"numbers: {numbers_path}")
+    with refuse_unwritable(figure_path, "--out"):
+        _draw_figure(results, figure_path, console)
+
+
+def _find_figure_path(config: SweepConfig) -> Path:
+    """Return the path of the figure, or raise an `InputError` if it cannot be written."""
+    from jaxnav.runs.policies import is_policy
+
+    # The default name lists every option that changes what is evaluated.
+    parts = ["sweep"]
+    folder = Path(config.source)
+    if is_policy(config.source):
+        folder = Path()
+        parts.append(Path(config.source).resolve().name)
+    if config.world:
+        parts.append(config.world)
+    elif config.scenes:
+        parts.append(f"scenes-{config.scenes.name.split('.')[0]}")  # never the name of a world
+    parts.append(config.split)
+    for option in (config.form, config.setting, "hold" if config.hold else None):
+        if option is not None:
+            parts.append(option)
+    if config.decoding == "sample":
+        parts.append("sampled")
+
+    path = config.out or folder / f"{'-'.join(parts)}.png"
+    if path.suffix != ".png":
+        raise InputError(f"--out {path}: give a name that ends in .png")
+    if path.is_dir() or (path.parent.exists() and not path.parent.is_dir()):
+        raise InputError(f"--out {path}: is a folder or lies in a file; give the name of a file to write")
+    return path
+
+
+def _print_tables(rows: "list[ThresholdRow]", notes: list[str], table_format: str) -> None:
+    """Print the rows and notes on stdout."""
+    from jaxnav.evaluation.sweep_tables import sweep_markdown, sweep_table
+
+    if table_format == "markdown":
+        print(escape_control_chars(sweep_markdown(rows, notes), keep="\n"), end="")
+        return
+    result_console = make_result_console()
+    print_table(result_console, sweep_table(rows))
+    for note in notes:
+        result_console.print(note)
+
+
+def _write_numbers(results: "list[Sweep]", rows: "list[ThresholdRow]", path: Path) -> None:
+    """Write settings and rows as JSON."""
+    from jaxnav.evaluation.report import package_versions
+    from jaxnav.store.files import write_atomic
+
+    # The settings of all shifts are equal but for the shift, which stands in the rows.
+    settings = {name: value for name, value in results[0].settings.items() if name != "shift"}
+    numbers: dict[str, Any] = {
+        "settings": settings,
+        "rows": [row.to_json() for row in rows],
+        "notes": results[0].notes(),
+        "compilations": sum(result.compilations for result in results),
+        "versions": package_versions(),
+        "format": _FORMAT,
+    }
+    write_atomic(path, (json.dumps(numbers, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _draw_figure(results: "list[Sweep]", path: Path, console: Console) -> None:
+    """Draw the figure if the plotting packages are installed."""
+    from jaxnav.viz import require_plotting_packages
+
+    try:
+        require_plotting_packages()
+    except InputError as error:
+        console.print(f"no figure: {error}")
+        return
+
+    from jaxnav.viz.style import save_figure
+    from jaxnav.viz.sweep import sweep_figure
+
+    save_figure(sweep_figure(results), path)
+    console.print(f"figure: {path}")

@@ -1,0 +1,103 @@
+"""The list command prints what is registered, within 80 columns."""
+
+import json
+from importlib import metadata
+from typing import Any
+
+import pytest
+
+import jaxnav
+from jaxnav.cli.list import main
+from jaxnav.layout import ESTIMATORS
+from jaxnav.policies.methods import METHODS
+from jaxnav.registry import _described_options
+from jaxnav.runs.config_files import CONFIGS
+from jaxnav.scenes.worlds import WORLDS
+
+
+@pytest.fixture(scope="module")
+def entries_by_kind():
+    return jaxnav.registered()
+
+
+def test_every_registry_is_listed_with_a_description(entries_by_kind):
+    names_by_kind = {kind: [entry["name"] for entry in entries] for kind, entries in entries_by_kind.items()}
+    assert names_by_kind["worlds"] == list(WORLDS)
+    assert names_by_kind["methods"] == sorted(METHODS)
+    assert names_by_kind["policies"] == ["rooms-org"]
+    assert {"study", "table2", "mixture"} <= set(names_by_kind["experiments"])
+    assert names_by_kind["configurations"] == list(CONFIGS)
+    assert set(ESTIMATORS) - {"calibrated"} <= set(names_by_kind["settings"])  # `calibrated` is the default
+
+    for entries in entries_by_kind.values():
+        for entry in entries:
+            assert 5 < len(entry["summary"]) <= 120, entry
+            assert "\n" not in entry["summary"]
+
+
+def test_entries_hold_the_facts_of_their_kind(entries_by_kind):
+    rooms = entries_by_kind["worlds"][0]
+    assert (rooms["scenes"]["val"], rooms["categories"], rooms["goals"], rooms["step_limit"]) == (20, 22, 22, 100)
+    hosts_layout = {entry["name"]: entry["hosts_layout"] for entry in entries_by_kind["methods"]}
+    assert (hosts_layout["org"], hosts_layout["anonymous"]) == (True, False)
+    (policy,) = entries_by_kind["policies"]
+    assert (policy["method"], policy["world"], policy["arm"]) == ("org", "rooms", "layout")
+    assert "89.7 %" in policy["summary"]
+
+
+def test_list_fits_80_columns(entries_by_kind, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([]) == 0
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 80
+    for entries in entries_by_kind.values():
+        for entry in entries:
+            assert f"\n{entry['name']} " in printed
+
+
+def test_list_prints_one_kind_as_json(capsys):
+    assert main(["methods", "--format", "json"]) == 0
+    assert json.loads(capsys.readouterr().out) == jaxnav.registered("methods")
+
+
+def test_methods_of_other_packages_are_listed(monkeypatch):
+    points = (
+        metadata.EntryPoint("mine", "jaxnav.policies.methods.eotp:UNIFORM", "jaxnav.methods"),
+        metadata.EntryPoint("broken", "no_such_package:METHOD", "jaxnav.methods"),
+        metadata.EntryPoint("org", "no_such_package:METHOD", "jaxnav.methods"),
+    )
+    monkeypatch.setattr(metadata, "entry_points", lambda group: metadata.EntryPoints(points).select(group=group))
+    entries = {entry["name"]: entry for entry in jaxnav.registered("methods")["methods"]}
+    assert entries["mine"]["source"] == "jaxnav.policies.methods.eotp:UNIFORM"
+    assert entries["mine"]["summary"] == entries["eotp"]["summary"]
+    assert entries["broken"]["hosts_layout"] is None
+    assert "cannot be imported" in entries["broken"]["summary"]
+    assert entries["org"]["source"] == "jaxnav"  # the method of this package precedes
+
+
+def test_list_refuses_unknown_kinds(capsys):
+    unknown_kind: Any = "agents"
+    with pytest.raises(jaxnav.InputError, match="'agents': choose one of worlds, methods"):
+        jaxnav.registered(unknown_kind)
+    with pytest.raises(SystemExit, match="2"):
+        main(["agents"])
+    assert "agents" in capsys.readouterr().err
+
+
+def test_options_of_a_docstring_are_described_by_their_first_sentence():
+    docstring = """Title.
+
+    Attributes:
+      gap: measure of the gap.
+        `one`: the first. More about it.
+        `two`: a description that goes on
+          over two lines.
+        `three`: another, which goes on
+        without indent.
+      other: `four` is no option.
+    """
+    assert _described_options(docstring) == {
+        "one": "The first.",
+        "two": "A description that goes on over two lines.",
+        "three": "Another, which goes on without indent.",
+    }

@@ -1,0 +1,96 @@
+"""The sweep command end to end, and its refusals."""
+
+import json
+import sys
+
+import pytest
+from support.commands import refusal
+from support.tiny_run import draw_run, tiny_config
+
+import jaxnav
+from jaxnav.cli.sweep import SweepConfig, _find_figure_path, main
+from jaxnav.runs.evaluate import SWEPT_THRESHOLDS
+
+OPTIONS = ("--epsilon", "0", "0.5", "--episodes", "24")
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    return draw_run(tiny_config(tmp_path_factory.mktemp("sweep"))).config.run_dir
+
+
+def test_sweep_prints_a_table_and_writes_figure_and_numbers(run_dir, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([str(run_dir), *OPTIONS]) == 0
+    printed = capsys.readouterr()
+    assert max(map(len, printed.out.splitlines()[:20])) <= 80
+    for shift in (0, 1):
+        assert f"shift {shift} " in printed.out
+    assert "95 % intervals over 2 training seeds and 4 floor plans." in printed.out
+    assert "1 compilation for all thresholds, seeds and shifts\n" in printed.err
+    assert (run_dir / "sweep-val.png").read_bytes().startswith(b"\x89PNG")
+
+    # The numbers are those of the call in Python.
+    numbers = json.loads((run_dir / "sweep-val.json").read_text())
+    assert numbers["compilations"] == 1
+    assert numbers["settings"]["seeds"] == 2
+    sweep = jaxnav.sweep(run_dir, (0.0, 0.5), shift=1.0, episodes=24)
+    rows = [row for row in numbers["rows"] if row["shift"] == 1.0]
+    assert [row["epsilon"] for row in rows] == [0.0, 0.5, None]
+    assert rows[0]["sr"]["mean"] == pytest.approx(100 * sweep.sr[0].mean(), abs=1e-9)
+    assert rows[0]["spl_change"] == sweep.rows()[0].changes["spl"].to_json()
+
+
+def test_sweep_prints_markdown(run_dir, tmp_path, capsys):
+    out = tmp_path / "figure.png"
+    assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(out), "--format", "markdown"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("| Shift | Threshold | SR (%) |")
+    assert len({line.count("|") for line in lines if line.startswith("|")}) == 1
+    assert out.exists()
+    assert out.with_suffix(".json").exists()
+
+
+def test_sweep_without_plotting_packages_prints_and_writes_numbers(run_dir, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    out = tmp_path / "figure.png"
+    assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert "Threshold" in printed.out
+    assert "no figure: " in printed.err
+    assert "pip install 'jaxnav[viz]'" in printed.err
+    assert [path.name for path in tmp_path.iterdir()] == ["figure.json"]
+
+
+def test_default_thresholds_are_those_of_the_function():
+    assert SweepConfig("run").epsilon == SWEPT_THRESHOLDS
+
+
+def test_file_names_differ_by_what_is_evaluated():
+    configs = [
+        SweepConfig("run"),
+        SweepConfig("run", world="houses", form="switch", hold=True),
+        SweepConfig("rooms-org", decoding="sample"),
+    ]
+    paths = [str(_find_figure_path(config)) for config in configs]
+    assert paths == ["run/sweep-val.png", "run/sweep-houses-val-switch-hold.png", "sweep-rooms-org-val-sampled.png"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("rooms-org", "--out", "figure.jpg"), "--out figure.jpg: give a name that ends in .png"),
+        (("rooms-org", "--shift"), "--shift: give at least one number"),
+        (("rooms-org", "--epsilon"), "--epsilon: give at least one number"),
+        (("rooms-org", "--seed", "-1"), "--seed -1: give a whole number from 0"),
+        (("nowhere",), "nowhere: neither a run directory (config.json is missing) nor an exported policy"),
+    ],
+)
+def test_sweep_refuses_impossible_options(capsys, arguments, problem):
+    assert main([*arguments]) == 2
+    assert problem in refusal(capsys)
+
+
+def test_sweep_refuses_policies_without_the_layout(run_dir, capsys):
+    assert main([str(run_dir / "policies" / "baseline-0")]) == 2
+    assert "a policy of the arm 'baseline', which does not use the layout" in refusal(capsys)
