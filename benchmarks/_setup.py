@@ -17,8 +17,7 @@ from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.worlds import CompiledWorld, compile_training_world
 from jaxnav.training.calibration import Exploration
-from jaxnav.training.config import PPOScalars
-from jaxnav.training.ppo import LearnerState
+from jaxnav.training.ppo import LearnerState, PPOScalars
 from jaxnav.training.trainer import Trainer
 
 

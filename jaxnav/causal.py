@@ -16,13 +16,14 @@ the factual memory (hidden state, previous action), D the layout gap, and epsilo
 """
 
 import typing
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
-#: Form in which equation 2 combines the logits, see `stde`.
-Form = Literal["paper", "residual", "switch"]
+from jaxnav.choices import Form
+
+#: Forms in which equation 2 combines the logits, see `stde`.
 FORMS: tuple[Form, ...] = typing.get_args(Form)
 Pathways = TypeVar("Pathways", bound=Any)
 

@@ -29,11 +29,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxnav.choices import Reduction
 from jaxnav.gaps import CooccurrenceEvidence, evidence_gap, learned_gap, overdue_gap, seen_together
 from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, presence_kl
-
-#: Reduction over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
-Reduction = Literal["mean_visible", "mean", "sum"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxnav.causal import FORMS, Form
+from jaxnav.causal import FORMS
+from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
-from jaxnav.evaluation.report import Decoding, Variant
 
 
 class EvaluationRow(NamedTuple):

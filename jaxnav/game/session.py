@@ -1,8 +1,6 @@
 """Episodes played by hand: `prepare_game` chooses one, `play_game` plays it with named keys from any source."""
 
-import dataclasses
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import jax
@@ -14,6 +12,7 @@ from jaxnav.env.objectnav import Observation
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import start_states
+from jaxnav.game.config import PlayConfig
 from jaxnav.layout import EstimatorConfig
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import ActionControl, Knowledge
@@ -39,32 +38,6 @@ KEY_ACTIONS = {
     "f": LOOK_DOWN,
 }
 QUIT_KEY = "q"
-
-
-@dataclasses.dataclass(frozen=True)
-class PlayConfig:
-    """Look for an object yourself, with what an agent perceives.
-
-    Attributes:
-      world: generated scenes and rules.
-      scenes: scene file to read instead of the world's scenes.
-      split: scenes to play in.
-      goal: category to look for; default: any.
-      seed: seed of the scenes and of the episode.
-      shift: layout shift of the scenes, from 0 to 1.
-      policy: folder of an exported policy, or one of the package (`rooms-org`): its advice and its belief are shown.
-        Without, the belief begins with what random walks in training scenes see together.
-      epsilon: threshold of sTDE in its advice.
-    """
-
-    world: Literal["rooms", "apartments", "houses"] = "rooms"
-    scenes: Path | None = None
-    split: Literal["train", "val", "test"] = "val"
-    goal: str | None = None
-    seed: int = 0
-    shift: float = 0.0
-    policy: str | None = None
-    epsilon: float = 0.5
 
 
 class Game(NamedTuple):

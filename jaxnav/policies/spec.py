@@ -3,10 +3,9 @@
 import dataclasses
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from jaxnav.policies.spatial_memory import SpatialMemory
-
 if TYPE_CHECKING:
     from jaxnav.policies.method import Method
+    from jaxnav.policies.spatial_memory import SpatialMemory
 
 #: Detections that the direct pathway G -> A sees: of all categories, of the goal alone, or none.
 Direct = Literal["all", "goal", "none"]
@@ -16,14 +15,14 @@ DecisionKind = Literal["fused", "streams"]
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Widths that all methods share.
+    """Widths of the layers that all methods have, each at least 1.
 
     Attributes:
-      hidden: H, width of the recurrent state and of the fused input.
-      view_outputs: S, width of the scene embedding.
-      appearance: d, width of a category's embedding.
-      row_hidden: width of the perceptron that reads a category's row.
-      row_outputs: m, its outputs per category.
+      hidden: width H of the recurrent state and of the fused input.
+      view_outputs: width S of the scene embedding.
+      appearance: width d of the embedding of a category.
+      row_hidden: width of the hidden layer that reads the row of a category.
+      row_outputs: number m of outputs of that layer for each category.
     """
 
     hidden: int = 64
@@ -56,7 +55,7 @@ class PolicySpec:
     method_sizes: tuple[tuple[str, int], ...] = ()
     direct: Direct = "all"
     done_gate: bool = False
-    spatial_memory: SpatialMemory | None = None
+    spatial_memory: "SpatialMemory | None" = None
     decision: DecisionKind = "fused"
     goal_row: bool = True
 
@@ -88,6 +87,8 @@ class PolicySpec:
         Raises:
           KeyError, TypeError, ValueError: a field is missing or has no such value.
         """
+        from jaxnav.policies.spatial_memory import SpatialMemory
+
         values = {field.name: fields[field.name] for field in dataclasses.fields(cls) if field.name != "num_categories"}
         memory = values["spatial_memory"]
         values |= {

@@ -8,19 +8,18 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from jaxnav.choices import Reduction
 from jaxnav.errors import InputError
-from jaxnav.layout import Reduction
-from jaxnav.policies.method import Method, Stage
-from jaxnav.policies.methods import find_method
-from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_index_at
-from jaxnav.training.devices import Devices
+
+if TYPE_CHECKING:
+    from jaxnav.policies.method import Method, Stage
 
 Arm = Literal["baseline", "layout"]
 #: Kinds of policies: without and with the layout estimator. They differ only in the layout weights.
@@ -29,24 +28,28 @@ ARMS: tuple[Arm, ...] = ("baseline", "layout")
 
 @dataclasses.dataclass(frozen=True)
 class WorldConfig:
-    """Scenes and lengths of episodes.
-
-    None stands for the default of the world.
+    """Scenes, episodes and rewards. The defaults depend on the world.
 
     Attributes:
-      num_train, num_val, num_test: number of generated scenes in each split.
-      seed: seed of the scene generator.
-      shift: layout shift of the scenes, from 0 to 1: share of the categories that exchange their places.
-      categories: categories that the agent can detect.
-      goals: categories that can be goals; None with `categories` of your own: all of them.
-      train_step_limit: maximum number of actions in a training episode.
-      step_limit: maximum number of actions in an evaluation episode.
-      large_step_limit: maximum number of actions in an evaluation episode in a living room.
-      shaping: training reward for every metre by which the agent is nearer to the goal than before in the episode.
-      near_starts: probability that a training episode starts near its goal, in the nearest of eight random cells.
-      shard_scenes: number of scenes in a shard. With more scenes, they are compiled to disk and streamed from there.
+      num_train: number of generated training scenes, at least 1.
+      num_val: number of generated validation scenes, at least 1.
+      num_test: number of generated test scenes, at least 1.
+      seed: random seed of the scene generator, from 0 to 4,294,967,295.
+      shift: layout shift of the scenes, from 0 to 1: the share of the categories that exchange their places.
+      categories: object categories that the agent can detect, at least 2.
+      goals: categories that can be goals, a part of `categories`. With your own `categories`, the default is all.
+      train_step_limit: largest number of actions in a training episode, at least 1.
+      step_limit: largest number of actions in an evaluation episode, at least 1.
+      large_step_limit: largest number of actions in an evaluation episode in a living room, at least 1.
+      shaping: training reward, at least 0, for every metre by which the agent comes nearer to the goal than before in
+        the episode.
+      near_starts: probability, from 0 to 1, that a training episode starts near its goal: in the nearest of eight
+        random cells.
+      shard_scenes: number of scenes in a shard, at least 1. If there are more scenes than this, they are compiled to
+        disk and streamed from there.
     """
 
+    # None stands for the default of the world, see `fill_world_defaults`.
     num_train: int | None = None
     num_val: int | None = None
     num_test: int | None = None
@@ -64,16 +67,19 @@ class WorldConfig:
 
 @dataclasses.dataclass(frozen=True)
 class LayoutConfig:
-    """Estimation of the layout.
+    """Layout estimator, the belief about which things stand near each other.
 
     Attributes:
-      setting: layout estimator.
-      strength, reduction: strength of the prior's rows, and reduction over rows in the gap; None calibrates them so
-        that the gap behaves as in the paper in the training scenes. Not used by `paper` and `released`.
-      prior: one prior for each `room` type, which tells the policy the type of the room, or one `pooled` over all
-        rooms.
-      walks, steps: number and length of the random walks in the training scenes that collect the prior; the gap
-        `learned` takes four times as many walks.
+      setting: layout estimator: as in the paper, as in the released code of the paper, or calibrated to the training
+        scenes.
+      strength: strength of the rows of the prior, above 0; only with `calibrated`. By default, calibration in the
+        training scenes chooses the value with which the layout gap behaves as in the paper.
+      reduction: reduction over rows in the layout gap; only with `calibrated`. By default, calibration chooses it.
+      prior: one prior for each type of `room`, so that the policy knows the type of the room, or one `pooled` prior for
+        all rooms.
+      walks: number of random walks in the training scenes that collect the prior, at least 1. The layout gap `learned`
+        takes four times as many.
+      steps: number of steps of each random walk, at least 1.
     """
 
     setting: Literal["paper", "released", "calibrated"] = "calibrated"
@@ -89,40 +95,43 @@ class RunConfig:
     """Settings of a training run.
 
     Attributes:
-      run_dir: directory of the run. Training resumes from its last checkpoint.
-      method: how experience is made: a name of this package, an entry point of the group `jaxnav.methods`, or
-        `package.module:NAME`.
-      world: generated world that sets the task, and the scenes unless `scenes` is given.
-      scenes: scene file to read in place of generated scenes; its splits are used.
-      arms: kinds of policies to train. A method that cannot host the layout has only the baseline.
-      seeds: number of policies of each kind.
-      total_steps: environment steps of each policy, imitation included, rounded up to whole chunks; None: the world's
-        default. The layout policies have also seen the random steps of the prior (`layout.walks x layout.steps`).
-      imitation: share of the steps in which the method imitates shortest paths, in whole chunks; None: the method's
-        default.
-      seed: seed of all randomness in training.
-      counterfactual: training of the branch that counterfactual decisions use.
-      decision: how pathways become logits: `fused` before one recurrent core, as in the paper, or as the sum of two
-        `streams`. The stream of experience is off at first and in some training episodes (see `ppo.alone` and
-        `ppo.experience`); with streams, `direct` is goal and `counterfactual` none.
-      direct: detections that the direct pathway of the goal sees.
-      spatial_memory: let policies remember, on the direct pathway of the scene, which cells they have seen and visited;
-        not in the paper.
-      goal_row: give the direct pathway the goal's detection in a separate row too, independent of its category; in the
-        paper it is only in the row of its category.
-      done_gate: multiply the logit of Done by 0.58 times the confidence that the goal is in sight.
-      chunk: updates per compiled call. Between calls the run logs, saves (every `save_every` calls) and, where scenes
-        are streamed, continues in the next shard with new episodes.
-      save_every: calls between checkpoints.
-      validations: number of times that policies are measured in val scenes during training, evenly spaced. The policy
-        of each seed with the most success under best actions is exported; with 0, the last one.
-      val_episodes: number of episodes in each of these measurements.
+      run_dir: directory of the run. Training resumes from the last checkpoint in it.
+      method: method that makes experience from detections: a method of jaxnav (`jaxnav list` prints them), an entry
+        point of the group `jaxnav.methods`, or `package.module:NAME`.
+      world: generated world, which sets the task. The scenes are from this world unless you give `scenes`.
+      scenes: scene file to read instead of generating scenes. The splits in the file are used.
+      arms: kinds of policies to train: without layout weights (`baseline`) and with them (`layout`). Methods that
+        cannot use layout weights train only the baseline.
+      seeds: number of policies of each arm, from 1 to 1,024.
+      total_steps: number of environment steps of each policy, at least 1, with imitation; rounded up to whole chunks.
+        The random walks that collect the prior are not included (`layout.walks` x `layout.steps`).
+      imitation: share of the steps in which the policy imitates shortest paths, between 0 and 1, rounded to whole
+        chunks; only for methods with such a stage. By default, the method chooses it.
+      seed: random seed of training, from 0 to 4,294,967,295.
+      counterfactual: training of the counterfactual branch: no training (`none`), training with both direct pathways
+        set to zero in random steps (`coin`), or distillation from the factual policy (`distil`).
+      decision: network from pathways to actions: all pathways `fused` before one recurrent core, as in the paper, or a
+        direct stream and an experience stream whose logits are added (`streams`). With `streams`, `direct` is always
+        `goal` and `counterfactual` always `none`.
+      direct: detections on the direct pathway of the goal: of all categories, of the goal only, or none.
+      spatial_memory: give the direct pathway of the scene a map of the cells that the agent has seen and visited. The
+        paper has no such map.
+      goal_row: give the direct pathway of the goal a separate row with the detection of the goal. In the paper, this
+        detection is only in the row of its category.
+      done_gate: multiply the logit of Done by 0.58 times the confidence of the detection of the goal.
+      chunk: number of updates in one compiled call, from 1 to 100,000. Between two calls, the run writes its log, and
+        continues in the next shard if scenes are streamed.
+      save_every: number of calls between two checkpoints, from 1 to 1,000,000.
+      validations: number of times that the policies are evaluated in validation scenes during training, from 0 to
+        10,000, evenly spaced. Of each seed, the policy with the highest success under best actions is exported; with 0,
+        the last one.
+      val_episodes: number of episodes in each of these evaluations, from 1 to 100,000.
       cache: folder for compiled scenes that are streamed from disk.
-      method_sizes: sizes that only the method has, whole numbers, where they differ from its defaults.
-      devices: devices to train on, which change results only by rounding: a number of devices of this process,
-        `cluster` for all that Slurm, Open MPI, Kubernetes or a TPU pod has started this command on, or
-        `HOST:PORT,INDEX,PROCESSES` for command number INDEX of several equal ones, which meet at that address of number
-        0 and share the file system of `run_dir`; None: one device, with seeds side by side on its cores.
+      devices: devices to train on, by default one; results change only by rounding. Give the number of devices of this
+        process, or `cluster` for all devices of the Slurm, Open MPI, Kubernetes or TPU job that started this command,
+        or `HOST:PORT,INDEX,PROCESSES` for command number INDEX of several equal commands. These commands meet at the
+        address of command 0 and share the file system of `run_dir`.
+      method_sizes: sizes of layers that only this method has, each at least 1: name and number, as often as needed.
     """
 
     run_dir: Path = Path("runs/rooms")
@@ -159,6 +168,17 @@ class RunConfig:
         return self.scenes or self.world
 
     @property
+    def policy_method(self) -> "Method":
+        """The method that `method` names.
+
+        Raises:
+          InputError: there is no such method.
+        """
+        from jaxnav.policies.methods import find_method  # imports JAX, and the help of a command needs no JAX
+
+        return find_method(self.method)
+
+    @property
     def task(self) -> Task:
         """Task of the world, with the categories, goals and detector of this configuration."""
         task = WORLDS[self.world].task
@@ -172,8 +192,10 @@ class RunConfig:
 
     def policy_spec(self, num_categories: int) -> PolicySpec:
         """Specification from which the run's policies are built."""
+        from jaxnav.policies.spatial_memory import SpatialMemory
+
         return PolicySpec(
-            method=find_method(self.method),
+            method=self.policy_method,
             num_categories=num_categories,
             sizes=self.sizes,
             method_sizes=tuple(sorted(self.method_sizes.items())),
@@ -197,14 +219,14 @@ class RunConfig:
         return self.worlds.near_starts
 
     @property
-    def stages(self) -> tuple[Stage, ...]:
+    def stages(self) -> tuple["Stage", ...]:
         """Stages of training, in order.
 
         The stages are those of the method, with shares rescaled to `imitation` where it is given. With streams, the
         last stage that does not imitate is split in two, so that the direct stream learns alone first.
         """
         # Stages of the method, with `imitation` as their share of imitation if it is set.
-        stages = list(find_method(self.method).stages)
+        stages = list(self.policy_method.stages)
         if self.imitation is not None:
             stages = _rescale_imitation(stages, self.imitation)
 
@@ -259,7 +281,7 @@ class RunConfig:
         return -(-self.ppo.num_updates(total_steps) // self.chunk) * self.chunk
 
 
-def _rescale_imitation(stages: Sequence[Stage], imitation: float) -> list[Stage]:
+def _rescale_imitation(stages: Sequence["Stage"], imitation: float) -> list["Stage"]:
     """Rescale shares so that the stages that imitate take `imitation` of training, and the rest the remainder."""
     # Total share of either kind of stages, as the method has them.
     imitation_share = sum(stage.share for stage in stages if stage.uses_expert)
@@ -276,13 +298,41 @@ def _rescale_imitation(stages: Sequence[Stage], imitation: float) -> list[Stage]
     return rescaled_stages
 
 
-def _split_by_stream(stage: Stage, ppo: PPOConfig) -> list[Stage]:
+def _split_by_stream(stage: "Stage", ppo: PPOConfig) -> list["Stage"]:
     """Split a stage into one for the direct stream alone and one for both streams, at a lower learning rate."""
     direct_stage = dataclasses.replace(stage, share=ppo.alone * stage.share, direct_stream_only=True)
     both_stage = dataclasses.replace(
         stage, share=(1.0 - ppo.alone) * stage.share, lr_scale=stage.lr_scale * ppo.experience_rate
     )
     return [direct_stage, both_stage]
+
+
+def fill_world_defaults(config: RunConfig) -> RunConfig:
+    """Replace the settings that are None by the values that are usual in the world of the run."""
+    world = WORLDS[config.world]
+    task = config.task
+    usual_settings = {
+        "num_train": world.counts["train"],
+        "num_val": world.counts["val"],
+        "num_test": world.counts["test"],
+        "categories": task.categories,
+        "goals": task.goals,
+        "train_step_limit": world.train_step_limit,
+        "step_limit": world.step_limit,
+        "large_step_limit": world.large_step_limit,
+        "shaping": world.shaping,
+        "near_starts": world.near_starts,
+    }
+
+    # Settings that are given stay.
+    missing_settings = {}
+    for name, value in usual_settings.items():
+        if getattr(config.worlds, name) is None:
+            missing_settings[name] = value
+    total_steps = world.total_steps if config.total_steps is None else config.total_steps
+    return dataclasses.replace(
+        config, worlds=dataclasses.replace(config.worlds, **missing_settings), total_steps=total_steps
+    )
 
 
 #: Upper bounds of the run's own settings. Larger values would exhaust memory or counters before the run finishes.
@@ -321,7 +371,7 @@ def check_config(config: RunConfig) -> RunConfig:
             config = dataclasses.replace(config, **{name: Path(path_setting)})
 
     # Settings that follow from the method and the decision.
-    method = find_method(config.method)
+    method = config.policy_method
     if not method.hosts_layout and config.arms == ARMS:
         config = dataclasses.replace(config, arms=("baseline",))
     if config.decision == "streams":
@@ -337,7 +387,7 @@ def check_config(config: RunConfig) -> RunConfig:
     return config
 
 
-def _check_method(config: RunConfig, method: Method) -> None:
+def _check_method(config: RunConfig, method: "Method") -> None:
     arms = config.arms
     _require(len(set(arms)) == len(arms) > 0, "arms", arms, f"give {' and '.join(ARMS)}, or one of them")
     has_host = method.hosts_layout or "layout" not in arms
@@ -368,6 +418,8 @@ def _check_numbers(config: RunConfig) -> None:
         _require(value is None or value <= max_value, name, value, f"give at most {max_value:,}")
 
     if config.devices is not None:
+        from jaxnav.training.devices import Devices
+
         accepted_forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
         _require(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), accepted_forms)
 
@@ -398,7 +450,7 @@ def _check_numbers(config: RunConfig) -> None:
     _require(num_chunks <= _MAX_CHUNKS, "total_steps", config.total_steps, advice)
 
 
-def _check_stages(config: RunConfig, method: Method) -> None:
+def _check_stages(config: RunConfig, method: "Method") -> None:
     imitation = config.imitation
     if imitation is not None:
         advice = "give a share between 0 and 1, both excluded"

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.choices import EstimatorName
 from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.errors import InputError
 from jaxnav.gaps import CooccurrenceEvidence
@@ -42,8 +43,6 @@ POLICIES_DIR = "policies"
 PACKAGED_POLICIES = Path(__file__).parents[1] / "weights"
 #: Measures of the layout gap.
 GapName = Literal["novelty", "evidence", "learned", "overdue", "clock"]
-#: Layout estimators that an evaluation may use in place of the one from training.
-EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
 
 
 class Policies(NamedTuple):
@@ -481,7 +480,9 @@ def config_for_policy(path: str | Path) -> RunConfig:
     arm = "baseline" if fields["layout"] is None else "layout"
     config = _config_for_task_fields(fields["task"], fields["method"], arm)
     if config is None:
-        raise InputError(f"{folder}: was trained for a task that no generated world has; give its run")
+        raise InputError(
+            f"{folder}: was trained for a task that no generated world has; give the run that it comes from"
+        )
     return config
 
 

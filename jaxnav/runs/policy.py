@@ -17,7 +17,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav import __version__
-from jaxnav.causal import Form, do, stde
+from jaxnav.causal import do, stde
+from jaxnav.choices import EstimatorName, Form
 from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, Observation, prior_index
 from jaxnav.errors import InputError
 from jaxnav.layout import EstimatorConfig
@@ -26,7 +27,7 @@ from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.network import Params, bind
 from jaxnav.policies.pathways import Decision, PolicyState
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.policies import EstimatorName, find_policy_folder, read_exported_policy
+from jaxnav.runs.policies import find_policy_folder, read_exported_policy
 from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import RowFormat

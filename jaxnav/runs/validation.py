@@ -14,10 +14,10 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from jaxnav.choices import Decoding
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
-from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge

@@ -7,7 +7,6 @@ C standable cells, H headings, K categories and P = C * H * horizons poses. `cel
 """
 
 import numpy as np
-from scipy import ndimage
 
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.visibility import TOLERANCE
@@ -32,6 +31,8 @@ def connected_parts(mask: np.ndarray) -> list[np.ndarray]:
     Returns:
       int [P, 2] each, the cells of a part; parts and cells are in row order.
     """
+    from scipy import ndimage  # slow to import, and not needed to show the help of a command
+
     # Label the parts 1, 2, ...; cells outside of the mask have the label 0.
     label_grid = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, np.ones((3, 3)), output=label_grid)

@@ -286,10 +286,10 @@ class SceneSource:
 
     Attributes:
       file: scene file, or the name of a generated world: `rooms`, `apartments` or `houses`.
-      split: split of the scenes; default: all scenes of a file, or `val` of a generated world.
-      seed: seed of a generated world and of the layout shift.
-      shift: layout shift, from 0 to 1: the share of the categories that exchange their places.
-      world: world whose categories and rules count; default: the generated one, or what the scenes of a file stand for.
+      split: split of the scenes. The default is all scenes of a file, or `val` of a generated world.
+      seed: random seed of a generated world and of the layout shift, at least 0.
+      shift: layout shift of the scenes, from 0 to 1: the share of the categories that exchange their places.
+      world: world whose categories and rules are used. By default, the scenes decide.
     """
 
     file: str

@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxnav.choices import Reduction
 from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.gaps import CooccurrenceEvidence, seen_together
-from jaxnav.layout import EstimatorConfig, Reduction, prior_from_counts
+from jaxnav.layout import EstimatorConfig, prior_from_counts
 from jaxnav.policies.agent_loop import Agent, AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.scenes.task import DONE

@@ -1,19 +1,18 @@
 """Settings of PPO, and the schedule of training stages.
 
-`PPOConfig` holds what a user can set. `PPOScalars` is its traced part, whose values may change without a new
-compilation. `stage_index_at` returns the stage of a method to which a part of training belongs.
+`PPOConfig` holds the options of PPO, and `stage_index_at` finds the training stage at a given progress. Commands show
+these options in their help, so importing this module must not import JAX.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from jaxnav.policies.method import Stage
+if TYPE_CHECKING:
+    from jaxnav.policies.method import Stage
+    from jaxnav.training.ppo import PPOScalars
 
 #: Training of the branch that counterfactual decisions use: not at all (the paper's text), by zeroing both direct
 #: pathways with probability 1/2 (the released code), or by matching the factual policy along the rollout.
@@ -22,28 +21,31 @@ CounterfactualTraining = Literal["none", "coin", "distil"]
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Settings of recurrent PPO.
+    """Settings of recurrent PPO, the training algorithm.
 
     Attributes:
-      num_envs: parallel episodes of each seed.
-      rollout: steps of each episode between two updates; at most the shortest step limit.
-      epochs: passes over a rollout.
-      minibatches: minibatches of a pass, split over episodes.
-      learning_rate: initial learning rate of Adam; decays linearly to 0 within each stage of training.
-      gamma: discount.
-      gae_lambda: lambda of generalised advantage estimation.
-      clip: clip range of the probability ratio.
-      entropy: weight of the entropy bonus at the start of a stage.
-      final_entropy: weight of the entropy bonus at the end of a stage; linear in between.
-      value: weight of the value loss.
-      max_grad_norm: global norm to which gradients are clipped.
-      distil: weight of the distillation loss of the counterfactual branch.
-      alone: with streams, share of the last stage without imitation in which only the direct stream acts and learns;
-        the stage begins with it.
-      experience: probability that an episode uses the stream of experience, in the rest of that stage.
-      experience_drawn: draw this once per `episode`, or anew at each `step`.
-      experience_rate: factor on the learning rate in the rest of that stage, because the added stream disturbs a policy
-        that has already learned.
+      num_envs: number of episodes that each policy plays in parallel, at least 1.
+      rollout: number of steps in each of these episodes between two updates, at least 1 and at most the shortest step
+        limit of training.
+      epochs: number of passes over a rollout in one update, at least 1.
+      minibatches: number of minibatches in one pass, at least 1. Episodes are divided among them, so `num_envs` must be
+        a multiple.
+      learning_rate: initial learning rate of Adam, above 0. The rate decays linearly to 0 within each training stage.
+      gamma: discount of future rewards, from 0 to 1.
+      gae_lambda: lambda of generalised advantage estimation, from 0 to 1.
+      clip: clip range of the probability ratio, above 0.
+      entropy: weight of the entropy bonus at the start of a training stage, at least 0.
+      final_entropy: weight of the entropy bonus at the end of a training stage, at least 0; linear in between.
+      value: weight of the value loss, at least 0.
+      max_grad_norm: global norm to which gradients are clipped, above 0.
+      distil: weight of the distillation loss of the counterfactual branch, at least 0.
+      alone: with `--decision streams`, share of the last stage without imitation in which only the direct stream acts
+        and learns, from 0 to below 1. The stage begins with this part.
+      experience: with `--decision streams`, probability that an episode uses the experience stream in the rest of that
+        stage, between 0 and 1.
+      experience_drawn: with `--decision streams`, whether this is drawn once per `episode` or at each `step`.
+      experience_rate: with `--decision streams`, factor on the learning rate in the rest of that stage, above 0. The
+        added stream disturbs a policy that has already learned, so the usual factor is below 1.
     """
 
     num_envs: int = 256
@@ -69,7 +71,7 @@ class PPOConfig:
         return -(-total_steps // (self.num_envs * self.rollout))
 
     def stage_scalars(
-        self, stages: Sequence[Stage], stage_by_chunk: Sequence[int], chunk_size: int
+        self, stages: Sequence["Stage"], stage_by_chunk: Sequence[int], chunk_size: int
     ) -> list["PPOScalars"]:
         """Traced settings of every training stage.
 
@@ -93,6 +95,10 @@ class PPOConfig:
           first_update: updates before the stage.
           lr_scale: factor on the learning rate.
         """
+        import jax.numpy as jnp
+
+        from jaxnav.training.ppo import PPOScalars
+
         return PPOScalars(
             learning_rate=jnp.float32(self.learning_rate) * lr_scale,
             gamma=jnp.float32(self.gamma),
@@ -108,30 +114,7 @@ class PPOConfig:
         )
 
 
-class PPOScalars(struct.PyTreeNode):
-    """Settings that may change without a new compilation, float32 [] each.
-
-    All fields but the last two hold the setting of `PPOConfig` with the same first word.
-
-    Attributes:
-      first_update: updates before the stage.
-      num_updates: updates in the stage.
-    """
-
-    learning_rate: jax.Array
-    gamma: jax.Array
-    gae_lambda: jax.Array
-    clip_range: jax.Array
-    entropy_weight: jax.Array
-    final_entropy_weight: jax.Array
-    value_weight: jax.Array
-    distil_weight: jax.Array
-    experience_prob: jax.Array
-    first_update: jax.Array
-    num_updates: jax.Array
-
-
-def stage_index_at(stages: tuple[Stage, ...], progress: float) -> int:
+def stage_index_at(stages: tuple["Stage", ...], progress: float) -> int:
     """Index of the stage that training is in.
 
     Args:

@@ -56,7 +56,7 @@ from jaxnav.policies.pathways import (
     mask_direct_pathways,
     mask_experience,
 )
-from jaxnav.training.config import CounterfactualTraining, PPOConfig, PPOScalars
+from jaxnav.training.config import CounterfactualTraining, PPOConfig
 from jaxnav.training.shares import ENV_AXIS, masked_mean, mean_and_std, mean_over_devices
 
 Metrics = dict[str, jax.Array]
@@ -70,6 +70,29 @@ _DIRECT_MASK, _ACTION, _ENV, _EXPERIENCE_DROPOUT = range(4)
 #: Tag for drawing experience dropout when all episodes are started. `AgentLoop.start` splits the same key, and
 #: `split(key, B)[i]` equals `fold_in(key, i)`, so this tag must exceed every environment index.
 _START_DROPOUT = 2**31 - 1
+
+
+class PPOScalars(struct.PyTreeNode):
+    """Settings that may change without a new compilation, float32 [] each.
+
+    All fields but the last two hold the setting of `PPOConfig` with the same first word.
+
+    Attributes:
+      first_update: updates before the stage.
+      num_updates: updates in the stage.
+    """
+
+    learning_rate: jax.Array
+    gamma: jax.Array
+    gae_lambda: jax.Array
+    clip_range: jax.Array
+    entropy_weight: jax.Array
+    final_entropy_weight: jax.Array
+    value_weight: jax.Array
+    distil_weight: jax.Array
+    experience_prob: jax.Array
+    first_update: jax.Array
+    num_updates: jax.Array
 
 
 # 1. Collect

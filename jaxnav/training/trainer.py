@@ -20,9 +20,8 @@ from jax.sharding import Mesh
 
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.policies.method import Knowledge, Stage
-from jaxnav.training.config import PPOScalars
 from jaxnav.training.devices import replicate_on_devices, replicated_sharding, state_sharding
-from jaxnav.training.ppo import Learner, LearnerState
+from jaxnav.training.ppo import Learner, LearnerState, PPOScalars
 from jaxnav.training.shares import SEED_AXIS
 
 #: States by arm and seed, as in a checkpoint.

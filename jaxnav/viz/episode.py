@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
+from jaxnav.choices import EstimatorName
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
@@ -24,7 +25,7 @@ from jaxnav.evaluation.variants import table_row
 from jaxnav.policies.methods import method_label
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import find_scene, replay_episodes
-from jaxnav.runs.policies import EstimatorName, Policies, is_policy, load_policies, load_policy_as_run
+from jaxnav.runs.policies import Policies, is_policy, load_policies, load_policy_as_run
 from jaxnav.runs.run import load_run_config
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift
 from jaxnav.scenes.categories import category_ids

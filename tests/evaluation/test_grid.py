@@ -11,11 +11,11 @@ from support import tiny_world as tiny
 from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_step
 
 from jaxnav.causal import stde
+from jaxnav.choices import Decoding
 from jaxnav.evaluation.episodes import draw_episodes, join_episode_lists
 from jaxnav.evaluation.grid import Evaluator, start_states
 from jaxnav.evaluation.playback import play_episodes
 from jaxnav.evaluation.removal import GapSource, RemovedLogits
-from jaxnav.evaluation.report import Decoding
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
 from jaxnav.policies.pathways import NO_ACTION, PolicyState
 from jaxnav.scenes.task import DONE, MOVE_AHEAD

@@ -10,11 +10,11 @@ from scipy.stats import kstest
 from support import tiny_world as tiny
 from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_step
 
-from jaxnav.causal import Form, do
+from jaxnav.causal import do
+from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import start_states
 from jaxnav.evaluation.removal import GapSource, RemovedLogits, logits_to_remove, select_gap
-from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState

@@ -13,7 +13,8 @@ from jaxnav.baselines.shortest_path import oracle_actions
 from jaxnav.env.objectnav import Observation
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
-from jaxnav.game.session import KEY_ACTIONS, Game, PlayConfig, choose_episode, play_game, prepare_game
+from jaxnav.game.config import PlayConfig
+from jaxnav.game.session import KEY_ACTIONS, Game, choose_episode, play_game, prepare_game
 from jaxnav.layout import LayoutEstimator
 from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.scenes.task import NUM_ACTIONS

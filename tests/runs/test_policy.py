@@ -12,12 +12,12 @@ from rich.console import Console
 from support import tiny_world as tiny
 
 import jaxnav
+from jaxnav.choices import Decoding, Variant
 from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import start_states
 from jaxnav.evaluation.playback import play_episodes
-from jaxnav.evaluation.report import Decoding, Variant
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.adaptation import WINDOW
 from jaxnav.policies.agent_loop import AgentLoop

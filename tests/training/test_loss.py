@@ -16,8 +16,8 @@ from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, ROWS, changed_parts, 
 
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION, Pathways, PolicyState
-from jaxnav.training.config import PPOConfig, PPOScalars
-from jaxnav.training.ppo import compute_advantages, mask_direct_pathways, ppo_loss, replay_rollout
+from jaxnav.training.config import PPOConfig
+from jaxnav.training.ppo import PPOScalars, compute_advantages, mask_direct_pathways, ppo_loss, replay_rollout
 
 FRACTIONS = st.floats(0, 1, width=32)
 SEEDS = st.integers(0, 1000)

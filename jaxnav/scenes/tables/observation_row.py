@@ -141,13 +141,13 @@ def detected_positions(detections: np.ndarray, agent_position: np.ndarray, forwa
 
 @dataclasses.dataclass(frozen=True)
 class Detector:
-    """Simulated object detector; the probabilities are in [0, 1].
+    """Simulated object detector and its errors.
 
     Attributes:
-      miss_near: probability of missing an object right in front.
-      miss_far: probability of missing an object at the end of its range.
-      false_alarm: probability per pose and category of a false detection.
-      seed: seed of the errors, used together with the scene's name.
+      miss_near: probability of missing an object directly in front of the agent, from 0 to 1.
+      miss_far: probability of missing an object at the end of its detection range, from 0 to 1.
+      false_alarm: probability of a false detection for each pose and category, from 0 to 1.
+      seed: random seed of the errors, from 0 to 4,294,967,295; combined with the name of the scene.
     """
 
     miss_near: float = 0.05

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, ParamSpec
 
 import numpy as np
-from scipy import ndimage
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, derive_walls
@@ -238,6 +237,8 @@ def component_containing(free: np.ndarray, start: np.ndarray) -> np.ndarray:
       free: bool [nz, nx].
       start: int [2], (iz, ix), a cell of `free`.
     """
+    from scipy import ndimage  # slow to import, and not needed to show the help of a command
+
     part_labels = np.zeros(free.shape, np.int32)
     ndimage.label(free, np.ones((3, 3)), output=part_labels)
     return part_labels == part_labels[tuple(start)]
