@@ -8,30 +8,35 @@ import sys
 from jaxnav import __version__
 
 COMMANDS = {
-    "train": "train a method with and without the layout estimator",
-    "eval": "evaluate a run: tables of variants, epsilons and seeds",
-    "report": "show a run on one page: tables, curves and replays side by side",
-    "log": "show a training log in TensorBoard or Weights & Biases, also while training goes on",
-    "export": "export a policy with its model card, also as a program that runs without jaxnav",
-    "episode": "draw one evaluation episode, at one or several layout shifts",
-    "play": "look for an object yourself, in the terminal, with what an agent perceives",
-    "study": "run an experiment: the paper's claims, tables and ablations, or what the experience of a run is worth",
-    "scenes": "import scenes, show one as a picture, tell what a file of them holds",
-    "table": "print an evaluation as a Markdown table",
+    "train": "train policies of a method, without and with layout weights",
+    "eval": "evaluate a run, or print a finished evaluation again",
+    "sweep": "evaluate many thresholds of sTDE: a table and a figure",
+    "study": "run an experiment of the paper, or measure what experience is worth",
+    "report": "show a run on one HTML page: tables, curves and replays",
+    "episode": "draw one evaluation episode",
+    "play": "search for an object yourself, in the terminal",
+    "scenes": "import scenes, draw one, or print statistics of scenes",
+    "export": "export a policy with its model card",
+    "log": "show a training log in TensorBoard or Weights & Biases",
+    "list": "list worlds, methods, policies, experiments and configurations",
+    "completion": "print a script that completes commands and options in your shell",
+    "help": "print this help, or the help of a command",
 }
 
 HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {summary}\n" for name, summary in COMMANDS.items())
 NOTES = """
-Each has its own --help; --version prints the version.
-Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. The environment variable
-JAX_COMPILATION_CACHE_DIR names another folder; with JAX_ENABLE_COMPILATION_CACHE=0 none are kept."""
+jaxnav COMMAND --help prints the options of a command; jaxnav --version prints the version.
 
-#: Commands that became experiments, with what replaces them.
+Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. Set JAX_COMPILATION_CACHE_DIR to
+use another folder, or JAX_ENABLE_COMPILATION_CACHE=0 to keep none."""
+
+#: Commands of earlier versions, with what replaces them.
 _FORMER_COMMANDS = {
-    "account": "study account --run RUN --without RUN",
-    "mixture": "study mixture --run RUN --without RUN",
+    "account": "study account --run RUN --reference RUN",
+    "mixture": "study mixture --run RUN --reference RUN",
     "instrument": "study instrument --run RUN",
     "compare": "study table2",
+    "table": "eval FILE.json --format markdown",
 }
 
 #: Exit code if the reader of the output has gone: 128 plus SIGPIPE, as of other programs.
@@ -55,14 +60,17 @@ def _dispatch(arguments: list[str] | None) -> int:
     """Print help or version, or import the command's module and call its entry point."""
     words = sys.argv[1:] if arguments is None else arguments
     name, *command_arguments = words or ["--help"]
-    if name in ("-h", "--help"):
+    # `jaxnav help COMMAND` is `jaxnav COMMAND --help`.
+    if name == "help" and command_arguments:
+        name, *command_arguments = [*command_arguments, "--help"]
+    if name in ("-h", "--help", "help"):
         print(HELP + NOTES)
         return 0
     if name == "--version":
         print(f"jaxnav {__version__}")
         return 0
     if name in _FORMER_COMMANDS:
-        print(f"error: jaxnav {name} is jaxnav {_FORMER_COMMANDS[name]} now", file=sys.stderr)
+        print(f"error: jaxnav {name} was renamed; use jaxnav {_FORMER_COMMANDS[name]}", file=sys.stderr)
         return 2
     if name not in COMMANDS:
         matches = difflib.get_close_matches(name, COMMANDS, n=1)

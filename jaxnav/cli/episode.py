@@ -2,39 +2,42 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
 from rich.console import Console
 
+from jaxnav.choices import EstimatorName
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.runs.policies import EstimatorName, is_policy
-from jaxnav.viz import require_plotting_packages
+
+DESCRIPTION = "Draw one evaluation episode as a GIF or a PNG."
 
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeConfig:
-    """Draw one episode, at one or several layout shifts side by side.
+    """Options of the episode command.
 
     Attributes:
-      source: a run directory, the folder of an exported policy, or a policy of the package (`rooms-org`). The first
-        seed acts, with the best action at every step.
+      source: run directory, folder of an exported policy, or name of a packaged policy, such as `rooms-org`. The first
+        seed acts, and takes the best action at each step.
       split: scenes to play in.
-      index: of the episode in the default list of an evaluation (of the first shard, where scenes are streamed).
-      out: GIF (moving) or PNG (its end); default: episode.gif in the run directory or, of a policy, here.
-      variant: `stde` takes experience out where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
-      epsilon: threshold of sTDE.
-      setting: layout estimator to use instead of the run's, as of `eval`.
-      scenes: scene file to read instead of the run's own world or file.
-      shift: layout shifts of the scenes, from 0 to 1, a panel each; default: the run's. With several, all episodes of
-        the list are played, and how many are found where is told.
-      map: draw what the agent's own map holds instead, the block it chose and its way there (PNG; methods that search
-        with a map).
-      step: at which the map is drawn, from 1; default: the last.
+      index: number of the episode, from 0, in the list of 1,000 episodes of `jaxnav eval`. If scenes are streamed, this
+        is the list of the first shard.
+      out: GIF to write, which shows every step, or PNG, which shows the end. The default is `episode.gif` (with
+        `--map`, `map.png`) in the run directory or, for a policy, in the working directory.
+      variant: `stde` removes experience where the layout gap exceeds epsilon, `layout` never removes it, and `baseline`
+        has no layout weights.
+      epsilon: threshold of sTDE, at least 0.
+      setting: layout estimator to use instead of that of the run; `jaxnav list settings` describes them.
+      scenes: scene file to use instead of the scenes of the run.
+      shift: layout shifts of the scenes, each from 0 (as in training) to 1, with one panel for each. The default is the
+        shift of the run. With several shifts, all episodes of the list are played and the success rates are printed.
+      map: draw the map that the agent made, the block that it searches and its way to it. This needs a method that
+        searches with a map, and writes a PNG.
+      step: step at which the map is drawn, from 1. The default is the last step.
     """
 
-    source: Annotated[str, tyro.conf.Positional]
+    source: str
     split: Literal["train", "val", "test"] = "val"
     index: int = 0
     out: Path | None = None
@@ -49,12 +52,13 @@ class EpisodeConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = parse_arguments(EpisodeConfig, arguments, "jaxnav episode", "Draw one episode.")
-    return run_command(lambda console: _draw(config, console))
+    return run_command(_draw, lambda: parse_arguments(EpisodeConfig, arguments, "jaxnav episode", DESCRIPTION))
 
 
 def _draw(config: EpisodeConfig, console: Console) -> None:
     """Play the episode and write its picture."""
+    from jaxnav.viz import require_plotting_packages
+
     require_plotting_packages()
     from jaxnav.viz.episode import draw_episode, play_episode
     from jaxnav.viz.search import draw_search, take_snapshot
@@ -65,9 +69,9 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
     if path.suffix not in suffixes:
         raise InputError(f"--out {path}: give a name that ends in {' or '.join(suffixes)}")
     if config.step is not None and not config.map:
-        raise InputError(f"--step {config.step}: is for the map; give --map too")
+        raise InputError(f"--step {config.step}: applies to the map only; add --map")
     if config.map and len(config.shift) > 1:
-        raise InputError("--map: is drawn at one layout shift; give one --shift")
+        raise InputError("--map: the map is drawn at one layout shift; give one --shift")
 
     episodes = play_episode(
         config.source,
@@ -92,5 +96,7 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
 
 def _default_path(config: EpisodeConfig) -> Path:
     """Return the picture's path in the run directory or, for a policy, in the working directory."""
+    from jaxnav.runs.policies import is_policy
+
     folder = Path() if is_policy(config.source) else Path(config.source)
     return folder / ("map.png" if config.map else "episode.gif")

@@ -1,46 +1,55 @@
-"""The eval command: evaluate a run; prints a table and writes it as JSON, with a row per episode."""
+"""The eval command: evaluate a run, or print a finished evaluation again.
+
+An evaluation is printed as a table, and written as JSON and as a CSV file with a row per episode.
+"""
 
 import dataclasses
+import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Literal
 
-import tyro
 from rich.console import Console
 
-from jaxnav.causal import Form
-from jaxnav.cli.console import make_result_console, parse_arguments, refuse_unwritable, run_command
+from jaxnav.choices import EstimatorName, Form
+from jaxnav.cli.console import (
+    escape_control_chars,
+    make_result_console,
+    parse_arguments,
+    print_table,
+    refuse_unwritable,
+    run_command,
+)
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import difference_table, results_table
-from jaxnav.runs.evaluate import evaluate
-from jaxnav.runs.policies import EstimatorName
-from jaxnav.runs.run import Run
+
+DESCRIPTION = "Evaluate the policies of a run, or print a finished evaluation again."
 
 
 @dataclasses.dataclass(frozen=True)
 class EvalConfig:
-    """Configure an evaluation of a training run.
+    """Options of the eval command.
 
     Attributes:
-      run: the run directory.
+      run: run directory to evaluate, or the JSON file of a finished evaluation to print.
       split: scenes to evaluate on.
-      scenes: scene file to read instead of the run's own world or file.
-      world: generated world instead, for a policy that was trained in scenes of a file; categories and rules stay the
-        run's.
-      shift: layout shift, from 0 to 1: the share of the categories that exchange their places; default: the run's, and
-        0 with `--scenes` or `--world`.
-      episodes: in the fixed list, balanced over room types and scenes; where scenes are streamed equally many in every
-        shard, and balanced there.
-      epsilon: thresholds of sTDE; all of them in one compiled call.
-      form: how sTDE combines the logits; default: the run's layout setting's.
-      setting: layout estimator to use instead of the run's: `paper` and `released` change the layout's weights too,
-        the others measure the gap in another way; see docs/methods.md.
-      hold: the gap never falls within an episode; with `--form switch` experience is then out for good.
-      inner_steps: by which a method that learns within an episode may adapt, 0 for none; default: its usual number.
-      seed: of the episode list and the sampled actions.
-      json: where to write the table; default: in the run directory.
+      scenes: scene file to use instead of the scenes of the run.
+      world: generated world to use instead of the scenes of the run. The categories and rules remain those of the run.
+      shift: layout shift of the scenes, from 0 (as in training) to 1. The default is the shift of the run, and 0 with
+        `--scenes` or `--world`.
+      episodes: number of fixed episodes, at least 1, balanced over room types and scenes.
+      epsilon: thresholds of sTDE, each at least 0. All of them are evaluated in one compiled call.
+      form: rules by which sTDE combines factual and counterfactual logits. The default is the rule of the layout
+        estimator of the run.
+      setting: layout estimator to use instead of that of the run; `jaxnav list settings` describes them.
+      hold: keep the layout gap from falling within an episode. With `--form switch`, experience then stays removed for
+        the rest of the episode once the gap exceeds the threshold.
+      inner_steps: largest number of adaptation steps in an episode, at least 0, for methods that learn while they act.
+        The default is the usual number of the method.
+      seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
+      json: JSON file to write. The default is a name such as `eval-val.json` in the run directory.
+      format: format in which the evaluation is printed.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Path
     split: Literal["train", "val", "test"] = "val"
     scenes: Path | None = None
     world: Literal["rooms", "apartments", "houses"] | None = None
@@ -53,20 +62,25 @@ class EvalConfig:
     inner_steps: int | None = None
     seed: int = 0
     json: Path | None = None
+    format: Literal["table", "markdown", "json"] = "table"
 
 
 def main(arguments: list[str] | None = None, prog: str = "jaxnav eval") -> int:
     """Run the command and return its exit code."""
-    config = parse_arguments(EvalConfig, arguments, prog, "Evaluate a training run.")
-    return run_command(lambda console: _print_evaluation(config, console, make_result_console()))
+    return run_command(_evaluate_or_print, lambda: parse_arguments(EvalConfig, arguments, prog, DESCRIPTION))
 
 
-def _print_evaluation(config: EvalConfig, console: Console, result_console: Console) -> None:
-    """Evaluate a run, print the table and write the files."""
+def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
+    """Evaluate a run, or read the file of an evaluation, and print the report."""
+    if config.run.is_file() or config.run.suffix == ".json":
+        _print_report(_read_finished_report(config), config.format)
+        return
+    from jaxnav.runs.evaluate import evaluate
+
     # Find the file first: an evaluation takes minutes.
     target = _find_target(config)
     results = evaluate(
-        Run.open(config.run),
+        config.run,
         split=config.split,
         scenes=config.scenes,
         world=config.world,
@@ -80,18 +94,45 @@ def _print_evaluation(config: EvalConfig, console: Console, result_console: Cons
         seed=config.seed,
         console=console,
     )
-
-    # Print the table, the paired differences and the notes.
-    result_console.print(results_table(results.report))
-    if results.report["differences"]:
-        result_console.print(difference_table(results.report))
-    for note in results.report["notes"]:
-        result_console.print(note)
+    _print_report(results.report, config.format)
 
     with refuse_unwritable(target, "--json"):
         results.write(target)
-    compilations = results.report["compilations"]
-    console.print(f"{len(results.episodes.goal)} episodes, {compilations} compilation; written to {target}")
+    num_compilations = results.report["compilations"]
+    plural = "" if num_compilations == 1 else "s"
+    num_episodes = len(results.episodes.goal)
+    console.print(f"{num_episodes} episodes, {num_compilations} compilation{plural}; written to {target}")
+
+
+def _read_finished_report(config: EvalConfig) -> dict[str, Any]:
+    """Read the report of a finished evaluation, for which only `--format` is an option."""
+    from jaxnav.evaluation.report import read_report
+
+    report = read_report(config.run)
+    for field in dataclasses.fields(config):
+        if field.name not in ("run", "format") and getattr(config, field.name) != field.default:
+            option = f"--{field.name.replace('_', '-')}"
+            raise InputError(f"{option}: {config.run} is a finished evaluation; omit the option or give a run")
+    return report
+
+
+def _print_report(report: dict[str, Any], report_format: str) -> None:
+    """Print a report on stdout: its table, paired differences and notes."""
+    from jaxnav.evaluation.report import difference_table, markdown_table, results_table
+
+    if report_format == "json":
+        print(escape_control_chars(json.dumps(report, indent=2), keep="\n"))
+        return
+    if report_format == "markdown":
+        print(escape_control_chars(markdown_table(report), keep="\n"), end="")
+        return
+
+    result_console = make_result_console()
+    print_table(result_console, results_table(report))
+    if report["differences"]:
+        print_table(result_console, difference_table(report), num_key_columns=2)
+    for note in report["notes"]:
+        result_console.print(note)
 
 
 def _find_target(config: EvalConfig) -> Path:

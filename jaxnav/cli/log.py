@@ -2,28 +2,28 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
 from rich.console import Console
 
 from jaxnav.cli.console import parse_arguments, run_command
-from jaxnav.runs.run import Run
-from jaxnav.runs.tracking import send_log
+
+DESCRIPTION = "Show a training log in TensorBoard or Weights & Biases, also while training is running."
 
 
 @dataclasses.dataclass(frozen=True)
 class LogConfig:
-    """Show the training log of a run elsewhere.
+    """Options of the log command.
 
     Attributes:
-      run: the run directory; training may still go on.
-      to: `tensorboard` writes RUN/tensorboard, `wandb` sends to Weights & Biases (WANDB_MODE=offline: to RUN/wandb).
-      follow: go on until the run is finished.
-      project: of Weights & Biases.
+      run: run directory of a finished or a running training.
+      to: where to show the log: `tensorboard` writes RUN/tensorboard, `wandb` sends to Weights & Biases, or writes
+        RUN/wandb if the environment variable WANDB_MODE is `offline`.
+      follow: continue until the training is finished.
+      project: project in Weights & Biases.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Path
     to: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
     follow: bool = False
     project: str = "jaxnav"
@@ -31,15 +31,17 @@ class LogConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = parse_arguments(LogConfig, arguments, "jaxnav log", "Show a training log elsewhere.")
-    return run_command(lambda console: _send(config, console))
+    return run_command(_send, lambda: parse_arguments(LogConfig, arguments, "jaxnav log", DESCRIPTION), compiles=False)
 
 
 def _send(config: LogConfig, console: Console) -> None:
     """Send the rows logged so far; with `--follow`, until the run is finished or Ctrl-C."""
+    from jaxnav.runs.run import Run
+    from jaxnav.runs.tracking import send_log
+
     try:
         num_rows = send_log(Run.open(config.run), config.to, config.follow, config.project)
     except KeyboardInterrupt:
-        console.print("stopped; what was logged so far has been sent")
+        console.print("stopped; every row logged so far has been sent")
         return
     console.print(f"{num_rows} rows of {config.run} sent to {' and '.join(config.to)}")

@@ -1,4 +1,4 @@
-"""The play command: an episode steered by hand, in the terminal."""
+"""The play command: an episode in the terminal, with the reader at the keys."""
 
 import sys
 
@@ -7,22 +7,25 @@ from rich.live import Live
 
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
-from jaxnav.game.session import PlayConfig, play_game, prepare_game
-from jaxnav.game.terminal import game_screen, read_keys, result_screen
+from jaxnav.game.config import PlayConfig
+
+DESCRIPTION = "Search for an object yourself, in the terminal: you see only what an agent perceives."
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    config = parse_arguments(PlayConfig, arguments, "jaxnav play", "Play an episode by hand.")
-    return run_command(lambda console: _play(config, console))
+    return run_command(_play, lambda: parse_arguments(PlayConfig, arguments, "jaxnav play", DESCRIPTION))
 
 
 def _play(config: PlayConfig, console: Console) -> None:
     """Play the episode on the screen, then show its map."""
+    from jaxnav.game.session import play_game, prepare_game
+    from jaxnav.game.terminal import game_screen, read_keys, result_screen
+
     screen = Console(highlight=False)
     with read_keys(sys.stdin) as keys:
         if not screen.is_terminal:
-            raise InputError("play: the output is no terminal; start it in one")
+            raise InputError("play: the output is not a terminal; start the command in a terminal")
         game = prepare_game(config, console)
         with Live(console=screen, screen=True, auto_refresh=False) as live:
             result = play_game(game, keys, lambda view: live.update(game_screen(game, view), refresh=True))

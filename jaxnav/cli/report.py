@@ -1,28 +1,27 @@
 """The report command: tables, curves and replays of a run on one HTML page."""
 
-import tyro
 from rich.console import Console
 
 from jaxnav.cli.console import parse_arguments, refuse_unwritable, run_command
 from jaxnav.errors import InputError
 from jaxnav.report.config import ReportConfig
-from jaxnav.runs.run import Run
-from jaxnav.store.files import write_atomic
-from jaxnav.viz import require_plotting_packages
+
+DESCRIPTION = "Show a training run on one HTML page: tables, curves and replays of episodes."
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    description = "Show a training run on one page."
-    positional = (tyro.conf.PositionalRequiredArgs,)
-    config = parse_arguments(ReportConfig, arguments, "jaxnav report", description, config=positional)
-    return run_command(lambda console: _write_report(config, console))
+    return run_command(_write_report, lambda: parse_arguments(ReportConfig, arguments, "jaxnav report", DESCRIPTION))
 
 
 def _write_report(config: ReportConfig, console: Console) -> None:
     """Measure the run and write the page."""
+    from jaxnav.viz import require_plotting_packages
+
     require_plotting_packages()
     from jaxnav.report.make import make_report
+    from jaxnav.runs.run import Run
+    from jaxnav.store.files import write_atomic
 
     # Check the options before anything is measured.
     target = config.out or config.run / "report.html"
@@ -30,7 +29,7 @@ def _write_report(config: ReportConfig, console: Console) -> None:
         raise InputError(f"--out {target}: is a folder; give the name of a file to write")
 
     run = Run.open(config.run)
-    reference_run = None if config.beside is None else Run.open(config.beside)
+    reference_run = None if config.reference is None else Run.open(config.reference)
     page = make_report(run, reference_run, config, console).encode()
     with refuse_unwritable(target, "--out"):
         write_atomic(target, page)

@@ -1,59 +1,57 @@
 """The scenes commands: import scenes to a file, show one as a picture, print statistics of a file."""
 
 import dataclasses
+import difflib
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-import tyro
 from rich.console import Console
-from rich.progress import track
 
-from jaxnav.cli.console import escape_parser_output, make_result_console, refuse_unwritable, run_command
-from jaxnav.errors import InputError
-from jaxnav.evaluation.scene_statistics import compute_scene_statistics
-from jaxnav.runs.policies import load_policies
-from jaxnav.runs.run import load_run_config
-from jaxnav.scenes.categories import format_most_common
-from jaxnav.scenes.files.importing import (
-    ImportSummary,
-    SceneFormat,
-    SceneSplit,
-    filter_scenes,
-    import_scenes,
-    read_source,
+from jaxnav.cli.console import (
+    HELP_OPTIONS,
+    escape_control_chars,
+    make_result_console,
+    parse_arguments,
+    print_table,
+    refuse_unwritable,
+    run_command,
 )
+from jaxnav.errors import InputError
+from jaxnav.scenes.files.importing import SceneFormat, SceneSplit
 from jaxnav.scenes.worlds import WORLDS, SceneSource
-from jaxnav.viz import require_plotting_packages
-from jaxnav.viz.scene_tables import scene_remarks, scene_tables
+
+if TYPE_CHECKING:
+    from jaxnav.scenes.files.importing import ImportSummary
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportConfig:
-    """Import scenes to a scene file.
+    """Options of the scenes import command.
 
     Attributes:
-      format: `procthor`: houses as JSON or JSON lines; `ai2thor`: metadata of the controller with reachable positions,
-        a file or a folder of files; `scene-data`: the offline folders of SAVN, ORG and L-sTDE; `habitat`: an ObjectNav
-        split or one of its files; `replacements`: places of movable objects in the rooms of `--base`; `scenes`: a scene
-        file, to divide it into splits.
-      source: what to read; with `--from-controller` names of scenes with commas between them.
+      format: format of the source. `procthor`: houses as JSON or JSON lines. `ai2thor`: metadata of the controller with
+        reachable positions, a file or a folder of files. `scene-data`: the offline folders of SAVN, ORG and L-sTDE.
+        `habitat`: an ObjectNav split or one of its files. `replacements`: places of movable objects in the rooms of
+        `--base`. `scenes`: a scene file, to divide it into splits.
+      source: file or folder to read; with `--from-controller`, names of scenes, separated by commas.
       out: scene file to write (`*.jsonl.gz`).
-      split: of the scenes that none of the following patterns fits.
-      val, test: patterns of scene names, such as `FloorPlan_Train11_*`, that make up these splits.
-      room_types: of the scenes to keep, such as `house`; default: all.
-      largest: cells along the longer side of the largest scene to keep (`shape` in the file); default: any.
-      world: world whose vocabulary the types are compared with; default: that which the scenes stand for.
-      categories: vocabulary to compare with instead.
+      split: split of the scenes that match none of the patterns `--val` and `--test`.
+      val: patterns of scene names, such as `FloorPlan_Val1_*`, that become the split val.
+      test: patterns of scene names that become the split test.
+      room_types: room types of the scenes to keep, such as `house`. The default is all.
+      largest: largest number of cells along the longer side of a scene to keep. The default is any number.
+      world: world whose categories are compared with the object types. By default, the scenes decide.
+      categories: categories to compare with the object types, instead of those of a world.
       assets: asset database of ProcTHOR (`procthor/databases/asset-database.json` of github.com/allenai/procthor), for
-        types and sizes.
-      agent_part: of ProcTHOR houses only what is connected with the agent's place in the file, instead of the largest
-        connected part.
+        types and sizes of objects.
+      agent_part: keep only the part of a ProcTHOR house that is connected with the agent's position in the file. By
+        default, the largest connected part is kept.
       maps: semantic floor maps for Habitat episodes (`*_info.pbz2`).
-      from_controller: read from an installed `ai2thor` simulator instead of from files.
-      base: scene file with the rooms that re-placements are of.
+      from_controller: read from an installed `ai2thor` simulator instead of files.
+      base: scene file with the rooms in which objects are placed again, for `replacements`.
     """
 
     format: SceneFormat
@@ -75,13 +73,14 @@ class ImportConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ShowConfig(SceneSource):
-    """Draw a picture of one scene.
+    """Options of the scenes show command.
 
     Attributes:
-      scene: name of the scene; default: the first.
-      index: its number instead, from 0; a generated world also has scenes beyond its usual number.
-      pose: x and z in metres and heading in degrees of the level camera; default: what detects most categories.
-      out: PNG to write; default: the scene's name in the working directory.
+      scene: name of the scene to draw. The default is the first scene.
+      index: number of the scene to draw, from 0, instead of its name.
+      pose: x and z in metres and the heading in degrees of the camera, which looks level. The default is the pose from
+        which the most categories are detected.
+      out: PNG to write. The default is the name of the scene, in the working directory.
     """
 
     scene: str | None = None
@@ -92,33 +91,37 @@ class ShowConfig(SceneSource):
 
 @dataclasses.dataclass(frozen=True)
 class StatsConfig(SceneSource):
-    """Print statistics of scenes.
+    """Options of the scenes stats command.
 
     Attributes:
-      run: a finished run; its categories and rules count, and the scenes are compared with its layout priors.
+      run: run directory of a finished training. Its categories and rules are used, and the scenes are compared with its
+        layout priors.
     """
 
     run: Path | None = None
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and return its exit code."""
-    with escape_parser_output():
-        config = tyro.extras.subcommand_cli_from_dict(
-            {"import": ImportConfig, "show": ShowConfig, "stats": StatsConfig},
-            args=arguments,
-            prog="jaxnav scenes",
-            config=(tyro.conf.PositionalRequiredArgs,),
-        )
-    if isinstance(config, ImportConfig):
-        return run_command(lambda console: _import(config, console))
-    if isinstance(config, ShowConfig):
-        return run_command(lambda console: _show(config, console))
-    return run_command(lambda console: _print_statistics(config, console))
+    """Run the command that the first argument names and return its exit code; 2 for an unknown one."""
+    name, *command_arguments = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in HELP_OPTIONS:
+        print(_HELP)
+        return 0
+    if name not in COMMANDS:
+        matches = difflib.get_close_matches(name, COMMANDS, n=1)
+        advice = f"did you mean {matches[0]!r}?" if matches else f"choose one of {', '.join(COMMANDS)}"
+        print(escape_control_chars(f"error: scenes: unknown command {name!r}; {advice}"), file=sys.stderr)
+        return 2
+
+    kind, command, summary = COMMANDS[name]
+    description = f"{summary[0].upper()}{summary[1:]}."
+    return run_command(command, lambda: parse_arguments(kind, command_arguments, f"jaxnav scenes {name}", description))
 
 
 def _import(config: ImportConfig, console: Console) -> None:
     """Import scenes, and print which were refused and which objects are of unknown types."""
+    from jaxnav.scenes.categories import format_most_common
+    from jaxnav.scenes.files.importing import filter_scenes, import_scenes, read_source
 
     def report_refusal(error: InputError) -> None:
         console.print(f"refused: {error}", style="yellow")
@@ -153,7 +156,7 @@ def _import(config: ImportConfig, console: Console) -> None:
     console.print(f"{counts}; written to {config.out}")
 
 
-def _import_warnings(summary: ImportSummary) -> Iterator[str]:
+def _import_warnings(summary: "ImportSummary") -> Iterator[str]:
     """Yield a line for each kind of values guessed, objects moved or cells skipped by an import."""
     for text, count in summary.notes.items():
         yield f"{count:,} {text}"
@@ -171,6 +174,8 @@ def _import_warnings(summary: ImportSummary) -> Iterator[str]:
 
 def _show(config: ShowConfig, console: Console) -> None:
     """Draw a scene and write the picture."""
+    from jaxnav.viz import require_plotting_packages
+
     require_plotting_packages()
     from jaxnav.viz.scene import draw_scene
 
@@ -202,9 +207,17 @@ def _warn_beyond_usual_number(config: ShowConfig, console: Console) -> None:
 
 def _print_statistics(config: StatsConfig, console: Console) -> None:
     """Compile the scenes of a file and print their statistics."""
+    import numpy as np
+    from rich.progress import track
+
+    from jaxnav.evaluation.scene_statistics import compute_scene_statistics
+    from jaxnav.runs.policies import load_policies
+    from jaxnav.runs.run import load_run_config
+    from jaxnav.viz.scene_tables import scene_remarks, scene_tables
+
     # The run or the world gives categories and rules; only a run has layout priors.
     if config.run and config.world:
-        raise InputError("--world, --run: both are given, but the run has a world; leave --world out")
+        raise InputError("--world, --run: both are given, but the run has a world; omit --world")
     run_config = load_run_config(config.run) if config.run else None
     if run_config:
         task = run_config.task
@@ -227,6 +240,21 @@ def _print_statistics(config: StatsConfig, console: Console) -> None:
     result_console.print(f"{config.file}: {len(statistics)} scenes, by the categories and rules of {world}")
     for title, table in scene_tables(statistics, task, priors).items():
         result_console.print(title, style="bold")
-        result_console.print(table, "")
+        print_table(result_console, table)
+        result_console.print()
     for remark in scene_remarks(statistics, task):
         result_console.print(remark)
+
+
+#: Options, function and summary of each command.
+COMMANDS: dict[str, tuple[type, Callable[[Any, Console], None], str]] = {
+    "import": (ImportConfig, _import, "import scenes of a simulator or dataset to a scene file"),
+    "show": (ShowConfig, _show, "draw a picture of one scene"),
+    "stats": (StatsConfig, _print_statistics, "print statistics of scenes"),
+}
+
+_HELP = (
+    "usage: jaxnav scenes COMMAND [OPTIONS]\n\n"
+    + "".join(f"  {name:11} {summary}\n" for name, (_, _, summary) in COMMANDS.items())
+    + "\nEach has its own help: jaxnav scenes COMMAND --help"
+)

@@ -4,28 +4,29 @@ import sys
 
 from rich.console import Console
 
-from jaxnav.cli.console import escape_control_chars, parse_config, run_command
+from jaxnav.cli.console import escape_control_chars, make_options_class, parse_config, run_command
 from jaxnav.errors import InputError
 from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig
-from jaxnav.experiments.driver import check_measurements, run_experiment
 
+Options = make_options_class(ExperimentConfig, EXPERIMENTS)
 DESCRIPTION = (
-    f"Run an experiment: {', '.join(EXPERIMENTS)}, or a YAML file. Trains and measures what is missing, and writes its "
-    "pages. The experiments account, mixture, handover and instrument measure a finished run: give --run RUN, and "
-    "--reference RUN for a run of layout-blind agents."
+    "Run an experiment: train and measure everything that has no results yet, and write its pages.\n\n"
+    f"NAME is {', '.join(EXPERIMENTS)}, or a YAML file. The experiments account, mixture, handover and instrument "
+    "measure a finished run: give --run RUN and, for layout-blind agents, --reference RUN. With a NAME, the help shows "
+    "the settings of that experiment."
 )
 
 
 def main(arguments: list[str] | None = None, prog: str = "jaxnav study") -> int:
     """Run the command and return its exit code."""
-    return run_command(lambda console: _run_study(arguments, prog, console))
+    return run_command(_run_study, lambda: parse_study(arguments, prog))
 
 
-def _run_study(arguments: list[str] | None, prog: str, console: Console) -> None:
-    config = parse_study(arguments, prog)
+def _run_study(config: ExperimentConfig, console: Console) -> None:
+    """Run the experiment, and print its pages if they are about a single run, which are short."""
+    from jaxnav.experiments.driver import run_experiment
+
     pages = run_experiment(config, console)
-
-    # Pages about a single run are short, and printed too.
     if config.run is not None:
         print(escape_control_chars("\n".join(pages), keep="\n"))
 
@@ -44,6 +45,13 @@ def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> Expe
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words:
         raise InputError(f"give an experiment: {', '.join(EXPERIMENTS)}, or a YAML file")
-    if words and not words[0].startswith("-"):
+    if not words[0].startswith("-"):
         words = ["--config", *words]
-    return parse_config(ExperimentConfig(), words, prog, DESCRIPTION, check_measurements, EXPERIMENTS)
+    return parse_config(ExperimentConfig(), words, f"{prog} NAME", DESCRIPTION, _check, EXPERIMENTS)
+
+
+def _check(config: ExperimentConfig) -> ExperimentConfig:
+    """Check the settings, and fill in those that follow from others."""
+    from jaxnav.experiments.driver import check_measurements
+
+    return check_measurements(config)

@@ -13,13 +13,13 @@ import json
 import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from jaxnav.causal import Form
+from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import (
@@ -31,13 +31,10 @@ from jaxnav.evaluation.statistics import (
     run_clusters,
     scene_clusters,
 )
-from jaxnav.store.files import installed_versions, write_atomic
+from jaxnav.store.files import WRITTEN_BY_0_1, installed_versions, write_atomic
 
 #: Version of the JSON layout.
 REPORT_FORMAT = 1
-
-Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
-Decoding = Literal["argmax", "sample"]
 
 #: Variants without training, whose seeds are repetitions.
 UNTRAINED_VARIANTS: tuple[Variant, ...] = ("oracle", "random")
@@ -207,6 +204,25 @@ def _to_report_units(metric: str, metric_values: np.ndarray) -> np.ndarray:
         valid_range = "metres, at least 0" if is_distance else "fractions from 0 to 1"
         raise InputError(f"{metric} contains NaN or values out of range; give {valid_range}")
     return metric_values * (1.0 if is_distance else 100.0)
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """Read the report that an evaluation wrote.
+
+    Raises:
+      InputError: the file cannot be read, or is not a report of this format.
+    """
+    remedy = "give a JSON file that jaxnav eval wrote"
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no evaluation can be read from it ({error}); {remedy}") from error
+    if not isinstance(report, dict) or report.get("format") != REPORT_FORMAT or "compilations" not in report:
+        raise InputError(f"{path}: is not an evaluation of format {REPORT_FORMAT}; {remedy}")
+    # Reports have notes since version 0.2.
+    if "notes" not in report:
+        raise InputError(f"{path}: {WRITTEN_BY_0_1}")
+    return report
 
 
 #: Titles and decimal places of the metrics.

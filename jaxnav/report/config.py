@@ -1,4 +1,4 @@
-"""Settings of a report; without imports of plotting packages, so that the command can refuse where they are missing."""
+"""Settings of a report; a module of its own, so that the help of the command needs no plotting packages."""
 
 import dataclasses
 from pathlib import Path
@@ -7,24 +7,25 @@ from typing import Literal
 
 @dataclasses.dataclass(frozen=True)
 class ReportConfig:
-    """Configure the report of a training run.
+    """Settings of the report of a training run.
 
     Attributes:
-      run: the run directory.
-      beside: that of agents which cannot know any layout, for the accounting of experience; trained in the same world,
-        with as many seeds, by `--method anonymous`.
+      run: run directory of a finished training.
+      reference: run directory of layout-blind agents, with which the value and the cost of experience are measured.
+        Train it with `--method anonymous` in the same world and with as many seeds.
       split: scenes to evaluate on.
-      shift: layout shifts, from 0 to 1.
-      episodes: in the fixed list, at each shift, as of `eval`.
-      epsilon: thresholds of sTDE in the curves.
-      threshold: of sTDE in the tables and the replays.
-      replays: episodes that can be replayed, in all; those in which the agents differ first.
-      seed: of the episode list and the sampled actions.
-      out: where to write the page; default: report.html in the run directory.
+      shift: layout shifts of the scenes, each from 0 (as in training) to 1.
+      episodes: number of fixed episodes at each layout shift, at least 1.
+      epsilon: thresholds of sTDE in the curves, each at least 0.
+      threshold: threshold of sTDE in the tables and replays, at least 0.
+      replays: number of episodes that can be replayed, at least one for each layout shift. Episodes in which the agents
+        differ come first.
+      seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
+      out: HTML file to write. The default is `report.html` in the run directory.
     """
 
     run: Path
-    beside: Path | None = None
+    reference: Path | None = None
     split: Literal["train", "val", "test"] = "val"
     shift: tuple[float, ...] = (0.0, 1.0)
     episodes: int = 1000

@@ -101,7 +101,7 @@ def _check(run: Run, reference_run: Run | None, config: ReportConfig) -> None:
     if reference_run is not None:
         reference_run.policies()
         if reference_run.config.task != run.config.task:
-            raise InputError("--beside: has another task or detector than the run; train both with equal settings")
+            raise InputError("--reference: has another task or detector than the run; train both with equal settings")
 
 
 def make_sections(run: Run, by_shift: Mapping[float, ShiftMeasurements], threshold: float) -> list[Section]:

@@ -29,7 +29,7 @@ def made(monkeypatch):
 
 def test_report_command_passes_options_and_writes_the_page(run_dir, tmp_path, made):
     out = tmp_path / "new" / "page.html"
-    assert report(run_dir, "--beside", run_dir, "--split", "test", "--shift", 0.5, "--replays", 6, "--out", out) == 0
+    assert report(run_dir, "--reference", run_dir, "--split", "test", "--shift", 0.5, "--replays", 6, "--out", out) == 0
     assert out.read_text() == "a page"
     run, reference_run, options, _ = made[0]
     assert run.config.run_dir == reference_run.config.run_dir == run_dir
@@ -55,8 +55,8 @@ def test_report_refuses_folders_without_a_finished_run(run_dir, tmp_path, capsys
         ((empty,), f"{empty}: holds no run (config.json is missing); train one there first"),
         ((unfinished,), f"{unfinished}/policies/baseline-0: is missing, so training has not finished"),
         ((foreign,), f"{foreign}/config.json"),
-        ((run_dir, "--beside", empty), f"{empty}: holds no run"),
-        ((run_dir, "--beside", unfinished), f"{unfinished}/policies/baseline-0: is missing"),
+        ((run_dir, "--reference", empty), f"{empty}: holds no run"),
+        ((run_dir, "--reference", unfinished), f"{unfinished}/policies/baseline-0: is missing"),
         ((run_dir, "--out", empty), f"--out {empty}: is a folder; give the name of a file to write"),
         ((run_dir, "--replays", 1), "--replays 1: give at least 2, one for each shift"),
     ):

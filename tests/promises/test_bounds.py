@@ -111,9 +111,9 @@ def test_products_of_sizes_are_capped(tmp_path, capsys):
     ("error", "named_parts"),
     [
         (MemoryError("Unable to allocate 6 GiB"), ["error: ", "memory", "6 GiB", "give "]),
-        (OSError(errno.ENOSPC, "No space left on device", "a/b"), ["error: a/b: ", "No space left on device", "mend"]),
-        (OSError(errno.EROFS, "Read-only file system", "a/b"), ["error: a/b: ", "Read-only file system", "mend"]),
-        (PermissionError(errno.EACCES, "Permission denied", "a"), ["error: a: ", "Permission denied", "mend"]),
+        (OSError(errno.ENOSPC, "No space left on device", "a/b"), ["error: a/b: ", "No space left on device", "check"]),
+        (OSError(errno.EROFS, "Read-only file system", "a/b"), ["error: a/b: ", "Read-only file system", "check"]),
+        (PermissionError(errno.EACCES, "Permission denied", "a"), ["error: a: ", "Permission denied", "check"]),
     ],
 )
 def test_run_command_reports_system_errors_in_one_line(capsys, error, named_parts):

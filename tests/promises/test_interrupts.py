@@ -52,7 +52,7 @@ def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
     assert process.returncode == 130, error
     message = error.splitlines()[-1]
     match = re.fullmatch(
-        rf"interrupted: {ended}: stopped after update (\d+) of 60 and saved; the same command goes on from there",
+        rf"interrupted: {ended}: stopped after update (\d+) of 60 and saved; run the same command again to continue",
         message,
     )
     assert match, error
@@ -121,7 +121,7 @@ def test_signal_during_the_last_save_is_reported(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(updates, "save_checkpoint", interrupted)
     assert train(config_file, run_dir) == 143
-    message = f"interrupted: {run_dir}: stopped after update 4 of 4 and saved; the same command goes on from there"
+    message = f"interrupted: {run_dir}: stopped after update 4 of 4 and saved; run the same command again to continue"
     assert message in capsys.readouterr().err
     assert not (run_dir / "policies").exists()
     monkeypatch.undo()
@@ -145,8 +145,8 @@ def test_interrupts_work_in_threads_without_signal_handlers():
 @pytest.mark.parametrize(
     ("end", "code", "message"),
     [
-        (Interrupted(signal.SIGTERM, "runs/a: saved"), 143, "interrupted: runs/a: saved; the same command goes on"),
-        (Interrupted(signal.SIGINT, "runs/a: saved"), 130, "interrupted: runs/a: saved; the same command goes on"),
+        (Interrupted(signal.SIGTERM, "runs/a: saved"), 143, "interrupted: runs/a: saved; run the same command again"),
+        (Interrupted(signal.SIGINT, "runs/a: saved"), 130, "interrupted: runs/a: saved; run the same command again"),
         (KeyboardInterrupt(), 130, "interrupted: "),
     ],
 )

@@ -30,8 +30,10 @@ HOSTILE = "[/x][bold]\x1b[31m\x07\n\u202e$\\frac$"
 #: Arguments of each command, with the hostile name in place of `@`.
 HOSTILE_ARGUMENTS = {
     "train": [("--run-dir", "@", "--scenes", "@"), ("--config", "@"), ("--method", "@")],
-    "eval": [("@",), ("@", "--scenes", "@"), ("@", "--json", "@")],
-    "report": [("@",), ("@", "--beside", "@"), ("@", "--out", "@")],
+    "eval": [("@",), ("@.json",), ("@", "--scenes", "@"), ("@", "--json", "@")],
+    "sweep": [("@",), ("rooms-org", "--scenes", "@"), ("rooms-org", "--out", "@")],
+    "report": [("@",), ("@", "--reference", "@"), ("@", "--out", "@")],
+    "list": [("@",)],
     "export": [("@",), ("@", "--policy", "@")],
     "episode": [("@",), ("@", "--scenes", "@")],
     "play": [("--scenes", "@"), ("--goal", "@"), ("--policy", "@")],
@@ -43,6 +45,8 @@ HOSTILE_ARGUMENTS = {
         ("import", "procthor", "@", "@"),
         ("import", "scenes", "@", "@.jsonl.gz"),
     ],
+    "completion": [("@",)],
+    "help": [("@",)],
     "table": [("@",)],
     "no such command @": [()],
 }
@@ -92,7 +96,7 @@ def test_hostile_arguments_cover_every_command():
         ("train", "--seed=@"),
         ("eval", "a", "--split=@"),
         ("study", "account", "--seed=@"),
-        ("table", "a", "--no-such@"),
+        ("list", "--no-such@"),
         ("scenes", "stats", "a", "--run", "b", "@"),
         ("scenes", "import", "@"),
     ],
@@ -129,10 +133,10 @@ def read_until_closed(descriptor):
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
-def test_parser_error_on_a_terminal_keeps_its_colours():
-    """The escapes that a parser adds for a terminal are not escaped as parts of a name."""
+def test_parser_error_on_a_terminal_has_no_escapes():
+    """The escapes that a parser adds for a terminal are removed, and not printed as parts of a name."""
     controller, terminal = os.openpty()
-    command = [sys.executable, "-m", "jaxnav", "table", "a", "--no-such"]
+    command = [sys.executable, "-m", "jaxnav", "eval", "a", "--no-such"]
     process = subprocess.Popen(command, stdout=terminal, stderr=terminal)
     os.close(terminal)
     output = read_until_closed(controller)

@@ -16,7 +16,6 @@ from support.tiny_run import write_config
 
 import jaxnav
 from jaxnav.cli import log as log_command
-from jaxnav.cli import table as table_command
 from jaxnav.errors import InputError
 from jaxnav.store import checkpoint
 from jaxnav.store.files import make_manifest, read_log_rows
@@ -64,12 +63,12 @@ def test_commands_refuse_a_run_of_0_1_and_leave_it_unchanged(run_of_0_1, tmp_pat
     assert contents(run_of_0_1) == before
 
 
-def test_table_refuses_a_report_of_0_1(run_of_0_2, tmp_path, capsys):
+def test_eval_refuses_a_report_of_0_1(run_of_0_2, tmp_path, capsys):
     report = json.loads((run_of_0_2 / "eval-val.json").read_text())
     del report["notes"]
     path = tmp_path / "report.json"
     path.write_text(json.dumps(report))
-    assert table_command.main([str(path)]) == 2
+    assert evaluate(path) == 2
     assert refusal(capsys) == f"error: {path}: {REFUSED}"
 
 
@@ -117,7 +116,7 @@ def test_run_of_0_2_is_evaluated_as_by_that_version(run_of_0_2, tmp_path):
 def test_policies_logs_and_reports_of_0_2_are_read(run_of_0_2, capsys):
     assert jaxnav.load_policy(run_of_0_2 / "policies" / "layout-0").spec.method.name == "org"
     assert [row["step"] for row in read_log_rows(run_of_0_2 / "metrics.jsonl") if row["arm"] == "layout"] == [2, 4]
-    assert table_command.main([str(run_of_0_2 / "eval-val.json")]) == 0
+    assert evaluate(run_of_0_2 / "eval-val.json", "--format", "markdown") == 0
     assert "| + w (layout) |" in capsys.readouterr().out
 
 

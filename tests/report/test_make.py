@@ -238,5 +238,5 @@ def test_make_report_refuses_a_reference_run_without_a_policy(run, tmp_path):
 @pytest.mark.usefixtures("no_measurement")
 def test_make_report_refuses_a_reference_run_with_another_detector(run, tmp_path):
     other_run = draw_run(tiny_config(tmp_path / "run", detector=Detector(seed=1)))
-    with pytest.raises(InputError, match=r"--beside: .* task or detector"):
+    with pytest.raises(InputError, match=r"--reference: .* task or detector"):
         make_report(run, other_run, OPTIONS, QUIET)

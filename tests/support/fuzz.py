@@ -29,7 +29,19 @@ from support.tiny_world import BEDROOM, KITCHEN
 #: Words of a command line, besides options and the names of commands.
 _WORDS = ("", "-1", "0", "7", "1e999", "nan", "10" * 40, "rooms", "val", "none", "a=b", "--", "-h", "[/x]", "\x1b[0m")
 _OPTIONS = ("--run-dir", "--seeds", "--config", "--split", "--epsilon", "--episodes", "--seed", "--scenes", "--out")
-_COMMANDS = ("eval", "account", "mixture", "report", "export", "episode", "table", "scenes")
+_COMMANDS = (
+    "eval",
+    "sweep",
+    "account",
+    "mixture",
+    "report",
+    "export",
+    "episode",
+    "table",
+    "scenes",
+    "help",
+    "completion",
+)
 
 
 def _scene_file(folder: Path, draw: random.Random) -> int:
