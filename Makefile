@@ -100,7 +100,7 @@ package: $(READY)
 	$(BIN)/python -m venv $(TRIAL)
 	$(TRIAL)/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
 	mkdir $(TRIAL)/smoke
-	cd $(TRIAL)/smoke && $(JAXNAV) --version | grep -Fx 'jaxnav $(VERSION)' && \
+	cd $(TRIAL)/smoke && $(JAXNAV) --version | grep -Fx 'jaxnav $(VERSION)' && $(JAXNAV) list && \
 	  $(JAXNAV) train --config smoke --total-steps 61_440 --run-dir run && $(JAXNAV) eval run --episodes 40
 
 # Needs a committed version with a section of the changelog. CONTRIBUTING.md lists the commands that publish it.
