@@ -196,7 +196,7 @@ def test_scenes_stats_refuses_missing_files_splits_and_runs(tmp_path, tmp_path_f
         ((scene_file, "--split", "test"), ("no scene of split 'test'", "train, val")),
         (("rooms", "--shift", "2"), ("shift 2.0", "from 0 to 1")),
         ((scene_file, "--run", tmp_path), ("holds no run",)),
-        ((scene_file, "--run", run_dir, "--world", "rooms"), ("--world, --run", "leave --world out")),
+        ((scene_file, "--run", run_dir, "--world", "rooms"), ("--world, --run", "the run has a world")),
     ):
         assert scenes_command.main(["stats", *map(str, arguments)]) == 2
         message = refusal(capsys)
