@@ -23,6 +23,7 @@ from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.scenes.files.scene_file import read_scenes
 
 DOCS = Path(__file__).parents[1] / "docs"
+BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
 def test_doctests_of_concepts_pass():
@@ -46,14 +47,11 @@ def test_python_blocks_of_use_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = "jaxnav.runs.config_files.apply_yaml(jaxnav.RunConfig(run_dir=Path('runs/org')), Path('tiny.yaml'))"
     write_config(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "use.md").read_text(), re.DOTALL)
-    assert blocks
+    blocks = [block for block in BLOCK.findall((DOCS / "use.md").read_text()) if "rejax" not in block]
+    assert len(blocks) == 3
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        for block in blocks:
-            code = re.sub(r"jaxnav\.RunConfig\(.*?\)(?=\))", small.replace("\\", "\\\\"), block, flags=re.DOTALL)
-            exec(
-                code.replace("import jaxnav\n", "import jaxnav\nimport jaxnav.runs.config_files\n"), {"__name__": "use"}
-            )
+        code = "\n".join(blocks).replace("import jaxnav\n", "import jaxnav\nimport jaxnav.runs.config_files\n")
+        exec(re.sub(r"jaxnav\.RunConfig\(.*?\)(?=\))", small.replace("\\", "\\\\"), code, flags=re.DOTALL), {})
     assert "['detections', 'goal', 'heading', 'horizon', 'moved', 'view']" in capsys.readouterr().out
     assert jaxnav.Run.open("runs/org").config.seeds == 2
 
@@ -113,19 +111,26 @@ def test_constants_of_the_reference_have_their_values():
     assert all(f"`{name}`" in (DOCS / "reference_parts.md").read_text() for name in jaxnav.METHODS)
 
 
-def run_python_blocks(path):
-    """Execute the Python blocks of a page in order, under the rules of promotion of a user."""
-    blocks = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
+def run_python_blocks(path, containing=""):
+    """Execute the Python blocks of a page in order, under the rules of promotion of a user; return their names."""
+    blocks = [block for block in BLOCK.findall(path.read_text()) if containing in block]
     assert blocks
+    names = {"__name__": "page"}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        exec(compile("\n".join(blocks), str(path), "exec"), {"__name__": "page"})
+        exec(compile("\n".join(blocks), str(path), "exec"), names)
+    return names
 
 
 def test_python_blocks_of_own_detections_run():
     run_python_blocks(DOCS / "own_detections.md")
 
 
-BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+@pytest.mark.slow
+def test_recipe_of_rejax_trains():
+    """The returns before and after training that the page states."""
+    pytest.importorskip("rejax")
+    returns = run_python_blocks(DOCS / "use.md", containing="rejax")["returns"]
+    np.testing.assert_allclose(returns.mean(axis=1), [0.30, 0.76], atol=0.15)
 
 
 @pytest.fixture
