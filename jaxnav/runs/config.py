@@ -401,11 +401,11 @@ def _check_method(config: RunConfig, method: "Method") -> None:
     # Sizes of the method's networks.
     size_names = method.experience.sizes
     if size_names:
-        known_sizes = f"{config.method!r} has {', '.join(size_names)}"
+        known_sizes = f"method {config.method!r} has the sizes {', '.join(size_names)}"
     else:
-        known_sizes = f"{config.method!r} has no such sizes"
+        known_sizes = f"method {config.method!r} has no sizes"
     for name, value in config.method_sizes.items():
-        _require(name in size_names, f"method_sizes.{name}", value, f"is unknown; {known_sizes}")
+        _require(name in size_names, f"method_sizes.{name}", value, f"this size is unknown, {known_sizes}")
         _require(value >= 1, f"method_sizes.{name}", value, "give at least 1")
 
 

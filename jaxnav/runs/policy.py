@@ -415,8 +415,8 @@ _MODEL_CARD = """\
 
 ## Limits
 
-It was trained on a grid with a simulated detector, never on images, and knows those categories alone.
-Success was measured in the scenes by which the run chose its policies; it is no result for a table.
+The policy was trained on a grid with a simulated detector, never on images, and only for the categories of its task.
+The val scenes also selected the policy during training, so the success in them is not a test result.
 """
 
 

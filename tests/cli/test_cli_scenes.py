@@ -162,8 +162,8 @@ def test_import_skips_bad_lines_of_a_scene_file(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--room-types", "house", "--largest", "26"], "--largest 26: leaves no scene; 27 cells long"),
-        (["--room-types", "bedroom"], "--room-types bedroom: leaves no scene; house\n"),
+        (["--room-types", "house", "--largest", "26"], "--largest 26: no scene is small enough; 27 cells long"),
+        (["--room-types", "bedroom"], "--room-types bedroom: no scene has these types; house\n"),
     ],
 )
 def test_import_refuses_a_selection_without_scenes(tmp_path, capsys, options, problem):

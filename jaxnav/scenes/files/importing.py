@@ -153,10 +153,10 @@ def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_si
     # Tell which limit would have left a scene.
     if excessive_sides and num_scenes == 0:
         smallest_side = min(excessive_sides)
-        raise InputError(f"--largest {max_side}: leaves no scene; the smallest is {smallest_side} cells long")
+        raise InputError(f"--largest {max_side}: no scene is small enough; the smallest is {smallest_side} cells long")
     if other_room_types and num_scenes == 0:
         present_types = ", ".join(sorted(other_room_types))
-        raise InputError(f"--room-types {' '.join(room_types)}: leaves no scene; there are {present_types}")
+        raise InputError(f"--room-types {' '.join(room_types)}: no scene has these types; there are {present_types}")
 
 
 def import_scenes(
