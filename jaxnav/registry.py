@@ -1,4 +1,4 @@
-"""What jaxnav offers by name: worlds, methods, policies, experiments, configurations and layout estimators.
+"""Everything that jaxnav offers by name: worlds, methods, policies, experiments, configurations and layout estimators.
 
 `registered` collects the entries from the registries of the package (`WORLDS`, `METHODS`, `EXPERIMENTS` and others),
 and their summaries from docstrings and files. The registries are imported in the functions that read them, so that

@@ -29,7 +29,7 @@ def update_where(mask: jax.Array, function: Function, shared: Any, inputs: Any, 
 
     Args:
       mask: bool [...].
-      function: from `shared` and leaves of `inputs` and `state` without a batch to the next state. In reverse mode
+      function: maps `shared` and leaves of `inputs` and `state` without a batch to the next state. In reverse mode
         gradients reach these three and no other array that the function closes over.
       shared: a pytree of float arrays.
       inputs: leaves [..., ...].

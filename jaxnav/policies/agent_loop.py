@@ -194,7 +194,7 @@ class StepResult(NamedTuple):
       truncated: bool, the step limit was reached.
       success: bool, Done was chosen where it succeeds.
       moved: bool, the agent changed its cell.
-      agent: after the action and before a reset; its perception excludes the view after the action.
+      agent: state after the action and before a reset; its perception excludes the view after the action.
     """
 
     reward: jax.Array

@@ -329,7 +329,7 @@ class Sweep(NamedTuple):
       compilations: number of compilations; 1 where the scenes are in memory.
       no_removal: outcomes of the same episodes without removal, leaves [S, E].
       episodes: the episodes.
-      settings: what was evaluated, as JSON: source, method, split, layout shift, decoding and more.
+      settings: settings of the sweep as JSON: source, method, split, layout shift, decoding and more.
     """
 
     epsilon: np.ndarray
@@ -354,7 +354,7 @@ class Sweep(NamedTuple):
         )
 
     def notes(self) -> list[str]:
-        """What the intervals cover, one sentence per note."""
+        """Notes on the coverage of the intervals, one sentence per note."""
         return sweep_notes(self.sr.shape[1], self.episodes)
 
     def table(self) -> Table:

@@ -116,7 +116,7 @@ def load_run_config(run_dir: Path) -> RunConfig:
 
 @contextlib.contextmanager
 def lock_run_dir(config: RunConfig) -> Iterator[FolderLock]:
-    """Hold the run directory for this run while the context is entered.
+    """Lock the run directory for this run while the context is entered.
 
     Of several processes of a run, the first one holds the directory for all.
 

@@ -68,7 +68,7 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
       run_dir: folder of the run; checkpoints go to `run_dir/checkpoints/<step>`.
       step: larger than every step saved so far.
       state: pytree whose leaves are all non-empty `jax.Array`, typed PRNG keys included.
-      manifest: from `make_manifest`.
+      manifest: manifest of the run, see `make_manifest`.
 
     Raises:
       InputError: the run already has this step or a later step.
@@ -105,7 +105,7 @@ def restore_checkpoint(
       run_dir: folder of the run.
       abstract_state: `jax.eval_shape` of the state's initialisation (or a state): structure, shapes, dtypes and, where
         given, shardings; leaves without a sharding are placed on the default device.
-      expected_manifest: from `make_manifest`, with the config of the run that resumes.
+      expected_manifest: manifest of the run that resumes, see `make_manifest`.
 
     Raises:
       InputError: the checkpoint has another format version, config or state structure, or all are damaged.

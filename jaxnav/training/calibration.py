@@ -168,7 +168,7 @@ class Calibration(NamedTuple):
     """A calibrated layout estimator.
 
     Attributes:
-      estimator_config: with the best strength and reduction.
+      estimator_config: estimator with the best strength and reduction.
       early: median over walks of the mean gap in the first three accepted views; NaN without any.
       late: median over walks of the gap at step 20.
     """
@@ -251,7 +251,7 @@ def _measure_gaps(
     """Early and late gap of each walk, float32 [W]; the early gap is NaN where no view was accepted.
 
     Args:
-      estimator_config: with a reduction; its strength has no effect.
+      estimator_config: estimator with a reduction; its strength has no effect.
       priors: float32 [rooms, K, K], of one strength.
       env_params, env, key, num_walks: as in `calibrate`.
     """

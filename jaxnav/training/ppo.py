@@ -694,7 +694,7 @@ class Learner:
     Attributes:
       agent_loop: runs policy and environment.
       config: sizes and static settings; the fields of `PPOScalars` are read from the traced argument of `train`.
-      counterfactual: how the counterfactual branch is trained.
+      counterfactual: training of the counterfactual branch, see `CounterfactualTraining`.
       stage: loss, schedules and frozen parameters of this part of training.
     """
 

@@ -22,7 +22,7 @@ def mean_over_devices(function: Callable[..., Any], *in_specs: Any) -> Callable[
     """Average the results of a function over the devices that share episodes.
 
     Args:
-      function: from arrays to a pytree of float32 means over its episodes.
+      function: maps arrays to a pytree of float32 means over its episodes.
       in_specs: sharding of each argument, a pytree prefix as for `jax.shard_map`.
     """
     mesh = jax.sharding.get_abstract_mesh()

@@ -139,7 +139,7 @@ class GoalRange(NamedTuple):
 
     Attributes:
       goals: the goal categories.
-      max_distance: from the goal to the nearest standable cell, metres.
+      max_distance: largest distance in metres from the goal to the nearest standable cell.
       to_footprint: True if the distance is to the nearest point of the object, False if it is to its centre.
     """
 

@@ -248,7 +248,7 @@ def _smallest_receptacle(
 
     Args:
       object_row: the object.
-      object_index: its index.
+      object_index: index of the object.
       index_by_id: index of each object.
       box_volumes: volumes of the objects' boxes.
     """

@@ -59,7 +59,7 @@ class SceneEpisodes(NamedTuple):
       record: the whole file; its errors name file and scene.
       name: name of the scene, for example `Collierville`.
       mesh: name of the scene's file, for example `Collierville.glb`.
-      episodes: at least one.
+      episodes: one or more episodes.
     """
 
     record: JsonRecord
