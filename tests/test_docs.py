@@ -138,7 +138,7 @@ def page_modules(tmp_path, monkeypatch):
     """A folder with the modules of the page on methods, in the path; returns the code that follows them."""
     blocks = BLOCK.findall((DOCS / "add_a_method.md").read_text())
     module_blocks = {name[1]: block for block in blocks if (name := re.match(r"# (\w+)\.py\n", block))}
-    assert sorted(module_blocks) == ["judged", "sectors"]
+    assert sorted(module_blocks) == ["judged", "sectors", "shortest"]
     for name, block in module_blocks.items():
         (tmp_path / f"{name}.py").write_text(block)
     monkeypatch.syspath_prepend(tmp_path)
@@ -151,12 +151,12 @@ def page_modules(tmp_path, monkeypatch):
 def test_methods_of_add_a_method_are_found(page_modules):
     sectored_method, judged_method = find_method("sectors:SECTORED"), find_method("judged:JUDGED")
     assert (sectored_method.control.num_choices, judged_method.adaptation is None) == (4, False)
-    assert 'check_method("sectors:SECTORED")' in page_modules
-    assert 'check_method("judged:JUDGED")' in page_modules
+    assert find_method("shortest:SHORTEST").tracker is None
+    assert all(name in page_modules for name in ("shortest:SHORTEST", "sectors:SECTORED", "judged:JUDGED"))
 
 
 @pytest.mark.parametrize("decision", ["fused", "streams"])
-@pytest.mark.parametrize("name", ["sectors:SECTORED", "judged:JUDGED"])
+@pytest.mark.parametrize("name", ["shortest:SHORTEST", "sectors:SECTORED", "judged:JUDGED"])
 def test_methods_of_add_a_method_decide_fused_and_in_streams(page_modules, name, decision):
     """Shapes alone: nothing is computed."""
     spec = dataclasses.replace(tiny.SPEC, method=find_method(name), method_sizes=(), decision=decision)
