@@ -25,10 +25,12 @@ COMMANDS = {
 
 HELP = "usage: jaxnav COMMAND [OPTIONS]\n\n" + "".join(f"  {name:11} {summary}\n" for name, summary in COMMANDS.items())
 NOTES = """
-jaxnav COMMAND --help prints the options of a command; jaxnav --version prints the version.
+jaxnav COMMAND --help prints the options of a command.
+jaxnav --version prints the version.
 
-Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. Set JAX_COMPILATION_CACHE_DIR to
-use another folder, or JAX_ENABLE_COMPILATION_CACHE=0 to keep none."""
+Compiled programs are kept in ~/.cache/jaxnav/xla for the next command. Set
+JAX_COMPILATION_CACHE_DIR to use another folder, or
+JAX_ENABLE_COMPILATION_CACHE=0 to keep none."""
 
 #: Commands of earlier versions, with what replaces them.
 _FORMER_COMMANDS = {

@@ -16,12 +16,15 @@ Shell = Literal["bash", "zsh", "fish"]
 
 DESCRIPTION = """Print a script that completes commands and options of jaxnav in your shell.
 
-  bash:  jaxnav completion bash > ~/.local/share/bash-completion/completions/jaxnav
-  zsh:   jaxnav completion zsh > ~/.zfunc/_jaxnav    (a folder of your fpath)
-  fish:  jaxnav completion fish > ~/.config/fish/completions/jaxnav.fish
+  bash:  jaxnav completion bash > DIR/jaxnav
+         in DIR = ~/.local/share/bash-completion/completions
+  zsh:   jaxnav completion zsh > DIR/_jaxnav
+         in a folder DIR of your fpath
+  fish:  jaxnav completion fish > DIR/jaxnav.fish
+         in DIR = ~/.config/fish/completions
 
 Create the folder first if it is missing, and start a new shell afterwards. \
-Completion does not start jaxnav; it needs python3. Print the script again after an update of jaxnav."""
+Completion needs python3, but does not start jaxnav. Print the script again after an update of jaxnav."""
 
 #: Bash completes file names where the script of tyro has nothing to complete.
 _BASH_FALLBACK = """

@@ -17,8 +17,10 @@ import difflib
 import functools
 import inspect
 import io
+import operator
 import os
 import re
+import shlex
 import shutil
 import signal
 import sys
@@ -177,10 +179,10 @@ def print_table(console: Console, table: Table, num_key_columns: int = 1) -> Non
         full_widths.append(max([header.maximum, *cell_widths]))
         narrow_widths.append(max([header.minimum, *cell_widths]))
 
-    # Names of rows may wrap where they would take more than half of the console.
-    key_widths = {}
-    for index in range(num_key_columns):
-        key_widths[index] = min(full_widths[index], max(_MIN_WIDTH // 2, console.width // 2))
+    # Names of rows may wrap where the key columns would take more than half of the console.
+    key_widths = dict(enumerate(full_widths[:num_key_columns]))
+    name_width = console.width // 2 - sum(full_widths[1:num_key_columns])
+    key_widths[0] = min(full_widths[0], max(_MIN_WIDTH // 2, name_width))
 
     # Add columns to a part of the table for as long as they fit.
     parts = [dict(key_widths)]
@@ -274,13 +276,22 @@ def escape_parser_output(arguments: Sequence[str]) -> Iterator[None]:
         for buffer in buffers:
             buffer.seek(0)
         help_text, error_text = (escape_control_chars(buffer.read(), keep="\n") for buffer in buffers)
-        streams[0].write(help_text)
+        streams[0].write(_wrap_long_lines(help_text))
         streams[1].write(_unbox_error(error_text))
 
 
 def _help_width() -> int:
     """Width of a help text: that of the terminal, within limits."""
     return min(max(_MIN_WIDTH, shutil.get_terminal_size().columns), _MAX_HELP_WIDTH)
+
+
+def _wrap_long_lines(text: str) -> str:
+    """Wrap usage and description of a help text, which tyro prints in one line each; boxes have the right width."""
+    lines = []
+    for line in text.splitlines():
+        is_long = len(line) > _help_width() and not line.startswith(" ")
+        lines += textwrap.wrap(line, _help_width(), break_on_hyphens=False) if is_long else [line]
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _unbox_error(text: str) -> str:
@@ -314,6 +325,7 @@ def parse_config(
     description: str,
     check: Callable[[Config], Config] = lambda config: config,
     configs: Mapping[str, Path] = CONFIGS,
+    is_positional: bool = False,
     complete_help: Callable[[Config, Sequence[str]], Config] = lambda config, arguments: config,
 ) -> Config:
     """Return the settings of a command that has the option `--config`.
@@ -327,6 +339,7 @@ def parse_config(
       description: of the command, for its help.
       check: validates the settings, and may complete them.
       configs: packaged configurations by name.
+      is_positional: True where the configuration is the first argument instead of the option `--config`.
       complete_help: returns the settings whose values the help shows as defaults, from those of the configuration and
         the command line.
 
@@ -336,6 +349,8 @@ def parse_config(
     """
     # The configuration file sets the defaults, so read it before the options are parsed.
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if is_positional and words and not words[0].startswith("-"):
+        words = ["--config", *words]
     config_parser = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
     config_parser.add_argument("--config")
     namespace, other_words = config_parser.parse_known_args(words)
@@ -344,24 +359,33 @@ def parse_config(
 
     if any(option in other_words for option in HELP_OPTIONS):
         default = complete_help(default, other_words)
-    options_class = make_options_class(type(default), configs)
+    options_class = make_options_class(type(default), configs, is_positional)
     options = parse_arguments(
         options_class, other_words, prog, description, default=options_class(namespace.config, default)
     )
+    if options.config != namespace.config:
+        raise InputError(f"{options.config}: unexpected argument; {prog} --help lists all options")
     try:
         return check(options.settings)
     except InputError as error:
         raise InputError(f"{namespace.config}: {error}" if namespace.config else str(error)) from error
 
 
-def make_options_class(settings_type: type, configs: Mapping[str, Path] = CONFIGS) -> type:
-    """Return a dataclass with the fields `config` and `settings`, whose options are `--config` and those of a type."""
-    config_option = tyro.conf.arg(
-        metavar="NAME|FILE.yaml",
-        help=f"configuration that replaces the defaults: a packaged configuration ({', '.join(configs)}) or a YAML "
-        "file. Other options override it.",
-    )
-    config_field = ("config", Annotated[str | None, config_option], None)
+def make_options_class(settings_type: type, configs: Mapping[str, Path] = CONFIGS, is_positional: bool = False) -> type:
+    """Return a dataclass with the fields `config` and `settings`, for a configuration and the options of a type.
+
+    Args:
+      settings_type: dataclass of the settings.
+      configs: packaged configurations by name.
+      is_positional: True where the configuration is the first argument instead of the option `--config`.
+    """
+    purpose = "experiment to run" if is_positional else "configuration that replaces the defaults"
+    text = f"{purpose}: {', '.join(configs)}, or a YAML file. Options override its settings."
+    config_option = tyro.conf.arg(metavar="NAME|FILE.yaml", help=text)
+    annotation = Annotated[str | None, config_option]
+    if is_positional:
+        annotation = Annotated[annotation, tyro.conf.Positional]
+    config_field = ("config", annotation, None)
     settings_field = ("settings", Annotated[settings_type, tyro.conf.arg(name="")], settings_type())
     return dataclasses.make_dataclass("Options", [config_field, settings_field])
 
@@ -384,17 +408,12 @@ def parse_arguments(
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     _refuse_renamed(words)
-    # Lines of a description wrap, but for indented ones, which are examples.
-    lines = []
-    for line in description.splitlines():
-        is_example = line.startswith(" ") or not line
-        lines.append(line if is_example else textwrap.fill(line, _help_width()))
     with escape_parser_output(words):
         config, unknown_words = tyro.cli(
             kind,
             args=words,
             prog=prog,
-            description="\n".join(lines),
+            description=description,
             return_unknown_args=True,
             registry=REGISTRY,
             **options,
@@ -526,7 +545,10 @@ def _read_attribute_docs(kind: type) -> dict[str, str]:
 
 def _format_default(label: str) -> str:
     """Format the default of an option in its help; a missing default is described in words."""
-    return "" if label in ("", "None") else f"(default: {label})"
+    # A single value needs no quotes to be read.
+    words = shlex.split(label)
+    label = words[0] if len(words) == 1 else label
+    return "" if label in ("", "None", "{}") else f"(default: {label})"
 
 
 @REGISTRY.primitive_rule
@@ -537,7 +559,7 @@ def _parse_optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | 
     members = [member for member in typing.get_args(info.type) if member is not type(None)]
     if len(members) == len(typing.get_args(info.type)):
         return None
-    value_type = functools.reduce(lambda left, right: left | right, members)
+    value_type = functools.reduce(operator.or_, members)
     spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(value_type, info.markers))
     if not isinstance(spec, PrimitiveConstructorSpec):
         return None

@@ -4,16 +4,14 @@ import sys
 
 from rich.console import Console
 
-from jaxnav.cli.console import escape_control_chars, make_options_class, parse_config, run_command
+from jaxnav.cli.console import escape_control_chars, parse_config, run_command
 from jaxnav.errors import InputError
 from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig
 
-Options = make_options_class(ExperimentConfig, EXPERIMENTS)
 DESCRIPTION = (
-    "Run an experiment: train and measure everything that has no results yet, and write its pages.\n\n"
-    f"NAME is {', '.join(EXPERIMENTS)}, or a YAML file. The experiments account, mixture, handover and instrument "
-    "measure a finished run: give --run RUN and, for layout-blind agents, --reference RUN. With a NAME, the help shows "
-    "the settings of that experiment."
+    "Run an experiment: train and measure everything that has no results yet, and write its pages. The experiments "
+    "account, mixture, handover and instrument measure a finished run: give --run RUN and, for layout-blind agents, "
+    "--reference RUN. The help shows the settings of the experiment that you give with it: jaxnav study table2 --help."
 )
 
 
@@ -45,9 +43,7 @@ def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> Expe
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words:
         raise InputError(f"give an experiment: {', '.join(EXPERIMENTS)}, or a YAML file")
-    if not words[0].startswith("-"):
-        words = ["--config", *words]
-    return parse_config(ExperimentConfig(), words, f"{prog} NAME", DESCRIPTION, _check, EXPERIMENTS)
+    return parse_config(ExperimentConfig(), words, prog, DESCRIPTION, _check, EXPERIMENTS, is_positional=True)
 
 
 def _check(config: ExperimentConfig) -> ExperimentConfig:

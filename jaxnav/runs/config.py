@@ -316,7 +316,7 @@ def fill_world_defaults(config: RunConfig) -> RunConfig:
         "num_val": world.counts["val"],
         "num_test": world.counts["test"],
         "categories": task.categories,
-        "goals": task.goals,
+        "goals": task.goals or task.categories,
         "train_step_limit": world.train_step_limit,
         "step_limit": world.step_limit,
         "large_step_limit": world.large_step_limit,

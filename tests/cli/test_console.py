@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import jax
 import pytest
+from rich.table import Table
 from support.commands import contents
 
 from jaxnav.cli import console
-from jaxnav.cli.console import run_command
+from jaxnav.cli.console import PlainConsole, make_result_console, print_table, run_command
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
 
@@ -96,3 +97,45 @@ def test_jax_reports_compilations_to_listeners(monkeypatch):
     console._trim_memory_after_compiling.__wrapped__()
     jax.jit(lambda x: x * 3 + 1)(2)
     assert set(trim_calls) == {0}
+
+
+# Tables
+
+
+def make_wide_table():
+    """A table that needs 122 columns."""
+    table = Table("Variant", "SR (%)", "SPL (%)", "DTS (m)", "SR within 20, 50 (%)", "Wrong Done (%)")
+    table.add_section()
+    table.add_row("rooms val, argmax decoding", style="bold")
+    table.add_row(
+        "+ w + sTDE (eps=0.5), switch", "62.4 [60.1, 64.7]", "22.1 [20.0, 24.2]", "1.23 [1.10, 1.36]", "20, 45", "3"
+    )
+    return table
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 200])
+def test_print_table_fits_the_console_and_breaks_no_cell(width, capsys):
+    print_table(PlainConsole(width=width), make_wide_table())
+    output = capsys.readouterr().out
+    assert max(map(len, output.splitlines())) <= width
+    for cell in ("62.4 [60.1, 64.7]", "22.1 [20.0, 24.2]", "1.23 [1.10, 1.36]", "20, 45", "Variant", "Wrong"):
+        assert cell in output
+    # Each part of the table names its rows.
+    num_parts = output.count("Variant")
+    assert output.count("+ w + sTDE") == num_parts
+    assert (num_parts == 1) == (width >= 200)
+
+
+def test_print_table_repeats_all_key_columns(capsys):
+    print_table(PlainConsole(width=72), make_wide_table(), num_key_columns=2)
+    output = capsys.readouterr().out
+    assert output.count("62.4 [60.1, 64.7]") == output.count("Variant") > 1
+
+
+def test_result_console_does_not_wrap_in_a_pipe(monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    make_result_console().print(100 * "word ")
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    monkeypatch.setenv("COLUMNS", "3")
+    make_result_console().print(100 * "word ")
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 40

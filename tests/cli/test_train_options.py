@@ -94,8 +94,8 @@ def test_command_help_lists_the_packaged_configurations(capsys, command, first_n
         main([command, "--help"])
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
     assert text.startswith(f"usage: jaxnav {command} ")
-    assert "--config NAME|FILE.yaml " in text
-    assert f"({first_name}, " in text
+    assert "NAME|FILE.yaml " in text
+    assert f": {first_name}, " in text
 
 
 @pytest.mark.parametrize(
