@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import shutil
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ def run_dir(tmp_path_factory):
 NUM_ROWS = 2 * (2 + 1 + 2) + 2
 NUM_EPISODES = 20  # 18, rounded up to a multiple of the four room types
 OPTIONS = ("--episodes", 18, "--epsilon", 0, 0.5)
+DATA = Path(__file__).parents[1] / "data"
 
 #: What the evaluation below prints.
 PRINTED_TABLE = io.StringIO()
@@ -292,3 +294,61 @@ def test_eval_refuses_an_export_of_another_task(run_dir, tmp_path, capsys):
         config["detector"]["false_alarm"] = 0.25
     assert evaluate(copied_run) == 2
     assert "its task differs from that of its run" in refusal(capsys)
+
+
+# Finished evaluations
+
+
+@pytest.fixture
+def finished_report(tmp_path):
+    """The JSON file of an evaluation."""
+    with tarfile.open(DATA / "run_of_version_0_2.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    (path,) = tmp_path.rglob("eval-val.json")
+    return path
+
+
+def test_eval_prints_a_finished_evaluation_in_each_format(finished_report, monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    files_before = contents(finished_report.parent)
+    assert evaluate(finished_report) == 0
+    table = capsys.readouterr().out
+    assert "Difference, paired on episodes" in table
+    for note in read_report(finished_report)["notes"]:
+        assert note in table
+
+    assert evaluate(finished_report, "--format", "markdown") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("| Variant | SR (%) |")
+    assert all(line.startswith("|") or not line.count("|") for line in lines)
+
+    assert evaluate(finished_report, "--format", "json") == 0
+    assert json.loads(capsys.readouterr().out) == read_report(finished_report)
+    assert contents(finished_report.parent) == files_before
+
+
+def test_eval_table_fits_a_narrow_terminal(finished_report, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert evaluate(finished_report) == 0
+    table_lines = [line for line in capsys.readouterr().out.splitlines() if line[:1] in "│┃"]
+    assert max(map(len, table_lines)) <= 80
+    row = read_report(finished_report)["rows"][0]
+    assert any(f"{row['sr']['mean']:.1f}" in line for line in table_lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [(None, "no evaluation can be read"), ("{", "no evaluation can be read"), ('{"rows": []}', "is not an evaluation")],
+)
+def test_eval_refuses_a_file_that_is_no_evaluation(text, problem, tmp_path, capsys):
+    path = tmp_path / "a.json"
+    if text is not None:
+        path.write_text(text)
+    assert evaluate(path) == 2
+    assert_message_names(refusal(capsys), f"{path}: ", problem, "jaxnav eval")
+
+
+@pytest.mark.parametrize("options", [("--epsilon", 0.1), ("--hold",), ("--split", "test")])
+def test_eval_refuses_options_of_a_run_for_a_finished_evaluation(options, finished_report, capsys):
+    assert evaluate(finished_report, *options) == 2
+    assert refusal(capsys).startswith(f"error: {options[0]}: ")
