@@ -414,7 +414,7 @@ def test_removal_keeps_value_and_recovers_cost(tmp_path):
     assert value == ["+6.0 [-]"] * 3 + ["-4.0 [-]"] * 3
 
     # Weights, then changes at both shifts and over the mixture, then value kept and cost recovered.
-    weights, *cells = read_lines(text.split("### Removal from")[1])["TDE"]
+    weights, *cells = read_lines(text.split("### Every removal")[1])["TDE"]
     assert weights == "1.00, 1.00"
     assert cells[:6] == ["-4.0 [-]"] * 3 + ["+3.0 [-]"] * 3
     assert cells[6:9] == ["-"] * 3  # there is no row over the mixture
