@@ -1,4 +1,4 @@
-"""Draw a kitchen of your own, and let the packaged policy look for the Toaster in it.
+"""Draw your own kitchen, and let the packaged policy search for the Toaster in it.
 
 The script prints the policy's path on the drawing, and the length of a shortest path.
 
@@ -17,7 +17,7 @@ from jaxnav.scenes.scene import CELL_SIZE, Scene
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import ACTIONS, DONE, ROOMS
 
-#: A mark is a quarter of a metre; # is wall, . is floor, @ the start, all other marks are furniture.
+#: A mark is a quarter of a metre; # is wall, . is floor, @ the start, all the rest is furniture.
 DRAWING = """
 ####################
 #FF.............CC.#

@@ -1,4 +1,4 @@
-"""Run the layout estimator on detections of your own: three views of a kitchen, then one that does not fit.
+"""Run the layout estimator on your own detections: three views of a kitchen, then one that does not fit.
 
 python examples/own_detections.py
 """
@@ -22,8 +22,8 @@ for view in VIEWS:
     presence = jnp.array([name in view for name in NAMES])
     belief = estimator.update(belief, presence)
 
-    # The weights say beside which categories the goal is expected.
+    # The weights state next to which categories the goal is expected.
     weights = np.asarray(LayoutEstimator.goal_weights(belief, goal_index))
     weight_texts = [f"{name} {weight:.2f}" for name, weight in zip(NAMES, weights, strict=True) if name != GOAL]
     visible = " and ".join(sorted(view))
-    print(f"{visible:18} gap {float(belief.gap):.2f}   the {GOAL} is expected beside: {', '.join(weight_texts)}")
+    print(f"{visible:18} gap {float(belief.gap):.2f}   the {GOAL} is expected next to: {', '.join(weight_texts)}")
