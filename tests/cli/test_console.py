@@ -9,8 +9,10 @@ import pytest
 from rich.table import Table
 from support.commands import contents
 
+from jaxnav.__main__ import main
 from jaxnav.cli import console
 from jaxnav.cli.console import PlainConsole, make_result_console, print_table, run_command
+from jaxnav.errors import InputError
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
 
@@ -139,3 +141,34 @@ def test_result_console_does_not_wrap_in_a_pipe(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "3")
     make_result_console().print(100 * "word ")
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 40
+
+
+# Commands that compile
+
+
+@pytest.mark.parametrize(
+    ("words", "function"),
+    [
+        (["train"], "runs.train.train"),
+        (["eval", "RUN"], "runs.evaluate.evaluate"),
+        (["sweep", "rooms-org"], "runs.evaluate.sweep_shifts"),
+        (["study", "account"], "experiments.driver.run_experiment"),
+        (["report", "RUN"], "runs.run.Run.open"),
+        (["episode", "RUN"], "viz.episode.play_episode"),
+        (["export", "RUN"], "runs.export.export_policy_of_run"),
+        (["scenes", "stats", "rooms"], "evaluation.scene_statistics.compute_scene_statistics"),
+    ],
+)
+def test_commands_keep_compiled_programs_when_their_work_begins(words, function, home, monkeypatch, capsys):
+    cache_folders = []
+
+    def stop(*_, **__):
+        cache_folders.append(jax.config.values["jax_compilation_cache_dir"])
+        raise InputError("this is as far as the test goes")
+
+    monkeypatch.chdir(home)
+    monkeypatch.setattr("jaxnav.experiments.driver.check_measurements", lambda config: config)
+    monkeypatch.setattr(f"jaxnav.{function}", stop)
+    assert main(words) == 2
+    assert "this is as far as the test goes" in capsys.readouterr().err
+    assert cache_folders == [str(home / ".cache" / "jaxnav" / "xla")]
