@@ -199,11 +199,11 @@ def table_line(*cells: Any) -> str:
     return f"| {' | '.join(words)} |"
 
 
-def table_header(*titles: Any) -> str:
-    """Make the two lines above a Markdown table; all columns but the first are right-aligned."""
+def table_header(*titles: Any, text_columns: int = 1) -> str:
+    """Make the two lines above a Markdown table; all columns but the first `text_columns` are right-aligned."""
     title_line = table_line(*titles)
     num_columns = title_line.count(" | ") + 1
-    return f"{title_line}\n| {' | '.join(['---'] + ['---:'] * (num_columns - 1))} |"
+    return f"{title_line}\n| {' | '.join(['---'] * text_columns + ['---:'] * (num_columns - text_columns))} |"
 
 
 def verdict(effect: Interval, min_effect: float) -> str:
