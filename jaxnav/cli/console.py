@@ -336,7 +336,7 @@ def parse_config(
       default: settings without any option.
       arguments: the options; None for those of the process.
       prog: name of the command in its help.
-      description: of the command, for its help.
+      description: description of the command in its help.
       check: validates the settings, and may complete them.
       configs: packaged configurations by name.
       is_positional: True where the configuration is the first argument instead of the option `--config`.
@@ -399,7 +399,7 @@ def parse_arguments(
       kind: dataclass of the settings.
       arguments: the options; None for those of the process.
       prog: name of the command in its help.
-      description: of the command, for its help.
+      description: description of the command in its help.
       options: further options of `tyro.cli`.
 
     Raises:
