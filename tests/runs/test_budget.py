@@ -37,7 +37,7 @@ def test_imitation_stage_counts_towards_the_step_budget():
     assert (last.stage_by_chunk, last.steps_by_purpose) == ([0, 0, 0, 0, 0, 0, 0, 0, 1, 1], CONFIG.steps_by_purpose)
     assert dataclasses.replace(last, imitation=0.5).stage_by_chunk == 5 * [0] + 5 * [1]
     assert plain.steps_by_purpose == {"exploration": 600, "imitation": 0, "learning": 12800}
-    budget = "600 of exploration for the layout priors, 2,560 of imitation, 10,240 of learning."
+    budget = "600 of random exploration for the layout priors, 2,560 of imitation learning, 10,240 of reinforcement"
     assert budget in budget_note(CONFIG.steps_by_purpose)
 
 
