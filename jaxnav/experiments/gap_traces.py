@@ -2,7 +2,7 @@
 
 `measure_gaps` evaluates a run of an experiment at every layout shift. `trace_gaps` walks episodes with the policies of
 a run while several estimators observe. `mean_by_step` and `auc_by_step` summarize the traces: the mean gap, and how
-well the gap tells shifted from unshifted episodes.
+well the gap separates shifted from unshifted episodes.
 """
 
 import functools

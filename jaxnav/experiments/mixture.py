@@ -4,8 +4,8 @@ Half of the episodes are in scenes with the training layout, half in shifted sce
 is worth its gain over the whole mixture. A gap is worth its gain over controls: the gap of another episode of the
 mixture, the mean gap of all episodes at the same time, and clocks.
 
-`measure_mixture` evaluates the removals of a run and their controls, `measure_handover` those that hand over to agents
-without experience. `PopulationMetrics` compares outcomes, at each shift and over the mixture.
+`measure_mixture` evaluates the removals of a run and their controls, `measure_handover` those that hand over to
+layout-blind agents. `PopulationMetrics` compares outcomes, at each shift and over the mixture.
 """
 
 import dataclasses

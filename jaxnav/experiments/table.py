@@ -272,7 +272,7 @@ def write_part(path: Path, settings: Mapping[str, Any], rows: Iterable[ResultRow
         if isinstance(row.value, Curve) or not math.isnan(row.value.mean):
             row_lines.append(row.to_json())
 
-    # Fields that all rows share are written once. They are compared as text, which tells -0 from 0.
+    # Fields that all rows share are written once. They are compared as text, which distinguishes -0 from 0.
     shared = dict(row_lines[0]) if len(row_lines) > 1 else {}
     for line in row_lines:
         shared = {name: value for name, value in shared.items() if str(line.get(name)) == str(value)}

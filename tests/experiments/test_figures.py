@@ -170,7 +170,7 @@ def test_the_gap_figure_has_a_panel_by_estimator():
         for index, curve in enumerate(GAP_LINES.values()):
             assert_curve(axes, index, curve)
 
-        # A marker tells the shift, a dash the belief.
+        # The marker stands for the shift, the dash for the belief.
         lines = [line for line in axes.get_lines() if line.get_marker() != "None"]
         assert [line.get_linestyle() for line in lines] == ["-", "--", "-", "--"]
         assert lines[0].get_marker() == lines[1].get_marker() != lines[2].get_marker() == lines[3].get_marker()
@@ -195,7 +195,7 @@ def test_the_effects_figure_fills_markers_whose_interval_excludes_zero():
     markers = [line for axes in (first, second) for line in axes.get_lines()[1:]]
     assert [marker.get_markerfacecolor() != "white" for marker in markers] == [True, False, True]
 
-    # The first effect is at the top, with its numbers beside it.
+    # The first effect is at the top, with its numbers next to it.
     assert [text.get_text() for text in first.get_yticklabels()] == ["+ w", "sTDE"]
     assert first.yaxis_inverted()
     assert first.texts[0].get_text() == "+3.0 [+2.0, +4.0]"

@@ -1,4 +1,4 @@
-"""Removal in a mixed population: what is compared with what."""
+"""Removal in a mixed population: its comparisons, and their intervals."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +68,7 @@ POPULATION = PopulationMetrics(population_episodes(), SHIFT, (15, 30))
 #: Without experience half of the goals are found. With it three of four where the layout holds, and else one of four.
 LAYOUT_BLIND_OUTCOME = make_outcome((0.5, 0.5))
 AGENT = make_outcome((0.75, 0.25))
-#: Hard removal makes the agent as good as one without experience.
+#: Hard removal makes the agent as good as a layout-blind one.
 HARD = make_outcome((0.5, 0.5), weight=1.0)
 
 
@@ -156,7 +156,7 @@ def bench(make_bench, drawn_run):
 
 @pytest.mark.slow
 def test_mixture_measures_every_removal_at_both_shifts(bench):
-    rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each estimator is compiled anew
+    rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each estimator compiles again
     table = ResultTable(measure_mixture(bench, bench.find_run("rooms", "main"), "sample", rules))
     row_fields = {"world": "rooms", "run": "main", "decoding": "sample"}
     assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
