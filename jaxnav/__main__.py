@@ -47,6 +47,11 @@ _BROKEN_PIPE = 141
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command named by the first argument and return its exit code; 2 for an unknown command."""
+    # A stream that was closed, as by `>&-`, is None; then read nothing and print nowhere.
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115  (open until the process ends)
+
     try:
         try:
             return _dispatch(arguments)

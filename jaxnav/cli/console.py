@@ -309,7 +309,7 @@ def _unbox_error(text: str) -> str:
         message_lines.append(content)
 
     # Missing arguments are listed as name and description, in turn.
-    missing_in = re.fullmatch("Missing from (.+):", message_lines[0])
+    missing_in = message_lines and re.fullmatch("Missing from (.+):", message_lines[0])
     if missing_in:
         return f"error: {', '.join(message_lines[1::2])}: missing; {missing_in[1]} --help describes the arguments\n"
     return f"error: {' '.join(message_lines).removeprefix('Error parsing ')}\n"

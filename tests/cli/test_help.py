@@ -156,3 +156,18 @@ def test_scripts_of_the_repository_have_the_help_of_their_command(capsys, monkey
         command = [sys.executable, str(root / f"{script}.py"), "--help"]
         output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         assert output.startswith(f"usage: {script}.py ")
+
+
+# Closed streams
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell")
+@pytest.mark.parametrize(
+    ("words", "exit_code"),
+    [("--help >&-", 0), ("log --help >&-", 0), ("log --help 2>&-", 0), ("log 2>&-", 2), ("play <&-", 2)],
+)
+def test_commands_end_quietly_where_a_stream_is_closed(words, exit_code):
+    command = f"{sys.executable} -m jaxnav {words}"
+    process = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)
+    assert process.returncode == exit_code
+    assert "Traceback" not in process.stderr
