@@ -25,7 +25,11 @@ Config = TypeVar("Config", bound=Any)
 CONFIGS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))}
 
 #: Settings that were renamed: old name to new name.
-RENAMED_SETTINGS = {"sizes.relation_layers": "method_sizes.relation_layers"}
+RENAMED_SETTINGS = {
+    "sizes.relation_layers": "method_sizes.relation_layers",
+    "unaware": "reference",
+    "without": "reference",
+}
 
 
 def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] = CONFIGS) -> Config:
@@ -131,7 +135,7 @@ def _check_key(name: Any, key: str, field_names: list[str], path: Path, prefix: 
     """Refuse a key that is no field, and name the most likely one."""
     for old_name, new_name in RENAMED_SETTINGS.items():
         if f".{key}".endswith(f".{old_name}"):
-            raise InputError(f"{path}: unknown key {key}; it is {new_name} now")
+            raise InputError(f"{path}: key {key} was renamed; use {new_name}")
     # A key that was never known is probably a slip.
     if name not in field_names:
         close_names = difflib.get_close_matches(str(name), field_names, n=1)

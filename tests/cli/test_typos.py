@@ -77,3 +77,10 @@ def test_bad_values_are_refused_in_one_line(words, parts, capsys):
 )
 def test_former_commands_and_options_name_their_replacement(words, replacement, capsys):
     assert replacement in read_error(capsys, *words)
+
+
+@pytest.mark.parametrize("key", ["unaware", "without"])
+def test_former_keys_of_an_experiment_name_their_replacement(key, tmp_path, capsys):
+    path = tmp_path / "experiment.yaml"
+    path.write_text(f"{key}: anonymous")
+    assert f"{key} was renamed; use reference" in read_error(capsys, "study", str(path))
