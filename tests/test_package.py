@@ -1,4 +1,4 @@
-"""What a newcomer meets first: the package's names, the commands, and the examples of the README."""
+"""First contact: the package's names, the commands, the README's example, and the shortest method of the docs."""
 
 import ast
 import dataclasses
@@ -29,8 +29,8 @@ ROOT = Path(__file__).parent.parent
 INIT = (ROOT / "jaxnav" / "__init__.py").read_text()
 README = (ROOT / "README.md").read_text()
 README_EXAMPLE, *_ = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-METHOD_SECTION = re.split(r"^## ", README.partition("\n## A method of your own\n")[2], flags=re.MULTILINE)[0]
-(README_METHOD,) = re.findall(r"```python\n(.*?)```", METHOD_SECTION, re.DOTALL)
+METHOD_SECTION = (ROOT / "docs" / "add_a_method.md").read_text().partition("\n## ")[0]
+(SHORTEST_METHOD,) = re.findall(r"```python\n(.*?)```", METHOD_SECTION, re.DOTALL)
 
 
 def test_package_shows_only_its_public_names():
@@ -94,21 +94,21 @@ def test_readme_example_runs(capsys):
     assert capsys.readouterr().out
 
 
-# The method of the README
+# The shortest method
 
 
 @pytest.fixture
 def method_folder(tmp_path):
-    """A folder with the README's module, and nothing else."""
+    """A folder with the page's module, and nothing else."""
     (tmp_path / "module").mkdir()
-    (tmp_path / "module" / "my_method.py").write_text(README_METHOD)
+    (tmp_path / "module" / "shortest.py").write_text(SHORTEST_METHOD)
     return tmp_path / "module"
 
 
 @pytest.mark.slow
-def test_readme_method_passes_ruff_and_pyright(method_folder):
-    assert README_METHOD.count("\n") <= 25
-    method_file, pyright_config = method_folder / "my_method.py", method_folder / "pyrightconfig.json"
+def test_shortest_method_passes_ruff_and_pyright(method_folder):
+    assert SHORTEST_METHOD.count("\n") <= 25
+    method_file, pyright_config = method_folder / "shortest.py", method_folder / "pyrightconfig.json"
     pyright_config.write_text(json.dumps({"include": ["."], "extraPaths": [str(ROOT)], "typeCheckingMode": "standard"}))
     checks = [
         ["ruff", "check", "--no-cache", "--config", ROOT / "pyproject.toml", method_file],
@@ -121,14 +121,14 @@ def test_readme_method_passes_ruff_and_pyright(method_folder):
 
     assert [is_clean(check) for check in checks] == [True] * 3
     method_file.write_text(
-        README_METHOD.replace("MINE = Method(MyExperience)", "MINE = Method( 'MyExperience', undefined)")
+        SHORTEST_METHOD.replace("SHORTEST = Method(Detections)", "SHORTEST = Method( 'Detections', undefined)")
     )
     assert [is_clean(check) for check in checks] == [False] * 3
 
 
-def test_readme_method_makes_experience(method_folder, monkeypatch):
+def test_shortest_method_makes_experience(method_folder, monkeypatch):
     monkeypatch.syspath_prepend(method_folder)
-    spec = dataclasses.replace(tiny.SPEC, method=find_method("my_method:MINE"), method_sizes=())
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("shortest:SHORTEST"), method_sizes=())
     params = jax.jit(init_params, static_argnums=0)(spec, jax.random.key(0))
     observation = Observation(row=jnp.asarray(tiny.BANK.rows[:4]), goal=jnp.zeros(4, jnp.int32))
     pathways = jax.jit(lambda params, weights: bind(spec, params).pathways(PolicyInputs(observation, weights)))
@@ -141,7 +141,7 @@ def test_readme_method_makes_experience(method_folder, monkeypatch):
 
 ACT = """
 import jax, jaxnav
-policy = jaxnav.load_policy("runs/mine/policies/layout-0")
+policy = jaxnav.load_policy("runs/shortest/policies/layout-0")
 env, params = jaxnav.make("rooms", "val")
 observation, state = env.reset(jax.random.key(0), params)
 print(policy.act(observation, policy.init(), heading=0, moved=False)[0])
@@ -149,11 +149,11 @@ print(policy.act(observation, policy.init(), heading=0, moved=False)[0])
 
 
 @pytest.mark.slow
-def test_readme_commands_train_and_evaluate_the_method(method_folder, tmp_path):
+def test_commands_of_the_page_train_and_evaluate_the_method(method_folder, tmp_path):
     run_dir = tmp_path / "run"
 
     def run(*arguments, cwd=method_folder):
-        arguments = [str(argument).replace("runs/mine", str(run_dir)) for argument in arguments]
+        arguments = [str(argument).replace("runs/shortest", str(run_dir)) for argument in arguments]
         environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
         environment.pop("PYTHONPATH", None)
         return subprocess.run(arguments, cwd=cwd, env=environment, capture_output=True, text=True)
@@ -179,5 +179,5 @@ def test_readme_commands_train_and_evaluate_the_method(method_folder, tmp_path):
     completed = run(*evaluate_command, cwd=ROOT)  # where the module is not
     assert completed.returncode == 2
     assert completed.stderr.count("\n") == 1
-    assert "my_method:MINE" in completed.stderr
+    assert "shortest:SHORTEST" in completed.stderr
     assert "ModuleNotFoundError" in completed.stderr
