@@ -11,7 +11,7 @@ COMMANDS = {
     "train": "train policies of a method, without and with layout weights",
     "eval": "evaluate a run, or print a finished evaluation again",
     "sweep": "evaluate many thresholds of sTDE: a table and a figure",
-    "study": "run an experiment of the paper, or measure what experience is worth",
+    "study": "run an experiment of the paper, or measure the value of experience",
     "report": "show a run on one HTML page: tables, curves and replays",
     "episode": "draw one evaluation episode",
     "play": "search for an object yourself, in the terminal",
