@@ -20,8 +20,8 @@ DOCS = Path(__file__).parent
 INTRODUCTION = """\
 # Commands
 
-Every command with its options, as `jaxnav COMMAND --help` prints them. The [options of `jaxnav train`][train] have their
-own page. [Python calls of the commands](reference_calls.md) lists the call behind each command.
+Every command with its options, as `jaxnav COMMAND --help` prints them. The [options of `jaxnav train`][train] have
+their own page. [Python calls of the commands](reference_calls.md) lists the call behind each command.
 
 [train]: commands_train.md
 """

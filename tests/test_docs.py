@@ -3,10 +3,12 @@
 import ast
 import dataclasses
 import doctest
-import importlib.util
+import importlib
 import re
+import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,16 +68,13 @@ def test_python_block_of_scene_format_writes_a_scene_file(tmp_path, monkeypatch)
 
 
 def load_script(name):
-    """A script of the documentation as a module."""
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    return script
+    """The names of a script of the documentation."""
+    return runpy.run_path(str(DOCS / f"{name}.py"), run_name=name)
 
 
 @pytest.mark.parametrize("name", ["commands.md", "commands_train.md"])
 def test_pages_of_commands_are_up_to_date(name):
-    assert (DOCS / name).read_text() == load_script("write_commands").write_pages()[name], (
+    assert (DOCS / name).read_text() == load_script("write_commands")["write_pages"]()[name], (
         "run: python docs/write_commands.py"
     )
 
@@ -115,7 +114,7 @@ def run_python_blocks(path, containing=""):
     """Execute the Python blocks of a page in order, under the rules of promotion of a user; return their names."""
     blocks = [block for block in BLOCK.findall(path.read_text()) if containing in block]
     assert blocks
-    names = {"__name__": "page"}
+    names: dict[str, Any] = {"__name__": "page"}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         exec(compile("\n".join(blocks), str(path), "exec"), names)
     return names

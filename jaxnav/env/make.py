@@ -38,6 +38,9 @@ def make(
       seed: seed of the generated scenes, and of the layout shift.
       shift: layout shift in [0, 1], the share of the categories that exchange their places.
 
+    Returns:
+      The environment, and its parameters with the compiled scenes.
+
     Raises:
       InputError: unknown world or split, bad scene file, or no scene with a reachable goal.
     """
@@ -82,6 +85,9 @@ def build_environment(
       num_scenes: least number of scenes; a smaller bank repeats its scenes from the first.
       shaping: see `ObjectNav`.
       with_expert: includes the actions of shortest paths, for imitation.
+
+    Returns:
+      The environment, and its parameters with the scenes of the bank.
     """
     # Sizes of the padding, and the scenes with their repetitions, [S].
     poses_per_cell = bank.task.rules.poses_per_cell

@@ -149,6 +149,9 @@ class ObjectNav:
         Args:
           key: PRNG key, consumed.
           params: scenes, limits and rewards.
+
+        Returns:
+          The first observation, row uint8 [R] and goal int32 [], and the state.
         """
         tables = params.tables
         rules = self.task.rules
@@ -251,7 +254,7 @@ class ObjectNav:
         return next_state, reward, terminated, truncated
 
     def observe(self, state: State, params: EnvParams) -> Observation:
-        """Observation of a state."""
+        """Observation of a state: row uint8 [R] and goal int32 []."""
         return Observation(row=params.tables.rows[state.pose], goal=state.goal)
 
     def next_pose(self, pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
@@ -305,12 +308,12 @@ class ObjectNav:
         return NUM_ACTIONS
 
     def observation_space(self, params: EnvParams) -> Dict:
-        """Return the space of observations."""
+        """Return the space of observations: row uint8 [R] and goal below K."""
         row_space = Box(0, 255, (self.row_format.num_bytes,), jnp.uint8)
         return Dict({"row": row_space, "goal": Discrete(len(self.categories))})
 
     def action_space(self, params: EnvParams | None = None) -> Discrete:
-        """Return the space of actions."""
+        """Return the space of actions: whole numbers from 0 to 5."""
         return Discrete(self.num_actions)
 
     @property

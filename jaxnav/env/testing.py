@@ -21,6 +21,13 @@ def check_environment(
     ranges; no episode is terminated and truncated at once; a batch of N equals N single episodes; time restarts after
     an episode ends, and the final state is the one before the reset; observations equal `observe(state)`.
 
+    Args:
+      env: environment to check.
+      params: its parameters.
+      num_envs: number of parallel episodes.
+      num_steps: number of random actions in each.
+      seed: seed of episodes and actions.
+
     Raises:
       AssertionError: a promise is broken.
     """

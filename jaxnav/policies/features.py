@@ -54,6 +54,9 @@ def unpack_features(row: jax.Array, goal: jax.Array, row_format: RowFormat) -> F
       row: uint8 [..., R].
       goal: int [...], index of the category that is sought.
       row_format: format of the rows.
+
+    Returns:
+      The features, leaves [..., K, ...] and view [..., 2 V V].
     """
     # Cells of the view: two flags each, for nothing is known of the remaining ones.
     view_cells = row_format.view_cells(row)

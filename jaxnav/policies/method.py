@@ -70,15 +70,30 @@ class Tracker(Protocol):
     """
 
     def init(self, knowledge: Knowledge, /) -> Tree:
-        """State before the first view."""
+        """Return the state before the first view, leaves without a batch axis."""
         ...
 
     def update(self, state: Tree, knowledge: Knowledge, percept: Percept, /) -> Tree:
-        """State after one step: the next view, and the action that led to it."""
+        """Return the state after one step.
+
+        Args:
+          state: state before the step.
+          knowledge: statistics from before training.
+          percept: the next view of one episode, and the action that led to it.
+        """
         ...
 
     def read(self, state: Tree, knowledge: Knowledge, goal: jax.Array, /) -> Tree:
-        """Input of the network from the tracker (the reading), leaves without a batch axis; rollouts store it."""
+        """Return the reading, the input of the network from the tracker; rollouts store it.
+
+        Args:
+          state: state of one episode.
+          knowledge: statistics from before training.
+          goal: int32 [], the category that is sought.
+
+        Returns:
+          A pytree with leaves without a batch axis.
+        """
         ...
 
 
@@ -154,7 +169,16 @@ class Control(Protocol):
         ...
 
     def act(self, choice: jax.Array, state: Tree, knowledge: Any, /) -> tuple[jax.Array, Tree]:
-        """Action int32 [] of a choice int32 [], and the next tracker state; one episode, callers `vmap`."""
+        """Turn a choice of one episode into an action; callers `vmap`.
+
+        Args:
+          choice: int32 [], index into the logits.
+          state: tracker state.
+          knowledge: statistics from before training.
+
+        Returns:
+          The action int32 [], and the next tracker state.
+        """
         ...
 
 

@@ -94,6 +94,10 @@ def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
 
     Scenes without a reachable goal are skipped and named in `skipped`.
 
+    Args:
+      scenes: scenes in the order of the bank.
+      task: task whose rules and detector apply.
+
     Raises:
       InputError: no scene has a reachable goal.
     """
