@@ -352,16 +352,16 @@ def difference_label(difference: dict[str, Any]) -> str:
 
 
 class ExperienceLead(NamedTuple):
-    """Lead of a row over the agent without experience, in one metric.
+    """Lead of a row over the layout-blind agent, in one metric.
 
     Attributes:
       row_index: index of the row in the evaluation.
       variant: label of the row, as printed in tables.
       decoding: rule that turns logits into actions.
       metric: `sr`, `spl` or `sr@N`.
-      lead: difference to the agent without experience, in percentage points.
-      left: share of the lead without removal that remains with it, in percent; None for rows that remove nothing. For
-        a value of experience it is the share kept; for a cost, 100 minus it is the share recovered.
+      lead: difference to the layout-blind agent, in percentage points.
+      remaining: share of the lead that remains after removal, in percent; None for rows that remove nothing. Of a
+        value of experience, this is the share kept; of a cost, 100 minus this share is recovered.
     """
 
     row_index: int
@@ -369,16 +369,16 @@ class ExperienceLead(NamedTuple):
     decoding: Decoding
     metric: str
     lead: Interval
-    left: Interval | None
+    remaining: Interval | None
 
 
-def remaining_share(unaware: np.ndarray, agent: np.ndarray, removed: np.ndarray, scenes: Clusters) -> Interval:
+def remaining_share(layout_blind: np.ndarray, agent: np.ndarray, removed: np.ndarray, scenes: Clusters) -> Interval:
     """Compute the share of an agent's lead that remains after removal.
 
-    The share is (removed - unaware) / (agent - unaware), of means over the same episodes.
+    The share is (removed - layout_blind) / (agent - layout_blind), of means over the same episodes.
 
     Args:
-      unaware: bool, int or float [S, E], results of the layout-blind agent.
+      layout_blind: bool, int or float [S, E], results of the layout-blind agent.
       agent: [S, E], results of the agent with experience, trained separately.
       removed: [S, E], results of the policies of `agent`, with removal.
       scenes: clusters of the E episodes.
@@ -387,7 +387,7 @@ def remaining_share(unaware: np.ndarray, agent: np.ndarray, removed: np.ndarray,
       The share in percent, with its interval; NaN if the interval of the lead contains 0 or has no bounds.
     """
     # A share of a lead that may be 0 is meaningless.
-    lead = paired_difference(unaware, agent, scenes)
+    lead = paired_difference(layout_blind, agent, scenes)
     if not lead.has_bounds or lead.low <= 0.0 <= lead.high:
         return Interval(float("nan"))
 
@@ -395,7 +395,7 @@ def remaining_share(unaware: np.ndarray, agent: np.ndarray, removed: np.ndarray,
     runs = run_clusters(2, len(agent))
 
     def lead_replicates(results: np.ndarray) -> np.ndarray:
-        signed_results = np.concatenate([-np.asarray(unaware, np.float64), np.asarray(results, np.float64)])
+        signed_results = np.concatenate([-np.asarray(layout_blind, np.float64), np.asarray(results, np.float64)])
         return runs.weights.T @ signed_results @ scenes.weights
 
     return jackknife_interval(100.0 * lead_replicates(removed) / lead_replicates(agent), scenes, runs)
@@ -424,7 +424,7 @@ def _lead_cells(lead_by_metric: Mapping[str, ExperienceLead]) -> list[str]:
     cells = []
     for lead_entry in lead_by_metric.values():
         cells.append(f"{lead_entry.lead:+.1f}")
-    remaining = lead_by_metric["sr"].left
+    remaining = lead_by_metric["sr"].remaining
     return [*cells, "" if remaining is None else f"{remaining:.0f}"]
 
 

@@ -252,8 +252,8 @@ def measure_account(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             fields = row_fields(run, shift, scores.results.rows[lead.row_index])
             fields |= {"reference": layout_blind_run.agent, "scenes": num_scenes(scores.episodes)}
             yield ResultRow(**fields, metric=lead.metric, value=lead.lead)
-            if lead.left is not None:
-                yield ResultRow(**fields, metric=f"{lead.metric} remaining", value=lead.left)
+            if lead.remaining is not None:
+                yield ResultRow(**fields, metric=f"{lead.metric} remaining", value=lead.remaining)
 
 
 def require_layout_blind_run(bench: Bench, run: AgentRun) -> AgentRun:

@@ -591,7 +591,7 @@ def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
         if row.arm is None:
             continue
 
-        # The agent without experience, and the agent with all of its experience, under the same decoding.
+        # The layout-blind agent, and the agent with all of its experience, under the same decoding.
         reference_index = reference.rows.index(EvaluationRow("baseline", None, None, row.decoding))
         agent_index = results.rows.index(EvaluationRow(row.arm, None, None, row.decoding))
         variant_label = row_label(results.report["rows"][index])

@@ -145,7 +145,7 @@ class Policies(NamedTuple):
         """Policies that hand over to fallback policies once experience is removed.
 
         Args:
-          fallback_policies: equally many policies without experience, trained for the same task.
+          fallback_policies: equally many layout-blind policies, trained for the same task.
 
         Returns:
           Policies with parameters {"agent": ..., "without": ...}.

@@ -271,7 +271,7 @@ def test_accounts_agree_with_the_leads_of_two_evaluations(bench, evaluated):
         fields = fields_of(evaluated.rows[lead.row_index]) | {"reference": "other"}
         assert bounds(table.find(fields, metric=lead.metric)) == pytest.approx(bounds(lead.lead), nan_ok=True)
         # Only what removes experience has a share.
-        share = Interval(float("nan")) if lead.left is None else lead.left
+        share = Interval(float("nan")) if lead.remaining is None else lead.remaining
         num_shares += table.has(fields, metric=f"{lead.metric} remaining")
         assert bounds(table.find(fields, metric=f"{lead.metric} remaining")) == pytest.approx(
             bounds(share), nan_ok=True

@@ -1,4 +1,4 @@
-"""Two policies of which one acts: a hand-over leaves the one without experience, as if it had acted all along."""
+"""Two policies of which one acts: a hand-over leaves the layout-blind one, as if it had acted all along."""
 
 import dataclasses
 
@@ -46,12 +46,12 @@ def alike(one, other):
 
 
 @pytest.fixture(scope="module")
-def unaware():
-    """Episodes of the policy without experience, which wears the name of the one arm that is there."""
+def layout_blind():
+    """Episodes of the layout-blind policy, which wears the name of the one arm that is there."""
     return outcome(ALONE, WITHOUT, table_row("layout", None, None, "argmax"))
 
 
-def test_what_removal_leaves_is_the_policy_without_experience_to_the_bit():
+def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
     decider = PAIR.bind_decider(BOTH)
     batch = jnp.arange(8)
     agent = PAIR.start(KEY, len(batch), decider.initial_memory(batch.shape), KNOWLEDGE, PARAMS)
@@ -78,14 +78,14 @@ def test_without_removal_the_policy_with_experience_acts():
     alike(outcome(PAIR, BOTH, row), outcome(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, row))
 
 
-def test_under_tde_the_policy_without_experience_acts(unaware):
-    alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), unaware)
+def test_under_tde_the_layout_blind_policy_acts(layout_blind):
+    alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), layout_blind)
 
 
-def test_handed_over_at_the_first_step_it_is_the_same(unaware):
+def test_handed_over_at_the_first_step_it_is_the_same(layout_blind):
     switch = table_row("stde", 0.5, "switch", "argmax")
     at_once = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=0, gap_end=2**30)
-    alike(at_once, unaware)
+    alike(at_once, layout_blind)
     # Two steps later it is neither of the two, but begins as the one with experience.
     later = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=2**30)
     assert (np.asarray(later.length) != np.asarray(at_once.length)).any()

@@ -34,7 +34,7 @@ def test_account_has_a_lead_per_row_and_metric(evaluated, halved):
 
 @pytest.mark.slow
 def test_account_has_a_share_for_rows_with_removal_alone(evaluated, halved):
-    shares = {entry.variant: entry.left for entry in measure_leads(evaluated, halved) if entry.metric == "sr"}
+    shares = {entry.variant: entry.remaining for entry in measure_leads(evaluated, halved) if entry.metric == "sr"}
     assert shares["ORG (baseline)"] is None
     assert shares["+ w (layout)"] is None
     assert shares["+ w + TDE"] is not None

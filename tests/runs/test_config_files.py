@@ -135,7 +135,8 @@ def test_apply_yaml_names_the_new_name_of_a_renamed_key(tmp_path):
     with pytest.raises(InputError, match=r"key sizes.relation_layers was renamed; use method_sizes.relation_layers$"):
         apply_yaml(RunConfig(), path)
     path.write_text("base: {sizes: {hidden: 8, relation_layers: 2}}")
-    with pytest.raises(InputError, match=r"key base.sizes.relation_layers was renamed; use method_sizes.relation_layers$"):
+    message = r"key base.sizes.relation_layers was renamed; use method_sizes.relation_layers$"
+    with pytest.raises(InputError, match=message):
         apply_yaml(Nested(), path)
     path.write_text("base: {method_sizes: {relation_layers: 2}}")
     assert apply_yaml(Nested(), path).base == RunConfig(method_sizes={"relation_layers": 2})

@@ -68,9 +68,7 @@ BAD_AGENTS = [
 
 
 @pytest.mark.parametrize(("house", "field_name", "remedy"), BAD)
-def test_read_procthor_refuses_bad_houses_naming_field_and_remedy(
-    tmp_path, read_house, house, field_name, remedy
-):
+def test_read_procthor_refuses_bad_houses_naming_field_and_remedy(tmp_path, read_house, house, field_name, remedy):
     error = read_house(house, ASSETS | {"Hall": {"boundingBox": point(6, 2, 6)}})
     assert isinstance(error, InputError)
     assert str(error).startswith(f"{tmp_path / 'house.json'}, line 1: house 'house-0'")
