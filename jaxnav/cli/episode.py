@@ -88,9 +88,11 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
     if config.map:
         # Steps are counted from 1 in the option, from 0 in the trace.
         step = (num_steps if config.step is None else config.step) - 1
-        draw_search(episodes[0], take_snapshot(episodes[0], step), step, path)
+        with console.status("drawing the map"):
+            draw_search(episodes[0], take_snapshot(episodes[0], step), step, path)
     else:
-        draw_episode(episodes, path)
+        with console.status("drawing the episode"):
+            draw_episode(episodes, path)
     console.print(f"{num_steps} steps; written to {path}")
 
 

@@ -42,9 +42,13 @@ class SweepConfig:
       scenes: scene file to use instead of the scenes of the run or policy.
       world: generated world to use instead of the scenes of the run or policy.
       episodes: number of fixed episodes, balanced over room types and scenes.
-      decoding: `argmax` for best actions, `sample` for sampled actions.
-      form: rule by which sTDE combines factual and counterfactual logits. The default is that of the layout estimator.
-      setting: layout estimator to use instead of that of the run or policy; `jaxnav list settings` describes them.
+      decoding: `argmax` for best actions (the largest logit), `sample` for sampled actions.
+      form: rule by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the logits
+        from experience alone, the excess of the layout gap over the threshold. `residual` does this without changing
+        the scale of the logits. `switch` subtracts these logits completely. The default is the rule of the layout
+        estimator.
+      setting: layout estimator or layout gap to use instead of that of the run or policy, for example `learned`, a gap
+        that detects another layout; `jaxnav list settings` describes all.
       hold: keep the gap from falling within an episode. With `--form switch`, experience then stays removed for the
         rest of the episode once the gap exceeds the threshold.
       seed: random seed of the episode list and of sampled actions.
@@ -186,5 +190,6 @@ def _draw_figure(results: "list[Sweep]", path: Path, console: Console) -> None:
     from jaxnav.viz.style import save_figure
     from jaxnav.viz.sweep import sweep_figure
 
-    save_figure(sweep_figure(results), path)
+    with console.status("drawing the figure"):
+        save_figure(sweep_figure(results), path)
     console.print(f"figure: {path}")

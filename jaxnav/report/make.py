@@ -84,9 +84,10 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
 
     # The sections compare the shifts; the replays, one player for each shift, follow the first section.
     page_title = f"{method_label(run.config.method)} in {first_row['world']}"
-    sections = make_sections(run, by_shift, config.threshold)
     replays_by_shift = [measurements.replays for measurements in by_shift.values()]
-    return render_page(page_title, run_facts, sections, replays_by_shift)
+    with console.status("drawing the page"):
+        sections = make_sections(run, by_shift, config.threshold)
+        return render_page(page_title, run_facts, sections, replays_by_shift)
 
 
 def _check(run: Run, reference_run: Run | None, config: ReportConfig) -> None:

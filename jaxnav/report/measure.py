@@ -66,8 +66,9 @@ def measure_shift(
     account = None
     if reference_run is not None:
         quiet_console = Console(quiet=True)
-        reference_world = compile_evaluation_world(reference_run.config, config.split, None, shift, quiet_console)
-        reference_results = _evaluate(reference_run, shift, reference_world, config, quiet_console)
+        with console.status(f"evaluating the reference run at shift {shift:g}"):
+            reference_world = compile_evaluation_world(reference_run.config, config.split, None, shift, quiet_console)
+            reference_results = _evaluate(reference_run, shift, reference_world, config, quiet_console)
         account = measure_leads(results, reference_results)
 
         # Among the replays these agents have a role of their own.
@@ -82,21 +83,23 @@ def measure_shift(
     similarity = _measure_similarity(results, policies, world) if has_one_bank else None
     gap_traces = None
     if has_one_bank and policies.estimator_config is not None:
-        gap_traces = trace_gaps(
-            policies.arm_params("layout"),
-            episodes,
-            world.make_env_params(0),
-            policies.make_agent_loop(world),
-            policies.knowledge,
-            [policies.estimator_config],
-            layout_priors(policies.prior_counts, policies.estimator_config)[None],
-            GAP_STEPS,
-            jax.random.key(config.seed),
-        )
+        with console.status(f"measuring the layout gap at shift {shift:g}"):
+            gap_traces = trace_gaps(
+                policies.arm_params("layout"),
+                episodes,
+                world.make_env_params(0),
+                policies.make_agent_loop(world),
+                policies.knowledge,
+                [policies.estimator_config],
+                layout_priors(policies.prior_counts, policies.estimator_config)[None],
+                GAP_STEPS,
+                jax.random.key(config.seed),
+            )
 
     # The number of replays is that of the whole page.
     replays_per_shift = config.replays // len(set(config.shift))
-    replays = make_replays(agents, episodes, replays_per_shift, shift, config.split)
+    with console.status(f"playing episodes for the replays at shift {shift:g}"):
+        replays = make_replays(agents, episodes, replays_per_shift, shift, config.split)
     return ShiftMeasurements(results, account, similarity, gap_traces, replays)
 
 

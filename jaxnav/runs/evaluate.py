@@ -141,9 +141,11 @@ def evaluate(
 
     # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world)
-    episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed)
-    env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
-    oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
+    applied_shift = evaluation_shift(config, scenes or world, shift)
+    with console.status(_describe_evaluation(episodes, applied_shift)):
+        episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed)
+        env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
+        oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
     results = Results(
@@ -163,7 +165,7 @@ def evaluate(
         "prior_steps": policies.prior_steps,
         "budget": steps_by_purpose,
         "evaluation_source": str(scenes or world or config.scene_source),
-        "evaluation_shift": evaluation_shift(config, scenes or world, shift),
+        "evaluation_shift": applied_shift,
         "evaluation_seed": seed,
         "evaluation_setting": setting,
         "evaluation_hold": hold,
@@ -226,6 +228,11 @@ def check_seed(seed: int) -> None:
     """
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
+
+
+def _describe_evaluation(num_episodes: int, shift: float) -> str:
+    """Words for the console while episodes are evaluated."""
+    return f"evaluating {num_episodes:,} episodes at shift {shift:g}"
 
 
 def _append_row(outcome: EpisodeOutcome, row_outcome: EpisodeOutcome) -> EpisodeOutcome:
@@ -467,7 +474,8 @@ def sweep_shifts(
         # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
         evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled))
         earlier_compilations = evaluator.compilations
-        episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed, evaluator)
+        with console.status(_describe_evaluation(episodes, applied_shift)):
+            episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed, evaluator)
 
         episode_list = join_episode_lists(episode_lists)
         threshold_outcome = jax.tree.map(lambda leaf: leaf[:-1], outcome)

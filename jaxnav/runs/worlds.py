@@ -178,7 +178,8 @@ def _compile_world(
 
     # Few scenes stay in memory as one bank.
     if len(scenes) <= config.worlds.shard_scenes:
-        bank = compile_bank((scenes[index] for index in range(len(scenes))), config.task)
+        with console.status(f"compiling {len(scenes):,} scenes"):
+            bank = compile_bank((scenes[index] for index in range(len(scenes))), config.task)
         console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{_skipped_note(bank.skipped)}")
         return CompiledWorld(
             scenes,

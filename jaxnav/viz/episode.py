@@ -151,7 +151,9 @@ def play_episode(
     traces_by_shift = []
     for shifted in episodes_by_shift:
         played_episodes = shifted.episodes.take(played_indices)
-        traces_by_shift.append(replay_episodes(policies, shifted.world, played_episodes, evaluation_row))
+        plural = "" if len(played_indices) == 1 else "s"
+        with console.status(f"playing {len(played_indices):,} episode{plural} at shift {shifted.shift:g}"):
+            traces_by_shift.append(replay_episodes(policies, shifted.world, played_episodes, evaluation_row))
     if len(shifts) > 1:
         _report_success(traces_by_shift, [shifted.shift for shifted in episodes_by_shift], console)
 

@@ -1,11 +1,13 @@
 """An evaluation from Python: its rows, numbers and files."""
 
 import csv
+import io
 import json
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 import jaxnav
 from jaxnav.env.objectnav import OTHER_ROOM
@@ -51,6 +53,19 @@ def test_evaluation_report_equals_the_results(evaluated):
         means = scale * metrics[name].mean((1, 2))
         assert [row[name]["mean"] for row in rows] == pytest.approx(means, rel=1e-6, abs=1e-9)
     assert evaluated.report["compilations"] == 1
+
+
+def test_evaluation_names_its_phases_on_a_terminal_alone(drawn_run):
+    printed_texts = []
+    for is_terminal in (True, False):
+        console = Console(file=io.StringIO(), force_terminal=is_terminal, width=80)
+        jaxnav.evaluate(drawn_run, shift=1.0, episodes=4, console=console)
+        printed_texts.append(console.file.getvalue())
+    on_terminal, in_pipe = printed_texts
+    assert on_terminal.index("compiling") < on_terminal.index("poses") < on_terminal.index("evaluating")
+    assert "shift 1" in on_terminal
+    assert in_pipe.count("\n") == 1
+    assert "poses" in in_pipe
 
 
 def test_evaluation_reports_a_deviation_over_seeds_of_trained_rows_alone(evaluated):
