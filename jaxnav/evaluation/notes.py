@@ -66,7 +66,11 @@ def convergence_note(log: Sequence[Mapping[str, Any]]) -> list[str]:
     if quarter_success is None:
         return []
     start, end = quarter_success
-    return [f"In the last quarter of training, success on val (best actions) went from {start:.1f} to {end:.1f} %."]
+    # Validation uses the val scenes of the run and the layout shift of training, whatever the table is about.
+    return [
+        "In the last quarter of training, success in val scenes with the layout of training (best actions) went from "
+        f"{start:.1f} to {end:.1f} %."
+    ]
 
 
 def last_quarter_success(log: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
