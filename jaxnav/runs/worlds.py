@@ -239,7 +239,8 @@ def _compile_to_cache(config: RunConfig, scenes: Scenes, console: Console) -> Sh
 
 
 def _skipped_note(skipped: Sequence[str]) -> str:
-    return f" ({len(skipped)} scenes without a goal skipped)" if skipped else ""
+    plural = "" if len(skipped) == 1 else "s"
+    return f" ({len(skipped)} scene{plural} without a goal skipped)" if skipped else ""
 
 
 def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
