@@ -348,7 +348,7 @@ def difference_label(difference: dict[str, Any]) -> str:
     """Name of a report's paired difference, as printed in tables."""
     compared = row_label({**difference, "variant": difference["to"], "method": ""})
     reference = "+ w" if difference["from"] == "layout" else difference["from"]
-    return f"{compared} - {reference}"
+    return f"{compared} vs. {reference}"
 
 
 class ExperienceLead(NamedTuple):
