@@ -58,9 +58,10 @@ def test_evaluation_report_equals_the_results(evaluated):
 def test_evaluation_names_its_phases_on_a_terminal_alone(drawn_run):
     printed_texts = []
     for is_terminal in (True, False):
-        console = Console(file=io.StringIO(), force_terminal=is_terminal, width=80)
+        output = io.StringIO()
+        console = Console(file=output, force_terminal=is_terminal, width=80)
         jaxnav.evaluate(drawn_run, shift=1.0, episodes=4, console=console)
-        printed_texts.append(console.file.getvalue())
+        printed_texts.append(output.getvalue())
     on_terminal, in_pipe = printed_texts
     assert on_terminal.index("compiling") < on_terminal.index("poses") < on_terminal.index("evaluating")
     assert "shift 1" in on_terminal
