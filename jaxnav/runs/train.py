@@ -26,6 +26,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column
 
 from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError, Interrupted, MissingSplitError
@@ -77,6 +78,9 @@ _EVIDENCE_WALK_FACTOR = 4
 
 #: Signals that end a run after the current chunk: Ctrl-C, and SIGTERM as schedulers send it.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Width of the progress bar, and of the two times after it with the spaces between them, in columns.
+_BAR_WIDTH = 12
+_TIMES_WIDTH = 17
 #: Chunks between two lines of progress on a console without a progress bar.
 _CHUNKS_PER_LINE = 4
 
@@ -578,7 +582,14 @@ class ProgressDisplay:
 
     def __init__(self, config: RunConfig, update: int, console: Console) -> None:
         """Prepare to show a run that starts or resumes after `update`."""
-        progress_columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        # Long words are cut, never the bar and the times.
+        words_width = max(1, console.width - _BAR_WIDTH - _TIMES_WIDTH)
+        progress_columns = (
+            TextColumn("{task.description}", table_column=Column(no_wrap=True, max_width=words_width)),
+            BarColumn(bar_width=_BAR_WIDTH),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
         self._config = config
         self._console = console
         self._bar = Progress(*progress_columns, console=console, disable=not console.is_terminal)
@@ -614,15 +625,15 @@ class ProgressDisplay:
         num_skipped = 0
         for arm, seeds in metrics.items():
             arm_success = np.mean([seed_metrics["success"] for seed_metrics in seeds])
-            success_rates.append(f"{arm} SR {100 * arm_success:.0f} %")
+            success_rates.append(f"{arm} {100 * arm_success:.0f} %")
             num_skipped += sum(seed_metrics["skipped_steps"] for seed_metrics in seeds)
         skip_note = f", {num_skipped:.0f} gradient steps skipped as not finite" if num_skipped else ""
 
-        progress_line = (
-            f"update {update}/{config.total_updates}, {steps_per_second / 1000:.0f} k steps/s, "
-            f"{', '.join(success_rates)}{skip_note}"
-        )
-        self._bar.update(self._task, completed=update, description=progress_line)
+        # This is success in training scenes, with sampled actions. Next to the bar is no room for the speed.
+        update_counts = f"{update}/{config.total_updates}"
+        training_success = f"training SR: {', '.join(success_rates)}{skip_note}"
+        self._bar.update(self._task, completed=update, description=f"{update_counts}, {training_success}")
+        progress_line = f"update {update_counts}, {steps_per_second / 1000:.0f} k steps/s, {training_success}"
         # A log file gets a line only every few chunks, and after the last one.
         is_line_due = (update // config.chunk) % _CHUNKS_PER_LINE == 0 or update == config.total_updates
         if not self._console.is_terminal and is_line_due:
