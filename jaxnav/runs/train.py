@@ -78,6 +78,8 @@ _EVIDENCE_WALK_FACTOR = 4
 
 #: Signals that end a run after the current chunk: Ctrl-C, and SIGTERM as schedulers send it.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Excess of the steps of a run over those asked for, from which it is printed.
+_NOTED_EXCESS = 0.05
 #: Width of the progress bar, and of the two times after it with the spaces between them, in columns.
 _BAR_WIDTH = 12
 _TIMES_WIDTH = 17
@@ -132,6 +134,7 @@ def _train_in_run_dir(
     """Train in a run directory whose lock is held; see `train`."""
     # Prepare the knowledge from before training: layout prior, estimator, and the method's own statistics.
     warn_if_rollout_too_short(config, console)
+    warn_if_more_steps(config, console)
     with console.status("random walks for the layout prior"):
         exploration = explore_world(config, world)
         num_steps = int(exploration.steps)
@@ -207,6 +210,17 @@ def warn_if_rollout_too_short(config: RunConfig, console: Console) -> None:
         console.print(
             f"{config.method} chooses every {choice_interval} actions, so rollouts of {rollout} steps rarely contain "
             f"the outcome of a choice; give --ppo.rollout {2 * choice_interval} or more, and fewer --ppo.num-envs"
+        )
+
+
+def warn_if_more_steps(config: RunConfig, console: Console) -> None:
+    """Say so if whole chunks make the run clearly longer than its `total_steps`."""
+    asked_steps = config.total_steps
+    num_steps = config.total_updates * config.steps_per_update
+    if asked_steps is not None and num_steps > (1 + _NOTED_EXCESS) * asked_steps:
+        chunk_steps = config.chunk * config.steps_per_update
+        console.print(
+            f"training for {num_steps:,} steps instead of {asked_steps:,}: whole chunks of {chunk_steps:,} steps each"
         )
 
 

@@ -1,4 +1,4 @@
-"""What a training run prints about its progress."""
+"""What a training run prints about its progress and its length."""
 
 import dataclasses
 import io
@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.train import ProgressDisplay
+from jaxnav.runs.train import ProgressDisplay, warn_if_more_steps
 
 
 @pytest.mark.parametrize("num_skipped", [0, 12])
@@ -27,3 +27,13 @@ def test_bar_and_both_times_fit_80_columns(num_skipped):
     assert num_skipped or "layout 88 %" in words
     assert len(bar) >= 10
     assert [len(cell) for cell in (elapsed, remaining)] == [7, 7]
+
+
+def test_steps_beyond_those_asked_for_are_printed():
+    chunk_steps = RunConfig().chunk * RunConfig().steps_per_update
+    for total_steps, is_printed in ((chunk_steps, False), (chunk_steps - 1, False), (chunk_steps + 1, True)):
+        output = io.StringIO()
+        warn_if_more_steps(dataclasses.replace(RunConfig(), total_steps=total_steps), Console(file=output, width=200))
+        printed = output.getvalue()
+        assert bool(printed) == is_printed
+        assert not is_printed or f"{2 * chunk_steps:,}" in printed
