@@ -30,7 +30,10 @@ def registered(kind: Kind | None = None) -> dict[Kind, list[Entry]]:
     * `methods`: `hosts_layout`, true where the layout weights can enter, and `source`, which is `jaxnav` or the
       `package.module:NAME` of an entry point of the group `jaxnav.methods`;
     * `policies`: `method`, `world` and `arm` of each packaged policy;
-    * `experiments`, `configurations`, `settings`: no further fields.
+    * `experiments`: `needs_run`, true where a finished run must be given; `scene_files` to import first; and the
+      training that an experiment without any results does: training `runs`, `policies` in them, and environment
+      `steps` of all policies;
+    * `configurations`, `settings`: no further fields.
 
     Args:
       kind: one kind; None for all.
@@ -111,13 +114,29 @@ def _list_policies() -> list[Entry]:
 
 
 def _list_experiments() -> list[Entry]:
-    import yaml
-
-    from jaxnav.experiments.config import EXPERIMENTS
+    from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig, agent_runs
+    from jaxnav.runs.config_files import apply_yaml
 
     entries = []
-    for name, path in EXPERIMENTS.items():
-        entries.append({"name": name, "summary": yaml.safe_load(path.read_text(encoding="utf-8"))["title"]})
+    for name in EXPERIMENTS:
+        experiment = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
+        configs = [run.config for run in agent_runs(experiment)]
+        num_policies = 0
+        num_steps = 0
+        for config in configs:
+            policies_of_run = config.seeds * len(config.arms)
+            num_policies += policies_of_run
+            num_steps += policies_of_run * config.total_updates * config.steps_per_update
+        entry = {
+            "name": name,
+            "summary": experiment.title,
+            "needs_run": not experiment.agents,
+            "scene_files": sorted({str(config.scenes) for config in configs if config.scenes}),
+            "runs": len(configs),
+            "policies": num_policies,
+            "steps": num_steps,
+        }
+        entries.append(entry)
     return entries
 
 

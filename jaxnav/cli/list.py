@@ -59,6 +59,8 @@ def _print_list(config: ListConfig, console: Console) -> None:
             result_console.print()
         result_console.print(f"{title}: {usage}", style="bold")
         result_console.print(_make_table(entries, _FORMATTERS.get(kind, {})))
+        if kind in _NOTES:
+            result_console.print(_NOTES[kind])
 
 
 def _make_table(entries: list[Entry], formatters: dict[str, Callable[[Entry], str]]) -> Table:
@@ -86,6 +88,24 @@ def _format_hosts_layout(entry: Entry) -> str:
     return {True: "yes", False: "no", None: "?"}[entry["hosts_layout"]]
 
 
+def _format_needs(entry: Entry) -> str:
+    """Describe what an experiment needs: a finished run, or scene files and training."""
+    if entry["needs_run"]:
+        return "needs --run RUN"
+    plural = "" if entry["runs"] == 1 else "s"
+    training = f"trains: {entry['runs']} run{plural}, {entry['steps'] / 1e6:,.0f} M steps"
+    if not entry["scene_files"]:
+        return training
+    return f"needs {', '.join(entry['scene_files'])}; {training}"
+
+
+#: Lines below a table.
+_NOTES: dict[Kind, str] = {
+    "experiments": (
+        "M steps: million environment steps of all policies. On two cores, study_quick takes eleven minutes, and study "
+        "about an hour. Finished runs and results are reused. `jaxnav scenes import` makes scene files."
+    ),
+}
 #: Columns between name and description.
 _FORMATTERS: dict[Kind, dict[str, Callable[[Entry], str]]] = {
     "worlds": {
@@ -97,6 +117,7 @@ _FORMATTERS: dict[Kind, dict[str, Callable[[Entry], str]]] = {
         "Step limit": _format_step_limit,
     },
     "methods": {"Layout": _format_hosts_layout},
+    "experiments": {"Needs": _format_needs},
     "policies": {
         "Method": lambda entry: f"{entry['method']}",
         "World": lambda entry: f"{entry['world']}",

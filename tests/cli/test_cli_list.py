@@ -43,6 +43,14 @@ def test_entries_hold_the_facts_of_their_kind(entries_by_kind):
     (policy,) = entries_by_kind["policies"]
     assert (policy["method"], policy["world"], policy["arm"]) == ("org", "rooms", "layout")
     assert "89.7 %" in policy["summary"]
+    experiments = {entry["name"]: entry for entry in entries_by_kind["experiments"]}
+    assert experiments["account"]["needs_run"]
+    assert (experiments["account"]["runs"], experiments["account"]["steps"]) == (0, 0)
+    assert not experiments["study"]["needs_run"]
+    assert experiments["accounts"]["scene_files"] == ["ITHOR.jsonl.gz", "ROBOTHOR.jsonl.gz"]
+    # Three agents of five seeds, of which one has both arms: 5 M steps each, rounded up to whole chunks.
+    assert (experiments["study"]["runs"], experiments["study"]["policies"]) == (3, 20)
+    assert 100e6 <= experiments["study"]["steps"] < 102e6
 
 
 def test_list_fits_80_columns(entries_by_kind, capsys, monkeypatch):
