@@ -18,18 +18,19 @@ class Sizes:
     """Widths of the layers that all methods have, each at least 1.
 
     Attributes:
-      hidden: width H of the recurrent state and of the fused input.
-      view_outputs: width S of the scene embedding.
-      appearance: width d of the embedding of a category.
-      row_hidden: width of the hidden layer that reads the row of a category.
-      row_outputs: number m of outputs of that layer for each category.
+      hidden: width of the memory (recurrent state) and of the layer that joins all inputs before it.
+      view_outputs: width of the features of the scene (free and blocked cells, without objects).
+      appearance: width of the learned embedding of an object category.
+      row_hidden: width of the hidden layer of the perceptron that reads the detection of each category.
+      row_outputs: number of features per category that the perceptron for detections makes.
     """
 
-    hidden: int = 64
-    view_outputs: int = 64
-    appearance: int = 16
-    row_hidden: int = 32
-    row_outputs: int = 8
+    # Letters of the sizes in shapes and equations.
+    hidden: int = 64  # H
+    view_outputs: int = 64  # S
+    appearance: int = 16  # d
+    row_hidden: int = 32  # h
+    row_outputs: int = 8  # m
 
 
 @dataclasses.dataclass(frozen=True)

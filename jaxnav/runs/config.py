@@ -35,7 +35,8 @@ class WorldConfig:
       num_val: number of generated validation scenes, at least 1.
       num_test: number of generated test scenes, at least 1.
       seed: random seed of the scene generator, from 0 to 4,294,967,295.
-      shift: layout shift of the scenes, from 0 to 1: the share of the categories that exchange their places.
+      shift: layout shift of all scenes, from 0 to 1: share of the categories that exchange their places. At 0, things
+        stand at their usual places. Evaluations have their own `--shift`.
       categories: object categories that the agent can detect, at least 2.
       goals: categories that can be goals, a part of `categories`. With your own `categories`, the default is all.
       train_step_limit: largest number of actions in a training episode, at least 1.
@@ -45,8 +46,9 @@ class WorldConfig:
         the episode.
       near_starts: probability, from 0 to 1, that a training episode starts near its goal: in the nearest of eight
         random cells.
-      shard_scenes: number of scenes in a shard, at least 1. If there are more scenes than this, they are compiled to
-        disk and streamed from there.
+      shard_scenes: number of scenes in a shard, a part of the scenes that is loaded at once, at least 1. With more
+        scenes than this, all are compiled to disk (`cache`), and training takes the shards in turn. Smaller shards need
+        less memory.
     """
 
     # None stands for the default of the world, see `fill_world_defaults`.
@@ -70,15 +72,20 @@ class LayoutConfig:
     """Layout estimator, the belief about which things stand near each other.
 
     Attributes:
-      setting: layout estimator: as in the paper, as in the released code of the paper, or calibrated to the training
-        scenes.
-      strength: strength of the rows of the prior, above 0; only with `calibrated`. By default, calibration in the
-        training scenes chooses the value with which the layout gap behaves as in the paper.
-      reduction: reduction over rows in the layout gap; only with `calibrated`. By default, calibration chooses it.
-      prior: one prior for each type of `room`, so that the policy knows the type of the room, or one `pooled` prior for
-        all rooms.
-      walks: number of random walks in the training scenes that collect the prior, at least 1. The layout gap `learned`
-        takes four times as many.
+      setting: variant of the layout estimator: `paper`, its equations as printed; `released`, as in the authors'
+        released code; or `calibrated`, with numbers that are chosen in the training scenes (`strength`, `reduction`).
+      strength: weight of the prior (the belief before the episode, from the training scenes), above 0: each of its rows
+        counts as this many sightings. With larger values, new views change the belief less. Only with `calibrated`,
+        which by default chooses the value whose layout gap (doubt about the layout, from 0 to 1) is nearest to 0.75 in
+        the first views and 0.25 after twenty steps, as in the paper.
+      reduction: one layout gap (doubt about the layout) from the changes that a view makes to the rows of the belief,
+        one row for each category: mean over visible categories (`mean_visible`), mean over all (`mean`), or `sum`. Only
+        with `calibrated`, which by default chooses it together with `strength`.
+      prior: belief at the start of an episode: a separate one for each type of `room`, so that the policy knows the
+        type of the room, or one `pooled` over all rooms.
+      walks: number of random walks in the training scenes before training, at least 1. They count which things are seen
+        together, and so make the prior (the first belief) of the layout estimator. The layout gap `learned` (see
+        `jaxnav list settings`) learns from four times as many walks.
       steps: number of steps of each random walk, at least 1.
     """
 
@@ -96,42 +103,54 @@ class RunConfig:
 
     Attributes:
       run_dir: directory of the run. Training resumes from the last checkpoint in it.
-      method: method that makes experience from detections: a method of jaxnav (`jaxnav list` prints them), an entry
-        point of the group `jaxnav.methods`, or `package.module:NAME`.
+      method: method that makes experience (features of the things that stand near each other) from detections: a method
+        of jaxnav (`jaxnav list methods` prints them), an entry point of the group `jaxnav.methods`, or
+        `package.module:NAME`.
       world: generated world, which sets the task. The scenes are from this world unless you give `scenes`.
       scenes: scene file to read instead of generating scenes. The splits in the file are used.
-      arms: kinds of policies to train: without layout weights (`baseline`) and with them (`layout`). Methods that
-        cannot use layout weights train only the baseline.
+      arms: kinds of policies to train: without layout weights (`baseline`) and with them (`layout`). The weights
+        multiply the experience features of each category by how often the goal is expected near it. Methods that cannot
+        use them train only the baseline.
       seeds: number of policies of each arm, from 1 to 1,024.
-      total_steps: number of environment steps of each policy, at least 1, with imitation; rounded up to whole chunks.
-        The random walks that collect the prior are not included (`layout.walks` x `layout.steps`).
+      total_steps: number of environment steps of each policy, at least 1, with imitation; rounded up to whole chunks
+        (see `chunk`). The random walks before training, from which the layout estimator starts, are not included
+        (`layout.walks` x `layout.steps`).
       imitation: share of the steps in which the policy imitates shortest paths, between 0 and 1, rounded to whole
-        chunks; only for methods with such a stage. By default, the method chooses it.
+        chunks. Of the methods of jaxnav, only `vtnet` and `tpn` imitate; the rest refuse the option. By default, the
+        method chooses the share.
       seed: random seed of training, from 0 to 4,294,967,295.
-      counterfactual: training of the counterfactual branch: no training (`none`), training with both direct pathways
-        set to zero in random steps (`coin`), or distillation from the factual policy (`distil`).
-      decision: network from pathways to actions: all pathways `fused` before one recurrent core, as in the paper, or a
-        direct stream and an experience stream whose logits are added (`streams`). With `streams`, `direct` is always
-        `goal` and `counterfactual` always `none`.
-      direct: detections on the direct pathway of the goal: of all categories, of the goal only, or none.
-      spatial_memory: give the direct pathway of the scene a map of the cells that the agent has seen and visited. The
-        paper has no such map.
-      goal_row: give the direct pathway of the goal a separate row with the detection of the goal. In the paper, this
-        detection is only in the row of its category.
-      done_gate: multiply the logit of Done by 0.58 times the confidence of the detection of the goal.
-      chunk: number of updates in one compiled call, from 1 to 100,000. Between two calls, the run writes its log, and
-        continues in the next shard if scenes are streamed.
-      save_every: number of calls between two checkpoints, from 1 to 1,000,000.
+      counterfactual: training of the counterfactual branch (logits from experience alone, which sTDE subtracts):
+        `distil` teaches these logits to match those of the complete policy; `coin` sets scene and goal to zero in half
+        of the steps, as the authors' code does; `none` does not train them.
+      decision: network from the inputs to the actions. `fused`, as in the paper: one recurrent network gets scene, goal
+        and experience. `streams`: two recurrent networks, one without experience (the direct stream) and one with it,
+        add their logits, so that the part that remains without experience is trained too. `streams` sets `--direct goal
+        --counterfactual none`.
+      direct: detections that the policy also gets directly, not only through experience; sTDE keeps this direct input.
+        Either those of all categories (as in the authors' code), of the goal only, or none.
+      spatial_memory: give the policy a map of the cells that it has seen and visited. The map holds no objects, so it
+        is not a part of experience. The paper has no such map, so turn it off to compare with the paper.
+      goal_row: give the policy the detection of its goal as a separate input. In the paper, this detection stands only
+        among those of all categories, so turn the option off to compare with the paper.
+      done_gate: multiply the logit of Done by 0.58 times the confidence of the detection of the goal (0 where the goal
+        is not detected). The factor is that of the authors' released code; use the option to compare with this code.
+      chunk: number of updates in one compiled call (a chunk), from 1 to 100,000. Between two chunks, the run writes its
+        log and, if there are more scenes than `worlds.shard_scenes`, loads other scenes. Fewer updates give a finer
+        log, more updates less overhead.
+      save_every: number of chunks (of `chunk` updates each) between two checkpoints, from 1 to 1,000,000. An
+        interrupted run continues from its last checkpoint.
       validations: number of times that the policies are evaluated in validation scenes during training, from 0 to
-        10,000, evenly spaced. Of each seed, the policy with the highest success under best actions is exported; with 0,
-        the last one.
-      val_episodes: number of episodes in each of these evaluations, from 1 to 100,000.
-      cache: folder for compiled scenes that are streamed from disk.
+        10,000, evenly spaced. Of each seed, the policy with the highest success under best actions (the action with the
+        largest logit) is exported; with 0, the last policy.
+      val_episodes: number of episodes in each evaluation during training (see `validations`), from 1 to 100,000.
+      cache: folder for compiled scenes, which are streamed from disk if there are more scenes than
+        `worlds.shard_scenes`.
       devices: devices to train on, by default one; results change only by rounding. Give the number of devices of this
         process, or `cluster` for all devices of the Slurm, Open MPI, Kubernetes or TPU job that started this command,
         or `HOST:PORT,INDEX,PROCESSES` for command number INDEX of several equal commands. These commands meet at the
         address of command 0 and share the file system of `run_dir`.
-      method_sizes: sizes of layers that only this method has, each at least 1: name and number, as often as needed.
+      method_sizes: sizes of layers that only this method has, each at least 1: name and number, as often as needed. An
+        unknown name prints the names that the method has.
     """
 
     run_dir: Path = Path("runs/rooms")

@@ -26,7 +26,7 @@ class PPOConfig:
     Attributes:
       num_envs: number of episodes that each policy plays in parallel, at least 1.
       rollout: number of steps in each of these episodes between two updates, at least 1 and at most the shortest step
-        limit of training.
+        limit of training. The gradient goes back in time over these steps.
       epochs: number of passes over a rollout in one update, at least 1.
       minibatches: number of minibatches in one pass, at least 1. Episodes are divided among them, so `num_envs` must be
         a multiple.
@@ -38,14 +38,19 @@ class PPOConfig:
       final_entropy: weight of the entropy bonus at the end of a training stage, at least 0; linear in between.
       value: weight of the value loss, at least 0.
       max_grad_norm: global norm to which gradients are clipped, above 0.
-      distil: weight of the distillation loss of the counterfactual branch, at least 0.
-      alone: with `--decision streams`, share of the last stage without imitation in which only the direct stream acts
-        and learns, from 0 to below 1. The stage begins with this part.
-      experience: with `--decision streams`, probability that an episode uses the experience stream in the rest of that
-        stage, between 0 and 1.
-      experience_drawn: with `--decision streams`, whether this is drawn once per `episode` or at each `step`.
-      experience_rate: with `--decision streams`, factor on the learning rate in the rest of that stage, above 0. The
-        added stream disturbs a policy that has already learned, so the usual factor is below 1.
+      distil: weight of the loss with which `--counterfactual distil` trains the logits from experience alone, at least
+        0.
+      alone: only with `--decision streams`: share of the training in which the direct stream (the network without
+        experience) acts and learns alone, before the experience stream is added, from 0 to below 1. Imitation does not
+        count.
+      experience: only with `--decision streams`: probability, between 0 and 1, that the experience stream takes part in
+        an episode once it has been added (after the share `ppo.alone`). In all other episodes, the direct stream acts
+        and learns alone.
+      experience_drawn: only with `--decision streams`: draw the participation of the experience stream (see
+        `ppo.experience`) once per `episode` or at each `step`.
+      experience_rate: only with `--decision streams`: factor on the learning rate once the experience stream has been
+        added (after the share `ppo.alone`), above 0. The added stream disturbs a policy that has already learned, so
+        the usual factor is below 1.
     """
 
     num_envs: int = 256
