@@ -16,7 +16,7 @@ COMMANDS = {
     "episode": "draw one evaluation episode",
     "play": "search for an object yourself, in the terminal",
     "scenes": "import scenes, draw one, or print statistics of scenes",
-    "export": "export a policy with its model card",
+    "export": "export a policy: parameters, or a program that runs without jaxnav",
     "log": "show a training log in TensorBoard or Weights & Biases",
     "list": "list worlds, methods, policies, experiments and configurations",
     "completion": "print a script that completes commands and options in your shell",

@@ -15,9 +15,9 @@ The estimator handles one episode; use `jax.vmap` for batches.
 
 `ESTIMATORS` holds the configurations that have a name:
   `calibrated`: the default, with a rescaled prior and updates only where a gate is open.
-  `paper`: equations 3 to 6 as printed, with 0/1 visibility as the counts n.
-  `released`: the estimator of the authors' released code.
-  `evidence`: `calibrated` with a gap that measures the misfit between the counts of the episode and the prior.
+  `paper`: equations 3 to 6 of the paper as printed; a view counts each visible category once, however many it shows.
+  `released`: the layout estimator of the authors' released code.
+  `evidence`: `calibrated`, with a layout gap that grows when the things seen together do not fit the training scenes.
 """
 
 import dataclasses
@@ -52,10 +52,12 @@ class EstimatorConfig:
         `passes` on `novelty` and `clock`.
         `novelty`: how much the last view changed the belief (eq. 5).
         `evidence`: misfit between the counts of the episode and the prior (`evidence_gap`).
-        `learned`: probability that the layout is not the training layout, from the pairs seen together (`learned_gap`).
-        `overdue`: probability that the training layout would have shown the goal by now (`overdue_gap`).
-        `clock`: 1 when the gate opens, decays afterwards. `novelty` behaves like this under `released`, because its sum
-        over all rows saturates tanh.
+        `learned`: layout gap, the probability that the layout differs from training, from the pairs seen together. See
+          `learned_gap`.
+        `overdue`: layout gap, the probability that the goal would have been seen by now in the training layout. See
+          `overdue_gap`.
+        `clock`: layout gap that ignores the layout, as a control: 1 at each new set of visible categories, then decays.
+          `novelty` behaves like this under `released`, because its sum over all rows saturates tanh.
         `none`: D stays 0, so that sTDE removes nothing.
       hold: the gap never falls within an episode.
       decay: the gap is multiplied by this factor in [0, 1] in each pass with the gate shut.

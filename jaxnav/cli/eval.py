@@ -36,14 +36,18 @@ class EvalConfig:
       shift: layout shift of the scenes, from 0 (as in training) to 1. The default is the shift of the run, and 0 with
         `--scenes` or `--world`.
       episodes: number of fixed episodes, at least 1, balanced over room types and scenes.
-      epsilon: thresholds of sTDE, each at least 0. All of them are evaluated in one compiled call.
-      form: rules by which sTDE combines factual and counterfactual logits. The default is the rule of the layout
-        estimator of the run.
-      setting: layout estimator to use instead of that of the run; `jaxnav list settings` describes them.
+      epsilon: thresholds of sTDE, each at least 0: experience is removed where the layout gap exceeds the threshold.
+        All thresholds are evaluated in one compiled call.
+      form: rules by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the
+        logits from experience alone; the share is the excess of the layout gap over the threshold. `residual` does this
+        without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds the
+        threshold. The default is the rule of the layout estimator.
+      setting: layout estimator or layout gap to use instead of that of the run, for example `learned`, a gap that
+        detects another layout; `jaxnav list settings` describes all.
       hold: keep the layout gap from falling within an episode. With `--form switch`, experience then stays removed for
         the rest of the episode once the gap exceeds the threshold.
-      inner_steps: largest number of adaptation steps in an episode, at least 0, for methods that learn while they act.
-        The default is the usual number of the method.
+      inner_steps: largest number of adaptation steps in an episode, at least 0, for methods that learn while they act
+        (`jaxnav list methods` describes the methods). The default is the usual number of the method.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
       json: JSON file to write. The default is a name such as `eval-val.json` in the run directory.
       format: format in which the evaluation is printed.

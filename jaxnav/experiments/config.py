@@ -37,18 +37,20 @@ class ExperimentConfig:
       results: folder of the result files, with one subfolder per split. With `run`, the default is the subfolder
         `results` of the run directory.
       runs: folder of the training runs of the experiment.
-      pages: pages to write, as a mapping from a Markdown document to its template. A template is a file, or the name of
-        a packaged template.
-      worlds: worlds by name. Each maps settings of `jaxnav train` to the values of all runs in that world.
-      agents: agents by name. Each maps settings of `jaxnav train` to the values of its runs. The key `against` lists
-        the agents that it is compared with, as AGENT or AGENT/VARIANT; the key `run` names a finished run to use
-        instead of training one.
+      pages: pages to write, as YAML that maps each Markdown document to its template: a file, or one of the packaged
+        templates account, factors, instrument, methods, mixture, paper and study.
+      worlds: worlds by name, as YAML. Each maps settings of `jaxnav train` to the values of all runs in that world.
+      agents: agents by name, as YAML. Each maps settings of `jaxnav train` to the values of its runs. The key `against`
+        lists agents to compare with: AGENT compares equal variants, AGENT/VARIANT always compares with that variant,
+        such as `org/baseline`. The key `run` names a finished run to use instead of training one.
       left_out: patterns of WORLD-AGENT, such as `rooms-*`, of which no run is trained or measured.
-      only: patterns of WORLD-AGENT that are measured in this call. The pages show every agent that has results.
+      only: patterns of WORLD-AGENT, such as `rooms-*`, that are measured in this call, after training where it is
+        missing. The pages show every agent that has results.
       measure: measurements by name (docs/experiments.md lists them). Each maps to a list of patterns of AGENT or
         WORLD-AGENT that are measured.
-      groups: groups of agents by name. The mean success of a group, with best actions and at the first layout shift, is
-        compared with an agent or with another variant of the group.
+      groups: groups of agents by name, as YAML, for the measurement `groups`. Each has the keys `agents`, `variant` and
+        `against`: the mean success of the agents in that variant is compared with another of their variants, or with
+        one AGENT/VARIANT; with best actions, at the first layout shift.
       reference: layout-blind agents, against which the value and the cost of experience are measured. With `run`, the
         run directory of such agents (a run of `--method anonymous`); otherwise the name of one of the agents, by
         default `anonymous`.
@@ -57,10 +59,15 @@ class ExperimentConfig:
       split: scenes to evaluate on.
       shifts: layout shifts, rising, each from 0 (as in training) to 1. The first is the reference of all changes.
       episodes: number of episodes, at least 1, at each layout shift.
-      epsilon: thresholds of sTDE, each at least 0. The first is the one that is compared.
-      form: rule by which sTDE combines factual and counterfactual logits.
-      decodings: rules that turn logits into actions, `argmax` (best actions) and `sample` (sampled actions); removal in
-        a mixed population is measured with each.
+      epsilon: thresholds of sTDE, each at least 0: experience is removed where the layout gap exceeds the threshold.
+        The first is the one that is compared.
+      form: rule by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the logits
+        from experience alone; the share is the excess of the layout gap over the threshold. `residual` does this
+        without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds the
+        threshold.
+      decodings: rules that choose actions from logits, `argmax` (best actions) and `sample` (sampled actions). The
+        measurements `mixture` and `handover`, in which half of the episodes are in shifted homes, are repeated with
+        each rule.
       steps: number of steps, at least 1, over which the curves of the layout gap are recorded.
       seed: random seed of the episode lists and the sampled actions, from 0 to 2**32 - 1.
       base: settings of `jaxnav train` that all runs of the experiment share.
