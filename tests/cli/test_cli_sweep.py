@@ -41,6 +41,7 @@ def test_sweep_prints_a_table_and_writes_figure_and_numbers(run_dir, capsys, mon
     assert rows[0]["spl_change"] == sweep.rows()[0].changes["spl"].to_json()
 
 
+@pytest.mark.slow
 def test_sweep_prints_markdown(run_dir, tmp_path, capsys):
     out = tmp_path / "figure.png"
     assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(out), "--format", "markdown"]) == 0

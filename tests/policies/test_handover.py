@@ -82,6 +82,7 @@ def test_under_tde_the_layout_blind_policy_acts(layout_blind):
     alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), layout_blind)
 
 
+@pytest.mark.slow
 def test_handed_over_at_the_first_step_it_is_the_same(layout_blind):
     switch = table_row("stde", 0.5, "switch", "argmax")
     at_once = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=0, gap_end=2**30)

@@ -149,6 +149,7 @@ def test_table_of_a_sweep_has_a_line_for_every_threshold(swept):
 # Several shifts
 
 
+@pytest.mark.slow
 def test_shifts_share_a_compilation_and_equal_evaluations(drawn_run):
     results = sweep_shifts(drawn_run, (0.0, 0.5), (0.0, 1.0), episodes=EPISODES)
     assert [result.compilations for result in results] == [1, 0]
@@ -163,6 +164,7 @@ def test_shifts_share_a_compilation_and_equal_evaluations(drawn_run):
 # Directories and policies
 
 
+@pytest.mark.slow
 def test_run_directory_stands_for_its_run(drawn_run, swept, evaluated):
     path = str(drawn_run.config.run_dir)
     chex.assert_trees_all_equal(jaxnav.sweep(path, EPSILON, episodes=EPISODES).outcome, swept["argmax"].outcome)
