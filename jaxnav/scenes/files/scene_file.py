@@ -303,7 +303,7 @@ def _decode_scene(record: JsonRecord) -> Scene:
 
 def _decode_origin(record: JsonRecord) -> tuple[float, float]:
     x, z = record.check_numbers("origin", record.get_list("origin", 2))
-    # Small errors of rounding are mended, larger ones are mistakes.
+    # Small errors of rounding are corrected, larger ones are mistakes.
     snapped_origin = (round(x / CELL_SIZE) * CELL_SIZE, round(z / CELL_SIZE) * CELL_SIZE)
     if max(abs(x - snapped_origin[0]), abs(z - snapped_origin[1])) > SNAP_TOLERANCE:
         expected = f"both must be multiples of {CELL_SIZE} (within {SNAP_TOLERANCE})"
