@@ -159,9 +159,9 @@ def test_method_without_layout_support_is_trained_as_baseline_alone(config, tmp_
     assert results.report["differences"] == []
 
     # What needs the layout is refused.
-    with pytest.raises(InputError, match="without the arm 'layout'"):
+    with pytest.raises(InputError, match="layout"):
         jaxnav.sweep(run, (0.5,))
-    with pytest.raises(InputError, match="without the arm 'layout'"):
+    with pytest.raises(InputError, match="layout"):
         run.policies(("layout",))
 
 
