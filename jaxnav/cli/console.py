@@ -119,6 +119,28 @@ def refuse_unwritable(path: object, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written ({error.strerror}); give another {remedy}") from error
 
 
+def name_evaluation(command: str, split: str, world: str | None, scenes: Path | None, *details: str | None) -> str:
+    """Return the name, without an ending, of the file that a command writes by default.
+
+    Args:
+      command: name of the command.
+      split: scenes that are evaluated.
+      world: generated world; None for that of the run or policy.
+      scenes: scene file; None without one.
+      details: texts for other options that change the results; None for options that are not given.
+    """
+    source = world
+    if source is None and scenes is not None:
+        source = f"scenes-{scenes.name.split('.')[0]}"  # never the name of a world
+    return "-".join(part for part in (command, source, split, *details) if part is not None)
+
+
+def refuse_folder(path: Path, option: str) -> None:
+    """Raise an `InputError` if no file can be written at a path, because it is a folder or lies in a file."""
+    if path.is_dir() or not path.name or (path.parent.exists() and not path.parent.is_dir()):
+        raise InputError(f"{option} {path}: is a folder or lies in a file; give the name of a file to write")
+
+
 def _user_message(error: Exception) -> str | None:
     """Return the message for an error that the user can fix, or None for a bug of the program."""
     match error:

@@ -14,8 +14,10 @@ from jaxnav.choices import EstimatorName, Form
 from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
+    name_evaluation,
     parse_arguments,
     print_table,
+    refuse_folder,
     refuse_unwritable,
     run_command,
 )
@@ -141,21 +143,12 @@ def _print_report(report: dict[str, Any], report_format: str) -> None:
 
 def _find_target(config: EvalConfig) -> Path:
     """Return the JSON file to write, or raise an `InputError` before anything is evaluated."""
-    # The default name lists every option that changes the results.
-    parts = ["eval"]
-    if config.world:
-        parts.append(config.world)
-    elif config.scenes:
-        parts.append(f"scenes-{config.scenes.name.split('.')[0]}")  # never the name of a world
-    parts.append(config.split)
-    if config.shift is not None:
-        parts.append(f"shift{config.shift:g}")
-    if config.setting is not None:
-        parts.append(config.setting)
-    if config.inner_steps is not None:
-        parts.append(f"inner{config.inner_steps}")
-
-    target = config.json or config.run / f"{'-'.join(parts)}.json"
-    if target.is_dir() or not target.name or (target.parent.exists() and not target.parent.is_dir()):
-        raise InputError(f"--json {target}: is a folder or lies in a file; give the name of a file to write")
+    details = (
+        None if config.shift is None else f"shift{config.shift:g}",
+        config.setting,
+        None if config.inner_steps is None else f"inner{config.inner_steps}",
+    )
+    name = name_evaluation("eval", config.split, config.world, config.scenes, *details)
+    target = config.json or config.run / f"{name}.json"
+    refuse_folder(target, "--json")
     return target

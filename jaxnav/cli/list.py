@@ -102,8 +102,8 @@ def _format_needs(entry: Entry) -> str:
 #: Lines below a table.
 _NOTES: dict[Kind, str] = {
     "experiments": (
-        "M steps: million environment steps of all policies. On two cores, study_quick takes eleven minutes, and study "
-        "about an hour. Finished runs and results are reused. `jaxnav scenes import` makes scene files."
+        "M steps: million environment steps of all policies. Finished runs and results are reused. `jaxnav scenes "
+        "import` makes scene files."
     ),
 }
 #: Columns between name and description.

@@ -3,17 +3,18 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
 from rich.console import Console
 
 from jaxnav.choices import Decoding, EstimatorName, Form
 from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
+    name_evaluation,
     parse_arguments,
     print_table,
+    refuse_folder,
     refuse_unwritable,
     run_command,
 )
@@ -41,7 +42,7 @@ class SweepConfig:
       split: scenes to evaluate on.
       scenes: scene file to use instead of the scenes of the run or policy.
       world: generated world to use instead of the scenes of the run or policy.
-      episodes: number of fixed episodes, balanced over room types and scenes.
+      episodes: number of fixed episodes, at least 1, balanced over room types and scenes.
       decoding: `argmax` for best actions (the largest logit), `sample` for sampled actions.
       form: rule by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the logits
         from experience alone; the share is the excess of the layout gap over the threshold. `residual` does this
@@ -51,13 +52,13 @@ class SweepConfig:
         that detects another layout; `jaxnav list settings` describes all.
       hold: keep the gap from falling within an episode. With `--form switch`, experience then stays removed for the
         rest of the episode once the gap exceeds the threshold.
-      seed: random seed of the episode list and of sampled actions.
+      seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
       out: PNG to write the figure to; the numbers are written next to it as JSON. The default is a name such as
         `sweep-val.png` in the run directory or, for a policy, in the working directory.
       format: format of the printed table.
     """
 
-    source: Annotated[str, tyro.conf.Positional]
+    source: str
     epsilon: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
     shift: tuple[float, ...] = (0.0, 1.0)
     split: Literal["train", "val", "test"] = "val"
@@ -121,28 +122,24 @@ def _find_figure_path(config: SweepConfig) -> Path:
     """Return the path of the figure, or raise an `InputError` if it cannot be written."""
     from jaxnav.runs.policies import is_policy
 
-    # The default name lists every option that changes what is evaluated.
-    parts = ["sweep"]
-    folder = Path(config.source)
-    if is_policy(config.source):
-        folder = Path()
-        parts.append(Path(config.source).resolve().name)
-    if config.world:
-        parts.append(config.world)
-    elif config.scenes:
-        parts.append(f"scenes-{config.scenes.name.split('.')[0]}")  # never the name of a world
-    parts.append(config.split)
-    for option in (config.form, config.setting, "hold" if config.hold else None):
-        if option is not None:
-            parts.append(option)
-    if config.decoding == "sample":
-        parts.append("sampled")
+    # A policy is not in a run directory, so its name belongs to the file.
+    is_single_policy = is_policy(config.source)
+    folder = Path() if is_single_policy else Path(config.source)
+    command = f"sweep-{Path(config.source).resolve().name}" if is_single_policy else "sweep"
+    has_default_shifts = config.shift == SweepConfig.shift
+    details = (
+        None if has_default_shifts else f"shift{'-'.join(f'{shift:g}' for shift in config.shift)}",
+        config.form,
+        config.setting,
+        "hold" if config.hold else None,
+        "sampled" if config.decoding == "sample" else None,
+    )
+    name = name_evaluation(command, config.split, config.world, config.scenes, *details)
 
-    path = config.out or folder / f"{'-'.join(parts)}.png"
+    path = config.out or folder / f"{name}.png"
     if path.suffix != ".png":
         raise InputError(f"--out {path}: give a name that ends in .png")
-    if path.is_dir() or (path.parent.exists() and not path.parent.is_dir()):
-        raise InputError(f"--out {path}: is a folder or lies in a file; give the name of a file to write")
+    refuse_folder(path, "--out")
     return path
 
 

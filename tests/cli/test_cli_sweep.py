@@ -72,9 +72,15 @@ def test_file_names_differ_by_what_is_evaluated():
         SweepConfig("run"),
         SweepConfig("run", world="houses", form="switch", hold=True),
         SweepConfig("rooms-org", decoding="sample"),
+        SweepConfig("run", shift=(0.0, 0.5)),
     ]
     paths = [str(_find_figure_path(config)) for config in configs]
-    assert paths == ["run/sweep-val.png", "run/sweep-houses-val-switch-hold.png", "sweep-rooms-org-val-sampled.png"]
+    assert paths == [
+        "run/sweep-val.png",
+        "run/sweep-houses-val-switch-hold.png",
+        "sweep-rooms-org-val-sampled.png",
+        "run/sweep-val-shift0-0.5.png",
+    ]
 
 
 @pytest.mark.parametrize(
