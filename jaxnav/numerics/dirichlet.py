@@ -1,7 +1,7 @@
 """KL divergence of a Dirichlet distribution from itself before an update.
 
-`presence_kl` is the form for the layout estimator (eq. 5), where every count is 0 or one fixed increment. The result is
-accurate in float32, where differences of lnGamma are not.
+`presence_kl` is the form for a layout estimator (eq. 5) that adds 0 or one fixed increment to every entry, and
+`counts_kl` is the form for any counts. Both are accurate in float32, where differences of lnGamma are not.
 
 Throughout, g(a, c) = lnGamma(a) - lnGamma(a + c) + c psi(a + c) is the Bregman divergence of lnGamma.
 """
@@ -48,6 +48,29 @@ def presence_kl(prior: jax.Array, counts: jax.Array, increment: int) -> jax.Arra
     entry_sum = jnp.log1p(jnp.where(is_present, growth, 0)).sum(-1)
     sum_leading = prior_sum * _log1p_excess(count_sum / prior_sum, log_sum_growth)
     return jnp.maximum(entry_sum - sum_leading - _bregman_remainder(prior_sum, count_sum, log_sum_growth), 0)
+
+
+def counts_kl(prior: jax.Array, counts: jax.Array) -> jax.Array:
+    """Return KL(Dir(prior + counts) || Dir(prior)) in nats, for any counts.
+
+    The divergence is sum_j g(a_j, c_j) - g(a_0, N), with the sums a_0 of the prior and N of the counts.
+
+    Args:
+      prior: float32 [..., K], concentrations, 0.01 or more; 0 with count 0 excludes an entry.
+      counts: float32 [..., K], 0 or more.
+
+    Returns:
+      float32 [...], >= 0; the error is below 4e-5 of the sum of the g(a_j, c_j), and below 1e-5 of it where all
+      concentrations are 1 or more.
+    """
+    entry_sum = _bregman_divergence(jnp.maximum(prior, MIN_CONCENTRATION), counts).sum(-1)
+    return jnp.maximum(entry_sum - _bregman_divergence(prior.sum(-1), counts.sum(-1)), 0)
+
+
+def _bregman_divergence(a: jax.Array, c: jax.Array) -> jax.Array:
+    """Return g(a, c) for concentrations a >= 0.01 and counts c >= 0; 0 where c is 0."""
+    log_ratio = jnp.log1p(c / a)
+    return a * _log1p_excess(c / a, log_ratio) + _bregman_remainder(a, c, log_ratio)
 
 
 def _log1p_excess(t: jax.Array, log1p_t: jax.Array) -> jax.Array:

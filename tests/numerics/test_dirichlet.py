@@ -11,7 +11,7 @@ from jax.scipy.special import gammaln as gammaln_float32
 from scipy.special import digamma, gammaln
 from support.numerics import exact_kl
 
-from jaxnav.numerics.dirichlet import presence_kl
+from jaxnav.numerics.dirichlet import counts_kl, presence_kl
 
 NUM_ROWS = 4000
 
@@ -89,6 +89,38 @@ def test_presence_kl_is_accurate_in_float32(increment):
         absolute_error = np.abs(values - np.maximum(exact_kl(prior, counts), 0))
         error = absolute_error / np.maximum(sum_of_entry_divergences(prior, counts), 1e-30)
         assert error.max() < 2e-5, kind
+
+
+@pytest.mark.parametrize("max_count", [1, 3, 40])
+def test_counts_kl_is_accurate_in_float32(max_count):
+    """Counts from 0 to 1, 3 and 40 in one row, and priors up to the sums of a million random views."""
+    rng = np.random.default_rng(max_count)
+    for kind, prior, drawn_counts in random_priors_and_counts(max_count, 22):
+        counts = (drawn_counts > 0) * rng.integers(1, max_count + 1, drawn_counts.shape)
+        scale = np.float32(1.0 if kind == "extremes" else 50.0)
+        values = jax.jit(counts_kl)(scale * prior, counts.astype(np.float32))
+        entry_sum = sum_of_entry_divergences(scale * prior, counts)
+        error = np.abs(values - np.maximum(exact_kl(scale * prior, counts), 0)) / np.maximum(entry_sum, 1e-30)
+        assert error.max() < 4e-5, kind
+        # Concentrations of 1 and more, as in a prior that starts with one sighting of each pair.
+        assert error[(scale * prior >= 1).all(axis=-1)].max(initial=0) < 1e-5, kind
+
+
+def test_counts_kl_follows_worked_arithmetic():
+    """KL(Dir(6, 3) || Dir(6, 2)) = ln 4 + psi(3) - psi(9), and two counts at once for Dir(3, 1) against Dir(1, 1)."""
+    np.testing.assert_allclose(counts_kl(jnp.array([6.0, 2]), jnp.array([0.0, 1])), 0.168437, rtol=1e-5)
+    # lnGamma(4) - lnGamma(2) - lnGamma(3) + lnGamma(1) + 2 (psi(3) - psi(4)) = ln 6 - ln 2 - 2 / 3.
+    np.testing.assert_allclose(counts_kl(jnp.ones(2), jnp.array([2.0, 0])), np.log(3) - 2 / 3, rtol=1e-5)
+    # An excluded entry changes nothing.
+    np.testing.assert_allclose(counts_kl(jnp.array([0.0, 1, 1]), jnp.array([0.0, 2, 0])), np.log(3) - 2 / 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("increment", [1, 5])
+def test_counts_kl_equals_presence_kl_for_equal_counts(increment):
+    for _, prior, drawn_counts in random_priors_and_counts(7, 8):
+        counts = (increment * (drawn_counts > 0)).astype(np.float32)
+        difference = np.abs(counts_kl(prior, counts) - presence_kl(prior, counts, increment))
+        assert (difference <= 6e-5 * sum_of_entry_divergences(prior, counts.astype(int)) + 1e-30).all()
 
 
 def test_presence_kl_sums_over_the_last_axis_only():
