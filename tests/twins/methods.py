@@ -42,7 +42,11 @@ class TwinAnonymous(TwinMethod):
 
 
 class TwinRelations(TwinMethod):
-    """Object relations (`org`): rows [R^T X | T], each times its weight, through a perceptron."""
+    """Object relations (`org`), as the released code states them.
+
+    info = relu(L1([info | indicator])).T, info = relu(L2(info)) for each layer, appear = (appear.T @ info).T; w g
+    multiplies the rows [appear | info | indicator], which a perceptron reads.
+    """
 
     def encode(
         self,
@@ -63,12 +67,26 @@ class TwinRelations(TwinMethod):
         weights: np.ndarray,
         table: np.ndarray,
     ) -> np.ndarray:
-        """Return the maps of the relations, with the given table beside them."""
-        relation = relu(linear(params["edges"], features.table)).T
+        """Return the maps of the rows [R^T X | table], each times its weight."""
+        relations = self.relations(params, features)
+        seen_appearance = features.visible[:, None] * appearance
+        related_appearance = self.aggregate(relations, seen_appearance)
+        return category_maps(params["maps"], self.weigh(weights, np.hstack([related_appearance, table])))
+
+    def relations(self, params: Params, features: TwinFeatures) -> np.ndarray:
+        """Return R [K, K], mixed over the categories of the second axis."""
+        relations = relu(linear(params["edges"], features.table)).T
         for kernel in params["mix"]:
-            relation = relu(relation @ kernel)
-        rows = np.hstack([relation @ (features.visible[:, None] * appearance), table])
-        return category_maps(params["maps"], weights[:, None] * rows)
+            relations = relu(relations @ kernel)
+        return relations
+
+    def aggregate(self, relations: np.ndarray, appearance: np.ndarray) -> np.ndarray:
+        """Return the related appearances (X^T R)^T, [K, d]."""
+        return (appearance.T @ relations).T
+
+    def weigh(self, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the rows times w g, equation 7."""
+        return np.diag(weights) @ rows
 
 
 class TwinZones(TwinRelations):

@@ -1,11 +1,12 @@
 """ORG: the object relation graph, which relates the detected categories to one another.
 
 Source: H. Du, X. Yu and L. Zheng, *Learning Object Relation Graph and Tentative Policy for Visual Navigation*, ECCV
-2020; a host of L-sTDE in the paper. (`jaxnav.policies.methods.tpn` adds its tentative policy.)
+2020, and its released code; a host of L-sTDE in the paper. (`jaxnav.policies.methods.tpn` adds its tentative policy.)
 
-Kept: relations R between categories are computed from their boxes and the goal, and mix the appearances of the detected
-categories. Changed: appearances are learned embeddings of the categories, and a perceptron shared by all categories
-reads each row.
+Kept: relations between categories are computed from their boxes and the goal, transposed, and mixed over the
+categories; their transpose mixes the appearances of the detected categories; a perceptron shared by all categories
+reads the rows of aggregated appearance, box and goal. Changed: appearances are learned embeddings of the categories,
+the mixing layers have no biases, and the perceptron is smaller.
 """
 
 from collections.abc import Mapping
@@ -24,9 +25,14 @@ from jaxnav.policies.spec import PolicySpec
 class ObjectRelations(Experience):
     """Relations between the detected categories and the goal.
 
-    The layout weights multiply (eq. 7) the table [R^T X | T | g] of K rows, with the appearance X and the boxes T of
-    the detected categories and the goal g, before a perceptron reads each row. The first layer of the perceptron is
-    linear, so the weights multiply its output instead, which is equivalent.
+    With the appearance X [K, d] and the boxes T [K, F] of the detected categories and the goal g [K],
+
+        R = ReLU([T | g] E + b)^T          [K, K], the edges
+        R = ReLU(R M_l)  for each layer l  [K, K], mixed over the categories of the second axis
+        Z = perceptron(w g * [R^T X | T | g])  row by row, [K, m]
+
+    where the layout weights w g [K] multiply the rows (eq. 7). The first layer of the perceptron is linear, so the
+    weights multiply its output before the bias, which is equivalent.
 
     Attributes:
       columns: number of columns of T and g; a subclass may add columns of its own.
@@ -50,18 +56,29 @@ class ObjectRelations(Experience):
         self.width = self.maps.width
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: Any) -> jax.Array:
-        """Return experience, each category weighted by the layout."""
+        """Return experience float32 [..., K m], each category weighted by the layout."""
         return self.relate(features, appearance, weights, features.table)
 
     def relate(self, features: Features, appearance: jax.Array, weights: jax.Array, table: jax.Array) -> jax.Array:
-        """Return the weighted experience of a table [..., K, columns]."""
-        # Relations R^T [..., K, K] from the boxes.
+        """Return the weighted experience of a table.
+
+        Args:
+          features: detections, leaves [..., K, ...].
+          appearance: float32 [K, d], X before undetected categories are masked.
+          weights: float32 [..., K], layout weights w g, not negative.
+          table: float32 [..., K, columns], the columns beside R^T X.
+
+        Returns:
+          float32 [..., K m], the maps of all categories side by side.
+        """
+        # Edges ReLU([T | g] E + b)^T, then ReLU(R M) for each mixing layer: relations R [..., K, K].
         relations = jnp.swapaxes(nnx.relu(self.edges(features.table)), -1, -2)
         for kernel in self.mix[...]:
             relations = nnx.relu(matmul_rows(relations, kernel))
 
-        # R^T X with X = visible * appearance; the appearance has already passed the first layer of the maps.
-        visible_relations = relations * features.visible[..., None, :]
+        # Aggregated appearance R^T X with X = visible * appearance [K, d], which has passed the first layer of the
+        # perceptron before the aggregation: [..., K, h].
+        visible_relations = jnp.swapaxes(relations, -1, -2) * features.visible[..., None, :]
         aggregated = matmul_rows(visible_relations, self.maps.project_appearance(appearance))
         return self.maps.finish(weights[..., None] * (aggregated + self.maps.project_rows(table)))
 
