@@ -103,6 +103,10 @@ class EstimatorConfig:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give {requirement}")
 
 
+#: Largest relative weight, see `scale_weights`. Without a bound, a rare goal's only companion would get up to K - 1.
+MAX_RELATIVE_WEIGHT = 4.0
+_MIN_MEAN_WEIGHT = 1e-6  # against division by zero
+
 #: Configurations by name, see the docstring of the module. `evidence` leaves priors and weights w as in `calibrated`.
 ESTIMATORS = {
     "paper": EstimatorConfig(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
@@ -314,3 +318,23 @@ class LayoutEstimator(struct.PyTreeNode):
         if goal is None:
             raise ValueError("gap='overdue': needs the goal; pass it to `update`")
         return overdue_gap(state.co_seen, self.cooccurrence.co_visibility, goal)
+
+def scale_weights(weights: jax.Array, goal: jax.Array) -> jax.Array:
+    """Scale w x g of eq. 7 so that the weights off the goal have mean 1 (the kind `relative`).
+
+    Raw weights off the goal are shares that add up to about 1, so they shrink the features of K - 1 categories about
+    K-fold. Relative weights keep what the belief says, which category is likelier than others near the goal, and drop
+    the common factor. Weights of ones, which disable the layout, stay ones.
+
+    Args:
+      weights: float32 [..., K], as from `LayoutEstimator.goal_weights`.
+      goal: int [...], index of the goal category.
+
+    Returns:
+      float32 [..., K], at most `MAX_RELATIVE_WEIGHT` off the goal; the goal keeps its weight.
+    """
+    num_categories = weights.shape[-1]
+    is_goal = jax.nn.one_hot(goal, num_categories, dtype=bool)
+    mean_weight = jnp.where(is_goal, 0.0, weights).sum(axis=-1, keepdims=True) / (num_categories - 1)
+    relative_weights = jnp.minimum(weights / jnp.maximum(mean_weight, _MIN_MEAN_WEIGHT), MAX_RELATIVE_WEIGHT)
+    return jnp.where(is_goal, weights, relative_weights)

@@ -8,10 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 from scipy.special import digamma
 from support.numerics import exact_kl
 
-from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutState, prior_from_counts
+from jaxnav.layout import (
+    ESTIMATORS,
+    MAX_RELATIVE_WEIGHT,
+    EstimatorConfig,
+    LayoutEstimator,
+    LayoutState,
+    prior_from_counts,
+    scale_weights,
+)
 
 NUM_CATEGORIES = 6
 PRESENCE = hnp.arrays(np.bool_, (4, NUM_CATEGORIES))
@@ -282,3 +291,37 @@ def test_prior_needs_two_categories():
 def test_unknown_estimator_names_the_nearest():
     with pytest.raises(ValueError, match="calibrated"):
         LayoutEstimator(jnp.ones((NUM_CATEGORIES, NUM_CATEGORIES)), "calibratd")
+
+
+# Relative weights
+
+
+def test_relative_weights_follow_worked_arithmetic():
+    """Goal 1 of four: the mean off the goal is (.01 + .02 + .06) / 3 = .03, so the weights are 1/3, 2/3 and 2."""
+    raw_weights = jnp.array([[0.01, 1.0, 0.02, 0.06], [0.01, 1.0, 0.02, 0.06]])
+    relative_weights = scale_weights(raw_weights, jnp.array([1, 1]))
+    np.testing.assert_allclose(relative_weights, [[1 / 3, 1.0, 2 / 3, 2.0]] * 2, rtol=1e-6)
+
+
+def test_relative_weights_are_bounded_off_the_goal_and_leave_the_goal_alone():
+    """One companion of eight has all weight: 7 times the mean; the released code's goal weight, above 1, stays."""
+    raw_weights = jnp.array([1.3, 0.7, *[0.0] * 6])
+    relative_weights = scale_weights(raw_weights, jnp.int32(0))
+    np.testing.assert_allclose(relative_weights, [1.3, MAX_RELATIVE_WEIGHT, *[0.0] * 6], rtol=1e-6)
+
+
+@given(hnp.arrays(np.float32, (NUM_CATEGORIES,), elements=st.floats(0.03125, 0.0625, width=32)), st.floats(0.1, 10))
+def test_relative_weights_have_mean_one_and_ignore_a_common_factor(raw_weights, factor):
+    """A bound of 4 is out of reach: the largest entry is at most .0625 / .03125 = 2 times the mean."""
+    relative_weights = np.asarray(scale_weights(jnp.asarray(raw_weights), jnp.int32(2)))
+    off_goal = np.arange(NUM_CATEGORIES) != 2
+    np.testing.assert_allclose(relative_weights[off_goal].mean(), 1.0, rtol=1e-5)
+    assert relative_weights[2] == raw_weights[2]
+    scaled_weights = scale_weights(jnp.asarray(raw_weights * np.float32(factor)), jnp.int32(2))
+    np.testing.assert_allclose(np.asarray(scaled_weights)[off_goal], relative_weights[off_goal], rtol=1e-5)
+
+
+def test_relative_weights_of_a_disabled_layout_are_ones_to_the_bit():
+    for num_categories in (2, 3, 15, 22):
+        ones = jnp.ones(num_categories)
+        np.testing.assert_array_equal(scale_weights(ones, jnp.int32(1)), ones)

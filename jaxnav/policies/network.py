@@ -22,10 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from jaxnav.layout import scale_weights
 from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.numerics.recurrence import gru_step
 from jaxnav.numerics.rounding import round_to_grid
-from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, unpack_features
+from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, scale_boxes, unpack_features
 from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_experience
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
@@ -212,6 +213,7 @@ class Policy(Stream):
         self.adaptation = method.adaptation
         self.direct = spec.direct
         self.goal_row = spec.goal_row
+        self.weight_kind = spec.weight_kind
         # A method may restrict what the networks see, down to the number of categories.
         perceived_spec = dataclasses.replace(spec, num_categories=self._num_perceived_categories())
 
@@ -272,7 +274,10 @@ class Policy(Stream):
 
         # Z: the method's experience, weighted by w x g (eq. 7). No gradient enters the layout belief.
         layout_weights = jax.lax.stop_gradient(inputs.layout_weights)
-        experience = self.method.encode(features, self.experience_appearance, layout_weights, inputs.reading)
+        if self.weight_kind == "relative":
+            layout_weights = scale_weights(layout_weights, inputs.observation.goal)
+        experience_features = scale_boxes(features) if self.weight_kind == "pixel" else features
+        experience = self.method.encode(experience_features, self.experience_appearance, layout_weights, inputs.reading)
 
         # The Done gate follows the confidence of the goal's detection.
         confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)

@@ -9,6 +9,9 @@ if TYPE_CHECKING:
 
 #: Detections that the direct pathway G -> A sees: of all categories, of the goal alone, or none.
 Direct = Literal["all", "goal", "none"]
+#: Scale at which the layout weights enter experience: as in eq. 7, over their mean (`jaxnav.layout.scale_weights`), or
+#: as in eq. 7 with boxes in pixels (`jaxnav.policies.features.scale_boxes`).
+WeightKind = Literal["raw", "relative", "pixel"]
 #: Network from pathways to logits: fused before one recurrent core (the paper), or two streams that are added.
 DecisionKind = Literal["fused", "streams"]
 
@@ -33,6 +36,10 @@ class Sizes:
     row_outputs: int = 8  # m
 
 
+#: Fields that policies of earlier versions lack, with the values that they were trained with.
+_EARLIER_FIELDS: dict[str, Any] = {"weight_kind": "raw"}
+
+
 @dataclasses.dataclass(frozen=True)
 class PolicySpec:
     """Specification of a policy; hashable.
@@ -48,6 +55,7 @@ class PolicySpec:
         not (released code of HOZ and L-sTDE). A logit of 0 is likely at first: this also changes how training starts.
       decision: network from pathways to logits.
       goal_row: whether the direct pathway holds the goal's detection once more, in a row of its own; not in the paper.
+      weight_kind: how the layout weights enter experience (eq. 7).
     """
 
     method: "Method"
@@ -59,10 +67,13 @@ class PolicySpec:
     spatial_memory: "SpatialMemory | None" = None
     decision: DecisionKind = "fused"
     goal_row: bool = True
+    weight_kind: WeightKind = "raw"
 
     def __post_init__(self) -> None:
-        if self.decision not in get_args(DecisionKind):
-            raise ValueError(f"decision is {self.decision!r}; choose one of {', '.join(get_args(DecisionKind))}")
+        for name, options in (("decision", get_args(DecisionKind)), ("weight_kind", get_args(WeightKind))):
+            value = getattr(self, name)
+            if value not in options:
+                raise ValueError(f"{name} is {value!r}; choose one of {', '.join(options)}")
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON values: the method by its name, without the number of categories."""
@@ -90,6 +101,7 @@ class PolicySpec:
         """
         from jaxnav.policies.spatial_memory import SpatialMemory
 
+        fields = _EARLIER_FIELDS | fields
         values = {field.name: fields[field.name] for field in dataclasses.fields(cls) if field.name != "num_categories"}
         memory = values["spatial_memory"]
         values |= {

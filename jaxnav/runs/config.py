@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from jaxnav.choices import Reduction
 from jaxnav.errors import InputError
-from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes
+from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS
@@ -81,6 +81,10 @@ class LayoutConfig:
       reduction: one layout gap (doubt about the layout) from the changes that a view makes to the rows of the belief,
         one row for each category: mean over visible categories (`mean_visible`), mean over all (`mean`), or `sum`. Only
         with `calibrated`, which by default chooses it together with `strength`.
+      weights: scale of the layout weights w that multiply the experience features of each category (eq. 7). `raw`, as
+        in the paper: w itself, about 1 / (number of categories) except for the goal. `relative`: w over its mean over
+        all categories but the goal, at most 4. `pixel`: w itself, with positions and sizes of the experience features
+        in pixels of an image of 300 x 300, as in the authors' code.
       prior: belief at the start of an episode: a separate one for each type of `room`, so that the policy knows the
         type of the room, or one `pooled` over all rooms.
       walks: number of random walks in the training scenes before training, at least 1. They count which things are seen
@@ -92,6 +96,7 @@ class LayoutConfig:
     setting: Literal["paper", "released", "calibrated"] = "calibrated"
     strength: float | None = None
     reduction: Reduction | None = None
+    weights: WeightKind = "raw"
     prior: Literal["room", "pooled"] = "room"
     walks: int = 2048
     steps: int = 100
@@ -223,6 +228,7 @@ class RunConfig:
             spatial_memory=SpatialMemory(self.task.rules.headings) if self.spatial_memory else None,
             decision=self.decision,
             goal_row=self.goal_row,
+            weight_kind=self.layout.weights,
         )
 
     @property
@@ -349,8 +355,11 @@ def fill_world_defaults(config: RunConfig) -> RunConfig:
         if getattr(config.worlds, name) is None:
             missing_settings[name] = value
     total_steps = world.total_steps if config.total_steps is None else config.total_steps
+    ppo = config.ppo
+    if ppo.guidance is None:
+        ppo = dataclasses.replace(ppo, guidance=world.guidance)
     return dataclasses.replace(
-        config, worlds=dataclasses.replace(config.worlds, **missing_settings), total_steps=total_steps
+        config, worlds=dataclasses.replace(config.worlds, **missing_settings), total_steps=total_steps, ppo=ppo
     )
 
 
@@ -395,6 +404,9 @@ def check_config(config: RunConfig) -> RunConfig:
         config = dataclasses.replace(config, arms=("baseline",))
     if config.decision == "streams":
         config = dataclasses.replace(config, direct="goal", counterfactual="none")
+    if config.ppo.guidance is None:
+        guidance = _usual_guidance(config, method)
+        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, guidance=guidance))
 
     # The method and the numbers come first: later checks compute with them.
     _check_method(config, method)
@@ -404,6 +416,11 @@ def check_config(config: RunConfig) -> RunConfig:
     _check_learning(config)
     _check_world(config)
     return config
+
+
+def _usual_guidance(config: RunConfig, method: "Method") -> float:
+    """Weight of guidance by default: that of the world, and 0 for methods that do not choose actions."""
+    return WORLDS[config.world].guidance if method.control.num_choices == NUM_ACTIONS else 0.0
 
 
 def _check_method(config: RunConfig, method: "Method") -> None:
@@ -416,6 +433,11 @@ def _check_method(config: RunConfig, method: "Method") -> None:
     can_gate = not config.done_gate or method.control.num_choices == NUM_ACTIONS
     advice = f"method {config.method!r} does not choose actions, so there is no Done to gate; omit the option"
     _require(can_gate, "done_gate", True, advice)
+
+    # Guidance compares the choices with the actions of shortest paths.
+    can_guide = not config.ppo.has_guidance or method.control.num_choices == NUM_ACTIONS
+    advice = f"method {config.method!r} does not choose actions, so shortest paths cannot guide it; omit the option"
+    _require(can_guide, "ppo.guidance", config.ppo.guidance, advice)
 
     # Sizes of the method's networks.
     size_names = method.experience.sizes
@@ -521,6 +543,9 @@ def _check_learning(config: RunConfig) -> None:
     _require_each(ppo, "ppo", ("alone",), lambda number: 0.0 <= number < 1.0, "give a share from 0 to below 1")
     _require_each(ppo, "ppo", positive_names, lambda number: 0.0 < number < math.inf, "give a positive number")
     _require_each(ppo, "ppo", loss_weights, lambda number: 0.0 <= number < math.inf, "give 0 or more")
+    for name in ("guidance", "final_guidance"):
+        weight = getattr(ppo, name)
+        _require(weight is None or 0.0 <= weight < math.inf, f"ppo.{name}", weight, "give 0 or more")
 
     # Minibatches divide the environments into equal parts.
     lower_multiple = ppo.num_envs // ppo.minibatches * ppo.minibatches

@@ -85,7 +85,8 @@ def compile_training_world(config: RunConfig, console: Console) -> CompiledWorld
     """Compile the training scenes of a run."""
     scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, console)
     world = _compile_world(config, scenes, {}, config.train_step_limit, console)
-    return dataclasses.replace(world, has_expert=any(stage.uses_expert for stage in config.stages))
+    has_expert = config.ppo.has_guidance or any(stage.uses_expert for stage in config.stages)
+    return dataclasses.replace(world, has_expert=has_expert)
 
 
 def compile_sample_bank(config: RunConfig) -> Bank:

@@ -38,6 +38,7 @@ class World:
       shaping: reward in training for every metre nearer to the goal than before in the episode, for worlds whose goals
         are rarely reached by chance.
       near_starts: probability that a training episode starts near its goal, for the same reason.
+      guidance: weight of the guidance by shortest paths in training, see `PPOConfig.guidance`.
       budgets: numbers of actions within which success is counted in addition: where experience is most valuable, and
         later.
     """
@@ -52,6 +53,7 @@ class World:
     large_step_limit: int
     shaping: float
     near_starts: float
+    guidance: float
     budgets: tuple[int, int]
 
 
@@ -68,6 +70,7 @@ WORLDS = {
         large_step_limit=200,
         shaping=0.0,
         near_starts=0.0,
+        guidance=0.0,
         budgets=(20, 50),
     ),
     "apartments": World(
@@ -81,6 +84,7 @@ WORLDS = {
         large_step_limit=500,
         shaping=1.0,
         near_starts=0.5,
+        guidance=0.0,
         budgets=(50, 150),
     ),
     "houses": World(
@@ -94,6 +98,7 @@ WORLDS = {
         large_step_limit=500,
         shaping=1.0,
         near_starts=0.5,
+        guidance=0.0,
         budgets=(50, 150),
     ),
 }

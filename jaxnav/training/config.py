@@ -37,6 +37,12 @@ class PPOConfig:
       entropy: weight of the entropy bonus at the start of a training stage, at least 0.
       final_entropy: weight of the entropy bonus at the end of a training stage, at least 0; linear in between.
       value: weight of the value loss, at least 0.
+      guidance: weight of the guidance at the start of a training stage, at least 0. Guidance is a further term of the
+        loss: the cross-entropy to the next action of a shortest path, at every step of the policy's own episodes. Only
+        training needs the shortest paths. The default depends on the world, and is 0 for methods that do not choose
+        actions.
+      final_guidance: weight of the guidance at the end of a training stage, at least 0; linear in between. By default,
+        the weight does not change.
       max_grad_norm: global norm to which gradients are clipped, above 0.
       distil: weight of the loss with which `--counterfactual distil` trains the logits from experience alone, at least
         0.
@@ -64,12 +70,19 @@ class PPOConfig:
     entropy: float = 0.01
     final_entropy: float = 0.0
     value: float = 0.5
+    guidance: float | None = None
+    final_guidance: float | None = None
     max_grad_norm: float = 0.5
     distil: float = 0.5
     alone: float = 0.5
     experience: float = 0.8
     experience_drawn: Literal["episode", "step"] = "episode"
     experience_rate: float = 0.5
+
+    @property
+    def has_guidance(self) -> bool:
+        """True if the loss has a term of shortest paths."""
+        return bool(self.guidance or self.final_guidance)
 
     def num_updates(self, total_steps: int) -> int:
         """Number of updates in `total_steps` environment steps of a seed, rounded up."""
@@ -104,6 +117,11 @@ class PPOConfig:
 
         from jaxnav.training.ppo import PPOScalars
 
+        # Without guidance, the tables have no shortest paths, and the loss has no such term.
+        guidance_weight, final_guidance_weight = None, None
+        if self.has_guidance:
+            guidance_weight = jnp.float32(self.guidance)
+            final_guidance_weight = jnp.float32(self.guidance if self.final_guidance is None else self.final_guidance)
         return PPOScalars(
             learning_rate=jnp.float32(self.learning_rate) * lr_scale,
             gamma=jnp.float32(self.gamma),
@@ -113,6 +131,8 @@ class PPOConfig:
             final_entropy_weight=jnp.float32(self.final_entropy),
             value_weight=jnp.float32(self.value),
             distil_weight=jnp.float32(self.distil),
+            guidance_weight=guidance_weight,
+            final_guidance_weight=final_guidance_weight,
             experience_prob=jnp.float32(self.experience),
             first_update=jnp.float32(first_update),
             num_updates=jnp.float32(num_updates),

@@ -21,6 +21,7 @@ Extensions of plain PPO:
   not at all, by zeroing the direct pathways at random while acting (a coin), or by distillation.
 * *Experience dropout*: policies with `decision: streams` may act without experience, for whole episodes or single
   steps.
+* *Guidance*: a cross-entropy to the next action of a shortest path, along the policy's own rollouts.
 * *Macro-actions*: a choice of the policy may last for several actions. Choices sampled meanwhile are ignored
   (`is_decision_step` is False): they do not enter the policy loss, and advantages are those of macro-steps.
 * *Stages*: each stage has its own loss, frozen parameters and schedules, and begins with a fresh Adam. Episodes
@@ -46,6 +47,7 @@ from jaxnav.numerics.recurrence import gru_step, unroll_gru
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Stage
+from jaxnav.policies.methods.imitation import expert_actions, imitation_loss
 from jaxnav.policies.network import Params, Policy, init_params
 from jaxnav.policies.pathways import (
     NO_ACTION,
@@ -75,7 +77,8 @@ _START_DROPOUT = 2**31 - 1
 class PPOScalars(struct.PyTreeNode):
     """Settings that may change without a new compilation, float32 [] each.
 
-    All fields but the last two hold the setting of `PPOConfig` with the same first word.
+    All fields but the last two hold the setting of `PPOConfig` with the same first word; None where there is no
+    guidance.
 
     Attributes:
       first_update: updates before the stage.
@@ -90,6 +93,8 @@ class PPOScalars(struct.PyTreeNode):
     final_entropy_weight: jax.Array
     value_weight: jax.Array
     distil_weight: jax.Array
+    guidance_weight: jax.Array | None
+    final_guidance_weight: jax.Array | None
     experience_prob: jax.Array
     first_update: jax.Array
     num_updates: jax.Array
@@ -495,7 +500,7 @@ def _replay_step_by_step(
 def ppo_loss(
     replay: Replay, advantages: jax.Array, scalars: PPOScalars, use_distillation: bool, method: Method
 ) -> tuple[jax.Array, Metrics]:
-    """Clipped PPO loss of a minibatch [T, B], plus distillation and the method's auxiliary loss.
+    """Clipped PPO loss of a minibatch [T, B], plus distillation, guidance and the method's auxiliary loss.
 
     Distillation adds KL(stop_gradient(pi) || counterfactual). Policy terms average over decision steps only; the value
     loss uses all steps, because a rollout may end (and bootstrap) within a macro-action.
@@ -538,6 +543,12 @@ def ppo_loss(
         distil_loss = masked_mean(divergence, is_decision_step)
         loss = loss + scalars.distil_weight * distil_loss
         loss_terms["distil_loss"] = distil_loss
+
+    # Guidance: cross-entropy to the next action of a shortest path.
+    if scalars.guidance_weight is not None:
+        guidance_loss, guidance_terms = imitation_loss(replay.factual.logits, expert_actions(replay))
+        loss = loss + scalars.guidance_weight * guidance_loss
+        loss_terms = loss_terms | guidance_terms
 
     # Auxiliary loss of the method.
     if method.auxiliary is not None:
@@ -831,13 +842,16 @@ class Learner:
         """Take a gradient step for every minibatch of every epoch."""
         config = self.config
 
-        # Schedules, linear within the stage: the learning rate falls to 0, the entropy weight goes to its final value.
-        # `scalars.num_updates` counts the updates of the stage; one call of `train` may run fewer. From here on
-        # `scalars.entropy_weight` is the scheduled weight.
+        # Schedules, linear within the stage: the learning rate falls to 0, entropy and guidance go to their final
+        # weights. `scalars.num_updates` counts the updates of the stage; one call of `train` may run fewer. From here
+        # on `scalars.entropy_weight` and `scalars.guidance_weight` are the scheduled weights.
         progress = (state.update.astype(jnp.float32) - scalars.first_update) / scalars.num_updates
         learning_rate = scalars.learning_rate * (1.0 - progress)
         entropy_change = scalars.final_entropy_weight - scalars.entropy_weight
         scalars = scalars.replace(entropy_weight=scalars.entropy_weight + progress * entropy_change)
+        if scalars.guidance_weight is not None:
+            guidance_change = scalars.final_guidance_weight - scalars.guidance_weight
+            scalars = scalars.replace(guidance_weight=scalars.guidance_weight + progress * guidance_change)
 
         # Each device computes loss and gradient on its share of the environments; their means over the devices are
         # those of the minibatch, also under masks (see `masked_mean`). The specs follow the arguments of

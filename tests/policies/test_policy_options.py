@@ -14,9 +14,11 @@ from support.tiny_world import BANK, SIZES, SPEC, random_params
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
+from jaxnav.policies.features import scale_boxes, unpack_features
 from jaxnav.policies.network import DONE_GATE, bind, init_params
 from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
-from jaxnav.policies.spec import Direct
+from jaxnav.policies.spec import Direct, PolicySpec
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 DIRECT = get_args(Direct)
@@ -175,3 +177,60 @@ def test_a_gate_that_is_off_is_ignored(plain):
     pathways = plain.pathways(uncertain())
     closed = Pathways(*pathways[:3], gate=jnp.zeros_like(pathways.gate))
     chex.assert_trees_all_equal(plain.decide(closed, memory()), plain.decide(pathways, memory()))
+
+
+# Scale at which the layout weights enter experience
+
+
+def encode_experience(weight_kind, observation, layout_weights):
+    """Z of a policy with this kind of weights, [BATCH, Z]."""
+    policy = bind(dataclasses.replace(SPEC, weight_kind=weight_kind), random_params(0))
+    return np.asarray(policy.pathways(PolicyInputs(observation, jnp.asarray(layout_weights))).experience)
+
+
+def test_relative_weights_enter_as_raw_weights_that_were_scaled():
+    observation = with_detections(detections(SEEN, SEEN))
+    raw_weights = np.tile(np.float32([0.1, 0.3, 0.2]), (BATCH, 1))
+    raw_weights[np.arange(BATCH), GOAL] = 1.0
+    # Two categories off the goal: each over the mean of both.
+    scaled_weights = raw_weights.copy()
+    for episode, goal in enumerate(GOAL):
+        others = np.arange(K) != goal
+        scaled_weights[episode, others] /= raw_weights[episode, others].mean()
+    relative = encode_experience("relative", observation, raw_weights)
+    np.testing.assert_allclose(relative, encode_experience("raw", observation, scaled_weights), rtol=1e-5, atol=1e-6)
+    assert np.abs(relative - encode_experience("raw", observation, raw_weights)).max() > 0.01
+
+
+@pytest.mark.parametrize("weight_kind", ["relative", "pixel"])
+def test_the_direct_pathways_do_not_depend_on_the_kind_of_weights(weight_kind):
+    observation = with_detections(detections(SEEN, SEEN))
+    inputs = PolicyInputs(observation, jnp.full((BATCH, K), 0.2))
+    pathways = {}
+    for kind in ("raw", weight_kind):
+        pathways[kind] = bind(dataclasses.replace(SPEC, weight_kind=kind), random_params(0)).pathways(inputs)
+    np.testing.assert_array_equal(pathways["raw"].scene, pathways[weight_kind].scene)
+    np.testing.assert_array_equal(pathways["raw"].goal, pathways[weight_kind].goal)
+    assert (pathways["raw"].experience != pathways[weight_kind].experience).any()
+
+
+def test_pixels_scale_position_and_size_but_not_visibility_confidence_and_goal():
+    features = unpack_features(with_detections(detections(SEEN, SEEN)).row, jnp.asarray(GOAL), RowFormat(K))
+    scaled_features = scale_boxes(features)
+    ratio = np.asarray(scaled_features.table / jnp.where(features.table == 0, 1, features.table))
+    is_set = np.asarray(features.table != 0)
+    expected = np.array([1, 1, 300, 300, 300, 300, 300, 300, 1]) * is_set
+    np.testing.assert_allclose(ratio, expected, rtol=1e-6)
+    np.testing.assert_array_equal(scaled_features.visible, features.visible)
+
+
+def test_specs_of_earlier_versions_have_raw_weights():
+    fields = dataclasses.replace(SPEC, weight_kind="relative").to_json()
+    assert PolicySpec.from_json(fields, SPEC.method, K).weight_kind == "relative"
+    del fields["weight_kind"]
+    assert PolicySpec.from_json(fields, SPEC.method, K) == SPEC
+
+
+def test_an_unknown_kind_of_weights_is_refused():
+    with pytest.raises(ValueError, match="weight_kind is 'squared'; choose one of raw, relative, pixel"):
+        dataclasses.replace(SPEC, weight_kind="squared")
