@@ -26,7 +26,7 @@ from jaxnav.policies.methods.tpn import (
     make_layer_changes,
 )
 from jaxnav.policies.network import NO_CHANGES, bind
-from jaxnav.policies.pathways import PolicyInputs, PolicyState
+from jaxnav.policies.pathways import NO_ACTION, PolicyInputs, PolicyState
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
@@ -45,53 +45,134 @@ KNOWLEDGE = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_mot
 
 @functools.cache
 def make_tentative_policy(policy_class: type[TentativePolicy] = TentativePolicy) -> Any:
-    return policy_class(SPEC, 16, nnx.Rngs(params=3))
+    with jax.ensure_compile_time_eval():
+        return policy_class(SPEC, 16, nnx.Rngs(params=3))
 
 
-def remember_trials(tentative_policy, hidden, actions):
-    """The trials after hidden states [M, H] and actions [M]."""
-    trials = jnp.zeros((NUM_TRIALS, HIDDEN_SIZE + NUM_ACTIONS))
-    for hidden_state, action in zip(hidden, actions, strict=True):
-        trials = tentative_policy.remember(trials, hidden_state, action)
-    return trials
+def draw_episode(num_decisions, seed=0):
+    """Hidden states [T, H], and the actions between them [T - 1]."""
+    rng = np.random.default_rng(seed)
+    hidden = jnp.asarray(rng.uniform(-1, 1, (num_decisions, HIDDEN_SIZE)), jnp.float32)
+    return hidden, jnp.asarray(rng.integers(0, NUM_ACTIONS, num_decisions - 1))
 
 
-@pytest.mark.slow
-def test_tentative_policy_attends_to_the_trial_in_the_same_state():
-    rng = np.random.default_rng(0)
-    num_trials = 40
-    hidden = jnp.asarray(rng.uniform(-1, 1, (num_trials, HIDDEN_SIZE)), jnp.float32)
-    actions = jnp.asarray(rng.integers(0, NUM_ACTIONS, num_trials))
+@jax.jit
+def predict_along(hidden, actions):
+    """Predicted logits [T, A] along an episode, and the values of the trials after it."""
     tentative_policy = make_tentative_policy()
-    trials = remember_trials(tentative_policy, hidden, actions)
+    led_by = jnp.concatenate([jnp.array([NO_ACTION]), actions])
 
-    # Each state attends to a few trials, and most to its own.
-    @jax.vmap
-    def attend(hidden_state):
-        return tentative_policy.attention(tentative_policy.state(hidden_state), trials, jnp.int32(num_trials))
+    def predict(trials, decision):
+        logits, trials = tentative_policy(hidden[decision], led_by[decision], trials, decision)
+        return trials, logits
 
-    attention = attend(hidden)
-    np.testing.assert_allclose(attention.sum(axis=1), 1.0, rtol=1e-5)
-    np.testing.assert_array_equal(attention.argmax(axis=1), NUM_TRIALS - num_trials + np.arange(num_trials))
-    assert attention.max(axis=1).min() > 0.3
-    assert set((np.asarray(attention) > 0).sum(axis=1)) == {NUM_ATTENDED}
+    no_trials = jnp.zeros((NUM_TRIALS, HIDDEN_SIZE + NUM_ACTIONS))
+    trials, logits = jax.lax.scan(predict, no_trials, jnp.arange(len(hidden)))
+    return logits, trials
 
-    # The actions of the trials decide what is predicted.
-    @functools.partial(jax.vmap, in_axes=(0, None))
-    def predict(hidden_state, trials):
-        return tentative_policy(hidden_state, trials, jnp.int32(num_trials))
 
-    other_trials = remember_trials(tentative_policy, hidden, (actions + 1) % NUM_ACTIONS)
-    change = np.abs(predict(hidden, trials) - predict(hidden, other_trials))
-    assert change.max(axis=1).min() > 1e-3
+def released_memory(hidden, actions, *, value_offset=1, scale=1.0):
+    """The answers [T, H + A] of the memory along an episode, by the released equations in float64.
+
+    At decision t the keys are the states s_0, ..., s_{t-1} and the values (s_{i+1}, a_i); the softmax of the ten
+    largest dot products with s_t mixes the values. Mistakes: `value_offset=0` takes (s_i, a_i), `scale` multiplies the
+    scores.
+    """
+    states = np.asarray(jax.vmap(make_tentative_policy().state)(hidden), float)
+    answers = np.zeros((len(states), HIDDEN_SIZE + NUM_ACTIONS))
+    for time in range(1, len(states)):
+        first = max(0, time - NUM_TRIALS)
+        keys = states[first:time]
+        next_states = states[first + value_offset : time + value_offset]
+        values = np.hstack([next_states, np.eye(NUM_ACTIONS)[np.asarray(actions[first:time])]])
+
+        scores = scale * keys @ states[time]
+        most_similar = np.argsort(-scores)[:NUM_ATTENDED]
+        attention = np.exp(scores[most_similar] - scores.max())
+        answers[time] = attention / attention.sum() @ values[most_similar]
+    return answers
+
+
+def logits_of_answers(hidden, answers):
+    """The logits that the network computes from answers of the memory, [T, A]."""
+    tentative_policy = make_tentative_policy()
+    state = tentative_policy.state(hidden)
+    read_trials = tentative_policy.trial(jnp.asarray(answers, jnp.float32))
+    return tentative_policy.expert(tentative_policy.both(jnp.concatenate([state, read_trials], axis=-1)))
+
+
+def test_memory_answers_as_the_released_one():
+    """Along an episode longer than the memory: nothing at first, all trials up to ten, then the ten most similar."""
+    hidden, actions = draw_episode(NUM_TRIALS + 30)
+    logits, _ = predict_along(hidden, actions)
+    expected = logits_of_answers(hidden, released_memory(hidden, actions))
+    np.testing.assert_allclose(logits, expected, atol=2e-5)
+
+    # Negative controls: the state before the action for the state after it, and scaled scores.
+    for mistake in ({"value_offset": 0}, {"scale": HIDDEN_SIZE**-0.5}):
+        mistaken = logits_of_answers(hidden, released_memory(hidden, actions, **mistake))
+        assert np.median(np.abs(logits - mistaken).max(axis=1)) > 0.02
+
+
+def test_first_decision_of_an_episode_reads_nothing():
+    hidden, actions = draw_episode(3)
+    tentative_policy = make_tentative_policy()
+    keys = jnp.ones((NUM_TRIALS, HIDDEN_SIZE))
+    attention = tentative_policy.attention(tentative_policy.state(hidden[0]), keys, jnp.int32(0))
+    np.testing.assert_array_equal(attention, np.zeros(NUM_TRIALS))
+
+    # Whatever the memory still holds is not read.
+    other_trials = jnp.full((NUM_TRIALS, HIDDEN_SIZE + NUM_ACTIONS), 7.0)
+    logits, _ = tentative_policy(hidden[0], jnp.int32(NO_ACTION), other_trials, jnp.int32(0))
+    np.testing.assert_allclose(logits, predict_along(hidden, actions)[0][0], atol=1e-5)
+
+
+def test_memory_retrieves_what_an_action_led_to():
+    """A state that returns reads the next state and the action that followed its first visit."""
+    hidden, actions = draw_episode(40)
+    hidden = hidden.at[-1].set(hidden[17])
+    answer = released_memory(hidden, actions)[-1]
+    _, trials = predict_along(hidden, actions)
+    tentative_policy = make_tentative_policy()
+    state = tentative_policy.state(hidden[-1])
+    keys = jnp.concatenate([jnp.zeros((1, HIDDEN_SIZE)), trials[:-1, :HIDDEN_SIZE]])
+    attention = tentative_policy.attention(state, keys, jnp.int32(39))
+    np.testing.assert_allclose(attention.sum(), 1.0, rtol=1e-5)
+    assert (np.asarray(attention) > 0).sum() <= NUM_ATTENDED
+    np.testing.assert_allclose(attention @ trials, answer, atol=1e-5)
+
+    # Nearly all attention is on the trial from the same state, whose value is the state and action after it.
+    assert attention[NUM_TRIALS - 39 + 17] > 0.9
+    assert answer[HIDDEN_SIZE:].argmax() == actions[17]
+    np.testing.assert_allclose(answer[:HIDDEN_SIZE], tentative_policy.state(hidden[18]), atol=0.3)
+
+
+def test_prediction_depends_on_the_actions_of_the_trials():
+    hidden, actions = draw_episode(40)
+    logits, _ = predict_along(hidden, actions)
+    other_logits, _ = predict_along(hidden, (actions + 1) % NUM_ACTIONS)
+    change = np.abs(logits - other_logits).max(axis=1)
+    assert change[0] == 0
+    assert change[1:].min() > 1e-3
+
+
+def test_no_gradient_passes_remembered_states():
+    hidden, actions = draw_episode(12)
+
+    def last_prediction(hidden):
+        return predict_along(hidden, actions)[0][-1].sum()
+
+    gradient = np.abs(jax.grad(last_prediction)(hidden)).max(axis=1)
+    assert gradient[-1] > 0
+    assert not gradient[:-1].any()
 
 
 def test_uniform_tentative_policy_attends_to_all_trials_equally():
     tentative_policy = make_tentative_policy(UniformTentativePolicy)
-    hidden = jnp.linspace(-1, 1, 3 * HIDDEN_SIZE).reshape(3, HIDDEN_SIZE)
-    trials = remember_trials(tentative_policy, hidden, jnp.arange(3))
-    attention = tentative_policy.attention(tentative_policy.state(hidden[0]), trials, jnp.int32(3))
-    np.testing.assert_allclose(attention, [0.0] * (NUM_TRIALS - 3) + [1 / 3] * 3, rtol=1e-6)
+    keys = jnp.linspace(-1, 1, NUM_TRIALS * HIDDEN_SIZE).reshape(NUM_TRIALS, HIDDEN_SIZE)
+    for count in (3, 40):
+        attention = tentative_policy.attention(keys[0], keys, jnp.int32(count))
+        np.testing.assert_allclose(attention, [0.0] * (NUM_TRIALS - count) + [1 / count] * count, rtol=1e-6)
 
 
 # The step

@@ -27,6 +27,7 @@ class Mistake(NamedTuple):
 
 
 INFERENCE = "twins/test_inference.py"
+TENTATIVE = "policies/test_tpn.py"
 PROBES = "promises/test_ppo_learns.py"
 STORED = "promises/test_stored_data_is_verified.py"
 NAMES = "promises/test_names_are_text.py"
@@ -36,6 +37,15 @@ MISTAKES = (
     Mistake("causal.py", "- s * counterfactual", "+ s * counterfactual", INFERENCE),
     Mistake("layout.py", "state.gap * config.decay", "state.gap * 1.01 * config.decay", INFERENCE),
     Mistake("policies/methods/org.py", "weights[..., None] * (aggregated", "(aggregated", INFERENCE),
+    Mistake("policies/methods/org.py", "weights[..., None] * (aggregated", "0.9 * weights[..., None] * (aggregated",
+            INFERENCE),
+    Mistake("policies/methods/org.py", "jnp.swapaxes(relations, -1, -2) * features", "relations * features", INFERENCE),
+    Mistake("policies/methods/org.py", "jnp.swapaxes(nnx.relu(self.edges(features.table)), -1, -2)",
+            "nnx.relu(self.edges(features.table))", INFERENCE),
+    Mistake("policies/methods/tpn.py", "values = known_values[..., 1:, :]", "values = known_values[..., :-1, :]",
+            TENTATIVE),
+    Mistake("policies/methods/tpn.py", "(keys @ state[..., None])[..., 0]",
+            "(keys @ state[..., None])[..., 0] / np.sqrt(state.shape[-1])", TENTATIVE),
     Mistake("policies/spatial_memory.py", "stride: int = 2", "stride: int = 1", INFERENCE),
     Mistake("training/ppo.py", "policy_loss = -masked_mean(", "policy_loss = masked_mean(", PROBES),
     Mistake("training/ppo.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES),

@@ -44,13 +44,13 @@ class TwinTentative(TwinMethod):
         return self.is_repeated
 
     def initial_fast(self, params: Params) -> Any:
-        """Return the trials of the episode, none yet, and the change of the actor's kernel."""
-        return [], np.zeros((params["actor"]["kernel"].shape[0] + 1, NUM_ACTIONS))
+        """Return the states and actions of the episode, none yet, and the change of the actor's kernel."""
+        return [], [], np.zeros((params["actor"]["kernel"].shape[0] + 1, NUM_ACTIONS))
 
     def layer_changes(self, fast: Any) -> LayerChanges:
         # The change is dropped every 50 decisions.
-        trials, change = fast
-        return {"actor": change * (len(trials) % 50 > 0)}
+        states, _, change = fast
+        return {"actor": change * (len(states) % 50 > 0)}
 
     def adapt(
         self,
@@ -64,17 +64,20 @@ class TwinTentative(TwinMethod):
         network = params["method"]["tentative"]
         change = self.layer_changes(memory.fast)["actor"]
 
-        # Remember the last state with the action that it led to.
-        last_state = residual_perceptron(network["state"], memory.hidden[0])
-        trial = np.concatenate([last_state, one_hot(memory.action, NUM_ACTIONS)])
-        trials = [*memory.fast[0], trial]
-
-        # Attend to the ten likeliest of the last 100 trials.
+        # All states of the episode, the present one at the end, and the actions between them.
         state = residual_perceptron(network["state"], hidden)
-        recent = np.array(trials[-100:])
-        scores = recent[:, : len(state)] @ state / np.sqrt(len(state))
-        likeliest = np.argsort(-scores)[:10]
-        answer = softmax(scores[likeliest]) @ recent[likeliest]
+        states = [*memory.fast[0], state]
+        actions = list(memory.fast[1])
+        if memory.action < NUM_ACTIONS:
+            actions.append(memory.action)
+
+        # Read the trials whose first states are most like the present one.
+        answer = np.zeros(len(state) + NUM_ACTIONS)
+        if actions:
+            keys, values = self.trials(states, actions)
+            scores = self.scores(keys[-100:], state)
+            likeliest = np.argsort(-scores)[:10]
+            answer = softmax(scores[likeliest]) @ values[-100:][likeliest]
 
         # Where the agent was before, the policy moves towards the expert's action.
         experience = residual_perceptron(network["trial"], answer)
@@ -82,7 +85,17 @@ class TwinTentative(TwinMethod):
         expert_action = one_hot(int(linear(network["expert"], both).argmax()), NUM_ACTIONS)
         if reading:
             change = change + 0.1 * np.outer(append_one(hidden), expert_action - softmax(logits))
-        return trials, change
+        return states, actions, change
+
+    def trials(self, states: list[np.ndarray], actions: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return keys s_i and values [s_{i+1}, a_i] of all trials, as the released `states_rep` and memories."""
+        keys = np.array(states[:-1])
+        taken_actions = np.eye(NUM_ACTIONS)[actions]
+        return keys, np.hstack([np.array(states[1:]), taken_actions])
+
+    def scores(self, keys: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """Return the dot products of the keys with the present state."""
+        return keys @ state
 
 
 class TwinLearnedSteps(TwinMethod):

@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from twins.agent import TwinEpisode
-from twins.methods import TWINS, TwinRelations
-from twins.policy import TwinMethod, TwinPolicy
+from twins.methods import TWINS, TwinRelations, TwinTentativeRelations
+from twins.policy import TwinMethod, TwinPolicy, linear, relu
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS, prior_index
@@ -191,15 +191,113 @@ class Unweighted(TwinRelations):
         return super().encode(params, features, appearance, np.ones_like(weights), reading, memory)
 
 
-class Mistaken(TwinRelations):
-    """Take another category for the goal."""
+def weights_times(factor: float, method: str) -> type[TwinMethod]:
+    """Make a twin that multiplies the layout weights of a method by a factor."""
 
-    def perceive(self, features):
-        return features._replace(goal=np.roll(features.goal, 1))
+    class Scaled(TWINS[method]):
+        def encode(self, params, features, appearance, weights, reading, memory):
+            return super().encode(params, features, appearance, factor * weights, reading, memory)
+
+    return Scaled
 
 
-@pytest.mark.parametrize("wrong", [Unweighted, Mistaken])
-def test_a_twin_that_is_wrong_is_noticed(wrong):
-    result = compare("org", "fused", ROWS[0], draw_episodes(world()[0], 4), wrong)
-    assert result.differences
-    assert max(result.errors["factual_logits"]) > 10 * TOLERANCE
+def goal_mistaken(method: str) -> type[TwinMethod]:
+    """Make a twin that takes another category for the goal."""
+
+    class Mistaken(TWINS[method]):
+        def perceive(self, features):
+            return features._replace(goal=np.roll(features.goal, 1))
+
+    return Mistaken
+
+
+def aggregation_transposed(method: str) -> type[TwinMethod]:
+    """Make a twin that aggregates appearances with R in place of its transpose."""
+
+    class Transposed(TWINS[method]):
+        def aggregate(self, relations, appearance):
+            return relations @ appearance
+
+    return Transposed
+
+
+def edges_transposed(method: str) -> type[TwinMethod]:
+    """Make a twin that mixes the edges before they are transposed."""
+
+    class Transposed(TWINS[method]):
+        def relations(self, params, features):
+            relations = relu(linear(params["edges"], features.table))
+            for kernel in params["mix"]:
+                relations = relu(relations @ kernel)
+            return relations
+
+    return Transposed
+
+
+class StateBeforeAction(TwinTentativeRelations):
+    """Remember the state before an action in place of the one that it led to."""
+
+    def trials(self, states, actions):
+        keys, values = super().trials(states, actions)
+        return keys, np.hstack([keys, values[:, len(keys[0]) :]])
+
+
+class ScoresOverRoot(TwinTentativeRelations):
+    """Divide the scores of trials by the square root of the width."""
+
+    def scores(self, keys, state):
+        return super().scores(keys, state) / np.sqrt(len(state))
+
+
+class StateAfterDecision(TWINS["savn"]):
+    """Keep the recurrent state after a decision in place of the one before it."""
+
+    def adapt(self, params, inputs, memory, logits, hidden, reading):
+        return super().adapt(params, inputs, memory._replace(hidden=[hidden]), logits, hidden, reading)
+
+
+class MemoryOfDirectStream(TWINS["eotp"]):
+    """Attend with the state of the direct stream in place of that of the experience stream."""
+
+    def encode(self, params, features, appearance, weights, reading, memory):
+        return super().encode(params, features, appearance, weights, reading, memory._replace(hidden=memory.hidden[:1]))
+
+
+class ZonesExchanged(TWINS["hoz"]):
+    """Read the goal's zone before the next zone."""
+
+    def read(self, goal):
+        rooms, zones = super().read(goal)
+        return rooms, zones[[0, 2, 1]]
+
+
+#: Methods and decisions with planted mistakes: transpositions, wrong slots of memory, factors.
+MISTAKES = {
+    "org: w left out": ("org", "fused", Unweighted),
+    "org: another goal": ("org", "fused", goal_mistaken("org")),
+    "org: aggregation transposed": ("org", "fused", aggregation_transposed("org")),
+    "org: edges not transposed": ("org", "fused", edges_transposed("org")),
+    "org: w by a factor": ("org", "fused", weights_times(0.9, "org")),
+}
+SLOW_MISTAKES = {
+    "hoz: aggregation transposed": ("hoz", "fused", aggregation_transposed("hoz")),
+    "tpn: aggregation transposed": ("tpn", "fused", aggregation_transposed("tpn")),
+    "tpn: state before the action": ("tpn", "fused", StateBeforeAction),
+    "savn: state after the decision": ("savn", "fused", StateAfterDecision),
+    "eotp: memory of the direct stream": ("eotp", "streams", MemoryOfDirectStream),
+    "hoz: zones exchanged": ("hoz", "fused", ZonesExchanged),
+    "tpn: scores over a root": ("tpn", "fused", ScoresOverRoot),
+}
+for _method in ("eotp", "hoz", "semexp", "sp", "tpn", "vtnet"):
+    SLOW_MISTAKES[f"{_method}: w by a factor"] = (_method, "fused", weights_times(0.9, _method))
+
+
+@pytest.mark.parametrize(
+    "mistake", [*MISTAKES, *(pytest.param(mistake, marks=pytest.mark.slow) for mistake in SLOW_MISTAKES)]
+)
+def test_a_twin_that_is_wrong_is_noticed(mistake):
+    method, decision, twin = (MISTAKES | SLOW_MISTAKES)[mistake]
+    result = compare(method, decision, ROWS[0], draw_episodes(world()[0], 8), twin)
+    worst = max(result.errors["factual_logits"])
+    print(mistake, worst, len(result.differences))
+    assert worst > 10 * TOLERANCE

@@ -4,10 +4,12 @@ Source: H. Du, X. Yu and L. Zheng, *Learning Object Relation Graph and Tentative
 2020, and its released code.
 
 Kept: ORG is trained first. The tentative policy then learns to imitate shortest paths at repeated poses, from the
-hidden state and the ten most similar of the last 100 trials of the episode, while the trained policy is fixed and acts.
-In an episode the policy takes a step of gradient descent towards the tentative policy's best action at every repeated
-pose, and is reset every 50 decisions. Changed: only the actor adapts, which has a closed form; a trial holds the
-one-hot action, not probabilities; and a repeated pose is recognised by compass, odometry and horizon.
+hidden state and the ten most similar trials of the episode, while the trained policy is fixed and acts. A trial is a
+transition: its key is a state, its value the next state with the action that led there, so that similar states retrieve
+what actions led to. Scores are dot products without a scale. In an episode the policy takes a step of gradient descent
+towards the tentative policy's best action at every repeated pose, and is reset every 50 decisions. Changed: only the
+actor adapts, which has a closed form; the last 100 trials are remembered, not all; a trial holds the one-hot action, in
+place of an embedding of the probabilities of all actions; and compass, odometry and horizon recognise a repeated pose.
 """
 
 import dataclasses
@@ -42,6 +44,7 @@ NUM_ATTENDED = 10
 _IMITATION_SHARE = 0.2
 _CELLS_PER_LINE = 2**13  # with 12 headings and 2 horizons, pose numbers fit in 31 bits
 _NO_POSE = np.iinfo(np.int32).min
+_NO_SCORE = np.finfo(np.float32).min
 
 
 # Tracker: which poses are repeated
@@ -117,7 +120,13 @@ def learn_motion(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndar
 class TentativePolicy(nnx.Module):
     """Network that predicts the action of a shortest path from past trials.
 
-    A trial is a state of the agent, as this network represents it, and the one-hot action that followed.
+    A trial i of an episode is a transition between two states of the agent, as this network represents them. With the
+    states s_0, ..., s_t and the actions a_0, ..., a_{t-1} so far,
+
+        key_i = s_i        value_i = [s_{i+1}, a_i]        i = 0, ..., t - 1
+        answer = sum_i softmax_i(s_t . key_i) value_i      over the `NUM_ATTENDED` largest scores
+
+    The key of a trial is the state part of the value before it, so only values are remembered.
     """
 
     def __init__(self, spec: PolicySpec, width: int, rngs: nnx.Rngs) -> None:
@@ -128,62 +137,68 @@ class TentativePolicy(nnx.Module):
         self.both = FeedForward(state_width + trial_width, width, rngs)
         self.expert = Linear(state_width + trial_width, NUM_ACTIONS, rngs=rngs)
 
-    def remember(self, trials: jax.Array, hidden: jax.Array, action: jax.Array) -> jax.Array:
-        """Append a trial, through which no gradient passes, and drop the oldest one.
-
-        Args:
-          trials: float32 [..., N, H + A].
-          hidden: float32 [..., H], the policy's hidden state.
-          action: int32 [...], the action that followed.
-
-        Returns:
-          float32 [..., N, H + A].
-        """
-        action_one_hot = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
-        trial = jnp.concatenate([self.state(hidden), action_one_hot], axis=-1)
-        return jnp.concatenate([trials[..., 1:, :], jax.lax.stop_gradient(trial)[..., None, :]], axis=-2)
-
-    def __call__(self, hidden: jax.Array, trials: jax.Array, count: jax.Array) -> jax.Array:
-        """Return logits of the action of a shortest path, float32 [..., A].
+    def __call__(
+        self, hidden: jax.Array, action: jax.Array, trials: jax.Array, count: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return logits of the action of a shortest path, and the trials with the latest one.
 
         Args:
           hidden: float32 [..., H], the policy's present hidden state.
-          trials: float32 [..., N, H + A], the latest at the end.
-          count: int32 [...], number of trials so far, at least 1.
-        """
-        # Attend to the trials in similar states, and predict the action from the state and the attended trial.
-        state = self.state(hidden)
-        attention = self.attention(state, trials, count)
-        attended_trial = (attention[..., None, :] @ trials)[..., 0, :]
-        answer = self.trial(attended_trial)
-        return self.expert(self.both(jnp.concatenate([state, answer], axis=-1)))
-
-    def attention(self, state: jax.Array, trials: jax.Array, count: jax.Array) -> jax.Array:
-        """Return the attention of a state float32 [..., H] to trials.
+          action: int32 [...], the action that led to the present state; no action at an episode's start.
+          trials: float32 [..., N, H + A], values of the trials before the latest one, the latest of them at the end.
+            The first value of an episode holds its first state, which no action led to; slots before it are 0.
+          count: int32 [...], number of trials so far, 0 at an episode's start.
 
         Returns:
-          float32 [..., N], with sum 1 over the `NUM_ATTENDED` most similar trials.
+          float32 [..., A], the logits, and float32 [..., N, H + A], the values that the next decision needs.
+        """
+        # Keys [..., N, H] and values [..., N, H + A] of the trials, the latest of which led to the present state.
+        state = self.state(hidden)
+        known_values = self.append_value(trials, state, action)
+        keys = known_values[..., :-1, : state.shape[-1]]
+        values = known_values[..., 1:, :]
+
+        # Read what the trials from similar states led to, and predict the action from the state and the answer.
+        attention = self.attention(state, keys, count)
+        answer = (attention[..., None, :] @ values)[..., 0, :]
+        read_trial = self.trial(answer)
+        return self.expert(self.both(jnp.concatenate([state, read_trial], axis=-1))), values
+
+    def append_value(self, trials: jax.Array, state: jax.Array, action: jax.Array) -> jax.Array:
+        """Append the value of the latest trial, through which no gradient passes, [..., N + 1, H + A]."""
+        action_one_hot = jax.nn.one_hot(action, NUM_ACTIONS, dtype=jnp.float32)
+        value = jax.lax.stop_gradient(jnp.concatenate([state, action_one_hot], axis=-1))
+        return jnp.concatenate([trials, value[..., None, :]], axis=-2)
+
+    def attention(self, state: jax.Array, keys: jax.Array, count: jax.Array) -> jax.Array:
+        """Return the attention of a state float32 [..., H] to trials with keys float32 [..., N, H].
+
+        Returns:
+          float32 [..., N], with sum 1 over the `NUM_ATTENDED` most similar trials; 0 without trials.
         """
         # Mask the slots that hold no trial yet.
-        ages = jnp.arange(trials.shape[-2], 0, -1).reshape((1,) * count.ndim + (-1,))
-        scores = jnp.where(ages <= count[..., None], self.scores(state, trials), -jnp.inf)
+        ages = jnp.arange(keys.shape[-2], 0, -1).reshape((1,) * count.ndim + (-1,))
+        is_trial = ages <= count[..., None]
+        scores = jnp.where(is_trial, self.scores(state, keys), _NO_SCORE)
 
         # Keep the NUM_ATTENDED highest scores and their ties: equal scores attend to all trials, as the ablation needs.
         lowest_attended = jax.lax.top_k(scores, NUM_ATTENDED)[0][..., -1:]
-        return jax.nn.softmax(jnp.where(scores >= lowest_attended, scores, -jnp.inf))
+        attention = jax.nn.softmax(jnp.where(scores >= lowest_attended, scores, _NO_SCORE))
 
-    def scores(self, state: jax.Array, trials: jax.Array) -> jax.Array:
-        """Return the scaled dot products of the state with the states of the trials, [..., N]."""
-        width = state.shape[-1]
-        return (trials[..., :width] @ state[..., None])[..., 0] / np.float32(np.sqrt(width))
+        # Without any trial the finite scores are equal: attend to none.
+        return jnp.where(is_trial, attention, 0.0)
+
+    def scores(self, state: jax.Array, keys: jax.Array) -> jax.Array:
+        """Return the dot products of the state with the keys, [..., N]."""
+        return (keys @ state[..., None])[..., 0]
 
 
 class UniformTentativePolicy(TentativePolicy):
     """Tentative policy with equal attention to all trials, for an ablation."""
 
-    def scores(self, state: jax.Array, trials: jax.Array) -> jax.Array:
+    def scores(self, state: jax.Array, keys: jax.Array) -> jax.Array:
         """Return zeros, [..., N]."""
-        return jnp.zeros(trials.shape[:-1])
+        return jnp.zeros(keys.shape[:-1])
 
 
 class TentativeRelations(ObjectRelations):
@@ -210,7 +225,8 @@ class TentativeState(NamedTuple):
     """Fast weights of the actor, and the trials that they are learned from.
 
     Attributes:
-      trials: float32 [..., N, H + A], the last trials, the latest at the end.
+      trials: float32 [..., N, H + A], the last states, each with the action that led to it, the latest at the end: the
+        values of the last trials (see `TentativePolicy`). 0 where the episode is shorter.
       num_decisions: int32 [...], decisions so far.
       actor_change: float32 [..., H + 1, A], change of the actor's kernel and bias.
       predicted_logits: float32 [..., A], logits of a shortest path's action at the last decision.
@@ -258,13 +274,10 @@ class TentativeAdaptation:
         actor_change = jnp.where(is_reset[..., None, None], 0.0, actor_change)
         output = policy.decide_with_changes(pathways, memory, make_layer_changes(actor_change))
 
-        # Hidden states, with streams of the direct stream alone; no gradient of the tentative policy passes them.
-        hidden_before = jax.lax.stop_gradient(memory.hidden[..., : policy.hidden])
+        # Predict a shortest path's action from the present state and the trials; with streams the state is that of the
+        # direct stream. No gradient of the tentative policy passes the state.
         hidden_now = jax.lax.stop_gradient(output.hidden[..., : policy.hidden])
-
-        # Remember the previous state with the action that followed, and predict a shortest path's action.
-        trials = tentative.remember(trials, hidden_before, memory.action)
-        predicted_logits = tentative(hidden_now, trials, num_decisions + 1)
+        predicted_logits, trials = tentative(hidden_now, memory.action, trials, num_decisions)
         best_one_hot = jax.nn.one_hot(predicted_logits.argmax(axis=-1), NUM_ACTIONS, dtype=jnp.float32)
 
         # Negative gradient of the cross-entropy by the actor's kernel and bias: the outer product of [h, 1] and
