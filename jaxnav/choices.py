@@ -9,6 +9,8 @@ from typing import Literal
 Form = Literal["paper", "residual", "switch"]
 #: Reduction over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
 Reduction = Literal["mean_visible", "mean", "sum"]
+#: Counts of a view in eq. 3: 1 for each visible category, or the number of its visible instances.
+Counts = Literal["presence", "instances"]
 #: Layout estimators that an evaluation may use in place of the one from training.
 EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
 #: Ways to use policies in an evaluation, and the two references without training.

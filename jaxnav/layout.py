@@ -15,7 +15,7 @@ The estimator handles one episode; use `jax.vmap` for batches.
 
 `ESTIMATORS` holds the configurations that have a name:
   `calibrated`: the default, with a rescaled prior and updates only where a gate is open.
-  `paper`: equations 3 to 6 of the paper as printed; a view counts each visible category once, however many it shows.
+  `paper`: equations 3 to 6 of the paper as printed, with instance counts.
   `released`: the layout estimator of the authors' released code.
   `evidence`: `calibrated`, with a layout gap that grows when the things seen together do not fit the training scenes.
 """
@@ -29,9 +29,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.choices import Reduction
+from jaxnav.choices import Counts, Reduction
 from jaxnav.gaps import CooccurrenceEvidence, evidence_gap, learned_gap, overdue_gap, seen_together
-from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, presence_kl
+from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, counts_kl, presence_kl
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,8 @@ class EstimatorConfig:
       rows: rows that gain counts (eq. 3). `visible`: rows of the visible categories; `all`: every row, as eq. 3 is
         printed.
       reduction: over the rows' divergences in eq. 5: `mean_visible`, `mean` over all K, or `sum`.
-      increment: whole number from 1 to 50, added to alpha per visible category.
+      counts: n in eq. 3. `presence`: 1 for each visible category. `instances`: the number of its visible instances.
+      increment: whole number from 1 to 50, added to alpha per count.
       own_column: a row also counts its own category, as in the released code; in the divergence of eq. 5 this entry
         has a concentration of 1 more.
       gate: update only where two or more categories are visible and the set differs from the last accepted one.
@@ -73,6 +74,7 @@ class EstimatorConfig:
 
     rows: Literal["visible", "all"] = "visible"
     reduction: Reduction = "mean_visible"
+    counts: Counts = "presence"
     increment: int = 1
     own_column: bool = False
     gate: bool = True
@@ -109,7 +111,9 @@ _MIN_MEAN_WEIGHT = 1e-6  # against division by zero
 
 #: Configurations by name, see the docstring of the module. `evidence` leaves priors and weights w as in `calibrated`.
 ESTIMATORS = {
-    "paper": EstimatorConfig(rows="all", reduction="mean", gate=False, strength=None, uniform=0.0, form="paper"),
+    "paper": EstimatorConfig(
+        rows="all", reduction="mean", counts="instances", gate=False, strength=None, uniform=0.0, form="paper"
+    ),
     "released": EstimatorConfig(
         rows="all", reduction="sum", increment=5, own_column=True, passes=2, strength=None, uniform=0.0
     ),
@@ -213,7 +217,8 @@ class LayoutEstimator(struct.PyTreeNode):
 
         Args:
           state: the belief before the step.
-          presence: bool or real [K], nonzero where a category is visible.
+          presence: bool or real [K], nonzero where a category is visible. Estimators with `counts="instances"` read it
+            as the number of visible instances, a whole number; all others count 1 for any number above 0.
           goal: int [], index of the goal category; only the gap `overdue` needs it.
 
         Returns:
@@ -229,7 +234,8 @@ class LayoutEstimator(struct.PyTreeNode):
 
         # Eq. 3: counts of this view, n_ij > 0 where j is visible (and i too, with `visible` rows).
         updated_rows = visible if config.rows == "visible" else jnp.ones_like(visible)
-        counts = config.increment * updated_rows[:, None] * visible[None, :]
+        view_counts = presence.astype(jnp.float32) if config.counts == "instances" else visible
+        counts = config.increment * updated_rows[:, None] * view_counts[None, :]
         if not config.own_column:
             counts = counts * (1 - diagonal)
 
@@ -297,7 +303,10 @@ class LayoutEstimator(struct.PyTreeNode):
         config = resolve_estimator(self.config)
         if config.gap == "clock":
             return jnp.float32(1.0)
-        row_kl = presence_kl(alpha, counts, config.increment)  # [K]
+        if config.counts == "instances":
+            row_kl = counts_kl(alpha, counts)  # [K]
+        else:
+            row_kl = presence_kl(alpha, counts, config.increment)
         match config.reduction:
             case "mean_visible":
                 reduced_kl = (row_kl * visible).sum() / jnp.maximum(visible.sum(), 1)
@@ -318,6 +327,7 @@ class LayoutEstimator(struct.PyTreeNode):
         if goal is None:
             raise ValueError("gap='overdue': needs the goal; pass it to `update`")
         return overdue_gap(state.co_seen, self.cooccurrence.co_visibility, goal)
+
 
 def scale_weights(weights: jax.Array, goal: jax.Array) -> jax.Array:
     """Scale w x g of eq. 7 so that the weights off the goal have mean 1 (the kind `relative`).

@@ -145,15 +145,39 @@ def test_released_counts_its_own_column_in_every_row():
 
 def test_paper_setting_follows_equation_5():
     """All rows, mean over K, no gate: also a single visible category and a repeated view count."""
+    views = np.array([[0, 1, 0, 0, 0, 0], [0, 3, 0, 0, 1, 0], [0, 3, 0, 0, 1, 0], [0] * 6, [12, 0, 1, 0, 0, 2]])
     prior = np.asarray(prior_from_counts(random_counts(3), "paper"))
-    states = run_views(LayoutEstimator(jnp.asarray(prior), "paper"), views_of({1}, {1, 4}, {1, 4}, ()))
+    states = run_views(LayoutEstimator(jnp.asarray(prior), "paper"), views)
     alpha = prior
-    for view, state in zip(views_of({1}, {1, 4}, {1, 4}, ()), states, strict=True):
-        counts = np.where(np.eye(NUM_CATEGORIES, dtype=bool), 0, view[None, :].astype(int))  # n_{-i}
+    for view, state in zip(views, states, strict=True):
+        counts = np.where(np.eye(NUM_CATEGORIES, dtype=bool), 0, view[None, :])  # n_{-i}
         row_divergences = [exact_kl(np.delete(alpha[i], i), np.delete(counts[i], i)) for i in range(NUM_CATEGORIES)]
         np.testing.assert_allclose(state.gap, np.tanh(np.mean(row_divergences)), rtol=1e-3, atol=1e-7)
         alpha = alpha + counts
         np.testing.assert_allclose(state.alpha, alpha)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_only_estimators_of_instances_read_more_than_presence(name):
+    estimator = LayoutEstimator(prior_from_counts(random_counts(4), name), name)
+    instances = np.array([[2, 1, 0, 0, 5, 0], [0, 0, 3, 1, 0, 0]], np.uint8)
+    states = run_views(estimator, instances)
+    presence_states = run_views(estimator, instances > 0)
+    for state, presence_state in zip(states, presence_states, strict=True):
+        is_equal = np.array_equal(state.alpha, presence_state.alpha) and state.gap == presence_state.gap
+        assert is_equal == (ESTIMATORS[name].counts == "presence")
+
+
+@pytest.mark.parametrize("name", ["released", "calibrated"])
+def test_instance_counts_of_one_equal_presence(name):
+    """Every kind of rows, reduction, increment and own column; the divergences are computed in two ways."""
+    prior = prior_from_counts(random_counts(8), name)
+    views = np.random.default_rng(2).random((12, NUM_CATEGORIES)) < 0.4
+    counting_config = dataclasses.replace(ESTIMATORS[name], counts="instances")
+    counting_states = run_views(LayoutEstimator(prior, counting_config), views)
+    for state, presence_state in zip(counting_states, run_views(LayoutEstimator(prior, name), views), strict=True):
+        np.testing.assert_array_equal(state.alpha, presence_state.alpha)
+        np.testing.assert_allclose(state.gap, presence_state.gap, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("rows", "reduction"), [("all", "mean_visible"), ("visible", "sum"), ("visible", "mean")])
@@ -250,9 +274,11 @@ def test_vmapped_update_equals_single_updates_and_traces_once(name):
 def test_named_estimators_have_the_documented_settings():
     common = {"strength": None, "uniform": 0.0, "rows": "all"}
     paper = {"reduction": "mean", "increment": 1, "own_column": False, "gate": False, "form": "paper"}
+    paper |= {"counts": "instances"}
     released = {"reduction": "sum", "increment": 5, "own_column": True, "gate": True, "form": "residual"}
     calibrated = {"rows": "visible", "reduction": "mean_visible", "increment": 1, "own_column": False, "gate": True}
     calibrated |= {"decay": 0.8, "passes": 1, "strength": 20.0, "uniform": 0.05, "form": "residual"}
+    calibrated |= {"counts": "presence"}
     expected = {
         "paper": common | paper | {"gap": "novelty"},
         "released": common | released | {"gap": "novelty", "decay": 0.8, "passes": 2},

@@ -300,7 +300,7 @@ class ObjectNav:
     @property
     def row_format(self) -> RowFormat:
         """Format of the observation rows."""
-        return RowFormat(len(self.categories))
+        return self.task.row_format
 
     @property
     def num_actions(self) -> int:

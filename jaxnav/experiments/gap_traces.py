@@ -27,7 +27,7 @@ from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutSt
 from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params, Policy
-from jaxnav.runs.policies import Policies, estimators_by_gap, load_policies
+from jaxnav.runs.policies import Policies, adapt_counts, estimators_by_gap, load_policies
 from jaxnav.training.calibration import layout_priors
 
 #: A belief is updated by observations (eq. 4), or stays at the prior.
@@ -99,7 +99,7 @@ def _compared_estimators(policies: Policies) -> dict[str, EstimatorConfig]:
     # The two published estimators come first, then those of this package.
     by_gap = estimators_by_gap(require_estimator_config(policies))
     estimators = {
-        "paper": ESTIMATORS["paper"],
+        "paper": adapt_counts(ESTIMATORS["paper"], policies.task),
         "released": ESTIMATORS["released"],
         "calibrated": by_gap["novelty"],
         "evidence": by_gap["evidence"],
@@ -202,6 +202,9 @@ def _walk_episodes(
       The gaps, float32 [N, T + 1, estimators, 2, E], and which episodes run, bool [N, T + 1, E].
     """
     num_episodes = len(start.pose)
+    # Estimators that count presence take instance counts, too.
+    row_format = agent_loop.env.row_format
+    read_presence = row_format.counts if row_format.has_counts else row_format.presence
 
     # Every estimator observes with the prior and the evidence of the episode's room type.
     room = env_params.room[start.scene]
@@ -220,8 +223,8 @@ def _walk_episodes(
         def step(carry: tuple, _: None) -> tuple[tuple, tuple[jax.Array, jax.Array]]:
             agent, running, beliefs = carry
 
-            # Observe the present view, bool [E, K], with both beliefs of every estimator.
-            presence = agent_loop.env.row_format.presence(env_params.tables.rows[agent.state.pose])
+            # Observe the present view, [E, K], with both beliefs of every estimator.
+            presence = read_presence(env_params.tables.rows[agent.state.pose])
             next_beliefs = []
             for observer, belief_pair in zip(observers, beliefs, strict=True):
                 next_beliefs.append(observer.update(belief_pair, presence, start.goal))
@@ -302,7 +305,7 @@ class _Observer(NamedTuple):
 
         Args:
           beliefs: both beliefs before the view, leaves [E, ...].
-          presence: bool [E, K].
+          presence: bool [E, K], or instance counts uint8 [E, K].
           goal: int32 [E].
         """
 

@@ -16,7 +16,7 @@ from jaxnav.game.config import PlayConfig
 from jaxnav.layout import EstimatorConfig
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import ActionControl, Knowledge
-from jaxnav.runs.config import RunConfig, WorldConfig
+from jaxnav.runs.config import LayoutConfig, RunConfig, WorldConfig
 from jaxnav.runs.policies import config_for_policy
 from jaxnav.runs.policy import LoadedPolicy, load_policy
 from jaxnav.runs.train import calibrate_estimator, explore_world
@@ -115,8 +115,11 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
     # Check the policy first, since compiling scenes takes longer.
     policy = config.policy
     adviser = None
+    layout_config = LayoutConfig()
     if policy is not None:
-        policy_world = config_for_policy(policy).world
+        policy_config = config_for_policy(policy)
+        policy_world = policy_config.world
+        layout_config = policy_config.layout
         adviser = load_policy(policy)
         method = adviser.spec.method
         if policy_world != config.world:
@@ -125,7 +128,7 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
             raise InputError(f"--policy {policy}: method {method.name!r} does not choose actions; give another policy")
 
     # The game takes one episode of the list that an evaluation with this seed would play.
-    run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed))
+    run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed), layout=layout_config)
     world = compile_evaluation_world(run_config, config.split, config.scenes, config.shift, console)
     episode = choose_episode(world.banks[0], config.goal, config.seed)
 
@@ -137,7 +140,7 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
         training_world = compile_training_world(run_config, console)
         exploration = explore_world(run_config, training_world)
         estimator_config = calibrate_estimator(run_config, training_world, exploration, console)
-        knowledge = Knowledge(layout_priors(exploration.counts, estimator_config))
+        knowledge = Knowledge(layout_priors(exploration.prior_counts, estimator_config))
     return Game(world, episode, knowledge, estimator_config, adviser, config.epsilon)
 
 

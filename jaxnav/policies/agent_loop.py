@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation, State
-from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState
+from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState, resolve_estimator
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.adaptation import limit_inner_steps
 from jaxnav.policies.handover import Decider, HandoverPolicy
@@ -92,8 +92,9 @@ class Perception:
         # Layout belief: equations 3 to 5.
         layout_estimator = self._layout_estimator(knowledge, room)
         if layout_estimator is not None and layout is not None:
-            presence = self.row_format.presence(percept.row)
-            layout = layout_estimator.update(layout, presence, percept.goal)
+            counts_instances = resolve_estimator(layout_estimator.config).counts == "instances"
+            read_counts = self.row_format.counts if counts_instances else self.row_format.presence
+            layout = layout_estimator.update(layout, read_counts(percept.row), percept.goal)
 
         # Map of free, blocked and visited cells.
         spatial_memory = self._spatial_memory

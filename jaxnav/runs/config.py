@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jaxnav.choices import Reduction
+from jaxnav.choices import Counts, Reduction
 from jaxnav.errors import InputError
 from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
@@ -81,6 +81,8 @@ class LayoutConfig:
       reduction: one layout gap (doubt about the layout) from the changes that a view makes to the rows of the belief,
         one row for each category: mean over visible categories (`mean_visible`), mean over all (`mean`), or `sum`. Only
         with `calibrated`, which by default chooses it together with `strength`.
+      counts: numbers that a view adds to the belief: 1 for each visible category (`presence`), or the number of its
+        visible instances (`instances`). The default is `instances` with `paper`, else `presence`.
       weights: scale of the layout weights w that multiply the experience features of each category (eq. 7). `raw`, as
         in the paper: w itself, about 1 / (number of categories) except for the goal. `relative`: w over its mean over
         all categories but the goal, at most 4. `pixel`: w itself, with positions and sizes of the experience features
@@ -96,6 +98,7 @@ class LayoutConfig:
     setting: Literal["paper", "released", "calibrated"] = "calibrated"
     strength: float | None = None
     reduction: Reduction | None = None
+    counts: Counts | None = None
     weights: WeightKind = "raw"
     prior: Literal["room", "pooled"] = "room"
     walks: int = 2048
@@ -212,7 +215,14 @@ class RunConfig:
             task = dataclasses.replace(task, categories=self.worlds.categories, goals=())
 
         goals = task.goals if self.worlds.goals is None else self.worlds.goals
-        return dataclasses.replace(task, goals=goals, detector=self.detector)
+        instance_counts = self.layout_counts == "instances"
+        return dataclasses.replace(task, goals=goals, detector=self.detector, instance_counts=instance_counts)
+
+    @property
+    def layout_counts(self) -> Counts:
+        """Counts of a view in the layout belief, see `LayoutConfig.counts`."""
+        usual_counts: Counts = "instances" if self.layout.setting == "paper" else "presence"
+        return self.layout.counts or usual_counts
 
     def policy_spec(self, num_categories: int) -> PolicySpec:
         """Specification from which the run's policies are built."""
@@ -404,6 +414,9 @@ def check_config(config: RunConfig) -> RunConfig:
         config = dataclasses.replace(config, arms=("baseline",))
     if config.decision == "streams":
         config = dataclasses.replace(config, direct="goal", counterfactual="none")
+    if config.layout.counts is None:
+        layout = dataclasses.replace(config.layout, counts=config.layout_counts)
+        config = dataclasses.replace(config, layout=layout)
     if config.ppo.guidance is None:
         guidance = _usual_guidance(config, method)
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, guidance=guidance))

@@ -27,7 +27,7 @@ from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import Params, bind, init_params
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.config import RunConfig
+from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
@@ -114,7 +114,7 @@ class Policies(NamedTuple):
         estimator_config = self.estimator_config
         knowledge = self.knowledge
         if name in ("paper", "released"):
-            estimator_config = ESTIMATORS[name]
+            estimator_config = adapt_counts(ESTIMATORS[name], self.task)
             knowledge = knowledge._replace(layout=layout_priors(self.prior_counts, estimator_config))
         elif name is not None:
             estimator_config = estimators_by_gap(estimator_config)[name]
@@ -177,6 +177,13 @@ class Policies(NamedTuple):
         return AgentLoop(world.env, self.spec, self.estimator_config, self.inner_steps, self.fallback_spec)
 
 
+def adapt_counts(estimator_config: EstimatorConfig, task: Task) -> EstimatorConfig:
+    """Let an estimator count presence where the observation rows of a task hold no instance counts."""
+    if task.instance_counts:
+        return estimator_config
+    return dataclasses.replace(estimator_config, counts="presence")
+
+
 def estimators_by_gap(estimator_config: EstimatorConfig) -> dict[GapName, EstimatorConfig]:
     """Variants of a layout estimator, one for each measure of the gap.
 
@@ -221,7 +228,7 @@ def export_policy(
     # Arrays, by group.
     arrays = {
         "policy": jax.device_get(params),
-        "layout": {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.counts)},
+        "layout": {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.prior_counts)},
     }
     if knowledge.method:
         arrays["knowledge"] = jax.device_get(knowledge.method)
@@ -276,8 +283,9 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
                 "train the run again"
             )
 
-    # The task may have changed with the version of jaxnav.
-    field_differences = list_differences(reference_fields["task"], _task_fields(config.task))
+    # The task may have changed with the version of jaxnav. Fields that are new since then have their default values.
+    trained_task = parsed_policies[reference_index].task
+    field_differences = list_differences(_task_fields(trained_task), _task_fields(config.task))
     if field_differences:
         raise InputError(
             f"{reference_folder}: its task differs from that of its run (policy != run): "
@@ -476,9 +484,9 @@ def config_for_policy(path: str | Path) -> RunConfig:
       InputError: no such policy, or no generated world has its task.
     """
     folder = find_policy_folder(path)
-    _, fields = load_params(folder)
-    arm = "baseline" if fields["layout"] is None else "layout"
-    config = _config_for_task_fields(fields["task"], fields["method"], arm)
+    policies = read_exported_policy(folder)
+    arm = "baseline" if policies.estimator_config is None else "layout"
+    config = config_for_task(policies.task, policies.spec.method.name, arm)
     if config is None:
         raise InputError(
             f"{folder}: was trained for a task that no generated world has; give the run that it comes from"
@@ -494,14 +502,11 @@ def config_for_task(task: Task, method: str, arm: str) -> RunConfig | None:
       method: name of its method.
       arm: `baseline` or `layout`.
     """
-    return _config_for_task_fields(_task_fields(task), method, arm)
-
-
-def _config_for_task_fields(task_fields: Mapping[str, Any], method: str, arm: str) -> RunConfig | None:
     # Generated worlds differ in their tasks, so the task identifies the world.
+    layout = LayoutConfig(counts="instances" if task.instance_counts else "presence")
     for world in WORLDS:
-        config = dataclasses.replace(RunConfig(), world=world, method=method, arms=(arm,), seeds=1)
-        if not list_differences(task_fields, _task_fields(config.task)):
+        config = dataclasses.replace(RunConfig(), world=world, method=method, arms=(arm,), seeds=1, layout=layout)
+        if config.task == task:
             return config
     return None
 

@@ -30,7 +30,6 @@ from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.policies import find_policy_folder, read_exported_policy
 from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from jaxnav.store.files import list_differences
 
@@ -217,7 +216,7 @@ class LoadedPolicy(struct.PyTreeNode):
 
     @property
     def _perception(self) -> Perception:
-        return Perception(RowFormat(self.spec.num_categories), self.spec, self.estimator_config)
+        return Perception(self.task.row_format, self.spec, self.estimator_config)
 
 
 def load_policy(
@@ -245,17 +244,22 @@ def load_policy(
     estimator_config = policies.estimator_config
     if estimator_config is not None and form is not None:
         estimator_config = dataclasses.replace(estimator_config, form=form)
-    # Categories and rules must equal the trained ones.
+    # Categories and rules must equal the trained ones, and so must the kind of rows if the estimator counts instances.
     if env is not None:
-        _check_task(path, policies.task, env.task)
+        _check_task(path, policies.task, env.task, estimator_config)
     return LoadedPolicy(policies.params, policies.knowledge, policies.spec, estimator_config, policies.task)
 
 
-def _check_task(path: str | Path, trained_task: Task, env_task: Task) -> None:
-    """Check that an environment has the categories and rules of training; goals and detector errors may differ."""
+def _check_task(path: str | Path, trained_task: Task, env_task: Task, estimator_config: EstimatorConfig | None) -> None:
+    """Check that an environment has the categories and rules of training; goals and detector errors may differ.
+
+    An estimator that counts instances also needs the rows of training.
+    """
+    counts_instances = estimator_config is not None and estimator_config.counts == "instances"
 
     def compared_fields(task: Task) -> dict[str, Any]:
-        return {"categories": task.categories, "rules": dataclasses.asdict(task.rules)}
+        fields: dict[str, Any] = {"categories": task.categories, "rules": dataclasses.asdict(task.rules)}
+        return fields | {"instance_counts": task.instance_counts} if counts_instances else fields
 
     task_differences = list_differences(compared_fields(trained_task), compared_fields(env_task))
     if task_differences:
@@ -300,9 +304,10 @@ def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Ar
       `action` int32 [], the best action; `logits` and `factual` float32 [C]; where the policy uses the layout
       `counterfactual` float32 [C], `gap` float32 [] and `weights` float32 [K], w x g of eq. 7; `memory`.
     """
-    # Programs take detections and view as arrays; the policy reads them packed into a row.
-    row_format = RowFormat(policy.spec.num_categories)
-    observation = Observation(row_format.pack(inputs["detections"], inputs["view"]), inputs["goal"])
+    # Programs take detections, view and counts as arrays; the policy reads them packed into a row.
+    row_format = policy.task.row_format
+    row = row_format.pack(inputs["detections"], inputs["view"], inputs["counts"] if row_format.has_counts else None)
+    observation = Observation(row, inputs["goal"])
 
     # Memory of the first step of an episode, or memory of the previous step with its action.
     initial_memory = policy.begin(inputs["room"])
@@ -349,6 +354,7 @@ def input_shapes(policy: LoadedPolicy, batch: Any) -> dict[str, Any]:
     Returns:
       detections: uint8 [B, K, 4], confidence, ahead, right and apparent size; see `RowFormat`.
       view: uint8 [B, V, V], 0 unknown, 1 free, 2 blocked; row 0 is nearest to the agent, column 0 leftmost.
+      counts: uint8 [B, K], detected instances of each category; only for tasks with instance counts.
       goal: int32 [B], index of a category.
       action: int32 [B], previous action.
       heading: int32 [B], clockwise.
@@ -358,7 +364,7 @@ def input_shapes(policy: LoadedPolicy, batch: Any) -> dict[str, Any]:
       first: bool [B], True where an episode begins; `action`, `moved` and `memory` are not read there.
       memory: output `memory` of the previous step, by name.
     """
-    row_format = RowFormat(policy.spec.num_categories)
+    row_format = policy.task.row_format
     index_shape = jax.ShapeDtypeStruct((), jnp.int32)
     flag_shape = jax.ShapeDtypeStruct((), jnp.bool_)
     # Shapes of one episode; the batch axis comes last.
@@ -374,6 +380,8 @@ def input_shapes(policy: LoadedPolicy, batch: Any) -> dict[str, Any]:
         "first": flag_shape,
         "memory": _memory_by_name(jax.eval_shape(policy.begin, index_shape)),
     }
+    if row_format.has_counts:
+        episode_shapes["counts"] = jax.ShapeDtypeStruct((row_format.num_categories,), jnp.uint8)
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((batch, *leaf.shape), leaf.dtype), episode_shapes)
 
 

@@ -37,6 +37,12 @@ TIMES_FILE = "times.jsonl"
 #: Success of the exported policies within budgets of actions; see `Validator.success_by_budget`.
 REACH_FILE = "reach.json"
 
+#: Settings that runs of earlier versions lack, with the values that they were trained with.
+_EARLIER_SETTINGS: dict[str, dict[str, Any]] = {
+    "layout": {"counts": "presence", "weights": "raw"},
+    "ppo": {"guidance": 0.0, "final_guidance": None},
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class Run:
@@ -103,6 +109,11 @@ def load_run_config(run_dir: Path) -> RunConfig:
         raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
     # The digest reveals edits and damage.
     saved_settings = read_json_with_digest(path, "restore the file or train in another --run-dir")
+
+    # Settings that came with later versions.
+    for group_name, earlier_values in _EARLIER_SETTINGS.items():
+        if isinstance(saved_settings.get(group_name), dict):
+            saved_settings[group_name] = earlier_values | saved_settings[group_name]
 
     # Settings that are missing in the file would silently take their default values.
     config = apply_values(RunConfig(), saved_settings, path)

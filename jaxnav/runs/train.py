@@ -234,18 +234,32 @@ def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
     walks_per_bank = -(-config.layout.walks // num_banks)  # rounded up
 
     # Explore bank by bank, and add up the counts.
-    explore_bank = jax.jit(explore, static_argnums=(0, 3, 4))
+    estimator_config = named_estimator(config)
+    explore_bank = jax.jit(explore, static_argnums=(0, 3, 4, 5))
     explorations = []
     for bank_index, params in enumerate(prefetch_env_params(world, range(num_banks))):
         bank_key = jax.random.fold_in(key, bank_index)
-        explorations.append(explore_bank(world.env, params, bank_key, walks_per_bank, config.layout.steps))
+        explorations.append(
+            explore_bank(world.env, params, bank_key, walks_per_bank, config.layout.steps, estimator_config)
+        )
     exploration = jax.tree.map(lambda *bank_leaves: sum(bank_leaves), *explorations)
 
     # A pooled prior gives every room type the counts of all rooms.
     if config.layout.prior == "room":
         return exploration
-    pooled_counts = exploration.counts.sum(axis=0)
-    return exploration._replace(counts=jnp.broadcast_to(pooled_counts, exploration.counts.shape))
+    return exploration._replace(
+        counts=_pool_rooms(exploration.counts), prior_counts=_pool_rooms(exploration.prior_counts)
+    )
+
+
+def _pool_rooms(counts: jax.Array) -> jax.Array:
+    """Give every room type the counts of all rooms, float32 [rooms, K, K]."""
+    return jnp.broadcast_to(counts.sum(axis=0), counts.shape)
+
+
+def named_estimator(config: RunConfig) -> EstimatorConfig:
+    """Layout estimator that `layout.setting` and `layout.counts` name, before calibration."""
+    return dataclasses.replace(ESTIMATORS[config.layout.setting], counts=config.layout_counts)
 
 
 def calibrate_estimator(
@@ -255,7 +269,7 @@ def calibrate_estimator(
 
     Values that the run's configuration leaves open are calibrated in the training scenes of the first bank.
     """
-    estimator_config = ESTIMATORS[config.layout.setting]
+    estimator_config = named_estimator(config)
     if estimator_config.strength is None:
         return estimator_config  # `paper` and `released` keep the sums of the counts, so nothing is calibrated
 
@@ -266,7 +280,7 @@ def calibrate_estimator(
     calibration = calibrate(
         world.env,
         world.make_env_params(0),
-        exploration.counts,
+        exploration.prior_counts,
         estimator_config,
         key,
         candidate_strengths,
@@ -288,7 +302,7 @@ def learn_knowledge(
 
     The evidence is learned in the training scenes of the first bank, and only where policies use the layout.
     """
-    layout = layout_priors(exploration.counts, estimator_config)
+    layout = layout_priors(exploration.prior_counts, estimator_config)
 
     # The method's own knowledge, from the tables of all banks.
     learn = find_method(config.method).learn

@@ -17,7 +17,7 @@ from jaxnav.scenes.categories import (
     ROBOTHOR_CATEGORIES,
     ROBOTHOR_GOALS,
 )
-from jaxnav.scenes.tables.observation_row import Detector
+from jaxnav.scenes.tables.observation_row import Detector, RowFormat
 
 #: Names of the actions; an action is an index into them.
 ACTIONS = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
@@ -129,12 +129,15 @@ class Task:
       goals: the categories that can be goals; () for all of `categories`.
       rules: rules of motion, view and success.
       detector: detector with its error rates.
+      instance_counts: whether observation rows also hold the number of detected instances of each category, which
+        layout estimators with `counts="instances"` need; all other bytes of a row stay the same.
     """
 
     categories: tuple[str, ...] = ITHOR_CATEGORIES
     goals: tuple[str, ...] = ()
     rules: Rules = Rules()
     detector: Detector = Detector()
+    instance_counts: bool = False
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Task":
@@ -143,6 +146,11 @@ class Task:
         task_rules = Rules(**_lists_to_tuples(values["rules"]))
         task_detector = Detector(**_lists_to_tuples(values["detector"]))
         return cls(**_lists_to_tuples(values) | {"rules": task_rules, "detector": task_detector})
+
+    @property
+    def row_format(self) -> RowFormat:
+        """Format of the observation rows."""
+        return RowFormat(len(self.categories), has_counts=self.instance_counts)
 
     def is_goal(self) -> np.ndarray:
         """Return where categories can be goals, bool [K]."""

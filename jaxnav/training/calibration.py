@@ -21,7 +21,7 @@ from jaxnav.choices import Reduction
 from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.gaps import CooccurrenceEvidence, seen_together
-from jaxnav.layout import EstimatorConfig, prior_from_counts
+from jaxnav.layout import EstimatorConfig, prior_from_counts, resolve_estimator
 from jaxnav.policies.agent_loop import Agent, AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.scenes.task import DONE
@@ -59,21 +59,31 @@ class Exploration(NamedTuple):
     Attributes:
       counts: float32 [rooms, K, K], number of poses at which two categories were detected together, by room type; on
         the diagonal, at which a category was detected.
+      prior_counts: float32 [rooms, K, K], counts behind the layout priors, as the layout estimator counts; `counts` for
+        estimators with a gate and presence counts.
       steps: int32 [], number of steps.
       poses: int32 [], number of distinct poses visited.
     """
 
     counts: jax.Array
+    prior_counts: jax.Array
     steps: jax.Array
     poses: jax.Array
 
 
 def explore(
-    env: ObjectNav, env_params: EnvParams, key: jax.Array, num_walks: int = 2048, num_steps: int = 100
+    env: ObjectNav,
+    env_params: EnvParams,
+    key: jax.Array,
+    num_walks: int = 2048,
+    num_steps: int = 100,
+    estimator_config: str | EstimatorConfig = "calibrated",
 ) -> Exploration:
     """Count which categories are detected together on random walks (paper, section 3.3, stage i).
 
-    The walks never choose Done, and each pose counts once, however often it is visited.
+    The walks never choose Done. In `counts` each pose counts once, however often it is visited. In `prior_counts` a
+    view that shows category i adds its counts n_j (eq. 3) to row i. Estimators with a gate take each pose once;
+    without a gate every view of the walks counts, as in eq. 4.
 
     Args:
       env: the environment.
@@ -81,6 +91,7 @@ def explore(
       key: consumed.
       num_walks: parallel walks.
       num_steps: steps of each walk.
+      estimator_config: layout estimator, or its name; `counts` and `gate` are read.
     """
     # Walk, and mark the poses visited in any walk.
     tables = env_params.tables
@@ -88,6 +99,7 @@ def explore(
     is_visited = jnp.zeros(tables.rows.shape[0], bool).at[poses].set(True)
 
     # Detections at visited poses [P, K], and the room type of each pose [P].
+    config = resolve_estimator(estimator_config)
     presence = (env.row_format.presence(tables.rows) & is_visited[:, None]).astype(jnp.float32)
     pose_scenes = jnp.repeat(
         jnp.arange(len(env_params.room)),
@@ -96,12 +108,28 @@ def explore(
     )
     pose_rooms = env_params.room[pose_scenes]
 
-    def count_pairs(room: jax.Array) -> jax.Array:
-        is_in_room = (pose_rooms == room)[:, None].astype(jnp.float32)
-        return (presence * is_in_room).T @ presence
+    def count_pairs(view_counts: jax.Array) -> jax.Array:
+        def count_in_room(room: jax.Array) -> jax.Array:
+            is_in_room = (pose_rooms == room)[:, None].astype(jnp.float32)
+            return jnp.matmul((presence * is_in_room).T, view_counts, precision="highest")
+
+        return jax.lax.map(count_in_room, jnp.arange(NUM_PRIORS))  # one room type at a time, to save memory
+
+    # Counts of the prior: instances instead of presence, and every view instead of every pose.
+    counts = count_pairs(presence)
+    prior_counts = counts
+    if config.counts == "instances" or not config.gate:
+        view_counts = presence
+        if config.counts == "instances":
+            view_counts = env.row_format.counts(tables.rows).astype(jnp.float32) * presence
+        if not config.gate:
+            num_visits = jnp.zeros(len(is_visited), jnp.float32).at[poses].add(1.0)
+            view_counts = view_counts * num_visits[:, None]
+        prior_counts = count_pairs(view_counts)
 
     return Exploration(
-        counts=jax.lax.map(count_pairs, jnp.arange(NUM_PRIORS)),  # one room type at a time, to save memory
+        counts=counts,
+        prior_counts=prior_counts,
         steps=jnp.int32(num_walks * num_steps),
         poses=is_visited.sum(dtype=jnp.int32),
     )
@@ -148,7 +176,7 @@ def layout_priors(counts: jax.Array, estimator_config: str | EstimatorConfig) ->
     all scenes together.
 
     Args:
-      counts: float32 [rooms, K, K], see `Exploration`.
+      counts: float32 [rooms, K, K], see `Exploration.prior_counts`.
       estimator_config: configuration of the layout estimator, or its name.
 
     Returns:
@@ -196,7 +224,7 @@ def calibrate(
     Args:
       env: the environment.
       env_params: parameters of the training environment.
-      counts: float32 [rooms, K, K], from `explore`.
+      counts: float32 [rooms, K, K], `Exploration.prior_counts`.
       estimator_config: all other settings of the estimator.
       key: consumed.
       strengths, reductions: candidates.

@@ -36,7 +36,8 @@ def test_stream_config_disables_counterfactual_training(streams):
 def test_exported_stream_policy_acts(drawn_run, streams, tmp_path):
     drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     params = random_params(0, streams.policy_spec(len(streams.task.categories)))
-    explored = Exploration(jnp.ones_like(drawn.knowledge.layout), jnp.int32(1), jnp.int32(1))
+    counts = jnp.ones_like(drawn.knowledge.layout)
+    explored = Exploration(counts, counts, jnp.int32(1), jnp.int32(1))
     export_policy(tmp_path / "policy", streams, params, drawn.knowledge, drawn.estimator_config, explored)
     policy = jaxnav.load_policy(tmp_path / "policy")
     assert policy.spec == streams.policy_spec(len(streams.task.categories))

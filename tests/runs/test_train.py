@@ -56,7 +56,7 @@ def test_run_opens_from_its_path(finished_config):
     run = jaxnav.Run(finished_config)
     for path in (finished_config.run_dir, str(finished_config.run_dir)):
         opened = jaxnav.Run.open(path)
-        assert opened.config == dataclasses.replace(finished_config, **defaults)
+        assert opened.config == check_config(dataclasses.replace(finished_config, **defaults))
         chex.assert_trees_all_equal(opened.policies(), run.policies())
         assert opened.log() == run.log()
     with pytest.raises(InputError, match="holds no run"):

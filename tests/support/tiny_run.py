@@ -90,7 +90,7 @@ def draw_run(config: RunConfig) -> Run:
     # No pair is seen more often than each of its two categories.
     counts = np.random.default_rng(0).integers(0, 9, shape).astype(np.float32)
     counts[:, np.arange(num_categories), np.arange(num_categories)] = 9
-    exploration = Exploration(jnp.asarray(counts), jnp.int32(1280), jnp.int32(600))
+    exploration = Exploration(jnp.asarray(counts), jnp.asarray(counts), jnp.int32(1280), jnp.int32(600))
 
     # What exploration would have taught: co-occurrence evidence above the diagonal, and a prior per room type.
     log_odds = np.triu(np.random.default_rng(1).normal(size=shape), 1).astype(np.float32)

@@ -1,13 +1,16 @@
 """The counts that the layout prior is made of, against a plain count over the poses that were walked through."""
 
+import dataclasses
 import itertools
 
 import jax
 import numpy as np
 from support import tiny_world as tiny
 
+from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS, ObjectNav
 from jaxnav.scenes.categories import ROOM_TYPES
+from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import DONE
 from jaxnav.training.calibration import explore
 
@@ -48,6 +51,43 @@ def test_short_walks_count_what_they_pass():
     result = run(ENV, PARAMS, key, walks, steps)
     assert walks < result.poses == len(passed) <= walks * (steps + 1)
     np.testing.assert_array_equal(result.counts, count(passed))
+
+
+def test_estimators_with_a_gate_and_presence_take_the_prior_from_poses():
+    for name in ("calibrated", "released"):
+        result = jax.jit(explore, static_argnums=(0, 3, 4, 5))(ENV, PARAMS, jax.random.key(0), 5, 4, name)
+        np.testing.assert_array_equal(result.prior_counts, result.counts)
+
+
+def test_the_paper_counts_every_view_and_every_instance():
+    """Each view of each walk adds its counts n_j to the rows of the categories that it shows."""
+    task = dataclasses.replace(tiny.BANK.task, instance_counts=True)
+    bank = compile_bank([tiny.KITCHEN, tiny.BEDROOM], task)
+    env, params = build_environment(bank, {}, 10)
+    key, num_walks, num_steps = jax.random.key(0), 7, 30
+    result = jax.jit(explore, static_argnums=(0, 3, 4, 5))(env, params, key, num_walks, num_steps, "paper")
+
+    # The same walks in NumPy, view by view.
+    keys = jax.random.split(jax.random.fold_in(key, 0), num_walks)
+    pose = np.asarray(jax.vmap(env.reset, (0, None))(keys, params)[1].pose)
+    view_poses = [*pose]
+    for actions in np.asarray(jax.random.randint(jax.random.fold_in(key, 1), (num_steps, num_walks), 0, DONE)):
+        pose = bank.successor[pose, actions]
+        view_poses += [*pose]
+    expected = np.zeros((NUM_PRIORS, 3, 3))
+    counts = bank.rows[:, 4 * 3 + 31 : 4 * 3 + 31 + 3]
+    for view_pose in view_poses:
+        room = KITCHEN if view_pose < KITCHEN_POSES else BEDROOM
+        for i in np.flatnonzero(counts[view_pose]):
+            expected[room, i] += counts[view_pose]
+    assert len(view_poses) == num_walks * (num_steps + 1) > len(set(view_poses))
+    np.testing.assert_array_equal(result.prior_counts, expected)
+
+    # Two books in the kitchen: instances exceed presence. The other counts are those of poses, as without the paper.
+    assert counts.max() == 2
+    plain_result = run(ENV, PARAMS, key, num_walks, num_steps)
+    np.testing.assert_array_equal(result.counts, plain_result.counts)
+    assert result.poses == plain_result.poses
 
 
 def test_rooms_without_scenes_have_no_counts():

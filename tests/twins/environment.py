@@ -94,19 +94,24 @@ class Twin:
 
         The list is empty for a category that is not detected, and has several entries where instances are equally near.
         """
-        # Instances in view, by category, with their distances.
+        nearest = []
+        for rows in self._instances_in_view():
+            min_distance = min((row[0] for row in rows), default=math.inf)
+            nearest.append([row[1:] for row in rows if row[0] <= min_distance + 1e-9])
+        return nearest
+
+    def instance_counts(self) -> list[int]:
+        """Return the number of instances that a detector without errors detects of each category."""
+        return [len(rows) for rows in self._instances_in_view()]
+
+    def _instances_in_view(self) -> list[list[tuple[float, float, float, float]]]:
+        """Return (distance, ahead, right, apparent size) of the instances in view, by category."""
         instances: list[list[tuple[float, float, float, float]]] = [[] for _ in self.categories]
         for box, distance in self.scene.detectable(self.cell):
             ahead, right, in_view = self.scene.offsets(self.cell, self.heading, self.horizon, box)
             if in_view and box.category is not None:
                 instances[box.category].append((distance, ahead, right, box.size / max(distance, 0.25)))
-
-        # The nearest ones of each.
-        nearest = []
-        for rows in instances:
-            min_distance = min((row[0] for row in rows), default=math.inf)
-            nearest.append([row[1:] for row in rows if row[0] <= min_distance + 1e-9])
-        return nearest
+        return instances
 
     def view(self) -> list[int]:
         return self.scene.view(self.cell, self.heading)

@@ -52,12 +52,14 @@ def same_distance(metres: float, expected: float) -> bool:
     return distance == expected or abs(distance - expected) < 1e-6
 
 
-def row_differences(row: np.ndarray, twin: Twin, num_categories: int) -> Iterator[str]:
-    """Yield the names of what differs between row and twin."""
+def row_differences(row: np.ndarray, twin: Twin, num_categories: int, has_counts: bool = False) -> Iterator[str]:
+    """Yield the names of what differs between row and twin; rows with instance counts hold them after the view."""
     entries, view = np.split(row, [4 * num_categories])
     view_cells = (view[:31, None] >> [0, 2, 4, 6] & 3).ravel()[:121]
     if view_cells.tolist() != twin.view():
         yield "view"
+    if has_counts and view[31 : 31 + num_categories].tolist() != twin.instance_counts():
+        yield "instance counts"
     for entry, instances in zip(entries.reshape(-1, 4), twin.detections(), strict=True):
         if bool(entry[0]) != bool(instances):
             yield "presence"

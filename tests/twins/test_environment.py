@@ -37,7 +37,7 @@ OTHER_LIMIT = 30
 SLOW = pytest.mark.slow
 TASKS = {
     "rooms": Task(rules=ROOMS, detector=PERFECT_DETECTOR),
-    "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT_DETECTOR),
+    "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT_DETECTOR, instance_counts=True),
     "houses": Task(rules=HOUSES, goals=ITHOR_CATEGORIES[1::2], detector=PERFECT_DETECTOR),
 }
 
@@ -211,7 +211,9 @@ def count_table_differences(scene: Scene, guide: Guide, task: Task, stride: int 
     # Rows, success of Done, and the poses after each action.
     differences = collections.Counter()
     for pose in range(0, len(successor), stride):
-        differences.update(row_differences(table.rows[pose], guide.place(pose), len(task.categories)))
+        row_twin = guide.place(pose)
+        num_categories = len(task.categories)
+        differences.update(row_differences(table.rows[pose], row_twin, num_categories, task.instance_counts))
         done_goals = set(np.flatnonzero(table.best_length[pose] == 1).tolist())
         differences["success"] += done_goals != set(goals_of(task)) & guide.place(pose).successes()
         for action in range(DONE + 1):

@@ -24,7 +24,7 @@ from jaxnav.scenes.lattice import (
     walking_distances,
 )
 from jaxnav.scenes.scene import Scene, box_footprints
-from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, detection_range, object_size
+from jaxnav.scenes.tables.observation_row import MAX_RANGE, detection_range, object_size
 from jaxnav.scenes.tables.visibility import (
     TOLERANCE,
     Targets,
@@ -47,7 +47,7 @@ class Bank(NamedTuple):
       names: [S] scene names.
       room_types: [S] room type names.
       ahead: int32 [C, H], cell after MoveAhead.
-      rows: uint8 [P, R], observation row of each pose, see `RowFormat`.
+      rows: uint8 [P, R], observation row of each pose, see `Task.row_format`.
       best_length: uint16 [P, K], length L* of a shortest path, Done included; 0 for an unreachable goal and for a
         category that is no goal.
       goal_distance: float32 [C, K], metres to the nearest object of a category, inf without an object. If success means
@@ -131,8 +131,8 @@ def compile_scene(scene: Scene, task: Task) -> Bank:
     success &= task.is_goal()
 
     # Observation rows and shortest paths.
-    detections = detect_objects(scene, task, sightings, num_poses)
-    row_format = RowFormat(num_categories)
+    detections, counts = detect_objects(scene, task, sightings, num_poses)
+    row_format = task.row_format
     views = ego_views(scene, rules, cells, row_format.view)
     best_length = best_lengths(pose_successors(ahead, rules), success)
 
@@ -143,7 +143,7 @@ def compile_scene(scene: Scene, task: Task) -> Bank:
         names=(scene.name,),
         room_types=(scene.room_type,),
         ahead=ahead,
-        rows=row_format.pack(detections, views),
+        rows=row_format.pack(detections, views, counts),
         best_length=best_length,
         goal_distance=goal_distance.astype(np.float32),
         first_cell=np.zeros(1, np.int32),

@@ -4,7 +4,8 @@ A row holds the detection of each category and an ego-centric view of the floor.
 NumPy and on JAX arrays. `Detector` simulates an object detector, whose errors are sampled once per pose.
 
 A detection has four bytes: confidence, metres ahead, metres to the right and apparent size, all 0 for an undetected
-category. `relative_position` converts the bytes of the position to metres.
+category. `relative_position` converts the bytes of the position to metres. Rows may also hold the number of detected
+instances of each category, for layout estimators that count instances.
 """
 
 import dataclasses
@@ -40,22 +41,25 @@ MIN_APPARENT_SIZE = 0.12
 
 @dataclasses.dataclass(frozen=True)
 class RowFormat:
-    """Layout of the bytes of a row: detections, the view at two bits per cell, padding.
+    """Layout of the bytes of a row: detections, the view at two bits per cell, instance counts if any, padding.
 
-    All methods accept NumPy and JAX arrays.
+    All methods accept NumPy and JAX arrays. Detections and view have the same places with and without counts, so a
+    format without counts reads them from rows of either kind.
 
     Attributes:
       num_categories: K.
       view: V, cells along each side of the ego-centric view.
+      has_counts: whether rows hold the number of detected instances of each category.
     """
 
     num_categories: int
     view: int = 11
+    has_counts: bool = False
 
     @property
     def num_bytes(self) -> int:
         """Length of a row, padded to a multiple of 32 bytes."""
-        return -(-(self._view_start + self._view_bytes) // 32) * 32
+        return -(-(self._counts_start + self._counts_bytes) // 32) * 32
 
     @property
     def _view_start(self) -> int:
@@ -65,16 +69,31 @@ class RowFormat:
     def _view_bytes(self) -> int:
         return -(-self.view * self.view // 4)
 
-    def pack(self, detections: Any, view: Any) -> Any:
-        """Pack detections and views into rows.
+    @property
+    def _counts_start(self) -> int:
+        return self._view_start + self._view_bytes
+
+    @property
+    def _counts_bytes(self) -> int:
+        return self.num_categories if self.has_counts else 0
+
+    def pack(self, detections: Any, view: Any, counts: Any = None) -> Any:
+        """Pack detections and views, and instance counts if the rows hold them, into rows.
 
         Args:
           detections: uint8 [..., K, 4].
           view: uint8 [..., V, V], ego-centric views.
+          counts: uint8 [..., K], detected instances of each category; None without counts.
 
         Returns:
           uint8 [..., num_bytes].
+
+        Raises:
+          ValueError: the rows hold counts, and none are given, or the reverse.
         """
+        if self.has_counts != (counts is not None):
+            raise ValueError("counts: give instance counts exactly for rows that hold them (has_counts)")
+
         # Four cells of the view share a byte.
         xp = view.__array_namespace__()
         batch_shape = view.shape[:-2]
@@ -84,9 +103,13 @@ class RowFormat:
         cell_groups = cells.reshape(*batch_shape, self._view_bytes, 4)
         packed_view = xp.sum(cell_groups << _cell_shifts(cell_groups.ndim), axis=-1, dtype=np.uint8)
 
-        # Detections, view and padding, one after another.
-        row_padding = xp.zeros((*batch_shape, self.num_bytes - self._view_start - self._view_bytes), dtype=np.uint8)
-        return xp.concat([detections.reshape(*batch_shape, self._view_start), packed_view, row_padding], axis=-1)
+        # Detections, view, counts and padding, one after another.
+        parts = [detections.reshape(*batch_shape, self._view_start), packed_view]
+        if counts is not None:
+            parts.append(counts)
+        num_padding = self.num_bytes - self._counts_start - self._counts_bytes
+        parts.append(xp.zeros((*batch_shape, num_padding), dtype=np.uint8))
+        return xp.concat(parts, axis=-1)
 
     def detections(self, rows: Any) -> Any:
         """Return the detections in rows uint8 [..., num_bytes], uint8 [..., K, 4]."""
@@ -96,12 +119,22 @@ class RowFormat:
         """Return True for the categories that are detected, bool [..., K]."""
         return rows[..., 0 : self._view_start : 4] > 0
 
+    def counts(self, rows: Any) -> Any:
+        """Return the number of detected instances of each category, uint8 [..., K].
+
+        Raises:
+          ValueError: the rows hold no counts.
+        """
+        if not self.has_counts:
+            raise ValueError("counts: these rows hold no instance counts; compile the scenes with instance counts")
+        return rows[..., self._counts_start : self._counts_start + self.num_categories]
+
     def view_cells(self, rows: Any) -> Any:
         """Return the ego-centric view, uint8 [..., V * V].
 
         Row 0 of the view is nearest to the agent, column 0 leftmost.
         """
-        packed_view = rows[..., self._view_start : self._view_start + self._view_bytes]
+        packed_view = rows[..., self._view_start : self._counts_start]
         cells = (packed_view[..., None] >> _cell_shifts(packed_view.ndim + 1)) & np.uint8(3)
         return cells.reshape(*rows.shape[:-1], -1)[..., : self.view * self.view]
 
@@ -184,8 +217,8 @@ class Detector:
         error_draw, noise, range_draw, bearing_draw = rng.random((4, *visible.shape), dtype=np.float32)
 
         # Misses become more likely with distance; false alarms only occur without a visible object.
-        nearness = np.clip(distance / detection_range(size), 0.0, 1.0)
-        is_missed = error_draw < self.miss_near + (self.miss_far - self.miss_near) * nearness**2
+        nearness = _relative_distance(distance, size)
+        is_missed = error_draw < self._miss_probability(nearness)
         false_alarm = ~visible & (error_draw < self.false_alarm)
         has_errors = self.miss_near > 0 or self.miss_far > 0 or self.false_alarm > 0
         confidence = 1.0 - 0.5 * nearness + (0.2 * (noise - 0.5) if has_errors else 0.0)
@@ -203,6 +236,43 @@ class Detector:
         is_detected = (visible & ~is_missed) | false_alarm
         detection_bytes = _scale_to_bytes(confidence, ahead, right, apparent_size)
         return np.where(is_detected[..., None], detection_bytes, 0.0).astype(np.uint8)
+
+    def count(
+        self,
+        scene_name: str,
+        is_detected: np.ndarray,
+        pose: np.ndarray,
+        category: np.ndarray,
+        distance: np.ndarray,
+        size: np.ndarray,
+    ) -> np.ndarray:
+        """Sample how many instances of each category are detected, with errors.
+
+        A detected category counts one for its detection, false alarms included, and one for every further visible
+        instance that is not missed. Each instance is missed with the probability of its own distance and size.
+
+        Args:
+          scene_name: name of the scene, which seeds the errors.
+          is_detected: bool [P, K], True where the category is detected (see `detect`).
+          pose, category: int [M], pose and category of each visible instance but the nearest ones, which `detect`
+            decides about.
+          distance, size: float [M], distance and size of these instances, metres.
+
+        Returns:
+          uint8 [P, K], 0 exactly where nothing is detected; more than 255 instances count 255.
+        """
+        # A random stream of its own leaves the errors of the detections unchanged.
+        rng = np.random.default_rng([self.seed, zlib.crc32(scene_name.encode()), 1])
+        error_draw = rng.random(len(pose), dtype=np.float32)
+        is_counted = error_draw >= self._miss_probability(_relative_distance(distance, size))
+
+        counts = np.ones(is_detected.shape, np.int64)
+        np.add.at(counts, (pose[is_counted], category[is_counted]), 1)
+        return np.where(is_detected, np.minimum(counts, 255), 0).astype(np.uint8)
+
+    def _miss_probability(self, nearness: np.ndarray) -> np.ndarray:
+        """Return the probability of missing an object at a distance relative to its detection range."""
+        return self.miss_near + (self.miss_far - self.miss_near) * nearness**2
 
 
 #: A detector without errors.
@@ -225,6 +295,11 @@ def detection_range(size: np.ndarray | float) -> np.ndarray:
       float [...], metres.
     """
     return np.clip(size / MIN_APPARENT_SIZE, MIN_RANGE, MAX_RANGE)
+
+
+def _relative_distance(distance: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return distances relative to the detection ranges of objects, from 0 to 1."""
+    return np.clip(distance / detection_range(size), 0.0, 1.0)
 
 
 def _scale_to_bytes(

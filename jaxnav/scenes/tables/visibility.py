@@ -130,8 +130,14 @@ def find_sightings(scene: Scene, rules: Rules, centres: np.ndarray, targets: Tar
     )
 
 
-def detect_objects(scene: Scene, task: Task, sightings: Sightings, num_poses: int) -> np.ndarray:
-    """Return the detections at every pose, uint8 [P, K, 4], see `Detector.detect`."""
+def detect_objects(
+    scene: Scene, task: Task, sightings: Sightings, num_poses: int
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the detections at every pose, and the instance counts if the task has them.
+
+    Returns:
+      Detections uint8 [P, K, 4], see `Detector.detect`, and counts uint8 [P, K], see `Detector.count`, or None.
+    """
     # Categories with an object within its detection range, [P, K].
     table_shape = (num_poses, len(task.categories))
     is_in_range = sightings.distance <= detection_range(sightings.size) + TOLERANCE
@@ -144,7 +150,24 @@ def detect_objects(scene: Scene, task: Task, sightings: Sightings, num_poses: in
     offsets = (sightings.ahead[pair, heading], sightings.right[pair, heading])
     nearest = np.zeros((4, *table_shape))
     nearest[:, pose, category] = np.stack([*offsets, sightings.distance[pair], sightings.size[pair]])
-    return task.detector.detect(scene.name, task.rules.half_view_tangents[0], visible, *nearest)
+    detections = task.detector.detect(scene.name, task.rules.half_view_tangents[0], visible, *nearest)
+    if not task.instance_counts:
+        return detections, None
+
+    # Instances behind the nearest one of their category: all entries but the last one of each pose and category.
+    last_entry = np.zeros(table_shape, np.int64)
+    last_entry[pose, category] = np.arange(len(pose))
+    is_further = last_entry[pose, category] != np.arange(len(pose))
+    further_pair = pair[is_further]
+    counts = task.detector.count(
+        scene.name,
+        detections[..., 0] > 0,
+        pose[is_further],
+        category[is_further],
+        sightings.distance[further_pair],
+        sightings.size[further_pair],
+    )
+    return detections, counts
 
 
 def ego_views(scene: Scene, rules: Rules, cells: np.ndarray, view: int) -> np.ndarray:

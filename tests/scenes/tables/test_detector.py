@@ -105,3 +105,54 @@ def test_detector_errors_leave_best_lengths_unchanged(rules):
     row_format = RowFormat(22)
     np.testing.assert_array_equal(blind_bank.best_length, perfect_bank.best_length)
     assert row_format.presence(blind_bank.rows).sum() < 0.1 * row_format.presence(perfect_bank.rows).sum()
+
+
+# Instance counts
+
+
+@pytest.mark.parametrize("detector", [Detector(), PERFECT_DETECTOR])
+def test_instance_counts_leave_all_other_bytes_unchanged(detector):
+    scenes = [generate_room("train", i, 0) for i in range(3)]
+    plain_task = Task(detector=detector)
+    counting_task = dataclasses.replace(plain_task, instance_counts=True)
+    plain_bank = compile_bank(scenes, plain_task)
+    counting_bank = compile_bank(scenes, counting_task)
+    num_filled = 4 * 22 + 31
+    np.testing.assert_array_equal(counting_bank.rows[:, :num_filled], plain_bank.rows[:, :num_filled])
+    np.testing.assert_array_equal(counting_bank.best_length, plain_bank.best_length)
+
+    # A category counts exactly where it is detected, and often more than once.
+    counts = counting_task.row_format.counts(counting_bank.rows)
+    np.testing.assert_array_equal(counts > 0, plain_task.row_format.presence(plain_bank.rows))
+    assert counts.max() >= 3
+
+
+def test_each_further_instance_is_missed_by_its_own_distance():
+    """Two further chairs at 0 and 2.5 m of 5 m: missed in 0.1 and 0.1 + 0.4 / 4 = 0.2 of the poses."""
+    detector = Detector(miss_near=0.1, miss_far=0.5)
+    num_poses = 40_000
+    pose = np.repeat(np.arange(num_poses), 2)
+    distance = np.tile([0.0, 2.5], num_poses)
+    is_detected = np.stack([np.arange(num_poses) % 4 > 0, np.zeros(num_poses, bool)], axis=-1)
+    counts = detector.count("room", is_detected, pose, np.zeros_like(pose), distance, np.full(len(pose), 0.6))
+
+    # Nothing counts where the category is not detected; one detection counts at least 1.
+    assert not counts[~is_detected].any()
+    detected_counts = counts[is_detected]
+    for number, probability in ((1, 0.1 * 0.2), (2, 0.1 * 0.8 + 0.9 * 0.2), (3, 0.9 * 0.8)):
+        num_equal = int((detected_counts == number).sum())
+        assert binomtest(num_equal, len(detected_counts), probability).pvalue > 1e-3
+        assert binomtest(num_equal, len(detected_counts), probability + 0.02).pvalue < 1e-3
+
+
+def test_false_alarms_count_one_instance():
+    task = Task(detector=Detector(miss_near=1.0, miss_far=1.0, false_alarm=0.3), instance_counts=True)
+    bank = compile_bank([generate_room("train", 0, 0)], task)
+    counts = task.row_format.counts(bank.rows)
+    assert set(np.unique(counts)) == {0, 1}
+
+
+def test_more_instances_than_a_byte_holds_count_255():
+    pose = np.zeros(300, int)
+    counts = PERFECT_DETECTOR.count("room", np.ones((1, 1), bool), pose, pose, np.zeros(300), np.ones(300))
+    assert counts.tolist() == [[255]]

@@ -28,3 +28,36 @@ def test_row_format_unpacks_what_it_packed(num_categories, num_bytes):
         np.testing.assert_array_equal(row_format.presence(packed_rows), detections[..., 0] > 0)
         np.testing.assert_array_equal(row_format.view_cells(packed_rows), view.reshape(num_poses, -1))
         np.testing.assert_array_equal(row_format.view_cells(packed_rows[0]), view[0].reshape(-1))
+
+
+@pytest.mark.parametrize(("num_categories", "num_bytes"), [(22, 160), (16, 128)])
+def test_counts_stand_behind_the_view_and_leave_the_other_bytes_in_place(num_categories, num_bytes):
+    # 22: 119 + 22 = 141 bytes; 16: 64 + 31 + 16 = 111; whole lines of 32.
+    row_format = RowFormat(num_categories, has_counts=True)
+    plain_format = RowFormat(num_categories)
+    draws = np.random.default_rng(1)
+    detections = draws.integers(0, 256, (20, num_categories, 4), np.uint8)
+    view = draws.integers(0, 3, (20, 11, 11), np.uint8)
+    counts = draws.integers(0, 256, (20, num_categories), np.uint8)
+
+    rows = row_format.pack(detections, view, counts)
+    assert rows.shape == (20, num_bytes) == (20, row_format.num_bytes)
+    num_filled = 4 * num_categories + 31
+    np.testing.assert_array_equal(rows[:, :num_filled], plain_format.pack(detections, view)[:, :num_filled])
+    for packed_rows in (rows, jnp.asarray(rows)):
+        np.testing.assert_array_equal(row_format.counts(packed_rows), counts)
+        # A format without counts reads the same rows.
+        for reader in (row_format, plain_format):
+            np.testing.assert_array_equal(reader.detections(packed_rows), detections)
+            np.testing.assert_array_equal(reader.view_cells(packed_rows), view.reshape(20, -1))
+
+
+def test_row_format_refuses_counts_that_its_rows_do_not_hold():
+    detections = np.zeros((3, 4), np.uint8)
+    view = np.zeros((11, 11), np.uint8)
+    counts = np.zeros(3, np.uint8)
+    for row_format, given_counts in ((RowFormat(3), counts), (RowFormat(3, has_counts=True), None)):
+        with pytest.raises(ValueError, match="give instance counts exactly for rows that hold them"):
+            row_format.pack(detections, view, given_counts)
+    with pytest.raises(ValueError, match="these rows hold no instance counts; compile the scenes with"):
+        RowFormat(3).counts(RowFormat(3).pack(detections, view))
