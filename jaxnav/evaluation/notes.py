@@ -20,6 +20,7 @@ def evaluation_notes(
     episodes: EpisodeList,
     *,
     has_room_prior: bool,
+    has_experience: bool = True,
     random_name: str = "Random",
 ) -> list[str]:
     """Describe the limits of a table, one sentence per note.
@@ -29,6 +30,7 @@ def evaluation_notes(
       success: float64 [R, S, E].
       episodes: the E episodes.
       has_room_prior: True if room types have different layout priors.
+      has_experience: False if the method's experience Z is empty, so that w has nothing to multiply.
       random_name: name of the agent that acts at random.
     """
     # Intervals first, then what a row knows in advance, then comparisons with chance.
@@ -37,6 +39,11 @@ def evaluation_notes(
         notes.append(
             "Rows with w receive the room type of the scene, because each room type has its own layout prior; "
             "other rows do not receive the room type."
+        )
+    if not has_experience and any(row.arm == "layout" for row in rows):
+        notes.append(
+            "A/A row: the method's Z is empty, so w has nothing to act on. The difference between a row with w and one "
+            "without w shows the noise between trainings."
         )
     return notes + _chance_notes(rows, success, episodes, random_name)
 

@@ -70,6 +70,12 @@ def _graph(spec: PolicySpec) -> "nnx.GraphDef[Policy]":
     return nnx.split(abstract_policy)[0]
 
 
+def has_experience(spec: PolicySpec) -> bool:
+    """True unless the method's experience Z is empty, so that layout weights have nothing to multiply."""
+    experience = nnx.eval_shape(lambda: spec.method.experience(spec, nnx.Rngs(0)))
+    return experience.width > 0
+
+
 # One recurrent core
 
 
@@ -232,12 +238,16 @@ class Policy(Stream):
 
         super().__init__(self._input_widths(sizes), method.control.num_choices, spec, rngs)
 
-    def pathways(self, inputs: PolicyInputs, memory: PolicyState | None = None) -> Pathways:
+    def pathways(
+        self, inputs: PolicyInputs, memory: PolicyState | None = None, others: PolicyInputs | None = None
+    ) -> Pathways:
         """Embed the scene (S), the goal (G) and the experience (Z).
 
         Args:
           inputs: leaves [...].
           memory: leaves [...]; None unless the method's experience reads the memory.
+          others: inputs with the goals of `inputs`, from which experience takes the detections of all categories but
+            the goal (`Experience.replace_others`); None takes them from `inputs`.
 
         Returns:
           Embeddings with leaves [..., size], see `Pathways`.
@@ -246,19 +256,16 @@ class Policy(Stream):
           ValueError: the experience reads the memory, and none is given.
         """
         # Only `attend` reads the memory; everything before it runs in parallel over time.
-        encoded = self.encode(inputs)
+        encoded = self.encode(inputs, others)
         if not self.method.reads_memory:
             return encoded
         if memory is None:
             raise ValueError("pathways: the experience of the method reads the memory; pass `memory`")
         return self.attend(encoded, memory)
 
-    def encode(self, inputs: PolicyInputs) -> Pathways:
+    def encode(self, inputs: PolicyInputs, others: PolicyInputs | None = None) -> Pathways:
         """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
-        # Unpack the rows; a method may restrict the features that its network reads.
-        features = unpack_features(inputs.observation.row, inputs.observation.goal, self.row_format)
-        if self.perceive is not None:
-            features = self.perceive(features)
+        features = self._unpack(inputs)
 
         # S: everything about the scene that does not depend on objects.
         scene_inputs = features.view
@@ -276,8 +283,14 @@ class Policy(Stream):
         layout_weights = jax.lax.stop_gradient(inputs.layout_weights)
         if self.weight_kind == "relative":
             layout_weights = scale_weights(layout_weights, inputs.observation.goal)
-        experience_features = scale_boxes(features) if self.weight_kind == "pixel" else features
-        experience = self.method.encode(experience_features, self.experience_appearance, layout_weights, inputs.reading)
+        experience_features, reading = features, inputs.reading
+        if others is not None:
+            experience_features, reading = self.method.replace_others(
+                features, inputs.reading, self._unpack(others), others.reading
+            )
+        if self.weight_kind == "pixel":
+            experience_features = scale_boxes(experience_features)
+        experience = self.method.encode(experience_features, self.experience_appearance, layout_weights, reading)
 
         # The Done gate follows the confidence of the goal's detection.
         confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)
@@ -358,6 +371,11 @@ class Policy(Stream):
         features = jax.eval_shape(lambda row: unpack_features(row, jnp.int32(0), self.row_format), row)
         return jax.eval_shape(self.perceive, features).visible.shape[-1]
 
+    def _unpack(self, inputs: PolicyInputs) -> Features:
+        """Unpack the rows; a method may restrict the features that its network reads."""
+        features = unpack_features(inputs.observation.row, inputs.observation.goal, self.row_format)
+        return features if self.perceive is None else self.perceive(features)
+
     def _embed_goal(self, features: Features, appearance: jax.Array) -> jax.Array:
         """Embed detections and the goal, without experience.
 
@@ -405,9 +423,9 @@ class StreamsPolicy(Policy):
         # Category embeddings of the experience stream, which shares none with the direct stream.
         self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
 
-    def encode(self, inputs: PolicyInputs) -> Pathways:
+    def encode(self, inputs: PolicyInputs, others: PolicyInputs | None = None) -> Pathways:
         """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
-        encoded = super().encode(inputs)
+        encoded = super().encode(inputs, others)
         # The view layer embeds the view twice, once per stream; the appended 1 is the factor of the stream.
         direct_view, experience_view = jnp.split(encoded.scene, 2, axis=-1)
         # The experience stays a pair until `_join_experience`: `attend`, if needed, computes only its first part.

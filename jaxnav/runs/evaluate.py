@@ -38,6 +38,7 @@ from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
 from jaxnav.policies.methods import find_method, method_label
+from jaxnav.policies.network import has_experience
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.policies import Policies, config_for_task, is_policy, list_packaged_policies, load_policy_as_run
 from jaxnav.runs.policy import LoadedPolicy
@@ -155,8 +156,15 @@ def evaluate(
     # Report: tables, notes, and the settings of run and evaluation.
     steps_by_purpose = config.steps_by_purpose | {"exploration": policies.prior_steps}
     names = {"method": method_label(config.method), "world": compiled.scenes[0].world, "split": split}
+    limit_notes = evaluation_notes(
+        rows,
+        results.metrics()["sr"],
+        results.episodes,
+        has_room_prior=policies.has_room_priors,
+        has_experience=has_experience(policies.spec),
+    )
     report_notes = [
-        *evaluation_notes(rows, results.metrics()["sr"], results.episodes, has_room_prior=policies.has_room_priors),
+        *limit_notes,
         budget_note(steps_by_purpose),
         *convergence_note(run.log()),
     ]

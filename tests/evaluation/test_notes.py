@@ -11,11 +11,13 @@ BASELINE, LAYOUT = (EvaluationRow(variant, None, None, "argmax") for variant in 
 RANDOM, ORACLE = EvaluationRow("random", None, None, "sample"), EvaluationRow("oracle", None, None, "argmax")
 
 
-def make_notes(rows=(BASELINE,), success=None, episodes=None, seeds=2, room_prior=False) -> list[str]:
+def make_notes(
+    rows=(BASELINE,), success=None, episodes=None, seeds=2, room_prior=False, has_experience=True
+) -> list[str]:
     """Return the notes on rows, all alike unless `success` [R, S, E] is given."""
     episodes = episodes_in([0, 1, 2, 3]) if episodes is None else episodes
     success = np.ones((len(rows), seeds, len(episodes.scene))) if success is None else np.array(success, float)
-    return evaluation_notes(rows, success, episodes, has_room_prior=room_prior)
+    return evaluation_notes(rows, success, episodes, has_room_prior=room_prior, has_experience=has_experience)
 
 
 def test_good_table_has_no_notes():
@@ -56,6 +58,14 @@ def test_prior_by_room_type_is_noted(row):
     # With one prior for all room types, or without rows of the layout, no row receives the room type.
     assert make_notes((BASELINE, row)) == []
     assert make_notes((BASELINE, ORACLE), room_prior=True) == []
+
+
+def test_rows_whose_weights_act_on_nothing_are_called_a_a_rows():
+    (note,) = make_notes((BASELINE, LAYOUT), has_experience=False)
+    assert note.startswith("A/A row")
+    assert "noise between trainings" in note
+    assert make_notes((BASELINE, LAYOUT)) == []
+    assert make_notes((BASELINE, ORACLE), has_experience=False) == []
 
 
 def test_policies_no_better_than_random_are_named():
