@@ -10,7 +10,7 @@ from jaxnav.policies.methods import find_method
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import apply_gradient, make_optimizer
 
-CONFIG, SLOWER = PPOConfig(), "jaxnav.policies.methods.vtnet:SLOWER"
+CONFIG, SINGLE_RATE = PPOConfig(), "jaxnav.policies.methods.vtnet:SINGLE_RATE"
 WEIGHTS = {"method": {"token": jnp.float32([1.0, 2.0])}, "actor": {"bias": jnp.float32([3.0])}}
 GRADIENT = {"method": {"token": jnp.float32([0.2, -0.1])}, "actor": {"bias": jnp.float32([0.3])}}
 
@@ -43,10 +43,14 @@ def test_a_gradient_of_what_does_not_move_is_no_matter():
     assert step(None, broken)[1] == 1
 
 
-def test_vtnet_may_go_on_at_a_tenth_of_the_rate_of_imitation():
-    (imitate, reinforce), (same, slower) = find_method("vtnet").stages, find_method(SLOWER).stages
+def test_vtnet_goes_on_at_a_tenth_of_the_rate_of_imitation():
+    (imitate, reinforce), (same, single_rate) = find_method("vtnet").stages, find_method(SINGLE_RATE).stages
     assert same == imitate
-    assert dataclasses.replace(slower, lr_scale_by_path=None) == reinforce
-    rates = [stage.lr_scale_by_path for stage in (imitate, slower) if stage.lr_scale_by_path is not None]
+    assert single_rate == dataclasses.replace(reinforce, lr_scale_by_path=None)
+    rates = [stage.lr_scale_by_path for stage in (imitate, reinforce) if stage.lr_scale_by_path is not None]
     assert [rate(("method", "maps", "bias")) for rate in rates] == [1, 0.1]
     assert [rate(("actor", "bias")) for rate in rates] == [0, 1]
+
+
+def test_runs_of_the_former_name_are_those_of_the_default():
+    assert find_method("jaxnav.policies.methods.vtnet:SLOWER").stages == find_method("vtnet").stages
