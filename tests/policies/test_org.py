@@ -36,7 +36,8 @@ def draw_inputs(seed=0):
     table = np.concatenate([detections, goal[..., None]], axis=-1).astype(np.float32)
     appearance = rng.normal(size=(NUM_CATEGORIES, tiny.SIZES.appearance)).astype(np.float32)
     weights = rng.uniform(0, 1, (BATCH_SIZE, NUM_CATEGORIES)).astype(np.float32)
-    return Features(np.zeros((BATCH_SIZE, 0), np.float32), visible, table, goal), appearance, weights
+    no_view = jnp.zeros((BATCH_SIZE, 0))
+    return Features(no_view, jnp.asarray(visible), jnp.asarray(table), jnp.asarray(goal)), appearance, weights
 
 
 def released_experience(params, features, appearance, weights, *, is_transposed=True):
@@ -111,10 +112,11 @@ def test_aggregation_by_hand():
 
     table = np.zeros((NUM_CATEGORIES, NUM_FEATURES), np.float32)
     table[:, ahead_column] = [1, 2, 3]
-    features = Features(np.zeros(0), visible=np.float32([1, 1, 0]), table=table, goal=np.float32([1, 0, 0]))
+    visible = jnp.array([1.0, 1.0, 0.0])
+    features = Features(jnp.zeros(0), visible, jnp.asarray(table), goal=jnp.array([1.0, 0.0, 0.0]))
     appearance = np.zeros((NUM_CATEGORIES, tiny.SIZES.appearance), np.float32)
     appearance[:, 0] = [5, 7, 11]
-    encoded = experience.encode(features, jnp.asarray(appearance), jnp.float32([1, 0.5, 0.1]), None)
+    encoded = experience.encode(features, jnp.asarray(appearance), jnp.array([1.0, 0.5, 0.1]), None)
     maps = np.asarray(encoded).reshape(NUM_CATEGORIES, -1)
     np.testing.assert_allclose(maps[:, 0], [5, 5, 15], rtol=1e-6)
     assert not maps[:, 1:].any()
