@@ -338,11 +338,12 @@ def part_settings(config: ExperimentConfig, run: AgentRun, references: list[Agen
       run: the measured run.
       references: the runs with which it is compared.
     """
-    from jaxnav.runs.run import run_settings
+    from jaxnav.runs.run import comparable_settings
 
-    settings = evaluation_settings(config) | {"run": run_settings(run.config)}
+    settings = evaluation_settings(config) | {"run": comparable_settings(run.config)}
     if references:
-        settings["references"] = {reference.agent: _digest(run_settings(reference.config)) for reference in references}
+        digests = {reference.agent: _digest(comparable_settings(reference.config)) for reference in references}
+        settings["references"] = digests
     return settings
 
 

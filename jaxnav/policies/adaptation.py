@@ -23,7 +23,7 @@ from flax import nnx
 from jaxnav.errors import InputError
 from jaxnav.numerics.product import Linear
 from jaxnav.numerics.sparse import update_where
-from jaxnav.policies.pathways import Decision, Pathways, PolicyState, mask_experience
+from jaxnav.policies.pathways import Decision, Pathways, PolicyState
 
 if TYPE_CHECKING:
     from jaxnav.policies.method import Adaptation
@@ -154,7 +154,7 @@ class LearnedLossAdaptation:
 
     def decide(self, policy: "Policy", pathways: Pathways, memory: PolicyState) -> Decision:
         """Decide with the changed layers, then adapt where the window is full."""
-        fast = _append_decision(memory.fast, pathways, memory)
+        fast = _append_decision(memory.fast, policy.adaptable_pathways(pathways), memory)
         output = policy.decide_with_changes(pathways, memory, dict(fast.layer_changes))
         return output._replace(fast=self.adapt_if_due(policy, fast))
 
@@ -266,14 +266,9 @@ def replay_window(
 
 
 def _append_decision(fast: FastWeights, pathways: Pathways, memory: PolicyState) -> FastWeights:
-    """Append the inputs of a decision to the window.
-
-    With streams, the window contains no experience: the direct stream adapts as if it acted alone.
-    """
-    no_experience = jax.tree.map(jnp.zeros_like, memory.use_experience)
-    direct_pathways = mask_experience(pathways, no_experience)
+    """Append the inputs of a decision to the window."""
     # Join the pathways, [..., P]; `reading`, the last field, is none.
-    joined_pathways = jnp.concatenate(direct_pathways[:-1], axis=-1)
+    joined_pathways = jnp.concatenate(pathways[:-1], axis=-1)
 
     # The window [..., W, P] follows the axes of the batch.
     window_axis = memory.action.ndim

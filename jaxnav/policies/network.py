@@ -8,7 +8,7 @@ modules that are built once; only their parameters, a nested dict of arrays, are
     policy = bind(spec, params)
     pathways = policy.pathways(PolicyInputs(observation, layout_weights, reading, surroundings), memory)
     decision = policy.decide(pathways, memory)
-    counterfactual = policy.decide(do(pathways, scene=0, goal=0), memory)
+    counterfactual = policy.decide(do(pathways, scene=0, goal=0), memory.counterfactual_state())
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from jaxnav.causal import do
 from jaxnav.layout import scale_weights
 from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.numerics.recurrence import gru_step
@@ -220,6 +221,8 @@ class Policy(Stream):
         self.direct = spec.direct
         self.goal_row = spec.goal_row
         self.weight_kind = spec.weight_kind
+        self.experience_dropout = spec.experience_dropout
+        self.counterfactual_memory = spec.counterfactual_memory
         # A method may restrict what the networks see, down to the number of categories.
         perceived_spec = dataclasses.replace(spec, num_categories=self._num_perceived_categories())
 
@@ -307,13 +310,19 @@ class Policy(Stream):
         If a factual and a counterfactual decision are traced in one jitted function, XLA computes their common products
         (experience, memory) once.
         """
-        # Experience dropout: in some training episodes Z = 0, so that the direct stream learns to act alone.
+        # Experience dropout: in some training episodes Z = 0, so that the network learns to act without experience.
         pathways = mask_experience(pathways, memory.use_experience)
         if self.adaptation is None:
             decision = self.decide_with_changes(pathways, memory)
         else:
             decision = self.adaptation.decide(self, pathways, memory)
-        return decision._replace(use_experience=memory.use_experience)
+        decision = decision._replace(use_experience=memory.use_experience)
+
+        # The counterfactual branch advances its own memory with the same experience.
+        if memory.counterfactual_hidden is None:
+            return decision
+        counterfactual = self.decide(do(pathways, scene=0.0, goal=0.0), memory.counterfactual_state())
+        return decision._replace(counterfactual_hidden=counterfactual.hidden)
 
     def decide_with_changes(
         self, pathways: Pathways, memory: PolicyState, changes: LayerChanges = NO_CHANGES
@@ -338,7 +347,16 @@ class Policy(Stream):
     def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
         """Return the memory at the start of an episode, leaves [*batch, ...]."""
         memory = PolicyState(hidden=jnp.zeros((*batch, self.hidden)), action=jnp.full(batch, NO_ACTION, jnp.int32))
+        # Episodes have experience unless training draws otherwise.
+        if self.experience_dropout:
+            memory = memory._replace(use_experience=jnp.ones(batch))
+        if self.counterfactual_memory == "own":
+            memory = memory._replace(counterfactual_hidden=jnp.zeros((*batch, self.hidden)))
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
+
+    def adaptable_pathways(self, pathways: Pathways) -> Pathways:
+        """Pathways that an adaptation learns from: all of them."""
+        return pathways
 
     @property
     def needs_stepwise_replay(self) -> bool:
@@ -491,6 +509,10 @@ class StreamsPolicy(Policy):
         """Return the memory at the start of an episode, leaves [*batch, ...]."""
         memory = super().initial_memory(batch)
         return memory._replace(hidden=jnp.zeros((*batch, 2 * self.hidden)), use_experience=jnp.ones(batch))
+
+    def adaptable_pathways(self, pathways: Pathways) -> Pathways:
+        """Pathways that an adaptation learns from: the direct ones, as if the direct stream acted alone."""
+        return do(pathways, experience=0.0)
 
     @property
     def experience_appearance(self) -> jax.Array:

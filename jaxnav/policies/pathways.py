@@ -67,14 +67,23 @@ class PolicyState(NamedTuple):
         first.
       action: int32 [...], the previous action; `NO_ACTION` at the start.
       fast: fast weights of the method's adaptation, leaves [...]; None without one.
-      use_experience: float32 [...], 0 in training episodes without experience, otherwise 1; None where the network
-        has no stream of experience.
+      use_experience: float32 [...], 0 in training episodes without experience, otherwise 1; None where all episodes
+        have experience.
+      counterfactual_hidden: float32 [..., H], recurrent state of the counterfactual branch, which has read the factual
+        experience and no direct pathway since the start; None where that branch reads the factual recurrent state.
     """
 
     hidden: jax.Array
     action: jax.Array
     fast: Any = None
     use_experience: jax.Array | None = None
+    counterfactual_hidden: jax.Array | None = None
+
+    def counterfactual_state(self) -> "PolicyState":
+        """Memory of the counterfactual branch: with its own recurrent state if it has one, else the factual one."""
+        if self.counterfactual_hidden is None:
+            return self
+        return self._replace(hidden=self.counterfactual_hidden, counterfactual_hidden=None)
 
 
 class Decision(NamedTuple):
@@ -86,6 +95,8 @@ class Decision(NamedTuple):
       hidden: float32 [..., H], recurrent state after the decision; with streams [..., 2 H].
       fast: fast weights after the decision; None without adaptation.
       use_experience: `use_experience` of the memory.
+      counterfactual_hidden: float32 [..., H], recurrent state of the counterfactual branch after the decision; None
+        where that branch has no memory of its own.
     """
 
     logits: jax.Array
@@ -93,10 +104,11 @@ class Decision(NamedTuple):
     hidden: jax.Array
     fast: Any = None
     use_experience: jax.Array | None = None
+    counterfactual_hidden: jax.Array | None = None
 
     def next_state(self, action: jax.Array) -> PolicyState:
         """Return the memory for the next step, given the action int32 [...] that was taken."""
-        return PolicyState(self.hidden, action, self.fast, self.use_experience)
+        return PolicyState(self.hidden, action, self.fast, self.use_experience, self.counterfactual_hidden)
 
 
 def mask_experience(pathways: Pathways, use_experience: jax.Array | None) -> Pathways:

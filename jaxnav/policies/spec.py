@@ -12,6 +12,8 @@ Direct = Literal["all", "goal", "none"]
 #: Scale at which the layout weights enter experience: as in eq. 7, over their mean (`jaxnav.layout.scale_weights`), or
 #: as in eq. 7 with boxes in pixels (`jaxnav.policies.features.scale_boxes`).
 WeightKind = Literal["raw", "relative", "pixel"]
+#: Memory of the counterfactual branch: the factual one, or one of its own, to which both direct pathways are zero.
+CounterfactualMemory = Literal["factual", "own"]
 #: Network from pathways to logits: fused before one recurrent core (the paper), or two streams that are added.
 DecisionKind = Literal["fused", "streams"]
 
@@ -37,7 +39,11 @@ class Sizes:
 
 
 #: Fields that policies of earlier versions lack, with the values that they were trained with.
-_EARLIER_FIELDS: dict[str, Any] = {"weight_kind": "raw"}
+_EARLIER_FIELDS: dict[str, Any] = {
+    "weight_kind": "raw",
+    "experience_dropout": False,
+    "counterfactual_memory": "factual",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +62,9 @@ class PolicySpec:
       decision: network from pathways to logits.
       goal_row: whether the direct pathway holds the goal's detection once more, in a row of its own; not in the paper.
       weight_kind: how the layout weights enter experience (eq. 7).
+      experience_dropout: whether a fused network was trained in some episodes without experience (Z = 0); two streams
+        always are.
+      counterfactual_memory: recurrent state from which the counterfactual branch decides.
     """
 
     method: "Method"
@@ -68,12 +77,25 @@ class PolicySpec:
     decision: DecisionKind = "fused"
     goal_row: bool = True
     weight_kind: WeightKind = "raw"
+    experience_dropout: bool = False
+    counterfactual_memory: CounterfactualMemory = "factual"
 
     def __post_init__(self) -> None:
-        for name, options in (("decision", get_args(DecisionKind)), ("weight_kind", get_args(WeightKind))):
+        for name, options in (
+            ("decision", get_args(DecisionKind)),
+            ("weight_kind", get_args(WeightKind)),
+            ("counterfactual_memory", get_args(CounterfactualMemory)),
+        ):
             value = getattr(self, name)
             if value not in options:
                 raise ValueError(f"{name} is {value!r}; choose one of {', '.join(options)}")
+        if self.counterfactual_memory == "own" and self.decision != "fused":
+            raise ValueError("counterfactual_memory is 'own', but two streams have separate memories; give 'factual'")
+
+    @property
+    def can_drop_experience(self) -> bool:
+        """True if training included episodes without experience, so that Z = 0 leaves a trained policy."""
+        return self.experience_dropout or self.decision == "streams"
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON values: the method by its name, without the number of categories."""

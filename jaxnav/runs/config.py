@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from jaxnav.choices import Counts, Reduction
 from jaxnav.errors import InputError
-from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
+from jaxnav.policies.spec import CounterfactualMemory, DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS
@@ -127,9 +127,12 @@ class RunConfig:
         chunks. Of the methods of jaxnav, only `vtnet` and `tpn` imitate; the rest refuse the option. By default, the
         method chooses the share.
       seed: random seed of training, from 0 to 4,294,967,295.
-      counterfactual: training of the counterfactual branch (logits from experience alone, which sTDE subtracts):
-        `distil` teaches these logits to match those of the complete policy; `coin` sets scene and goal to zero in half
-        of the steps, as the authors' code does; `none` does not train them.
+      counterfactual: training of the counterfactual branch (logits with scene and goal set to zero but with factual
+        experience, which sTDE subtracts): `distil` teaches these logits to match those of the complete policy; `coin`
+        sets scene and goal to zero in half of the steps, as the authors' code does; `none` does not train them.
+      counterfactual_memory: memory from which the counterfactual branch decides. `factual`, as in the paper: the memory
+        of the complete policy, which has read scene and goal. `own`: a memory of its own, for which scene and goal have
+        been zero since the start of the episode; only with `--decision fused`.
       decision: network from the inputs to the actions. `fused`, as in the paper: one recurrent network gets scene, goal
         and experience. `streams`: two recurrent networks, one without experience (the direct stream) and one with it,
         add their logits, so that the part that remains without experience is trained too. `streams` sets `--direct goal
@@ -171,6 +174,7 @@ class RunConfig:
     imitation: float | None = None
     seed: int = 0
     counterfactual: CounterfactualTraining = "distil"
+    counterfactual_memory: CounterfactualMemory = "factual"
     decision: DecisionKind = "fused"
     direct: Direct = "all"
     spatial_memory: bool = True
@@ -239,6 +243,8 @@ class RunConfig:
             decision=self.decision,
             goal_row=self.goal_row,
             weight_kind=self.layout.weights,
+            experience_dropout=self.decision == "fused" and self.ppo.experience_prob < 1.0,
+            counterfactual_memory=self.counterfactual_memory,
         )
 
     @property
@@ -420,6 +426,9 @@ def check_config(config: RunConfig) -> RunConfig:
     if config.ppo.guidance is None:
         guidance = _usual_guidance(config, method)
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, guidance=guidance))
+    if config.ppo.experience is None:
+        usual_experience = 0.8 if config.decision == "streams" else 1.0
+        config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, experience=usual_experience))
 
     # The method and the numbers come first: later checks compute with them.
     _check_method(config, method)
@@ -551,8 +560,16 @@ def _check_learning(config: RunConfig) -> None:
     positive_names = ("learning_rate", "experience_rate", "clip", "max_grad_norm")
     loss_weights = ("entropy", "final_entropy", "value", "distil")
     _require_each(ppo, "ppo", discount_names, lambda number: 0.0 <= number <= 1.0, "give a number from 0 to 1")
-    advice = "give a number between 0 and 1, both excluded"
-    _require_each(ppo, "ppo", ("experience",), lambda number: 0.0 < number < 1.0, advice)
+    # The direct stream learns only in episodes without experience; a fused network needs none of these.
+    experience = ppo.experience_prob
+    if config.decision == "streams":
+        advice = "give a number between 0 and 1, both excluded"
+        _require(0.0 < experience < 1.0, "ppo.experience", experience, advice)
+    else:
+        _require(0.0 < experience <= 1.0, "ppo.experience", experience, "give a number above 0, at most 1")
+    advice = "two streams have separate memories already; omit the option"
+    has_memory = config.counterfactual_memory == "factual" or config.decision == "fused"
+    _require(has_memory, "counterfactual_memory", config.counterfactual_memory, advice)
     _require_each(ppo, "ppo", ("alone",), lambda number: 0.0 <= number < 1.0, "give a share from 0 to below 1")
     _require_each(ppo, "ppo", positive_names, lambda number: 0.0 < number < math.inf, "give a positive number")
     _require_each(ppo, "ppo", loss_weights, lambda number: 0.0 <= number < math.inf, "give 0 or more")

@@ -36,12 +36,13 @@ LOG_FILE = "metrics.jsonl"
 TIMES_FILE = "times.jsonl"
 #: Success of the exported policies within budgets of actions; see `Validator.success_by_budget`.
 REACH_FILE = "reach.json"
-
 #: Settings that runs of earlier versions lack, with the values that they were trained with.
 _EARLIER_SETTINGS: dict[str, dict[str, Any]] = {
     "layout": {"counts": "presence", "weights": "raw"},
     "ppo": {"guidance": 0.0, "final_guidance": None},
 }
+#: `ppo.experience` of fused networks in files without `counterfactual_memory`: earlier versions ignored this setting.
+_IGNORED_EXPERIENCE = 0.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,12 +91,52 @@ def run_settings(config: RunConfig) -> dict[str, Any]:
     """Settings that identify a run, as JSON.
 
     Paths, devices and the number of calls between checkpoints are omitted, because they may change when a run resumes.
+    Networks with complete experience and a factual counterfactual memory have the settings of earlier versions.
     """
+    setting_fields = _all_settings(config)
+    is_fused = config.decision == "fused"
+    if config.counterfactual_memory == "factual" and not (is_fused and config.ppo.experience_prob < 1.0):
+        del setting_fields["counterfactual_memory"]
+        if is_fused:
+            setting_fields["ppo"]["experience"] = _IGNORED_EXPERIENCE
+    return setting_fields
+
+
+def comparable_settings(config: RunConfig) -> dict[str, Any]:
+    """Settings that identify a run, without those that stand for the behaviour of versions that lack them.
+
+    Results of earlier versions are recognized by these settings.
+    """
+    settings = run_settings(config)
+    for group_name, earlier_values in _EARLIER_SETTINGS.items():
+        for name, earlier_value in earlier_values.items():
+            if settings[group_name][name] == earlier_value:
+                del settings[group_name][name]
+    return settings
+
+
+def _all_settings(config: RunConfig) -> dict[str, Any]:
+    """All settings but those that may change when a run resumes, as JSON."""
     setting_fields = dataclasses.asdict(config)
     setting_fields = json.loads(json.dumps(setting_fields, default=str))  # tuples become lists, as in the file
     for name in ("run_dir", "save_every", "cache", "devices"):
         del setting_fields[name]
     return setting_fields
+
+
+def _complete_settings(saved_settings: dict[str, Any]) -> dict[str, Any]:
+    """Add the settings that came with later versions to those of a file."""
+    settings = dict(saved_settings)
+    for group_name, earlier_values in _EARLIER_SETTINGS.items():
+        if isinstance(settings.get(group_name), dict):
+            settings[group_name] = earlier_values | settings[group_name]
+
+    # Without the kind of counterfactual memory, a fused network has complete experience.
+    if "counterfactual_memory" not in settings:
+        settings["counterfactual_memory"] = "factual"
+        if settings.get("decision") == "fused" and isinstance(settings.get("ppo"), dict):
+            settings["ppo"] = settings["ppo"] | {"experience": None}
+    return settings
 
 
 def load_run_config(run_dir: Path) -> RunConfig:
@@ -109,15 +150,11 @@ def load_run_config(run_dir: Path) -> RunConfig:
         raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
     # The digest reveals edits and damage.
     saved_settings = read_json_with_digest(path, "restore the file or train in another --run-dir")
-
-    # Settings that came with later versions.
-    for group_name, earlier_values in _EARLIER_SETTINGS.items():
-        if isinstance(saved_settings.get(group_name), dict):
-            saved_settings[group_name] = earlier_values | saved_settings[group_name]
+    saved_settings = _complete_settings(saved_settings)
 
     # Settings that are missing in the file would silently take their default values.
     config = apply_values(RunConfig(), saved_settings, path)
-    setting_differences = list_differences(saved_settings, run_settings(config))
+    setting_differences = list_differences(saved_settings, _all_settings(config))
     if setting_differences:
         raise InputError(
             f"{path}: lacks settings ({'; '.join(setting_differences)}); restore the file or train the run again"

@@ -44,16 +44,16 @@ class PPOConfig:
       final_guidance: weight of the guidance at the end of a training stage, at least 0; linear in between. By default,
         the weight does not change.
       max_grad_norm: global norm to which gradients are clipped, above 0.
-      distil: weight of the loss with which `--counterfactual distil` trains the logits from experience alone, at least
-        0.
+      distil: weight of the loss with which `--counterfactual distil` trains the counterfactual logits, at least 0.
       alone: only with `--decision streams`: share of the training in which the direct stream (the network without
         experience) acts and learns alone, before the experience stream is added, from 0 to below 1. Imitation does not
         count.
-      experience: only with `--decision streams`: probability, between 0 and 1, that the experience stream takes part in
-        an episode once it has been added (after the share `ppo.alone`). In all other episodes, the direct stream acts
-        and learns alone.
-      experience_drawn: only with `--decision streams`: draw the participation of the experience stream (see
-        `ppo.experience`) once per `episode` or at each `step`.
+      experience: probability, above 0, that a training episode has experience; in all other episodes the policy acts
+        and learns without experience. With `--decision fused`, at most 1, and the default is 1. Below 1, the policy
+        also learns to act without experience, which `jaxnav eval --removal cde` needs. With `--decision streams`, below
+        1, and the default is 0.8: the probability that the experience stream takes part once it has been added (after
+        the share `ppo.alone`).
+      experience_drawn: draw whether there is experience (see `ppo.experience`) once per `episode` or at each `step`.
       experience_rate: only with `--decision streams`: factor on the learning rate once the experience stream has been
         added (after the share `ppo.alone`), above 0. The added stream disturbs a policy that has already learned, so
         the usual factor is below 1.
@@ -75,7 +75,7 @@ class PPOConfig:
     max_grad_norm: float = 0.5
     distil: float = 0.5
     alone: float = 0.5
-    experience: float = 0.8
+    experience: float | None = None
     experience_drawn: Literal["episode", "step"] = "episode"
     experience_rate: float = 0.5
 
@@ -83,6 +83,11 @@ class PPOConfig:
     def has_guidance(self) -> bool:
         """True if the loss has a term of shortest paths."""
         return bool(self.guidance or self.final_guidance)
+
+    @property
+    def experience_prob(self) -> float:
+        """Probability that a training episode has experience; 1 unless `experience` is set (see `check_config`)."""
+        return 1.0 if self.experience is None else self.experience
 
     def num_updates(self, total_steps: int) -> int:
         """Number of updates in `total_steps` environment steps of a seed, rounded up."""
@@ -133,7 +138,7 @@ class PPOConfig:
             distil_weight=jnp.float32(self.distil),
             guidance_weight=guidance_weight,
             final_guidance_weight=final_guidance_weight,
-            experience_prob=jnp.float32(self.experience),
+            experience_prob=jnp.float32(self.experience_prob),
             first_update=jnp.float32(first_update),
             num_updates=jnp.float32(num_updates),
         )

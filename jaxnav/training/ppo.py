@@ -17,10 +17,10 @@ Extensions of plain PPO:
 
 * *Pathways*: the action depends on three inputs: scene and goal (the *direct* pathways), and the method's *experience*
   features (the mediator; *experience* never means collected transitions here). The *counterfactual branch* is the same
-  network at the same memory with both direct pathways zero. `CounterfactualTraining` says how this branch is trained:
-  not at all, by zeroing the direct pathways at random while acting (a coin), or by distillation.
-* *Experience dropout*: policies with `decision: streams` may act without experience, for whole episodes or single
-  steps.
+  network with both direct pathways zero, at the same memory or at a memory of its own, to which they have been zero
+  since the start of the episode. `CounterfactualTraining` says how this branch is trained: not at all, by zeroing the
+  direct pathways at random while acting (a coin), or by distillation.
+* *Experience dropout*: policies may act without experience, for whole episodes or single steps.
 * *Guidance*: a cross-entropy to the next action of a shortest path, along the policy's own rollouts.
 * *Macro-actions*: a choice of the policy may last for several actions. Choices sampled meanwhile are ignored
   (`is_decision_step` is False): they do not enter the policy loss, and advantages are those of macro-steps.
@@ -391,8 +391,8 @@ class Replay(NamedTuple):
       transitions: the rollout's transitions.
       pathways: output of `policy.encode`, before masking and before the experience attends to the memory.
       factual: decisions as in the rollout.
-      counterfactual: decisions with both direct pathways zero, and the same experience and memory; no gradient enters
-        the memory.
+      counterfactual: decisions with both direct pathways zero, and the same experience. The recurrent state is that of
+        the factual decisions, which no gradient enters, or a state of its own.
       env_params: parameters of the environment.
     """
 
@@ -460,10 +460,17 @@ def _replay_in_parallel(
     unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
     factual_decision = policy.apply_heads(unrolled_core.hidden_after, factual_pathways)
 
-    # Counterfactual: one GRU step at each time with the mediated input only, from the factual hidden state before it.
-    # `unroll_gru` treats that state as a constant, so no gradient enters it.
+    # Counterfactual: the mediated input only.
     counterfactual_gates = policy.input_gates(mediated_input)
-    counterfactual_hidden = gru_step(counterfactual_gates, unrolled_core.hidden_gates, unrolled_core.hidden_before)
+    if memory.counterfactual_hidden is None:
+        # One GRU step at each time, from the factual hidden state before it. `unroll_gru` treats that state as a
+        # constant, so no gradient enters it.
+        counterfactual_hidden = gru_step(counterfactual_gates, unrolled_core.hidden_gates, unrolled_core.hidden_before)
+    else:
+        # Unroll the GRU a second time, along the memory of the branch itself.
+        counterfactual_hidden = unroll_gru(
+            policy.recurrent_kernel, counterfactual_gates, transitions.ended, memory.counterfactual_hidden
+        ).hidden_after
     return factual_decision, policy.apply_heads(counterfactual_hidden, counterfactual_pathways)
 
 
@@ -484,13 +491,16 @@ def _replay_step_by_step(
         factual_pathways = mask_direct_pathways(policy.attend(encoded, memory), transition.use_direct)
         factual_decision = policy.decide(factual_pathways, memory)
 
-        # No gradient of the counterfactual branch enters the memory.
-        fixed_memory = jax.lax.stop_gradient(memory)
+        # No gradient of the counterfactual branch enters the factual memory, but a state of its own has gradients.
+        fixed_memory = jax.lax.stop_gradient(memory)._replace(counterfactual_hidden=memory.counterfactual_hidden)
         counterfactual_pathways = do(policy.attend(encoded, fixed_memory), scene=0.0, goal=0.0)
-        counterfactual_decision = policy.decide(counterfactual_pathways, fixed_memory)
+        counterfactual_decision = policy.decide(counterfactual_pathways, fixed_memory.counterfactual_state())
 
         # New episodes start from fresh memory.
-        next_memory = tree_where(transition.ended, fresh_memory, factual_decision.next_state(transition.action))
+        next_memory = factual_decision.next_state(transition.action)
+        if memory.counterfactual_hidden is not None:
+            next_memory = next_memory._replace(counterfactual_hidden=counterfactual_decision.hidden)
+        next_memory = tree_where(transition.ended, fresh_memory, next_memory)
         return next_memory, (factual_decision, counterfactual_decision)
 
     _, decisions = jax.lax.scan(replay_step, memory, (pathways, transitions))
@@ -897,7 +907,7 @@ class Learner:
     ) -> Agent:
         """Start an episode in every environment, and draw its experience dropout."""
         num_envs = self.config.num_envs
-        experience_prob = self._experience_prob(self.config.experience)
+        experience_prob = self._experience_prob(self.config.experience_prob)
         memory = self.agent_loop.bind(policy_params).initial_memory((num_envs,))
         dropout_key = jax.random.fold_in(key, _START_DROPOUT)
         memory = sample_experience_dropout(memory, True, dropout_key, experience_prob)

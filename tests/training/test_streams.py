@@ -30,8 +30,8 @@ def make_spec(method_name):
     return dataclasses.replace(tiny.STREAMS, method=find_method(method_name), method_sizes=())
 
 
-def make_learner(method_name, **settings):
-    config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4, **settings)
+def make_learner(method_name, experience=0.8, **settings):
+    config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4, experience=experience, **settings)
     return Learner(AgentLoop(ENV, make_spec(method_name), tiny.ESTIMATOR), config, "none")
 
 

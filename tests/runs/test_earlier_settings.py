@@ -1,0 +1,77 @@
+"""Settings and fields that earlier versions lack: what stands for them in runs and exported policies."""
+
+import dataclasses
+import shutil
+
+import pytest
+from support.mutations import resigned
+
+import jaxnav
+from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.policies import POLICIES_DIR
+from jaxnav.runs.run import claim_run_dir, load_run_config, run_settings
+from jaxnav.store.files import write_json_with_digest
+from jaxnav.training.config import PPOConfig
+
+
+def make_config(**changes):
+    return check_config(dataclasses.replace(RunConfig(), **changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"ppo": PPOConfig(experience=0.8)},
+        {"counterfactual_memory": "own"},
+        {"counterfactual_memory": "own", "ppo": PPOConfig(experience=0.5)},
+        {"decision": "streams"},
+        {"decision": "streams", "ppo": PPOConfig(experience=0.6)},
+    ],
+)
+def test_settings_are_read_as_they_were_written(tmp_path, changes):
+    config = make_config(run_dir=tmp_path / "run", **changes)
+    claim_run_dir(config)
+    loaded_config = load_run_config(config.run_dir)
+    assert run_settings(loaded_config) == run_settings(config)
+    assert loaded_config.policy_spec(9) == config.policy_spec(9)
+    assert loaded_config.ppo == config.ppo
+
+
+def test_experience_dropout_is_a_setting_of_its_own():
+    plain, dropping = run_settings(make_config()), run_settings(make_config(ppo=PPOConfig(experience=0.8)))
+    assert plain != dropping
+    assert "counterfactual_memory" not in plain
+
+
+@pytest.mark.parametrize("ignored_experience", [0.8, 0.3])
+def test_a_fused_run_of_an_earlier_version_has_no_experience_dropout(tmp_path, ignored_experience):
+    """These files hold `ppo.experience`, which fused networks ignored, and no kind of counterfactual memory."""
+    settings = run_settings(make_config())
+    settings["ppo"]["experience"] = ignored_experience
+    (tmp_path / "run").mkdir()
+    write_json_with_digest(tmp_path / "run" / "config.json", settings)
+    config = load_run_config(tmp_path / "run")
+    assert config.ppo.experience == 1.0
+    assert config.counterfactual_memory == "factual"
+
+
+def test_a_missing_setting_is_refused(tmp_path):
+    settings = run_settings(make_config())
+    del settings["ppo"]["gamma"]
+    (tmp_path / "run").mkdir()
+    write_json_with_digest(tmp_path / "run" / "config.json", settings)
+    with pytest.raises(InputError, match=r"lacks settings \(ppo.gamma: \(absent\) != 0.99\)"):
+        load_run_config(tmp_path / "run")
+
+
+def test_a_policy_of_an_earlier_version_is_loaded(drawn_run, tmp_path):
+    folder = shutil.copytree(drawn_run.config.run_dir / POLICIES_DIR / "layout-0", tmp_path / "layout-0")
+    with resigned(folder / "policy.json") as exported:
+        del exported["spec"]["experience_dropout"], exported["spec"]["counterfactual_memory"]
+    policy = jaxnav.load_policy(folder)
+    assert policy.spec == jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0").spec
+    assert not policy.spec.experience_dropout
+    assert policy.spec.counterfactual_memory == "factual"
+    assert policy.init().policy_state.use_experience is None

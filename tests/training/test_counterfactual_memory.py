@@ -1,0 +1,208 @@
+"""The counterfactual branch with a memory of its own: which inputs reach it, and how training unrolls it."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts
+
+from jaxnav.causal import do
+from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.methods import find_method
+from jaxnav.policies.network import bind
+from jaxnav.policies.pathways import Pathways
+from jaxnav.training import ppo
+from jaxnav.training.config import PPOConfig
+
+OWN = dataclasses.replace(tiny.SPEC, counterfactual_memory="own")
+NUM_STEPS = 9
+BATCH_SIZE = 16
+
+
+def random_pathways(policy, rng, num_steps=NUM_STEPS):
+    """Random embeddings, leaves [T, B, ...]."""
+    widths = policy.pathway_widths
+    scene, goal, experience, _ = (
+        jnp.asarray(rng.normal(size=(num_steps, BATCH_SIZE, width)), jnp.float32) for width in widths
+    )
+    return Pathways(scene, goal, experience, jnp.ones((num_steps, BATCH_SIZE, 1)))
+
+
+def decide_in_turn(policy, pathways, actions, start=0):
+    """Decisions of an episode, a list of T, from pathways [T, B, ...] and actions int32 [T, B]."""
+    memory = policy.initial_memory((BATCH_SIZE,))
+    decisions = []
+    for time in range(start, len(actions)):
+        decision = policy.decide(jax.tree.map(lambda leaf, time=time: leaf[time], pathways), memory)
+        decisions.append(decision)
+        memory = decision.next_state(actions[time])
+    return decisions
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return bind(OWN, tiny.random_params(4))
+
+
+@pytest.fixture(scope="module")
+def actions():
+    return jnp.asarray(np.random.default_rng(1).integers(0, 6, (NUM_STEPS, BATCH_SIZE)), jnp.int32)
+
+
+def test_own_memory_equals_the_factual_one_where_scene_and_goal_are_always_zero(policy, actions):
+    pathways = do(random_pathways(policy, np.random.default_rng(0)), scene=0.0, goal=0.0)
+    for decision in decide_in_turn(policy, pathways, actions):
+        chex.assert_trees_all_equal(decision.counterfactual_hidden, decision.hidden)
+
+
+def test_own_memory_is_that_of_a_network_without_scene_and_goal_since_the_start(policy, actions):
+    pathways = random_pathways(policy, np.random.default_rng(0))
+    factual_policy = bind(tiny.SPEC, tiny.random_params(4))
+    expected_decisions = decide_in_turn(factual_policy, do(pathways, scene=0.0, goal=0.0), actions)
+    for decision, expected in zip(decide_in_turn(policy, pathways, actions), expected_decisions, strict=True):
+        chex.assert_trees_all_equal(decision.counterfactual_hidden, expected.hidden)
+        assert np.abs(decision.counterfactual_hidden - decision.hidden).max() > 0.1
+
+
+def test_only_experience_and_actions_reach_the_own_memory(policy, actions):
+    rng = np.random.default_rng(0)
+    pathways, other_pathways = random_pathways(policy, rng), random_pathways(policy, rng)
+    last = decide_in_turn(policy, pathways, actions)[-1]
+    other_scene = do(pathways, scene=other_pathways.scene, goal=other_pathways.goal)
+    chex.assert_trees_all_equal(
+        decide_in_turn(policy, other_scene, actions)[-1].counterfactual_hidden, last.counterfactual_hidden
+    )
+    # Negative controls: the factual memory reads scene and goal, and both memories read experience and actions.
+    assert np.abs(decide_in_turn(policy, other_scene, actions)[-1].hidden - last.hidden).max() > 0.1
+    other_experience = do(pathways, experience=other_pathways.experience)
+    for changed in (
+        decide_in_turn(policy, other_experience, actions),
+        decide_in_turn(policy, pathways, (actions + 1) % 6),
+    ):
+        assert np.abs(changed[-1].counterfactual_hidden - last.counterfactual_hidden).max() > 0.01
+
+
+def test_policies_carry_no_second_memory_by_default():
+    factual_policy = bind(tiny.SPEC, tiny.random_params(4))
+    memory = factual_policy.initial_memory((3,))
+    assert memory.counterfactual_hidden is None
+    assert memory.counterfactual_state() is memory
+    own_memory = bind(OWN, tiny.random_params(4)).initial_memory((3,))
+    np.testing.assert_array_equal(own_memory.counterfactual_hidden, np.zeros((3, tiny.SIZES.hidden)))
+
+
+def test_policy_spec_refuses_an_own_memory_of_two_streams():
+    with pytest.raises(ValueError, match="counterfactual_memory is 'own', but two streams"):
+        dataclasses.replace(tiny.STREAMS, counterfactual_memory="own")
+
+
+# Training
+
+
+@functools.cache
+def collect_two_rollouts(method_name, counterfactual_memory="own"):
+    """The weights of a policy, and two rollouts, the second of which begins within episodes."""
+    spec = dataclasses.replace(
+        tiny.SPEC,
+        method=find_method(method_name),
+        method_sizes=(),
+        counterfactual_memory=counterfactual_memory,
+    )
+    agent_loop = AgentLoop(ENV, spec, tiny.ESTIMATOR)
+    weights = tiny.random_params(3, spec)
+    policy = agent_loop.bind(weights)
+
+    @jax.jit
+    def collect(agent, key):
+        return ppo.collect_rollout(agent_loop, policy, agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH)
+
+    agent = agent_loop.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
+    rollouts = []
+    for number in range(2):
+        agent, rollout = collect(agent, jax.random.key(number))
+        rollouts.append(rollout)
+    return agent_loop, weights, rollouts, agent
+
+
+def replay_as(replay_decisions: Any, agent_loop: AgentLoop, weights: Any, rollout: Any) -> Any:
+    """Factual and counterfactual decisions by one of the two kinds of replay."""
+    policy = agent_loop.bind(weights)
+    observation = ppo.Observation(PARAMS.tables.rows[rollout.transitions.pose], rollout.transitions.goal)
+    inputs = ppo.PolicyInputs(observation, rollout.transitions.layout_weights)
+    return replay_decisions(policy, policy.encode(inputs), rollout.transitions, rollout.initial_memory)
+
+
+def distil_loss(decisions):
+    """Sum of the divergences of the counterfactual decisions from the fixed factual ones."""
+    factual, counterfactual = decisions
+    target = jax.lax.stop_gradient(jax.nn.log_softmax(factual.logits))
+    return (jnp.exp(target) * (target - jax.nn.log_softmax(counterfactual.logits))).sum()
+
+
+def test_both_kinds_of_replay_agree_in_decisions_and_gradients():
+    agent_loop, weights, rollouts, _ = collect_two_rollouts("org")
+    rollout = rollouts[1]
+    assert rollout.transitions.ended[:-1].sum() > 20
+    results = []
+    for replay_decisions in (ppo._replay_in_parallel, ppo._replay_step_by_step):
+
+        @jax.jit
+        def compute(weights, replay_decisions=replay_decisions):
+            def loss(weights):
+                decisions = replay_as(replay_decisions, agent_loop, weights, rollout)
+                return distil_loss(decisions), [decision.logits for decision in decisions]
+
+            return jax.grad(loss, has_aux=True)(weights)
+
+        results.append(compute(weights))
+    chex.assert_trees_all_close(*results, rtol=1e-3, atol=1e-5)
+
+    # Distillation reaches nothing that only the direct pathways use.
+    gradient, _ = results[0]
+    reached = changed_parts(jax.tree.map(jnp.zeros_like, gradient), gradient)
+    assert reached >= {"method", "core", "actor", "fuse"}
+    assert not reached & {"view", "sought", "critic"}
+
+
+@pytest.mark.parametrize("method_name", ["org", pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.slow)])
+def test_replay_repeats_the_memory_that_acting_carries(method_name):
+    agent_loop, weights, rollouts, last_agent = collect_two_rollouts(method_name)
+    memories = [rollouts[0].initial_memory, rollouts[1].initial_memory, last_agent.memory]
+    kinds = [ppo._replay_step_by_step] if "ATTENTIVE" in method_name else [ppo._replay_in_parallel]
+    for rollout, next_memory in zip(rollouts, memories[1:], strict=True):
+        _, counterfactual = replay_as(kinds[0], agent_loop, weights, rollout)
+        has_ended = rollout.transitions.ended[-1][:, None]
+        expected = np.where(has_ended, 0.0, counterfactual.hidden[-1])
+        np.testing.assert_allclose(next_memory.counterfactual_hidden, expected, atol=1e-5)
+    assert np.abs(memories[-1].counterfactual_hidden - memories[-1].hidden).max() > 0.1
+
+
+def test_acting_and_factual_decisions_do_not_depend_on_the_kind_of_memory():
+    results = []
+    for kind in ("factual", "own"):
+        agent_loop, weights, rollouts, _ = collect_two_rollouts("org", kind)
+        factual, counterfactual = replay_as(ppo._replay_in_parallel, agent_loop, weights, rollouts[1])
+        results.append((rollouts[1].transitions, factual.logits, counterfactual.logits))
+    chex.assert_trees_all_equal(results[0][:2], results[1][:2])
+    assert np.abs(results[0][2] - results[1][2]).max() > 0.01
+
+
+@pytest.mark.slow
+def test_distillation_along_the_own_memory_lowers_its_divergence():
+    agent_loop, _, _, _ = collect_two_rollouts("org")
+    learner = ppo.Learner(agent_loop, PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4), "distil")
+    state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
+    scalars = learner.config.scalars(12).replace(distil_weight=jnp.float32(5.0))
+    losses = []
+    update = jax.jit(learner.update)
+    for _ in range(12):
+        state, metrics = update(state, scalars, PARAMS, KNOWLEDGE)
+        losses.append(float(metrics["distil_loss"]))
+    assert np.isfinite(losses).all()
+    assert losses[-1] < 0.5 * max(losses)
