@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from twins.perception import TwinBelief, TwinMap, unpack_cells, unpack_row
+from twins.perception import TwinBelief, TwinMap, TwinPaperBelief, unpack_cells, unpack_counts, unpack_row
 from twins.policy import NUM_ACTIONS, TwinDecision, TwinPolicy
 
 from jaxnav.policies.method import Percept
@@ -37,7 +37,10 @@ class TwinEpisode:
         self.bank = bank
         self.goal = goal
         self.pose = pose
-        self.belief = None if prior is None else TwinBelief(prior)
+        # Rows with instance counts belong to the estimator of the paper.
+        self.counts_instances = bank.task.instance_counts
+        belief_type = TwinPaperBelief if self.counts_instances else TwinBelief
+        self.belief = None if prior is None else belief_type(prior)
         self.map = TwinMap()
         self.memory = policy.initial_memory()
         self.action = NUM_ACTIONS
@@ -69,7 +72,7 @@ class TwinEpisode:
         layout = np.ones(num_categories)
         gap = 0.0
         if self.belief is not None:
-            self.belief.update(features.visible > 0)
+            self.belief.update(unpack_counts(row, num_categories) if self.counts_instances else features.visible > 0)
             layout = self.belief.weights(self.goal)
             gap = self.belief.gap
 

@@ -94,6 +94,26 @@ class TwinBelief:
         return weights
 
 
+class TwinPaperBelief(TwinBelief):
+    """The belief by equations 3 to 6 of the paper as printed: every view adds its instance counts to every row."""
+
+    def update(self, counts: np.ndarray) -> None:
+        """Update with the number of detected instances of each category, [K]."""
+        divergences = []
+        for i in range(len(counts)):
+            others = np.arange(len(counts)) != i  # n_{-i}, and the row without its own entry
+            prior_row = self.alpha[i, others]
+            divergences.append(_kl(prior_row + counts[others], prior_row))
+            self.alpha[i, others] += counts[others]
+        self.gap = math.tanh(sum(divergences) / len(counts))
+
+
+def unpack_counts(row: np.ndarray, num_categories: int) -> np.ndarray:
+    """Return the instance counts of a row that holds them, float64 [K]: one byte each, right behind the view."""
+    first_byte = 4 * num_categories + 31
+    return row[first_byte : first_byte + num_categories].astype(float)
+
+
 def _kl(b: np.ndarray, a: np.ndarray) -> float:
     """Return KL(Dir(b) || Dir(a)) in nats."""
     return float(

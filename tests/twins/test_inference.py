@@ -19,8 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
+from twins import agent
 from twins.agent import TwinEpisode
 from twins.methods import TWINS, TwinRelations, TwinTentativeRelations
+from twins.perception import unpack_counts
 from twins.policy import TwinMethod, TwinPolicy, linear, relu
 
 from jaxnav.env.make import build_environment
@@ -29,7 +31,7 @@ from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import start_states
 from jaxnav.evaluation.playback import EpisodeTrace, play_episodes
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row
-from jaxnav.layout import ESTIMATORS, prior_from_counts
+from jaxnav.layout import ESTIMATORS, EstimatorConfig, prior_from_counts
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import METHODS
@@ -65,9 +67,9 @@ FEWER_EPISODES = {"savn": max(12, NUM_EPISODES // 10)}
 
 
 @functools.cache
-def world() -> tuple[Any, Any, Any, Any]:
+def world(instance_counts: bool = False) -> tuple[Any, Any, Any, Any]:
     """Return a bank of four rooms, their environment, and poses at which categories are seen together [R, K, K]."""
-    bank = compile_bank([generate_room("train", i, 0) for i in range(4)], Task())
+    bank = compile_bank([generate_room("train", i, 0) for i in range(4)], Task(instance_counts=instance_counts))
     env, params = build_environment(bank, {}, LIMIT)
     seen = env.row_format.presence(bank.rows).astype(np.float32)
     counts = np.ones((NUM_PRIORS, len(env.categories), len(env.categories)), np.float32)
@@ -84,16 +86,20 @@ class Case(NamedTuple):
     weights: Any
     knowledge: Knowledge
 
+    @property
+    def world(self) -> tuple[Any, Any, Any, Any]:
+        return world(self.acting.env.task.instance_counts)
+
     def played(self, cell: Any, episodes: EpisodeList) -> list[EpisodeTrace]:
-        return play_episodes(cell, self.weights, start_states(episodes), self.acting, world()[2], self.knowledge)
+        return play_episodes(cell, self.weights, start_states(episodes), self.acting, self.world[2], self.knowledge)
 
 
 @functools.cache
-def case(name: str, decision: Any) -> Case:
-    bank, env, _, counts = world()
+def case(name: str, decision: Any, setting: EstimatorConfig = SETTING) -> Case:
+    bank, env, _, counts = world(setting.counts == "instances")
     method = METHODS[name]
     learned = {} if method.learn is None else method.learn([bank], counts)
-    prior = jax.vmap(lambda one: prior_from_counts(one, SETTING))(jnp.asarray(counts))
+    prior = jax.vmap(lambda one: prior_from_counts(one, setting))(jnp.asarray(counts))
     spec = PolicySpec(
         method,
         len(env.categories),
@@ -105,7 +111,7 @@ def case(name: str, decision: Any) -> Case:
     )
     knowledge = Knowledge(prior, jax.tree.map(jnp.asarray, learned))
     weights = jax.tree.map(lambda leaf: CALMER.get(name, 1.0) * leaf, tiny.random_params(3, spec))
-    return Case(AgentLoop(env, spec, SETTING if method.hosts_layout else None), weights, knowledge)
+    return Case(AgentLoop(env, spec, setting if method.hosts_layout else None), weights, knowledge)
 
 
 class Compared(NamedTuple):
@@ -124,12 +130,20 @@ def noise(episode: int, time: int, size: int) -> np.ndarray:
     return np.asarray(jax.random.gumbel(key, (size,)))
 
 
-def compare(method: str, decision: str, row: EvaluationRow, episodes: EpisodeList, twin: type[TwinMethod]) -> Compared:
+def compare(
+    method: str,
+    decision: str,
+    row: EvaluationRow,
+    episodes: EpisodeList,
+    twin: type[TwinMethod],
+    setting: EstimatorConfig = SETTING,
+) -> Compared:
     """Go along the episodes that the package plays.
 
     Where the best two choices are equal within its tolerance and the twin takes the other one, it leaves the episode.
     """
-    (bank, _, params, _), played = world(), case(method, decision)
+    played = case(method, decision, setting)
+    bank, _, params, _ = played.world
     (acting, weights, knowledge), cell = played, tiny.leaves_at(inference_grid([row], ("layout",), 1), 0)
     assert acting.spec is not None
     policy = TwinPolicy(acting.spec, jax.tree.map(lambda leaf: np.asarray(leaf, float), weights), twin(knowledge))
@@ -182,6 +196,34 @@ def test_every_decision_is_the_twins(method, decision, count):
         assert max(np.quantile(errors, 0.99) for errors in result.errors.values()) < TOLERANCE / 2
         removals += result.removals
     assert removals > 0
+
+
+@pytest.mark.parametrize("strength", [5.0, None])
+def test_decisions_of_the_setting_paper_are_the_twins(strength):
+    """Equations 1 to 7 with instance counts, from a weak prior with large gaps and from the counts themselves."""
+    setting = dataclasses.replace(ESTIMATORS["paper"], strength=strength)
+    removal_row, threshold_row = table_row("stde", 0.0, "paper", "argmax"), table_row("stde", 0.5, "paper", "sample")
+    episodes = draw_episodes(world()[0], 12)
+    gaps, weights = [], []
+    for row in (removal_row, threshold_row):
+        result = compare("org", "fused", row, episodes, TWINS["org"], setting)
+        worst = {name: max(errors) for name, errors in result.errors.items()}
+        assert result.differences == []
+        assert result.ties <= 1
+        assert max(worst.values()) < TOLERANCE
+        gaps.append(worst["gap"])
+        weights.append(worst["layout_weights"])
+    assert max(gaps) < 1e-4
+    assert max(weights) < 1e-6
+
+
+def test_a_twin_that_counts_presence_is_noticed(monkeypatch):
+    monkeypatch.setattr(agent, "unpack_counts", lambda row, size: np.minimum(unpack_counts(row, size), 1.0))
+    setting = dataclasses.replace(ESTIMATORS["paper"], strength=5.0)
+    row = table_row("stde", 0.0, "paper", "argmax")
+    result = compare("org", "fused", row, draw_episodes(world()[0], 4), TWINS["org"], setting)
+    assert max(result.errors["gap"]) > 1e-2
+    assert max(result.errors["layout_weights"]) > 1e-2
 
 
 class Unweighted(TwinRelations):
