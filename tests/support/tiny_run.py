@@ -15,7 +15,7 @@ import pytest
 
 from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.gaps import CooccurrenceEvidence
-from jaxnav.layout import ESTIMATORS
+from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.policies.method import Knowledge
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.config_files import apply_yaml
@@ -77,7 +77,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return config_file, run_dir
 
 
-def draw_run(config: RunConfig) -> Run:
+def draw_run(config: RunConfig, layout_estimator: EstimatorConfig = DRAWN_ESTIMATOR) -> Run:
     """Fill a run directory with random policies of every arm and seed, and return the run.
 
     Policies of a few updates never choose Done, so all their episodes are alike; random ones act by what they see.
@@ -95,13 +95,13 @@ def draw_run(config: RunConfig) -> Run:
     # What exploration would have taught: co-occurrence evidence above the diagonal, and a prior per room type.
     log_odds = np.triu(np.random.default_rng(1).normal(size=shape), 1).astype(np.float32)
     evidence = CooccurrenceEvidence(jnp.asarray(log_odds), co_visibility_from_counts(exploration.counts))
-    knowledge = Knowledge(layout_priors(exploration.counts, DRAWN_ESTIMATOR), cooccurrence=evidence)
+    knowledge = Knowledge(layout_priors(exploration.counts, layout_estimator), cooccurrence=evidence)
 
     for arm_index, arm in enumerate(config.arms):
         for seed in range(NUM_SEEDS):
             params = random_params(NUM_SEEDS * arm_index + seed, config.policy_spec(num_categories))
             params["actor"]["bias"] = params["actor"]["bias"].at[DONE].set(-2.0)  # episodes of several steps
-            estimator_config = DRAWN_ESTIMATOR if arm == "layout" else None
+            estimator_config = layout_estimator if arm == "layout" else None
             policy_dir = config.run_dir / POLICIES_DIR / f"{arm}-{seed}"
             export_policy(policy_dir, config, params, knowledge, estimator_config, exploration)
     return Run(config)
