@@ -97,15 +97,15 @@ class TwinBelief:
 class TwinPaperBelief(TwinBelief):
     """The belief by equations 3 to 6 of the paper as printed: every view adds its instance counts to every row."""
 
-    def update(self, counts: np.ndarray) -> None:
-        """Update with the number of detected instances of each category, [K]."""
+    def update(self, visible: np.ndarray) -> None:
+        """Update with the number of visible instances of each category, [K]."""
         divergences = []
-        for i in range(len(counts)):
-            others = np.arange(len(counts)) != i  # n_{-i}, and the row without its own entry
+        for i in range(len(visible)):
+            others = np.arange(len(visible)) != i  # n_{-i}, and the row without its own entry
             prior_row = self.alpha[i, others]
-            divergences.append(_kl(prior_row + counts[others], prior_row))
-            self.alpha[i, others] += counts[others]
-        self.gap = math.tanh(sum(divergences) / len(counts))
+            divergences.append(_kl(prior_row + visible[others], prior_row))
+            self.alpha[i, others] += visible[others]
+        self.gap = math.tanh(sum(divergences) / len(visible))
 
 
 def unpack_counts(row: np.ndarray, num_categories: int) -> np.ndarray:

@@ -205,6 +205,7 @@ class TwinPolicy:
           memory: before the decision.
         """
         params = self.params
+        weights = self._scale_weights(weights, int(features.goal.argmax()))
         features = self.method.perceive(features)
         reading = self.method.read(int(features.goal.argmax()))
 
@@ -213,10 +214,28 @@ class TwinPolicy:
         scene = relu(linear(params["view"], np.concatenate(scene_inputs)))
         goal = self._embed_goal(features)
         appearance = params["known_appearance" if self.has_streams else "appearance"]["embedding"]
-        experience = self.method.encode(params.get("method", {}), features, appearance, weights, reading, memory)
+        known = self._scale_boxes(features)
+        experience = self.method.encode(params.get("method", {}), known, appearance, weights, reading, memory)
 
         decide = self._decide_in_streams if self.has_streams else self._decide_fused
         return decide(scene, goal, experience, memory, reading)
+
+    def _scale_weights(self, weights: np.ndarray, goal: int) -> np.ndarray:
+        """Return w x g at the scale of the spec; `relative` is over the mean of all categories but the goal."""
+        if self.spec.weight_kind != "relative":
+            return weights
+        others = [weight for category, weight in enumerate(weights.tolist()) if category != goal]
+        scaled = np.array([min(weight / (sum(others) / len(others)), 4.0) for weight in weights.tolist()])
+        scaled[goal] = weights[goal]
+        return scaled
+
+    def _scale_boxes(self, features: TwinFeatures) -> TwinFeatures:
+        """Return the features that experience reads; `pixel` has positions, bearings and sizes in pixels."""
+        if self.spec.weight_kind != "pixel":
+            return features
+        table = features.table.copy()
+        table[:, [2, 3, 4, 5, 6, 7]] *= 300
+        return features._replace(table=table)
 
     def _decide_fused(
         self, scene: np.ndarray, goal: np.ndarray, experience: np.ndarray, memory: TwinMemory, reading: Any

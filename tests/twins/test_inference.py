@@ -95,7 +95,7 @@ class Case(NamedTuple):
 
 
 @functools.cache
-def case(name: str, decision: Any, setting: EstimatorConfig = SETTING) -> Case:
+def case(name: str, decision: Any, setting: EstimatorConfig = SETTING, weight_kind: Any = "raw") -> Case:
     bank, env, _, counts = world(setting.counts == "instances")
     method = METHODS[name]
     learned = {} if method.learn is None else method.learn([bank], counts)
@@ -108,6 +108,7 @@ def case(name: str, decision: Any, setting: EstimatorConfig = SETTING) -> Case:
         direct="goal" if decision == "streams" else "all",
         spatial_memory=SpatialMemory(bank.task.rules.headings),
         decision=decision,
+        weight_kind=weight_kind,
     )
     knowledge = Knowledge(prior, jax.tree.map(jnp.asarray, learned))
     weights = jax.tree.map(lambda leaf: CALMER.get(name, 1.0) * leaf, tiny.random_params(3, spec))
@@ -137,12 +138,13 @@ def compare(
     episodes: EpisodeList,
     twin: type[TwinMethod],
     setting: EstimatorConfig = SETTING,
+    weight_kind: str = "raw",
 ) -> Compared:
     """Go along the episodes that the package plays.
 
     Where the best two choices are equal within its tolerance and the twin takes the other one, it leaves the episode.
     """
-    played = case(method, decision, setting)
+    played = case(method, decision, setting, weight_kind)
     bank, _, params, _ = played.world
     (acting, weights, knowledge), cell = played, tiny.leaves_at(inference_grid([row], ("layout",), 1), 0)
     assert acting.spec is not None
@@ -196,6 +198,34 @@ def test_every_decision_is_the_twins(method, decision, count):
         assert max(np.quantile(errors, 0.99) for errors in result.errors.values()) < TOLERANCE / 2
         removals += result.removals
     assert removals > 0
+
+
+@pytest.mark.parametrize(
+    ("method", "weight_kind"),
+    [
+        ("org", "relative"),
+        *(pytest.param(name, "relative", marks=pytest.mark.slow) for name in ("eotp", "semexp", "vtnet")),
+    ],
+)
+def test_decisions_with_scaled_weights_are_the_twins(method, weight_kind):
+    row = table_row("stde", 0.0, "paper", "argmax")
+    episodes = draw_episodes(world()[0], 8)
+    result = compare(method, "fused", row, episodes, TWINS[method], weight_kind=weight_kind)
+    assert result.differences == []
+    assert result.ties <= 1 + result.decisions / 1000
+    assert max(max(errors) for errors in result.errors.values()) < TOLERANCE
+
+    # A twin with raw weights has other logits.
+    raw_weights = type("RawWeights", (TWINS[method],), {"encode": encode_with_raw_weights})
+    mistaken = compare(method, "fused", row, episodes, raw_weights, weight_kind=weight_kind)
+    assert max(mistaken.errors["factual_logits"]) > 10 * TOLERANCE
+
+
+def encode_with_raw_weights(self, params, features, appearance, weights, reading, memory):
+    """Encode with weights off the goal that sum to 1."""
+    is_goal = features.goal > 0
+    raw_weights = np.where(is_goal, weights, weights / weights[~is_goal].sum())
+    return super(type(self), self).encode(params, features, appearance, raw_weights, reading, memory)
 
 
 @pytest.mark.parametrize("strength", [5.0, None])
