@@ -163,7 +163,7 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
 def test_weights_multiply_the_rows_of_experience_unscaled():
     """Equation 7: the experience of the policy is that of its method with w x g itself."""
     world = paper_world()
-    spec = dataclasses.replace(world.perception.spec, sizes=load_config("paper_small").sizes)
+    spec = load_config("paper_small").policy_spec(NUM_CATEGORIES)
     policy = bind(spec, init_params(spec, jax.random.key(0)))
     row = jnp.asarray(world.bank.rows[int(np.argmax((world.bank.rows[:, : 4 * NUM_CATEGORIES : 4] > 0).sum(1)))])
     goal = jnp.int32(3)
