@@ -14,6 +14,11 @@ Counts = Literal["presence", "instances"]
 #: Layout estimators that an evaluation may use in place of the one from training.
 EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
 #: Ways to use policies in an evaluation, and the two references without training.
-Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde"]
+Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde", "cde", "scde"]
+#: Causal quantity that a complete removal of experience leaves: the total direct effect (eq. 1), or the decision under
+#: do(Z = 0) (controlled direct effect).
+Removal = Literal["tde", "cde"]
+#: Memory of the counterfactual branch: the factual one, or one of its own, to which both direct pathways are zero.
+CounterfactualMemory = Literal["factual", "own"]
 #: Rule that turns logits into actions: the best action, or a sampled one.
 Decoding = Literal["argmax", "sample"]

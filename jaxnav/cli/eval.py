@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName, Form
+from jaxnav.choices import CounterfactualMemory, EstimatorName, Form, Removal
 from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
@@ -38,12 +38,19 @@ class EvalConfig:
       shift: layout shift of the scenes, from 0 (as in training) to 1. The default is the shift of the run, and 0 with
         `--scenes` or `--world`.
       episodes: number of fixed episodes, at least 1, balanced over room types and scenes.
-      epsilon: thresholds of sTDE, each at least 0: experience is removed where the layout gap exceeds the threshold.
-        All thresholds are evaluated in one compiled call.
+      epsilon: thresholds of soft removal, each at least 0: experience is removed where the layout gap exceeds the
+        threshold. All thresholds are evaluated in one compiled call.
       form: rules by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the
-        logits from experience alone; the share is the excess of the layout gap over the threshold. `residual` does this
-        without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds the
-        threshold. The default is the rule of the layout estimator.
+        counterfactual logits (see `removal`); the share is the excess of the layout gap over the threshold. `residual`
+        does this without changing the scale of the logits. `switch` subtracts these logits completely where the gap
+        exceeds the threshold. The default is the rule of the layout estimator, and `paper` with `--removal cde`.
+      removal: decisions that are left when experience is removed. `tde`, the total direct effect (equation 1):
+        subtracts the counterfactual logits, in which scene and goal are zero and experience is not. `cde`, the
+        controlled direct effect: leads over to the decision of the same network without experience throughout the
+        episode, for runs with `--ppo.experience` below 1. Each adds a row for complete removal and one for each
+        threshold and rule.
+      counterfactual_memory: memory from which the counterfactual logits are computed: the `factual` one, or one of
+        their `own`, for runs with this option. The default is the one of the run.
       setting: layout estimator or layout gap to use instead of that of the run, for example `learned`, a gap that
         detects another layout; `jaxnav list settings` describes all.
       hold: keep the layout gap from falling within an episode. With `--form switch`, experience then stays removed for
@@ -66,6 +73,8 @@ class EvalConfig:
     setting: EstimatorName | None = None
     hold: bool = False
     inner_steps: int | None = None
+    removal: tuple[Removal, ...] = ("tde",)
+    counterfactual_memory: CounterfactualMemory | None = None
     seed: int = 0
     json: Path | None = None
     format: Literal["table", "markdown", "json"] = "table"
@@ -97,6 +106,8 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
         setting=config.setting,
         hold=config.hold,
         inner_steps=config.inner_steps,
+        removal=config.removal,
+        counterfactual_memory=config.counterfactual_memory,
         seed=config.seed,
         console=console,
     )
@@ -147,6 +158,8 @@ def _find_target(config: EvalConfig) -> Path:
         None if config.shift is None else f"shift{config.shift:g}",
         config.setting,
         None if config.inner_steps is None else f"inner{config.inner_steps}",
+        None if config.removal == ("tde",) else "-".join(config.removal),
+        None if config.counterfactual_memory is None else f"{config.counterfactual_memory}-memory",
     )
     name = name_evaluation("eval", config.split, config.world, config.scenes, *details)
     target = config.json or config.run / f"{name}.json"

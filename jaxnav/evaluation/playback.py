@@ -101,7 +101,7 @@ def _episode_trace(all_steps: _Step, episode: int) -> EpisodeTrace:
 def _begin(
     policy_params: Params, initial_states: State, agent_loop: AgentLoop, env_params: EnvParams, knowledge: Knowledge
 ) -> Agent:
-    initial_memory = agent_loop.bind(policy_params).initial_memory(initial_states.pose.shape)
+    initial_memory = agent_loop.bind_decider(policy_params).initial_memory(initial_states.pose.shape)
     return agent_loop.start_from(initial_states, initial_memory, knowledge, env_params)
 
 
@@ -122,7 +122,7 @@ def _step(
       The agents after the step, which episodes still run, and the step.
     """
     # Act in all episodes, including those that have ended: shapes stay fixed.
-    policy = agent_loop.bind(policy_params)
+    policy = agent_loop.bind_decider(policy_params)
     next_agent, step_result, inferred = infer_and_act(
         config,
         policy,

@@ -1,6 +1,7 @@
 """Removal of experience from a decision: sTDE (eq. 2), TDE (eq. 1), and the controls that they are compared with.
 
-sTDE and TDE subtract the counterfactual logits, to which only experience contributes (scene and goal are set to zero).
+sTDE and TDE subtract the counterfactual logits: do(S = 0, G = 0) with the factual experience Z, and with the factual
+memory or a memory of its own (`PolicyState.counterfactual_hidden`).
 
 An `InferenceConfig` says how one entry of an evaluation grid turns a decision into logits to act by. At every step
 `logits_to_remove` decides without the direct pathways, `select_gap` picks the layout gap, and `apply_removal` combines
@@ -120,7 +121,8 @@ def logits_to_remove(
 ) -> jax.Array:
     """Logits to remove from E decisions, float32 [E, A]: counterfactual logits, or those of a control.
 
-    The counterfactual decision shares experience and memory with the factual one; its updated memory is discarded.
+    The counterfactual decision shares experience and previous action with the factual one, and also the recurrent
+    state, unless its branch has a state of its own. Its updated memory is discarded.
 
     Args:
       config: configuration of the grid entry.
@@ -142,11 +144,11 @@ def logits_to_remove(
             lambda: jnp.zeros_like(pathway),
         )
 
-    # do(S = 0, G = 0) with the factual experience and memory.
+    # do(S = 0, G = 0) with the factual experience.
     scene_value = intervention_value(_SCENE_TAG, pathways.scene)
     goal_value = intervention_value(_GOAL_TAG, pathways.goal)
     counterfactual_pathways = do(pathways, scene=scene_value, goal=goal_value)
-    logits = policy.decide(counterfactual_pathways, memory).logits
+    logits = policy.decide(counterfactual_pathways, memory.counterfactual_state()).logits
 
     # One branch per member of `RemovedLogits`.
     branches = (

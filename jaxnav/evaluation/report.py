@@ -339,6 +339,11 @@ def row_label(row: dict[str, Any]) -> str:
             return "+ w (layout)"
         case "tde":
             return "+ w + TDE"
+        case "cde":
+            return "+ w + CDE"
+        case "scde":
+            form_suffix = {"residual": ", residual form", "switch": ", switch"}.get(row["form"], "")
+            return f"+ w + sCDE (eps={row['epsilon']:g}){form_suffix}"
         case _:
             form_suffix = {"paper": ", paper form", "switch": ", switch"}.get(row["form"], "")
             return f"+ w + sTDE (eps={row['epsilon']:g}){form_suffix}"

@@ -5,16 +5,19 @@
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxnav.causal import FORMS
-from jaxnav.choices import Decoding, Form, Variant
+from jaxnav.choices import Decoding, Form, Removal, Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
+
+#: Variants of each kind of removal: complete, and soft.
+REMOVAL_VARIANTS: Mapping[Removal, tuple[Variant, Variant]] = {"tde": ("tde", "stde"), "cde": ("cde", "scde")}
 
 
 class EvaluationRow(NamedTuple):
@@ -22,7 +25,7 @@ class EvaluationRow(NamedTuple):
 
     Attributes:
       variant: the evaluated variant.
-      epsilon: threshold of sTDE; None for other variants.
+      epsilon: threshold of soft removal; None for other variants.
       form: how counterfactual logits are combined; None for variants without counterfactual.
       decoding: `argmax` or `sample`.
     """
@@ -39,26 +42,52 @@ class EvaluationRow(NamedTuple):
             return None
         return "baseline" if self.variant == "baseline" else "layout"
 
+    @property
+    def uses_own_fallback(self) -> bool:
+        """True if removal leaves the decision of the policy itself under do(Z = 0)."""
+        return self.variant in REMOVAL_VARIANTS["cde"]
 
-def table_rows(epsilons: Sequence[float], forms: Sequence[Form], arms: Sequence[str]) -> list[EvaluationRow]:
+
+def table_rows(
+    epsilons: Sequence[float],
+    forms: Sequence[Form] | None,
+    arms: Sequence[str],
+    removals: Sequence[Removal] = ("tde",),
+    default_form: Form = "residual",
+) -> list[EvaluationRow]:
     """List the rows of an evaluation.
 
-    The rows are baseline, layout, hard TDE, and sTDE for every epsilon and form, first with argmax and then with
-    sampled actions; Random comes last. Rows of arms that were not trained are omitted.
+    The rows are baseline, layout, and for each kind of removal the complete one and the soft one for every epsilon and
+    form, first with argmax and then with sampled actions; Random comes last. Rows of arms that were not trained are
+    omitted.
+
+    Args:
+      epsilons: thresholds of soft removal.
+      forms: forms of soft removal; None for `default_form` of sTDE, and `paper` of sCDE, a - s (a - a0).
+      arms: names of the arms.
+      removals: kinds of removal.
+      default_form: form of sTDE if `forms` is None.
 
     Raises:
-      InputError: no epsilon, or one outside [0, inf), or NaN.
+      InputError: no kind of removal, no epsilon, or one outside [0, inf), or NaN.
     """
     if not epsilons:
         raise InputError("--epsilon: give at least one number")
+    if not removals:
+        raise InputError("--removal: give tde, cde or both")
+    default_forms: Mapping[Removal, Form] = {"tde": default_form, "cde": "paper"}
 
     # Best actions first, then sampled ones: the order of the printed table.
     all_rows: list[EvaluationRow] = []
     for decoding in ("argmax", "sample"):
-        for variant in ("baseline", "layout", "tde"):
+        for variant in ("baseline", "layout"):
             all_rows.append(table_row(variant, None, None, decoding))
-        for epsilon, form in itertools.product(epsilons, forms):
-            all_rows.append(table_row("stde", epsilon, form, decoding))
+        for removal in dict.fromkeys(removals):
+            complete_variant, soft_variant = REMOVAL_VARIANTS[removal]
+            all_rows.append(table_row(complete_variant, None, None, decoding))
+            soft_forms = (default_forms[removal],) if forms is None else forms
+            for epsilon, form in itertools.product(epsilons, soft_forms):
+                all_rows.append(table_row(soft_variant, epsilon, form, decoding))
 
     # Random needs no policy and is always included.
     trained_rows = [row for row in all_rows if row.arm in arms]
@@ -71,9 +100,9 @@ def table_row(variant: Variant, epsilon: float | None, form: Form | None, decodi
     Raises:
       InputError: an epsilon outside [0, inf), or NaN.
     """
-    if variant == "tde":
+    if variant in ("tde", "cde"):
         return EvaluationRow(variant, None, "paper", decoding)  # equation 1
-    if variant != "stde":
+    if variant not in ("stde", "scde"):
         return EvaluationRow(variant, None, None, decoding)
     if epsilon is None or not 0.0 <= epsilon < float("inf"):
         raise InputError(f"--epsilon {epsilon}: give finite numbers of at least 0")
@@ -103,7 +132,7 @@ def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: i
     return InferenceConfig(
         policy_index=jnp.int32(seed + num_seeds * arm_index),
         epsilon=jnp.float32(float("inf") if row.epsilon is None else row.epsilon),
-        use_tde=jnp.bool_(row.variant == "tde"),
+        use_tde=jnp.bool_(row.variant in ("tde", "cde")),
         form=jnp.int32(FORMS.index(row.form or "paper")),
         use_layout=jnp.bool_(row.arm == "layout"),
         greedy=jnp.bool_(row.decoding == "argmax"),

@@ -221,6 +221,7 @@ class AgentLoop:
       estimator_config: configuration of the layout estimator; None leaves the layout out.
       inner_steps: adaptation steps that the method may take in an episode; 0 for none, None for its default.
       fallback_spec: spec of a layout-blind policy that acts after a hand-over; None without one.
+      use_own_fallback: whether the policy itself under do(Z = 0) acts after a hand-over.
     """
 
     env: ObjectNav
@@ -228,6 +229,7 @@ class AgentLoop:
     estimator_config: EstimatorConfig | None = None
     inner_steps: int | None = None
     fallback_spec: PolicySpec | None = None
+    use_own_fallback: bool = False
 
     @property
     def method(self) -> Method | None:
@@ -249,6 +251,8 @@ class AgentLoop:
         Args:
           params: parameters of the policy; {"agent": ..., "without": ...} with a fallback.
         """
+        if self.use_own_fallback:
+            return HandoverPolicy(self.bind(params))
         if self.fallback_spec is None:
             return self.bind(params)
         return HandoverPolicy(self.bind(params["agent"]), bind(self.fallback_spec, params["without"]))

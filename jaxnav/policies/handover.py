@@ -1,78 +1,102 @@
-"""A policy made of two: one with experience and one that is layout-blind, either of which can act."""
+"""A policy made of two: one with experience and a fallback without it, either of which can act."""
 
 from typing import Any, cast
 
 import jax.numpy as jnp
 
+from jaxnav.causal import do
 from jaxnav.numerics.rounding import round_to_grid
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Decision, Pathways, PolicyInputs, PolicyState
 
 
 class HandoverPolicy:
-    """Policy with experience from which a removal of experience leaves another policy.
+    """Policy with experience from which a removal of experience leaves a fallback policy.
 
-    As with two streams, experience is the difference that the first policy adds to the logits of the second: TDE
-    (eq. 1) leaves the logits of the layout-blind policy, bit-identically, and the form `switch` of eq. 2 hands
-    over to that policy. Both policies follow the whole episode, whichever acts. All methods work on batches.
+    As with two streams, experience is the difference that the first policy adds to the logits of the fallback: TDE
+    (eq. 1) leaves the logits of the fallback, bit-identically, and the form `switch` of eq. 2 hands over to it. With
+    the logits a of the policy and a0 of the fallback, the form `paper` is a - s (a - a0). Both policies follow the
+    whole episode, each with a memory of its own, whichever acts. All methods work on batches.
+
+    The fallback is a layout-blind policy, or the policy itself under do(Z = 0) throughout the episode. The logits a0
+    of the latter hold the controlled direct effect of scene and goal; experience dropout trains them.
 
     Attributes:
       experienced: the policy with experience.
-      layout_blind: a layout-blind policy without a tracker; the two share one spatial memory.
+      fallback: the policy that a removal leaves. A layout-blind one has no tracker, and the two share one spatial
+        memory.
+      is_same_network: True if the fallback is `experienced` under do(Z = 0).
     """
 
-    def __init__(self, experienced: Policy, layout_blind: Policy) -> None:
+    def __init__(self, experienced: Policy, layout_blind: Policy | None = None) -> None:
+        """Pair two policies.
+
+        Args:
+          experienced: the policy with experience.
+          layout_blind: the fallback; None for `experienced` under do(Z = 0).
+        """
         self.experienced = experienced
-        self.layout_blind = layout_blind
+        self.fallback = experienced if layout_blind is None else layout_blind
+        self.is_same_network = layout_blind is None
 
     def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
         """Return the state of both policies at the start of an episode, their hidden states joined."""
         experienced_state = self.experienced.initial_memory(batch)
-        layout_blind_state = self.layout_blind.initial_memory(batch)
-        hidden = jnp.concatenate([experienced_state.hidden, layout_blind_state.hidden], axis=-1)
-        return experienced_state._replace(hidden=hidden)
+        fallback_state = self.fallback.initial_memory(batch)
+        hidden = jnp.concatenate([experienced_state.hidden, fallback_state.hidden], axis=-1)
+        # The fallback takes the place of the counterfactual branch.
+        return experienced_state._replace(
+            hidden=hidden, fast=(experienced_state.fast, fallback_state.fast), counterfactual_hidden=None
+        )
 
     def pathways(self, inputs: PolicyInputs, memory: PolicyState) -> Pathways:
         """Embed the inputs of both policies; arguments as in `Policy.pathways`.
 
         The experience is the pair of the two policies' pathways. Scene and goal are 1 [..., 1]; setting them to 0
-        removes the layout-blind policy.
+        removes the fallback.
         """
-        experienced_state, layout_blind_state = self._split_state(memory)
+        experienced_state, fallback_state = self._split_state(memory)
         # The policy with experience reads everything, the layout weights included.
         experienced_pathways = self.experienced.pathways(inputs, experienced_state)
-        # The layout-blind policy knows no layout and has no tracker.
-        plain_inputs = inputs._replace(layout_weights=jnp.ones_like(inputs.layout_weights), reading=None)
-        layout_blind_pathways = self.layout_blind.pathways(plain_inputs, layout_blind_state)
+        if self.is_same_network:
+            fallback_pathways = do(self.fallback.pathways(inputs, fallback_state), experience=0.0)
+        else:
+            # The layout-blind policy knows no layout and has no tracker.
+            plain_inputs = inputs._replace(layout_weights=jnp.ones_like(inputs.layout_weights), reading=None)
+            fallback_pathways = self.fallback.pathways(plain_inputs, fallback_state)
 
-        # Scene and goal are factors on the layout-blind policy, float32 [..., 1].
+        # Scene and goal are factors on the fallback, float32 [..., 1].
         ones = jnp.ones_like(inputs.layout_weights[..., :1])
-        both_pathways: Any = (experienced_pathways, layout_blind_pathways)
+        both_pathways: Any = (experienced_pathways, fallback_pathways)
         return Pathways(scene=ones, goal=ones, experience=both_pathways, gate=ones)
 
     def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
         """Return the logits of the policy that acts, with the value of the policy with experience."""
-        experienced_state, layout_blind_state = self._split_state(memory)
-        experienced_pathways, layout_blind_pathways = cast(tuple[Pathways, Pathways], pathways.experience)
+        experienced_state, fallback_state = self._split_state(memory)
+        experienced_pathways, fallback_pathways = cast(tuple[Pathways, Pathways], pathways.experience)
         # Both policies decide at every step, whichever acts.
         experienced_output = self.experienced.decide(experienced_pathways, experienced_state)
-        layout_blind_output = self.layout_blind.decide(layout_blind_pathways, layout_blind_state)
+        fallback_output = self.fallback.decide(fallback_pathways, fallback_state)
 
         # Rounded logits add and subtract without error, so removal restores the direct logits exactly.
-        direct_logits = round_to_grid(layout_blind_output.logits)
+        direct_logits = round_to_grid(fallback_output.logits)
         experience_logits = round_to_grid(experienced_output.logits) - direct_logits
         logits = pathways.scene * direct_logits + experience_logits
 
-        # Both hidden states continue, joined in the order of `initial_memory`.
-        hidden = jnp.concatenate([experienced_output.hidden, layout_blind_output.hidden], axis=-1)
-        return experienced_output._replace(logits=logits, hidden=hidden)
+        # Both memories continue, joined in the order of `initial_memory`.
+        hidden = jnp.concatenate([experienced_output.hidden, fallback_output.hidden], axis=-1)
+        fast = (experienced_output.fast, fallback_output.fast)
+        return experienced_output._replace(logits=logits, hidden=hidden, fast=fast)
 
     def _split_state(self, memory: PolicyState) -> tuple[PolicyState, PolicyState]:
         """Split the joined state into those of the two policies."""
         # The state of the policy with experience comes first.
-        experienced_width = memory.hidden.shape[-1] - self.layout_blind.hidden
-        experienced_hidden, layout_blind_hidden = jnp.split(memory.hidden, [experienced_width], axis=-1)
-        return memory._replace(hidden=experienced_hidden), PolicyState(layout_blind_hidden, memory.action)
+        fallback_width = self.fallback.initial_memory().hidden.shape[-1]
+        experienced_width = memory.hidden.shape[-1] - fallback_width
+        experienced_hidden, fallback_hidden = jnp.split(memory.hidden, [experienced_width], axis=-1)
+        experienced_fast, fallback_fast = memory.fast
+        experienced_state = memory._replace(hidden=experienced_hidden, fast=experienced_fast)
+        return experienced_state, PolicyState(fallback_hidden, memory.action, fallback_fast)
 
 
 #: Either kind of policy that an agent loop can run.

@@ -3,6 +3,8 @@
 import dataclasses
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from jaxnav.choices import CounterfactualMemory
+
 if TYPE_CHECKING:
     from jaxnav.policies.method import Method
     from jaxnav.policies.spatial_memory import SpatialMemory
@@ -12,8 +14,6 @@ Direct = Literal["all", "goal", "none"]
 #: Scale at which the layout weights enter experience: as in eq. 7, over their mean (`jaxnav.layout.scale_weights`), or
 #: as in eq. 7 with boxes in pixels (`jaxnav.policies.features.scale_boxes`).
 WeightKind = Literal["raw", "relative", "pixel"]
-#: Memory of the counterfactual branch: the factual one, or one of its own, to which both direct pathways are zero.
-CounterfactualMemory = Literal["factual", "own"]
 #: Network from pathways to logits: fused before one recurrent core (the paper), or two streams that are added.
 DecisionKind = Literal["fused", "streams"]
 

@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jaxnav.choices import Counts, Reduction
+from jaxnav.choices import CounterfactualMemory, Counts, Reduction
 from jaxnav.errors import InputError
-from jaxnav.policies.spec import CounterfactualMemory, DecisionKind, Direct, PolicySpec, Sizes, WeightKind
+from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS

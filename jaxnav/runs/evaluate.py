@@ -1,9 +1,9 @@
 """Evaluation of a run on fixed episodes.
 
-`evaluate` measures every variant of the run's policies (baseline, layout weights, hard TDE, and sTDE at every epsilon)
-and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many epsilons and all seeds in one
-compiled call, and `sweep_shifts` does so at several layout shifts. `measure_leads` compares results with those of
-layout-blind agents, and `replay_episodes` plays episodes step by step.
+`evaluate` measures every variant of the run's policies (baseline, layout weights, complete removal of experience, and
+soft removal at every epsilon) and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many
+epsilons and all seeds in one compiled call, and `sweep_shifts` does so at several layout shifts. `measure_leads`
+compares results with those of layout-blind agents, and `replay_episodes` plays episodes step by step.
 """
 
 import csv
@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
-from jaxnav.choices import Decoding, EstimatorName, Form
+from jaxnav.choices import CounterfactualMemory, Decoding, EstimatorName, Form, Removal
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
@@ -102,6 +102,8 @@ def evaluate(
     form: Sequence[Form] | None = None,
     setting: EstimatorName | None = None,
     hold: bool = False,
+    removal: Sequence[Removal] = ("tde",),
+    counterfactual_memory: CounterfactualMemory | None = None,
     inner_steps: int | None = None,
     seed: int = 0,
     compiled: CompiledWorld | None = None,
@@ -116,9 +118,15 @@ def evaluate(
       world: generated world to use in place of the run's scenes, with the categories and rules of the run.
       shift: layout shift, from 0 to 1; None for the run's, and 0 with `scenes` or `world`.
       episodes: number of fixed episodes, balanced over room types and scenes.
-      epsilon: thresholds of sTDE.
-      form: forms in which sTDE combines the logits; None for the form of the run's layout estimator.
+      epsilon: thresholds of soft removal.
+      form: forms in which soft removal combines the logits; None for the form of the run's layout estimator with sTDE,
+        and for a - s (a - a0) with sCDE.
       setting, hold: layout estimator to use in place of the run's; see `Policies.with_estimator`.
+      removal: quantities that a complete removal leaves: `tde`, the total direct effect (eq. 1), with the variants
+        `tde` and `stde`; `cde`, the decision of the same network under do(Z = 0), with the variants `cde` and `scde`,
+        which take a compiled call of their own; see `Policies.with_own_fallback`.
+      counterfactual_memory: memory from which the counterfactual branch decides; see
+        `Policies.with_counterfactual_memory`.
       inner_steps: limit of adaptation steps in an episode; see `Policies.with_inner_steps`.
       seed: seed of the episode list and the sampled actions, from 0 to 2**32 - 1.
       compiled: result of `compile_evaluation_world` for the same arguments; None compiles it.
@@ -132,13 +140,16 @@ def evaluate(
     run = run if isinstance(run, Run) else Run.open(run)
     config = run.config
     policies = run.policies().with_estimator(setting, hold).with_inner_steps(inner_steps)
+    policies = policies.with_counterfactual_memory(counterfactual_memory)
+    if "cde" in removal:
+        policies.with_own_fallback()  # refuses policies that cannot act without experience
 
-    # Rows of the table: variants, thresholds and forms, with best and with sampled actions.
-    removal_forms = form
-    if removal_forms is None:
-        removal_forms = () if policies.estimator_config is None else (policies.estimator_config.form,)
+    # Rows of the table: variants, thresholds and forms, with best and with sampled actions. Rows that hand over to the
+    # policy itself are run apart.
+    default_form = "residual" if policies.estimator_config is None else policies.estimator_config.form
     thresholds = np.asarray(epsilon, float).tolist()
-    rows = table_rows(thresholds, removal_forms, policies.arms)
+    all_rows = table_rows(thresholds, form, policies.arms, removal, default_form)
+    rows = [row for row in all_rows if not row.uses_own_fallback]
 
     # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world)
@@ -149,6 +160,12 @@ def evaluate(
         oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
+    if any(row.uses_own_fallback for row in all_rows):
+        with console.status("evaluating removals that leave the policy without experience"):
+            rows, outcome, num_compilations = _add_fallback_rows(
+                all_rows, rows, outcome, policies, compiled, episodes, seed
+            )
+        compilations += num_compilations
     results = Results(
         rows, outcome, join_episode_lists(episode_lists), compiled.env.categories, WORLDS[config.world].budgets, {}
     )
@@ -178,6 +195,7 @@ def evaluate(
         "evaluation_setting": setting,
         "evaluation_hold": hold,
         "evaluation_inner_steps": inner_steps,
+        "evaluation_counterfactual_memory": policies.spec.counterfactual_memory,
     }
     report = build_report(
         _build_rows(results, names), _build_differences(results), report_notes, compilations, report_settings
@@ -220,6 +238,42 @@ def evaluate_rows(
     # The grid is flat: [R S, E] becomes [R, S, E].
     outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.num_seeds, -1), outcome)
     return episode_lists, outcome, evaluator.compilations
+
+
+def _add_fallback_rows(
+    all_rows: Sequence[EvaluationRow],
+    rows: Sequence[EvaluationRow],
+    outcome: EpisodeOutcome,
+    policies: Policies,
+    world: CompiledWorld,
+    num_episodes: int,
+    seed: int,
+) -> tuple[list[EvaluationRow], EpisodeOutcome, int]:
+    """Run the rows of a table that hand over to the policy itself, and add them to the others.
+
+    Args:
+      all_rows: rows in the order of the table, without the oracle.
+      rows: rows that were run, with the oracle at the end.
+      outcome: outcomes of `rows`, leaves [R, S, E].
+      policies, world, num_episodes, seed: as in `evaluate_rows`.
+
+    Returns:
+      All rows in order, their outcomes, and the number of further compilations.
+    """
+    # Policies that hand over carry a second memory, so these rows are compiled apart.
+    fallback_rows = [row for row in all_rows if row.uses_own_fallback]
+    _, fallback_outcome, compilations = evaluate_rows(
+        fallback_rows, policies.with_own_fallback(), world, num_episodes, seed
+    )
+
+    # Put all rows into the order of the table.
+    run_order = [*rows, *fallback_rows]
+    table_order = [*all_rows, rows[-1]]
+    row_order = np.array([run_order.index(row) for row in table_order])
+    outcome = jax.tree.map(
+        lambda leaf, fallback_leaf: np.concatenate([leaf, fallback_leaf])[row_order], outcome, fallback_outcome
+    )
+    return table_order, outcome, compilations
 
 
 def draw_episode_lists(world: CompiledWorld, num_episodes: int, seed: int) -> list[EpisodeList]:
@@ -662,6 +716,9 @@ def replay_episodes(
     Raises:
       InputError: the method cannot act in the scenes.
     """
+    if row.uses_own_fallback:
+        policies = policies.with_own_fallback()
+
     # The first cell of the grid is the row with the first seed.
     inference = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], policies.arms, policies.num_seeds))
     params = jax.tree.map(lambda leaf: leaf[inference.policy_index], policies.params)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.choices import EstimatorName
+from jaxnav.choices import CounterfactualMemory, EstimatorName
 from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.errors import InputError
 from jaxnav.gaps import CooccurrenceEvidence
@@ -59,6 +59,7 @@ class Policies(NamedTuple):
       task: task of the training.
       inner_steps: limit of adaptation steps in an episode; None for the method's default.
       fallback_spec: specification of the policies that decide once experience is removed; None without handover.
+      use_own_fallback: whether these policies themselves decide once experience is removed, under do(Z = 0).
     """
 
     params: dict[str, Any]
@@ -71,6 +72,7 @@ class Policies(NamedTuple):
     task: Task
     inner_steps: int | None = None
     fallback_spec: PolicySpec | None = None
+    use_own_fallback: bool = False
 
     @property
     def num_seeds(self) -> int:
@@ -166,6 +168,34 @@ class Policies(NamedTuple):
         paired_params = {"agent": self.params, "without": fallback_policies.params}
         return self._replace(params=paired_params, fallback_spec=fallback_policies.spec)
 
+    def with_own_fallback(self) -> "Policies":
+        """Policies that hand over to themselves under do(Z = 0) once experience is removed.
+
+        Raises:
+          InputError: the policies had experience in every episode of training.
+        """
+        if not self.spec.can_drop_experience:
+            raise InputError(
+                "cde: these policies had experience in every episode of training, so they never learned to act "
+                "without it (Z = 0); train a run with --ppo.experience below 1, such as 0.8"
+            )
+        return self._replace(use_own_fallback=True)
+
+    def with_counterfactual_memory(self, memory: CounterfactualMemory | None) -> "Policies":
+        """Policies whose counterfactual branch decides from a given memory; None keeps that of the training.
+
+        Raises:
+          InputError: the policies were trained without a memory of the branch itself.
+        """
+        if memory is None:
+            return self
+        if memory == "own" and self.spec.counterfactual_memory != "own":
+            raise InputError(
+                "--counterfactual-memory own: the counterfactual branch of these policies was trained without a memory "
+                "of its own; train a run with --counterfactual-memory own"
+            )
+        return self._replace(spec=dataclasses.replace(self.spec, counterfactual_memory=memory))
+
     def make_agent_loop(self, world: CompiledWorld) -> AgentLoop:
         """Agent loop of these policies in the scenes of a world.
 
@@ -174,7 +204,14 @@ class Policies(NamedTuple):
         """
         # Some methods refuse scenes, such as those that are larger than their map.
         world.check_method(self.spec.method, self.knowledge)
-        return AgentLoop(world.env, self.spec, self.estimator_config, self.inner_steps, self.fallback_spec)
+        return AgentLoop(
+            world.env,
+            self.spec,
+            self.estimator_config,
+            self.inner_steps,
+            self.fallback_spec,
+            self.use_own_fallback,
+        )
 
 
 def adapt_counts(estimator_config: EstimatorConfig, task: Task) -> EstimatorConfig:

@@ -190,8 +190,9 @@ class LoadedPolicy(struct.PyTreeNode):
         if layout is None or self.estimator_config is None:
             return PolicyOutput(factual, factual, None, None, None, perception_state, decision)
 
-        # Counterfactual decision by experience alone, and its removal.
-        counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.policy_state).logits
+        # Counterfactual decision under do(S = 0, G = 0) with the factual experience, and its removal.
+        counterfactual_state = memory.policy_state.counterfactual_state()
+        counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), counterfactual_state).logits
         logits = stde(factual, counterfactual, layout.gap, epsilon, self.estimator_config.form)
         return PolicyOutput(
             logits, factual, counterfactual, layout.gap, inputs.layout_weights, perception_state, decision

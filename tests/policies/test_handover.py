@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 
-from jaxnav.causal import do
+from jaxnav.causal import do, stde, tde
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator
@@ -92,6 +92,113 @@ def test_handed_over_at_the_first_step_it_is_the_same(layout_blind):
     assert (np.asarray(later.length) != np.asarray(at_once.length)).any()
     assert (np.asarray(later.mean_weight) > 0).any()
     assert (np.asarray(later.mean_weight) < 1).all()
+
+
+# The same network without experience
+
+
+DROPPING = dataclasses.replace(tiny.SPEC, experience_dropout=True)
+OWN_PAIR = AgentLoop(ENV, DROPPING, tiny.ESTIMATOR, use_own_fallback=True)
+
+
+def follow_alone(policy, inputs_by_step, actions, use_experience):
+    """Logits of each step of a policy that has experience in all steps or in none."""
+    batch_size = len(actions[0])
+    memory = policy.initial_memory((batch_size,))._replace(use_experience=jnp.full(batch_size, use_experience))
+    logits = []
+    for inputs, action in zip(inputs_by_step, actions, strict=True):
+        decision = policy.decide(policy.pathways(inputs, memory), memory)
+        logits.append(decision.logits)
+        memory = decision.next_state(action)
+    return logits
+
+
+@pytest.mark.parametrize(
+    "method_name",
+    ["org", *(pytest.param(f"support.methods:{name}", marks=pytest.mark.slow) for name in ("ATTENTIVE", "ADAPTIVE"))],
+)
+def test_reference_removal_leaves_the_network_without_experience_to_the_bit(method_name):
+    """At s = 1, at every step of an episode: eq. 1 leaves a0, whose memory has never held experience."""
+    spec = dataclasses.replace(DROPPING, method=find_method(method_name), method_sizes=())
+    loop = dataclasses.replace(OWN_PAIR, spec=spec)
+    params = tiny.random_params(6, spec)
+    decider = loop.bind_decider(params)
+    agent = loop.start(KEY, 8, decider.initial_memory((8,)), KNOWLEDGE, PARAMS)
+    inputs_by_step, actions, factual_by_step, removed_by_step = [], [], [], []
+    for step in range(4):
+        memory = agent.memory
+        assert memory is not None
+        inputs = loop.policy_inputs(agent, KNOWLEDGE, PARAMS)
+        pathways = decider.pathways(inputs, memory)
+        decision = decider.decide(pathways, memory)
+        counterfactual = decider.decide(do(pathways, scene=0.0, goal=0.0), memory.counterfactual_state())
+        inputs_by_step.append(inputs)
+        factual_by_step.append(decision.logits)
+        removed_by_step.append(tde(decision.logits, counterfactual.logits))
+        # Moves and turns alone, so that no episode ends.
+        action = (jnp.arange(8) + step) % 3
+        actions.append(action)
+        agent, _ = loop.step(agent, action, KNOWLEDGE, PARAMS, policy=decider, decision=decision)
+
+    policy = loop.bind(params)
+    chex.assert_trees_all_equal(
+        removed_by_step, [round_to_grid(logits) for logits in follow_alone(policy, inputs_by_step, actions, 0.0)]
+    )
+    chex.assert_trees_all_equal(
+        factual_by_step, [round_to_grid(logits) for logits in follow_alone(policy, inputs_by_step, actions, 1.0)]
+    )
+    assert np.abs(removed_by_step[-1] - factual_by_step[-1]).max() > 0.05
+
+
+def test_half_of_the_reference_removal_lies_midway():
+    """The form `paper` is a - s (a - a0): at s = 1/2 the mean of both logits."""
+    decider = OWN_PAIR.bind_decider(AGENT)
+    agent = OWN_PAIR.start(KEY, 8, decider.initial_memory((8,)), KNOWLEDGE, PARAMS)
+    memory = agent.memory
+    assert memory is not None
+    pathways = decider.pathways(OWN_PAIR.policy_inputs(agent, KNOWLEDGE, PARAMS), memory)
+    factual = decider.decide(pathways, memory).logits
+    removed = decider.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
+    without_experience = tde(factual, removed)
+    result = stde(factual, removed, jnp.full(8, 0.5), 0.0, "paper")
+    np.testing.assert_allclose(result, (factual + without_experience) / 2, atol=1e-6)
+
+
+def test_under_cde_episodes_are_those_of_the_network_without_experience():
+    """Whole episodes: a policy whose experience columns are zero takes the same actions."""
+    kernel = AGENT["fuse"]["kernel"]
+    policy = AgentLoop(ENV, DROPPING).bind(AGENT)
+    first_row = sum(policy.widths[:2])
+    mute_kernel = kernel.at[first_row : first_row + policy.widths[2]].set(0.0)
+    mute = AGENT | {"fuse": AGENT["fuse"] | {"kernel": mute_kernel}}
+    removed = outcome(OWN_PAIR, AGENT, table_row("cde", None, None, "argmax"))
+    alike(removed, outcome(AgentLoop(ENV, DROPPING, tiny.ESTIMATOR), mute, table_row("layout", None, None, "argmax")))
+    # Negative control: with experience the episodes differ.
+    plain = outcome(OWN_PAIR, AGENT, table_row("layout", None, None, "argmax"))
+    assert (np.asarray(plain.length) != np.asarray(removed.length)).any()
+
+
+def test_own_fallback_replaces_the_counterfactual_memory():
+    loop = dataclasses.replace(OWN_PAIR, spec=dataclasses.replace(DROPPING, counterfactual_memory="own"))
+    memory = loop.bind_decider(AGENT).initial_memory((2,))
+    assert memory.counterfactual_hidden is None
+    assert memory.hidden.shape == (2, 2 * tiny.SIZES.hidden)
+
+
+def test_policies_that_always_had_experience_have_no_own_fallback():
+    with pytest.raises(InputError, match=r"cde: these policies had experience in every .* --ppo.experience below 1"):
+        policies(tiny.SPEC, AGENT).with_own_fallback()
+    for spec in (DROPPING, tiny.STREAMS):
+        assert policies(spec, AGENT).with_own_fallback().use_own_fallback
+
+
+def test_own_counterfactual_memory_needs_one_from_training():
+    own = dataclasses.replace(tiny.SPEC, counterfactual_memory="own")
+    with pytest.raises(InputError, match=r"--counterfactual-memory own: .* trained without a memory of its own; train"):
+        policies(tiny.SPEC, AGENT).with_counterfactual_memory("own")
+    assert policies(own, AGENT).with_counterfactual_memory("own").spec == own
+    assert policies(own, AGENT).with_counterfactual_memory("factual").spec == tiny.SPEC
+    assert policies(own, AGENT).with_counterfactual_memory(None).spec == own
 
 
 def policies(spec, params):
