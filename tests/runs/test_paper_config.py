@@ -223,6 +223,7 @@ def test_every_world_has_the_papers_reward(world):
     config = check_config(fill_world_defaults(dataclasses.replace(apply_yaml(RunConfig(), "paper"), world=world)))
     assert (config.worlds.shaping, config.near_starts, config.ppo.guidance) == (0, 0, 0)
     assert not config.ppo.has_guidance
+    assert config.ppo.experience == 1.0  # no episodes without experience
     assert config.task.instance_counts
 
 
