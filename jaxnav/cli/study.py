@@ -11,9 +11,9 @@ from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig
 DESCRIPTION = (
     "Run an experiment: train and measure everything that has no results yet, and write its pages. `jaxnav study NAME` "
     "needs no option; `jaxnav list experiments` describes the names, and how much each one trains. The exceptions are "
-    "account, handover, instrument and mixture, which measure a finished run: give --run RUN, and --reference RUN with "
-    "a run of layout-blind agents (--method anonymous). The options change an experiment; their defaults are shown for "
-    "the experiment that you give: jaxnav study table2 --help."
+    "account, cde, handover, instrument and mixture, which measure a finished run: give --run RUN, and --reference RUN "
+    "with a run of layout-blind agents (--method anonymous). The options change an experiment; their defaults are "
+    "shown for the experiment that you give: jaxnav study table2 --help."
 )
 
 

@@ -62,12 +62,12 @@ class ExperimentConfig:
       epsilon: thresholds of sTDE, each at least 0: experience is removed where the layout gap exceeds the threshold.
         The first is the one that is compared.
       form: rule by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the logits
-        from experience alone; the share is the excess of the layout gap over the threshold. `residual` does this
-        without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds the
-        threshold.
+        with scene and goal set to zero; the share is the excess of the layout gap over the threshold. `residual` does
+        this without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds
+        the threshold.
       decodings: rules that choose actions from logits, `argmax` (best actions) and `sample` (sampled actions). The
-        measurements `mixture` and `handover`, in which half of the episodes are in shifted homes, are repeated with
-        each rule.
+        measurements `mixture`, `handover` and `cde`, in which half of the episodes are in shifted homes, are repeated
+        with each rule.
       steps: number of steps, at least 1, over which the curves of the layout gap are recorded.
       seed: random seed of the episode lists and the sampled actions, from 0 to 2**32 - 1.
       base: settings of `jaxnav train` that all runs of the experiment share.

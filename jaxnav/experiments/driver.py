@@ -23,7 +23,7 @@ from jaxnav.experiments.config import (
 )
 from jaxnav.experiments.gap_traces import measure_gaps
 from jaxnav.experiments.instrument import measure_instrument
-from jaxnav.experiments.mixture import measure_handover, measure_mixture
+from jaxnav.experiments.mixture import measure_cde, measure_handover, measure_mixture
 from jaxnav.experiments.pages import check_page, render_page
 from jaxnav.experiments.scores import measure_account, measure_evaluation, measure_frontier, measure_groups
 from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, read_settings, write_part
@@ -82,6 +82,7 @@ MEASUREMENTS = {
     "gaps": Measurement(measure_gaps, compares_shifts=True),
     "mixture": Measurement(measure_mixture, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
     "handover": Measurement(measure_handover, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
+    "cde": Measurement(measure_cde, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
 }
 
 

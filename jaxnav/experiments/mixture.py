@@ -5,12 +5,13 @@ is worth its gain over the whole mixture. A gap is worth its gain over controls:
 mixture, the mean gap of all episodes at the same time, and clocks.
 
 `measure_mixture` evaluates the removals of a run and their controls, `measure_handover` those that hand over to
-layout-blind agents. `PopulationMetrics` compares outcomes, at each shift and over the mixture.
+layout-blind agents, and `measure_cde` those that leave the network without experience. `PopulationMetrics` compares
+outcomes, at each shift and over the mixture.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -101,18 +102,35 @@ def measure_mixture(
     Raises:
       InputError: there are no layout-blind agents, or they differ in world, goals or number of seeds.
     """
-    return _measure_removals(bench, run, decoding, rules, hand_over=False)
+    return _measure_removals(bench, run, decoding, rules, "own")
 
 
 def measure_handover(
     bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
 ) -> Iterator[ResultRow]:
     """Evaluate removals that hand over to the layout-blind agents; see `measure_mixture`."""
-    return _measure_removals(bench, run, decoding, rules, hand_over=True)
+    return _measure_removals(bench, run, decoding, rules, "layout-blind")
+
+
+def measure_cde(
+    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
+) -> Iterator[ResultRow]:
+    """Evaluate removals that leave the same network under do(Z = 0), the controlled direct effect.
+
+    See `measure_mixture`.
+
+    Raises:
+      InputError: the run has no experience dropout.
+    """
+    return _measure_removals(bench, run, decoding, rules, "without experience")
 
 
 def _measure_removals(
-    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule], *, hand_over: bool
+    bench: Bench,
+    run: AgentRun,
+    decoding: Decoding,
+    rules: Sequence[RemovalRule],
+    direct_policy: Literal["own", "layout-blind", "without experience"],
 ) -> Iterator[ResultRow]:
     # Paired comparisons need the same episodes and as many training runs on both sides.
     layout_blind_run = require_layout_blind_run(bench, run)
@@ -126,8 +144,16 @@ def _measure_removals(
     world, episodes, shift_index = draw_mixed_population(bench, run, shifts)
     layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
     policies = load_policies(run.config, ("layout",))
-    if hand_over:
-        policies = policies.with_handover_to(layout_blind.policies)
+    agent_name = run.agent
+    hard_name = "TDE"
+    match direct_policy:
+        case "layout-blind":
+            policies = policies.with_handover_to(layout_blind.policies)
+            agent_name = f"{run.agent}, handed over to {layout_blind_run.agent}"
+        case "without experience":
+            policies = policies.with_own_fallback()
+            agent_name = f"{run.agent}, without experience"
+            hard_name = "CDE"
     evaluated_run = EvaluatedRun(policies, world, episodes)
     estimator = require_estimator_config(policies)
 
@@ -143,7 +169,6 @@ def _measure_removals(
 
     # Values of the agents themselves.
     metrics = PopulationMetrics(episodes, shift_index, budgets)
-    agent_name = f"{run.agent}, handed over to {layout_blind_run.agent}" if hand_over else run.agent
     report = _RemovalReport(
         fields={"world": run.world, "run": agent_name, "decoding": decoding},
         shifts=shifts,
@@ -158,10 +183,16 @@ def _measure_removals(
         yield report.row("length", Interval(float(np.median(lengths))), variant=WITHOUT_REMOVAL, shift=shift)
 
     # Hard removal, the oracle and the clocks need no estimate of the shift from the views of an episode.
-    yield from report.removal_rows("TDE", outcomes[hard_trial])
+    yield from report.removal_rows(hard_name, outcomes[hard_trial])
     yield from report.removal_rows(ORACLE_NAME, metrics.oracle_removal(outcomes[plain_trial], outcomes[hard_trial]))
     for name, outcome in outcome_by_clock.items():
         yield from report.removal_rows(name, outcome)
+
+    # A counterfactual memory of its own is compared with the factual one.
+    if direct_policy == "own" and policies.spec.counterfactual_memory == "own":
+        factual_run = evaluated_run._replace(policies=policies.with_counterfactual_memory("factual"))
+        factual_outcomes = runner.run_trials(factual_run, estimator, [hard_trial])
+        yield from report.removal_rows("TDE, factual memory", factual_outcomes[hard_trial])
 
     # Every rule is compared with its own controls and with the best clock.
     best_clock = max(outcome_by_clock, key=lambda name: report.mixture_gain(outcome_by_clock[name], budgets[-1]))

@@ -21,13 +21,13 @@ from jaxnav.experiments.config import (
 from jaxnav.experiments.driver import check_measurements, list_parts
 from jaxnav.experiments.pages import check_page
 from jaxnav.experiments.table import has_part
-from jaxnav.runs.config import RunConfig
+from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_yaml
 from jaxnav.runs.run import run_settings
 
 REPOSITORY = Path(__file__).parents[2]
 #: Experiments that measure finished runs.
-OF_FINISHED_RUNS = ("account", "mixture", "handover", "instrument")
+OF_FINISHED_RUNS = ("account", "cde", "mixture", "handover", "instrument")
 WORLDS = {"near": {"world": "rooms"}, "far": {"world": "apartments", "seeds": 4}}
 AGENTS = {"plain": {}, "wide": {"sizes": {"hidden": 256}, "seeds": 5}}
 
@@ -129,7 +129,7 @@ def test_finished_runs_replace_the_agents(drawn_run):
     for run in runs:
         assert run.is_external
         assert run.config.run_dir == run_dir
-        assert run_settings(run.config) == run_settings(drawn_run.config)
+        assert run_settings(run.config) == run_settings(check_config(drawn_run.config))
     assert config.results == run_dir / "results"
     assert config.pages == {str(run_dir / "account.md"): "account"}
 
@@ -138,7 +138,7 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
     finished = {"run": str(drawn_run.config.run_dir), "against": ["plain/layout"]}
     config = make_config(worlds={"near": {}}, agents={"plain": {}, "done": finished})
     runs = agent_runs(check_experiment(config))
-    assert run_settings(runs[1].config) == run_settings(drawn_run.config)
+    assert run_settings(runs[1].config) == run_settings(check_config(drawn_run.config))
     assert runs[1].against == ("plain/layout",)
     assert [run.is_external for run in runs] == [False, True]
 

@@ -1,8 +1,11 @@
 """Removal in a mixed population: its comparisons, and their intervals."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.tiny_run import draw_run
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
@@ -16,11 +19,13 @@ from jaxnav.experiments.mixture import (
     PopulationMetrics,
     clock_trials,
     join_end_to_end,
+    measure_cde,
     measure_handover,
     measure_mixture,
 )
 from jaxnav.experiments.table import ResultTable
 from jaxnav.experiments.trials import NEVER
+from jaxnav.runs.evaluate import evaluate
 
 NUM_SCENES, EPISODES_PER_SCENE, NUM_RUNS = 6, 4, 3
 SHIFT = np.repeat([0, 1], NUM_SCENES * EPISODES_PER_SCENE)
@@ -215,7 +220,37 @@ def test_handover_leaves_the_layout_blind_agents(bench):
             assert agent.mean + change.mean == pytest.approx(layout_blind.mean)
 
 
-@pytest.mark.parametrize("measure", [measure_mixture, measure_handover])
+@pytest.mark.slow
+def test_cde_leaves_the_network_without_experience(make_bench, config, tmp_path_factory):
+    """All of it: two agents whose networks lack the same experience are alike under CDE, and only there."""
+    dropping_config = dataclasses.replace(config, run_dir=tmp_path_factory.mktemp("dropping") / "run")
+    dropping_config = dataclasses.replace(
+        dropping_config, counterfactual_memory="own", ppo=dataclasses.replace(config.ppo, experience=0.8)
+    )
+    run = {"run": str(draw_run(dropping_config).config.run_dir)}
+    bench = make_bench(agents={"main": run, "anonymous": run}, shifts=(0.0, 1.0), episodes=8)
+    table = ResultTable(measure_cde(bench, bench.find_run("rooms", "main"), "argmax", ()))
+    row_fields = {"world": "rooms", "run": "main, without experience", "decoding": "argmax"}
+    removals = table.distinct("variant", row_fields, reference=WITHOUT_REMOVAL)
+    assert removals[:2] == ["CDE", ORACLE_NAME]
+    for shift in (0.0, 1.0):
+        assert table.find(row_fields, variant="CDE", shift=shift, metric="weight").mean == 1.0
+
+    # The same numbers as in the evaluation of the run.
+    results = evaluate(run["run"], episodes=8, removal=("cde",), shift=0.0)
+    metrics = results.metrics()
+    rows = {(row.variant, row.decoding): index for index, row in enumerate(results.rows)}
+    for metric in ("sr", "spl"):
+        change = table.find(row_fields, variant="CDE", reference=WITHOUT_REMOVAL, shift=0.0, metric=metric)
+        removed, plain = (metrics[metric][rows[variant, "argmax"]].mean() for variant in ("cde", "layout"))
+        assert change.mean == pytest.approx(100 * (removed - plain), abs=1e-6)
+
+    # A mixture of the own counterfactual memory shows the factual one beside it.
+    table = ResultTable(measure_mixture(bench, bench.find_run("rooms", "main"), "argmax", ()))
+    assert "TDE, factual memory" in table.distinct("variant", reference=WITHOUT_REMOVAL)
+
+
+@pytest.mark.parametrize("measure", [measure_mixture, measure_handover, measure_cde])
 @pytest.mark.parametrize("changes", [{"seeds": 3}, {"world": "houses"}, {"worlds": {"num_val": 5}}])
 def test_mixtures_refuse_runs_that_differ_before_any_training(make_bench, drawn_run, measure, changes):
     bench = make_bench(agents={"main": {}, "anonymous": changes}, base=drawn_run.config, shifts=(0.0, 1.0))
