@@ -71,12 +71,6 @@ def _graph(spec: PolicySpec) -> "nnx.GraphDef[Policy]":
     return nnx.split(abstract_policy)[0]
 
 
-def has_experience(spec: PolicySpec) -> bool:
-    """True unless the method's experience Z is empty, so that layout weights have nothing to multiply."""
-    experience = nnx.eval_shape(lambda: spec.method.experience(spec, nnx.Rngs(0)))
-    return experience.width > 0
-
-
 # One recurrent core
 
 

@@ -99,7 +99,7 @@ class LayoutConfig:
     strength: float | None = None
     reduction: Reduction | None = None
     counts: Counts | None = None
-    weights: WeightKind = "raw"
+    weights: WeightKind = "relative"
     prior: Literal["room", "pooled"] = "room"
     walks: int = 2048
     steps: int = 100
@@ -138,7 +138,8 @@ class RunConfig:
         add their logits, so that the part that remains without experience is trained too. `streams` sets `--direct goal
         --counterfactual none`.
       direct: detections that the policy also gets directly, not only through experience; sTDE keeps this direct input.
-        Either those of all categories (as in the authors' code), of the goal only, or none.
+        Those of `all` categories (as in the authors' code), of the `goal` only, or `none`. The default is `goal`, so
+        that other categories act through experience alone, and `all` for methods without experience (rgb, savn).
       spatial_memory: give the policy a map of the cells that it has seen and visited. The map holds no objects, so it
         is not a part of experience. The paper has no such map, so turn it off to compare with the paper.
       goal_row: give the policy the detection of its goal as a separate input. In the paper, this detection stands only
@@ -176,7 +177,7 @@ class RunConfig:
     counterfactual: CounterfactualTraining = "distil"
     counterfactual_memory: CounterfactualMemory = "factual"
     decision: DecisionKind = "fused"
-    direct: Direct = "all"
+    direct: Direct | None = None
     spatial_memory: bool = True
     goal_row: bool = True
     done_gate: bool = False
@@ -237,7 +238,7 @@ class RunConfig:
             num_categories=num_categories,
             sizes=self.sizes,
             method_sizes=tuple(sorted(self.method_sizes.items())),
-            direct=self.direct,
+            direct=self.direct or usual_direct(self.policy_method),
             done_gate=self.done_gate,
             spatial_memory=SpatialMemory(self.task.rules.headings) if self.spatial_memory else None,
             decision=self.decision,
@@ -420,6 +421,8 @@ def check_config(config: RunConfig) -> RunConfig:
         config = dataclasses.replace(config, arms=("baseline",))
     if config.decision == "streams":
         config = dataclasses.replace(config, direct="goal", counterfactual="none")
+    if config.direct is None:
+        config = dataclasses.replace(config, direct=usual_direct(method))
     if config.layout.counts is None:
         layout = dataclasses.replace(config.layout, counts=config.layout_counts)
         config = dataclasses.replace(config, layout=layout)
@@ -438,6 +441,15 @@ def check_config(config: RunConfig) -> RunConfig:
     _check_learning(config)
     _check_world(config)
     return config
+
+
+def usual_direct(method: "Method") -> Direct:
+    """Detections of the direct pathway by default: of the goal; of all categories where experience is empty.
+
+    With `goal`, experience is the only way by which other categories reach the decision, so that removing experience
+    removes them.
+    """
+    return "all" if method.experience.is_empty else "goal"
 
 
 def _usual_guidance(config: RunConfig, method: "Method") -> float:

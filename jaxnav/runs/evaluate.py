@@ -38,7 +38,6 @@ from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
 from jaxnav.policies.methods import find_method, method_label
-from jaxnav.policies.network import has_experience
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.policies import Policies, config_for_task, is_policy, list_packaged_policies, load_policy_as_run
 from jaxnav.runs.policy import LoadedPolicy
@@ -178,7 +177,7 @@ def evaluate(
         results.metrics()["sr"],
         results.episodes,
         has_room_prior=policies.has_room_priors,
-        has_experience=has_experience(policies.spec),
+        has_experience=not policies.spec.method.experience.is_empty,
     )
     report_notes = [
         *limit_notes,

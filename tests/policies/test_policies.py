@@ -18,7 +18,7 @@ from support.tiny_world import BANK, SIZES, SPEC, decide, leaves_at, random_para
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.methods import METHODS, find_method
-from jaxnav.policies.network import INITIAL_DONE_LOGIT, bind, has_experience, init_params
+from jaxnav.policies.network import INITIAL_DONE_LOGIT, bind, init_params
 from jaxnav.policies.pathways import NO_ACTION, PolicyInputs, PolicyState
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.lattice import NUM_ACTIONS
@@ -186,7 +186,8 @@ def test_layout_weights_have_no_gradient(org):
 @pytest.mark.parametrize("method", METHODS)
 def test_only_methods_without_a_mechanism_in_z_have_no_experience(method):
     spec = dataclasses.replace(SPEC, method=find_method(method), method_sizes=())
-    assert has_experience(spec) == (method not in {"rgb", "anonymous", "savn"})
+    assert METHODS[method].experience.is_empty == (bind(spec, init_params(spec, jax.random.key(0))).method.width == 0)
+    assert METHODS[method].experience.is_empty == (method in {"rgb", "anonymous", "savn"})
 
 
 def test_rgb_has_no_experience():

@@ -26,6 +26,8 @@ from jaxnav.policies.spec import PolicySpec
 class NoExperience(Experience):
     """Empty experience: Z has no entries."""
 
+    is_empty = True
+
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         self.width = 0
 
