@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import CounterfactualMemory, EstimatorName, Form, Removal
+from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal
 from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
@@ -57,6 +57,9 @@ class EvalConfig:
         the rest of the episode once the gap exceeds the threshold.
       inner_steps: largest number of adaptation steps in an episode, at least 0, for methods that learn while they act
         (`jaxnav list methods` describes the methods). The default is the usual number of the method.
+      costs: parts of the decisions whose cost is measured, by replacing them by those of other episodes throughout.
+        `others`: the categories other than the goal within experience, on a quarter of the episodes. `all`: every part,
+        on all episodes. The shares of decisions that change are always measured.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
       json: JSON file to write. The default is a name such as `eval-val.json` in the run directory.
       format: format in which the evaluation is printed.
@@ -75,6 +78,7 @@ class EvalConfig:
     inner_steps: int | None = None
     removal: tuple[Removal, ...] = ("tde",)
     counterfactual_memory: CounterfactualMemory | None = None
+    costs: Costs = "others"
     seed: int = 0
     json: Path | None = None
     format: Literal["table", "markdown", "json"] = "table"
@@ -108,6 +112,7 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
         inner_steps=config.inner_steps,
         removal=config.removal,
         counterfactual_memory=config.counterfactual_memory,
+        costs=config.costs,
         seed=config.seed,
         console=console,
     )
@@ -134,8 +139,14 @@ def _read_finished_report(config: EvalConfig) -> dict[str, Any]:
 
 
 def _print_report(report: dict[str, Any], report_format: str) -> None:
-    """Print a report on stdout: its table, paired differences and notes."""
-    from jaxnav.evaluation.report import difference_table, markdown_table, results_table
+    """Print a report on stdout: its table, paired differences, decision shares and notes."""
+    from jaxnav.evaluation.report import (
+        decision_share_table,
+        difference_table,
+        has_decision_shares,
+        markdown_table,
+        results_table,
+    )
 
     if report_format == "json":
         print(escape_control_chars(json.dumps(report, indent=2), keep="\n"))
@@ -148,6 +159,8 @@ def _print_report(report: dict[str, Any], report_format: str) -> None:
     print_table(result_console, results_table(report))
     if report["differences"]:
         print_table(result_console, difference_table(report), num_key_columns=2)
+    if has_decision_shares(report):
+        print_table(result_console, decision_share_table(report), num_key_columns=2)
     for note in report["notes"]:
         result_console.print(note)
 

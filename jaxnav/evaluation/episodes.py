@@ -53,6 +53,15 @@ class EpisodeList(NamedTuple):
             room=self.room[selection],
         )
 
+    @property
+    def room_rank(self) -> np.ndarray:
+        """Number of earlier episodes of the same room type, int32 [E]."""
+        ranks = np.zeros(len(self.room), np.int32)
+        for room in set(self.room.tolist()):
+            in_room = self.room == room
+            ranks[in_room] = np.arange(in_room.sum())
+        return ranks
+
     def clusters(self) -> Clusters:
         """Cluster the episodes by floor plan, within room types."""
         return scene_clusters(self.floor_plans, self.room)

@@ -8,8 +8,9 @@ several steps. `episode_metrics` turns the outcomes into success rate (SR), succ
 success weighted by action efficiency (SAE) and distance to success (DTS).
 """
 
+import functools
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +18,20 @@ import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace, apply_removal, logits_to_remove, select_gap
-from jaxnav.numerics.trees import tree_where
-from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, decide, policy_memory
+from jaxnav.evaluation.interventions import ReplacedPart, replace_part, select_part
+from jaxnav.evaluation.removal import (
+    InferenceConfig,
+    InferenceTrace,
+    apply_removal,
+    logits_to_remove,
+    other_running_episode,
+    select_gap,
+)
+from jaxnav.numerics.trees import take_rows, tree_where
+from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, policy_memory
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.method import Knowledge
-from jaxnav.policies.network import Params
+from jaxnav.policies.network import Params, Policy
 from jaxnav.scenes.task import MOVE_AHEAD
 
 Tree = TypeVar("Tree")
@@ -114,17 +123,29 @@ class Evaluator:
       compilations: number of compilations so far.
     """
 
-    def __init__(self, agent_loop: AgentLoop, can_remove: bool = True) -> None:
+    def __init__(
+        self,
+        agent_loop: AgentLoop,
+        can_remove: bool = True,
+        has_controls: bool = True,
+        replaced_parts: tuple[ReplacedPart, ...] = (),
+    ) -> None:
         """Prepare the compiled function.
 
         Args:
           agent_loop: environment, policy specification and layout estimator.
           can_remove: whether experience may be removed. False compiles only the factual decision, which halves the
             compilation time; the grid must then remove nothing.
+          has_controls: whether grids may have the controls `intervention` and `removed`. False compiles faster.
+          replaced_parts: parts that the entries of a grid may replace (`InferenceConfig.replaced`).
         """
         self.compilations = 0
         self._agent_loop = agent_loop
-        self._can_remove = can_remove
+        self._compiled_parts = {
+            "can_remove": can_remove,
+            "has_controls": has_controls,
+            "replaced_parts": replaced_parts,
+        }
         self._compiled_run = jax.jit(self._run_grid)
 
     def __call__(
@@ -152,7 +173,10 @@ class Evaluator:
         for bank_index, (episodes, env_params) in enumerate(banks):
             bank_key = jax.random.fold_in(key, bank_index)
             initial_states = start_states(episodes)
-            outcome = self._compiled_run(grid, policy_params, initial_states, env_params, knowledge, bank_key)
+            room_rank = jnp.asarray(episodes.room_rank)
+            outcome = self._compiled_run(
+                grid, policy_params, initial_states, room_rank, env_params, knowledge, bank_key
+            )
             outcomes.append(jax.tree.map(np.asarray, outcome))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *outcomes)
 
@@ -161,6 +185,7 @@ class Evaluator:
         grid: InferenceConfig,
         policy_params: Params,
         initial_states: State,
+        room_rank: jax.Array,
         env_params: EnvParams,
         knowledge: Knowledge,
         key: jax.Array,
@@ -175,11 +200,12 @@ class Evaluator:
                 config,
                 policy,
                 initial_states,
+                room_rank,
                 key,
                 agent_loop=self._agent_loop,
                 env_params=env_params,
                 knowledge=knowledge,
-                can_remove=self._can_remove,
+                **self._compiled_parts,
             )
 
         return jax.lax.map(run_entry, grid)
@@ -199,12 +225,13 @@ def _run_episodes(
     config: InferenceConfig,
     policy: Decider,
     initial_states: State,
+    room_rank: jax.Array,
     key: jax.Array,
     *,
     agent_loop: AgentLoop,
     env_params: EnvParams,
     knowledge: Knowledge,
-    can_remove: bool,
+    **compiled_parts: Any,
 ) -> EpisodeOutcome:
     """Run all episodes of one grid entry until every episode has ended."""
     num_episodes = len(initial_states.pose)
@@ -221,15 +248,16 @@ def _run_episodes(
             agent_loop=agent_loop,
             env_params=env_params,
             knowledge=knowledge,
-            can_remove=can_remove,
+            **compiled_parts,
         )
         # The memory holds the executed action, which differs from the choice where the method has macro-actions.
         action = policy_memory(result.agent).action
         is_decision_step = agent_loop.is_decision_step(batch.agent)  # of the state before the step
         outcome = batch.outcome.add_step(batch.running, action, result, trace.removal_weight, is_decision_step)
-        # Ended episodes keep their agent.
+        # Ended episodes keep their state; their memories and beliefs are no longer used.
+        state = tree_where(batch.running, next_agent.state, batch.agent.state)
         return _Batch(
-            agent=tree_where(batch.running, next_agent, batch.agent),
+            agent=next_agent._replace(state=state),
             running=batch.running & ~result.ended,
             outcome=outcome,
             episode_keys=batch.episode_keys,
@@ -242,7 +270,7 @@ def _run_episodes(
     memory = policy.initial_memory((num_episodes,))
     batch = _Batch(
         agent=agent_loop.start_from(initial_states, memory, knowledge, env_params),
-        running=jnp.ones(num_episodes, bool),
+        running=room_rank < config.max_room_episodes,
         outcome=EpisodeOutcome.zeros((num_episodes,)),
         episode_keys=episode_keys,
     )
@@ -257,7 +285,7 @@ def _run_episodes(
         episode_table = _write_rows(episode_table, batch_ids, (batch.outcome, batch.agent.state))
         kept_rows = jnp.argsort(~batch.running)[:next_size]  # running episodes first; ended ones may fill the rest
         batch_ids = batch_ids[kept_rows]
-        batch = _take_rows(batch, kept_rows)
+        batch = take_rows(batch, kept_rows)
 
     # DTS needs the distance from the final cell; the sum of the weights becomes their mean.
     outcome, final_state = episode_table
@@ -274,11 +302,6 @@ def _write_rows(table: Tree, row_indices: jax.Array, values: Tree) -> Tree:
     return jax.tree.map(lambda leaf, value: leaf.at[row_indices].set(value), table, values)
 
 
-def _take_rows(table: Tree, row_indices: jax.Array) -> Tree:
-    """Rows `row_indices`, int [B], of leaves [E, ...]."""
-    return jax.tree.map(lambda leaf: leaf[row_indices], table)
-
-
 def infer_and_act(
     config: InferenceConfig,
     policy: Decider,
@@ -290,6 +313,8 @@ def infer_and_act(
     env_params: EnvParams,
     knowledge: Knowledge,
     can_remove: bool = True,
+    has_controls: bool = True,
+    replaced_parts: tuple[ReplacedPart, ...] = (),
 ) -> tuple[Agent, StepResult, InferenceTrace]:
     """Decide, remove experience, choose and act: one step of each of E episodes.
 
@@ -303,6 +328,8 @@ def infer_and_act(
       env_params: parameters of the environment.
       knowledge: layout priors and statistics from before training.
       can_remove: whether experience may be removed.
+      has_controls: whether `config` may name the controls `intervention` and `removed`.
+      replaced_parts: parts that `config.replaced` may name.
 
     Returns:
       The agents after the step [E], the result of the step, leaves [E], and the trace of the inference, leaves
@@ -311,14 +338,35 @@ def infer_and_act(
     # Factual decision; entries without the layout replace its weights by ones.
     inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
     layout_weights = jnp.where(config.use_layout, inputs.layout_weights, 1.0)
+    inputs = inputs._replace(layout_weights=layout_weights)
     memory = policy_memory(agent)
-    pathways, decision = decide(policy, inputs._replace(layout_weights=layout_weights), memory)
+    pathways = policy.pathways(inputs, memory)
+
+    # Replace a part of the decision by that of another episode.
+    if replaced_parts:
+        assert isinstance(policy, Policy)
+        replace = functools.partial(
+            replace_part,
+            partner=other_running_episode(running, episode_keys),
+            pathways=pathways,
+            inputs=inputs,
+            uses_layout=config.use_layout,
+            policy=policy,
+            agent=agent,
+            agent_loop=agent_loop,
+            knowledge=knowledge,
+            env_params=env_params,
+        )
+        pathways, memory = select_part(replaced_parts, config.replaced, replace)
+    decision = policy.decide(pathways, memory)
 
     # Remove experience (eqs. 1, 2).
     step_keys = jax.vmap(jax.random.fold_in)(episode_keys, agent.state.time)
     gap = agent_loop.layout_gap(agent)
     if can_remove:
-        removed_logits = logits_to_remove(config, policy, pathways, memory, episode_keys, step_keys)
+        removed_logits = logits_to_remove(
+            config, policy, pathways, memory, episode_keys, step_keys, has_controls=has_controls
+        )
         gap = select_gap(config, gap, running, episode_keys, agent.state.time)
         logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap)
     else:

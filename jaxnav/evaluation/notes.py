@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.statistics import MIN_SCENE_DEGREES, paired_difference
+from jaxnav.evaluation.statistics import MIN_SCENE_DEGREES, Interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow
+
+#: Share of other categories within Z, in percent, below which a row draws no verdict about w or sTDE.
+MIN_OTHERS_SHARE = 5.0
 
 
 def evaluation_notes(
@@ -46,6 +49,33 @@ def evaluation_notes(
             "without w shows the noise between trainings."
         )
     return notes + _chance_notes(rows, success, episodes, random_name)
+
+
+def decision_share_notes(decision_shares: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Name the rows whose decisions hardly depend on other categories within Z.
+
+    Args:
+      decision_shares: entries of the report with the shares and costs of parts of the decisions.
+    """
+    share_notes = []
+    for entry in decision_shares:
+        share = entry["share"]["mean"]
+        if entry["part"] != "others" or share is None:
+            continue
+
+        # A share without a cost is noise. Without an interval, the share alone decides.
+        cost_text = ""
+        has_no_cost = False
+        if entry["cost"] is not None and entry["cost"]["spl"]["ci95"] is not None:
+            cost = Interval.from_json(entry["cost"]["spl"])
+            has_no_cost = cost.low <= 0.0 <= cost.high
+            cost_text = f" and replacing them costs {cost:.1f} SPL"
+        if share < MIN_OTHERS_SHARE or has_no_cost:
+            share_notes.append(
+                f"{entry['variant']} ({entry['decoding']}): {share:.1f} % of the decisions depend on other categories "
+                f"within Z{cost_text}, so this row tests neither w nor sTDE."
+            )
+    return share_notes
 
 
 def budget_note(budget: Mapping[str, int]) -> str:

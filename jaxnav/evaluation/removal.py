@@ -74,6 +74,9 @@ class InferenceConfig(struct.PyTreeNode):
       intervention: float32, upper bound of the uniform noise that replaces scene and goal; 0 sets them to zero, as in
         sTDE.
       removed: int32, a `RemovedLogits`.
+      replaced: int32, a `ReplacedPart` (`jaxnav.evaluation.interventions`), replaced at every step.
+      max_room_episodes: int32, number of episodes of each room type that the entry runs, the first in the list; the
+        outcomes of the remaining ones are 0.
     """
 
     policy_index: jax.Array
@@ -89,6 +92,8 @@ class InferenceConfig(struct.PyTreeNode):
     gap_end: jax.Array
     intervention: jax.Array
     removed: jax.Array
+    replaced: jax.Array
+    max_room_episodes: jax.Array
 
 
 class InferenceTrace(NamedTuple):
@@ -118,6 +123,7 @@ def logits_to_remove(
     memory: PolicyState,
     episode_keys: jax.Array,
     step_keys: jax.Array,
+    has_controls: bool = True,
 ) -> jax.Array:
     """Logits to remove from E decisions, float32 [E, A]: counterfactual logits, or those of a control.
 
@@ -129,7 +135,10 @@ def logits_to_remove(
       policy: policy with the entry's parameters.
       pathways, memory: inputs of the factual decisions, leaves [E, ...].
       episode_keys, step_keys: PRNG keys [E] of the episodes and of their current step; folded further.
+      has_controls: whether `config.intervention` and `config.removed` may name controls. False compiles faster.
     """
+    if not has_controls:
+        return policy.decide(do(pathways, scene=0, goal=0), memory.counterfactual_state()).logits
 
     def sample_rows(keys: jax.Array, tag: int, row_shape: tuple[int, ...], sampler: Callable[..., jax.Array]):
         """Sample float32 [E, *row_shape], each row with a key of its own."""
@@ -178,7 +187,7 @@ def select_gap(
     # One branch per member of `GapSource`.
     branches = (
         lambda: gap,
-        lambda: gap[_other_running_episode(running, episode_keys)],
+        lambda: gap[other_running_episode(running, episode_keys)],
         lambda: jnp.broadcast_to(jnp.mean(gap, where=running), gap.shape),
         lambda: jnp.where(in_given_window, config.given_gap, 0.0),
     )
@@ -208,16 +217,21 @@ def apply_removal(
     return corrected_logits, weight
 
 
-def _other_running_episode(running: jax.Array, episode_keys: jax.Array) -> jax.Array:
+def other_running_episode(running: jax.Array, episode_keys: jax.Array, distance: int = 1) -> jax.Array:
     """Index of another running episode for each running one, int [E]; undefined for ended episodes.
 
     The other episode is the next one in a cyclic order. The order depends only on the keys, so two paired episodes stay
     paired while both run, also when the batch shrinks.
+
+    Args:
+      running: bool [E], episodes that have not ended. With `distance` or fewer, an episode may be paired with itself.
+      episode_keys: PRNG keys [E] of the episodes; folded further.
+      distance: number of steps in the cyclic order.
     """
     # Ended episodes sort last: their score is 1.
     score = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, _ORDER_TAG)))(episode_keys)
     cyclic_order = jnp.argsort(jnp.where(running, score, 1.0))
     # The rank of each episode is the inverse permutation.
     rank = jnp.zeros_like(cyclic_order).at[cyclic_order].set(jnp.arange(len(cyclic_order)))
-    next_rank = (rank + 1) % jnp.maximum(running.sum(), 1)
+    next_rank = (rank + distance) % jnp.maximum(running.sum(), 1)
     return cyclic_order[next_rank]

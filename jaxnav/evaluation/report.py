@@ -157,6 +157,7 @@ def build_report(
     notes: list[str],
     compilations: int,
     run: dict[str, Any],
+    decision_shares: Sequence[dict[str, Any]] = (),
 ) -> dict[str, Any]:
     """Build the report.
 
@@ -166,11 +167,13 @@ def build_report(
       notes: see `jaxnav.evaluation.notes`.
       compilations: number of compilations of the evaluation.
       run: settings of the run.
+      decision_shares: see `jaxnav.runs.decision_shares`; reports of versions before 0.4 have none.
     """
     return {
         "run": run,
         "rows": rows,
         "differences": differences,
+        "decision_shares": list(decision_shares),
         "notes": notes,
         "compilations": compilations,
         "versions": package_versions(),
@@ -265,6 +268,72 @@ def difference_table(report: dict[str, Any]) -> Table:
     return table
 
 
+#: Names of the parts of a decision, as printed in tables.
+PART_LABELS = {
+    "others": "other categories in Z",
+    "experience": "Z",
+    "prior_weights": "w (prior instead)",
+    "uniform_weights": "w (uniform instead)",
+    "direct": "scene and goal",
+    "memory": "memory",
+}
+#: Titles of the columns of decision shares.
+_SHARE_TITLES = ("share (%)", "floor (%)", "cost in SPL", "cost in SR")
+
+
+def has_decision_shares(report: dict[str, Any]) -> bool:
+    """True if a report has decision shares; those of versions before 0.4 have none."""
+    return bool(report.get("decision_shares"))
+
+
+def decision_share_table(report: dict[str, Any]) -> Table:
+    """Make the table of the decision shares for a terminal.
+
+    One line per row and part: how many decisions change when the part becomes that of another episode, how many differ
+    between two other episodes, and what the change costs throughout the episode.
+    """
+    table = Table("Part of the decision", "decoding", *_SHARE_TITLES)
+    previous_variant = ""
+    for entry in report["decision_shares"]:
+        if entry["variant"] != previous_variant:
+            table.add_section()
+            table.add_row(_share_heading(report, entry), style="bold")
+            previous_variant = entry["variant"]
+        table.add_row(PART_LABELS[entry["part"]], entry["decoding"], *_share_cells(entry))
+    return table
+
+
+def _share_heading(report: dict[str, Any], entry: dict[str, Any]) -> str:
+    """Name of the row whose decisions an entry is about."""
+    for row in report["rows"]:
+        if row["variant"] == entry["variant"]:
+            return row_label(row)
+    return entry["variant"]
+
+
+def _share_cells(entry: dict[str, Any]) -> list[str]:
+    """Cells of one entry: share, floor, cost in SPL, cost in SR; empty where nothing was measured."""
+    floor = entry["floor"]
+    cost = entry["cost"]
+    cells = [
+        f"{Interval.from_json(entry['share']):.1f}",
+        "" if floor is None else f"{Interval.from_json(floor).mean:.1f}",
+    ]
+    for metric in ("spl", "sr"):
+        cells.append("" if cost is None else f"{Interval.from_json(cost[metric]):+.1f}")
+    return cells
+
+
+def _share_markdown(report: dict[str, Any]) -> str:
+    """Table of the decision shares in Markdown."""
+    titles = ("Row", "Part of the decision", "decoding", *_SHARE_TITLES)
+    lines = [titles, ("---", "---", "---", *["---:"] * len(_SHARE_TITLES))]
+    for entry in report["decision_shares"]:
+        heading = _share_heading(report, entry)
+        lines.append((heading, PART_LABELS[entry["part"]], entry["decoding"], *_share_cells(entry)))
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
 def markdown_table(report: dict[str, Any]) -> str:
     """Make the table of a report in Markdown, with its notes, ending with a newline."""
     # Title and alignment: text to the left, numbers to the right.
@@ -280,6 +349,8 @@ def markdown_table(report: dict[str, Any]) -> str:
     text_parts = []
     for cells in table_lines:
         text_parts.append(f"| {' | '.join(cells)} |\n")
+    if has_decision_shares(report):
+        text_parts.append("\n" + _share_markdown(report))
     for note in report["notes"]:
         text_parts.append(f"\n{note}\n")
     return "".join(text_parts)

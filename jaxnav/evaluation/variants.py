@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jaxnav.causal import FORMS
 from jaxnav.choices import Decoding, Form, Removal, Variant
 from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import MAX_EPISODES
+from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
 
 #: Variants of each kind of removal: complete, and soft.
@@ -125,6 +127,36 @@ def inference_grid(rows: Sequence[EvaluationRow], arms: Sequence[str], num_seeds
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *entries)
 
 
+class Replacement(NamedTuple):
+    """A row in which a part of every decision is replaced by that of another episode.
+
+    Attributes:
+      row: the row without the replacement.
+      part: the replaced part.
+    """
+
+    row: EvaluationRow
+    part: ReplacedPart
+
+
+def replacement_grid(
+    replacements: Sequence[Replacement], arms: Sequence[str], num_seeds: int, max_room_episodes: int
+) -> InferenceConfig:
+    """Make the grid of replacements and seeds, leaves [R S].
+
+    Args:
+      replacements: R replacements; the arms of their rows must be in `arms`.
+      arms, num_seeds: as in `inference_grid`.
+      max_room_episodes: number of episodes of each room type to run.
+    """
+    grid = inference_grid([replacement.row for replacement in replacements], arms, num_seeds)
+    parts = jnp.asarray([replacement.part for replacement in replacements], jnp.int32)
+    return grid.replace(
+        replaced=jnp.repeat(parts, num_seeds),
+        max_room_episodes=jnp.full_like(grid.max_room_episodes, max_room_episodes),
+    )
+
+
 def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: int) -> InferenceConfig:
     """Grid entry of one row and seed, leaves []; the controls of sTDE are off."""
     # Random gets the policies of the first arm, which it ignores. An infinite epsilon never removes anything.
@@ -143,4 +175,6 @@ def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: i
         gap_end=jnp.int32(0),
         intervention=jnp.float32(0.0),
         removed=jnp.int32(RemovedLogits.COUNTERFACTUAL),
+        replaced=jnp.int32(ReplacedPart.NONE),
+        max_room_episodes=jnp.int32(MAX_EPISODES),
     )

@@ -1,4 +1,4 @@
-"""Selection between pytrees of arrays."""
+"""Selection between pytrees of arrays, and of their rows."""
 
 from typing import TypeVar
 
@@ -23,3 +23,8 @@ def tree_where(condition: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
         return jnp.where(leaf_condition, true_leaf, false_leaf)
 
     return jax.tree.map(select_leaf, on_true, on_false)
+
+
+def take_rows(tree: Tree, row_indices: jax.Array) -> Tree:
+    """Take the rows `row_indices`, int [B], of leaves [E, ...]."""
+    return jax.tree.map(lambda leaf: leaf[row_indices], tree)

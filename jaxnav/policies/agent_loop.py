@@ -286,6 +286,18 @@ class AgentLoop:
         observation = jax.vmap(self.env.observe, (0, None))(agent.state, env_params)
         return jax.vmap(self._perception.policy_inputs, (0, 0, None))(agent.perception, observation, knowledge)
 
+    def read_tracker(self, perception: PerceptionState, goal: jax.Array, knowledge: Any) -> Any:
+        """Readings of tracker states [B] for goals int32 [B], leaves [B, ...]; None without a tracker."""
+        tracker = self._perception.tracker
+        if tracker is None:
+            return None
+        return jax.vmap(tracker.read, (0, None, 0))(perception.tracker_state, knowledge, goal)
+
+    def prior_weights(self, agent: Agent, knowledge: Knowledge, env_params: EnvParams) -> jax.Array:
+        """Layout weights before the first view, w of the prior times g, float32 [B, K]; ones without the layout."""
+        prior_agent = self._init_agent(agent.state, agent.memory, knowledge, env_params)
+        return self.policy_inputs(prior_agent, knowledge, env_params).layout_weights
+
     def layout_gap(self, agent: Agent) -> jax.Array:
         """Layout gaps D of the current beliefs, float32 [B]; 0 without the layout."""
         layout = agent.perception.layout

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
@@ -136,6 +137,27 @@ class Experience(nnx.Module):
           float32 [..., Z], or a pytree with leaves [...] that `attend` maps to float32 [..., Z].
         """
         raise NotImplementedError
+
+    def replace_others(
+        self, features: Features, reading: Tree, other_features: Features, other_reading: Tree
+    ) -> tuple[Features, Tree]:
+        """Replace all categories but the goal by those of another episode, for `jaxnav.evaluation.interventions`.
+
+        A method whose reading holds categories overrides this function, so that the reading is replaced too.
+
+        Args:
+          features, reading: inputs of `encode`.
+          other_features, other_reading: the same of another episode, read for the goal of this one.
+
+        Returns:
+          Features and reading. The view and the goal's detection stay, and here the reading too.
+        """
+        is_goal = features.goal > 0
+        mixed_features = features._replace(
+            visible=jnp.where(is_goal, features.visible, other_features.visible),
+            table=jnp.where(is_goal[..., None], features.table, other_features.table),
+        )
+        return mixed_features, reading
 
     @staticmethod
     def scene_inputs(reading: Tree) -> jax.Array:

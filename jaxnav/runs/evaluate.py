@@ -9,6 +9,7 @@ compares results with those of layout-blind agents, and `replay_episodes` plays 
 import csv
 import io
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +20,13 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
-from jaxnav.choices import CounterfactualMemory, Decoding, EstimatorName, Form, Removal
+from jaxnav.choices import Costs, CounterfactualMemory, Decoding, EstimatorName, Form, Removal
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
-from jaxnav.evaluation.notes import budget_note, convergence_note, evaluation_notes
+from jaxnav.evaluation.notes import budget_note, convergence_note, decision_share_notes, evaluation_notes
 from jaxnav.evaluation.playback import EpisodeTrace, play_episodes
+from jaxnav.evaluation.removal import InferenceConfig
 from jaxnav.evaluation.report import (
     ExperienceLead,
     build_difference,
@@ -36,9 +38,24 @@ from jaxnav.evaluation.report import (
 )
 from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
-from jaxnav.evaluation.variants import EvaluationRow, inference_grid, table_row, table_rows
+from jaxnav.evaluation.variants import (
+    EvaluationRow,
+    Replacement,
+    inference_grid,
+    replacement_grid,
+    table_row,
+    table_rows,
+)
 from jaxnav.policies.methods import find_method, method_label
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.decision_shares import (
+    build_decision_shares,
+    count_shares,
+    max_room_episodes,
+    measure_costs,
+    policy_rows,
+    replacements_to_run,
+)
 from jaxnav.runs.policies import Policies, config_for_task, is_policy, list_packaged_policies, load_policy_as_run
 from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.run import CONFIG_FILE, Run, run_settings
@@ -104,6 +121,7 @@ def evaluate(
     removal: Sequence[Removal] = ("tde",),
     counterfactual_memory: CounterfactualMemory | None = None,
     inner_steps: int | None = None,
+    costs: Costs = "others",
     seed: int = 0,
     compiled: CompiledWorld | None = None,
     console: Console | None = None,
@@ -127,6 +145,8 @@ def evaluate(
       counterfactual_memory: memory from which the counterfactual branch decides; see
         `Policies.with_counterfactual_memory`.
       inner_steps: limit of adaptation steps in an episode; see `Policies.with_inner_steps`.
+      costs: parts of the decisions that are replaced throughout episodes to measure their cost: `others` for other
+        categories within experience, on a quarter of the episodes; `all` for every part, on all episodes; or `none`.
       seed: seed of the episode list and the sampled actions, from 0 to 2**32 - 1.
       compiled: result of `compile_evaluation_world` for the same arguments; None compiles it.
       console: console for progress; None for silence.
@@ -153,10 +173,23 @@ def evaluate(
     # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world)
     applied_shift = evaluation_shift(config, scenes or world, shift)
-    with console.status(_describe_evaluation(episodes, applied_shift)):
-        episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed)
+    with console.status(_describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
+        # Decision shares are counted in a thread: compilations use one core each.
+        episode_lists = draw_episode_lists(compiled, episodes, seed)
+        share_rows = policy_rows(rows)
+        counting = thread.submit(count_shares, share_rows, policies, compiled, episode_lists, seed)
+
+        # Replacements are further rows of the same grid.
+        replacements = replacements_to_run(rows, costs)
+        room_episodes = max_room_episodes(episode_lists, costs)
+        outcome, replaced_outcome, compilations = _evaluate_with_replacements(
+            rows, replacements, room_episodes, policies, compiled, episode_lists, seed
+        )
         env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
         oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
+        share_counts, probed_episodes = counting.result()
+    costs_by_replacement = measure_costs(rows, outcome, replacements, replaced_outcome, episode_lists, room_episodes)
+    decision_shares = build_decision_shares(share_rows, share_counts, probed_episodes, costs_by_replacement)
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
     if any(row.uses_own_fallback for row in all_rows):
@@ -181,6 +214,7 @@ def evaluate(
     )
     report_notes = [
         *limit_notes,
+        *(decision_share_notes(decision_shares) if not policies.spec.method.experience.is_empty else []),
         budget_note(steps_by_purpose),
         *convergence_note(run.log()),
     ]
@@ -197,7 +231,12 @@ def evaluate(
         "evaluation_counterfactual_memory": policies.spec.counterfactual_memory,
     }
     report = build_report(
-        _build_rows(results, names), _build_differences(results), report_notes, compilations, report_settings
+        _build_rows(results, names),
+        _build_differences(results),
+        report_notes,
+        compilations,
+        report_settings,
+        decision_shares,
     )
     return results._replace(report=report)
 
@@ -223,20 +262,60 @@ def evaluate_rows(
     Returns:
       The episodes of each bank, the outcomes with leaves [R, S, E], and the number of compilations of the evaluator.
     """
-    # While one bank is evaluated, a thread reads the next.
     episode_lists = draw_episode_lists(world, num_episodes, seed)
+    evaluator = evaluator or Evaluator(policies.make_agent_loop(world), has_controls=False)
+    grid = inference_grid(rows, policies.arms, policies.num_seeds)
+    outcome = _run_grid(evaluator, grid, policies, world, episode_lists, seed)
+    return episode_lists, outcome, evaluator.compilations
+
+
+def _evaluate_with_replacements(
+    rows: Sequence[EvaluationRow],
+    replacements: Sequence[Replacement],
+    room_episodes: int,
+    policies: Policies,
+    world: CompiledWorld,
+    episode_lists: Sequence[EpisodeList],
+    seed: int,
+) -> tuple[EpisodeOutcome, EpisodeOutcome, int]:
+    """Run R rows and C replacements in one compiled call.
+
+    Returns:
+      Outcomes with leaves [R, S, E] and [C, S, E], and the number of compilations.
+    """
+    grids = [inference_grid(rows, policies.arms, policies.num_seeds)]
+    if replacements:
+        grids.append(replacement_grid(replacements, policies.arms, policies.num_seeds, room_episodes))
+    grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *grids)
+
+    # Only the parts that are replaced are compiled.
+    parts = tuple(sorted({replacement.part for replacement in replacements}))
+    evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False, replaced_parts=parts)
+    outcome = _run_grid(evaluator, grid, policies, world, episode_lists, seed)
+    row_outcome = jax.tree.map(lambda leaf: leaf[: len(rows)], outcome)
+    replaced_outcome = jax.tree.map(lambda leaf: leaf[len(rows) :], outcome)
+    return row_outcome, replaced_outcome, evaluator.compilations
+
+
+def _run_grid(
+    evaluator: Evaluator,
+    grid: InferenceConfig,
+    policies: Policies,
+    world: CompiledWorld,
+    episode_lists: Sequence[EpisodeList],
+    seed: int,
+) -> EpisodeOutcome:
+    """Run a grid of rows and seeds, leaves [R S], over all banks; returns outcomes with leaves [R, S, E]."""
+    # While one bank is evaluated, a thread reads the next.
     env_params = prefetch_env_params(world, range(len(world.banks)))
-    evaluator = evaluator or Evaluator(policies.make_agent_loop(world))
     outcome = evaluator(
-        inference_grid(rows, policies.arms, policies.num_seeds),
+        grid,
         policies.params,
         zip(episode_lists, env_params, strict=True),
         policies.knowledge,
         jax.random.key(seed),
     )
-    # The grid is flat: [R S, E] becomes [R, S, E].
-    outcome = jax.tree.map(lambda leaf: leaf.reshape(len(rows), policies.num_seeds, -1), outcome)
-    return episode_lists, outcome, evaluator.compilations
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, policies.num_seeds, leaf.shape[-1]), outcome)
 
 
 def _add_fallback_rows(
@@ -533,7 +612,7 @@ def sweep_shifts(
         console.print(f"shift {applied_shift:g}: {len(epsilon)} thresholds x {seed_text} x {episodes:,} episodes")
 
         # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
-        evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled))
+        evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled), has_controls=False)
         earlier_compilations = evaluator.compilations
         with console.status(_describe_evaluation(episodes, applied_shift)):
             episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed, evaluator)

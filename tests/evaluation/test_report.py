@@ -152,7 +152,16 @@ def test_written_report_is_read_back(tmp_path):
     path.write_text("old")
     reports.write_report(path, report)
     assert json.loads(path.read_text(encoding="utf-8")) == report
-    assert set(report) == {"run", "rows", "differences", "notes", "compilations", "versions", "format"}
+    assert set(report) == {
+        "run",
+        "rows",
+        "differences",
+        "decision_shares",
+        "notes",
+        "compilations",
+        "versions",
+        "format",
+    }
     assert (report["notes"], report["compilations"], report["format"]) == (["A note."], 2, 1)
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
 

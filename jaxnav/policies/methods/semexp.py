@@ -75,6 +75,21 @@ class MappedCategories(Experience):
             block_flags.append((reading.blocks & flag > 0).astype(jnp.float32))
         return jnp.concatenate([*block_flags, reading.compass], axis=-1)
 
+    def replace_others(
+        self, features: Features, reading: MapReading, other_features: Features, other_reading: MapReading
+    ) -> tuple[Features, MapReading]:
+        """Replace the categories in each block; floor, walls and the goal stay."""
+        mixed_features, _ = super().replace_others(features, reading, other_features, other_reading)
+
+        # The bits of all categories but the goal, uint32 [..., 1].
+        num_categories = features.goal.shape[-1]
+        category_bits = jnp.asarray(1 << np.arange(num_categories), jnp.uint32)
+        replaced_bits = jnp.where(features.goal > 0, jnp.uint32(0), category_bits).sum(
+            axis=-1, keepdims=True, dtype=jnp.uint32
+        )
+        blocks = (reading.blocks & ~replaced_bits) | (other_reading.blocks & replaced_bits)
+        return mixed_features, reading._replace(blocks=blocks)
+
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: MapReading) -> jax.Array:
         """Return experience, each category weighted by the layout."""
         # Unpack the categories of each block, [..., M, K], and sum their weighted appearances, [..., M, d].

@@ -1,0 +1,274 @@
+"""Decision shares: how many decisions change when one part is replaced by that of another episode.
+
+A decision counts as changed when its best action changes and the KL divergence from the factual to the changed action
+probabilities exceeds `MIN_KL`, so that near ties do not count. The *floor* of a part compares two replacements by the
+parts of two different episodes: a share near its floor says that the episode's own part acts like any other.
+
+`ShareProbe` runs a small batch of the evaluation's episodes by the factual decisions and intervenes on decisions on the
+way; the interventions do not act. `share_interval` turns its counts into a share with an interval.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.env.objectnav import EnvParams, State
+from jaxnav.evaluation.grid import infer_and_act
+from jaxnav.evaluation.interventions import DRAWN_PARTS, ReplacedPart, replace_part
+from jaxnav.evaluation.removal import InferenceConfig, other_running_episode
+from jaxnav.evaluation.statistics import Clusters, Interval, jackknife_interval, run_clusters
+from jaxnav.numerics.trees import tree_where
+from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.network import Params, Policy
+
+#: Smallest KL divergence, in nats, of a decision that counts as changed.
+MIN_KL = 0.02
+#: Number of running episodes below which nothing is counted: an episode and two different partners.
+_MIN_RUNNING = 3
+
+
+class ShareCounts(NamedTuple):
+    """Numbers of decisions by episode, leaves [..., E] and [..., E, P] for P parts.
+
+    Attributes:
+      decisions: int32 [..., E], decisions that were intervened on.
+      changed: int32 [..., E, P], decisions that change when the part is replaced.
+      differing: int32 [..., E, P], decisions that differ between replacements by two episodes; 0 for a part whose
+        replacement is the same in all episodes.
+      deleted: int32 [..., E], decisions that change with Z = 0.
+    """
+
+    decisions: jax.Array
+    changed: jax.Array
+    differing: jax.Array
+    deleted: jax.Array
+
+
+def is_changed(logits: jax.Array, changed_logits: jax.Array) -> jax.Array:
+    """True where the best action differs and the KL divergence exceeds `MIN_KL`.
+
+    Args:
+      logits: float32 [..., A], logits of p.
+      changed_logits: float32 [..., A], logits of q; the divergence is KL(p || q).
+
+    Returns:
+      bool [...].
+    """
+    log_probs = jax.nn.log_softmax(logits)
+    changed_log_probs = jax.nn.log_softmax(changed_logits)
+    kl = (jnp.exp(log_probs) * (log_probs - changed_log_probs)).sum(axis=-1)
+    return (logits.argmax(axis=-1) != changed_logits.argmax(axis=-1)) & (kl > MIN_KL)
+
+
+def count_changes(
+    config: InferenceConfig,
+    policy: Policy,
+    agent: Agent,
+    counted: jax.Array,
+    partners: tuple[jax.Array, jax.Array],
+    *,
+    parts: Sequence[ReplacedPart],
+    agent_loop: AgentLoop,
+    env_params: EnvParams,
+    knowledge: Knowledge,
+) -> ShareCounts:
+    """Intervene on one decision of each of E episodes.
+
+    Args:
+      config: configuration of the grid entry.
+      policy: policy with the entry's parameters.
+      agent: agents of the episodes.
+      counted: bool [E], decisions to count.
+      partners: for each episode the indices of two other episodes, int [E] each.
+      parts: the P parts.
+      agent_loop, env_params, knowledge: as in `infer_and_act`.
+
+    Returns:
+      Counts of 0 or 1, leaves [E] and [E, P].
+    """
+    # Factual decision.
+    inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
+    inputs = inputs._replace(layout_weights=jnp.where(config.use_layout, inputs.layout_weights, 1.0))
+    memory = policy_memory(agent)
+    pathways = policy.pathways(inputs, memory)
+    factual_logits = policy.decide(pathways, memory).logits
+
+    def decide_with_part(part: ReplacedPart, partner: jax.Array) -> jax.Array:
+        """Logits with the part of the partner."""
+        changed_pathways, changed_memory = replace_part(
+            part,
+            partner,
+            pathways,
+            inputs,
+            uses_layout=config.use_layout,
+            policy=policy,
+            agent=agent,
+            agent_loop=agent_loop,
+            knowledge=knowledge,
+            env_params=env_params,
+        )
+        return policy.decide(changed_pathways, changed_memory).logits
+
+    # Replace every part once, and the drawn ones twice.
+    changed_columns = []
+    differing_columns = []
+    for part in parts:
+        changed_logits = decide_with_part(part, partners[0])
+        changed_columns.append(is_changed(factual_logits, changed_logits))
+        is_different = jnp.zeros_like(counted)
+        if part in DRAWN_PARTS:
+            is_different = is_changed(changed_logits, decide_with_part(part, partners[1]))
+        differing_columns.append(is_different)
+
+    # Deletion stands beside the replacement of Z.
+    without_experience = pathways._replace(experience=jnp.zeros_like(pathways.experience))
+    deleted_logits = policy.decide(without_experience, memory).logits
+    return ShareCounts(
+        decisions=counted.astype(jnp.int32),
+        changed=(jnp.stack(changed_columns, axis=-1) & counted[:, None]).astype(jnp.int32),
+        differing=(jnp.stack(differing_columns, axis=-1) & counted[:, None]).astype(jnp.int32),
+        deleted=(is_changed(factual_logits, deleted_logits) & counted).astype(jnp.int32),
+    )
+
+
+class ShareProbe:
+    """Measurement of decision shares; one compilation serves all grids and banks of equal shapes."""
+
+    def __init__(self, agent_loop: AgentLoop, parts: Sequence[ReplacedPart], interval: int = 1) -> None:
+        """Prepare the compiled function.
+
+        Args:
+          agent_loop: environment, policy specification and layout estimator, without a fallback.
+          parts: the P parts to replace.
+          interval: steps from one intervention to the next.
+        """
+        self._agent_loop = agent_loop
+        self._parts = tuple(parts)
+        self._interval = interval
+        self._compiled_run = jax.jit(self._run_grid)
+
+    def __call__(
+        self,
+        grid: InferenceConfig,
+        policy_params: Params,
+        initial_states: State,
+        env_params: EnvParams,
+        knowledge: Knowledge,
+        key: jax.Array,
+    ) -> ShareCounts:
+        """Run all entries of a grid over the episodes of one bank and count changed decisions.
+
+        Args:
+          grid: leaves [C]; the entries remove and replace nothing.
+          policy_params: parameters of all policies, leaves [N, ...].
+          initial_states: initial states of E episodes.
+          env_params: parameters of the environment.
+          knowledge: layout priors and statistics from before training.
+          key: typed PRNG key []; policy index, episode and time are folded in.
+
+        Returns:
+          Counts, leaves [C, E] and [C, E, P].
+        """
+        counts = self._compiled_run(grid, policy_params, initial_states, env_params, knowledge, key)
+        return jax.tree.map(np.asarray, counts)
+
+    def _run_grid(
+        self,
+        grid: InferenceConfig,
+        policy_params: Params,
+        initial_states: State,
+        env_params: EnvParams,
+        knowledge: Knowledge,
+        key: jax.Array,
+    ) -> ShareCounts:
+        """Run all entries of a grid over the episodes of one bank; jitted."""
+
+        def run_entry(config: InferenceConfig) -> ShareCounts:
+            policy = self._agent_loop.bind(jax.tree.map(lambda leaf: leaf[config.policy_index], policy_params))
+            policy_key = jax.random.fold_in(key, config.policy_index)
+            return self._run_episodes(config, policy, initial_states, env_params, knowledge, policy_key)
+
+        return jax.lax.map(run_entry, grid)
+
+    def _run_episodes(
+        self,
+        config: InferenceConfig,
+        policy: Policy,
+        initial_states: State,
+        env_params: EnvParams,
+        knowledge: Knowledge,
+        key: jax.Array,
+    ) -> ShareCounts:
+        """Run the episodes of one entry, and intervene at every `interval`-th step."""
+        agent_loop = self._agent_loop
+        num_episodes = len(initial_states.pose)
+        episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes))
+        shared_arguments = {"agent_loop": agent_loop, "env_params": env_params, "knowledge": knowledge}
+
+        def intervene(agent: Agent, running: jax.Array) -> ShareCounts:
+            # Only decisions that take effect count.
+            is_decision_step = agent_loop.is_decision_step(agent)
+            counted = running if is_decision_step is None else running & is_decision_step
+            partners = (
+                other_running_episode(running, episode_keys, distance=1),
+                other_running_episode(running, episode_keys, distance=2),
+            )
+            return count_changes(config, policy, agent, counted, partners, parts=self._parts, **shared_arguments)
+
+        def step(carry: tuple[Agent, jax.Array, jax.Array, ShareCounts]):
+            agent, running, time, counts = carry
+            new_counts = jax.lax.cond(
+                time % self._interval == 0,
+                intervene,
+                lambda *_: jax.tree.map(jnp.zeros_like, counts),
+                agent,
+                running,
+            )
+            counts = jax.tree.map(jnp.add, counts, new_counts)
+
+            # The factual decision acts. Ended episodes keep their agent.
+            next_agent, result, _ = infer_and_act(
+                config, policy, agent, running, episode_keys, can_remove=False, **shared_arguments
+            )
+            return tree_where(running, next_agent, agent), running & ~result.ended, time + 1, counts
+
+        # Start all episodes, and stop when too few are left to be partners.
+        agent = agent_loop.start_from(initial_states, policy.initial_memory((num_episodes,)), knowledge, env_params)
+        by_episode = jnp.zeros(num_episodes, jnp.int32)
+        by_part = jnp.zeros((num_episodes, len(self._parts)), jnp.int32)
+        no_counts = ShareCounts(decisions=by_episode, changed=by_part, differing=by_part, deleted=by_episode)
+        start = (agent, jnp.ones(num_episodes, bool), jnp.int32(0), no_counts)
+        *_, counts = jax.lax.while_loop(lambda carry: carry[1].sum() >= _MIN_RUNNING, step, start)
+        return counts
+
+
+def share_interval(counted: np.ndarray, decisions: np.ndarray, scenes: Clusters) -> Interval:
+    """Compute the share of decisions, in percent, with its interval over scenes and training runs.
+
+    Args:
+      counted: int [S, E], counted decisions by training run and episode.
+      decisions: int [S, E], all decisions that were intervened on.
+      scenes: clusters of the E episodes.
+
+    Returns:
+      The share over all runs, with that of every run in `seeds`; NaN without decisions.
+    """
+    # Numerator and denominator leave out the same run and the same scene.
+    runs = run_clusters(1, len(decisions))
+    counted_replicates = runs.weights.T @ counted @ scenes.weights
+    decision_replicates = runs.weights.T @ decisions @ scenes.weights
+    if not (decision_replicates > 0).all():
+        return Interval(float("nan"))
+
+    seed_shares = 100.0 * counted.sum(axis=1) / np.maximum(decisions.sum(axis=1), 1)
+    return jackknife_interval(
+        100.0 * counted_replicates / decision_replicates,
+        scenes,
+        runs,
+        std=float(seed_shares.std(ddof=1)) if len(seed_shares) > 1 else float("nan"),
+        seeds=tuple(seed_shares.tolist()),
+    )

@@ -1,0 +1,217 @@
+"""Decision shares: closed forms, policies that provably use or ignore a part, and replacement by oneself."""
+
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_step
+
+from jaxnav.evaluation.decision_share import ShareProbe, is_changed, share_interval
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.evaluation.grid import Evaluator, start_states
+from jaxnav.evaluation.interventions import ReplacedPart, replace_part
+from jaxnav.evaluation.variants import Replacement, inference_grid, replacement_grid, table_row, table_rows
+from jaxnav.policies.agent_loop import policy_memory
+from jaxnav.policies.features import Features
+from jaxnav.policies.methods.hoz import ZoneReading, ZoneRelations
+from jaxnav.policies.methods.map_tracker import FREE_BIT, MapReading
+from jaxnav.policies.methods.semexp import MappedCategories
+
+PARTS = tuple(part for part in ReplacedPart if part != ReplacedPart.NONE)
+ARMS = ("baseline", "layout")
+PARAMS = tiny.world()[1].replace(step_limit=jnp.array((12, 16), jnp.int32))
+EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
+KEY = jax.random.key(3)
+
+
+def stack_params(change):
+    """A baseline and a layout policy, after a change of their parameters."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(change(tiny.random_params(seed)) for seed in (5, 6)))
+
+
+def scale_inputs(params, scale_by_input):
+    """Scale the kernel rows of `fuse` by input: scene, goal, experience, action."""
+    policy = AGENT_LOOP.bind(params)
+    scales = np.repeat(
+        [scale_by_input.get(name, 1.0) for name in ("scene", "goal", "experience", "action")], policy.widths
+    )
+    fuse = params["fuse"] | {"kernel": params["fuse"]["kernel"] * jnp.asarray(scales, jnp.float32)[:, None]}
+    return params | {"fuse": fuse}
+
+
+def ignore_experience(params):
+    return scale_inputs(params, {"experience": 0.0})
+
+
+def use_only_experience(params):
+    """Decide from Z and its past alone: neither direct pathway nor previous action enters."""
+    params = scale_inputs(params, {"scene": 0.0, "goal": 0.0, "action": 0.0, "experience": 20.0})
+    actor = params["actor"] | {"kernel": 20.0 * params["actor"]["kernel"]}
+    return params | {"actor": actor}
+
+
+@pytest.fixture(scope="module")
+def probe():
+    """Shares of every part, by variant and decoding."""
+    share_probe = ShareProbe(AGENT_LOOP, PARTS)
+    rows = [table_row(variant, None, None, "sample") for variant in ARMS]
+    grid = inference_grid(rows, ARMS, 1)
+
+    def measure(change):
+        counts = share_probe(grid, stack_params(change), start_states(EPISODES), PARAMS, KNOWLEDGE, KEY)
+        return counts, counts.changed.sum(axis=1) / counts.decisions.sum(axis=1)[:, None]
+
+    return measure
+
+
+def test_a_decision_changes_if_its_best_action_does_and_kl_exceeds_the_bound():
+    def changed(probs, changed_probs):
+        return bool(is_changed(jnp.log(jnp.array(probs)), jnp.log(jnp.array(changed_probs))))
+
+    # KL((.6, .4) || (.4, .6)) = .2 ln 1.5 = .081; KL((.51, .49) || (.49, .51)) = .02 ln (.51 / .49) = .0008.
+    assert math.isclose(0.2 * math.log(1.5), 0.0811, abs_tol=1e-4)
+    assert changed((0.6, 0.4), (0.4, 0.6))
+    assert not changed((0.51, 0.49), (0.49, 0.51))
+    # The best action stays, although KL is large.
+    assert not changed((0.98, 0.02), (0.51, 0.49))
+
+
+def test_a_policy_that_ignores_experience_has_shares_of_zero(probe):
+    counts, shares = probe(ignore_experience)
+    experience_parts = (ReplacedPart.OTHERS, *PARTS[1:4])
+    for part in experience_parts:
+        assert (shares[:, part - 1] == 0).all()
+    assert counts.deleted.sum() == 0
+    assert counts.differing[..., ReplacedPart.EXPERIENCE - 1].sum() == 0
+    # Negative control: the parts that the policy does read.
+    assert (shares[:, ReplacedPart.DIRECT - 1] > 0.05).all()
+
+
+def test_a_policy_of_experience_alone_depends_on_no_direct_pathway(probe):
+    _, shares = probe(use_only_experience)
+    assert (shares[:, ReplacedPart.DIRECT - 1] == 0).all()
+    assert (shares[:, ReplacedPart.EXPERIENCE - 1] > 0.1).all()
+    assert (shares[:, ReplacedPart.OTHERS - 1] > 0.05).all()
+    # The baseline has no w to replace.
+    assert shares[0, ReplacedPart.UNIFORM_WEIGHTS - 1] == 0
+
+
+def replaced_parts_of(agent, partner, part):
+    """Pathways and memory with a part replaced, and the factual ones, compiled."""
+
+    @jax.jit
+    def replace(params, agent):
+        policy = AGENT_LOOP.bind(params)
+        inputs = AGENT_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS)
+        pathways = policy.pathways(inputs, policy_memory(agent))
+        replaced = replace_part(
+            part,
+            partner,
+            pathways,
+            inputs,
+            uses_layout=jnp.bool_(True),
+            policy=policy,
+            agent=agent,
+            agent_loop=AGENT_LOOP,
+            knowledge=KNOWLEDGE,
+            env_params=PARAMS,
+        )
+        return replaced, (pathways, policy_memory(agent))
+
+    return replace(tiny.random_params(6), agent)
+
+
+@pytest.mark.parametrize(
+    "part", [ReplacedPart.OTHERS, ReplacedPart.EXPERIENCE, ReplacedPart.DIRECT, ReplacedPart.MEMORY]
+)
+def test_replacing_a_part_by_oneself_changes_nothing(part):
+    weights = tiny.random_params(6)
+    agent = start_agent(weights, start_states(EPISODES), PARAMS)
+    cell = tiny.leaves_at(inference_grid([table_row("layout", None, None, "sample")], ("layout",), 1), 0)
+    running = jnp.ones(len(EPISODES.goal), bool)
+    keys = jax.random.split(KEY, len(EPISODES.goal))
+    agent, *_ = take_step(cell, weights, agent, running, keys, PARAMS)
+
+    own = jnp.arange(len(EPISODES.goal))
+    replaced, factual = replaced_parts_of(agent, own, part)
+    chex.assert_trees_all_equal(replaced, factual)
+    # Negative control: another episode.
+    replaced, factual = replaced_parts_of(agent, jnp.roll(own, 1), part)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(replaced, factual)
+
+
+def test_replacements_leave_other_rows_bit_identical():
+    weights = stack_params(ignore_experience)
+    rows = table_rows([0.0, 0.5], ["residual"], ARMS)
+    grid = inference_grid(rows, ARMS, 1)
+    factual = Evaluator(AGENT_LOOP)(grid, weights, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+
+    layout_row = rows.index(table_row("layout", None, None, "sample"))
+    replacements = [
+        Replacement(rows[layout_row], ReplacedPart.EXPERIENCE),
+        Replacement(rows[layout_row], ReplacedPart.DIRECT),
+    ]
+    replaced_grid = replacement_grid(replacements, ARMS, 1, max_room_episodes=6)
+    whole_grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), grid, replaced_grid)
+    evaluator = Evaluator(AGENT_LOOP, has_controls=False, replaced_parts=(ReplacedPart.EXPERIENCE, ReplacedPart.DIRECT))
+    outcome = evaluator(whole_grid, weights, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[: len(rows)], outcome), factual)
+
+    # These policies ignore Z, so its replacement changes no action; the direct pathways do.
+    was_run = EPISODES.room_rank < 6
+    assert was_run.sum() == 12
+    lengths = outcome.length[:, was_run]
+    np.testing.assert_array_equal(lengths[-2], lengths[layout_row])
+    assert (lengths[-1] != lengths[layout_row]).any()
+    assert (outcome.length[-2:, ~was_run] == 0).all()
+
+
+def test_share_interval_pools_decisions():
+    # Two runs of three episodes: 1 of 10 decisions, and 5 of 20.
+    decisions = np.array([[4, 4, 2], [10, 5, 5]])
+    counted = np.array([[1, 0, 0], [3, 1, 1]])
+    share = share_interval(counted, decisions, EPISODES.take(np.array([0, 1, 12])).clusters())
+    assert share.mean == pytest.approx(20.0)
+    assert share.seeds == pytest.approx((10.0, 25.0))
+    assert math.isnan(share_interval(counted, 0 * decisions, EPISODES.take(np.arange(3)).clusters()).mean)
+
+
+# Hooks of the methods
+
+
+def make_features(seed, goal):
+    rng = np.random.default_rng(seed)
+    goal_one_hot = np.eye(3, dtype=np.float32)[goal]
+    return Features(
+        view=jnp.zeros(2),
+        visible=jnp.asarray(rng.random(3)),
+        table=jnp.asarray(rng.random((3, 9))),
+        goal=jnp.asarray(goal_one_hot),
+    )
+
+
+def test_hoz_takes_room_and_zones_of_the_other_episode():
+    own, other = make_features(0, goal=1), make_features(1, goal=1)
+    own_reading = ZoneReading(jnp.array([1.0, 0.0]), jnp.zeros((3, 3)))
+    other_reading = ZoneReading(jnp.array([0.0, 1.0]), jnp.ones((3, 3)))
+    mixed, reading = ZoneRelations.replace_others(object.__new__(ZoneRelations), own, own_reading, other, other_reading)
+    chex.assert_trees_all_equal(reading, other_reading)
+    np.testing.assert_array_equal(mixed.table, np.stack([other.table[0], own.table[1], other.table[2]]))
+    np.testing.assert_array_equal(mixed.visible, np.stack([other.visible[0], own.visible[1], other.visible[2]]))
+
+
+def test_semexp_keeps_floor_and_goal_of_its_map():
+    own, other = make_features(0, goal=1), make_features(1, goal=1)
+    # Bits of categories 0 to 2; the goal is 1.
+    own_reading = MapReading(jnp.array([0b011, 0b000], jnp.uint32) | FREE_BIT, jnp.array([0.0, 1.0]))
+    other_reading = MapReading(jnp.array([0b100, 0b111], jnp.uint32), jnp.array([1.0, 0.0]))
+    _, reading = MappedCategories.replace_others(
+        object.__new__(MappedCategories), own, own_reading, other, other_reading
+    )
+    np.testing.assert_array_equal(reading.blocks, np.array([0b110, 0b101], np.uint32) | FREE_BIT)
+    np.testing.assert_array_equal(reading.compass, own_reading.compass)
