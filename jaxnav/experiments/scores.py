@@ -49,6 +49,7 @@ def measure_evaluation(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             if reference_run is not None:
                 references[reference] = bench.evaluate(reference_run, shift)
         yield from difference_rows(run, shift, scores, references)
+        yield from share_rows(run, shift, scores)
     yield from training_rows(run)
 
 
@@ -62,6 +63,24 @@ def value_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRo
             yield ResultRow(
                 **row_fields(run, shift, row), metric=metric, value=interval, scenes=num_scenes(scores.episodes)
             )
+
+
+def share_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRow]:
+    """List the decision shares of an evaluation with their floors and costs."""
+    for entry in scores.results.report["decision_shares"]:
+        fields = {"world": run.world, "run": run.agent, "shift": shift}
+        fields |= {"variant": entry["variant"], "decoding": entry["decoding"]}
+        measured = {"share": entry["share"], "floor": entry["floor"]}
+        if entry["cost"] is not None:
+            measured |= {"cost in spl": entry["cost"]["spl"], "cost in sr": entry["cost"]["sr"]}
+
+        # A part whose replacement is the same in all episodes has no floor.
+        for name, interval in measured.items():
+            if interval is not None:
+                metric = f"{name} of {entry['part']}"
+                yield ResultRow(
+                    **fields, metric=metric, value=Interval.from_json(interval), scenes=num_scenes(scores.episodes)
+                )
 
 
 def difference_rows(
