@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.episodes import episodes_in
 
-from jaxnav.evaluation.notes import convergence_note, evaluation_notes
+from jaxnav.evaluation.notes import convergence_note, decision_share_notes, evaluation_notes
 from jaxnav.evaluation.variants import EvaluationRow
 
 BASELINE, LAYOUT = (EvaluationRow(variant, None, None, "argmax") for variant in ("baseline", "layout"))
@@ -111,3 +111,33 @@ def test_convergence_note_gives_success_of_the_last_quarter():
     (note,) = convergence_note(rows)
     assert "from 55.0 to 75.0 %" in note  # 0.5 and 0.6 at three quarters, 0.7 and 0.8 at the end
     assert convergence_note(rows[:1]) == convergence_note([]) == []
+
+
+@pytest.mark.parametrize(
+    ("share", "bounds", "has_note"),
+    [
+        (12.0, [0.5, 3.0], False),
+        (12.0, [-0.5, 3.0], True),
+        (4.9, [0.5, 3.0], True),
+        # Without an interval of the cost, the share decides alone.
+        (12.0, None, False),
+        (4.9, None, True),
+        (None, None, False),
+    ],
+)
+def test_rows_that_hardly_use_other_categories_are_noted(share, bounds, has_note):
+    def make_entry(part, share):
+        return {
+            "variant": "layout",
+            "decoding": "argmax",
+            "part": part,
+            "share": {"mean": share, "ci95": None},
+            "cost": {"spl": {"mean": 1.7, "ci95": bounds}},
+        }
+
+    # Shares of other parts have no note.
+    notes = decision_share_notes([make_entry("others", share), make_entry("memory", 0.0)])
+    assert len(notes) == has_note
+    if has_note:
+        assert notes[0].startswith(f"layout (argmax): {share} % of the decisions")
+        assert ("costs 1.7 [" in notes[0]) == (bounds is not None)

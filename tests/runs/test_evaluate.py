@@ -12,7 +12,7 @@ from rich.console import Console
 import jaxnav
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.errors import InputError
-from jaxnav.evaluation.notes import budget_note, evaluation_notes
+from jaxnav.evaluation.notes import budget_note, decision_share_notes, evaluation_notes
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.training.calibration import layout_priors
 
@@ -89,10 +89,27 @@ def test_evaluation_reports_a_deviation_over_seeds_of_trained_rows_alone(evaluat
     assert tde_difference["seeds"] == pytest.approx(success_gain)
 
 
+def test_every_policy_row_has_decision_shares(evaluated):
+    entries = evaluated.report["decision_shares"]
+    parts = {"baseline": 4, "layout": 6}
+    assert len(entries) == 2 * sum(parts.values())
+    for entry in entries:
+        assert min(entry["decisions"]) > 0
+        assert 0.0 <= entry["share"]["mean"] <= 100.0
+        assert len(entry["share"]["seeds"]) == 2
+        # A replacement that is the same in all episodes has no floor; by default only one cost is measured.
+        assert (entry["floor"] is None) == entry["part"].endswith("_weights")
+        assert (entry["cost"] is None) == (entry["part"] != "others")
+    for variant, num_parts in parts.items():
+        assert sum(entry["variant"] == variant for entry in entries) == 2 * num_parts
+
+
 def test_evaluation_notes_describe_the_rows_and_the_run(evaluated):
     success_rates = evaluated.metrics()["sr"]
     expected_notes = evaluation_notes(evaluated.rows, success_rates, evaluated.episodes, has_room_prior=True)
-    assert evaluated.report["notes"] == [*expected_notes, budget_note(evaluated.report["run"]["budget"])]
+    share_notes = decision_share_notes(evaluated.report["decision_shares"])
+    budget = budget_note(evaluated.report["run"]["budget"])
+    assert evaluated.report["notes"] == [*expected_notes, *share_notes, budget]
     assert any("receive the room type" in note for note in expected_notes)
     assert expected_notes != evaluation_notes(evaluated.rows, success_rates, evaluated.episodes, has_room_prior=False)
 
