@@ -342,7 +342,8 @@ def infer_and_act(
     memory = policy_memory(agent)
     pathways = policy.pathways(inputs, memory)
 
-    # Replace a part of the decision by that of another episode.
+    # Replace a part of the decision, or of the counterfactual decision alone, by that of another episode.
+    counterfactual_pathways, counterfactual_memory = pathways, memory
     if replaced_parts:
         assert isinstance(policy, Policy)
         replace = functools.partial(
@@ -357,7 +358,12 @@ def infer_and_act(
             knowledge=knowledge,
             env_params=env_params,
         )
-        pathways, memory = select_part(replaced_parts, config.replaced, replace)
+        counterfactual_pathways, counterfactual_memory = select_part(replaced_parts, config.replaced, replace)
+        pathways, memory = jax.tree.map(
+            functools.partial(jnp.where, config.replaces_factual),
+            (counterfactual_pathways, counterfactual_memory),
+            (pathways, memory),
+        )
     decision = policy.decide(pathways, memory)
 
     # Remove experience (eqs. 1, 2).
@@ -365,7 +371,13 @@ def infer_and_act(
     gap = agent_loop.layout_gap(agent)
     if can_remove:
         removed_logits = logits_to_remove(
-            config, policy, pathways, memory, episode_keys, step_keys, has_controls=has_controls
+            config,
+            policy,
+            counterfactual_pathways,
+            counterfactual_memory,
+            episode_keys,
+            step_keys,
+            has_controls=has_controls,
         )
         gap = select_gap(config, gap, running, episode_keys, agent.state.time)
         logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap)

@@ -75,6 +75,7 @@ class InferenceConfig(struct.PyTreeNode):
         sTDE.
       removed: int32, a `RemovedLogits`.
       replaced: int32, a `ReplacedPart` (`jaxnav.evaluation.interventions`), replaced at every step.
+      replaces_factual: bool, False to replace the part in the counterfactual decision alone.
       max_room_episodes: int32, number of episodes of each room type that the entry runs, the first in the list; the
         outcomes of the remaining ones are 0.
     """
@@ -93,6 +94,7 @@ class InferenceConfig(struct.PyTreeNode):
     intervention: jax.Array
     removed: jax.Array
     replaced: jax.Array
+    replaces_factual: jax.Array
     max_room_episodes: jax.Array
 
 

@@ -176,5 +176,6 @@ def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: i
         intervention=jnp.float32(0.0),
         removed=jnp.int32(RemovedLogits.COUNTERFACTUAL),
         replaced=jnp.int32(ReplacedPart.NONE),
+        replaces_factual=jnp.bool_(True),
         max_room_episodes=jnp.int32(MAX_EPISODES),
     )

@@ -51,6 +51,14 @@ CLOCK_TIMES = (0.1, 0.25, 0.5)
 ORACLE_NAME = "oracle removal"
 
 
+#: Controls of complete removal: the removed logits are counterfactual logits with a part of another episode.
+HARD_CONTROLS: Mapping[str, TrialControl] = {
+    "TDE, other categories of another episode": "other_categories",
+    "TDE, experience of another episode": "other_experience",
+    "TDE, memory of another episode": "other_memory",
+}
+
+
 class RemovalRule(NamedTuple):
     """A rule of soft removal.
 
@@ -187,6 +195,13 @@ def _measure_removals(
     yield from report.removal_rows(ORACLE_NAME, metrics.oracle_removal(outcomes[plain_trial], outcomes[hard_trial]))
     for name, outcome in outcome_by_clock.items():
         yield from report.removal_rows(name, outcome)
+
+    # Complete removal with counterfactual logits that know nothing of a part of this episode.
+    if direct_policy == "own":
+        control_trials = {name: Trial("tde", decoding, control=control) for name, control in HARD_CONTROLS.items()}
+        control_outcomes = runner.run_trials(evaluated_run, estimator, control_trials.values())
+        for name, trial in control_trials.items():
+            yield from report.removal_rows(name, control_outcomes[trial])
 
     # A counterfactual memory of its own is compared with the factual one.
     if direct_policy == "own" and policies.spec.counterfactual_memory == "own":

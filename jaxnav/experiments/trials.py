@@ -18,6 +18,7 @@ from jaxnav.choices import Decoding, Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
+from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.evaluation.statistics import Interval, SharedDesign, mean_interval, paired_difference
@@ -36,8 +37,17 @@ from jaxnav.runs.worlds import CompiledWorld
 #: are 1 after or until a step, and 0 at other times.
 GapSchedule = Literal["course", "after", "until"]
 #: Modification of sTDE by a control. The gap: that of another episode (`shuffled`), or `constant`, such that the weight
-#: is its mean at every step. The removed logits: `zeros` or `noise`. The intervention: `random` instead of zero.
-TrialControl = Literal["shuffled", "constant", "zeros", "noise", "random"]
+#: is its mean at every step. The removed logits: `zeros`, `noise`, or counterfactual logits with a part of another
+#: episode (`REPLACED_PARTS`). The intervention: `random` instead of zero.
+TrialControl = Literal[
+    "shuffled", "constant", "zeros", "noise", "random", "other_categories", "other_experience", "other_memory"
+]
+#: Part of the counterfactual decision that a control takes from another episode.
+REPLACED_PARTS: Mapping[str, ReplacedPart] = {
+    "other_categories": ReplacedPart.OTHERS,
+    "other_experience": ReplacedPart.EXPERIENCE,
+    "other_memory": ReplacedPart.MEMORY,
+}
 TrialVariant = Literal["baseline", "layout", "tde", "stde"]
 
 DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
@@ -129,6 +139,9 @@ class Trial:
                 return {"removed": jnp.int32(RemovedLogits.NOISE)}
             case "random":
                 return {"intervention": jnp.float32(1.0)}
+            case "other_categories" | "other_experience" | "other_memory":
+                part = REPLACED_PARTS[self.control]
+                return {"replaced": jnp.int32(part), "replaces_factual": jnp.bool_(False)}
             case None:
                 return {}
 
@@ -183,7 +196,7 @@ class TrialRunner:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self._evaluators: dict[AgentLoop, Evaluator] = {}
+        self._evaluators: dict[tuple[AgentLoop, tuple[ReplacedPart, ...]], Evaluator] = {}
 
     def run_trials(
         self, evaluated_run: EvaluatedRun, estimator: EstimatorConfig | None, trials: Iterable[Trial]
@@ -193,14 +206,17 @@ class TrialRunner:
         Raises:
           InputError: the method cannot act in the scenes.
         """
-        # An evaluator compiles once, so trials with the same agent loop share it.
+        # An evaluator compiles once, so trials with the same agent loop and replaced parts share it.
         policies, world, episodes = evaluated_run
         num_seeds = policies.num_seeds
         agent_loop = policies._replace(estimator_config=estimator).make_agent_loop(world)
-        evaluator = self._evaluators.setdefault(agent_loop, Evaluator(agent_loop))
-        env_params = world.make_env_params(0)
-
         distinct_trials = list(dict.fromkeys(trials))
+        controls = {trial.control for trial in distinct_trials}
+        replaced_parts = tuple(part for control, part in REPLACED_PARTS.items() if control in controls)
+        evaluator = self._evaluators.setdefault(
+            (agent_loop, replaced_parts), Evaluator(agent_loop, replaced_parts=replaced_parts)
+        )
+        env_params = world.make_env_params(0)
         outcomes: dict[Trial, EpisodeOutcome] = {}
         for start in range(0, len(distinct_trials), self.BLOCK_SIZE):
             # The last block repeats its last trial up to the full size.

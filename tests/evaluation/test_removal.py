@@ -13,8 +13,9 @@ from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_st
 from jaxnav.causal import do
 from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.evaluation.episodes import draw_episodes
-from jaxnav.evaluation.grid import start_states
-from jaxnav.evaluation.removal import GapSource, RemovedLogits, logits_to_remove, select_gap
+from jaxnav.evaluation.grid import infer_and_act, start_states
+from jaxnav.evaluation.interventions import ReplacedPart
+from jaxnav.evaluation.removal import GapSource, RemovedLogits, logits_to_remove, other_running_episode, select_gap
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState
@@ -100,6 +101,50 @@ def test_noise_control_has_the_spread_of_the_counterfactual_logits(agent):
     # 48 episodes of 6 actions: 288 independent draws.
     assert kstest(standard.ravel(), "norm").pvalue > 0.01
     assert abs(np.corrcoef(np.asarray(result).ravel(), np.asarray(counterfactual).ravel())[0, 1]) < 0.2
+
+
+@pytest.mark.parametrize("part", [ReplacedPart.EXPERIENCE, ReplacedPart.MEMORY])
+def test_controls_take_a_part_of_the_counterfactual_decision_from_another_episode(agent, part):
+    """The factual decision stays, and the removed logits are those with the partner's part."""
+    running = np.arange(NUM_EPISODES) % 3 > 0
+    cell = make_cell("tde", replaced=part, replaces_factual=False)
+
+    @jax.jit
+    def infer(cell, agent):
+        return infer_and_act(
+            cell,
+            AGENT_LOOP.bind(WEIGHTS),
+            agent,
+            jnp.asarray(running),
+            EPISODE_KEYS,
+            agent_loop=AGENT_LOOP,
+            env_params=PARAMS,
+            knowledge=KNOWLEDGE,
+            replaced_parts=(ReplacedPart.EXPERIENCE, ReplacedPart.MEMORY),
+        )[2]
+
+    trace = infer(cell, agent)
+    plain_trace = infer(make_cell("tde"), agent)
+    np.testing.assert_array_equal(trace.factual_logits, plain_trace.factual_logits)
+    np.testing.assert_allclose(trace.action_logits, trace.factual_logits - trace.removed_logits, atol=1e-6)
+
+    policy = AGENT_LOOP.bind(WEIGHTS)
+    pathways = policy.pathways(AGENT_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS), agent.memory)
+    without_direct = do(pathways, scene=0.0, goal=0.0)
+    partner = np.asarray(other_running_episode(jnp.asarray(running), EPISODE_KEYS))
+    memory = agent.memory
+    if part == ReplacedPart.EXPERIENCE:
+        without_direct = without_direct._replace(experience=pathways.experience[partner])
+    else:
+        memory = jax.tree.map(lambda leaf: leaf[partner], memory)
+    expected = policy.decide(without_direct, memory).logits
+    np.testing.assert_allclose(trace.removed_logits[running], expected[running], rtol=1e-4, atol=1e-5)
+    assert np.abs(trace.removed_logits - plain_trace.removed_logits)[running].max() > 0.01
+
+    # Without the restriction, the factual decision changes too.
+    both_trace = infer(make_cell("tde", replaced=part), agent)
+    np.testing.assert_allclose(both_trace.removed_logits, trace.removed_logits, rtol=1e-5, atol=1e-6)
+    assert np.abs(both_trace.factual_logits - trace.factual_logits)[running].max() > 0.01
 
 
 class ConcatenatingPolicy:

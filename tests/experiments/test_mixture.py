@@ -12,6 +12,7 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.mixture import (
+    HARD_CONTROLS,
     LAYOUT_BLIND,
     ORACLE_NAME,
     REMOVAL_RULES,
@@ -167,11 +168,12 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
     assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
     assert {row.scenes for row in table.rows} == {4}
 
-    # TDE and the oracle, then nine clocks, then the rules.
+    # TDE and the oracle, then nine clocks, three controls of TDE, and the rules.
     removals = table.distinct("variant", row_fields, reference=WITHOUT_REMOVAL)
     assert removals[:2] == ["TDE", ORACLE_NAME]
     assert removals[-2:] == [str(rule) for rule in rules]
-    assert len(removals) == 2 + 9 + 2
+    assert len(removals) == 2 + 9 + 3 + 2
+    assert removals[-5:-2] == list(HARD_CONTROLS)
 
     # The oracle removes nothing at the first shift, and all experience at the last.
     for shift, weight in ((0.0, 0.0), (1.0, 1.0)):
@@ -203,7 +205,7 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
     for rule, own_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
         controls = table.distinct("control", row_fields, variant=str(rule), reference="control")
         assert controls[:-1] == own_controls
-        assert controls[-1] in removals[2:-2]
+        assert controls[-1] in removals[2:-5]
 
 
 @pytest.mark.slow
@@ -221,11 +223,13 @@ def test_handover_leaves_the_layout_blind_agents(bench):
 
 
 @pytest.mark.slow
-def test_cde_leaves_the_network_without_experience(make_bench, config, tmp_path_factory):
-    """All of it: two agents whose networks lack the same experience are alike under CDE, and only there."""
-    dropping_config = dataclasses.replace(config, run_dir=tmp_path_factory.mktemp("dropping") / "run")
+def test_cde_leaves_the_network_without_experience(make_bench, drawn_run, tmp_path_factory):
+    config = drawn_run.config
     dropping_config = dataclasses.replace(
-        dropping_config, counterfactual_memory="own", ppo=dataclasses.replace(config.ppo, experience=0.8)
+        config,
+        run_dir=tmp_path_factory.mktemp("dropping") / "run",
+        counterfactual_memory="own",
+        ppo=dataclasses.replace(config.ppo, experience=0.8),
     )
     run = {"run": str(draw_run(dropping_config).config.run_dir)}
     bench = make_bench(agents={"main": run, "anonymous": run}, shifts=(0.0, 1.0), episodes=8)

@@ -15,6 +15,7 @@ from support.intervals import around, bounds
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
+from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, RemovedLogits
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.evaluation.variants import inference_grid, table_rows
@@ -89,6 +90,9 @@ def test_controls_change_the_cells_of_stde_and_nothing_else():
         "zeros": {"removed": RemovedLogits.ZEROS},
         "noise": {"removed": RemovedLogits.NOISE},
         "random": {"intervention": 1.0},
+        "other_categories": {"replaced": ReplacedPart.OTHERS, "replaces_factual": False},
+        "other_experience": {"replaced": ReplacedPart.EXPERIENCE, "replaces_factual": False},
+        "other_memory": {"replaced": ReplacedPart.MEMORY, "replaces_factual": False},
     }
     assert set(changed_fields) == {*get_args(TrialControl), *get_args(GapSchedule)}
     for control, changes in changed_fields.items():
