@@ -859,7 +859,7 @@ class Learner:
         learning_rate = scalars.learning_rate * (1.0 - progress)
         entropy_change = scalars.final_entropy_weight - scalars.entropy_weight
         scalars = scalars.replace(entropy_weight=scalars.entropy_weight + progress * entropy_change)
-        if scalars.guidance_weight is not None:
+        if scalars.guidance_weight is not None and scalars.final_guidance_weight is not None:
             guidance_change = scalars.final_guidance_weight - scalars.guidance_weight
             scalars = scalars.replace(guidance_weight=scalars.guidance_weight + progress * guidance_change)
 

@@ -214,8 +214,10 @@ class TwinPolicy:
         scene = relu(linear(params["view"], np.concatenate(scene_inputs)))
         goal = self._embed_goal(features)
         appearance = params["known_appearance" if self.has_streams else "appearance"]["embedding"]
-        known = self._scale_boxes(features)
-        experience = self.method.encode(params.get("method", {}), known, appearance, weights, reading, memory)
+        experience_features = self._scale_boxes(features)
+        experience = self.method.encode(
+            params.get("method", {}), experience_features, appearance, weights, reading, memory
+        )
 
         decide = self._decide_in_streams if self.has_streams else self._decide_fused
         return decide(scene, goal, experience, memory, reading)
