@@ -216,16 +216,20 @@ def test_decisions_with_scaled_weights_are_the_twins(method, weight_kind):
     assert max(max(errors) for errors in result.errors.values()) < TOLERANCE
 
     # A twin with raw weights has other logits.
-    raw_weights = type("RawWeights", (TWINS[method],), {"encode": encode_with_raw_weights})
-    mistaken = compare(method, "fused", row, episodes, raw_weights, weight_kind=weight_kind)
+    mistaken = compare(method, "fused", row, episodes, weights_of_sum_one(method), weight_kind=weight_kind)
     assert max(mistaken.errors["factual_logits"]) > 10 * TOLERANCE
 
 
-def encode_with_raw_weights(self, params, features, appearance, weights, reading, memory):
-    """Encode with weights off the goal that sum to 1."""
-    is_goal = features.goal > 0
-    raw_weights = np.where(is_goal, weights, weights / weights[~is_goal].sum())
-    return super(type(self), self).encode(params, features, appearance, raw_weights, reading, memory)
+def weights_of_sum_one(method: str) -> type[TwinMethod]:
+    """Make a twin whose layout weights off the goal add up to 1, as raw weights nearly do."""
+
+    class Raw(TWINS[method]):
+        def encode(self, params, features, appearance, weights, reading, memory):
+            is_goal = features.goal > 0
+            raw_weights = np.where(is_goal, weights, weights / weights[~is_goal].sum())
+            return super().encode(params, features, appearance, raw_weights, reading, memory)
+
+    return Raw
 
 
 @pytest.mark.parametrize("strength", [5.0, None])
