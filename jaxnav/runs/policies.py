@@ -23,8 +23,9 @@ from jaxnav.gaps import CooccurrenceEvidence
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.policies.adaptation import limit_inner_steps
 from jaxnav.policies.agent_loop import AgentLoop, Perception
-from jaxnav.policies.method import Knowledge, Percept
+from jaxnav.policies.method import Knowledge, Method, Percept
 from jaxnav.policies.methods import find_method
+from jaxnav.policies.methods.org import ObjectRelations
 from jaxnav.policies.network import Params, bind, init_params
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.runs.config import LayoutConfig, RunConfig
@@ -348,6 +349,7 @@ def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) 
     try:
         # The specification decides which arrays there must be.
         method = find_method(fields["method"])
+        _refuse_former_relations(method, fields)
         if method.learn is not None and "knowledge" not in arrays:
             raise InputError(f"the statistics of method {fields['method']!r} are missing; train the run again")
         policy_spec = PolicySpec.from_json(fields, method, len(fields["categories"]))
@@ -389,6 +391,23 @@ def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) 
         raise InputError(
             f"{folder}: its spec does not fit this code ({type(error).__name__}: {error}); train the run again"
         ) from error
+
+
+def _refuse_former_relations(method: Method, fields: Mapping[str, Any]) -> None:
+    """Refuse a policy that was trained while ORG's relation matrix was not transposed (jaxnav 0.3 and earlier).
+
+    Its arrays fit this code, so that without a refusal the policy would load and decide differently.
+
+    Raises:
+      InputError: the method computes ORG's relations, and the specification is of jaxnav 0.3 or earlier.
+    """
+    # Exports have the kind of the layout weights since 0.4.
+    is_earlier_export = "weight_kind" not in fields
+    if is_earlier_export and issubclass(method.experience, ObjectRelations):
+        raise InputError(
+            "was trained before jaxnav 0.4, which corrected the relations of org; "
+            "train it again, or use it with jaxnav 0.3"
+        )
 
 
 def check_arrays(folder: Path, arrays: Mapping[str, Any], spec: PolicySpec) -> None:

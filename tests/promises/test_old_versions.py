@@ -1,26 +1,42 @@
-"""What version 0.2 wrote is read, or refused by name; what 0.1 wrote is refused; both are left as they are.
+"""What earlier versions wrote is read, or refused by name, and is left as it is.
 
 `tests/data` holds what is refused of a run of version 0.1.0 (settings, log, a policy without its arrays), and a run of
-0.2.0 with an evaluation: two chunks of a tiny policy, as `train.py` of that version left them.
+0.2.0 with an evaluation: two chunks of a tiny policy of ORG, as `train.py` of that version left them.
 """
 
 import json
+import shutil
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from support.commands import contents, evaluate, refusal, train
-from support.tiny_run import write_config
+from support.mutations import resigned
+from support.tiny_run import DRAWN_ESTIMATOR, tiny_config, write_config
+from support.tiny_world import random_params
 
 import jaxnav
 from jaxnav.cli import log as log_command
+from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.errors import InputError
+from jaxnav.policies.method import Knowledge
+from jaxnav.policies.spec import WeightKind
+from jaxnav.runs.config import LayoutConfig
+from jaxnav.runs.policies import PACKAGED_POLICIES, export_policy
+from jaxnav.runs.run import load_run_config
+from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.store import checkpoint
 from jaxnav.store.files import make_manifest, read_log_rows
+from jaxnav.training.calibration import Exploration, layout_priors
 
 DATA = Path(__file__).parents[1] / "data"
+REFUSED_RELATIONS = (
+    "was trained before jaxnav 0.4, which corrected the relations of org; train it again, or use it with jaxnav 0.3"
+)
 REFUSED = "written by jaxnav 0.1; train again, or read it with jaxnav 0.1"
 
 
@@ -100,29 +116,98 @@ def test_restore_refuses_a_checkpoint_of_0_1(tmp_path, monkeypatch):
 # Version 0.2
 
 
-def test_run_of_0_2_is_evaluated_as_by_that_version(run_of_0_2, tmp_path):
-    before = json.loads((run_of_0_2 / "eval-val.json").read_text())
-    assert evaluate(run_of_0_2, "--episodes", 24, "--json", tmp_path / "new.json") == 0
-    after = json.loads((tmp_path / "new.json").read_text())
-    assert after.keys() == before.keys()
-    assert [(row["variant"], row["decoding"]) for row in after["rows"]] == [
-        (row["variant"], row["decoding"]) for row in before["rows"]
-    ]
-    # Another processor rounds otherwise, which may change single episodes of 24.
-    for row_before, row_after in zip(before["rows"], after["rows"], strict=True):
-        assert row_after["sr"]["mean"] == pytest.approx(row_before["sr"]["mean"], abs=100 * 3 / 24)
-
-
-def test_policies_logs_and_reports_of_0_2_are_read(run_of_0_2, capsys):
-    assert jaxnav.load_policy(run_of_0_2 / "policies" / "layout-0").spec.method.name == "org"
+def test_settings_logs_and_reports_of_0_2_are_read(run_of_0_2, capsys):
+    config = load_run_config(run_of_0_2)
+    assert (config.method, config.direct, config.layout.weights, config.ppo.guidance) == ("org", "all", "raw", 0.0)
     assert [row["step"] for row in read_log_rows(run_of_0_2 / "metrics.jsonl") if row["arm"] == "layout"] == [2, 4]
     assert evaluate(run_of_0_2 / "eval-val.json", "--format", "markdown") == 0
     assert "| + w (layout) |" in capsys.readouterr().out
 
 
+def test_eval_refuses_a_run_of_0_2_with_former_relations_and_leaves_it_unchanged(run_of_0_2, capsys):
+    before = contents(run_of_0_2)
+    assert evaluate(run_of_0_2) == 2
+    assert refusal(capsys) == f"error: {run_of_0_2}/policies/baseline-0: {REFUSED_RELATIONS}"
+    assert contents(run_of_0_2) == before
+
+
 def test_train_refuses_a_checkpoint_of_0_2_by_its_version(run_of_0_2, tmp_path, capsys):
     before = contents(run_of_0_2)
-    assert train(write_config(tmp_path, num_seeds=1), run_of_0_2) == 2
+    settings_of_0_2 = ("--direct", "all", "--layout.weights", "raw")
+    assert train(write_config(tmp_path, num_seeds=1), run_of_0_2, *settings_of_0_2) == 2
     assert "has format version 1, this code reads version 2; use the jaxnav that wrote it (0.2.0)" in refusal(capsys)
     after = contents(run_of_0_2)
     assert {name: after[name] for name in before} == before
+
+
+# Policies of version 0.3
+
+
+def remove_new_fields(policy_file: Path, **changes: Any) -> None:
+    """Turn the description of an export into one of version 0.3, which lacks the fields of later versions."""
+    with resigned(policy_file) as policy:
+        spec = policy["spec"]
+        for name in ("weight_kind", "experience_dropout", "counterfactual_memory"):
+            del spec[name]
+        del spec["task"]["instance_counts"]
+        if spec["layout"] is not None:
+            del spec["layout"]["counts"]
+        spec |= changes
+
+
+def test_load_policy_refuses_a_policy_of_0_2_with_former_relations(run_of_0_2):
+    folder = run_of_0_2 / "policies" / "layout-0"
+    with pytest.raises(InputError) as refused:
+        jaxnav.load_policy(folder)
+    assert str(refused.value) == f"{folder}: {REFUSED_RELATIONS}"
+
+
+@pytest.mark.parametrize("method", ["org", "hoz", "tpn", "support.methods:STEPWISE"])
+def test_load_policy_refuses_former_relations_of_every_method(tmp_path, method):
+    """The packaged policy, which loads, as 0.3 would have described it."""
+    folder = shutil.copytree(PACKAGED_POLICIES / "rooms-org", tmp_path / "policy")
+    assert jaxnav.load_policy(folder).spec.method.name == "org"
+    remove_new_fields(folder / "policy.json", method=method)
+    with pytest.raises(InputError) as refused:
+        jaxnav.load_policy(folder)
+    assert str(refused.value) == f"{folder}: {REFUSED_RELATIONS}"
+
+
+def export_tiny_policy(folder: Path, method: str, weight_kind: WeightKind) -> Path:
+    """Export a random policy that sees all categories directly, with statistics where its method has some."""
+    layout = LayoutConfig(weights=weight_kind)
+    config = tiny_config(folder, method=method, method_sizes={}, direct="all", layout=layout)
+    num_categories = len(config.task.categories)
+    spec = config.policy_spec(num_categories)
+
+    # Statistics that no training learned, with the shapes of those that a training learns.
+    counts = jnp.ones((NUM_PRIORS, num_categories, num_categories))
+    learned = {"mixing": jnp.eye(num_categories)} if spec.method.learn is not None else {}
+    knowledge = Knowledge(layout_priors(counts, DRAWN_ESTIMATOR), learned)
+    exploration = Exploration(counts, counts, jnp.int32(1280), jnp.int32(600))
+    export_policy(folder / "policy", config, random_params(0, spec), knowledge, DRAWN_ESTIMATOR, exploration)
+    return folder / "policy"
+
+
+def decide_once(policy: jaxnav.LoadedPolicy) -> jax.Array:
+    """Logits float32 [A] for a random observation row, in which many categories are detected."""
+    num_bytes = RowFormat(policy.spec.num_categories).num_bytes
+    row = jax.random.randint(jax.random.key(0), (num_bytes,), 0, 256).astype(jnp.uint8)
+    observation = Observation(row, goal=jnp.int32(1))
+    return policy.decide(observation, policy.init("kitchen"), heading=0, moved=False, horizon=0).logits
+
+
+@pytest.mark.parametrize("method", ["rgb", "anonymous", "sp"])
+def test_policies_of_0_3_of_other_methods_keep_their_meaning(tmp_path, method):
+    folder = export_tiny_policy(tmp_path / "raw", method, "raw")
+    new_policy = jaxnav.load_policy(folder)
+    remove_new_fields(folder / "policy.json")
+    old_policy = jaxnav.load_policy(folder)
+    assert old_policy.spec == new_policy.spec
+    assert (old_policy.spec.weight_kind, old_policy.spec.direct) == ("raw", "all")
+    np.testing.assert_array_equal(decide_once(old_policy), decide_once(new_policy))
+
+    # Control: where a method has experience, another kind of weights decides otherwise.
+    if method == "sp":
+        relative_policy = jaxnav.load_policy(export_tiny_policy(tmp_path / "relative", method, "relative"))
+        assert (decide_once(old_policy) != decide_once(relative_policy)).any()
