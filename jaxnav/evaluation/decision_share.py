@@ -27,12 +27,18 @@ from jaxnav.policies.network import Params, Policy
 
 #: Smallest KL divergence, in nats, of a decision that counts as changed.
 MIN_KL = 0.02
+#: Steps, in units of the interval, after which interventions become half as frequent, and how often they do.
+_STEPS_PER_HALVING = 32
+_MAX_HALVINGS = 3
 #: Number of running episodes below which nothing is counted: an episode and two different partners.
 _MIN_RUNNING = 3
 
 
 class ShareCounts(NamedTuple):
     """Numbers of decisions by episode, leaves [..., E] and [..., E, P] for P parts.
+
+    Late steps, at which few episodes still run, are intervened on more rarely; a decision counts as often as the steps
+    that it stands for.
 
     Attributes:
       decisions: int32 [..., E], decisions that were intervened on.
@@ -144,11 +150,14 @@ class ShareProbe:
         Args:
           agent_loop: environment, policy specification and layout estimator, without a fallback.
           parts: the P parts to replace.
-          interval: steps from one intervention to the next.
+          interval: steps from one intervention to the next in the early part of an episode.
         """
         self._agent_loop = agent_loop
         self._parts = tuple(parts)
-        self._interval = interval
+        # Macro-actions have few decision steps, so all of them are intervened on.
+        has_macro_actions = agent_loop.method is not None and agent_loop.method.control.interval > 1
+        self._interval = 1 if has_macro_actions else interval
+        self._max_halvings = 0 if has_macro_actions else _MAX_HALVINGS
         self._compiled_run = jax.jit(self._run_grid)
 
     def __call__(
@@ -203,16 +212,13 @@ class ShareProbe:
         knowledge: Knowledge,
         key: jax.Array,
     ) -> ShareCounts:
-        """Run the episodes of one entry, and intervene at every `interval`-th step."""
+        """Run the episodes of one entry, and intervene at some of its steps."""
         agent_loop = self._agent_loop
         num_episodes = len(initial_states.pose)
         episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes))
         shared_arguments = {"agent_loop": agent_loop, "env_params": env_params, "knowledge": knowledge}
 
-        def intervene(agent: Agent, running: jax.Array) -> ShareCounts:
-            # Only decisions that take effect count.
-            is_decision_step = agent_loop.is_decision_step(agent)
-            counted = running if is_decision_step is None else running & is_decision_step
+        def intervene(agent: Agent, running: jax.Array, counted: jax.Array) -> ShareCounts:
             partners = (
                 other_running_episode(running, episode_keys, distance=1),
                 other_running_episode(running, episode_keys, distance=2),
@@ -220,15 +226,24 @@ class ShareProbe:
             return count_changes(config, policy, agent, counted, partners, parts=self._parts, **shared_arguments)
 
         def step(carry: tuple[Agent, jax.Array, jax.Array, ShareCounts]):
+            # Only decisions that take effect count.
             agent, running, time, counts = carry
+            is_decision_step = agent_loop.is_decision_step(agent)
+            counted = running if is_decision_step is None else running & is_decision_step
+
+            # Intervene at every `num_steps`-th step.
+            num_halvings = jnp.minimum(time // (_STEPS_PER_HALVING * self._interval), self._max_halvings)
+            num_steps = self._interval * 2**num_halvings
             new_counts = jax.lax.cond(
-                time % self._interval == 0,
+                (time % num_steps == 0) & counted.any(),
                 intervene,
                 lambda *_: jax.tree.map(jnp.zeros_like, counts),
                 agent,
                 running,
+                counted,
             )
-            counts = jax.tree.map(jnp.add, counts, new_counts)
+            weight = num_steps // self._interval
+            counts = jax.tree.map(lambda total, new: total + weight * new, counts, new_counts)
 
             # The factual decision acts. Ended episodes keep their agent.
             next_agent, result, _ = infer_and_act(
