@@ -7,6 +7,7 @@ per host and kind in rooms, acts with sampled actions in val scenes, and measure
   moved N       mean relative change of w x g from the prior to the N-th step, over the same categories
   others / Z    share of the change of the recurrent core's input that other categories make: mean square of the change
                 when the other categories in Z become those of another episode, over that when all of Z does
+  untrained     the same share of a policy before training
   Z / all       mean square of the change when Z becomes that of another episode, over that when all pathways do
 
 Runs are stored in FOLDER, by default a temporary one, and a repeated command uses those that are finished. The result
@@ -32,7 +33,7 @@ from jaxnav.evaluation.removal import other_running_episode
 from jaxnav.layout import scale_weights
 from jaxnav.numerics.trees import take_rows
 from jaxnav.policies.agent_loop import policy_memory
-from jaxnav.policies.network import Policy
+from jaxnav.policies.network import Policy, init_params
 from jaxnav.policies.pathways import Pathways
 from jaxnav.policies.spec import WeightKind
 from jaxnav.runs.policies import Policies
@@ -64,7 +65,11 @@ def main(folder: Path, hosts: list[str], total_steps: int) -> None:
             )
             run = jaxnav.train(config)
             world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
-            rows.append({"host": host, "weights": weight_kind} | measure(run.policies(), world))
+            policies = run.policies()
+            fresh_params = init_params(policies.spec, jax.random.key(0))
+            untrained = policies._replace(params=jax.tree.map(lambda leaf: leaf[None], fresh_params))
+            row = {"host": host, "weights": weight_kind} | measure(policies, world)
+            rows.append(row | {"untrained": measure(untrained, world)["others / Z"]})
             print(rows[-1], file=sys.stderr, flush=True)
     print(format_table(rows), file=sys.stderr)
     print_report({"total_steps": total_steps, "rows": rows})
