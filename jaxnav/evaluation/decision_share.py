@@ -276,12 +276,14 @@ def share_interval(counted: np.ndarray, decisions: np.ndarray, scenes: Clusters)
     runs = run_clusters(1, len(decisions))
     counted_replicates = runs.weights.T @ counted @ scenes.weights
     decision_replicates = runs.weights.T @ decisions @ scenes.weights
-    if not (decision_replicates > 0).all():
+    if not decisions.any():
         return Interval(float("nan"))
+    # Leaving out the only run leaves no decision; `jackknife_interval` then ignores the replicate.
+    share_replicates = 100.0 * counted_replicates / np.maximum(decision_replicates, np.finfo(float).tiny)
 
     seed_shares = 100.0 * counted.sum(axis=1) / np.maximum(decisions.sum(axis=1), 1)
     return jackknife_interval(
-        100.0 * counted_replicates / decision_replicates,
+        share_replicates,
         scenes,
         runs,
         std=float(seed_shares.std(ddof=1)) if len(seed_shares) > 1 else float("nan"),

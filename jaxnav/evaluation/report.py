@@ -317,7 +317,7 @@ def _share_cells(entry: dict[str, Any]) -> list[str]:
     cost = entry["cost"]
     cells = [
         f"{Interval.from_json(entry['share']):.1f}",
-        "" if floor is None else f"{Interval.from_json(floor).mean:.1f}",
+        "" if floor is None else f"{Interval.from_json(floor):.1f}".partition(" ")[0],
     ]
     for metric in ("spl", "sr"):
         cells.append("" if cost is None else f"{Interval.from_json(cost[metric]):+.1f}")

@@ -178,6 +178,10 @@ def test_share_interval_pools_decisions():
     share = share_interval(counted, decisions, EPISODES.take(np.array([0, 1, 12])).clusters())
     assert share.mean == pytest.approx(20.0)
     assert share.seeds == pytest.approx((10.0, 25.0))
+    # A single run has a share without an interval.
+    single_run = share_interval(counted[:1], decisions[:1], EPISODES.take(np.arange(3)).clusters())
+    assert single_run.mean == pytest.approx(10.0)
+    assert not single_run.has_bounds
     assert math.isnan(share_interval(counted, 0 * decisions, EPISODES.take(np.arange(3)).clusters()).mean)
 
 

@@ -114,6 +114,12 @@ def test_decision_shares_stand_below_the_table():
     assert "| ORG (baseline) | w (uniform instead) | argmax | 0.5 [-] |  |  |  |" in lines
     assert report_tables.decision_share_table(report).row_count == 3  # with the heading of the row
 
+    # Without decisions, share and floor are undefined.
+    entry = make_share("memory", 0.0, 0.0, None)
+    entry["share"]["mean"] = entry["floor"]["mean"] = None
+    undefined_report = report | {"decision_shares": [entry]}
+    assert "| ORG (baseline) | memory | argmax | - | - |  |  |" in report_tables.markdown_table(undefined_report)
+
 
 def test_reports_of_earlier_versions_have_no_shares():
     report = fixed_report(fixed_row())
