@@ -67,7 +67,7 @@ def set_up_training(config: RunConfig, mesh: Mesh | None = None, explore: bool =
     else:
         num_categories = len(world.env.categories)
         counts = jnp.zeros((NUM_PRIORS, num_categories, num_categories))
-        exploration = Exploration(counts, jnp.int32(0), jnp.int32(0))
+        exploration = Exploration(counts, counts, jnp.int32(0), jnp.int32(0))
 
     # The trainer compiles each arm on its first update.
     knowledge = learn_knowledge(config, world, exploration, estimator_config)

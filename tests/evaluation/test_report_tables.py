@@ -116,7 +116,10 @@ def test_decision_shares_stand_below_the_table():
 
     # Without decisions, share and floor are undefined.
     entry = make_share("memory", 0.0, 0.0, None)
-    entry["share"]["mean"] = entry["floor"]["mean"] = None
+    for name in ("share", "floor"):
+        interval = entry[name]
+        assert isinstance(interval, dict)
+        interval["mean"] = None
     undefined_report = report | {"decision_shares": [entry]}
     assert "| ORG (baseline) | memory | argmax | - | - |  |  |" in report_tables.markdown_table(undefined_report)
 

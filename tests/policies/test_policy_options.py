@@ -190,7 +190,7 @@ def encode_experience(weight_kind, observation, layout_weights):
 
 def test_relative_weights_enter_as_raw_weights_that_were_scaled():
     observation = with_detections(detections(SEEN, SEEN))
-    raw_weights = np.tile(np.float32([0.1, 0.3, 0.2]), (BATCH, 1))
+    raw_weights = np.tile(np.array([0.1, 0.3, 0.2], np.float32), (BATCH, 1))
     raw_weights[np.arange(BATCH), GOAL] = 1.0
     # Two categories off the goal: each over the mean of both.
     scaled_weights = raw_weights.copy()
