@@ -22,7 +22,9 @@ from jaxnav.training.calibration import Exploration
 
 @pytest.fixture(scope="module")
 def streams(config):
-    return check_config(dataclasses.replace(config, decision="streams"))
+    # The default of `ppo.experience` depends on the decision.
+    ppo = dataclasses.replace(config.ppo, experience=None)
+    return check_config(dataclasses.replace(config, decision="streams", ppo=ppo))
 
 
 def test_stream_config_disables_counterfactual_training(streams):
@@ -30,7 +32,7 @@ def test_stream_config_disables_counterfactual_training(streams):
     spec = streams.policy_spec(9)
     assert (spec.decision, spec.direct) == ("streams", "goal")
     fused = check_config(RunConfig())
-    assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "all", "distil")
+    assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "goal", "distil")
 
 
 def test_exported_stream_policy_acts(drawn_run, streams, tmp_path):

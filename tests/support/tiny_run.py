@@ -17,7 +17,7 @@ from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.gaps import CooccurrenceEvidence
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.policies.method import Knowledge
-from jaxnav.runs.config import RunConfig
+from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_yaml
 from jaxnav.runs.policies import POLICIES_DIR, export_policy
 from jaxnav.runs.run import Run, claim_run_dir
@@ -58,7 +58,7 @@ def tiny_config(folder: Path, **changes: Any) -> RunConfig:
     """Return the settings of the tiny run, with changes, for the run directory `folder / "run"`."""
     folder.mkdir(exist_ok=True)
     config = apply_yaml(RunConfig(), write_config(folder))
-    return dataclasses.replace(config, run_dir=folder / "run", **changes)
+    return check_config(dataclasses.replace(config, run_dir=folder / "run", **changes))
 
 
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
