@@ -145,6 +145,7 @@ def test_replacing_a_part_by_oneself_changes_nothing(part):
         chex.assert_trees_all_equal(replaced, factual)
 
 
+@pytest.mark.slow
 def test_replacements_leave_other_rows_bit_identical():
     weights = stack_params(ignore_experience)
     rows = table_rows([0.0, 0.5], ["residual"], ARMS)

@@ -290,6 +290,7 @@ def test_policy_that_counts_instances_refuses_rows_without_counts(counting_run):
     assert baseline.estimator_config is None
 
 
+@pytest.mark.slow
 def test_evaluations_by_the_paper_count_what_the_rows_hold(counting_run, drawn_run):
     assert counting_run.policies().with_estimator("paper").estimator_config == ESTIMATORS["paper"]
     presence = dataclasses.replace(ESTIMATORS["paper"], counts="presence")

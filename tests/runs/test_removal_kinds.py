@@ -42,6 +42,7 @@ def outcome_of(results, variant, epsilon=None, decoding="argmax"):
     raise LookupError(variant)
 
 
+@pytest.mark.slow
 def test_controlled_direct_effect_adds_rows_and_changes_no_other(run, results):
     plain = jaxnav.evaluate(run, epsilon=THRESHOLDS, episodes=NUM_EPISODES)
     assert [row for row in results.rows if row.variant not in ("cde", "scde")] == plain.rows
@@ -62,6 +63,7 @@ def test_controlled_direct_effect_adds_rows_and_changes_no_other(run, results):
     assert (outcome_of(results, "cde").length != outcome_of(results, "layout").length).any()
 
 
+@pytest.mark.slow
 def test_rows_are_named_after_their_causal_quantity(results):
     labels = [row_label(row) for row in results.report["rows"] if row["decoding"] == "argmax"]
     assert labels[1:] == [
@@ -78,6 +80,7 @@ def test_rows_are_named_after_their_causal_quantity(results):
     assert {"+ w + CDE vs. + w", "+ w + sCDE (eps=0) vs. + w", "+ w + TDE vs. + w"} <= difference_labels
 
 
+@pytest.mark.slow
 def test_cde_leaves_the_policy_without_experience_in_a_replay(run, results):
     world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
     policies = run.policies()
@@ -88,6 +91,7 @@ def test_cde_leaves_the_policy_without_experience_in_a_replay(run, results):
     np.testing.assert_array_equal([len(trace.action) for trace in traces], expected_length)
 
 
+@pytest.mark.slow
 def test_counterfactual_memory_changes_only_rows_with_counterfactual_logits(run, results):
     factual = jaxnav.evaluate(run, epsilon=THRESHOLDS, episodes=NUM_EPISODES, counterfactual_memory="factual")
     own = jaxnav.evaluate(run, epsilon=THRESHOLDS, episodes=NUM_EPISODES, counterfactual_memory="own")
