@@ -61,7 +61,8 @@ def read_episodes(path):
 @pytest.mark.slow
 def test_eval_report_holds_all_rows_and_differences(report_file):
     report = read_report(report_file)
-    assert list(report) == ["run", "rows", "differences", "notes", "compilations", "versions", "format"]
+    parts = ["run", "rows", "differences", "decision_shares", "notes", "compilations", "versions", "format"]
+    assert list(report) == parts
     assert report["run"]["method"] == "org"
     assert report["run"]["steps_per_policy"] == 512
     assert report["run"]["prior_steps"] == 64 * 20

@@ -62,7 +62,8 @@ def test_load_policy_refuses_export_without_decision(drawn_run, tmp_path):
 
 @pytest.mark.slow
 def test_stream_run_is_trained_and_evaluated(config, tmp_path):
-    run = jaxnav.train(dataclasses.replace(config, decision="streams", run_dir=tmp_path / "run"))
+    ppo = dataclasses.replace(config.ppo, experience=0.5)
+    run = jaxnav.train(dataclasses.replace(config, decision="streams", ppo=ppo, run_dir=tmp_path / "run"))
     assert run.config.decision == "streams"
     policies = run.policies()
     assert policies.spec.decision == "streams"

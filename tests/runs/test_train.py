@@ -44,7 +44,7 @@ def finished_config(tmp_path_factory):
 @pytest.mark.slow
 def test_train_leaves_a_finished_run_unchanged(finished_config, capsys):
     files_before = contents(finished_config.run_dir)
-    assert jaxnav.train(finished_config) == jaxnav.Run(finished_config)
+    assert jaxnav.train(finished_config) == jaxnav.Run(check_config(finished_config))
     assert contents(finished_config.run_dir) == files_before
     assert capsys.readouterr() == ("", "")
 
