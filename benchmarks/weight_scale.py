@@ -28,8 +28,8 @@ from _common import print_report
 from rich.console import Console
 
 import jaxnav
-from jaxnav.evaluation.interventions import ReplacedPart, replace_part
 from jaxnav.evaluation.removal import other_running_episode
+from jaxnav.evaluation.replacements import ReplacedPart, replace_part
 from jaxnav.layout import scale_weights
 from jaxnav.numerics.trees import take_rows
 from jaxnav.policies.agent_loop import policy_memory

@@ -4,8 +4,9 @@ A decision counts as changed when its best action changes and the KL divergence 
 probabilities exceeds `MIN_KL`, so that near ties do not count. The *floor* of a part compares two replacements by the
 parts of two different episodes: a share near its floor says that the episode's own part acts like any other.
 
-`ShareProbe` runs a small batch of the evaluation's episodes by the factual decisions and intervenes on decisions on the
-way; the interventions do not act. `share_interval` turns its counts into a share with an interval.
+`ShareProbe` runs a small batch of the evaluation's episodes and replaces parts of their decisions on the way. Episodes
+follow the factual decisions; replaced decisions are only compared. `share_interval` turns the counts into a share with
+an interval.
 """
 
 from collections.abc import Sequence
@@ -17,8 +18,8 @@ import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.grid import infer_and_act
-from jaxnav.evaluation.interventions import DRAWN_PARTS, ReplacedPart, replace_part
 from jaxnav.evaluation.removal import InferenceConfig, other_running_episode
+from jaxnav.evaluation.replacements import DRAWN_PARTS, ReplacedPart, replace_part
 from jaxnav.evaluation.statistics import Clusters, Interval, jackknife_interval, run_clusters
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
@@ -27,9 +28,9 @@ from jaxnav.policies.network import Params, Policy
 
 #: Smallest KL divergence, in nats, of a decision that counts as changed.
 MIN_KL = 0.02
-#: Steps, in units of the interval, after which interventions become half as frequent, and how often they do.
-_STEPS_PER_HALVING = 32
-_MAX_HALVINGS = 3
+#: The stride between probes doubles whenever 32 initial strides have passed, at most three times.
+_STRIDES_PER_DOUBLING = 32
+_MAX_DOUBLINGS = 3
 #: Number of running episodes below which nothing is counted: an episode and two different partners.
 _MIN_RUNNING = 3
 
@@ -37,11 +38,11 @@ _MIN_RUNNING = 3
 class ShareCounts(NamedTuple):
     """Numbers of decisions by episode, leaves [..., E] and [..., E, P] for P parts.
 
-    Late steps, at which few episodes still run, are intervened on more rarely; a decision counts as often as the steps
+    Late steps, at which few episodes still run, are probed more rarely; a probed decision counts as often as the steps
     that it stands for.
 
     Attributes:
-      decisions: int32 [..., E], decisions that were intervened on.
+      decisions: int32 [..., E], probed decisions.
       changed: int32 [..., E, P], decisions that change when the part is replaced.
       differing: int32 [..., E, P], decisions that differ between replacements by two episodes; 0 for a part whose
         replacement is the same in all episodes.
@@ -82,7 +83,7 @@ def count_changes(
     env_params: EnvParams,
     knowledge: Knowledge,
 ) -> ShareCounts:
-    """Intervene on one decision of each of E episodes.
+    """Replace every part of one decision of each of E episodes.
 
     Args:
       config: configuration of the grid entry.
@@ -130,7 +131,7 @@ def count_changes(
             is_different = is_changed(changed_logits, decide_with_part(part, partners[1]))
         differing_columns.append(is_different)
 
-    # Deletion stands beside the replacement of Z.
+    # For comparison: the decision with Z = 0.
     without_experience = pathways._replace(experience=jnp.zeros_like(pathways.experience))
     deleted_logits = policy.decide(without_experience, memory).logits
     return ShareCounts(
@@ -144,20 +145,20 @@ def count_changes(
 class ShareProbe:
     """Measurement of decision shares; one compilation serves all grids and banks of equal shapes."""
 
-    def __init__(self, agent_loop: AgentLoop, parts: Sequence[ReplacedPart], interval: int = 1) -> None:
+    def __init__(self, agent_loop: AgentLoop, parts: Sequence[ReplacedPart], probe_stride: int = 1) -> None:
         """Prepare the compiled function.
 
         Args:
           agent_loop: environment, policy specification and layout estimator, without a fallback.
           parts: the P parts to replace.
-          interval: steps from one intervention to the next in the early part of an episode.
+          probe_stride: steps from one probe to the next in the early part of an episode.
         """
         self._agent_loop = agent_loop
         self._parts = tuple(parts)
-        # Macro-actions have few decision steps, so all of them are intervened on.
+        # Macro-actions have few decision steps, so all of them are probed.
         has_macro_actions = agent_loop.method is not None and agent_loop.method.control.interval > 1
-        self._interval = 1 if has_macro_actions else interval
-        self._max_halvings = 0 if has_macro_actions else _MAX_HALVINGS
+        self._probe_stride = 1 if has_macro_actions else probe_stride
+        self._max_doublings = 0 if has_macro_actions else _MAX_DOUBLINGS
         self._compiled_run = jax.jit(self._run_grid)
 
     def __call__(
@@ -212,13 +213,13 @@ class ShareProbe:
         knowledge: Knowledge,
         key: jax.Array,
     ) -> ShareCounts:
-        """Run the episodes of one entry, and intervene at some of its steps."""
+        """Run the episodes of one entry, and probe some of its steps."""
         agent_loop = self._agent_loop
         num_episodes = len(initial_states.pose)
         episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes))
         shared_arguments = {"agent_loop": agent_loop, "env_params": env_params, "knowledge": knowledge}
 
-        def intervene(agent: Agent, running: jax.Array, counted: jax.Array) -> ShareCounts:
+        def probe_decisions(agent: Agent, running: jax.Array, counted: jax.Array) -> ShareCounts:
             partners = (
                 other_running_episode(running, episode_keys, distance=1),
                 other_running_episode(running, episode_keys, distance=2),
@@ -231,18 +232,18 @@ class ShareProbe:
             is_decision_step = agent_loop.is_decision_step(agent)
             counted = running if is_decision_step is None else running & is_decision_step
 
-            # Intervene at every `num_steps`-th step.
-            num_halvings = jnp.minimum(time // (_STEPS_PER_HALVING * self._interval), self._max_halvings)
-            num_steps = self._interval * 2**num_halvings
+            # Probe every `stride`-th step; the stride grows with the time.
+            num_doublings = jnp.minimum(time // (_STRIDES_PER_DOUBLING * self._probe_stride), self._max_doublings)
+            stride = self._probe_stride * 2**num_doublings
             new_counts = jax.lax.cond(
-                (time % num_steps == 0) & counted.any(),
-                intervene,
+                (time % stride == 0) & counted.any(),
+                probe_decisions,
                 lambda *_: jax.tree.map(jnp.zeros_like, counts),
                 agent,
                 running,
                 counted,
             )
-            weight = num_steps // self._interval
+            weight = stride // self._probe_stride
             counts = jax.tree.map(lambda total, new: total + weight * new, counts, new_counts)
 
             # The factual decision acts. Ended episodes keep their agent.
@@ -266,7 +267,7 @@ def share_interval(counted: np.ndarray, decisions: np.ndarray, scenes: Clusters)
 
     Args:
       counted: int [S, E], counted decisions by training run and episode.
-      decisions: int [S, E], all decisions that were intervened on.
+      decisions: int [S, E], all probed decisions.
       scenes: clusters of the E episodes.
 
     Returns:

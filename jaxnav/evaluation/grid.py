@@ -18,7 +18,6 @@ import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.interventions import ReplacedPart, replace_part, select_part
 from jaxnav.evaluation.removal import (
     InferenceConfig,
     InferenceTrace,
@@ -27,6 +26,7 @@ from jaxnav.evaluation.removal import (
     other_running_episode,
     select_gap,
 )
+from jaxnav.evaluation.replacements import ReplacedPart, replace_part, select_part
 from jaxnav.numerics.trees import take_rows, tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, policy_memory
 from jaxnav.policies.handover import Decider
@@ -136,8 +136,8 @@ class Evaluator:
           agent_loop: environment, policy specification and layout estimator.
           can_remove: whether experience may be removed. False compiles only the factual decision, which halves the
             compilation time; the grid must then remove nothing.
-          has_controls: whether grids may have the controls `intervention` and `removed`. False compiles faster.
-          replaced_parts: parts that the entries of a grid may replace (`InferenceConfig.replaced`).
+          has_controls: whether grids may have the controls `direct_noise` and `removed_source`. False compiles faster.
+          replaced_parts: parts that the entries of a grid may replace (`InferenceConfig.replaced_part`).
         """
         self.compilations = 0
         self._agent_loop = agent_loop
@@ -328,8 +328,8 @@ def infer_and_act(
       env_params: parameters of the environment.
       knowledge: layout priors and statistics from before training.
       can_remove: whether experience may be removed.
-      has_controls: whether `config` may name the controls `intervention` and `removed`.
-      replaced_parts: parts that `config.replaced` may name.
+      has_controls: whether `config` may name the controls `direct_noise` and `removed_source`.
+      replaced_parts: parts that `config.replaced_part` may name.
 
     Returns:
       The agents after the step [E], the result of the step, leaves [E], and the trace of the inference, leaves
@@ -358,7 +358,7 @@ def infer_and_act(
             knowledge=knowledge,
             env_params=env_params,
         )
-        counterfactual_pathways, counterfactual_memory = select_part(replaced_parts, config.replaced, replace)
+        counterfactual_pathways, counterfactual_memory = select_part(replaced_parts, config.replaced_part, replace)
         pathways, memory = jax.tree.map(
             functools.partial(jnp.where, config.replaces_factual),
             (counterfactual_pathways, counterfactual_memory),

@@ -1,7 +1,8 @@
 """Removal of experience from a decision: sTDE (eq. 2), TDE (eq. 1), and the controls that they are compared with.
 
 sTDE and TDE subtract the counterfactual logits: do(S = 0, G = 0) with the factual experience Z, and with the factual
-memory or a memory of its own (`PolicyState.counterfactual_hidden`).
+memory or a memory of its own (`PolicyState.counterfactual_hidden`). The controlled direct effect (CDE) uses the same
+equations: a `HandoverPolicy` whose fallback is the policy under do(Z = 0) keeps the logits of the fallback.
 
 An `InferenceConfig` says how one entry of an evaluation grid turns a decision into logits to act by. At every step
 `logits_to_remove` decides without the direct pathways, `select_gap` picks the layout gap, and `apply_removal` combines
@@ -57,13 +58,14 @@ class GapSource(enum.IntEnum):
 class InferenceConfig(struct.PyTreeNode):
     """Inference of one entry of an evaluation grid, leaves []; or of all C entries, leaves [C].
 
-    Experience is removed by sTDE (eq. 2) with the threshold `epsilon`, or by TDE (eq. 1) where `use_tde` holds; with
-    epsilon = inf sTDE removes nothing. The fields from `gap_source` on are controls.
+    Experience is removed by equation 2 with the threshold `epsilon`, or completely; with epsilon = inf equation 2
+    removes nothing. The fields from `gap_source` to `removed_source`, and `replaces_factual`, are controls of sTDE.
 
     Attributes:
       policy_index: int32, index of the policy's parameters.
-      epsilon: float32, threshold of sTDE.
-      use_tde: bool, remove by TDE instead.
+      epsilon: float32, threshold of soft removal (eq. 2).
+      remove_completely: bool, remove by equation 1, which leaves the TDE; with a `HandoverPolicy`, the CDE or the
+        decision of the layout-blind fallback.
       form: int32, index of the form of eq. 2 in `causal.FORMS`.
       use_layout: bool, use the layout's weights; otherwise they are ones.
       greedy: bool, take the best action instead of sampling.
@@ -71,10 +73,11 @@ class InferenceConfig(struct.PyTreeNode):
       gap_source: int32, a `GapSource`.
       given_gap: float32, the gap of `GapSource.GIVEN` from step `gap_begin` to before step `gap_end`; 0 at other times.
       gap_begin, gap_end: int32, steps.
-      intervention: float32, upper bound of the uniform noise that replaces scene and goal; 0 sets them to zero, as in
+      direct_noise: float32, upper bound of the uniform noise that replaces scene and goal; 0 sets them to zero, as in
         sTDE.
-      removed: int32, a `RemovedLogits`.
-      replaced: int32, a `ReplacedPart` (`jaxnav.evaluation.interventions`), replaced at every step.
+      removed_source: int32, a `RemovedLogits`.
+      replaced_part: int32, a `ReplacedPart` (`jaxnav.evaluation.replacements`), the part that is replaced at every
+        step.
       replaces_factual: bool, False to replace the part in the counterfactual decision alone.
       max_room_episodes: int32, number of episodes of each room type that the entry runs, the first in the list; the
         outcomes of the remaining ones are 0.
@@ -82,7 +85,7 @@ class InferenceConfig(struct.PyTreeNode):
 
     policy_index: jax.Array
     epsilon: jax.Array
-    use_tde: jax.Array
+    remove_completely: jax.Array
     form: jax.Array
     use_layout: jax.Array
     greedy: jax.Array
@@ -91,9 +94,9 @@ class InferenceConfig(struct.PyTreeNode):
     given_gap: jax.Array
     gap_begin: jax.Array
     gap_end: jax.Array
-    intervention: jax.Array
-    removed: jax.Array
-    replaced: jax.Array
+    direct_noise: jax.Array
+    removed_source: jax.Array
+    replaced_part: jax.Array
     replaces_factual: jax.Array
     max_room_episodes: jax.Array
 
@@ -137,7 +140,7 @@ def logits_to_remove(
       policy: policy with the entry's parameters.
       pathways, memory: inputs of the factual decisions, leaves [E, ...].
       episode_keys, step_keys: PRNG keys [E] of the episodes and of their current step; folded further.
-      has_controls: whether `config.intervention` and `config.removed` may name controls. False compiles faster.
+      has_controls: whether `config.direct_noise` and `config.removed_source` may name controls. False compiles faster.
     """
     if not has_controls:
         return policy.decide(do(pathways, scene=0, goal=0), memory.counterfactual_state()).logits
@@ -150,8 +153,8 @@ def logits_to_remove(
     def intervention_value(tag: int, pathway: jax.Array) -> jax.Array:
         """Zeros, or the uniform noise of the control. Entries run one by one, so `cond` samples only if needed."""
         return jax.lax.cond(
-            config.intervention > 0,
-            lambda: config.intervention * sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform),
+            config.direct_noise > 0,
+            lambda: config.direct_noise * sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform),
             lambda: jnp.zeros_like(pathway),
         )
 
@@ -170,7 +173,7 @@ def logits_to_remove(
             * sample_rows(episode_keys, _NOISE_TAG, logits.shape[1:], jax.random.normal)
         ),
     )
-    return jax.lax.switch(config.removed, branches)
+    return jax.lax.switch(config.removed_source, branches)
 
 
 def select_gap(
@@ -214,8 +217,8 @@ def apply_removal(
     soft_logits = jnp.stack([stde(logits, removed_logits, gap, config.epsilon, form) for form in FORMS])[config.form]
     soft_weight = jnp.stack([removal_weight(gap, config.epsilon, form) for form in FORMS])[config.form]
 
-    corrected_logits = jnp.where(config.use_tde, tde(logits, removed_logits), soft_logits)
-    weight = jnp.where(config.use_tde, 1.0, soft_weight)
+    corrected_logits = jnp.where(config.remove_completely, tde(logits, removed_logits), soft_logits)
+    weight = jnp.where(config.remove_completely, 1.0, soft_weight)
     return corrected_logits, weight
 
 

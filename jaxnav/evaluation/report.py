@@ -167,7 +167,7 @@ def build_report(
       notes: see `jaxnav.evaluation.notes`.
       compilations: number of compilations of the evaluation.
       run: settings of the run.
-      decision_shares: see `jaxnav.runs.decision_shares`; reports of versions before 0.4 have none.
+      decision_shares: see `jaxnav.runs.share_report`; reports of versions before 0.4 have none.
     """
     return {
         "run": run,

@@ -15,8 +15,8 @@ from jaxnav.causal import FORMS
 from jaxnav.choices import Decoding, Form, Removal, Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import MAX_EPISODES
-from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
+from jaxnav.evaluation.replacements import ReplacedPart
 
 #: Variants of each kind of removal: complete, and soft.
 REMOVAL_VARIANTS: Mapping[Removal, tuple[Variant, Variant]] = {"tde": ("tde", "stde"), "cde": ("cde", "scde")}
@@ -152,7 +152,7 @@ def replacement_grid(
     grid = inference_grid([replacement.row for replacement in replacements], arms, num_seeds)
     parts = jnp.asarray([replacement.part for replacement in replacements], jnp.int32)
     return grid.replace(
-        replaced=jnp.repeat(parts, num_seeds),
+        replaced_part=jnp.repeat(parts, num_seeds),
         max_room_episodes=jnp.full_like(grid.max_room_episodes, max_room_episodes),
     )
 
@@ -164,7 +164,7 @@ def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: i
     return InferenceConfig(
         policy_index=jnp.int32(seed + num_seeds * arm_index),
         epsilon=jnp.float32(float("inf") if row.epsilon is None else row.epsilon),
-        use_tde=jnp.bool_(row.variant in ("tde", "cde")),
+        remove_completely=jnp.bool_(row.variant in ("tde", "cde")),
         form=jnp.int32(FORMS.index(row.form or "paper")),
         use_layout=jnp.bool_(row.arm == "layout"),
         greedy=jnp.bool_(row.decoding == "argmax"),
@@ -173,9 +173,9 @@ def _grid_entry(row: EvaluationRow, arms: Sequence[str], seed: int, num_seeds: i
         given_gap=jnp.float32(0.0),
         gap_begin=jnp.int32(0),
         gap_end=jnp.int32(0),
-        intervention=jnp.float32(0.0),
-        removed=jnp.int32(RemovedLogits.COUNTERFACTUAL),
-        replaced=jnp.int32(ReplacedPart.NONE),
+        direct_noise=jnp.float32(0.0),
+        removed_source=jnp.int32(RemovedLogits.COUNTERFACTUAL),
+        replaced_part=jnp.int32(ReplacedPart.NONE),
         replaces_factual=jnp.bool_(True),
         max_room_episodes=jnp.int32(MAX_EPISODES),
     )

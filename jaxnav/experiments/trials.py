@@ -18,8 +18,8 @@ from jaxnav.choices import Decoding, Form
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
-from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
+from jaxnav.evaluation.replacements import ReplacedPart
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.evaluation.statistics import Interval, SharedDesign, mean_interval, paired_difference
 from jaxnav.evaluation.variants import inference_grid, table_row
@@ -38,7 +38,7 @@ from jaxnav.runs.worlds import CompiledWorld
 GapSchedule = Literal["course", "after", "until"]
 #: Modification of sTDE by a control. The gap: that of another episode (`shuffled`), or `constant`, such that the weight
 #: is its mean at every step. The removed logits: `zeros`, `noise`, or counterfactual logits with a part of another
-#: episode (`REPLACED_PARTS`). The intervention: `random` instead of zero.
+#: episode (`REPLACED_PARTS`). Scene and goal of the counterfactual decision: `random` instead of zero.
 TrialControl = Literal[
     "shuffled", "constant", "zeros", "noise", "random", "other_categories", "other_experience", "other_memory"
 ]
@@ -134,14 +134,14 @@ class Trial:
             case "until":
                 return _given_gap(1.0, 0, self._schedule_step)
             case "zeros":
-                return {"removed": jnp.int32(RemovedLogits.ZEROS)}
+                return {"removed_source": jnp.int32(RemovedLogits.ZEROS)}
             case "noise":
-                return {"removed": jnp.int32(RemovedLogits.NOISE)}
+                return {"removed_source": jnp.int32(RemovedLogits.NOISE)}
             case "random":
-                return {"intervention": jnp.float32(1.0)}
+                return {"direct_noise": jnp.float32(1.0)}
             case "other_categories" | "other_experience" | "other_memory":
                 part = REPLACED_PARTS[self.control]
-                return {"replaced": jnp.int32(part), "replaces_factual": jnp.bool_(False)}
+                return {"replaced_part": jnp.int32(part), "replaces_factual": jnp.bool_(False)}
             case None:
                 return {}
 

@@ -1,4 +1,8 @@
-"""A policy made of two: one with experience and a fallback without it, either of which can act."""
+"""A policy made of two: one with experience and a fallback without it, either of which can act.
+
+Handover to a layout-blind policy uses this class, and so does the controlled direct effect (CDE), whose fallback is the
+policy itself under do(Z = 0).
+"""
 
 from typing import Any, cast
 

@@ -141,7 +141,7 @@ class Experience(nnx.Module):
     def replace_others(
         self, features: Features, reading: Tree, other_features: Features, other_reading: Tree
     ) -> tuple[Features, Tree]:
-        """Replace all categories but the goal by those of another episode, for `jaxnav.evaluation.interventions`.
+        """Replace all categories but the goal by those of another episode, for `jaxnav.evaluation.replacements`.
 
         A method whose reading holds categories overrides this function, so that the reading is replaced too.
 

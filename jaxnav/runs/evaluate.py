@@ -48,17 +48,17 @@ from jaxnav.evaluation.variants import (
 )
 from jaxnav.policies.methods import find_method, method_label
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.decision_shares import (
-    build_decision_shares,
-    count_shares,
-    max_room_episodes,
-    measure_costs,
-    policy_rows,
-    replacements_to_run,
-)
 from jaxnav.runs.policies import Policies, config_for_task, is_policy, list_packaged_policies, load_policy_as_run
 from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.run import CONFIG_FILE, Run, run_settings
+from jaxnav.runs.share_report import (
+    build_decision_shares,
+    count_shares,
+    list_cost_replacements,
+    max_room_episodes,
+    measure_costs,
+    rows_without_removal,
+)
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, prefetch_env_params
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
@@ -176,11 +176,11 @@ def evaluate(
     with console.status(_describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
         # Decision shares are counted in a thread: compilations use one core each.
         episode_lists = draw_episode_lists(compiled, episodes, seed)
-        share_rows = policy_rows(rows)
+        share_rows = rows_without_removal(rows)
         counting = thread.submit(count_shares, share_rows, policies, compiled, episode_lists, seed)
 
         # Replacements are further rows of the same grid.
-        replacements = replacements_to_run(rows, costs)
+        replacements = list_cost_replacements(rows, costs)
         room_episodes = max_room_episodes(episode_lists, costs)
         outcome, replaced_outcome, compilations = _evaluate_with_replacements(
             rows, replacements, room_episodes, policies, compiled, episode_lists, seed

@@ -13,7 +13,7 @@ from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_st
 from jaxnav.evaluation.decision_share import ShareProbe, is_changed, share_interval
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator, start_states
-from jaxnav.evaluation.interventions import ReplacedPart, replace_part
+from jaxnav.evaluation.replacements import ReplacedPart, replace_part
 from jaxnav.evaluation.variants import Replacement, inference_grid, replacement_grid, table_row, table_rows
 from jaxnav.policies.agent_loop import policy_memory
 from jaxnav.policies.features import Features

@@ -40,8 +40,8 @@ CONTROLS = [
     control_cells(0.0, "paper", "argmax", gap_source=GapSource.OTHER),
     control_cells(0.2, "residual", "sample", gap_source=GapSource.MEAN),
     control_cells(0.2, "residual", "sample", gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=5),
-    control_cells(0.0, "paper", "argmax", removed=RemovedLogits.NOISE),
-    control_cells(0.0, "paper", "sample", intervention=1.0),
+    control_cells(0.0, "paper", "argmax", removed_source=RemovedLogits.NOISE),
+    control_cells(0.0, "paper", "sample", direct_noise=1.0),
 ]
 CELLS = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), inference_grid(ROWS, ARMS, SEEDS), *CONTROLS)
 KEY = jax.random.key(3)

@@ -14,8 +14,8 @@ from jaxnav.causal import do
 from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import infer_and_act, start_states
-from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, RemovedLogits, logits_to_remove, other_running_episode, select_gap
+from jaxnav.evaluation.replacements import ReplacedPart
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState
@@ -43,9 +43,9 @@ CONTROLS: dict[str, dict[str, Any]] = {
     "none": {},
     "other": {"gap_source": GapSource.OTHER},
     "course": {"gap_source": GapSource.MEAN},
-    "zeros": {"removed": RemovedLogits.ZEROS},
-    "noise": {"removed": RemovedLogits.NOISE},
-    "random": {"intervention": 1.0},
+    "zeros": {"removed_source": RemovedLogits.ZEROS},
+    "noise": {"removed_source": RemovedLogits.NOISE},
+    "random": {"direct_noise": 1.0},
 }
 EPISODE_KEYS, STEP_KEYS = jax.random.split(jax.random.key(3), (2, NUM_EPISODES))
 ALL_RUNNING = np.ones(NUM_EPISODES, bool)
@@ -107,7 +107,7 @@ def test_noise_control_has_the_spread_of_the_counterfactual_logits(agent):
 def test_controls_take_a_part_of_the_counterfactual_decision_from_another_episode(agent, part):
     """The factual decision stays, and the removed logits are those with the partner's part."""
     running = np.arange(NUM_EPISODES) % 3 > 0
-    cell = make_cell("tde", replaced=part, replaces_factual=False)
+    cell = make_cell("tde", replaced_part=part, replaces_factual=False)
 
     @jax.jit
     def infer(cell, agent):
@@ -142,7 +142,7 @@ def test_controls_take_a_part_of_the_counterfactual_decision_from_another_episod
     assert np.abs(trace.removed_logits - plain_trace.removed_logits)[running].max() > 0.01
 
     # Without the restriction, the factual decision changes too.
-    both_trace = infer(make_cell("tde", replaced=part), agent)
+    both_trace = infer(make_cell("tde", replaced_part=part), agent)
     np.testing.assert_allclose(both_trace.removed_logits, trace.removed_logits, rtol=1e-5, atol=1e-6)
     assert np.abs(both_trace.factual_logits - trace.factual_logits)[running].max() > 0.01
 
@@ -167,7 +167,7 @@ def test_a_random_intervention_sets_scene_and_goal_alone(max_value):
     def logits(**changes):
         return np.asarray(logits_to_remove(make_cell(**changes), policy, pathways, memory, *keys))
 
-    result = logits(intervention=max_value)
+    result = logits(direct_noise=max_value)
     np.testing.assert_array_equal(result[:, 4], 9.0)
     # Columns of scene and goal are uniform and owe nothing to each other.
     for column in result[:, :4].T:

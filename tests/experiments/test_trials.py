@@ -15,8 +15,8 @@ from support.intervals import around, bounds
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
-from jaxnav.evaluation.interventions import ReplacedPart
 from jaxnav.evaluation.removal import GapSource, RemovedLogits
+from jaxnav.evaluation.replacements import ReplacedPart
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.evaluation.variants import inference_grid, table_rows
 from jaxnav.experiments.bench import best_epsilon
@@ -73,7 +73,7 @@ def test_inference_grid_holds_a_cell_per_row_and_seed():
         np.testing.assert_array_equal(cells.use_layout, [not is_plain] * 2)
         np.testing.assert_array_equal(cells.greedy, [row.decoding == "argmax"] * 2)
         np.testing.assert_array_equal(cells.act_randomly, [row.variant == "random"] * 2)
-        np.testing.assert_array_equal(cells.use_tde, [row.variant == "tde"] * 2)
+        np.testing.assert_array_equal(cells.remove_completely, [row.variant == "tde"] * 2)
         epsilon = np.inf if row.epsilon is None else row.epsilon
         np.testing.assert_array_equal(cells.epsilon, np.full(2, epsilon, np.float32))
 
@@ -87,12 +87,12 @@ def test_controls_change_the_cells_of_stde_and_nothing_else():
         "constant": {"gap_source": given, "given_gap": np.float32(0.3), "gap_end": NEVER, "epsilon": np.float32(0.0)},
         "after": {"gap_source": given, "given_gap": 1.0, "gap_begin": 7, "gap_end": NEVER},
         "until": {"gap_source": given, "given_gap": 1.0, "gap_end": 7},
-        "zeros": {"removed": RemovedLogits.ZEROS},
-        "noise": {"removed": RemovedLogits.NOISE},
-        "random": {"intervention": 1.0},
-        "other_categories": {"replaced": ReplacedPart.OTHERS, "replaces_factual": False},
-        "other_experience": {"replaced": ReplacedPart.EXPERIENCE, "replaces_factual": False},
-        "other_memory": {"replaced": ReplacedPart.MEMORY, "replaces_factual": False},
+        "zeros": {"removed_source": RemovedLogits.ZEROS},
+        "noise": {"removed_source": RemovedLogits.NOISE},
+        "random": {"direct_noise": 1.0},
+        "other_categories": {"replaced_part": ReplacedPart.OTHERS, "replaces_factual": False},
+        "other_experience": {"replaced_part": ReplacedPart.EXPERIENCE, "replaces_factual": False},
+        "other_memory": {"replaced_part": ReplacedPart.MEMORY, "replaces_factual": False},
     }
     assert set(changed_fields) == {*get_args(TrialControl), *get_args(GapSchedule)}
     for control, changes in changed_fields.items():

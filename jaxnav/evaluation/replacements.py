@@ -1,11 +1,11 @@
-"""Interventions that replace one part of a decision by that of another episode.
+"""Replacement of one part of a decision by the part of another episode.
 
-How much of a decision depends on a part, such as the detections of other categories within experience? An intervention
-replaces this part by the part of another running episode at the same step and keeps the rest. The replacement is a
-value that the policy meets in its own episodes; a deleted part, such as Z = 0, is not.
+How much of a decision depends on a part, such as the detections of other categories within experience? A replacement
+takes this part from another running episode at the same step and keeps the rest. The new part is a value that the
+policy meets in its own episodes; a deleted part, such as Z = 0, is not.
 
 `replace_part` makes the pathways and the memory of one such decision. `jaxnav.evaluation.decision_share` counts the
-decisions that change; `InferenceConfig.replaced` replaces a part in every step of an episode.
+decisions that change; `InferenceConfig.replaced_part` replaces a part in every step of an episode.
 """
 
 import enum
@@ -23,7 +23,7 @@ from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
 
 
 class ReplacedPart(enum.IntEnum):
-    """Part of a decision that an intervention replaces by the part of another episode at the same step.
+    """Part of a decision that is replaced by the part of another episode at the same step.
 
     `NONE`: nothing. `OTHERS`: the detections of all categories but the goal within experience. `EXPERIENCE`: all of Z.
     `PRIOR_WEIGHTS`: w, by the w of the layout prior. `UNIFORM_WEIGHTS`: w, by equal weights off the goal. `DIRECT`:

@@ -1,7 +1,7 @@
 """Decision shares of an evaluation: what is measured, on which episodes, and the entries of the report.
 
-`replacements_to_run` lists the replacements whose cost the evaluation measures, `count_shares` counts changed decisions
-on a few episodes of the evaluation, and `build_decision_shares` makes the report's entries from both.
+`list_cost_replacements` lists the replacements whose cost the evaluation measures, `count_shares` counts changed
+decisions on a few episodes of the evaluation, and `build_decision_shares` makes the report's entries from both.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from jaxnav.choices import Costs
 from jaxnav.evaluation.decision_share import ShareCounts, ShareProbe, share_interval
 from jaxnav.evaluation.episodes import MAX_EPISODES, EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics, start_states
-from jaxnav.evaluation.interventions import DRAWN_PARTS, WEIGHT_PARTS, ReplacedPart
+from jaxnav.evaluation.replacements import DRAWN_PARTS, WEIGHT_PARTS, ReplacedPart
 from jaxnav.evaluation.statistics import Interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow, Replacement, inference_grid
 from jaxnav.runs.policies import Policies
@@ -22,10 +22,10 @@ from jaxnav.runs.worlds import CompiledWorld
 
 #: Number of episodes on which shares are counted; about 2,000 decisions of each row and seed.
 PROBED_EPISODES = 64
-#: Interventions on a decision in so many steps of the longest episode.
+#: Number of probes in an episode of maximal length if the stride between probes did not grow.
 _PROBED_STEPS = 100
-#: Share of the evaluation's episodes on which the cost of other categories is measured, unless all costs are.
-_COST_SHARE = 0.25
+#: Fraction of the evaluation's episodes on which the cost of other categories is measured, unless all costs are.
+_COST_EPISODE_FRACTION = 0.25
 
 
 def replaced_parts(row: EvaluationRow) -> list[ReplacedPart]:
@@ -37,15 +37,15 @@ def replaced_parts(row: EvaluationRow) -> list[ReplacedPart]:
     return parts
 
 
-def policy_rows(rows: Sequence[EvaluationRow]) -> list[EvaluationRow]:
+def rows_without_removal(rows: Sequence[EvaluationRow]) -> list[EvaluationRow]:
     """Rows of policies from which nothing is removed; only these have decision shares."""
     return [row for row in rows if row.variant in ("baseline", "layout")]
 
 
-def replacements_to_run(rows: Sequence[EvaluationRow], costs: Costs) -> list[Replacement]:
+def list_cost_replacements(rows: Sequence[EvaluationRow], costs: Costs) -> list[Replacement]:
     """List the replacements whose cost is measured."""
     replacements = []
-    for row in policy_rows(rows):
+    for row in rows_without_removal(rows):
         for part in replaced_parts(row):
             if costs == "all" or (costs == "others" and part == ReplacedPart.OTHERS):
                 replacements.append(Replacement(row, part))
@@ -57,7 +57,7 @@ def max_room_episodes(episode_lists: Sequence[EpisodeList], costs: Costs) -> int
     if costs == "all":
         return MAX_EPISODES
     most_episodes = max(int(episodes.room_rank.max()) + 1 for episodes in episode_lists)
-    return int(np.ceil(_COST_SHARE * most_episodes))
+    return int(np.ceil(_COST_EPISODE_FRACTION * most_episodes))
 
 
 def count_shares(
@@ -70,7 +70,7 @@ def count_shares(
     """Count changed decisions of R rows and S seeds on a few episodes of the evaluation.
 
     Args:
-      rows: rows with decision shares, see `policy_rows`.
+      rows: rows with decision shares, see `rows_without_removal`.
       policies: policies with S seeds of each arm.
       world: compiled scenes.
       episode_lists: the evaluation's episodes, for each bank.
@@ -79,9 +79,9 @@ def count_shares(
     Returns:
       Counts, leaves [R, S, E] and [R, S, E, P], with the P parts in the order of `ReplacedPart`; and the E episodes.
     """
-    interval = max(1, -(-world.step_limit // _PROBED_STEPS))  # rounded up
+    probe_stride = max(1, -(-world.step_limit // _PROBED_STEPS))  # rounded up
     parts = [part for part in ReplacedPart if part != ReplacedPart.NONE]
-    probe = ShareProbe(policies.make_agent_loop(world), parts, interval)
+    probe = ShareProbe(policies.make_agent_loop(world), parts, probe_stride)
     grid = inference_grid(rows, policies.arms, policies.num_seeds)
 
     # Evenly spaced episodes of every bank.
