@@ -19,6 +19,8 @@ from typing import Any
 
 import jax
 
+from jaxnav.training.config import PPOConfig
+
 #: Median, minimum and maximum.
 Spread = dict[str, float]
 
@@ -33,6 +35,9 @@ TUNED_ALLOCATOR = {
     "MALLOC_TRIM_THRESHOLD_": "8589934592",
     "MALLOC_TOP_PAD_": "268435456",
 }
+
+#: Rollouts of SemExp hold two of its macro-steps, with as many steps an update as usual.
+SEMEXP_PPO = PPOConfig(num_envs=64, rollout=60)
 
 # Timing
 

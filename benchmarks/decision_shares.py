@@ -1,4 +1,4 @@
-"""Decision shares of every method, with the settings of version 0.3 and with today's defaults.
+"""Decision shares of every method, with the settings of version 0.3 and with the default ones.
 
 `python benchmarks/decision_shares.py [FOLDER] [--methods org ...] [--seeds N] [--total-steps N]` trains both arms of
 every method in rooms and evaluates them on 400 episodes in val scenes. A row holds, for best actions, the percentage of
@@ -16,18 +16,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from _common import print_report
+from _common import SEMEXP_PPO, print_report
 
 import jaxnav
 from jaxnav.training.config import PPOConfig
 
 METHODS = ("rgb", "sp", "savn", "eotp", "org", "tpn", "vtnet", "hoz", "semexp")
 #: Version 0.3: raw weights, every detection in the direct pathway; there was no guidance.
-SETTINGS = ("0.3", "now")
-#: Rollouts of SemExp hold two of its macro-steps, with as many steps an update as usual.
-SEMEXP_PPO = PPOConfig(num_envs=64, rollout=60)
+SETTINGS = ("0.3", "default")
 NUM_EPISODES = 400
-PARTS = ("others", "experience", "prior_weights", "uniform_weights", "direct", "memory")
+PARTS = ("other_categories", "experience", "prior_weights", "uniform_weights", "scene_and_goal", "memory")
 
 
 def main(folder: Path, methods: list[str], seeds: int, total_steps: int) -> None:
@@ -36,9 +34,10 @@ def main(folder: Path, methods: list[str], seeds: int, total_steps: int) -> None
         for setting in SETTINGS:
             run = jaxnav.train(make_config(folder, method, setting, seeds, total_steps))
             report = jaxnav.evaluate(run, episodes=NUM_EPISODES).report
-            rows.extend(share_rows(report, method, setting))
-            print(format_row(rows[-1]), file=sys.stderr, flush=True)
-    print("\n".join([*header(), *map(format_row, rows)]), file=sys.stderr)
+            for row in collect_share_rows(report, method, setting):
+                rows.append(row)
+                print(format_row(row), file=sys.stderr, flush=True)
+    print("\n".join([*format_header(), *map(format_row, rows)]), file=sys.stderr)
     print_report({"seeds": seeds, "total_steps": total_steps, "episodes": NUM_EPISODES, "rows": rows})
 
 
@@ -59,8 +58,8 @@ def make_config(folder: Path, method: str, setting: str, seeds: int, total_steps
     return config
 
 
-def share_rows(report: dict[str, Any], method: str, setting: str) -> list[dict[str, Any]]:
-    """Return a row for each arm with best actions: success, and share, floor and cost of each part."""
+def collect_share_rows(report: dict[str, Any], method: str, setting: str) -> list[dict[str, Any]]:
+    """Return a row for each arm with best actions: success, and share, partner difference and cost of each part."""
     rows = []
     for table_row in report["rows"]:
         variant = table_row["variant"]
@@ -69,14 +68,14 @@ def share_rows(report: dict[str, Any], method: str, setting: str) -> list[dict[s
         row = {"method": method, "setting": setting, "variant": variant, "sr": table_row["sr"], "parts": {}}
         for entry in report["decision_shares"]:
             if (entry["variant"], entry["decoding"]) == (variant, "argmax"):
-                row["parts"][entry["part"]] = {name: entry[name] for name in ("share", "floor", "cost")}
+                row["parts"][entry["part"]] = {name: entry[name] for name in ("share", "partner_difference", "cost")}
         rows.append(row)
     return rows
 
 
-def header() -> list[str]:
+def format_header() -> list[str]:
     """Return the first two lines of the table."""
-    names = ["SR", *PARTS, "cost of others in SPL"]
+    names = ["SR", *PARTS, "cost of other categories in SPL"]
     return [f"| method | settings | variant | {' | '.join(names)} |", "| --- | --- | --- |" + " ---: |" * len(names)]
 
 
@@ -84,9 +83,9 @@ def format_row(row: dict[str, Any]) -> str:
     """Return a line of the table in Markdown."""
     cells = [row["method"], row["setting"], row["variant"], f"{row['sr']['mean']:.1f}"]
     for part in PARTS:
-        share = row["parts"].get(part)
-        cells.append("-" if share is None else f"{share['share']['mean']:.1f}")
-    cost = row["parts"]["others"]["cost"]["spl"]
+        entry = row["parts"].get(part)
+        cells.append("-" if entry is None else f"{entry['share']['mean']:.1f}")
+    cost = row["parts"]["other_categories"]["cost"]["spl"]
     low, high = cost["ci95"]
     cells.append(f"{cost['mean']:+.1f} [{low:+.1f}, {high:+.1f}]")
     return f"| {' | '.join(cells)} |"

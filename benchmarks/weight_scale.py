@@ -1,14 +1,17 @@
-"""The scale at which the layout weights enter, for every host and kind of weights (`--layout.weights`).
+"""The scale at which the layout weights enter, for every method and kind of weights (`--layout.weights`).
 
-`python benchmarks/weight_scale.py [FOLDER] [--hosts org ...] [--total-steps N]` trains one policy with layout weights
-per host and kind in rooms, acts with sampled actions in val scenes, and measures at every decision:
+`python benchmarks/weight_scale.py [FOLDER] [--methods org ...] [--total-steps N]` trains one policy with layout weights
+per method and kind in rooms, acts with sampled actions in val scenes, and measures at every decision:
 
-  factor        factor on the features of visible categories other than the goal: median, and 5th to 95th percentile
-  moved N       mean relative change of w x g from the prior to the N-th step, over the same categories
-  others / Z    share of the change of the recurrent core's input that other categories make: mean square of the change
-                when the other categories in Z become those of another episode, over that when all of Z does
-  untrained     the same share of a policy before training
-  Z / all       mean square of the change when Z becomes that of another episode, over that when all pathways do
+  factor          factor on the features of visible categories other than the goal: median, and 5th to 95th percentile
+  moved N         mean relative change of the goal's column of w from the prior to the N-th step, over these categories
+  categories / Z  share of the change of the recurrent core's input that other categories make: mean square of the
+                  change when the other categories in Z become those of another episode, over that when all of Z does
+  untrained       the same share of a policy before training
+  Z / all         mean square of the change when Z becomes that of another episode, over that when all pathways and the
+                  previous action do
+
+The input of the recurrent core is measured before its activation (ReLU).
 
 Runs are stored in FOLDER, by default a temporary one, and a repeated command uses those that are finished. The result
 goes to stdout as JSON, the table to stderr.
@@ -24,7 +27,7 @@ from typing import Any, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import print_report
+from _common import SEMEXP_PPO, print_report
 from rich.console import Console
 
 import jaxnav
@@ -40,36 +43,34 @@ from jaxnav.runs.policies import Policies
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
 from jaxnav.training.config import PPOConfig
 
-HOSTS = ("org", "eotp", "vtnet", "hoz", "semexp")
-#: Rollouts of SemExp hold two of its macro-steps, with as many steps an update as usual.
-SEMEXP_PPO = PPOConfig(num_envs=64, rollout=60)
+METHODS = ("org", "eotp", "vtnet", "hoz", "semexp")
 NUM_EPISODES = 256
 NUM_STEPS = 60
 #: Steps of an episode at which the change of w is reported.
 REPORTED_STEPS = (1, 5, 10, 20, 50)
 
 
-def main(folder: Path, hosts: list[str], total_steps: int) -> None:
+def main(folder: Path, methods: list[str], total_steps: int) -> None:
     rows = []
-    for host in hosts:
+    for method in methods:
         for weight_kind in get_args(WeightKind):
             config = jaxnav.RunConfig(
-                run_dir=folder / f"{host}-{weight_kind}",
-                method=host,
+                run_dir=folder / f"{method}-{weight_kind}",
+                method=method,
                 arms=("layout",),
                 seeds=1,
                 total_steps=total_steps,
                 validations=1,
                 layout=dataclasses.replace(jaxnav.RunConfig().layout, weights=weight_kind),
-                ppo=SEMEXP_PPO if host == "semexp" else PPOConfig(),
+                ppo=SEMEXP_PPO if method == "semexp" else PPOConfig(),
             )
             run = jaxnav.train(config)
             world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
             policies = run.policies()
             fresh_params = init_params(policies.spec, jax.random.key(0))
             untrained = policies._replace(params=jax.tree.map(lambda leaf: leaf[None], fresh_params))
-            row = {"host": host, "weights": weight_kind} | measure(policies, world)
-            rows.append(row | {"untrained": measure(untrained, world)["others / Z"]})
+            row = {"method": method, "weights": weight_kind} | measure(policies, world)
+            rows.append(row | {"untrained": measure(untrained, world)["categories / Z"]})
             print(rows[-1], file=sys.stderr, flush=True)
     print(format_table(rows), file=sys.stderr)
     print_report({"total_steps": total_steps, "rows": rows})
@@ -89,8 +90,9 @@ def measure(policies: Policies, world: CompiledWorld) -> dict[str, float]:
 
     # Mean squares over the decisions with a partner.
     is_paired = recorded["running"] & (recorded["running"].sum(axis=1, keepdims=True) > 1)
-    others, experience, everything = (recorded[name][is_paired].mean() for name in ("others", "experience", "all"))
-    row |= {"others / Z": others / experience, "Z / all": experience / everything}
+    names = ("other_categories", "experience", "all")
+    other_categories, experience, everything = (recorded[name][is_paired].mean() for name in names)
+    row |= {"categories / Z": other_categories / experience, "Z / all": experience / everything}
     return {name: float(f"{value:.3g}") for name, value in row.items()}
 
 
@@ -132,7 +134,7 @@ def record_steps(policies: Policies, world: CompiledWorld) -> dict[str, jax.Arra
 
             core_input = project(policy, pathways, memory.action)
             changed_inputs = {
-                "others": project(policy, replace(ReplacedPart.OTHERS), memory.action),
+                "other_categories": project(policy, replace(ReplacedPart.OTHER_CATEGORIES), memory.action),
                 "experience": project(policy, replace(ReplacedPart.EXPERIENCE), memory.action),
                 "all": take_rows(core_input, partner),
             }
@@ -169,20 +171,20 @@ def project(policy: Policy, pathways: Pathways, action: jax.Array) -> jax.Array:
 
 def format_table(rows: list[dict[str, Any]]) -> str:
     """Return the rows in Markdown."""
-    names = [name for name in rows[0] if name not in ("host", "weights", "low", "high")]
-    lines = [f"| host | weights | {' | '.join(names)} |", "| --- | --- |" + " ---: |" * len(names)]
+    names = [name for name in rows[0] if name not in ("method", "weights", "low", "high")]
+    lines = [f"| method | weights | {' | '.join(names)} |", "| --- | --- |" + " ---: |" * len(names)]
     for row in rows:
         cells = [f"{row[name]:.3g}" for name in names]
         cells[0] += f" ({row['low']:.3g} to {row['high']:.3g})"
-        lines.append(f"| {row['host']} | {row['weights']} | {' | '.join(cells)} |")
+        lines.append(f"| {row['method']} | {row['weights']} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--hosts", nargs="+", default=list(HOSTS))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--total-steps", type=int, default=600_000)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary_folder:
-        main(options.folder or Path(temporary_folder), options.hosts, options.total_steps)
+        main(options.folder or Path(temporary_folder), options.methods, options.total_steps)
