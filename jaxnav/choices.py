@@ -16,7 +16,7 @@ EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "
 #: Ways to use policies in an evaluation, and the two references without training.
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde", "cde", "scde"]
 #: Parts of a decision whose cost an evaluation measures: other categories in Z, all parts, or none.
-Costs = Literal["others", "all", "none"]
+Costs = Literal["categories", "all", "none"]
 #: Causal quantity that a complete removal of experience leaves: the total direct effect (eq. 1), or the decision under
 #: do(Z = 0) (controlled direct effect).
 Removal = Literal["tde", "cde"]

@@ -58,8 +58,8 @@ class EvalConfig:
       inner_steps: largest number of adaptation steps in an episode, at least 0, for methods that learn while they act
         (`jaxnav list methods` describes the methods). The default is the usual number of the method.
       costs: parts of the decisions whose cost is measured, by replacing them by those of other episodes throughout.
-        `others`: the categories other than the goal within experience, on a quarter of the episodes. `all`: every part,
-        on all episodes. The shares of decisions that change are always measured.
+        `categories`: the categories other than the goal within experience, on a quarter of the episodes. `all`: every
+        part, on all episodes. The shares of decisions that change are always measured.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
       json: JSON file to write. The default is a name such as `eval-val.json` in the run directory.
       format: format in which the evaluation is printed.
@@ -78,7 +78,7 @@ class EvalConfig:
     inner_steps: int | None = None
     removal: tuple[Removal, ...] = ("tde",)
     counterfactual_memory: CounterfactualMemory | None = None
-    costs: Costs = "others"
+    costs: Costs = "categories"
     seed: int = 0
     json: Path | None = None
     format: Literal["table", "markdown", "json"] = "table"

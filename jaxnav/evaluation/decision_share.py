@@ -1,8 +1,9 @@
 """Decision shares: how many decisions change when one part is replaced by that of another episode.
 
 A decision counts as changed when its best action changes and the KL divergence from the factual to the changed action
-probabilities exceeds `MIN_KL`, so that near ties do not count. The *floor* of a part compares two replacements by the
-parts of two different episodes: a share near its floor says that the episode's own part acts like any other.
+probabilities exceeds `MIN_KL`, so that near ties do not count. The *partner difference* of a part is the share of
+decisions that differ between the parts of two other episodes (partners). Share and partner difference are equal if the
+episode's own part and the rest of the decision are independent.
 
 `ShareProbe` runs a small batch of the evaluation's episodes and replaces parts of their decisions on the way. Episodes
 follow the factual decisions; replaced decisions are only compared. `share_interval` turns the counts into a share with
@@ -19,7 +20,7 @@ import numpy as np
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.grid import infer_and_act
 from jaxnav.evaluation.removal import InferenceConfig, other_running_episode
-from jaxnav.evaluation.replacements import DRAWN_PARTS, ReplacedPart, replace_part
+from jaxnav.evaluation.replacements import PARTNER_PARTS, ReplacedPart, replace_part
 from jaxnav.evaluation.statistics import Clusters, Interval, jackknife_interval, run_clusters
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
@@ -36,22 +37,22 @@ _MIN_RUNNING = 3
 
 
 class ShareCounts(NamedTuple):
-    """Numbers of decisions by episode, leaves [..., E] and [..., E, P] for P parts.
+    """Weighted numbers of decisions by episode, leaves [..., E] and [..., E, P] for P parts.
 
-    Late steps, at which few episodes still run, are probed more rarely; a probed decision counts as often as the steps
-    that it stands for.
+    Late steps, at which few episodes still run, are probed more rarely. The weight of a probed decision is its stride
+    over the initial stride, so that the decisions that it stands for count too.
 
     Attributes:
-      decisions: int32 [..., E], probed decisions.
+      weighted_decisions: int32 [..., E], all probed decisions.
       changed: int32 [..., E, P], decisions that change when the part is replaced.
-      differing: int32 [..., E, P], decisions that differ between replacements by two episodes; 0 for a part whose
-        replacement is the same in all episodes.
+      partner_differences: int32 [..., E, P], decisions that differ between two partners; 0 for a part that is not
+        replaced by a partner's.
       deleted: int32 [..., E], decisions that change with Z = 0.
     """
 
-    decisions: jax.Array
+    weighted_decisions: jax.Array
     changed: jax.Array
-    differing: jax.Array
+    partner_differences: jax.Array
     deleted: jax.Array
 
 
@@ -90,7 +91,7 @@ def count_changes(
       policy: policy with the entry's parameters.
       agent: agents of the episodes.
       counted: bool [E], decisions to count.
-      partners: for each episode the indices of two other episodes, int [E] each.
+      partners: for each episode the indices of two other episodes, int [E] each; their parts are the replacements.
       parts: the P parts.
       agent_loop, env_params, knowledge: as in `infer_and_act`.
 
@@ -120,24 +121,24 @@ def count_changes(
         )
         return policy.decide(changed_pathways, changed_memory).logits
 
-    # Replace every part once, and the drawn ones twice.
+    # Replace every part once, and those of partners twice.
     changed_columns = []
-    differing_columns = []
+    difference_columns = []
     for part in parts:
         changed_logits = decide_with_part(part, partners[0])
         changed_columns.append(is_changed(factual_logits, changed_logits))
         is_different = jnp.zeros_like(counted)
-        if part in DRAWN_PARTS:
+        if part in PARTNER_PARTS:
             is_different = is_changed(changed_logits, decide_with_part(part, partners[1]))
-        differing_columns.append(is_different)
+        difference_columns.append(is_different)
 
     # For comparison: the decision with Z = 0.
     without_experience = pathways._replace(experience=jnp.zeros_like(pathways.experience))
     deleted_logits = policy.decide(without_experience, memory).logits
     return ShareCounts(
-        decisions=counted.astype(jnp.int32),
+        weighted_decisions=counted.astype(jnp.int32),
         changed=(jnp.stack(changed_columns, axis=-1) & counted[:, None]).astype(jnp.int32),
-        differing=(jnp.stack(differing_columns, axis=-1) & counted[:, None]).astype(jnp.int32),
+        partner_differences=(jnp.stack(difference_columns, axis=-1) & counted[:, None]).astype(jnp.int32),
         deleted=(is_changed(factual_logits, deleted_logits) & counted).astype(jnp.int32),
     )
 
@@ -256,33 +257,35 @@ class ShareProbe:
         agent = agent_loop.start_from(initial_states, policy.initial_memory((num_episodes,)), knowledge, env_params)
         by_episode = jnp.zeros(num_episodes, jnp.int32)
         by_part = jnp.zeros((num_episodes, len(self._parts)), jnp.int32)
-        no_counts = ShareCounts(decisions=by_episode, changed=by_part, differing=by_part, deleted=by_episode)
+        no_counts = ShareCounts(
+            weighted_decisions=by_episode, changed=by_part, partner_differences=by_part, deleted=by_episode
+        )
         start = (agent, jnp.ones(num_episodes, bool), jnp.int32(0), no_counts)
         *_, counts = jax.lax.while_loop(lambda carry: carry[1].sum() >= _MIN_RUNNING, step, start)
         return counts
 
 
-def share_interval(counted: np.ndarray, decisions: np.ndarray, scenes: Clusters) -> Interval:
+def share_interval(counted: np.ndarray, weighted_decisions: np.ndarray, scenes: Clusters) -> Interval:
     """Compute the share of decisions, in percent, with its interval over scenes and training runs.
 
     Args:
-      counted: int [S, E], counted decisions by training run and episode.
-      decisions: int [S, E], all probed decisions.
+      counted: int [S, E], weighted number of the decisions to count, by training run and episode.
+      weighted_decisions: int [S, E], weighted number of all probed decisions.
       scenes: clusters of the E episodes.
 
     Returns:
       The share over all runs, with that of every run in `seeds`; NaN without decisions.
     """
     # Numerator and denominator leave out the same run and the same scene.
-    runs = run_clusters(1, len(decisions))
+    runs = run_clusters(1, len(weighted_decisions))
     counted_replicates = runs.weights.T @ counted @ scenes.weights
-    decision_replicates = runs.weights.T @ decisions @ scenes.weights
-    if not decisions.any():
+    decision_replicates = runs.weights.T @ weighted_decisions @ scenes.weights
+    if not weighted_decisions.any():
         return Interval(float("nan"))
     # Leaving out the only run leaves no decision; `jackknife_interval` then ignores the replicate.
     share_replicates = 100.0 * counted_replicates / np.maximum(decision_replicates, np.finfo(float).tiny)
 
-    seed_shares = 100.0 * counted.sum(axis=1) / np.maximum(decisions.sum(axis=1), 1)
+    seed_shares = 100.0 * counted.sum(axis=1) / np.maximum(weighted_decisions.sum(axis=1), 1)
     return jackknife_interval(
         share_replicates,
         scenes,

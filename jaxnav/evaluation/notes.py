@@ -14,7 +14,7 @@ from jaxnav.evaluation.statistics import MIN_SCENE_DEGREES, Interval, paired_dif
 from jaxnav.evaluation.variants import EvaluationRow
 
 #: Share of other categories within Z, in percent, below which a row draws no verdict about w or sTDE.
-MIN_OTHERS_SHARE = 5.0
+MIN_OTHER_CATEGORIES_SHARE = 5.0
 
 
 def evaluation_notes(
@@ -60,7 +60,7 @@ def decision_share_notes(decision_shares: Sequence[Mapping[str, Any]]) -> list[s
     share_notes = []
     for entry in decision_shares:
         share = entry["share"]["mean"]
-        if entry["part"] != "others" or share is None:
+        if entry["part"] != "other_categories" or share is None:
             continue
 
         # A share without a cost is noise. Without an interval, the share alone decides.
@@ -70,7 +70,7 @@ def decision_share_notes(decision_shares: Sequence[Mapping[str, Any]]) -> list[s
             cost = Interval.from_json(entry["cost"]["spl"])
             has_no_cost = cost.low <= 0.0 <= cost.high
             cost_text = f" and replacing them costs {cost:.1f} SPL"
-        if share < MIN_OTHERS_SHARE or has_no_cost:
+        if share < MIN_OTHER_CATEGORIES_SHARE or has_no_cost:
             share_notes.append(
                 f"{entry['variant']} ({entry['decoding']}): {share:.1f} % of the decisions depend on other categories "
                 f"within Z{cost_text}, so this row tests neither w nor sTDE."

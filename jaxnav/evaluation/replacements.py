@@ -23,24 +23,30 @@ from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
 
 
 class ReplacedPart(enum.IntEnum):
-    """Part of a decision that is replaced by the part of another episode at the same step.
+    """Part of a decision that can be replaced: by the part of another episode at the same step, except for weights.
 
-    `NONE`: nothing. `OTHERS`: the detections of all categories but the goal within experience. `EXPERIENCE`: all of Z.
-    `PRIOR_WEIGHTS`: w, by the w of the layout prior. `UNIFORM_WEIGHTS`: w, by equal weights off the goal. `DIRECT`:
-    both direct pathways, scene and goal. `MEMORY`: recurrent state, previous action and fast weights.
+    `NONE`: nothing. `OTHER_CATEGORIES`: the detections of all categories but the goal within experience. `EXPERIENCE`:
+    all of Z. `PRIOR_WEIGHTS`: w, by the w of the layout prior. `UNIFORM_WEIGHTS`: w, by equal weights off the goal; the
+    goal keeps its weight. `SCENE_AND_GOAL`: both direct pathways. `MEMORY`: recurrent state, previous action and fast
+    weights.
     """
 
     NONE = 0
-    OTHERS = 1
+    OTHER_CATEGORIES = 1
     EXPERIENCE = 2
     PRIOR_WEIGHTS = 3
     UNIFORM_WEIGHTS = 4
-    DIRECT = 5
+    SCENE_AND_GOAL = 5
     MEMORY = 6
 
 
-#: Parts that are replaced by those of another episode; the replacement of the remaining ones is the same in all.
-DRAWN_PARTS = (ReplacedPart.OTHERS, ReplacedPart.EXPERIENCE, ReplacedPart.DIRECT, ReplacedPart.MEMORY)
+#: Parts whose replacement comes from a partner episode.
+PARTNER_PARTS = (
+    ReplacedPart.OTHER_CATEGORIES,
+    ReplacedPart.EXPERIENCE,
+    ReplacedPart.SCENE_AND_GOAL,
+    ReplacedPart.MEMORY,
+)
 #: Parts that only policies with layout weights have.
 WEIGHT_PARTS = (ReplacedPart.PRIOR_WEIGHTS, ReplacedPart.UNIFORM_WEIGHTS)
 
@@ -85,7 +91,7 @@ def replace_part(
     match part:
         case ReplacedPart.NONE:
             return pathways, memory
-        case ReplacedPart.OTHERS:
+        case ReplacedPart.OTHER_CATEGORIES:
             # Rows and readings of the partners, read for the goals of the episodes themselves.
             partner_observation = inputs.observation.replace(row=inputs.observation.row[partner])
             partner_perception = take_rows(agent.perception, partner)
@@ -94,7 +100,7 @@ def replace_part(
                 layout_weights=inputs.layout_weights,
                 reading=agent_loop.read_tracker(partner_perception, agent.state.goal, knowledge),
             )
-            mixed = policy.pathways(inputs, memory, others=partner_inputs)
+            mixed = policy.pathways(inputs, memory, partner_inputs=partner_inputs)
             return pathways._replace(experience=mixed.experience), memory
         case ReplacedPart.EXPERIENCE:
             return pathways._replace(experience=partner_pathways.experience), memory
@@ -103,8 +109,8 @@ def replace_part(
         case ReplacedPart.UNIFORM_WEIGHTS:
             num_categories = inputs.layout_weights.shape[-1]
             is_goal = jax.nn.one_hot(agent.state.goal, num_categories, dtype=bool)
-            return with_weights(jnp.where(is_goal, 1.0, 1.0 / (num_categories - 1))), memory
-        case ReplacedPart.DIRECT:
+            return with_weights(jnp.where(is_goal, inputs.layout_weights, 1.0 / (num_categories - 1))), memory
+        case ReplacedPart.SCENE_AND_GOAL:
             return pathways._replace(scene=partner_pathways.scene, goal=partner_pathways.goal), memory
         case ReplacedPart.MEMORY:
             # Experience that reads the memory is computed again.

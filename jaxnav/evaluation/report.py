@@ -270,15 +270,15 @@ def difference_table(report: dict[str, Any]) -> Table:
 
 #: Names of the parts of a decision, as printed in tables.
 PART_LABELS = {
-    "others": "other categories in Z",
+    "other_categories": "other categories in Z",
     "experience": "Z",
     "prior_weights": "w (prior instead)",
     "uniform_weights": "w (uniform instead)",
-    "direct": "scene and goal",
+    "scene_and_goal": "scene and goal",
     "memory": "memory",
 }
 #: Titles of the columns of decision shares.
-_SHARE_TITLES = ("share (%)", "floor (%)", "cost in SPL", "cost in SR")
+_SHARE_TITLES = ("share (%)", "partner difference (%)", "cost in SPL", "cost in SR")
 
 
 def has_decision_shares(report: dict[str, Any]) -> bool:
@@ -290,7 +290,7 @@ def decision_share_table(report: dict[str, Any]) -> Table:
     """Make the table of the decision shares for a terminal.
 
     One line per row and part: how many decisions change when the part becomes that of another episode, how many differ
-    between two other episodes, and what the change costs throughout the episode.
+    between the parts of two other episodes (partners), and what the change costs throughout the episode.
     """
     table = Table("Part of the decision", "decoding", *_SHARE_TITLES)
     previous_variant = ""
@@ -312,12 +312,12 @@ def _share_heading(report: dict[str, Any], entry: dict[str, Any]) -> str:
 
 
 def _share_cells(entry: dict[str, Any]) -> list[str]:
-    """Cells of one entry: share, floor, cost in SPL, cost in SR; empty where nothing was measured."""
-    floor = entry["floor"]
+    """Cells of one entry: share, partner difference, cost in SPL, cost in SR; empty without a measurement."""
+    partner_difference = entry["partner_difference"]
     cost = entry["cost"]
     cells = [
         f"{Interval.from_json(entry['share']):.1f}",
-        "" if floor is None else f"{Interval.from_json(floor):.1f}".partition(" ")[0],
+        "" if partner_difference is None else f"{Interval.from_json(partner_difference):.1f}".partition(" ")[0],
     ]
     for metric in ("spl", "sr"):
         cells.append("" if cost is None else f"{Interval.from_json(cost[metric]):+.1f}")

@@ -66,15 +66,15 @@ def value_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRo
 
 
 def share_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRow]:
-    """List the decision shares of an evaluation with their floors and costs."""
+    """List the decision shares of an evaluation with the differences between partners and the costs."""
     for entry in scores.results.report["decision_shares"]:
         fields = {"world": run.world, "run": run.agent, "shift": shift}
         fields |= {"variant": entry["variant"], "decoding": entry["decoding"]}
-        measured = {"share": entry["share"], "floor": entry["floor"]}
+        measured = {"share": entry["share"], "partner difference": entry["partner_difference"]}
         if entry["cost"] is not None:
             measured |= {"cost in spl": entry["cost"]["spl"], "cost in sr": entry["cost"]["sr"]}
 
-        # A part whose replacement is the same in all episodes has no floor.
+        # Only parts of partner episodes have a difference between partners.
         for name, interval in measured.items():
             if interval is not None:
                 metric = f"{name} of {entry['part']}"

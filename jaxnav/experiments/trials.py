@@ -44,7 +44,7 @@ TrialControl = Literal[
 ]
 #: Part of the counterfactual decision that a control takes from another episode.
 REPLACED_PARTS: Mapping[str, ReplacedPart] = {
-    "other_categories": ReplacedPart.OTHERS,
+    "other_categories": ReplacedPart.OTHER_CATEGORIES,
     "other_experience": ReplacedPart.EXPERIENCE,
     "other_memory": ReplacedPart.MEMORY,
 }

@@ -138,7 +138,7 @@ class Experience(nnx.Module):
         """
         raise NotImplementedError
 
-    def replace_others(
+    def replace_other_categories(
         self, features: Features, reading: Tree, other_features: Features, other_reading: Tree
     ) -> tuple[Features, Tree]:
         """Replace all categories but the goal by those of another episode, for `jaxnav.evaluation.replacements`.

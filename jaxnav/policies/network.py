@@ -236,15 +236,16 @@ class Policy(Stream):
         super().__init__(self._input_widths(sizes), method.control.num_choices, spec, rngs)
 
     def pathways(
-        self, inputs: PolicyInputs, memory: PolicyState | None = None, others: PolicyInputs | None = None
+        self, inputs: PolicyInputs, memory: PolicyState | None = None, partner_inputs: PolicyInputs | None = None
     ) -> Pathways:
         """Embed the scene (S), the goal (G) and the experience (Z).
 
         Args:
           inputs: leaves [...].
           memory: leaves [...]; None unless the method's experience reads the memory.
-          others: inputs with the goals of `inputs`, from which experience takes the detections of all categories but
-            the goal (`Experience.replace_others`); None takes them from `inputs`.
+          partner_inputs: inputs of other episodes with the goals of `inputs`, from which experience takes the
+            detections of all categories but the goal (`Experience.replace_other_categories`); None takes them from
+            `inputs`.
 
         Returns:
           Embeddings with leaves [..., size], see `Pathways`.
@@ -253,14 +254,14 @@ class Policy(Stream):
           ValueError: the experience reads the memory, and none is given.
         """
         # Only `attend` reads the memory; everything before it runs in parallel over time.
-        encoded = self.encode(inputs, others)
+        encoded = self.encode(inputs, partner_inputs)
         if not self.method.reads_memory:
             return encoded
         if memory is None:
             raise ValueError("pathways: the experience of the method reads the memory; pass `memory`")
         return self.attend(encoded, memory)
 
-    def encode(self, inputs: PolicyInputs, others: PolicyInputs | None = None) -> Pathways:
+    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> Pathways:
         """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
         features = self._unpack(inputs)
 
@@ -273,17 +274,17 @@ class Policy(Stream):
             scene_inputs = jnp.concatenate([scene_inputs, self.method.scene_inputs(inputs.reading)], axis=-1)
         scene = nnx.relu(self.view(scene_inputs))
 
-        # G: the detections of all categories and the goal.
+        # G: the detections that `direct` selects, and the goal.
         goal_embedding = self._embed_goal(features, self.appearance.embedding[...])
 
-        # Z: the method's experience, weighted by w x g (eq. 7). No gradient enters the layout belief.
+        # Z: the method's experience, weighted by the goal's column of w (eq. 7). No gradient enters the layout belief.
         layout_weights = jax.lax.stop_gradient(inputs.layout_weights)
         if self.weight_kind == "relative":
             layout_weights = scale_weights(layout_weights, inputs.observation.goal)
         experience_features, reading = features, inputs.reading
-        if others is not None:
-            experience_features, reading = self.method.replace_others(
-                features, inputs.reading, self._unpack(others), others.reading
+        if partner_inputs is not None:
+            experience_features, reading = self.method.replace_other_categories(
+                features, inputs.reading, self._unpack(partner_inputs), partner_inputs.reading
             )
         if self.weight_kind == "pixel":
             experience_features = scale_boxes(experience_features)
@@ -389,10 +390,10 @@ class Policy(Stream):
         return features if self.perceive is None else self.perceive(features)
 
     def _embed_goal(self, features: Features, appearance: jax.Array) -> jax.Array:
-        """Embed detections and the goal, without experience.
+        """Embed the detections that `direct` selects, and the goal, without experience.
 
-        With `goal_row` the goal's detection enters twice: among all categories, and through the same perceptron in a
-        row of its own, so that Done is learned jointly for all goals.
+        With `goal_row` the goal's detection enters twice: in the table of the selected detections, and through the same
+        perceptron in a row of its own, so that Done is learned jointly for all goals.
         """
         # Rows [..., K, h]; `direct` masks rows.
         rows = self.detections.project_detections(features, appearance)
@@ -401,7 +402,7 @@ class Policy(Stream):
         elif self.direct == "none":
             rows = rows * jnp.zeros_like(features.goal)[..., None]
 
-        # All categories first, then the row of the goal, then the embedding of the goal.
+        # The selected detections first, then the row of the goal, then the embedding of the goal.
         embeddings = [self.detections.finish(rows)]
         if self.goal_row:
             goal_row = (rows * features.goal[..., None]).sum(axis=-2, keepdims=True)
@@ -435,9 +436,9 @@ class StreamsPolicy(Policy):
         # Category embeddings of the experience stream, which shares none with the direct stream.
         self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
 
-    def encode(self, inputs: PolicyInputs, others: PolicyInputs | None = None) -> Pathways:
+    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> Pathways:
         """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
-        encoded = super().encode(inputs, others)
+        encoded = super().encode(inputs, partner_inputs)
         # The view layer embeds the view twice, once per stream; the appended 1 is the factor of the stream.
         direct_view, experience_view = jnp.split(encoded.scene, 2, axis=-1)
         # The experience stays a pair until `_join_experience`: `attend`, if needed, computes only its first part.

@@ -121,7 +121,7 @@ def evaluate(
     removal: Sequence[Removal] = ("tde",),
     counterfactual_memory: CounterfactualMemory | None = None,
     inner_steps: int | None = None,
-    costs: Costs = "others",
+    costs: Costs = "categories",
     seed: int = 0,
     compiled: CompiledWorld | None = None,
     console: Console | None = None,
@@ -145,7 +145,7 @@ def evaluate(
       counterfactual_memory: memory from which the counterfactual branch decides; see
         `Policies.with_counterfactual_memory`.
       inner_steps: limit of adaptation steps in an episode; see `Policies.with_inner_steps`.
-      costs: parts of the decisions that are replaced throughout episodes to measure their cost: `others` for other
+      costs: parts of the decisions that are replaced throughout episodes to measure their cost: `categories` for other
         categories within experience, on a quarter of the episodes; `all` for every part, on all episodes; or `none`.
       seed: seed of the episode list and the sampled actions, from 0 to 2**32 - 1.
       compiled: result of `compile_evaluation_world` for the same arguments; None compiles it.

@@ -14,7 +14,7 @@ from jaxnav.choices import Costs
 from jaxnav.evaluation.decision_share import ShareCounts, ShareProbe, share_interval
 from jaxnav.evaluation.episodes import MAX_EPISODES, EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics, start_states
-from jaxnav.evaluation.replacements import DRAWN_PARTS, WEIGHT_PARTS, ReplacedPart
+from jaxnav.evaluation.replacements import PARTNER_PARTS, WEIGHT_PARTS, ReplacedPart
 from jaxnav.evaluation.statistics import Interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow, Replacement, inference_grid
 from jaxnav.runs.policies import Policies
@@ -47,7 +47,7 @@ def list_cost_replacements(rows: Sequence[EvaluationRow], costs: Costs) -> list[
     replacements = []
     for row in rows_without_removal(rows):
         for part in replaced_parts(row):
-            if costs == "all" or (costs == "others" and part == ReplacedPart.OTHERS):
+            if costs == "all" or (costs == "categories" and part == ReplacedPart.OTHER_CATEGORIES):
                 replacements.append(Replacement(row, part))
     return replacements
 
@@ -124,24 +124,30 @@ def build_decision_shares(
       replacement_costs: costs as from `measure_costs`.
     """
     scenes = probed_episodes.clusters()
+
+    def share_of(counted: jax.Array, weighted_decisions: jax.Array) -> dict[str, Any]:
+        """Share of a row's decisions, from numbers [S, E]."""
+        return share_interval(np.asarray(counted), np.asarray(weighted_decisions), scenes).to_json()
+
     entries = []
     for row_index, row in enumerate(rows):
-        decisions, changed, differing, deleted = (np.asarray(leaf[row_index]) for leaf in counts)
+        weighted_decisions = counts.weighted_decisions[row_index]
         for part in replaced_parts(row):
             part_index = part - 1  # `NONE` is no part
             entry = {
                 "variant": row.variant,
                 "decoding": row.decoding,
                 "part": part.name.lower(),
-                "decisions": decisions.sum(axis=1).tolist(),
-                "share": share_interval(changed[..., part_index], decisions, scenes).to_json(),
-                "floor": None,
+                "weighted_decisions": weighted_decisions.sum(axis=1).tolist(),
+                "share": share_of(counts.changed[row_index, ..., part_index], weighted_decisions),
+                "partner_difference": None,
                 "cost": replacement_costs.get(Replacement(row, part)),
             }
-            if part in DRAWN_PARTS:
-                entry["floor"] = share_interval(differing[..., part_index], decisions, scenes).to_json()
+            if part in PARTNER_PARTS:
+                partner_differences = counts.partner_differences[row_index, ..., part_index]
+                entry["partner_difference"] = share_of(partner_differences, weighted_decisions)
             if part == ReplacedPart.EXPERIENCE:
-                entry["deleted"] = share_interval(deleted, decisions, scenes).to_json()
+                entry["deleted"] = share_of(counts.deleted[row_index], weighted_decisions)
             entries.append(entry)
     return entries
 

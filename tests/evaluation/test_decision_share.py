@@ -63,7 +63,7 @@ def probe():
 
     def measure(change):
         counts = share_probe(grid, stack_params(change), start_states(EPISODES), PARAMS, KNOWLEDGE, KEY)
-        return counts, counts.changed.sum(axis=1) / counts.decisions.sum(axis=1)[:, None]
+        return counts, counts.changed.sum(axis=1) / counts.weighted_decisions.sum(axis=1)[:, None]
 
     return measure
 
@@ -82,31 +82,33 @@ def test_a_decision_changes_if_its_best_action_does_and_kl_exceeds_the_bound():
 
 def test_a_policy_that_ignores_experience_has_shares_of_zero(probe):
     counts, shares = probe(ignore_experience)
-    experience_parts = (ReplacedPart.OTHERS, *PARTS[1:4])
+    experience_parts = (ReplacedPart.OTHER_CATEGORIES, *PARTS[1:4])
     for part in experience_parts:
         assert (shares[:, part - 1] == 0).all()
     assert counts.deleted.sum() == 0
-    assert counts.differing[..., ReplacedPart.EXPERIENCE - 1].sum() == 0
+    assert counts.partner_differences[..., ReplacedPart.EXPERIENCE - 1].sum() == 0
     # Negative control: the parts that the policy does read.
-    assert (shares[:, ReplacedPart.DIRECT - 1] > 0.05).all()
+    assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] > 0.05).all()
 
 
 def test_a_policy_of_experience_alone_depends_on_no_direct_pathway(probe):
     _, shares = probe(use_only_experience)
-    assert (shares[:, ReplacedPart.DIRECT - 1] == 0).all()
+    assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] == 0).all()
     assert (shares[:, ReplacedPart.EXPERIENCE - 1] > 0.1).all()
-    assert (shares[:, ReplacedPart.OTHERS - 1] > 0.05).all()
+    assert (shares[:, ReplacedPart.OTHER_CATEGORIES - 1] > 0.05).all()
     # The baseline has no w to replace.
     assert shares[0, ReplacedPart.UNIFORM_WEIGHTS - 1] == 0
 
 
-def replaced_parts_of(agent, partner, part):
+def replaced_parts_of(agent, partner, part, layout_weights=None):
     """Pathways and memory with a part replaced, and the factual ones, compiled."""
 
     @jax.jit
     def replace(params, agent):
         policy = AGENT_LOOP.bind(params)
         inputs = AGENT_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS)
+        if layout_weights is not None:
+            inputs = inputs._replace(layout_weights=layout_weights)
         pathways = policy.pathways(inputs, policy_memory(agent))
         replaced = replace_part(
             part,
@@ -126,7 +128,7 @@ def replaced_parts_of(agent, partner, part):
 
 
 @pytest.mark.parametrize(
-    "part", [ReplacedPart.OTHERS, ReplacedPart.EXPERIENCE, ReplacedPart.DIRECT, ReplacedPart.MEMORY]
+    "part", [ReplacedPart.OTHER_CATEGORIES, ReplacedPart.EXPERIENCE, ReplacedPart.SCENE_AND_GOAL, ReplacedPart.MEMORY]
 )
 def test_replacing_a_part_by_oneself_changes_nothing(part):
     weights = tiny.random_params(6)
@@ -145,6 +147,26 @@ def test_replacing_a_part_by_oneself_changes_nothing(part):
         chex.assert_trees_all_equal(replaced, factual)
 
 
+def test_uniform_weights_keep_the_weight_of_the_goal():
+    """Where the weights off the goal are uniform already, their replacement changes nothing."""
+    agent = start_agent(tiny.random_params(6), start_states(EPISODES), PARAMS)
+    own = jnp.arange(len(EPISODES.goal))
+    num_categories = KNOWLEDGE.layout.shape[-1]
+
+    def replace_weights(goal_weight, other_weight):
+        is_goal = jax.nn.one_hot(agent.state.goal, num_categories, dtype=bool)
+        weights = jnp.where(is_goal, goal_weight, other_weight)
+        return replaced_parts_of(agent, own, ReplacedPart.UNIFORM_WEIGHTS, weights)
+
+    uniform = 1.0 / (num_categories - 1)
+    for goal_weight in (1.0, 1.3):
+        replaced, factual = replace_weights(goal_weight, uniform)
+        chex.assert_trees_all_equal(replaced, factual)
+    # Negative control: other weights off the goal.
+    replaced, factual = replace_weights(1.3, 2 * uniform)
+    assert np.abs(replaced[0].experience - factual[0].experience).max() > 1e-3
+
+
 @pytest.mark.slow
 def test_replacements_leave_other_rows_bit_identical():
     weights = stack_params(ignore_experience)
@@ -155,11 +177,13 @@ def test_replacements_leave_other_rows_bit_identical():
     layout_row = rows.index(table_row("layout", None, None, "sample"))
     replacements = [
         Replacement(rows[layout_row], ReplacedPart.EXPERIENCE),
-        Replacement(rows[layout_row], ReplacedPart.DIRECT),
+        Replacement(rows[layout_row], ReplacedPart.SCENE_AND_GOAL),
     ]
     replaced_grid = replacement_grid(replacements, ARMS, 1, max_room_episodes=6)
     whole_grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), grid, replaced_grid)
-    evaluator = Evaluator(AGENT_LOOP, has_controls=False, replaced_parts=(ReplacedPart.EXPERIENCE, ReplacedPart.DIRECT))
+    evaluator = Evaluator(
+        AGENT_LOOP, has_controls=False, replaced_parts=(ReplacedPart.EXPERIENCE, ReplacedPart.SCENE_AND_GOAL)
+    )
     outcome = evaluator(whole_grid, weights, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
     chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[: len(rows)], outcome), factual)
 
@@ -204,7 +228,9 @@ def test_hoz_takes_room_and_zones_of_the_other_episode():
     own, other = make_features(0, goal=1), make_features(1, goal=1)
     own_reading = ZoneReading(jnp.array([1.0, 0.0]), jnp.zeros((3, 3)))
     other_reading = ZoneReading(jnp.array([0.0, 1.0]), jnp.ones((3, 3)))
-    mixed, reading = ZoneRelations.replace_others(object.__new__(ZoneRelations), own, own_reading, other, other_reading)
+    mixed, reading = ZoneRelations.replace_other_categories(
+        object.__new__(ZoneRelations), own, own_reading, other, other_reading
+    )
     chex.assert_trees_all_equal(reading, other_reading)
     np.testing.assert_array_equal(mixed.table, np.stack([other.table[0], own.table[1], other.table[2]]))
     np.testing.assert_array_equal(mixed.visible, np.stack([other.visible[0], own.visible[1], other.visible[2]]))
@@ -215,7 +241,7 @@ def test_semexp_keeps_floor_and_goal_of_its_map():
     # Bits of categories 0 to 2; the goal is 1.
     own_reading = MapReading(jnp.array([0b011, 0b000], jnp.uint32) | FREE_BIT, jnp.array([0.0, 1.0]))
     other_reading = MapReading(jnp.array([0b100, 0b111], jnp.uint32), jnp.array([1.0, 0.0]))
-    _, reading = MappedCategories.replace_others(
+    _, reading = MappedCategories.replace_other_categories(
         object.__new__(MappedCategories), own, own_reading, other, other_reading
     )
     np.testing.assert_array_equal(reading.blocks, np.array([0b110, 0b101], np.uint32) | FREE_BIT)

@@ -136,7 +136,7 @@ def test_rows_that_hardly_use_other_categories_are_noted(share, bounds, has_note
         }
 
     # Shares of other parts have no note.
-    notes = decision_share_notes([make_entry("others", share), make_entry("memory", 0.0)])
+    notes = decision_share_notes([make_entry("other_categories", share), make_entry("memory", 0.0)])
     assert len(notes) == has_note
     if has_note:
         assert notes[0].startswith(f"layout (argmax): {share} % of the decisions")

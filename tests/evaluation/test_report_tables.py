@@ -94,7 +94,7 @@ def test_difference_table_has_a_line_per_comparison():
     assert cells == ["argmax", "+25.0 [+10.0, +40.0]", "-1.2 [-2.0, +0.5]", "-0.03 [-0.10, +0.00]"]
 
 
-def make_share(part, share, floor, cost):
+def make_share(part, share, partner_difference, cost):
     """An entry of a report about the baseline, with values without intervals; None where nothing was measured."""
 
     def interval_json(mean):
@@ -102,21 +102,24 @@ def make_share(part, share, floor, cost):
 
     entry = {"variant": "baseline", "decoding": "argmax", "part": part, "share": interval_json(share)}
     costs = None if cost is None else {"episodes": 10, "spl": interval_json(cost), "sr": interval_json(2 * cost)}
-    return entry | {"floor": interval_json(floor), "cost": costs}
+    return entry | {"partner_difference": interval_json(partner_difference), "cost": costs}
 
 
 def test_decision_shares_stand_below_the_table():
     report = fixed_report(fixed_row()) | {
-        "decision_shares": [make_share("others", 3.14, 2.0, 1.5), make_share("uniform_weights", 0.5, None, None)]
+        "decision_shares": [
+            make_share("other_categories", 3.14, 2.0, 1.5),
+            make_share("uniform_weights", 0.5, None, None),
+        ]
     }
     lines = report_tables.markdown_table(report).splitlines()
     assert "| ORG (baseline) | other categories in Z | argmax | 3.1 [-] | 2.0 | +1.5 [-] | +3.0 [-] |" in lines
     assert "| ORG (baseline) | w (uniform instead) | argmax | 0.5 [-] |  |  |  |" in lines
     assert report_tables.decision_share_table(report).row_count == 3  # with the heading of the row
 
-    # Without decisions, share and floor are undefined.
+    # Without decisions, share and partner difference are undefined.
     entry = make_share("memory", 0.0, 0.0, None)
-    for name in ("share", "floor"):
+    for name in ("share", "partner_difference"):
         interval = entry[name]
         assert isinstance(interval, dict)
         interval["mean"] = None

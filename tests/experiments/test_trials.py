@@ -90,7 +90,7 @@ def test_controls_change_the_cells_of_stde_and_nothing_else():
         "zeros": {"removed_source": RemovedLogits.ZEROS},
         "noise": {"removed_source": RemovedLogits.NOISE},
         "random": {"direct_noise": 1.0},
-        "other_categories": {"replaced_part": ReplacedPart.OTHERS, "replaces_factual": False},
+        "other_categories": {"replaced_part": ReplacedPart.OTHER_CATEGORIES, "replaces_factual": False},
         "other_experience": {"replaced_part": ReplacedPart.EXPERIENCE, "replaces_factual": False},
         "other_memory": {"replaced_part": ReplacedPart.MEMORY, "replaces_factual": False},
     }

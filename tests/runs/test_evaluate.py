@@ -94,12 +94,12 @@ def test_every_policy_row_has_decision_shares(evaluated):
     parts = {"baseline": 4, "layout": 6}
     assert len(entries) == 2 * sum(parts.values())
     for entry in entries:
-        assert min(entry["decisions"]) > 0
+        assert min(entry["weighted_decisions"]) > 0
         assert 0.0 <= entry["share"]["mean"] <= 100.0
         assert len(entry["share"]["seeds"]) == 2
-        # A replacement that is the same in all episodes has no floor; by default only one cost is measured.
-        assert (entry["floor"] is None) == entry["part"].endswith("_weights")
-        assert (entry["cost"] is None) == (entry["part"] != "others")
+        # Weights have no partner, and so no difference between partners; by default only one cost is measured.
+        assert (entry["partner_difference"] is None) == entry["part"].endswith("_weights")
+        assert (entry["cost"] is None) == (entry["part"] != "other_categories")
     for variant, num_parts in parts.items():
         assert sum(entry["variant"] == variant for entry in entries) == 2 * num_parts
 

@@ -346,11 +346,11 @@ class ZoneRelations(ObjectRelations):
         self.embed = Linear(spec.num_categories, spec.num_categories, use_bias=False, rngs=rngs)
         self.width = self.maps.width + NUM_PRIORS
 
-    def replace_others(
+    def replace_other_categories(
         self, features: Features, reading: ZoneReading, other_features: Features, other_reading: ZoneReading
     ) -> tuple[Features, ZoneReading]:
         """Replace the detections, and with them room type and zones, which follow from the categories seen so far."""
-        mixed_features, _ = super().replace_others(features, reading, other_features, other_reading)
+        mixed_features, _ = super().replace_other_categories(features, reading, other_features, other_reading)
         return mixed_features, other_reading
 
     def encode(self, features: Features, appearance: jax.Array, weights: jax.Array, reading: ZoneReading) -> jax.Array:

@@ -75,11 +75,11 @@ class MappedCategories(Experience):
             block_flags.append((reading.blocks & flag > 0).astype(jnp.float32))
         return jnp.concatenate([*block_flags, reading.compass], axis=-1)
 
-    def replace_others(
+    def replace_other_categories(
         self, features: Features, reading: MapReading, other_features: Features, other_reading: MapReading
     ) -> tuple[Features, MapReading]:
         """Replace the categories in each block; floor, walls and the goal stay."""
-        mixed_features, _ = super().replace_others(features, reading, other_features, other_reading)
+        mixed_features, _ = super().replace_other_categories(features, reading, other_features, other_reading)
 
         # The bits of all categories but the goal, uint32 [..., 1].
         num_categories = features.goal.shape[-1]
