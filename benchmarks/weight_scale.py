@@ -31,11 +31,15 @@ from _common import SEMEXP_PPO, print_report
 from rich.console import Console
 
 import jaxnav
-from jaxnav.evaluation.removal import other_running_episode
-from jaxnav.evaluation.replacements import ReplacedPart, replace_part
+from jaxnav.evaluation.replacements import (
+    DecisionContext,
+    ReplacedPart,
+    make_factual_decision,
+    other_running_episode,
+    replace_part,
+)
 from jaxnav.layout import scale_weights
 from jaxnav.numerics.trees import take_rows
-from jaxnav.policies.agent_loop import policy_memory
 from jaxnav.policies.network import Policy, init_params
 from jaxnav.policies.pathways import Pathways
 from jaxnav.policies.spec import WeightKind
@@ -111,31 +115,19 @@ def record_steps(policies: Policies, world: CompiledWorld) -> dict[str, jax.Arra
 
         def step(carry: tuple[Any, jax.Array], step_key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
             agent, running = carry
-            inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
-            memory = policy_memory(agent)
-            pathways = policy.pathways(inputs, memory)
-            decision = policy.decide(pathways, memory)
+            context = DecisionContext(policy, jnp.bool_(True), agent_loop, knowledge, env_params)
+            factual = make_factual_decision(agent, context)
+            inputs, memory = factual.inputs, factual.memory
+            decision = policy.decide(factual.pathways, memory)
+
+            # Inputs of the recurrent core: factual, and with parts of another episode.
+            core_input = project(policy, factual.pathways, memory.action)
             partner = other_running_episode(running, keys)
-
-            def replace(part: ReplacedPart) -> Pathways:
-                changed, _ = replace_part(
-                    part,
-                    partner,
-                    pathways,
-                    inputs,
-                    uses_layout=jnp.bool_(True),
-                    policy=policy,
-                    agent=agent,
-                    agent_loop=agent_loop,
-                    knowledge=knowledge,
-                    env_params=env_params,
-                )
-                return changed
-
-            core_input = project(policy, pathways, memory.action)
+            categories_replaced, _ = replace_part(ReplacedPart.OTHER_CATEGORIES, partner, factual, context)
+            experience_replaced, _ = replace_part(ReplacedPart.EXPERIENCE, partner, factual, context)
             changed_inputs = {
-                "other_categories": project(policy, replace(ReplacedPart.OTHER_CATEGORIES), memory.action),
-                "experience": project(policy, replace(ReplacedPart.EXPERIENCE), memory.action),
+                "other_categories": project(policy, categories_replaced, memory.action),
+                "experience": project(policy, experience_replaced, memory.action),
                 "all": take_rows(core_input, partner),
             }
             is_goal = jax.nn.one_hot(agent.state.goal, inputs.layout_weights.shape[-1], dtype=bool)

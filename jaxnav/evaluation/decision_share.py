@@ -17,13 +17,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.grid import infer_and_act
-from jaxnav.evaluation.removal import InferenceConfig, other_running_episode
-from jaxnav.evaluation.replacements import PARTNER_PARTS, ReplacedPart, replace_part
+from jaxnav.evaluation.removal import InferenceConfig
+from jaxnav.evaluation.replacements import (
+    PARTNER_PARTS,
+    DecisionContext,
+    ReplacedPart,
+    make_factual_decision,
+    other_running_episode,
+    replace_part,
+)
 from jaxnav.evaluation.statistics import Clusters, Interval, jackknife_interval, run_clusters
 from jaxnav.numerics.trees import tree_where
-from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
+from jaxnav.policies.agent_loop import Agent, AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params, Policy
 
@@ -73,52 +81,31 @@ def is_changed(logits: jax.Array, changed_logits: jax.Array) -> jax.Array:
 
 
 def count_changes(
-    config: InferenceConfig,
-    policy: Policy,
+    context: DecisionContext,
     agent: Agent,
     counted: jax.Array,
     partners: tuple[jax.Array, jax.Array],
-    *,
     parts: Sequence[ReplacedPart],
-    agent_loop: AgentLoop,
-    env_params: EnvParams,
-    knowledge: Knowledge,
 ) -> ShareCounts:
     """Replace every part of one decision of each of E episodes.
 
     Args:
-      config: configuration of the grid entry.
-      policy: policy with the entry's parameters.
+      context: policy and world of the decisions.
       agent: agents of the episodes.
       counted: bool [E], decisions to count.
       partners: for each episode the indices of two other episodes, int [E] each; their parts are the replacements.
       parts: the P parts.
-      agent_loop, env_params, knowledge: as in `infer_and_act`.
 
     Returns:
       Counts of 0 or 1, leaves [E] and [E, P].
     """
-    # Factual decision.
-    inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
-    inputs = inputs._replace(layout_weights=jnp.where(config.use_layout, inputs.layout_weights, 1.0))
-    memory = policy_memory(agent)
-    pathways = policy.pathways(inputs, memory)
-    factual_logits = policy.decide(pathways, memory).logits
+    policy = context.policy
+    factual = make_factual_decision(agent, context)
+    factual_logits = policy.decide(factual.pathways, factual.memory).logits
 
     def decide_with_part(part: ReplacedPart, partner: jax.Array) -> jax.Array:
         """Logits with the part of the partner."""
-        changed_pathways, changed_memory = replace_part(
-            part,
-            partner,
-            pathways,
-            inputs,
-            uses_layout=config.use_layout,
-            policy=policy,
-            agent=agent,
-            agent_loop=agent_loop,
-            knowledge=knowledge,
-            env_params=env_params,
-        )
+        changed_pathways, changed_memory = replace_part(part, partner, factual, context)
         return policy.decide(changed_pathways, changed_memory).logits
 
     # Replace every part once, and those of partners twice.
@@ -133,8 +120,8 @@ def count_changes(
         difference_columns.append(is_different)
 
     # For comparison: the decision with Z = 0.
-    without_experience = pathways._replace(experience=jnp.zeros_like(pathways.experience))
-    deleted_logits = policy.decide(without_experience, memory).logits
+    without_experience = do(factual.pathways, experience=0.0)
+    deleted_logits = policy.decide(without_experience, factual.memory).logits
     return ShareCounts(
         weighted_decisions=counted.astype(jnp.int32),
         changed=(jnp.stack(changed_columns, axis=-1) & counted[:, None]).astype(jnp.int32),
@@ -218,14 +205,14 @@ class ShareProbe:
         agent_loop = self._agent_loop
         num_episodes = len(initial_states.pose)
         episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes))
-        shared_arguments = {"agent_loop": agent_loop, "env_params": env_params, "knowledge": knowledge}
+        context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
 
         def probe_decisions(agent: Agent, running: jax.Array, counted: jax.Array) -> ShareCounts:
             partners = (
                 other_running_episode(running, episode_keys, distance=1),
                 other_running_episode(running, episode_keys, distance=2),
             )
-            return count_changes(config, policy, agent, counted, partners, parts=self._parts, **shared_arguments)
+            return count_changes(context, agent, counted, partners, self._parts)
 
         def step(carry: tuple[Agent, jax.Array, jax.Array, ShareCounts]):
             # Only decisions that take effect count.
@@ -249,7 +236,15 @@ class ShareProbe:
 
             # The factual decision acts. Ended episodes keep their agent.
             next_agent, result, _ = infer_and_act(
-                config, policy, agent, running, episode_keys, can_remove=False, **shared_arguments
+                config,
+                policy,
+                agent,
+                running,
+                episode_keys,
+                agent_loop=agent_loop,
+                env_params=env_params,
+                knowledge=knowledge,
+                can_remove=False,
             )
             return tree_where(running, next_agent, agent), running & ~result.ended, time + 1, counts
 

@@ -22,16 +22,23 @@ from jaxnav.evaluation.removal import (
     InferenceConfig,
     InferenceTrace,
     apply_removal,
-    logits_to_remove,
-    other_running_episode,
+    control_logits,
+    counterfactual_logits,
     select_gap,
 )
-from jaxnav.evaluation.replacements import ReplacedPart, replace_part, select_part
+from jaxnav.evaluation.replacements import (
+    DecisionContext,
+    ReplacedPart,
+    apply_selected_part,
+    make_factual_decision,
+    other_running_episode,
+    replace_part,
+)
 from jaxnav.numerics.trees import take_rows, tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, policy_memory
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.method import Knowledge
-from jaxnav.policies.network import Params, Policy
+from jaxnav.policies.network import Params
 from jaxnav.scenes.task import MOVE_AHEAD
 
 Tree = TypeVar("Tree")
@@ -336,32 +343,19 @@ def infer_and_act(
       [E, ...].
     """
     # Factual decision; entries without the layout replace its weights by ones.
-    inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
-    layout_weights = jnp.where(config.use_layout, inputs.layout_weights, 1.0)
-    inputs = inputs._replace(layout_weights=layout_weights)
-    memory = policy_memory(agent)
-    pathways = policy.pathways(inputs, memory)
+    context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
+    factual = make_factual_decision(agent, context)
+    pathways, memory = factual.pathways, factual.memory
 
     # Replace a part of the decision, or of the counterfactual decision alone, by that of another episode.
-    counterfactual_pathways, counterfactual_memory = pathways, memory
+    replaced_pathways, replaced_memory = pathways, memory
     if replaced_parts:
-        assert isinstance(policy, Policy)
-        replace = functools.partial(
-            replace_part,
-            partner=other_running_episode(running, episode_keys),
-            pathways=pathways,
-            inputs=inputs,
-            uses_layout=config.use_layout,
-            policy=policy,
-            agent=agent,
-            agent_loop=agent_loop,
-            knowledge=knowledge,
-            env_params=env_params,
-        )
-        counterfactual_pathways, counterfactual_memory = select_part(replaced_parts, config.replaced_part, replace)
+        partner = other_running_episode(running, episode_keys)
+        replace = functools.partial(replace_part, partner=partner, factual=factual, context=context)
+        replaced_pathways, replaced_memory = apply_selected_part(replaced_parts, config.replaced_part, replace)
         pathways, memory = jax.tree.map(
             functools.partial(jnp.where, config.replaces_factual),
-            (counterfactual_pathways, counterfactual_memory),
+            (replaced_pathways, replaced_memory),
             (pathways, memory),
         )
     decision = policy.decide(pathways, memory)
@@ -370,15 +364,10 @@ def infer_and_act(
     step_keys = jax.vmap(jax.random.fold_in)(episode_keys, agent.state.time)
     gap = agent_loop.layout_gap(agent)
     if can_remove:
-        removed_logits = logits_to_remove(
-            config,
-            policy,
-            counterfactual_pathways,
-            counterfactual_memory,
-            episode_keys,
-            step_keys,
-            has_controls=has_controls,
-        )
+        if has_controls:
+            removed_logits = control_logits(config, policy, replaced_pathways, replaced_memory, episode_keys, step_keys)
+        else:
+            removed_logits = counterfactual_logits(policy, replaced_pathways, replaced_memory)
         gap = select_gap(config, gap, running, episode_keys, agent.state.time)
         logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap)
     else:
@@ -394,7 +383,7 @@ def infer_and_act(
     choice = jnp.where(config.greedy, jnp.argmax(logits, axis=-1), sampled_choice).astype(jnp.int32)
     next_agent, result = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
     trace = InferenceTrace(
-        layout_weights=layout_weights,
+        layout_weights=factual.inputs.layout_weights,
         gap=gap,
         removal_weight=removal_weight,
         factual_logits=decision.logits,

@@ -5,8 +5,9 @@ memory or a memory of its own (`PolicyState.counterfactual_hidden`). The control
 equations: a `HandoverPolicy` whose fallback is the policy under do(Z = 0) keeps the logits of the fallback.
 
 An `InferenceConfig` says how one entry of an evaluation grid turns a decision into logits to act by. At every step
-`logits_to_remove` decides without the direct pathways, `select_gap` picks the layout gap, and `apply_removal` combines
-both with the factual logits. Every field of the configuration is a traced array, so one compilation serves all entries.
+`counterfactual_logits` decides without the direct pathways, or `control_logits` in a grid with controls. `select_gap`
+picks the layout gap, and `apply_removal` combines both with the factual logits. Every field of the configuration is a
+traced array, so one compilation serves all entries.
 """
 
 import enum
@@ -18,15 +19,16 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.causal import FORMS, do, removal_weight, stde, tde
+from jaxnav.evaluation.replacements import other_running_episode
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.pathways import Pathways, PolicyState
 
 # Constants folded into the key of a step.
 _SCENE_TAG = 0
 _GOAL_TAG = 1
-# Constants folded into the key of an episode. Its time steps are folded into the same key, and are smaller.
+# Constant folded into the key of an episode. Its time steps are folded into the same key, and are smaller; see also
+# `jaxnav.evaluation.replacements`.
 _NOISE_TAG = 2**30
-_ORDER_TAG = 2**30 + 1
 
 
 class RemovedLogits(enum.IntEnum):
@@ -121,59 +123,70 @@ class InferenceTrace(NamedTuple):
     action_logits: jax.Array
 
 
-def logits_to_remove(
+def counterfactual_logits(
+    policy: Decider,
+    pathways: Pathways,
+    memory: PolicyState,
+    scene: jax.Array | float = 0.0,
+    goal: jax.Array | float = 0.0,
+) -> jax.Array:
+    """Logits of E decisions under do(S = scene, G = goal), float32 [E, A].
+
+    The counterfactual decision shares experience and previous action with the factual one, and also the recurrent
+    state, unless its branch has a state of its own. Its updated memory is discarded.
+
+    Args:
+      policy: policy with the entry's parameters.
+      pathways, memory: inputs of the factual decisions, leaves [E, ...].
+      scene, goal: values of the direct pathways, numbers or float32 [E, ...].
+    """
+    counterfactual_pathways = do(pathways, scene=scene, goal=goal)
+    return policy.decide(counterfactual_pathways, memory.counterfactual_state()).logits
+
+
+def control_logits(
     config: InferenceConfig,
     policy: Decider,
     pathways: Pathways,
     memory: PolicyState,
     episode_keys: jax.Array,
     step_keys: jax.Array,
-    has_controls: bool = True,
 ) -> jax.Array:
-    """Logits to remove from E decisions, float32 [E, A]: counterfactual logits, or those of a control.
-
-    The counterfactual decision shares experience and previous action with the factual one, and also the recurrent
-    state, unless its branch has a state of its own. Its updated memory is discarded.
+    """Logits to remove from E decisions in a grid with controls, float32 [E, A].
 
     Args:
-      config: configuration of the grid entry.
+      config: configuration of the grid entry; without controls the result is that of `counterfactual_logits`.
       policy: policy with the entry's parameters.
       pathways, memory: inputs of the factual decisions, leaves [E, ...].
       episode_keys, step_keys: PRNG keys [E] of the episodes and of their current step; folded further.
-      has_controls: whether `config.direct_noise` and `config.removed_source` may name controls. False compiles faster.
     """
-    if not has_controls:
-        return policy.decide(do(pathways, scene=0, goal=0), memory.counterfactual_state()).logits
+    scene = _direct_value(config, pathways.scene, step_keys, _SCENE_TAG)
+    goal = _direct_value(config, pathways.goal, step_keys, _GOAL_TAG)
+    logits = counterfactual_logits(policy, pathways, memory, scene, goal)
 
-    def sample_rows(keys: jax.Array, tag: int, row_shape: tuple[int, ...], sampler: Callable[..., jax.Array]):
-        """Sample float32 [E, *row_shape], each row with a key of its own."""
-        row_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, tag)
-        return jax.vmap(lambda key: sampler(key, row_shape))(row_keys)
-
-    def intervention_value(tag: int, pathway: jax.Array) -> jax.Array:
-        """Zeros, or the uniform noise of the control. Entries run one by one, so `cond` samples only if needed."""
-        return jax.lax.cond(
-            config.direct_noise > 0,
-            lambda: config.direct_noise * sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform),
-            lambda: jnp.zeros_like(pathway),
-        )
-
-    # do(S = 0, G = 0) with the factual experience.
-    scene_value = intervention_value(_SCENE_TAG, pathways.scene)
-    goal_value = intervention_value(_GOAL_TAG, pathways.goal)
-    counterfactual_pathways = do(pathways, scene=scene_value, goal=goal_value)
-    logits = policy.decide(counterfactual_pathways, memory.counterfactual_state()).logits
+    def sample_noise() -> jax.Array:
+        noise = _sample_rows(episode_keys, _NOISE_TAG, logits.shape[1:], jax.random.normal)
+        return logits.std(axis=-1, keepdims=True) * noise
 
     # One branch per member of `RemovedLogits`.
-    branches = (
-        lambda: logits,
-        lambda: jnp.zeros_like(logits),
-        lambda: (
-            logits.std(axis=-1, keepdims=True)
-            * sample_rows(episode_keys, _NOISE_TAG, logits.shape[1:], jax.random.normal)
-        ),
-    )
+    branches = (lambda: logits, lambda: jnp.zeros_like(logits), sample_noise)
     return jax.lax.switch(config.removed_source, branches)
+
+
+def _direct_value(config: InferenceConfig, pathway: jax.Array, step_keys: jax.Array, tag: int) -> jax.Array:
+    """Value of a direct pathway, float32 [E, ...]: zeros, or the uniform noise of the control."""
+
+    def sample_noise() -> jax.Array:
+        return config.direct_noise * _sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform)
+
+    # Entries run one by one, so `cond` samples only if needed.
+    return jax.lax.cond(config.direct_noise > 0, sample_noise, lambda: jnp.zeros_like(pathway))
+
+
+def _sample_rows(keys: jax.Array, tag: int, row_shape: tuple[int, ...], sampler: Callable[..., jax.Array]) -> jax.Array:
+    """Sample float32 [E, *row_shape], each row with a key of its own."""
+    row_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, tag)
+    return jax.vmap(lambda key: sampler(key, row_shape))(row_keys)
 
 
 def select_gap(
@@ -220,23 +233,3 @@ def apply_removal(
     corrected_logits = jnp.where(config.remove_completely, tde(logits, removed_logits), soft_logits)
     weight = jnp.where(config.remove_completely, 1.0, soft_weight)
     return corrected_logits, weight
-
-
-def other_running_episode(running: jax.Array, episode_keys: jax.Array, distance: int = 1) -> jax.Array:
-    """Index of another running episode for each running one, int [E]; undefined for ended episodes.
-
-    The other episode is the next one in a cyclic order. The order depends only on the keys, so two paired episodes stay
-    paired while both run, also when the batch shrinks.
-
-    Args:
-      running: bool [E], episodes that have not ended. With `distance` or fewer, an episode may be paired with itself.
-      episode_keys: PRNG keys [E] of the episodes; folded further.
-      distance: number of steps in the cyclic order.
-    """
-    # Ended episodes sort last: their score is 1.
-    score = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, _ORDER_TAG)))(episode_keys)
-    cyclic_order = jnp.argsort(jnp.where(running, score, 1.0))
-    # The rank of each episode is the inverse permutation.
-    rank = jnp.zeros_like(cyclic_order).at[cyclic_order].set(jnp.arange(len(cyclic_order)))
-    next_rank = (rank + distance) % jnp.maximum(running.sum(), 1)
-    return cyclic_order[next_rank]

@@ -4,19 +4,24 @@ How much of a decision depends on a part, such as the detections of other catego
 takes this part from another running episode at the same step and keeps the rest. The new part is a value that the
 policy meets in its own episodes; a deleted part, such as Z = 0, is not.
 
-`replace_part` makes the pathways and the memory of one such decision. `jaxnav.evaluation.decision_share` counts the
+`make_factual_decision` embeds the inputs of a decision, and `replace_part` makes the pathways and the memory of the
+decision with another part. `jaxnav.evaluation.decision_share` counts the
 decisions that change; `InferenceConfig.replaced_part` replaces a part in every step of an episode.
 """
 
 import enum
+import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.numerics.trees import take_rows
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
+from jaxnav.policies.handover import Decider
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
@@ -51,40 +56,75 @@ PARTNER_PARTS = (
 WEIGHT_PARTS = (ReplacedPart.PRIOR_WEIGHTS, ReplacedPart.UNIFORM_WEIGHTS)
 
 
+# Constant folded into the key of an episode. Its time steps are folded into the same key, and are smaller; see also
+# `jaxnav.evaluation.removal`.
+_ORDER_TAG = 2**30 + 1
+
+
+class DecisionContext(NamedTuple):
+    """Policy and world of a decision: all that it depends on but the agents.
+
+    Attributes:
+      policy: policy with the parameters of the grid entry.
+      use_layout: bool [], whether the policy reads the layout weights; otherwise they are ones.
+      agent_loop: runs policy and environment.
+      knowledge: layout priors and statistics from before training.
+      env_params: parameters of the environment.
+    """
+
+    policy: Decider
+    use_layout: jax.Array
+    agent_loop: AgentLoop
+    knowledge: Knowledge
+    env_params: EnvParams
+
+
+class FactualDecision(NamedTuple):
+    """Agents of E episodes with pathways and memory from which they decide, leaves [E, ...].
+
+    Attributes:
+      agent: the agents.
+      inputs: inputs of the pathways.
+      pathways: scene, goal and experience.
+      memory: memory of the policy before the decision.
+    """
+
+    agent: Agent
+    inputs: PolicyInputs
+    pathways: Pathways
+    memory: PolicyState
+
+
+def make_factual_decision(agent: Agent, context: DecisionContext) -> FactualDecision:
+    """Embed the inputs of agents in E episodes."""
+    inputs = context.agent_loop.policy_inputs(agent, context.knowledge, context.env_params)
+    inputs = inputs._replace(layout_weights=jnp.where(context.use_layout, inputs.layout_weights, 1.0))
+    memory = policy_memory(agent)
+    return FactualDecision(agent, inputs, context.policy.pathways(inputs, memory), memory)
+
+
 def replace_part(
-    part: ReplacedPart,
-    partner: jax.Array,
-    pathways: Pathways,
-    inputs: PolicyInputs,
-    *,
-    uses_layout: jax.Array,
-    policy: Policy,
-    agent: Agent,
-    agent_loop: AgentLoop,
-    knowledge: Knowledge,
-    env_params: EnvParams,
+    part: ReplacedPart, partner: jax.Array, factual: FactualDecision, context: DecisionContext
 ) -> tuple[Pathways, PolicyState]:
     """Replace one part of E decisions.
 
     Args:
       part: the replaced part.
       partner: int [E], for each episode the index of the episode whose part it gets.
-      pathways: factual pathways, leaves [E, ...].
-      inputs: inputs of the factual pathways.
-      uses_layout: bool [], False where the layout weights are ones; they then stay ones.
-      policy: the policy that decides.
-      agent: agents of the E episodes.
-      agent_loop, knowledge, env_params: as in `jaxnav.evaluation.grid.infer_and_act`.
+      factual: the decisions.
+      context: policy and world of the decisions; a `HandoverPolicy` has no parts to replace.
 
     Returns:
       Pathways and memory of the changed decisions, leaves [E, ...].
     """
-    memory = policy_memory(agent)
+    policy, use_layout, agent_loop, knowledge, env_params = context
+    agent, inputs, pathways, memory = factual
+    assert isinstance(policy, Policy)
     partner_pathways = take_rows(pathways, partner)
 
     def with_weights(weights: jax.Array) -> Pathways:
-        """Pathways whose experience has other layout weights."""
-        changed_weights = jnp.where(uses_layout, weights, inputs.layout_weights)
+        """Pathways whose experience has other layout weights; without the layout, they stay ones."""
+        changed_weights = jnp.where(use_layout, weights, inputs.layout_weights)
         changed_inputs = inputs._replace(layout_weights=changed_weights)
         return pathways._replace(experience=policy.pathways(changed_inputs, memory).experience)
 
@@ -121,7 +161,7 @@ def replace_part(
             return pathways._replace(experience=experience), partner_memory
 
 
-def select_part(
+def apply_selected_part(
     parts: tuple[ReplacedPart, ...], part_index: jax.Array, change: Callable[[ReplacedPart], tuple]
 ) -> tuple:
     """Apply `change` to the part that a traced index selects.
@@ -131,7 +171,31 @@ def select_part(
       part_index: int32 [], a `ReplacedPart`; `NONE` if it is not among the parts.
       change: function from a part to arrays, whose shapes do not depend on the part.
     """
-    all_parts = (ReplacedPart.NONE, *parts)
-    branch_of_part = [all_parts.index(part) if part in all_parts else 0 for part in ReplacedPart]
-    branches = [lambda part=part: change(part) for part in all_parts]
+    # One branch per compiled part; the first one stands for all parts that are not compiled.
+    compiled_parts = (ReplacedPart.NONE, *parts)
+    branch_of_part = np.zeros(len(ReplacedPart), np.int32)
+    branches = []
+    for branch_index, part in enumerate(compiled_parts):
+        branch_of_part[part] = branch_index
+        branches.append(functools.partial(change, part))
     return jax.lax.switch(jnp.asarray(branch_of_part)[part_index], branches)
+
+
+def other_running_episode(running: jax.Array, episode_keys: jax.Array, distance: int = 1) -> jax.Array:
+    """Index of another running episode for each running one, int [E]; undefined for ended episodes.
+
+    The other episode is the next one in a cyclic order. The order depends only on the keys, so two paired episodes stay
+    paired while both run, also when the batch shrinks.
+
+    Args:
+      running: bool [E], episodes that have not ended. With `distance` or fewer, an episode may be paired with itself.
+      episode_keys: PRNG keys [E] of the episodes; folded further.
+      distance: number of steps in the cyclic order.
+    """
+    # Ended episodes sort last: their score is 1.
+    score = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, _ORDER_TAG)))(episode_keys)
+    cyclic_order = jnp.argsort(jnp.where(running, score, 1.0))
+    # The rank of each episode is the inverse permutation.
+    rank = jnp.zeros_like(cyclic_order).at[cyclic_order].set(jnp.arange(len(cyclic_order)))
+    next_rank = (rank + distance) % jnp.maximum(running.sum(), 1)
+    return cyclic_order[next_rank]

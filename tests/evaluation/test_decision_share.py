@@ -13,9 +13,8 @@ from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_st
 from jaxnav.evaluation.decision_share import ShareProbe, is_changed, share_interval
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator, start_states
-from jaxnav.evaluation.replacements import ReplacedPart, replace_part
+from jaxnav.evaluation.replacements import DecisionContext, ReplacedPart, make_factual_decision, replace_part
 from jaxnav.evaluation.variants import Replacement, inference_grid, replacement_grid, table_row, table_rows
-from jaxnav.policies.agent_loop import policy_memory
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.hoz import ZoneReading, ZoneRelations
 from jaxnav.policies.methods.map_tracker import FREE_BIT, MapReading
@@ -106,23 +105,12 @@ def replaced_parts_of(agent, partner, part, layout_weights=None):
     @jax.jit
     def replace(params, agent):
         policy = AGENT_LOOP.bind(params)
-        inputs = AGENT_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS)
+        context = DecisionContext(policy, jnp.bool_(True), AGENT_LOOP, KNOWLEDGE, PARAMS)
+        factual = make_factual_decision(agent, context)
         if layout_weights is not None:
-            inputs = inputs._replace(layout_weights=layout_weights)
-        pathways = policy.pathways(inputs, policy_memory(agent))
-        replaced = replace_part(
-            part,
-            partner,
-            pathways,
-            inputs,
-            uses_layout=jnp.bool_(True),
-            policy=policy,
-            agent=agent,
-            agent_loop=AGENT_LOOP,
-            knowledge=KNOWLEDGE,
-            env_params=PARAMS,
-        )
-        return replaced, (pathways, policy_memory(agent))
+            inputs = factual.inputs._replace(layout_weights=layout_weights)
+            factual = factual._replace(inputs=inputs, pathways=policy.pathways(inputs, factual.memory))
+        return replace_part(part, partner, factual, context), (factual.pathways, factual.memory)
 
     return replace(tiny.random_params(6), agent)
 

@@ -14,8 +14,8 @@ from jaxnav.causal import do
 from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import infer_and_act, start_states
-from jaxnav.evaluation.removal import GapSource, RemovedLogits, logits_to_remove, other_running_episode, select_gap
-from jaxnav.evaluation.replacements import ReplacedPart
+from jaxnav.evaluation.removal import GapSource, RemovedLogits, control_logits, select_gap
+from jaxnav.evaluation.replacements import ReplacedPart, other_running_episode
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState
@@ -57,7 +57,7 @@ def removed_and_counterfactual(cell, weights, agent, keys, step_keys):
     policy = AGENT_LOOP.bind(weights)
     pathways = policy.pathways(AGENT_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS), agent.memory)
     zeroed = policy.decide(do(pathways, scene=0.0, goal=0.0), agent.memory)
-    return logits_to_remove(cell, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
+    return control_logits(cell, policy, pathways, agent.memory, keys, step_keys), zeroed.logits
 
 
 WEIGHTS = tiny.random_params(6)
@@ -165,7 +165,7 @@ def test_a_random_intervention_sets_scene_and_goal_alone(max_value):
     keys = jax.random.split(jax.random.key(0), (2, num_episodes))
 
     def logits(**changes):
-        return np.asarray(logits_to_remove(make_cell(**changes), policy, pathways, memory, *keys))
+        return np.asarray(control_logits(make_cell(**changes), policy, pathways, memory, *keys))
 
     result = logits(direct_noise=max_value)
     np.testing.assert_array_equal(result[:, 4], 9.0)
