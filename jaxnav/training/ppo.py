@@ -77,8 +77,8 @@ _START_DROPOUT = 2**31 - 1
 class PPOScalars(struct.PyTreeNode):
     """Settings that may change without a new compilation, float32 [] each.
 
-    All fields but the last two hold the setting of `PPOConfig` with the same first word; None where there is no
-    guidance.
+    Each field but the last two holds the setting of `PPOConfig` of that name without `_weight`, `_range` or `_prob`,
+    `learning_rate` times the factor of the stage. Both guidance weights are None without guidance.
 
     Attributes:
       first_update: updates before the stage.
@@ -99,6 +99,26 @@ class PPOScalars(struct.PyTreeNode):
     first_update: jax.Array
     num_updates: jax.Array
 
+    def at_update(self, update: jax.Array) -> "PPOScalars":
+        """Settings of one update; those with a schedule have the value of this update.
+
+        Schedules are linear within the stage: the learning rate falls to 0, entropy and guidance go to their final
+        weights. One call of `Learner.train` may run fewer updates than the stage has.
+
+        Args:
+          update: int32 [], updates since the start of training.
+        """
+        progress = (update.astype(jnp.float32) - self.first_update) / self.num_updates
+        entropy_change = self.final_entropy_weight - self.entropy_weight
+        scheduled = self.replace(
+            learning_rate=self.learning_rate * (1.0 - progress),
+            entropy_weight=self.entropy_weight + progress * entropy_change,
+        )
+        if self.guidance_weight is None or self.final_guidance_weight is None:
+            return scheduled
+        guidance_change = self.final_guidance_weight - self.guidance_weight
+        return scheduled.replace(guidance_weight=self.guidance_weight + progress * guidance_change)
+
 
 # 1. Collect
 
@@ -110,7 +130,7 @@ class Transition(NamedTuple):
 
     Attributes:
       pose, goal: int32 [B].
-      layout_weights: float32 [B, K], the layout's weights for the goal (w x g, eq. 7).
+      layout_weights: float32 [B, K], the layout's weights for the goal (column of w, eq. 7).
       reading: output of the method's tracker, leaves [B, ...]; None without one.
       surroundings: uint8 [B, M], map cells around the agent; None without a spatial memory.
       use_direct: bool [B], False where the coin zeroed both direct pathways; None without a coin.
@@ -322,10 +342,6 @@ def _bootstrap_values(
     is_truncation = jnp.arange(len(next_value))[:, None] == truncation_step[None, :]
     next_value = jnp.where(is_truncation, truncated_value[None, :], next_value)
     return jnp.where(transitions.terminated, 0.0, next_value)
-
-
-#: Transitions [T, B / M, ...], initial memory [B / M, ...] and advantages [T, B / M] in B / M environments.
-Minibatch = tuple[Transition, PolicyState, jax.Array]
 
 
 # 2. Advantages
@@ -673,6 +689,9 @@ def split_minibatches(tree: Any, order: jax.Array, axis: int) -> Any:
 
 # 5. The learner: one training seed
 
+#: Transitions [T, B / M, ...], initial memory [B / M, ...] and advantages [T, B / M] in B / M environments.
+Minibatch = tuple[Transition, PolicyState, jax.Array]
+
 
 class BestPolicy(struct.PyTreeNode):
     """The policy of a seed with the best validation so far.
@@ -828,8 +847,9 @@ class Learner:
         )
 
         # 3. and 4. Gradient steps.
+        scheduled_scalars = scalars.at_update(state.update)
         (policy_params, opt_state), losses = self._run_epochs(
-            state, rollout, advantages, shuffle_key, scalars, env_params
+            state, rollout, advantages, shuffle_key, scheduled_scalars, env_params
         )
 
         # Losses are means over the minibatches, statistics of episodes are sums.
@@ -849,19 +869,8 @@ class Learner:
         scalars: PPOScalars,
         env_params: EnvParams,
     ) -> tuple[tuple[Params, Any], Metrics]:
-        """Take a gradient step for every minibatch of every epoch."""
+        """Take a gradient step for every minibatch of every epoch, with the scheduled settings of the update."""
         config = self.config
-
-        # Schedules, linear within the stage: the learning rate falls to 0, entropy and guidance go to their final
-        # weights. `scalars.num_updates` counts the updates of the stage; one call of `train` may run fewer. From here
-        # on `scalars.entropy_weight` and `scalars.guidance_weight` are the scheduled weights.
-        progress = (state.update.astype(jnp.float32) - scalars.first_update) / scalars.num_updates
-        learning_rate = scalars.learning_rate * (1.0 - progress)
-        entropy_change = scalars.final_entropy_weight - scalars.entropy_weight
-        scalars = scalars.replace(entropy_weight=scalars.entropy_weight + progress * entropy_change)
-        if scalars.guidance_weight is not None and scalars.final_guidance_weight is not None:
-            guidance_change = scalars.final_guidance_weight - scalars.guidance_weight
-            scalars = scalars.replace(guidance_weight=scalars.guidance_weight + progress * guidance_change)
 
         # Each device computes loss and gradient on its share of the environments; their means over the devices are
         # those of the minibatch, also under masks (see `masked_mean`). The specs follow the arguments of
@@ -877,7 +886,7 @@ class Learner:
             policy_params, opt_state = carry
             gradient, losses = loss_gradient(policy_params, minibatch, env_params, scalars)
             carry = apply_gradient(
-                config, policy_params, opt_state, gradient, learning_rate, self.stage.lr_scale_by_path
+                config, policy_params, opt_state, gradient, scalars.learning_rate, self.stage.lr_scale_by_path
             )
             return carry, losses | {"gradient_norm": optax.tree.norm(gradient)}
 
