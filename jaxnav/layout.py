@@ -138,12 +138,12 @@ def resolve_estimator(config: str | EstimatorConfig) -> EstimatorConfig:
     return ESTIMATORS[config]
 
 
-def prior_from_counts(counts: jax.Array, setting: str | EstimatorConfig = "calibrated") -> jax.Array:
+def prior_from_counts(counts: jax.Array, config: str | EstimatorConfig = "calibrated") -> jax.Array:
     """Make the prior alpha* from co-occurrence counts of exploration.
 
     Args:
       counts: real [K, K], how often j was seen with i; the diagonal is ignored.
-      setting: name or configuration of the estimator; `uniform` and `strength` are read.
+      config: configuration of the estimator, or its name; `uniform` and `strength` are read.
 
     Returns:
       float32 [K, K], >= 0.01 off the diagonal and 0 on it. A row without counts is all ones before rescaling.
@@ -153,7 +153,7 @@ def prior_from_counts(counts: jax.Array, setting: str | EstimatorConfig = "calib
     """
     if counts.shape[-1] < 2:
         raise ValueError(f"counts has shape {counts.shape}: give counts of at least two categories")
-    config = resolve_estimator(setting)
+    config = resolve_estimator(config)
 
     # Off-diagonal counts; a category that was never seen with any other has a uniform row.
     off_diagonal = 1 - jnp.eye(counts.shape[-1], dtype=jnp.float32)
@@ -285,9 +285,9 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """w x g of eq. 7, float32 [K]: the goal's column of w, because g is one-hot.
+        """The goal's column of w, float32 [K]: w times g in eq. 7, because g is one-hot.
 
-        A method multiplies what Z holds of category i by entry i, see `Experience.encode`.
+        A method multiplies what Z holds of category i by the entry w_ig, see `Experience.encode`.
         """
         goal_share = state.alpha[:, goal] / state.alpha.sum(-1)
         return goal_share.at[goal].add(1)
@@ -330,11 +330,12 @@ class LayoutEstimator(struct.PyTreeNode):
 
 
 def scale_weights(weights: jax.Array, goal: jax.Array) -> jax.Array:
-    """Scale w x g of eq. 7 so that the weights off the goal have mean 1 (the kind `relative`).
+    """Scale the goal's column of w so that the weights off the goal have mean 1 (the kind `relative`).
 
-    Raw weights off the goal are shares that add up to about 1, so they shrink the features of K - 1 categories about
-    K-fold. Relative weights keep what the belief says, which category is likelier than others near the goal, and drop
-    the common factor. Weights of ones, which disable the layout, stay ones.
+    The mean is 1 before weights are clipped at `MAX_RELATIVE_WEIGHT`. Each row of w adds up to 1 over K - 1 categories,
+    so a raw weight w_ig is about 1 / (K - 1) and shrinks the features of category i about K-fold. Relative weights keep
+    what the belief says, which category is likelier than others near the goal, and drop the common factor. Weights of
+    ones, which disable the layout, stay ones.
 
     Args:
       weights: float32 [..., K], as from `LayoutEstimator.goal_weights`.

@@ -182,7 +182,7 @@ def layout_priors(counts: jax.Array, estimator_config: str | EstimatorConfig) ->
     Returns:
       float32 [rooms, K, K].
     """
-    make_prior = partial(prior_from_counts, setting=estimator_config)
+    make_prior = partial(prior_from_counts, config=estimator_config)
     return jax.vmap(make_prior)(_fill_unseen_rooms(counts) + 1.0)
 
 
