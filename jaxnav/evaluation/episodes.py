@@ -5,14 +5,17 @@
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Clusters, scene_clusters
 from jaxnav.scenes.scene import floor_plan_name
 from jaxnav.scenes.tables.compile import Bank
+
+Array = TypeVar("Array", np.ndarray, jax.Array)
 
 #: Upper bound on the episodes of a bank: a million take about a minute to draw, and memory in every row of a table.
 MAX_EPISODES = 10**6
@@ -65,6 +68,16 @@ class EpisodeList(NamedTuple):
     def clusters(self) -> Clusters:
         """Cluster the episodes by floor plan, within room types."""
         return scene_clusters(self.floor_plans, self.room)
+
+
+def select_first_episodes(room_rank: Array, max_room_episodes: Any) -> Array:
+    """True for the first `max_room_episodes` episodes of each room type, bool [E].
+
+    Args:
+      room_rank: int32 [E], `EpisodeList.room_rank`, of NumPy or traced.
+      max_room_episodes: largest number of episodes of a room type, int or int32 [].
+    """
+    return room_rank < max_room_episodes
 
 
 def draw_episodes(bank: Bank, num_episodes: int = 1000, seed: int = 0, bank_index: int = 0) -> EpisodeList:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, State
-from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.episodes import EpisodeList, select_first_episodes
 from jaxnav.evaluation.removal import (
     InferenceConfig,
     InferenceTrace,
@@ -277,7 +277,7 @@ def _run_episodes(
     memory = policy.initial_memory((num_episodes,))
     batch = _Batch(
         agent=agent_loop.start_from(initial_states, memory, knowledge, env_params),
-        running=room_rank < config.max_room_episodes,
+        running=select_first_episodes(room_rank, config.max_room_episodes),
         outcome=EpisodeOutcome.zeros((num_episodes,)),
         episode_keys=episode_keys,
     )

@@ -54,8 +54,8 @@ from jaxnav.runs.run import CONFIG_FILE, Run, run_settings
 from jaxnav.runs.share_report import (
     build_decision_shares,
     count_shares,
+    limit_room_episodes,
     list_cost_replacements,
-    max_room_episodes,
     measure_costs,
     rows_without_removal,
 )
@@ -181,14 +181,16 @@ def evaluate(
 
         # Replacements are further rows of the same grid.
         replacements = list_cost_replacements(rows, costs)
-        room_episodes = max_room_episodes(episode_lists, costs)
+        max_room_episodes = limit_room_episodes(episode_lists, costs)
         outcome, replaced_outcome, compilations = _evaluate_with_replacements(
-            rows, replacements, room_episodes, policies, compiled, episode_lists, seed
+            rows, replacements, max_room_episodes, policies, compiled, episode_lists, seed
         )
         env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
         oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
         share_counts, probed_episodes = counting.result()
-    costs_by_replacement = measure_costs(rows, outcome, replacements, replaced_outcome, episode_lists, room_episodes)
+    costs_by_replacement = measure_costs(
+        rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes
+    )
     decision_shares = build_decision_shares(share_rows, share_counts, probed_episodes, costs_by_replacement)
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
@@ -272,7 +274,7 @@ def evaluate_rows(
 def _evaluate_with_replacements(
     rows: Sequence[EvaluationRow],
     replacements: Sequence[Replacement],
-    room_episodes: int,
+    max_room_episodes: int,
     policies: Policies,
     world: CompiledWorld,
     episode_lists: Sequence[EpisodeList],
@@ -285,7 +287,7 @@ def _evaluate_with_replacements(
     """
     grids = [inference_grid(rows, policies.arms, policies.num_seeds)]
     if replacements:
-        grids.append(replacement_grid(replacements, policies.arms, policies.num_seeds, room_episodes))
+        grids.append(replacement_grid(replacements, policies.arms, policies.num_seeds, max_room_episodes))
     grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *grids)
 
     # Only the parts that are replaced are compiled.

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxnav.choices import Costs
 from jaxnav.evaluation.decision_share import ShareCounts, ShareProbe, share_interval
-from jaxnav.evaluation.episodes import MAX_EPISODES, EpisodeList, join_episode_lists
+from jaxnav.evaluation.episodes import MAX_EPISODES, EpisodeList, join_episode_lists, select_first_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics, start_states
 from jaxnav.evaluation.replacements import PARTNER_PARTS, WEIGHT_PARTS, ReplacedPart
 from jaxnav.evaluation.statistics import Interval, paired_difference
@@ -52,8 +52,8 @@ def list_cost_replacements(rows: Sequence[EvaluationRow], costs: Costs) -> list[
     return replacements
 
 
-def max_room_episodes(episode_lists: Sequence[EpisodeList], costs: Costs) -> int:
-    """Number of episodes of each room type, in each bank, on which costs are measured."""
+def limit_room_episodes(episode_lists: Sequence[EpisodeList], costs: Costs) -> int:
+    """Largest number of episodes of each room type, in each bank, on which costs are measured."""
     if costs == "all":
         return MAX_EPISODES
     most_episodes = max(int(episodes.room_rank.max()) + 1 for episodes in episode_lists)
@@ -158,24 +158,27 @@ def measure_costs(
     replacements: Sequence[Replacement],
     replaced_outcome: EpisodeOutcome,
     episode_lists: Sequence[EpisodeList],
-    room_episodes: int,
+    max_room_episodes: int,
 ) -> dict[Replacement, dict[str, Any]]:
     """Measure what each replacement costs: factual less replaced, in percentage points, on the same episodes.
 
     Args:
-      rows: rows of `outcome`, [R, S, E].
-      replacements: rows of `replaced_outcome`.
-      episode_lists: the episodes of each bank.
-      room_episodes: number of episodes of each room type that the replacements ran.
+      rows: the R rows of `outcome`.
+      outcome: outcomes without replacement, leaves [R, S, E].
+      replacements: the P replacements; their rows are among `rows`.
+      replaced_outcome: outcomes with replacement, leaves [P, S, E].
+      episode_lists: the episodes of each bank, E in total.
+      max_room_episodes: number of episodes of each room type that the replacements ran, see `limit_room_episodes`.
 
     Returns:
       By replacement, the number of `episodes`, and the intervals of `sr` and `spl`.
     """
     # Both sides on the episodes that the replacements ran.
-    was_run = np.concatenate([episodes.room_rank < room_episodes for episodes in episode_lists])
-    episodes = join_episode_lists(episode_lists).take(was_run)
-    metrics = _metrics_of(outcome, was_run, episodes)
-    replaced_metrics = _metrics_of(replaced_outcome, was_run, episodes)
+    selections = [select_first_episodes(episodes.room_rank, max_room_episodes) for episodes in episode_lists]
+    selection = np.concatenate(selections)
+    episodes = join_episode_lists(episode_lists).take(selection)
+    metrics = _metrics_of(outcome, selection, episodes)
+    replaced_metrics = _metrics_of(replaced_outcome, selection, episodes)
 
     costs: dict[Replacement, dict[str, Any]] = {}
     for index, replacement in enumerate(replacements):
