@@ -26,10 +26,10 @@ NUM_FEATURES = 9
 #: Column of `Features.table` with the confidence of the detection, 0 to 1.
 CONFIDENCE_INDEX = 1
 
-#: Size of an image in pixels: factor on position and size of a detection in `scale_boxes`.
+#: Size of an image in pixels: factor on the geometry of a detection in `scale_geometry`.
 IMAGE_PIXELS = 300.0
-#: Columns of `Features.table` that stand for the box of a detection: position, bearing and size.
-_BOX_COLUMNS = slice(2, 8)
+#: Columns of `Features.table` with the geometry of a detection: offsets, distance, bearing (sine, cosine), size.
+_GEOMETRY_COLUMNS = slice(2, 8)
 
 _OFFSET_SCALE = 5.0  # metres; scales the offsets to about 1
 _MIN_DISTANCE = 0.01  # of the scaled distance, against division by zero
@@ -94,13 +94,13 @@ def unpack_features(row: jax.Array, goal: jax.Array, row_format: RowFormat) -> F
     return Features(view=view, visible=visible, table=table, goal=goal_one_hot)
 
 
-def scale_boxes(features: Features) -> Features:
-    """Scale position and size of the detections as if they were boxes in pixels.
+def scale_geometry(features: Features) -> Features:
+    """Scale all six columns of geometry to the size of boxes in pixels: offsets, distance, bearing and apparent size.
 
-    The released code multiplies w x g (eq. 7) into boxes in pixels, up to 300, so that w of about 0.1 still leaves
-    large features. Confidence, visibility and the goal flag keep their scale.
+    The released code multiplies the goal's column of w (eq. 7) into boxes in pixels, up to 300, so that weights of
+    about 0.1 still leave large features. Confidence, visibility and the goal flag keep their scale.
     """
-    return features._replace(table=features.table.at[..., _BOX_COLUMNS].multiply(IMAGE_PIXELS))
+    return features._replace(table=features.table.at[..., _GEOMETRY_COLUMNS].multiply(IMAGE_PIXELS))
 
 
 class CategoryMaps(nnx.Module):

@@ -27,7 +27,7 @@ from jaxnav.layout import scale_weights
 from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.numerics.recurrence import gru_step
 from jaxnav.numerics.rounding import round_to_grid
-from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, scale_boxes, unpack_features
+from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, scale_geometry, unpack_features
 from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_experience
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
@@ -287,7 +287,7 @@ class Policy(Stream):
                 features, inputs.reading, self._unpack(partner_inputs), partner_inputs.reading
             )
         if self.weight_kind == "pixel":
-            experience_features = scale_boxes(experience_features)
+            experience_features = scale_geometry(experience_features)
         experience = self.method.encode(experience_features, self.experience_appearance, layout_weights, reading)
 
         # The Done gate follows the confidence of the goal's detection.
@@ -307,17 +307,9 @@ class Policy(Stream):
         """
         # Experience dropout: in some training episodes Z = 0, so that the network learns to act without experience.
         pathways = mask_experience(pathways, memory.use_experience)
-        if self.adaptation is None:
-            decision = self.decide_with_changes(pathways, memory)
-        else:
-            decision = self.adaptation.decide(self, pathways, memory)
-        decision = decision._replace(use_experience=memory.use_experience)
-
-        # The counterfactual branch advances its own memory with the same experience.
-        if memory.counterfactual_hidden is None:
-            return decision
-        counterfactual = self.decide(do(pathways, scene=0.0, goal=0.0), memory.counterfactual_state())
-        return decision._replace(counterfactual_hidden=counterfactual.hidden)
+        decision = self._decide_with_adaptation(pathways, memory)
+        counterfactual_hidden = self._advance_counterfactual(pathways, memory)
+        return decision._replace(use_experience=memory.use_experience, counterfactual_hidden=counterfactual_hidden)
 
     def decide_with_changes(
         self, pathways: Pathways, memory: PolicyState, changes: LayerChanges = NO_CHANGES
@@ -333,6 +325,23 @@ class Policy(Stream):
         # Step the recurrent core, and decide from its new hidden state.
         hidden = gru_step(input_gates, hidden_gates, memory.hidden)
         return self.apply_heads(hidden, pathways, changes)._replace(fast=memory.fast)
+
+    def _decide_with_adaptation(self, pathways: Pathways, memory: PolicyState) -> Decision:
+        """Decide, with the method's adaptation if it has one."""
+        if self.adaptation is None:
+            return self.decide_with_changes(pathways, memory)
+        return self.adaptation.decide(self, pathways, memory)
+
+    def _advance_counterfactual(self, pathways: Pathways, memory: PolicyState) -> jax.Array | None:
+        """Next recurrent state of a counterfactual branch with its own memory, which reads the factual experience.
+
+        Returns:
+          float32 [..., H]; None if the branch has no memory of its own.
+        """
+        if memory.counterfactual_hidden is None:
+            return None
+        counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
+        return self._decide_with_adaptation(counterfactual_pathways, memory.counterfactual_state()).hidden
 
     def direct_input(self, pathways: Pathways) -> jax.Array:
         """Project both direct pathways, float32 [..., H]; linear, so zero where both are zero."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 #: Detections that the direct pathway G -> A sees: of all categories, of the goal alone, or none.
 Direct = Literal["all", "goal", "none"]
 #: Scale at which the layout weights enter experience: as in eq. 7, over their mean (`jaxnav.layout.scale_weights`), or
-#: as in eq. 7 with boxes in pixels (`jaxnav.policies.features.scale_boxes`).
+#: as in eq. 7 with boxes in pixels (`jaxnav.policies.features.scale_geometry`).
 WeightKind = Literal["raw", "relative", "pixel"]
 #: Network from pathways to logits: fused before one recurrent core (the paper), or two streams that are added.
 DecisionKind = Literal["fused", "streams"]

@@ -85,8 +85,8 @@ class LayoutConfig:
         visible instances (`instances`). The default is `instances` with `paper`, else `presence`.
       weights: scale of the layout weights w that multiply the experience features of each category (eq. 7). `raw`, as
         in the paper: w itself, about 1 / (number of categories) except for the goal. `relative`: w over its mean over
-        all categories but the goal, at most 4. `pixel`: w itself, with positions and sizes of the experience features
-        in pixels of an image of 300 x 300, as in the authors' code.
+        all categories but the goal, at most 4. `pixel`: w itself, with the geometry of the experience features
+        (offsets, distance, bearing and size) times 300, the scale of boxes in pixels in the authors' code.
       prior: belief at the start of an episode: a separate one for each type of `room`, so that the policy knows the
         type of the room, or one `pooled` over all rooms.
       walks: number of random walks in the training scenes before training, at least 1. They count which things are seen

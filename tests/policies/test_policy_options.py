@@ -14,7 +14,7 @@ from support.tiny_world import BANK, SIZES, SPEC, random_params
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
-from jaxnav.policies.features import scale_boxes, unpack_features
+from jaxnav.policies.features import scale_geometry, unpack_features
 from jaxnav.policies.network import DONE_GATE, bind, init_params
 from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
 from jaxnav.policies.spec import Direct, PolicySpec
@@ -216,7 +216,7 @@ def test_the_direct_pathways_do_not_depend_on_the_kind_of_weights(weight_kind):
 
 def test_pixels_scale_position_and_size_but_not_visibility_confidence_and_goal():
     features = unpack_features(with_detections(detections(SEEN, SEEN)).row, jnp.asarray(GOAL), RowFormat(K))
-    scaled_features = scale_boxes(features)
+    scaled_features = scale_geometry(features)
     ratio = np.asarray(scaled_features.table / jnp.where(features.table == 0, 1, features.table))
     is_set = np.asarray(features.table != 0)
     expected = np.array([1, 1, 300, 300, 300, 300, 300, 300, 1]) * is_set
