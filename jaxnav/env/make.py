@@ -84,7 +84,7 @@ def build_environment(
         share one compilation.
       num_scenes: least number of scenes; a smaller bank repeats its scenes from the first.
       shaping: see `ObjectNav`.
-      with_expert: includes the actions of shortest paths, for imitation.
+      with_expert: includes the actions of shortest paths, for imitation and guidance.
 
     Returns:
       The environment, and its parameters with the scenes of the bank.

@@ -54,7 +54,8 @@ class SceneTables(struct.PyTreeNode):
       num_cells: int32 [S], number of cells of each scene.
       goals: int32 [S, K], possible goals of each scene; the first `num_goals` entries are valid.
       num_goals: int32 [S], number of possible goals of each scene.
-      expert: uint8 [P, K], first action of a shortest path to each goal; None unless a training stage imitates it.
+      expert: uint8 [P, K], first action of a shortest path to each goal; None unless training imitates it or guides
+        by it.
     """
 
     ahead: jax.Array

@@ -77,7 +77,7 @@ class GameView(NamedTuple):
       pose: index of the pose in the bank, whose row holds the observation.
       time: number of actions so far.
       step_limit: largest number of actions.
-      layout_weights: float32 [K], w x g of eq. 7.
+      layout_weights: float32 [K], the goal's column of w (eq. 7).
       layout_gap: layout gap D.
       advice: float32 [A], the policy's probability of each action; None without a policy.
     """

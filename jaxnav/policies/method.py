@@ -130,7 +130,7 @@ class Experience(nnx.Module):
         Args:
           features: detections and goal, leaves [..., K, ...].
           appearance: float32 [K, d], an embedding per category.
-          weights: float32 [..., K], w x g of eq. 7; ones disable the layout.
+          weights: float32 [..., K], the goal's column of w (eq. 7); ones disable the layout.
           reading: output of the method's tracker, leaves [...]; None without a tracker.
 
         Returns:
@@ -244,8 +244,8 @@ class Stage:
       share: share of all updates, above 0; the shares of a method add up to 1.
       loss: loss in place of PPO's, with the arguments and results of `jaxnav.training.ppo.ppo_loss`.
       lr_scale_by_path: learning-rate factor by parameter path; 0 freezes a parameter. None for 1 everywhere.
-      uses_expert: whether the loss reads the actions of shortest paths, `SceneTables.expert`, which are compiled only
-        then.
+      uses_expert: whether the loss reads the actions of shortest paths, `SceneTables.expert`. Guidance reads them in
+        every stage.
       direct_stream_only: whether only the direct stream acts and learns, for policies with streams.
       lr_scale: factor on the learning rate of all parameters.
       adapts_online: whether the method's adaptation changes the policy while it acts and learns; if not, fast weights

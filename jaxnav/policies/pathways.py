@@ -26,7 +26,8 @@ class PolicyInputs(NamedTuple):
 
     Attributes:
       observation: packed row and goal.
-      layout_weights: float32 [..., K], w x g of eq. 7, the layout's weights for the goal; ones disable the layout.
+      layout_weights: float32 [..., K], the layout's weights for the goal, its column of w (eq. 7); ones disable the
+        layout.
       reading: output of the method's tracker, a pytree; None without a tracker.
       surroundings: uint8 [..., M], known cells around the agent; None without a spatial memory.
     """

@@ -61,7 +61,8 @@ class PolicyOutput(NamedTuple):
       factual: float32 [C], factual logits a.
       counterfactual: float32 [C], counterfactual logits a_bar; None where the policy does not use the layout.
       gap: float32 [], layout gap D; None where the policy does not use the layout.
-      weights: float32 [K], layout weights w x g of eq. 7; None where the policy does not use the layout.
+      weights: float32 [K], layout weights, the goal's column of w (eq. 7); None where the policy does not use the
+        layout.
       perception_state: layout belief, spatial map and tracker state, with this observation.
       decision: factual output of the network, which becomes the policy state once the action is known.
     """
@@ -303,7 +304,8 @@ def policy_step(policy: LoadedPolicy, inputs: Mapping[str, Any], epsilon: jax.Ar
 
     Returns:
       `action` int32 [], the best action; `logits` and `factual` float32 [C]; where the policy uses the layout
-      `counterfactual` float32 [C], `gap` float32 [] and `weights` float32 [K], w x g of eq. 7; `memory`.
+      `counterfactual` float32 [C], `gap` float32 [] and `weights` float32 [K], the goal's column of w (eq. 7);
+      `memory`.
     """
     # Programs take detections, view and counts as arrays; the policy reads them packed into a row.
     row_format = policy.task.row_format

@@ -1,8 +1,8 @@
-"""Imitation of shortest paths, for stages of training that use an expert.
+"""The cross-entropy to shortest paths, for guidance (`jaxnav.training.ppo.ppo_loss`) and for imitation stages.
 
-In a stage with `uses_expert` the scene tables have `SceneTables.expert`, the first action of a shortest path from every
-pose to every goal. `expert_actions` looks up these actions along a rollout, and `imitation_loss` is the cross-entropy
-to them.
+With guidance, or with a stage that has `uses_expert`, the scene tables have `SceneTables.expert`, the first action of a
+shortest path from every pose to every goal. `expert_actions` looks up these actions along a rollout, and
+`imitation_loss` is the cross-entropy to them.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ def expert_actions(replay: Any) -> jax.Array:
     """Return the first action of a shortest path at every step of a rollout, int32 [T, B].
 
     Args:
-      replay: a `jaxnav.training.ppo.Replay`, in a stage that uses an expert.
+      replay: a `jaxnav.training.ppo.Replay`, of a training with guidance or of a stage that uses an expert.
     """
     transitions = replay.transitions
     return replay.env_params.tables.expert[transitions.pose, transitions.goal].astype(jnp.int32)
