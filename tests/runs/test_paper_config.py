@@ -147,7 +147,7 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
         state = update(state, percept, knowledge, room)
         inputs = read_inputs(state, Observation(row, goal), knowledge)
 
-        # Equations 3 and 4, 5, 6, and w x g of equation 7.
+        # Equations 3 and 4, 5, 6, and the goal's column of w (equation 7).
         twin.update(instance_counts(world.bank.rows[pose]))
         assert state.layout is not None
         np.testing.assert_array_equal(state.layout.alpha, twin.alpha)
@@ -161,7 +161,7 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
 
 
 def test_weights_multiply_the_rows_of_experience_unscaled():
-    """Equation 7: the experience of the policy is that of its method with w x g itself."""
+    """Equation 7: the experience of the policy is that of its method with raw weights."""
     world = paper_world()
     spec = load_config("paper_small").policy_spec(NUM_CATEGORIES)
     policy = bind(spec, init_params(spec, jax.random.key(0)))

@@ -88,7 +88,7 @@ class TwinBelief:
         self.last_visible = visible.copy()
 
     def weights(self, goal: int) -> np.ndarray:
-        """Return w x g, [K]: the expectation that the goal is where each category is seen."""
+        """Return the column of w, [K]: the expectation that the goal is where each category is seen."""
         weights = self.alpha[:, goal] / self.alpha.sum(axis=1)
         weights[goal] = 1.0
         return weights

@@ -214,7 +214,7 @@ class TwinPolicy:
         scene = relu(linear(params["view"], np.concatenate(scene_inputs)))
         goal = self._embed_goal(features)
         appearance = params["known_appearance" if self.has_streams else "appearance"]["embedding"]
-        experience_features = self._scale_boxes(features)
+        experience_features = self._scale_geometry(features)
         experience = self.method.encode(
             params.get("method", {}), experience_features, appearance, weights, reading, memory
         )
@@ -223,7 +223,7 @@ class TwinPolicy:
         return decide(scene, goal, experience, memory, reading)
 
     def _scale_weights(self, weights: np.ndarray, goal: int) -> np.ndarray:
-        """Return w x g at the scale of the spec; `relative` is over the mean of all categories but the goal."""
+        """Return the goal's column of w at the scale of the spec; `relative` is over the mean off the goal."""
         if self.spec.weight_kind != "relative":
             return weights
         others = [weight for category, weight in enumerate(weights.tolist()) if category != goal]
@@ -231,8 +231,8 @@ class TwinPolicy:
         scaled[goal] = weights[goal]
         return scaled
 
-    def _scale_boxes(self, features: TwinFeatures) -> TwinFeatures:
-        """Return the features that experience reads; `pixel` has positions, bearings and sizes in pixels."""
+    def _scale_geometry(self, features: TwinFeatures) -> TwinFeatures:
+        """Return the features that experience reads; `pixel` multiplies all columns of geometry by 300."""
         if self.spec.weight_kind != "pixel":
             return features
         table = features.table.copy()
