@@ -1,9 +1,10 @@
 """Value of the layout to a planner: the same search with and without a prior.
 
 `python benchmarks/layout_value.py [WORLD or SCENE FILE ...] [--scenes 48] [--episodes 320] [--shift 0]
-[--goals CATEGORY ...]` searches in the scenes of generated worlds (all three without arguments) and of scene files.
-Every scene is searched with a prior fitted to other scenes: the scenes are divided into folds by floor plan, within
-room types. The detector makes no errors. Rows:
+[--shift-by size] [--goals CATEGORY ...]` searches in the scenes of generated worlds (all three without arguments) and
+of scene files. Every scene is searched with a prior fitted to other scenes, without a shift: the scenes are divided
+into folds by floor plan, within room types. An exchange by context is fitted to the other folds too. The detector makes
+no errors. Rows:
 
   flat    all sites are equally likely
   places  knows where objects stand at all (on furniture, at walls), but tells no category from another
@@ -17,7 +18,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from _common import print_report
@@ -32,14 +33,18 @@ from jaxnav.baselines.layout_model import (
 )
 from jaxnav.baselines.planner import PlannerScene, SearchResult, search_for_goal
 from jaxnav.baselines.sites import find_sites
+from jaxnav.choices import ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference, scene_clusters
+from jaxnav.scenes.context_exchange import fit_context_exchange
 from jaxnav.scenes.lattice import pose_successors
+from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.scene import Scene, floor_plan_name
 from jaxnav.scenes.tables.compile import Bank, compile_scene, join_scenes
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
-from jaxnav.scenes.worlds import WORLDS, World, load_scenes, make_generated_scenes, shift_scenes, world_name_of_origin
+from jaxnav.scenes.task import Task
+from jaxnav.scenes.worlds import WORLDS, World, load_scenes, make_generated_scenes, world_name_of_origin
 
 NUM_FOLDS = 4
 #: Variants to compare.
@@ -52,6 +57,7 @@ class SearchWorld(NamedTuple):
     Attributes:
       world: rules and step limits.
       bank: tables of the scenes.
+      scenes: the S scenes.
       planner_scenes: the S scenes as the planner needs them.
       fold: of every scene, int [S].
       episodes: the E episodes.
@@ -59,34 +65,40 @@ class SearchWorld(NamedTuple):
 
     world: World
     bank: Bank
+    scenes: list[Scene]
     planner_scenes: list[PlannerScene]
     fold: np.ndarray
     episodes: EpisodeList
 
 
-def main(sources: Sequence[str], num_scenes: int, num_episodes: int, shift: float, goals: Sequence[str]) -> None:
+def main(
+    sources: Sequence[str],
+    num_scenes: int,
+    num_episodes: int,
+    shift: float,
+    shift_by: ShiftKind,
+    goals: Sequence[str],
+) -> None:
     results = {}
     for source in sources:
         name = Path(source).name
-        search_world = compile_search_world(source, num_scenes, num_episodes, shift, goals)
-        results[name] = compare_priors(search_world)
+        training_world = compile_search_world(source, num_scenes, num_episodes, goals)
+        search_world = shift_search_world(training_world, shift, shift_by, num_episodes)
+        results[name] = compare_priors(training_world, search_world)
         print(format_table(name, results[name]), file=sys.stderr, flush=True)
-    print_report({"shift": shift, "goals": list(goals), "worlds": results})
+    print_report({"shift": shift, "shift_by": shift_by, "goals": list(goals), "worlds": results})
 
 
 # Scenes
 
 
-def compile_search_world(
-    source: str, max_scenes: int, num_episodes: int, shift: float, goals: Sequence[str]
-) -> SearchWorld:
-    """Compile scenes and draw episodes.
+def compile_search_world(source: str, max_scenes: int, num_episodes: int, goals: Sequence[str]) -> SearchWorld:
+    """Compile scenes without a shift and draw episodes.
 
     Args:
       source: name of a generated world, or scene file.
       max_scenes: number of scenes, evenly spread over a file.
       num_episodes: E.
-      shift: layout shift of the scenes, from 0 to 1.
       goals: categories to search for; those of the world if empty.
     """
     if source in WORLDS:
@@ -96,10 +108,33 @@ def compile_search_world(
         all_scenes = load_scenes(source, None)
         world = WORLDS[world_name_of_origin(all_scenes[0].world)]
     task = dataclasses.replace(world.task, detector=PERFECT_DETECTOR, goals=tuple(goals) or world.task.goals)
-    shifted_scenes = shift_scenes(all_scenes, task, shift)
+    indices = np.unique(np.linspace(0, len(all_scenes) - 1, max_scenes).astype(int))
+    return prepare_search([all_scenes[int(index)] for index in indices], world, task, num_episodes)
 
-    indices = np.unique(np.linspace(0, len(shifted_scenes) - 1, max_scenes).astype(int))
-    scenes = [shifted_scenes[int(index)] for index in indices]
+
+def shift_search_world(
+    training_world: SearchWorld, shift: float, shift_by: ShiftKind, num_episodes: int
+) -> SearchWorld:
+    """Shift the layout of the scenes and draw episodes anew; without a shift, the world itself."""
+    if shift == 0.0:
+        return training_world
+    task = training_world.bank.task
+    scenes = training_world.scenes
+    shifted_scenes = []
+    for fold in range(NUM_FOLDS):
+        # The exchange of a fold is fitted to the scenes of all other folds.
+        exchange = None
+        if shift_by == "context":
+            other_indices = np.flatnonzero(training_world.fold != fold)
+            exchange = fit_context_exchange((scenes[index] for index in other_indices), task)
+        for index in np.flatnonzero(training_world.fold == fold):
+            shifted_scenes.append((index, exchange_places(scenes[index], task, shift, 0, exchange)))
+    scenes_in_order = [scene for _, scene in sorted(shifted_scenes, key=lambda entry: entry[0])]
+    return prepare_search(scenes_in_order, training_world.world, task, num_episodes)
+
+
+def prepare_search(scenes: Sequence[Scene], world: World, task: Task, num_episodes: int) -> SearchWorld:
+    """Compile scenes and draw episodes."""
     tables = [compile_scene(scene, task) for scene in scenes]
     bank = join_scenes(tables, task)
 
@@ -112,7 +147,8 @@ def compile_search_world(
             successors = pose_successors(table.ahead, task.rules)
             searchable_scenes.append(scene)
             planner_scenes.append(PlannerScene(sites, successors, table.best_length))
-    return SearchWorld(world, bank, planner_scenes, assign_folds(searchable_scenes), draw_episodes(bank, num_episodes))
+    fold = assign_folds(searchable_scenes)
+    return SearchWorld(world, bank, searchable_scenes, planner_scenes, fold, draw_episodes(bank, num_episodes))
 
 
 def assign_folds(scenes: Sequence[Scene]) -> np.ndarray:
@@ -127,27 +163,30 @@ def assign_folds(scenes: Sequence[Scene]) -> np.ndarray:
 # Searches
 
 
-def compare_priors(search_world: SearchWorld) -> dict[str, Any]:
-    """Search with each prior, and return means and differences with intervals."""
-    episodes = search_world.episodes
-    episode_fold = search_world.fold[episodes.scene]
-
+def compare_priors(training_world: SearchWorld, search_world: SearchWorld) -> dict[str, Any]:
+    """Search with each prior, fitted to the training world, and return means and differences with intervals."""
     # Detection rates of each fold come from the scenes of the other folds.
-    counts = np.stack([detection_counts(planner_scene.sites) for planner_scene in search_world.planner_scenes])
+    counts = np.stack([detection_counts(planner_scene.sites) for planner_scene in training_world.planner_scenes])
     rates = []
     for fold in range(NUM_FOLDS):
-        rates.append(detection_rates(counts[search_world.fold != fold].sum(axis=0)))
+        rates.append(detection_rates(counts[training_world.fold != fold].sum(axis=0)))
 
     # Searches with a flat belief give the snapshots to which the models of the other folds are fitted.
-    uniform_model = uniform_layout_model(len(search_world.bank.task.categories))
-    flat_searches = run_searches(search_world, rates, [uniform_model] * NUM_FOLDS)
+    uniform_models = [uniform_layout_model(len(search_world.bank.task.categories))] * NUM_FOLDS
+    training_searches = run_searches(training_world, rates, uniform_models)
+    training_fold = training_world.fold[training_world.episodes.scene]
     snapshots_by_fold = []
     for fold in range(NUM_FOLDS):
         snapshots = []
-        for episode_index in np.flatnonzero(episode_fold != fold):
-            snapshots += flat_searches[episode_index].snapshots
+        for episode_index in np.flatnonzero(training_fold != fold):
+            snapshots += training_searches[episode_index].snapshots
         snapshots_by_fold.append(snapshots)
 
+    episodes = search_world.episodes
+    episode_fold = search_world.fold[episodes.scene]
+    flat_searches = training_searches
+    if search_world is not training_world:
+        flat_searches = run_searches(search_world, rates, uniform_models)
     searches = {"flat": flat_searches}
     bits = {}
     for name, use_relations in (("places", False), ("layout", True)):
@@ -272,9 +311,10 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", type=int, default=48)
     parser.add_argument("--episodes", type=int, default=320)
     parser.add_argument("--shift", type=float, default=0.0)
+    parser.add_argument("--shift-by", choices=get_args(ShiftKind), default="size")
     parser.add_argument("--goals", nargs="+", default=())
     options = parser.parse_args()
     try:
-        main(options.sources, options.scenes, options.episodes, options.shift, options.goals)
+        main(options.sources, options.scenes, options.episodes, options.shift, options.shift_by, options.goals)
     except InputError as error:
         sys.exit(f"error: {error}")

@@ -12,7 +12,7 @@ Reduction = Literal["mean_visible", "mean", "sum"]
 #: Counts of a view in eq. 3: 1 for each visible category, or the number of its visible instances.
 Counts = Literal["presence", "instances"]
 #: Layout estimators that an evaluation may use in place of the one from training.
-EstimatorName = Literal["paper", "released", "evidence", "learned", "overdue", "clock"]
+EstimatorName = Literal["paper", "released", "evidence", "learned", "surprise", "overdue", "clock"]
 #: Ways to use policies in an evaluation, and the two references without training.
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde", "cde", "scde"]
 #: Parts of a decision whose cost an evaluation measures: other categories in Z, all parts, or none.
@@ -22,5 +22,8 @@ Costs = Literal["categories", "all", "none"]
 Removal = Literal["tde", "cde"]
 #: Memory of the counterfactual branch: the factual one, or one of its own, to which both direct pathways are zero.
 CounterfactualMemory = Literal["factual", "own"]
+#: Categories that exchange their places under a layout shift: neighbours in size, drawn for each scene, or the ones
+#: whose exchange misleads most, equal in all scenes.
+ShiftKind = Literal["size", "context"]
 #: Rule that turns logits into actions: the best action, or a sampled one.
 Decoding = Literal["argmax", "sample"]

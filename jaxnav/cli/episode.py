@@ -6,7 +6,7 @@ from typing import Literal
 
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName
+from jaxnav.choices import EstimatorName, ShiftKind
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
 
@@ -32,6 +32,8 @@ class EpisodeConfig:
       scenes: scene file to use instead of the scenes of the run.
       shift: layout shifts of the scenes, each from 0 (as in training) to 1, with one panel for each. The default is the
         shift of the run. With several shifts, all episodes of the list are played and the success rates are printed.
+      shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
+        `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       map: draw the map that the agent made, the block that it searches and its way to it. This needs a method that
         searches with a map, and writes a PNG.
       step: step at which the map is drawn, from 1. The default is the last step.
@@ -46,6 +48,7 @@ class EpisodeConfig:
     setting: EstimatorName | None = None
     scenes: Path | None = None
     shift: tuple[float, ...] = ()
+    shift_by: ShiftKind = "size"
     map: bool = False
     step: int | None = None
 
@@ -82,6 +85,7 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
         estimator=config.setting,
         scenes=config.scenes,
         shifts=config.shift or (None,),
+        shift_by=config.shift_by,
         console=console,
     )
     num_steps = max(len(episode.trace.pose) for episode in episodes)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal
+from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal, ShiftKind
 from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
@@ -37,6 +37,8 @@ class EvalConfig:
       world: generated world to use instead of the scenes of the run. The categories and rules remain those of the run.
       shift: layout shift of the scenes, from 0 (as in training) to 1. The default is the shift of the run, and 0 with
         `--scenes` or `--world`.
+      shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
+        `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       episodes: number of fixed episodes, at least 1, balanced over room types and scenes.
       epsilon: thresholds of soft removal, each at least 0: experience is removed where the layout gap exceeds the
         threshold. All thresholds are evaluated in one compiled call.
@@ -70,6 +72,7 @@ class EvalConfig:
     scenes: Path | None = None
     world: Literal["rooms", "apartments", "houses"] | None = None
     shift: float | None = None
+    shift_by: ShiftKind = "size"
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.5,)
     form: tuple[Form, ...] | None = None
@@ -104,6 +107,7 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
         scenes=config.scenes,
         world=config.world,
         shift=config.shift,
+        shift_by=config.shift_by,
         episodes=config.episodes,
         epsilon=config.epsilon,
         form=config.form,
@@ -169,6 +173,7 @@ def _find_target(config: EvalConfig) -> Path:
     """Return the JSON file to write, or raise an `InputError` before anything is evaluated."""
     details = (
         None if config.shift is None else f"shift{config.shift:g}",
+        None if config.shift_by == "size" else f"by-{config.shift_by}",
         config.setting,
         None if config.inner_steps is None else f"inner{config.inner_steps}",
         None if config.removal == ("tde",) else "-".join(config.removal),

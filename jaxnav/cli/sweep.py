@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import Decoding, EstimatorName, Form
+from jaxnav.choices import Decoding, EstimatorName, Form, ShiftKind
 from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
@@ -39,6 +39,8 @@ class SweepConfig:
       epsilon: thresholds of sTDE, at least 0. Experience is removed where the layout gap exceeds the threshold; for
         thresholds of 1 and more nothing is removed.
       shift: layout shifts of the scenes, from 0 (as in training) to 1; each gets a section of the table and a curve.
+      shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
+        `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       split: scenes to evaluate on.
       scenes: scene file to use instead of the scenes of the run or policy.
       world: generated world to use instead of the scenes of the run or policy.
@@ -61,6 +63,7 @@ class SweepConfig:
     source: str
     epsilon: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
     shift: tuple[float, ...] = (0.0, 1.0)
+    shift_by: ShiftKind = "size"
     split: Literal["train", "val", "test"] = "val"
     scenes: Path | None = None
     world: Literal["rooms", "apartments", "houses"] | None = None
@@ -96,6 +99,7 @@ def _run_sweep(config: SweepConfig, console: Console) -> None:
         split=config.split,
         scenes=config.scenes,
         world=config.world,
+        shift_by=config.shift_by,
         episodes=config.episodes,
         decoding=config.decoding,
         form=config.form,
@@ -129,6 +133,7 @@ def _find_figure_path(config: SweepConfig) -> Path:
     has_default_shifts = config.shift == SweepConfig.shift
     details = (
         None if has_default_shifts else f"shift{'-'.join(f'{shift:g}' for shift in config.shift)}",
+        None if config.shift_by == "size" else f"by-{config.shift_by}",
         config.form,
         config.setting,
         "hold" if config.hold else None,

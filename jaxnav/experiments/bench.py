@@ -100,7 +100,9 @@ class Bench:
 
     def compile_world(self, run: AgentRun, shift: float) -> CompiledWorld:
         """Compile the scenes of a run at a layout shift."""
-        return compile_evaluation_world(run.config, self.config.split, None, shift, self.console)
+        return compile_evaluation_world(
+            run.config, self.config.split, None, shift, self.console, shift_by=self.config.shift_by
+        )
 
     def draw_episodes(self, world: CompiledWorld) -> EpisodeList:
         """Draw the episodes of the experiment in a world.
@@ -127,6 +129,7 @@ class Bench:
             Run(run.config),
             split=config.split,
             shift=shift,
+            shift_by=config.shift_by,
             episodes=config.episodes,
             epsilon=config.epsilon,
             form=(config.form,),

@@ -15,7 +15,7 @@ import re
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-from jaxnav.choices import Decoding, Form, Variant
+from jaxnav.choices import Decoding, Form, ShiftKind, Variant
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
@@ -58,6 +58,8 @@ class ExperimentConfig:
         written to that directory.
       split: scenes to evaluate on.
       shifts: layout shifts, rising, each from 0 (as in training) to 1. The first is the reference of all changes.
+      shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
+        `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       episodes: number of episodes, at least 1, at each layout shift.
       epsilon: thresholds of sTDE, each at least 0: experience is removed where the layout gap exceeds the threshold.
         The first is the one that is compared.
@@ -87,6 +89,7 @@ class ExperimentConfig:
     run: Path | None = None
     split: Literal["train", "val", "test"] = "val"
     shifts: tuple[float, ...] = (0.0, 1.0)
+    shift_by: ShiftKind = "size"
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.5,)
     form: Form = "residual"
@@ -327,6 +330,8 @@ def evaluation_settings(config: ExperimentConfig) -> dict[str, Any]:
     for name in EVALUATION_SETTINGS:
         value = getattr(config, name)
         settings[name] = list(value) if isinstance(value, tuple) else value
+    if config.shift_by != "size":  # results of earlier versions have no such setting
+        settings["shift_by"] = config.shift_by
     return settings
 
 

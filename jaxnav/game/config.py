@@ -4,6 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from jaxnav.choices import ShiftKind
+
 
 @dataclasses.dataclass(frozen=True)
 class PlayConfig:
@@ -16,6 +18,8 @@ class PlayConfig:
       goal: category to search for. By default, a random goal.
       seed: random seed of the scenes and of the episode, at least 0.
       shift: layout shift of the scenes, from 0 (as in training) to 1.
+      shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
+        `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       policy: policy whose advice and belief are shown: the folder of an exported policy, or the name of a packaged
         policy, such as `rooms-org`. Without a policy, the belief starts from random walks in training scenes.
       epsilon: threshold of sTDE in the advice of the policy, at least 0.
@@ -27,5 +31,6 @@ class PlayConfig:
     goal: str | None = None
     seed: int = 0
     shift: float = 0.0
+    shift_by: ShiftKind = "size"
     policy: str | None = None
     epsilon: float = 0.5

@@ -129,7 +129,9 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
 
     # The game takes one episode of the list that an evaluation with this seed would play.
     run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed), layout=layout_config)
-    world = compile_evaluation_world(run_config, config.split, config.scenes, config.shift, console)
+    world = compile_evaluation_world(
+        run_config, config.split, config.scenes, config.shift, console, shift_by=config.shift_by
+    )
     episode = choose_episode(world.banks[0], config.goal, config.seed)
 
     # Without a policy that estimates the layout, the belief starts from random walks in training scenes.

@@ -4,6 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from jaxnav.choices import ShiftKind
+
 
 @dataclasses.dataclass(frozen=True)
 class ReportConfig:
@@ -15,6 +17,8 @@ class ReportConfig:
         Train it with `--method anonymous` in the same world and with as many seeds.
       split: scenes to evaluate on.
       shift: layout shifts of the scenes, each from 0 (as in training) to 1.
+      shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
+        `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       episodes: number of fixed episodes at each layout shift, at least 1.
       epsilon: thresholds of sTDE in the curves, each at least 0.
       threshold: threshold of sTDE in the tables and replays, at least 0.
@@ -28,6 +32,7 @@ class ReportConfig:
     reference: Path | None = None
     split: Literal["train", "val", "test"] = "val"
     shift: tuple[float, ...] = (0.0, 1.0)
+    shift_by: ShiftKind = "size"
     episodes: int = 1000
     epsilon: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
     threshold: float = 0.5

@@ -57,7 +57,7 @@ def measure_shift(
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
     # Evaluate the run.
-    world = compile_evaluation_world(run.config, config.split, None, shift, console)
+    world = compile_evaluation_world(run.config, config.split, None, shift, console, shift_by=config.shift_by)
     results = _evaluate(run, shift, world, config, console)
     policies = run.policies()
     agents = _select_agents(results, policies, world, config.threshold)
@@ -67,7 +67,9 @@ def measure_shift(
     if reference_run is not None:
         quiet_console = Console(quiet=True)
         with console.status(f"evaluating the reference run at shift {shift:g}"):
-            reference_world = compile_evaluation_world(reference_run.config, config.split, None, shift, quiet_console)
+            reference_world = compile_evaluation_world(
+                reference_run.config, config.split, None, shift, quiet_console, shift_by=config.shift_by
+            )
             reference_results = _evaluate(reference_run, shift, reference_world, config, quiet_console)
         account = measure_leads(results, reference_results)
 
@@ -109,6 +111,7 @@ def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig
         run,
         split=config.split,
         shift=shift,
+        shift_by=config.shift_by,
         episodes=config.episodes,
         epsilon=sorted({*config.epsilon, config.threshold}),
         seed=config.seed,

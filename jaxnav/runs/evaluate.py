@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
-from jaxnav.choices import Costs, CounterfactualMemory, Decoding, EstimatorName, Form, Removal
+from jaxnav.choices import Costs, CounterfactualMemory, Decoding, EstimatorName, Form, Removal, ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
@@ -113,6 +113,7 @@ def evaluate(
     scenes: Path | None = None,
     world: str | None = None,
     shift: float | None = None,
+    shift_by: ShiftKind = "size",
     episodes: int = 1000,
     epsilon: Sequence[float] | np.ndarray = (0.5,),
     form: Sequence[Form] | None = None,
@@ -134,6 +135,8 @@ def evaluate(
       scenes: scene file to read in place of the run's scenes.
       world: generated world to use in place of the run's scenes, with the categories and rules of the run.
       shift: layout shift, from 0 to 1; None for the run's, and 0 with `scenes` or `world`.
+      shift_by: categories that exchange their places: neighbours in size (`size`), or the ones whose exchange misleads
+        most (`context`); see `exchange_places`.
       episodes: number of fixed episodes, balanced over room types and scenes.
       epsilon: thresholds of soft removal.
       form: forms in which soft removal combines the logits; None for the form of the run's layout estimator with sTDE,
@@ -171,7 +174,7 @@ def evaluate(
     rows = [row for row in all_rows if not row.uses_own_fallback]
 
     # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
-    compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world)
+    compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
     applied_shift = evaluation_shift(config, scenes or world, shift)
     with console.status(_describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
         # Decision shares are counted in a thread: compilations use one core each.
@@ -226,6 +229,7 @@ def evaluate(
         "budget": steps_by_purpose,
         "evaluation_source": str(scenes or world or config.scene_source),
         "evaluation_shift": applied_shift,
+        "evaluation_shift_by": shift_by,
         "evaluation_seed": seed,
         "evaluation_setting": setting,
         "evaluation_hold": hold,
@@ -520,6 +524,7 @@ def sweep(
     scenes: Path | None = None,
     world: str | None = None,
     shift: float | None = None,
+    shift_by: ShiftKind = "size",
     episodes: int = 1000,
     decoding: Decoding = "argmax",
     form: Form | None = None,
@@ -535,8 +540,8 @@ def sweep(
         one seed: a `LoadedPolicy`, the folder of an export, or the name of a packaged policy, such as `rooms-org`.
       epsilon: thresholds [X]; no experience is removed for epsilon >= 1.
       params: network parameters of your own, leaves [S, ...]; None for those of the source.
-      split, scenes, world, shift, episodes, setting, hold, seed, console: as in `jaxnav.evaluate`. A policy is
-        evaluated in the generated world that it was trained for, unless `scenes` or `world` is given.
+      split, scenes, world, shift, shift_by, episodes, setting, hold, seed, console: as in `jaxnav.evaluate`. A policy
+        is evaluated in the generated world that it was trained for, unless `scenes` or `world` is given.
       decoding: `argmax` for best actions, `sample` for sampled ones.
       form: form in which sTDE combines the logits; None for the form of the layout estimator.
 
@@ -551,6 +556,7 @@ def sweep(
         split=split,
         scenes=scenes,
         world=world,
+        shift_by=shift_by,
         episodes=episodes,
         decoding=decoding,
         form=form,
@@ -571,6 +577,7 @@ def sweep_shifts(
     split: str = "val",
     scenes: Path | None = None,
     world: str | None = None,
+    shift_by: ShiftKind = "size",
     episodes: int = 1000,
     decoding: Decoding = "argmax",
     form: Form | None = None,
@@ -608,7 +615,7 @@ def sweep_shifts(
     evaluator = None
     for shift in shifts:
         applied_shift = evaluation_shift(config, scenes or world, shift)
-        compiled = compile_evaluation_world(config, split, scenes, shift, console, world)
+        compiled = compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
         num_seeds = policies.num_seeds
         seed_text = "1 seed" if num_seeds == 1 else f"{num_seeds} seeds"
         console.print(f"shift {applied_shift:g}: {len(epsilon)} thresholds x {seed_text} x {episodes:,} episodes")
@@ -629,6 +636,7 @@ def sweep_shifts(
             "scenes": str(scenes or world or config.scene_source),
             "split": split,
             "shift": applied_shift,
+            "shift_by": shift_by,
             "episodes": len(episode_list.goal),
             "decoding": decoding,
             "form": form,

@@ -14,16 +14,25 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from jaxnav.choices import ShiftKind
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.policies.method import Knowledge, Method
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import count_unknown_types, format_most_common
+from jaxnav.scenes.context_exchange import ContextExchange
 from jaxnav.scenes.scene import SPLITS
 from jaxnav.scenes.tables.compile import Bank, bank_checksum, compile_bank, concatenate_banks
 from jaxnav.scenes.tables.shards import Shards, compile_shards
-from jaxnav.scenes.worlds import WORLDS, Scenes, load_scenes, make_generated_scenes, shift_scenes
+from jaxnav.scenes.worlds import (
+    WORLDS,
+    Scenes,
+    fit_scene_exchange,
+    load_scenes,
+    make_generated_scenes,
+    shift_scenes,
+)
 
 #: Scenes in which a method of another package is checked.
 _NUM_SAMPLE_SCENES = 4
@@ -104,6 +113,7 @@ def compile_evaluation_world(
     shift: float | None,
     console: Console,
     world: str | None = None,
+    shift_by: ShiftKind = "size",
 ) -> CompiledWorld:
     """Compile the scenes in which a run is evaluated.
 
@@ -116,10 +126,11 @@ def compile_evaluation_world(
       shift: layout shift; see `evaluation_shift`.
       console: console for progress.
       world: generated world to use in place of the run's scenes.
+      shift_by: categories that exchange their places; `context` is fitted to the training scenes of the run.
 
     Raises:
-      InputError: unknown split or world, bad scene file, no scene of the split, a bad shift, or both a file and a
-        world.
+      InputError: unknown split or world, bad scene file, no scene of the split, a bad shift, no exchange by context
+        that misleads, or both a file and a world.
     """
     world_name = world or config.world
     if split not in SPLITS:
@@ -134,7 +145,7 @@ def compile_evaluation_world(
     if not (scenes or world):
         path = config.scenes
     evaluation_scenes = _load_scenes(
-        config, world_name, split, path, evaluation_shift(config, scenes or world, shift), console
+        config, world_name, split, path, evaluation_shift(config, scenes or world, shift), console, shift_by
     )
 
     # Episodes in living rooms may be longer.
@@ -151,15 +162,22 @@ def evaluation_shift(config: RunConfig, other_source: Path | str | None, shift: 
 
 
 def _load_scenes(
-    config: RunConfig, world: str, split: str, path: Path | None, shift: float, console: Console
+    config: RunConfig,
+    world: str,
+    split: str,
+    path: Path | None,
+    shift: float,
+    console: Console,
+    shift_by: ShiftKind = "size",
 ) -> Scenes:
     """Read or generate the scenes of a split, and shift their layout."""
+    context_exchange = fit_run_exchange(config) if shift and shift_by == "context" else None
     # The seed of the generator also decides which categories exchange their places.
     seed = config.worlds.seed
     if path is None:
         num_scenes = getattr(config.worlds, f"num_{split}")
         scenes = make_generated_scenes(world, split, num_scenes, seed)
-        return shift_scenes(scenes, config.task, shift, seed)
+        return shift_scenes(scenes, config.task, shift, seed, context_exchange)
 
     # Objects of a file need not be categories of the task.
     scenes = load_scenes(path, split)
@@ -167,7 +185,20 @@ def _load_scenes(
     if unknown_types:
         type_names = format_most_common(unknown_types)
         console.print(f"{path}: these object types are not categories and only block the view: {type_names}")
-    return shift_scenes(scenes, config.task, shift, seed)
+    return shift_scenes(scenes, config.task, shift, seed, context_exchange)
+
+
+def fit_run_exchange(config: RunConfig) -> ContextExchange:
+    """Fit the exchange of categories that misleads most to the training scenes of a run, without their shift.
+
+    Raises:
+      InputError: the scene file has no training scenes, or no exchange misleads.
+    """
+    if config.scenes is None:
+        scenes: Scenes = make_generated_scenes(config.world, "train", config.worlds.num_train, config.worlds.seed)
+    else:
+        scenes = load_scenes(config.scenes, "train")
+    return fit_scene_exchange(scenes, config.task)
 
 
 def _compile_world(

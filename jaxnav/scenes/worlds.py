@@ -9,11 +9,15 @@ import dataclasses
 import difflib
 import functools
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, Protocol
 
+import numpy as np
+
+from jaxnav.choices import ShiftKind
 from jaxnav.errors import InputError, MissingSplitError
+from jaxnav.scenes.context_exchange import ContextExchange, fit_context_exchange
 from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
 from jaxnav.scenes.generate.rooms import generate_room
@@ -194,27 +198,33 @@ class ShiftedScenes:
       task: task whose categories exchange their places.
       shift: share of the categories, from 0 to 1; see `exchange_places`.
       seed: seed of the exchange.
+      context_exchange: the exchange that misleads most, or None for one by size.
     """
 
     scenes: Scenes
     task: Task
     shift: float
     seed: int
+    context_exchange: ContextExchange | None = None
 
     @property
     def identity(self) -> str:
         """Identity of the unshifted scenes, with the shift."""
         exchange_options = f"{self.shift}, {self.seed}, {self.task.categories}, {self.task.goals}"
+        if self.context_exchange is not None:
+            exchange_options += f", by context: {self.context_exchange}"
         return f"{self.scenes.identity}, places exchanged: {exchange_options}"
 
     def __len__(self) -> int:
         return len(self.scenes)
 
     def __getitem__(self, index: int) -> Scene:
-        return exchange_places(self.scenes[index], self.task, self.shift, self.seed)
+        return exchange_places(self.scenes[index], self.task, self.shift, self.seed, self.context_exchange)
 
 
-def shift_scenes(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Scenes:
+def shift_scenes(
+    scenes: Scenes, task: Task, shift: float, seed: int = 0, context_exchange: ContextExchange | None = None
+) -> Scenes:
     """Return scenes with a shifted layout.
 
     Args:
@@ -222,13 +232,36 @@ def shift_scenes(scenes: Scenes, task: Task, shift: float, seed: int = 0) -> Sce
       task: task whose categories exchange their places; see `exchange_places`.
       shift: layout shift, from 0 (the scenes themselves) to 1.
       seed: seed of the exchange, at least 0.
+      context_exchange: the exchange that misleads most (`fit_context_exchange`); by default, categories of neighbouring
+        sizes exchange.
 
     Raises:
       InputError: an impossible number.
     """
     if seed < 0 or not 0.0 <= shift <= 1.0:  # also rejects NaN
         raise InputError(f"layout shift: seed {seed}, shift {shift}; give a seed of at least 0 and a shift from 0 to 1")
-    return ShiftedScenes(scenes, task, shift, seed) if shift else scenes
+    return ShiftedScenes(scenes, task, shift, seed, context_exchange) if shift else scenes
+
+
+#: Exchanges by context are fitted to at most this number of scenes, evenly spread.
+_MAX_FITTED_SCENES = 100
+
+
+def fit_scene_exchange(scenes: Scenes | Sequence[Scene], task: Task) -> ContextExchange:
+    """Fit the exchange of categories that misleads most to training scenes; see `fit_context_exchange`.
+
+    Args:
+      scenes: training scenes without a shift, of which 100 are read.
+      task: task whose categories exchange their places.
+
+    Raises:
+      InputError: no exchange misleads in any room type.
+    """
+    indices = np.unique(np.linspace(0, len(scenes) - 1, min(_MAX_FITTED_SCENES, len(scenes))).astype(int))
+    context_exchange = fit_context_exchange((scenes[int(index)] for index in indices), task)
+    if not any(context_exchange.values()):
+        raise InputError("--shift-by context: no exchange of categories misleads in the training scenes; use size")
+    return context_exchange
 
 
 def make_generated_scenes(world: str, split: str, count: int | None = None, seed: int = 0) -> GeneratedScenes:
@@ -294,6 +327,8 @@ class SceneSource:
       split: split of the scenes. The default is all scenes of a file, or `val` of a generated world.
       seed: random seed of a generated world and of the layout shift, at least 0.
       shift: layout shift of the scenes, from 0 to 1: the share of the categories that exchange their places.
+      shift_by: categories that exchange their places. `size`: neighbours in size, drawn for each scene. `context`: the
+        ones whose exchange misleads most, fitted to the training scenes of the file or world and equal in all scenes.
       world: world whose categories and rules are used. By default, the scenes decide.
     """
 
@@ -301,6 +336,7 @@ class SceneSource:
     split: Literal["train", "val", "test"] | None = None
     seed: int = 0
     shift: float = 0.0
+    shift_by: ShiftKind = "size"
     world: Literal["rooms", "apartments", "houses"] | None = None
 
     @functools.cached_property
@@ -337,12 +373,22 @@ class SceneSource:
           InputError: no readable scene file, no scene of the split, or an impossible number.
         """
         # Names of worlds come before files of the same name.
+        task = task or self.task
         scenes: Scenes
         if self.file in WORLDS:
             scenes = make_generated_scenes(self.file, self.split or "val", count, self.seed)
         else:
             scenes = load_scenes(self.file, self.split)
-        return shift_scenes(scenes, task or self.task, self.shift, self.seed)
+        if not (self.shift and self.shift_by == "context"):
+            return shift_scenes(scenes, task, self.shift, self.seed)
+
+        # The exchange that misleads most is that of the training scenes.
+        training_scenes: Scenes
+        if self.file in WORLDS:
+            training_scenes = make_generated_scenes(self.file, "train", seed=self.seed)
+        else:
+            training_scenes = load_scenes(self.file, "train")
+        return shift_scenes(scenes, task, self.shift, self.seed, fit_scene_exchange(training_scenes, task))
 
     def select_scene(self, name: str | None = None, index: int | None = None) -> Scene:
         """Return the scene of a name or an index, or else the first scene.

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName
+from jaxnav.choices import EstimatorName, ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
@@ -112,6 +112,7 @@ def play_episode(
     estimator: EstimatorName | None = None,
     scenes: Path | None = None,
     shifts: Sequence[float | None] = (None,),
+    shift_by: ShiftKind = "size",
     console: Console | None = None,
 ) -> list[PlayedEpisode]:
     """Play one episode of an evaluation at every layout shift.
@@ -128,6 +129,7 @@ def play_episode(
       estimator: layout estimator to use instead of the run's; see `Policies.with_estimator`.
       scenes: scene file to read instead of the run's world or file.
       shifts: layout shifts of the scenes, from 0 to 1; None for the run's.
+      shift_by: categories that exchange their places, see `jaxnav.evaluate`.
       console: receives messages; None for silence.
 
     Raises:
@@ -141,7 +143,7 @@ def play_episode(
     policies = policies.with_estimator(estimator)
 
     # Play the episode alone or, to compare shifts, all episodes whose goal can be reached at every shift.
-    episodes_by_shift = _draw_shifted_episodes(config, split, scenes, shifts, console)
+    episodes_by_shift = _draw_shifted_episodes(config, split, scenes, shifts, shift_by, console)
     is_reachable = _check_index(index, episodes_by_shift)
     played_indices = np.flatnonzero(is_reachable) if len(shifts) > 1 else np.array([index])
 
@@ -186,12 +188,17 @@ def _load_source(source: str | Path, arm: str) -> tuple[RunConfig, Policies]:
 
 
 def _draw_shifted_episodes(
-    config: RunConfig, split: str, scenes: Path | None, shifts: Sequence[float | None], console: Console
+    config: RunConfig,
+    split: str,
+    scenes: Path | None,
+    shifts: Sequence[float | None],
+    shift_by: ShiftKind,
+    console: Console,
 ) -> list[ShiftedEpisodes]:
     """Compile the scenes at every shift, and draw the episodes of the first shift for all of them."""
     worlds = []
     for shift in shifts:
-        worlds.append(compile_evaluation_world(config, split, scenes, shift, console))
+        worlds.append(compile_evaluation_world(config, split, scenes, shift, console, shift_by=shift_by))
     episodes = draw_episodes(worlds[0].banks[0])
 
     # Objects lie at other places at other shifts, so the shortest paths differ.

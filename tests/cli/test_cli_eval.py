@@ -156,7 +156,13 @@ def test_eval_of_a_shift_is_named_in_file_and_report(run_dir, tmp_path, capsys):
     report = read_report(copied_run / "eval-val-shift1.json")
     assert report["run"]["evaluation_shift"] == 1.0
     assert report["run"]["worlds"]["shift"] == 0.0
+    assert report["run"]["evaluation_shift_by"] == "size"
     assert not (copied_run / "eval-val.json").exists()
+
+    # The exchange that misleads most is another one, and the file is named after it.
+    assert evaluate(copied_run, "--episodes", 4, "--shift", 1, "--shift-by", "context") == 0
+    context_report = read_report(copied_run / "eval-val-shift1-by-context.json")
+    assert context_report["run"]["evaluation_shift_by"] == "context"
 
     capsys.readouterr()
     assert evaluate(copied_run, "--shift", 1.5) == 2
