@@ -1,7 +1,8 @@
 """Alternative layout gaps: scores of how far the episode's layout differs from the training layout.
 
-`learned_gap` adds up learned log odds of the pairs seen together, `overdue_gap` grows as the goal fails to appear where
-the training layout would show it, and `evidence_gap` is a z-test of the counts against layouts drawn from the prior.
+`learned_gap` adds up learned log odds of the pairs seen together, `surprise_gap` those of pairs seen near each other in
+one view or several. `overdue_gap` grows as the goal fails to appear where the training layout would show it, and
+`evidence_gap` is a z-test of the counts against layouts drawn from the prior.
 All handle one episode.
 """
 
@@ -9,6 +10,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+#: Distances within which two categories count as near each other, metres.
+NEAR_DISTANCES = (1.0, 2.0, 4.0, float("inf"))
+#: Numbers of views that show a pair so near, of which each is a feature: a false alarm rarely comes twice.
+NEAR_VIEW_COUNTS = (1, 3, 8, 20)
+#: F, the number of features of a pair.
+NUM_NEAR_FEATURES = len(NEAR_DISTANCES) * len(NEAR_VIEW_COUNTS)
+#: Views of a pair are counted up to this number.
+_MAX_VIEW_COUNT = 200
 
 
 class CooccurrenceEvidence(NamedTuple):
@@ -19,10 +29,13 @@ class CooccurrenceEvidence(NamedTuple):
         been seen together; 0 on and below the diagonal, so that each pair counts once.
       co_visibility: float32 [..., K, K], in [0, 1], 0 on the diagonal; P(j visible | i visible) over the
         training poses.
+      near_log_odds: float32 [..., F, K, K], the same as `log_odds` for the F features of `near_features`; None in runs
+        of earlier versions.
     """
 
     log_odds: jax.Array
     co_visibility: jax.Array
+    near_log_odds: jax.Array | None = None
 
 
 def seen_together(presence: jax.Array) -> jax.Array:
@@ -50,6 +63,82 @@ def learned_gap(co_seen: jax.Array, log_odds: jax.Array) -> jax.Array:
       float32 [], in [0, 1]; 1/2 where no pair was seen.
     """
     return jax.nn.sigmoid(jnp.where(co_seen, log_odds, 0.0).sum())
+
+
+class PairSightings(NamedTuple):
+    """Where the categories were seen in one episode, and how often pairs of them were near each other.
+
+    Attributes:
+      offsets: float32 [K, 2], metres from the agent to the last detection of each category, along the axes of the
+        compass.
+      is_seen: bool [K], whether a category has been detected.
+      counts: uint8 [R, K, K], number of views that showed one of two categories while both were known, within each of
+        `NEAR_DISTANCES` of each other; at most 200.
+    """
+
+    offsets: jax.Array
+    is_seen: jax.Array
+    counts: jax.Array
+
+    @staticmethod
+    def init(num_categories: int) -> "PairSightings":
+        """Sightings before the first view."""
+        counts_shape = (len(NEAR_DISTANCES), num_categories, num_categories)
+        return PairSightings(
+            offsets=jnp.zeros((num_categories, 2), jnp.float32),
+            is_seen=jnp.zeros(num_categories, bool),
+            counts=jnp.zeros(counts_shape, jnp.uint8),
+        )
+
+    def update(self, is_visible: jax.Array, offsets: jax.Array, motion: jax.Array) -> "PairSightings":
+        """Add a view.
+
+        Args:
+          is_visible: bool [K], categories detected in the view.
+          offsets: float32 [K, 2], metres from the agent to each detection, along the axes of the compass; read only
+            for the visible categories.
+          motion: float32 [2], metres that the agent has moved since the last view, along the same axes.
+        """
+        # Earlier detections move with the agent's frame; new ones replace them.
+        offsets = jnp.where(is_visible[:, None], offsets, self.offsets - motion[None])
+        is_seen = self.is_seen | is_visible
+
+        # A view counts for the pairs of which it shows at least one category.
+        distance = jnp.linalg.norm(offsets[:, None] - offsets[None], axis=-1)  # [K, K]
+        is_counted = (is_visible[:, None] | is_visible[None]) & is_seen[:, None] & is_seen[None]
+        within = distance[None] <= jnp.array(NEAR_DISTANCES)[:, None, None]  # [R, K, K]
+        is_near = is_counted[None] & within & (self.counts < _MAX_VIEW_COUNT)
+        return PairSightings(offsets, is_seen, self.counts + is_near.astype(jnp.uint8))
+
+
+def near_features(counts: jax.Array) -> jax.Array:
+    """Features of the counts of `PairSightings`: at least so many views within so many metres.
+
+    Args:
+      counts: uint8 [..., R, K, K].
+
+    Returns:
+      bool [..., F, K, K], F = R times the number of `NEAR_VIEW_COUNTS`.
+    """
+    # [..., R, thresholds, K, K]
+    is_reached = jnp.stack([counts >= threshold for threshold in NEAR_VIEW_COUNTS], axis=-3)
+    return is_reached.reshape(*counts.shape[:-3], -1, *counts.shape[-2:])
+
+
+def surprise_gap(counts: jax.Array, near_log_odds: jax.Array) -> jax.Array:
+    """Return the gap D as the probability that the layout is not that of training, from where things were seen.
+
+    The features of all pairs add up to the log odds z (prior odds of 1), and D = sigmoid(z). In contrast to
+    `learned_gap`, two categories need not be in one view: odometry tells how far apart they were seen.
+
+    Args:
+      counts: uint8 [R, K, K], of `PairSightings`.
+      near_log_odds: float32 [F, K, K], of `CooccurrenceEvidence`.
+
+    Returns:
+      float32 [], in [0, 1]; 1/2 where no pair was seen.
+    """
+    return learned_gap(near_features(counts), near_log_odds)
 
 
 def overdue_gap(co_seen: jax.Array, co_visibility: jax.Array, goal: jax.Array | int) -> jax.Array:

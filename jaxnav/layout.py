@@ -23,14 +23,22 @@ The estimator handles one episode; use `jax.vmap` for batches.
 import dataclasses
 import difflib
 import typing
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.choices import Counts, Reduction
-from jaxnav.gaps import CooccurrenceEvidence, evidence_gap, learned_gap, overdue_gap, seen_together
+from jaxnav.gaps import (
+    CooccurrenceEvidence,
+    PairSightings,
+    evidence_gap,
+    learned_gap,
+    overdue_gap,
+    seen_together,
+    surprise_gap,
+)
 from jaxnav.numerics.dirichlet import MIN_CONCENTRATION, counts_kl, presence_kl
 
 
@@ -55,6 +63,8 @@ class EstimatorConfig:
         `evidence`: misfit between the counts of the episode and the prior (`evidence_gap`).
         `learned`: layout gap, the probability that the layout differs from training, from the pairs seen together. See
           `learned_gap`.
+        `surprise`: layout gap, the probability that the layout differs from training, from the distances of pairs.
+          They need not be in one view. See `surprise_gap`.
         `overdue`: layout gap, the probability that the goal would have been seen by now in the training layout. See
           `overdue_gap`.
         `clock`: layout gap that ignores the layout, as a control: 1 at each new set of visible categories, then decays.
@@ -78,7 +88,7 @@ class EstimatorConfig:
     increment: int = 1
     own_column: bool = False
     gate: bool = True
-    gap: Literal["novelty", "evidence", "learned", "overdue", "clock", "none"] = "novelty"
+    gap: Literal["novelty", "evidence", "learned", "surprise", "overdue", "clock", "none"] = "novelty"
     hold: bool = False
     decay: float = 0.8
     passes: int = 1
@@ -177,12 +187,26 @@ class LayoutState(struct.PyTreeNode):
       gap: float32 [], layout gap D in [0, 1] (1 only by rounding).
       co_seen: bool [K, K], pairs that were visible together so far (`seen_together`), for the gaps `learned` and
         `overdue`; None for the rest.
+      sightings: where the categories were seen so far, for the gap `surprise`; None for the rest.
     """
 
     alpha: jax.Array
     last_visible: jax.Array
     gap: jax.Array
     co_seen: jax.Array | None = None
+    sightings: PairSightings | None = None
+
+
+class ViewGeometry(NamedTuple):
+    """Where one view shows the categories, by compass and odometry.
+
+    Attributes:
+      offsets: float32 [K, 2], metres from the agent to each detected category, along the axes of the compass.
+      motion: float32 [2], metres that the agent has moved since the last view, along the same axes.
+    """
+
+    offsets: jax.Array
+    motion: jax.Array
 
 
 class LayoutEstimator(struct.PyTreeNode):
@@ -191,7 +215,7 @@ class LayoutEstimator(struct.PyTreeNode):
     Attributes:
       prior: float32 [K, K], alpha* as from `prior_from_counts`.
       config: a name in `ESTIMATORS` or an `EstimatorConfig`; static. An unknown name raises a ValueError.
-      cooccurrence: evidence for the gaps `learned` and `overdue`, leaves [K, K]; None for the rest.
+      cooccurrence: evidence for the gaps `learned`, `surprise` and `overdue`, leaves [..., K, K]; None for the rest.
     """
 
     prior: jax.Array
@@ -204,15 +228,23 @@ class LayoutEstimator(struct.PyTreeNode):
     def init(self) -> LayoutState:
         """Belief at the start of an episode."""
         num_categories = self.prior.shape[-1]
-        records_pairs = resolve_estimator(self.config).gap in ("learned", "overdue")
+        gap_name = resolve_estimator(self.config).gap
+        records_pairs = gap_name in ("learned", "overdue")
         return LayoutState(
             alpha=self.prior,
             last_visible=jnp.zeros(num_categories, dtype=bool),
             gap=jnp.zeros((), dtype=jnp.float32),
             co_seen=jnp.zeros((num_categories, num_categories), dtype=bool) if records_pairs else None,
+            sightings=PairSightings.init(num_categories) if gap_name == "surprise" else None,
         )
 
-    def update(self, state: LayoutState, presence: jax.Array, goal: jax.Array | int | None = None) -> LayoutState:
+    def update(
+        self,
+        state: LayoutState,
+        presence: jax.Array,
+        goal: jax.Array | int | None = None,
+        geometry: ViewGeometry | None = None,
+    ) -> LayoutState:
         """Update belief and gap with the categories visible at one step (eqs. 3-5).
 
         Args:
@@ -220,12 +252,13 @@ class LayoutEstimator(struct.PyTreeNode):
           presence: bool or real [K], nonzero where a category is visible. Estimators with `counts="instances"` read it
             as the number of visible instances, a whole number; all others count 1 for any number above 0.
           goal: int [], index of the goal category; only the gap `overdue` needs it.
+          geometry: where the view shows the categories; only the gap `surprise` needs it.
 
         Returns:
           The belief after the step, including the layout gap.
 
         Raises:
-          ValueError: the gap needs `cooccurrence` or a goal, and there is none.
+          ValueError: the gap needs `cooccurrence`, a goal or the geometry of the view, and there is none.
         """
         config = resolve_estimator(self.config)
         is_visible = presence.astype(bool)
@@ -248,6 +281,7 @@ class LayoutEstimator(struct.PyTreeNode):
             last_visible=jnp.where(is_accepted, is_visible, state.last_visible),
             gap=state.gap,
             co_seen=state.co_seen,
+            sightings=state.sightings,
         )
 
         # Eq. 5, or another measure of the gap.
@@ -260,6 +294,9 @@ class LayoutEstimator(struct.PyTreeNode):
                 assert state.co_seen is not None
                 next_state = next_state.replace(co_seen=state.co_seen | seen_together(is_visible[None]))
                 gap = self._cooccurrence_gap(next_state, goal)
+            case "surprise":
+                next_state = next_state.replace(sightings=self._add_sightings(state, is_visible, geometry))
+                gap = self._surprise_gap(next_state)
             case "novelty" | "clock":
                 # The released code adds 1 to a row's own category before the divergence.
                 row_alpha = state.alpha + diagonal if config.own_column else state.alpha
@@ -315,6 +352,21 @@ class LayoutEstimator(struct.PyTreeNode):
             case "sum":
                 reduced_kl = row_kl.sum()
         return jnp.tanh(reduced_kl)
+
+    @staticmethod
+    def _add_sightings(state: LayoutState, is_visible: jax.Array, geometry: ViewGeometry | None) -> PairSightings:
+        """Return the sightings after a view."""
+        if geometry is None:
+            raise ValueError("gap='surprise': needs the geometry of the view; pass it to `update`")
+        assert state.sightings is not None
+        return state.sightings.update(is_visible, geometry.offsets, geometry.motion)
+
+    def _surprise_gap(self, state: LayoutState) -> jax.Array:
+        """Return the gap `surprise`, from the sightings so far."""
+        assert state.sightings is not None
+        if self.cooccurrence is None or self.cooccurrence.near_log_odds is None:
+            raise ValueError("gap='surprise': needs `cooccurrence` with `near_log_odds`, learned before training")
+        return surprise_gap(state.sightings.counts, self.cooccurrence.near_log_odds)
 
     def _cooccurrence_gap(self, state: LayoutState, goal: jax.Array | int | None) -> jax.Array:
         """Return the gap `learned` or `overdue`, from the pairs seen so far."""

@@ -8,9 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
+from support.scenes import draw
 
-from jaxnav.gaps import CooccurrenceEvidence, learned_gap, overdue_gap, seen_together
-from jaxnav.layout import EstimatorConfig, LayoutEstimator, prior_from_counts
+from jaxnav.gaps import (
+    NEAR_DISTANCES,
+    NEAR_VIEW_COUNTS,
+    NUM_NEAR_FEATURES,
+    CooccurrenceEvidence,
+    PairSightings,
+    learned_gap,
+    near_features,
+    overdue_gap,
+    seen_together,
+    surprise_gap,
+)
+from jaxnav.layout import EstimatorConfig, LayoutEstimator, ViewGeometry, prior_from_counts
+from jaxnav.policies.agent_loop import Perception
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.tables.compile import compile_bank
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, detected_positions
+from jaxnav.scenes.tables.visibility import cell_centres
+from jaxnav.scenes.task import Task
 
 NUM_CATEGORIES = 5
 VIEWS = hnp.arrays(np.bool_, (6, NUM_CATEGORIES))
@@ -46,6 +64,83 @@ def test_learned_gap_follows_worked_arithmetic():
     co_seen = seen_together(jnp.array([[1, 1, 1, 0]], bool))
     np.testing.assert_allclose(learned_gap(co_seen, log_odds), 6 / 7, rtol=1e-6)
     assert float(learned_gap(jnp.zeros((4, 4), bool), log_odds)) == 0.5
+
+
+def test_sightings_follow_worked_arithmetic():
+    """Two categories, seen one after the other.
+
+    The first view shows 0 at (3, 0) from the agent, which then moves by (1, 0): 0 is now at (2, 0). The second view
+    shows 1 at (2, 1.5), 1.5 m from it: within 2 and 4 m, not within 1 m. The third view shows 1 again, 0.5 m from 0.
+    """
+    far_away = [0.0, 0.0]
+    sightings = PairSightings.init(2)
+    assert (1.0, 2.0, 4.0, float("inf")) == NEAR_DISTANCES
+    sightings = sightings.update(jnp.array([True, False]), jnp.array([[3.0, 0.0], far_away]), jnp.zeros(2))
+    assert sightings.counts[:, 0, 1].tolist() == [0, 0, 0, 0]  # 1 is not known yet
+    sightings = sightings.update(jnp.array([False, True]), jnp.array([far_away, [2.0, 1.5]]), jnp.array([1.0, 0.0]))
+    np.testing.assert_allclose(sightings.offsets, [[2.0, 0.0], [2.0, 1.5]])
+    assert sightings.counts[:, 0, 1].tolist() == [0, 1, 1, 1]
+    sightings = sightings.update(jnp.array([False, True]), jnp.array([far_away, [2.5, 0.0]]), jnp.zeros(2))
+    assert sightings.counts[:, 0, 1].tolist() == [1, 2, 2, 2]
+    # A view without either category adds nothing, wherever the agent goes.
+    unchanged = sightings.update(jnp.zeros(2, bool), jnp.zeros((2, 2)), jnp.array([5.0, 5.0]))
+    np.testing.assert_array_equal(unchanged.counts, sightings.counts)
+    np.testing.assert_array_equal(sightings.counts, jnp.swapaxes(sightings.counts, 1, 2))
+
+
+def test_surprise_gap_follows_worked_arithmetic():
+    """One view within 4 m reaches one feature of each of two distances: ln 3 + ln 2 - ln 1 = ln 6, p = 6 / 7."""
+    assert NEAR_VIEW_COUNTS[:2] == (1, 3)
+    counts = jnp.zeros((4, 2, 2), jnp.uint8).at[2:, 0, 1].set(1)
+    num_thresholds = len(NEAR_VIEW_COUNTS)
+    log_odds = jnp.zeros((NUM_NEAR_FEATURES, 2, 2))
+    log_odds = log_odds.at[2 * num_thresholds, 0, 1].set(np.log(3)).at[3 * num_thresholds, 0, 1].set(np.log(2))
+    log_odds = log_odds.at[2 * num_thresholds + 1, 0, 1].set(5.0)  # three views within 4 m: not reached
+    np.testing.assert_allclose(surprise_gap(counts, log_odds), 6 / 7, rtol=1e-6)
+    assert float(surprise_gap(jnp.zeros((4, 2, 2), jnp.uint8), log_odds)) == 0.5
+
+
+def test_near_features_grow_with_the_number_of_views():
+    counts = jnp.arange(25, dtype=jnp.uint8)[:, None, None, None]  # a batch of 25, one distance, one pair
+    features = near_features(counts)[:, :, 0, 0]
+    np.testing.assert_array_equal(features.sum(axis=1), [sum(n >= m for m in NEAR_VIEW_COUNTS) for n in range(25)])
+
+
+def test_surprise_needs_geometry_and_evidence():
+    estimator = LayoutEstimator(PRIOR, EstimatorConfig(gap="surprise"), EVIDENCE)
+    view = jnp.ones(NUM_CATEGORIES, bool)
+    with pytest.raises(ValueError, match="geometry"):
+        estimator.update(estimator.init(), view)
+    geometry = ViewGeometry(jnp.zeros((NUM_CATEGORIES, 2)), jnp.zeros(2))
+    with pytest.raises(ValueError, match="near_log_odds"):
+        estimator.update(estimator.init(), view, None, geometry)
+
+
+def test_offsets_and_odometry_give_the_places_of_the_detections():
+    """Along a walk through a drawn room, agent plus offset is the place in the world, by the NumPy formula."""
+    scene = draw(["....."] * 5, ("Book", 0.5, 0.9, 1.5, 0.2, 0.2, 0.2), ("Fridge", 1.6, 1.0, 0.4, 0.4, 1.8, 0.4))
+    task = Task(detector=PERFECT_DETECTOR)
+    bank = compile_bank([scene], task)
+    rules = task.rules
+    centres = cell_centres(scene, standable_cells(scene.reach))
+    perception = Perception(task.row_format, rules=rules)
+    num_detections = 0
+    for pose in [0, 1, 2, *GENERATOR.integers(0, len(bank.rows), 200).tolist()]:
+        cell, heading, _ = rules.split_pose(pose)
+        row = bank.rows[pose]
+        geometry = perception.view_geometry(jnp.asarray(row), jnp.int32(heading), jnp.bool_(False))
+        np.testing.assert_array_equal(geometry.motion, 0.0)
+        visible = np.flatnonzero(task.row_format.presence(row))
+        detections = task.row_format.detections(row)[visible]
+        expected = detected_positions(detections, centres[cell], rules.heading_directions()[heading])
+        np.testing.assert_allclose(centres[cell] + np.asarray(geometry.offsets)[visible], expected, atol=1e-4)
+        num_detections += len(visible)
+
+        # A step ahead leads to the neighbouring cell that the motion names.
+        if bank.ahead[cell, heading] != cell:  # else something blocks the step
+            moved = perception.view_geometry(jnp.asarray(row), jnp.int32(heading), jnp.bool_(True)).motion
+            np.testing.assert_allclose(centres[bank.ahead[cell, heading]] - centres[cell], moved, atol=1e-6)
+    assert num_detections > 50
 
 
 def test_overdue_gap_follows_worked_arithmetic():

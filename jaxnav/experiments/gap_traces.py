@@ -23,8 +23,8 @@ from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import Curve, ResultRow
 from jaxnav.experiments.trials import require_estimator_config
 from jaxnav.gaps import CooccurrenceEvidence
-from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutState
-from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, policy_memory
+from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutState, ViewGeometry
+from jaxnav.policies.agent_loop import Agent, AgentLoop, Perception, decide, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params, Policy
 from jaxnav.runs.policies import Policies, adapt_counts, estimators_by_gap, load_policies
@@ -106,6 +106,8 @@ def _compared_estimators(policies: Policies) -> dict[str, EstimatorConfig]:
     }
     if policies.knowledge.cooccurrence is not None:
         estimators["learned"] = by_gap["learned"]
+        if policies.knowledge.cooccurrence.near_log_odds is not None:
+            estimators["surprise"] = by_gap["surprise"]
         estimators["overdue"] = by_gap["overdue"]
     return estimators
 
@@ -205,6 +207,8 @@ def _walk_episodes(
     # Estimators that count presence take instance counts, too.
     row_format = agent_loop.env.row_format
     read_presence = row_format.counts if row_format.has_counts else row_format.presence
+    rules = agent_loop.env.task.rules
+    perception = Perception(row_format, rules=rules)
 
     # Every estimator observes with the prior and the evidence of the episode's room type.
     room = env_params.room[start.scene]
@@ -221,13 +225,17 @@ def _walk_episodes(
         episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(policy_key, jnp.arange(num_episodes))
 
         def step(carry: tuple, _: None) -> tuple[tuple, tuple[jax.Array, jax.Array]]:
-            agent, running, beliefs = carry
+            agent, running, beliefs, previous_cell = carry
 
             # Observe the present view, [E, K], with both beliefs of every estimator.
-            presence = read_presence(env_params.tables.rows[agent.state.pose])
+            rows = env_params.tables.rows[agent.state.pose]
+            presence = read_presence(rows)
+            cell = agent_loop.env.cell_of_pose(agent.state.pose)
+            _, heading, _ = rules.split_pose(agent.state.pose)
+            geometry = jax.vmap(perception.view_geometry)(rows, heading, cell != previous_cell)
             next_beliefs = []
             for observer, belief_pair in zip(observers, beliefs, strict=True):
-                next_beliefs.append(observer.update(belief_pair, presence, start.goal))
+                next_beliefs.append(observer.update(belief_pair, presence, start.goal, geometry))
             gap_pairs = []
             for updated, frozen in next_beliefs:
                 gap_pairs.append(jnp.stack([updated.gap, frozen.gap]))
@@ -235,12 +243,13 @@ def _walk_episodes(
 
             # Act, and record whether the episode was still running at this view.
             next_agent, ended = _sample_step(agent_loop, policy, agent, knowledge, env_params, episode_keys)
-            return (next_agent, running & ~ended, next_beliefs), (gaps, running)
+            return (next_agent, running & ~ended, next_beliefs, cell), (gaps, running)
 
         # Before the first view, both beliefs equal the prior.
         beliefs = [observer.init() for observer in observers]
         agent = agent_loop.start_from(start, policy.initial_memory((num_episodes,)), knowledge, env_params)
-        carry = (agent, jnp.ones(num_episodes, bool), beliefs)
+        first_cell = agent_loop.env.cell_of_pose(agent.state.pose)
+        carry = (agent, jnp.ones(num_episodes, bool), beliefs, first_cell)
         _, (gaps, running) = jax.lax.scan(step, carry, length=num_steps + 1)
         return gaps, running
 
@@ -299,7 +308,11 @@ class _Observer(NamedTuple):
         return initial_belief, initial_belief
 
     def update(
-        self, beliefs: tuple[LayoutState, LayoutState], presence: jax.Array, goal: jax.Array
+        self,
+        beliefs: tuple[LayoutState, LayoutState],
+        presence: jax.Array,
+        goal: jax.Array,
+        geometry: ViewGeometry,
     ) -> tuple[LayoutState, LayoutState]:
         """Return both beliefs after one view of each episode.
 
@@ -307,6 +320,7 @@ class _Observer(NamedTuple):
           beliefs: both beliefs before the view, leaves [E, ...].
           presence: bool [E, K], or instance counts uint8 [E, K].
           goal: int32 [E].
+          geometry: where the views show the categories, leaves [E, ...].
         """
 
         def update_one(
@@ -316,14 +330,15 @@ class _Observer(NamedTuple):
             frozen: LayoutState,
             presence: jax.Array,
             goal: jax.Array,
+            geometry: ViewGeometry,
         ) -> tuple[LayoutState, LayoutState]:
             # The frozen belief takes the view into its gap, but its alpha returns to the prior.
             estimator = LayoutEstimator(prior, self.estimator, evidence)
-            next_updated = estimator.update(updated, presence, goal)
-            next_frozen = estimator.update(frozen, presence, goal).replace(alpha=prior)
+            next_updated = estimator.update(updated, presence, goal, geometry)
+            next_frozen = estimator.update(frozen, presence, goal, geometry).replace(alpha=prior)
             return next_updated, next_frozen
 
-        return jax.vmap(update_one)(self.priors, self.evidence, *beliefs, presence, goal)
+        return jax.vmap(update_one)(self.priors, self.evidence, *beliefs, presence, goal, geometry)
 
 
 # Statistics by step

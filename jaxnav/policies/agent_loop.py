@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation, State
-from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState, resolve_estimator
+from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState, ViewGeometry, resolve_estimator
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.adaptation import limit_inner_steps
 from jaxnav.policies.handover import Decider, HandoverPolicy
@@ -29,7 +29,9 @@ from jaxnav.policies.network import Params, Policy, bind
 from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_direct_pathways
 from jaxnav.policies.spatial_memory import ExplorationMap, SpatialMemory
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.scene import CELL_SIZE
+from jaxnav.scenes.tables.observation_row import RowFormat, relative_position
+from jaxnav.scenes.task import Rules
 
 
 class PerceptionState(NamedTuple):
@@ -57,11 +59,13 @@ class Perception:
       row_format: format of the observation rows.
       spec: spec of the policy; None where actions are given.
       estimator_config: configuration of the layout estimator; None leaves the layout out.
+      rules: motion and camera of the agent.
     """
 
     row_format: RowFormat
     spec: PolicySpec | None = None
     estimator_config: EstimatorConfig | None = None
+    rules: Rules = Rules()
 
     def init(self, knowledge: Knowledge | None, room: jax.Array) -> PerceptionState:
         """Return the state before the first view.
@@ -94,7 +98,10 @@ class Perception:
         if layout_estimator is not None and layout is not None:
             counts_instances = resolve_estimator(layout_estimator.config).counts == "instances"
             read_counts = self.row_format.counts if counts_instances else self.row_format.presence
-            layout = layout_estimator.update(layout, read_counts(percept.row), percept.goal)
+            geometry = None
+            if self._uses_geometry:
+                geometry = self.view_geometry(percept.row, percept.heading, percept.moved)
+            layout = layout_estimator.update(layout, read_counts(percept.row), percept.goal, geometry)
 
         # Map of free, blocked and visited cells.
         spatial_memory = self._spatial_memory
@@ -132,7 +139,31 @@ class Perception:
     @property
     def uses_odometry(self) -> bool:
         """True where compass heading and motion are needed."""
-        return self.tracker is not None or self._spatial_memory is not None
+        return self.tracker is not None or self._spatial_memory is not None or self._uses_geometry
+
+    def view_geometry(self, row: jax.Array, heading: jax.Array, moved: jax.Array) -> ViewGeometry:
+        """Where a view shows the categories, by compass and odometry.
+
+        Args:
+          row: uint8 [R], the observation row.
+          heading: int32 [], compass heading.
+          moved: bool [], whether the last action changed the cell.
+        """
+        # Axes of the compass: x to the right and z ahead at heading 0.
+        forward = jnp.asarray(self.rules.heading_directions(), jnp.float32)[heading]
+        rightward = jnp.stack([forward[1], -forward[0]])
+        detections = self.row_format.detections(row).astype(jnp.float32)
+        ahead, right = relative_position(detections)  # [K] each
+        offsets = ahead[:, None] * forward[None] + right[:, None] * rightward[None]
+
+        # A move leads to the next cell in the direction of the heading.
+        move_step = jnp.asarray(self.rules.move_steps(), jnp.float32)[heading, ::-1]  # (z, x) to (x, z)
+        return ViewGeometry(offsets, jnp.where(moved, CELL_SIZE * move_step, 0.0))
+
+    @property
+    def _uses_geometry(self) -> bool:
+        """True where the layout gap reads the positions of detections."""
+        return self.estimator_config is not None and resolve_estimator(self.estimator_config).gap == "surprise"
 
     @property
     def tracker(self) -> Any:
@@ -394,7 +425,7 @@ class AgentLoop:
 
     @property
     def _perception(self) -> Perception:
-        return Perception(self.env.row_format, self.spec, self.estimator_config)
+        return Perception(self.env.row_format, self.spec, self.estimator_config, self.env.task.rules)
 
     def _apply_control(self, agent: Agent, choice: jax.Array, knowledge: Any) -> tuple[jax.Array, Agent]:
         """Turn choices into actions; the method's control may change the tracker states."""

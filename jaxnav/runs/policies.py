@@ -19,7 +19,7 @@ import numpy as np
 from jaxnav.choices import CounterfactualMemory, EstimatorName
 from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.errors import InputError
-from jaxnav.gaps import CooccurrenceEvidence
+from jaxnav.gaps import NUM_NEAR_FEATURES, CooccurrenceEvidence
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.policies.adaptation import limit_inner_steps
 from jaxnav.policies.agent_loop import AgentLoop, Perception
@@ -43,7 +43,7 @@ POLICIES_DIR = "policies"
 #: Folder of the policies that come with the package, each in a folder of its own.
 PACKAGED_POLICIES = Path(__file__).parents[1] / "weights"
 #: Measures of the layout gap.
-GapName = Literal["novelty", "evidence", "learned", "overdue", "clock"]
+GapName = Literal["novelty", "evidence", "learned", "surprise", "overdue", "clock"]
 
 
 class Policies(NamedTuple):
@@ -100,8 +100,8 @@ class Policies(NamedTuple):
           hold: keep the gap from falling within an episode.
 
         Raises:
-          InputError: no policy uses the layout, or the run learned no co-occurrence evidence, which `learned` and
-            `overdue` need.
+          InputError: no policy uses the layout, or the run learned no co-occurrence evidence, which `learned`,
+            `surprise` and `overdue` need.
         """
         if name is None and not hold:
             return self
@@ -110,8 +110,13 @@ class Policies(NamedTuple):
         if self.estimator_config is None:
             option = "--hold" if name is None else f"--setting {name}"
             raise InputError(f"{option}: needs policies with the layout estimator; train a run with the arm `layout`")
-        if name in ("learned", "overdue") and self.knowledge.cooccurrence is None:
+        evidence = self.knowledge.cooccurrence
+        if name in ("learned", "surprise", "overdue") and evidence is None:
             raise InputError(f"--setting {name}: the run has no evidence from co-occurrence; train the run again")
+        if name == "surprise" and evidence is not None and evidence.near_log_odds is None:
+            raise InputError(
+                "--setting surprise: the run was trained before 0.4, which learns this gap; train the run again"
+            )
 
         # `paper` and `released` also build the priors in their own way.
         estimator_config = self.estimator_config
@@ -271,8 +276,10 @@ def export_policy(
     if knowledge.method:
         arrays["knowledge"] = jax.device_get(knowledge.method)
     if knowledge.cooccurrence is not None:
-        log_odds, co_visibility = jax.device_get(knowledge.cooccurrence)
-        arrays["signs"] = {"odds": log_odds, "chance": co_visibility}
+        evidence = jax.device_get(knowledge.cooccurrence)
+        arrays["signs"] = {"odds": evidence.log_odds, "chance": evidence.co_visibility}
+        if evidence.near_log_odds is not None:
+            arrays["signs"]["near_odds"] = evidence.near_log_odds
 
     export_params(folder, arrays, fields)
 
@@ -362,8 +369,11 @@ def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) 
         cooccurrence = None
         if "signs" in arrays:
             evidence_arrays = arrays["signs"]
+            near_log_odds = evidence_arrays.get("near_odds")  # missing in exports of earlier versions
             cooccurrence = CooccurrenceEvidence(
-                jnp.asarray(evidence_arrays["odds"]), jnp.asarray(evidence_arrays["chance"])
+                jnp.asarray(evidence_arrays["odds"]),
+                jnp.asarray(evidence_arrays["chance"]),
+                None if near_log_odds is None else jnp.asarray(near_log_odds),
             )
         knowledge = Knowledge(
             layout=jnp.asarray(arrays["layout"]["prior"]),
@@ -425,6 +435,8 @@ def check_arrays(folder: Path, arrays: Mapping[str, Any], spec: PolicySpec) -> N
     expected_arrays = dict(_expected_arrays(spec))
     if "signs" not in arrays:
         del expected_arrays["signs"]
+    elif "near_odds" not in arrays["signs"]:  # an export of an earlier version
+        expected_arrays["signs"] = {name: expected_arrays["signs"][name] for name in ("odds", "chance")}
     present_arrays = {name: arrays.get(name, {}) for name in expected_arrays}
     field_differences = list_differences(describe_arrays(present_arrays), describe_arrays(expected_arrays))
     if field_differences:
@@ -444,10 +456,11 @@ def check_arrays(folder: Path, arrays: Mapping[str, Any], spec: PolicySpec) -> N
 def _expected_arrays(spec: PolicySpec) -> dict[str, Any]:
     """Shapes and dtypes of all arrays but the method's knowledge."""
     category_pairs = jax.ShapeDtypeStruct((NUM_PRIORS, spec.num_categories, spec.num_categories), jnp.float32)
+    near_pairs = jax.ShapeDtypeStruct((NUM_PRIORS, NUM_NEAR_FEATURES, *category_pairs.shape[1:]), jnp.float32)
     return {
         "policy": jax.eval_shape(functools.partial(init_params, spec), jax.random.key(0)),
         "layout": {"prior": category_pairs, "counts": category_pairs},
-        "signs": {"odds": category_pairs, "chance": category_pairs},
+        "signs": {"odds": category_pairs, "chance": category_pairs, "near_odds": near_pairs},
     }
 
 

@@ -218,7 +218,7 @@ class LoadedPolicy(struct.PyTreeNode):
 
     @property
     def _perception(self) -> Perception:
-        return Perception(self.task.row_format, self.spec, self.estimator_config)
+        return Perception(self.task.row_format, self.spec, self.estimator_config, self.task.rules)
 
 
 def load_policy(

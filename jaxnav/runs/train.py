@@ -56,6 +56,7 @@ from jaxnav.training.calibration import (
     calibrate,
     explore,
     fit_shift_classifier,
+    fit_sighting_classifier,
     layout_priors,
 )
 from jaxnav.training.devices import (
@@ -72,9 +73,12 @@ from jaxnav.training.trainer import SeedMetrics, ShardedTrainer, Trainer, Traine
 _EXPLORE = 2**31 - 1
 _CALIBRATE = 2**31 - 2
 _COOCCURRENCE = 2**31 - 3
+_SIGHTINGS = 2**31 - 4
 
 #: Random walks of the co-occurrence evidence, as a multiple of those of the prior.
 _EVIDENCE_WALK_FACTOR = 4
+#: The same for the sightings of the gap `surprise`.
+_SIGHTING_WALK_FACTOR = 2
 
 #: Signals that end a run after the current chunk: Ctrl-C, and SIGTERM as schedulers send it.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -317,8 +321,15 @@ def learn_knowledge(
     num_walks = _EVIDENCE_WALK_FACTOR * config.layout.walks
     is_pooled = config.layout.prior == "pooled"
     learn_evidence = jax.jit(fit_shift_classifier, static_argnums=(0, 4, 5))
-    cooccurrence = learn_evidence(world.env, world.make_env_params(0), exploration.counts, key, num_walks, is_pooled)
-    return Knowledge(layout, method_knowledge, cooccurrence)
+    env_params = world.make_env_params(0)
+    cooccurrence = learn_evidence(world.env, env_params, exploration.counts, key, num_walks, is_pooled)
+
+    # Log odds of the distances at which pairs were seen.
+    near_key = jax.random.fold_in(jax.random.key(config.seed), _SIGHTINGS)
+    num_walks = _SIGHTING_WALK_FACTOR * config.layout.walks
+    learn_near_evidence = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
+    near_log_odds = learn_near_evidence(world.env, env_params, exploration.counts, near_key, num_walks, is_pooled)
+    return Knowledge(layout, method_knowledge, cooccurrence._replace(near_log_odds=near_log_odds))
 
 
 def make_trainer(

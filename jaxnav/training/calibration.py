@@ -4,7 +4,8 @@
 2. `calibrate` chooses strength and reduction of the layout estimator, and `layout_priors` turns the counts into its
    priors.
 3. `fit_shift_classifier` learns how strongly pairs of categories seen together indicate another layout than that of
-   training, by a logistic regression against walks under a simulated layout shift.
+   training, by a logistic regression against walks under a simulated layout shift. `fit_sighting_classifier` learns the
+   same of the distances at which pairs were seen.
 """
 
 import dataclasses
@@ -20,9 +21,9 @@ import optax
 from jaxnav.choices import Reduction
 from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
 from jaxnav.errors import InputError
-from jaxnav.gaps import CooccurrenceEvidence, seen_together
+from jaxnav.gaps import CooccurrenceEvidence, PairSightings, near_features, seen_together
 from jaxnav.layout import EstimatorConfig, prior_from_counts, resolve_estimator
-from jaxnav.policies.agent_loop import Agent, AgentLoop
+from jaxnav.policies.agent_loop import Agent, AgentLoop, Perception
 from jaxnav.policies.method import Knowledge
 from jaxnav.scenes.task import DONE
 
@@ -39,6 +40,10 @@ LATE_STEP = 20
 
 #: Lengths of the walks that the shift classifier learns from; each walk is cut at one of them.
 _WALK_LENGTHS = (1, 2, 5, 10, 20, 40, 60)
+#: The same for the sightings of a walk, whose evidence grows for longer.
+_SIGHTING_LENGTHS = (5, 10, 20, 40, 80, 120)
+#: Number of walks whose sightings are computed at once.
+_SIGHTING_BATCH = 64
 #: Standard deviation of the noise on the frequency ranks by which categories are paired for an exchange, in ranks.
 _RANK_NOISE = 3.0
 #: Weight of the squared log odds in the loss of the regression.
@@ -369,6 +374,85 @@ def fit_shift_classifier(
         pair_log_odds = jnp.broadcast_to(pair_log_odds[0], pair_log_odds.shape)
     log_odds = jnp.zeros_like(counts).at[:, rows, columns].set(pair_log_odds)
     return CooccurrenceEvidence(log_odds=log_odds, co_visibility=co_visibility_from_counts(counts))
+
+
+def fit_sighting_classifier(
+    env: ObjectNav,
+    env_params: EnvParams,
+    counts: jax.Array,
+    key: jax.Array,
+    num_walks: int = 4096,
+    pooled: bool = False,
+) -> jax.Array:
+    """Learn which distances between categories indicate another layout than that of training.
+
+    As `fit_shift_classifier`, with the features `near_features` of the sightings of each walk.
+
+    Args:
+      env: the environment.
+      env_params: parameters of the training environment.
+      counts: float32 [rooms, K, K], from `explore`.
+      key: consumed.
+      num_walks: W, parallel walks.
+      pooled: learn the same log odds for all room types.
+
+    Returns:
+      float32 [rooms, F, K, K], log odds of each feature; 0 on and below the diagonal.
+    """
+    walk_key = jax.random.fold_in(key, 0)
+    exchange_key = jax.random.fold_in(key, 1)
+    length_key = jax.random.fold_in(key, 2)
+    scene_key = jax.random.fold_in(key, 3)
+
+    # Sightings of each walk when it is cut at a random length, uint8 [W, R, K, K].
+    poses, scene = _walk(env, env_params, walk_key, num_walks, _SIGHTING_LENGTHS[-1])
+    lengths = jax.random.choice(length_key, jnp.array(_SIGHTING_LENGTHS), (num_walks,))
+    count_sightings = partial(_count_sightings, env, env_params)
+    sightings = jax.lax.map(lambda walk: count_sightings(*walk), (poses, lengths), batch_size=_SIGHTING_BATCH)
+
+    # The same sightings in another layout: a new exchange of categories for each walk.
+    room = env_params.room[scene]
+    is_present = _find_present_categories(env, env_params)[scene]  # [W, K]
+    frequency = jnp.diagonal(counts, axis1=1, axis2=2)[room]
+    exchange_keys = jax.random.split(exchange_key, num_walks)
+    exchanges = jax.vmap(draw_category_exchange)(exchange_keys, is_present, frequency)
+    shifted_sightings = jax.vmap(lambda matrix, exchange: matrix[:, exchange][:, :, exchange])(sightings, exchanges)
+
+    # Examples of both layouts, bool [2 W, F pairs], and the scenes that only calibrate.
+    num_categories = counts.shape[-1]
+    rows, columns = jnp.triu_indices(num_categories, 1)
+    features = near_features(jnp.concatenate([sightings, shifted_sightings]))[..., rows, columns]  # [2 W, F, pairs]
+    num_features = features.shape[1]
+    is_held_out = jax.random.bernoulli(scene_key, _CALIBRATION_SHARE, env_params.room.shape)[scene]
+
+    # Log odds of each room type, or of all as if they were the first one.
+    fit_rooms = jnp.zeros_like(room) if pooled else room
+    examples = features.reshape(2 * num_walks, -1)
+    log_odds = _fit_log_odds(examples, jnp.tile(fit_rooms, 2), jnp.tile(is_held_out, 2), len(counts))
+    if pooled:
+        log_odds = jnp.broadcast_to(log_odds[0], log_odds.shape)
+    near_log_odds = jnp.zeros((len(counts), num_features, num_categories, num_categories))
+    return near_log_odds.at[:, :, rows, columns].set(log_odds.reshape(len(counts), num_features, -1))
+
+
+def _count_sightings(env: ObjectNav, env_params: EnvParams, poses: jax.Array, length: jax.Array) -> jax.Array:
+    """Count the sightings of a walk of poses int32 [T + 1] in its first `length` steps, uint8 [R, K, K]."""
+    perception = Perception(env.row_format, rules=env.task.rules)
+    rows = env_params.tables.rows[poses]
+    _, heading, _ = env.task.rules.split_pose(poses)
+    cell = env.cell_of_pose(poses)
+    has_moved = jnp.concatenate([jnp.zeros(1, bool), cell[1:] != cell[:-1]])
+
+    def add_view(sightings: PairSightings, view: tuple) -> tuple[PairSightings, None]:
+        row, view_heading, moved, is_counted = view
+        geometry = perception.view_geometry(row, view_heading, moved)
+        # After the end of the walk nothing is seen.
+        is_visible = env.row_format.presence(row) & is_counted
+        return sightings.update(is_visible, geometry.offsets, geometry.motion), None
+
+    is_counted = jnp.arange(len(poses)) <= length
+    views = (rows, heading, has_moved, is_counted)
+    return jax.lax.scan(add_view, PairSightings.init(env.row_format.num_categories), views)[0].counts
 
 
 def co_visibility_from_counts(counts: jax.Array) -> jax.Array:

@@ -1,5 +1,7 @@
 """Signs of another layout: exchanges, chances, and what a regression on walks learns."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +13,19 @@ from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE, HOUSES, SMALL, draw
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.gaps import NUM_NEAR_FEATURES, surprise_gap
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.task import Task
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 from jaxnav.training import calibration as module
-from jaxnav.training.calibration import co_visibility_from_counts, draw_category_exchange, fit_shift_classifier
+from jaxnav.training.calibration import (
+    co_visibility_from_counts,
+    draw_category_exchange,
+    explore,
+    fit_shift_classifier,
+    fit_sighting_classifier,
+)
 
 K = 9
 EXCHANGE = jax.jit(draw_category_exchange)
@@ -87,6 +97,53 @@ def test_signs_of_a_world(pooled):
     assert signs.log_odds.dtype == signs.co_visibility.dtype == np.float32
     assert np.abs(signs.log_odds).max() < 1e-3
     np.testing.assert_array_equal(signs.co_visibility, co_visibility_from_counts(counts))
+
+
+def test_near_log_odds_of_a_world():
+    """Rooms of two categories: their exchange leaves the pair as near as before, so there is nothing to learn of the pair."""
+    env, params = tiny.world()
+    size = env.row_format.num_categories
+    counts = jnp.zeros((NUM_PRIORS, size, size)).at[np.unique(params.room)].set(1 + jnp.eye(size)[None])
+    fit = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
+    log_odds = fit(env, params, counts, jax.random.key(1), 64, False)
+    assert log_odds.shape == (NUM_PRIORS, NUM_NEAR_FEATURES, size, size)
+    assert log_odds.dtype == np.float32
+    # The third category of a room is a false alarm.
+    for scene, present in enumerate(np.asarray(module._find_present_categories(env, params))):
+        first, second = np.flatnonzero(present)
+        np.testing.assert_allclose(log_odds[params.room[scene], :, first, second], 0.0, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_near_log_odds_separate_layouts_in_new_homes():
+    """Fitted to 24 houses, the gap of walks in 12 others is larger where their categories have exchanged places."""
+    task = WORLDS["houses"].task
+    worlds = []
+    for split, num_scenes in (("train", 24), ("val", 12)):
+        scenes = make_generated_scenes("houses", split, num_scenes)
+        worlds.append(build_environment(compile_bank((scenes[i] for i in range(num_scenes)), task), {}, 500))
+    (env, params), (_, new_params) = worlds
+    counts = jax.jit(explore, static_argnums=(0, 3, 4))(env, params, jax.random.key(0), 512, 100).counts
+    fit = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
+    log_odds = fit(env, params, counts, jax.random.key(1), 1024, True)[0]
+    assert not np.tril(log_odds).any()
+
+    # Sightings of new walks, and of the same walks with categories exchanged.
+    num_walks = 256
+    poses, scene = jax.jit(module._walk, static_argnums=(0, 3, 4))(env, new_params, jax.random.key(2), num_walks, 80)
+    count_sightings = jax.jit(jax.vmap(functools.partial(module._count_sightings, env, new_params)))
+    sightings = count_sightings(poses, jnp.full(num_walks, 80))
+    present = module._find_present_categories(env, new_params)[scene]
+    frequency = jnp.broadcast_to(jnp.diagonal(counts.sum(axis=0)), present.shape)
+    exchanges = jax.vmap(draw_category_exchange)(jax.random.split(jax.random.key(3), num_walks), present, frequency)
+    shifted = jax.vmap(lambda matrix, exchange: matrix[:, exchange][:, :, exchange])(sightings, exchanges)
+    gap = np.asarray(jax.vmap(surprise_gap, (0, None))(sightings, log_odds))
+    shifted_gap = np.asarray(jax.vmap(surprise_gap, (0, None))(shifted, log_odds))
+
+    # Area under the curve, and calibration: the mean gap is the share of shifted walks, one half.
+    area = (shifted_gap[:, None] > gap).mean() + 0.5 * (shifted_gap[:, None] == gap).mean()
+    assert area > 0.6
+    assert np.concatenate([gap, shifted_gap]).mean() == pytest.approx(0.5, abs=0.1)
 
 
 def test_all_that_stands_in_a_scene_exchanges_goal_or_not():
