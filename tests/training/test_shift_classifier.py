@@ -100,7 +100,7 @@ def test_signs_of_a_world(pooled):
 
 
 def test_near_log_odds_of_a_world():
-    """Rooms of two categories: their exchange leaves the pair as near as before, so there is nothing to learn of the pair."""
+    """Rooms of two categories: their exchange leaves the pair as near as before, so it tells nothing."""
     env, params = tiny.world()
     size = env.row_format.num_categories
     counts = jnp.zeros((NUM_PRIORS, size, size)).at[np.unique(params.room)].set(1 + jnp.eye(size)[None])
