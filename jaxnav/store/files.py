@@ -272,7 +272,7 @@ def _parse_row(line: bytes) -> dict[str, Any] | None:
 # The manifest of a checkpoint
 
 #: Increased whenever the stored state changes in a way that older code cannot read.
-CHECKPOINT_FORMAT_VERSION = 2
+CHECKPOINT_FORMAT_VERSION = 3
 
 #: Packages that shape the stored state.
 _PACKAGES = ("jaxnav", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
