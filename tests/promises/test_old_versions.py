@@ -135,7 +135,7 @@ def test_train_refuses_a_checkpoint_of_0_2_by_its_version(run_of_0_2, tmp_path, 
     before = contents(run_of_0_2)
     settings_of_0_2 = ("--direct", "all", "--layout.weights", "raw")
     assert train(write_config(tmp_path, num_seeds=1), run_of_0_2, *settings_of_0_2) == 2
-    assert "has format version 1, this code reads version 2; use the jaxnav that wrote it (0.2.0)" in refusal(capsys)
+    assert "has format version 1, this code reads version 3; use the jaxnav that wrote it (0.2.0)" in refusal(capsys)
     after = contents(run_of_0_2)
     assert {name: after[name] for name in before} == before
 
