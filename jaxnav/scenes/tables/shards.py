@@ -39,7 +39,7 @@ ARRAY_FIELDS = tuple(field for field in Bank._fields if field not in ("task", *T
 
 #: The code that determines shards, below `_SOURCE`. Importers are excluded, because scene files have checksums.
 _CODE = (
-    *("categories.py", "lattice.py", "layout_shift.py", "scene.py", "task.py", "worlds.py"),
+    *("categories.py", "context_exchange.py", "lattice.py", "layout_shift.py", "scene.py", "task.py", "worlds.py"),
     *("generate/*.py", "generate/*.yaml", "tables/*.py"),
     "files/scene_file.py",
 )
