@@ -77,16 +77,19 @@ class RemovalRule(NamedTuple):
         return f"{self.gap}{suffix}, {self.options.form}, eps {self.options.epsilon:g}"
 
 
-#: Soft removal by every gap, then switches that hand over for the rest of the episode.
+#: Soft removal by every gap, then switches, which with `held` hand over for the rest of the episode. Rules of the gap
+#: `surprise` are left out for runs without its evidence.
 REMOVAL_RULES = (
     RemovalRule("novelty", False, StdeOptions(0.5, "residual")),
     RemovalRule("novelty", False, StdeOptions(0.0, "paper")),
     RemovalRule("evidence", False, StdeOptions(0.0, "paper")),
     RemovalRule("learned", False, StdeOptions(0.0, "paper")),
+    RemovalRule("surprise", False, StdeOptions(0.0, "paper")),
     RemovalRule("overdue", False, StdeOptions(0.0, "paper")),
     RemovalRule("evidence", True, StdeOptions(0.5, "switch")),
     RemovalRule("overdue", True, StdeOptions(0.5, "switch")),
     RemovalRule("learned", True, StdeOptions(0.75, "switch")),
+    RemovalRule("surprise", False, StdeOptions(0.5, "switch")),
 )
 #: Controls of each form. A mean gap is not a switch, so `course` does not apply there.
 CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
@@ -211,7 +214,11 @@ def _measure_removals(
 
     # Every rule is compared with its own controls and with the best clock.
     best_clock = max(outcome_by_clock, key=lambda name: report.mixture_gain(outcome_by_clock[name], budgets[-1]))
+    evidence = policies.knowledge.cooccurrence
+    has_near_evidence = evidence is not None and evidence.near_log_odds is not None
     for rule in rules:
+        if rule.gap == "surprise" and not has_near_evidence:
+            continue
         bench.console.print(str(rule))
         rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)
         trial = Trial("stde", decoding, *rule.options)
