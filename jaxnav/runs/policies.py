@@ -115,7 +115,8 @@ class Policies(NamedTuple):
             raise InputError(f"--setting {name}: the run has no evidence from co-occurrence; train the run again")
         if name == "surprise" and evidence is not None and evidence.near_log_odds is None:
             raise InputError(
-                "--setting surprise: the run was trained before 0.4, which learns this gap; train the run again"
+                "--setting surprise: the run or policy was trained by an earlier version and holds no evidence of this "
+                "gap; train the run again"
             )
 
         # `paper` and `released` also build the priors in their own way.

@@ -1,0 +1,113 @@
+"""The gap `surprise` of played episodes, against a count in world coordinates, and its export."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+from jaxnav.env.objectnav import NUM_PRIORS
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.evaluation.variants import table_row
+from jaxnav.gaps import NEAR_DISTANCES, NEAR_VIEW_COUNTS, NUM_NEAR_FEATURES
+from jaxnav.runs.evaluate import replay_episodes
+from jaxnav.runs.policies import export_policy, load_policy_as_run
+from jaxnav.runs.worlds import compile_evaluation_world
+from jaxnav.scenes.lattice import standable_cells
+from jaxnav.scenes.tables.observation_row import detected_positions
+from jaxnav.scenes.tables.visibility import cell_centres
+from jaxnav.training.calibration import Exploration
+
+
+@pytest.fixture(scope="module")
+def policies(drawn_run):
+    """Policies whose evidence of sightings is drawn at random, above the diagonal."""
+    policies = drawn_run.policies()
+    num_categories = policies.spec.num_categories
+    shape = (NUM_PRIORS, NUM_NEAR_FEATURES, num_categories, num_categories)
+    near_log_odds = np.triu(np.random.default_rng(0).normal(0.0, 0.3, shape), 1).astype(np.float32)
+    evidence = policies.knowledge.cooccurrence._replace(near_log_odds=near_log_odds)
+    return policies._replace(knowledge=policies.knowledge._replace(cooccurrence=evidence))
+
+
+def count_in_the_world(poses, bank, centres, task, near_log_odds):
+    """Return the gap after each pose, with the places of all detections in world coordinates.
+
+    Pairs are counted view by view: both known, one of the two in view, and at most so far apart.
+    """
+    rules = task.rules
+    num_categories = len(task.categories)
+    last_place = {}
+    counts = np.zeros((len(NEAR_DISTANCES), num_categories, num_categories), int)
+    gaps = []
+    for pose in poses:
+        cell, heading, _ = rules.split_pose(pose)
+        visible = np.flatnonzero(task.row_format.presence(bank.rows[pose]))
+        detections = task.row_format.detections(bank.rows[pose])[visible]
+        places = detected_positions(detections, centres[cell], rules.heading_directions()[heading])
+        last_place.update(zip(visible.tolist(), places, strict=True))
+        for first in visible.tolist():
+            for second in last_place:
+                if second in visible and second < first:
+                    continue  # counted with the roles exchanged
+                distance = np.linalg.norm(last_place[first] - last_place[second])
+                for index, limit in enumerate(NEAR_DISTANCES):
+                    if distance <= limit:
+                        counts[index, min(first, second), max(first, second)] += 1
+
+        log_odds = 0.0
+        for index in range(len(NEAR_DISTANCES)):
+            for threshold_index, threshold in enumerate(NEAR_VIEW_COUNTS):
+                feature = index * len(NEAR_VIEW_COUNTS) + threshold_index
+                log_odds += near_log_odds[feature][np.triu(counts[index] >= threshold, 1)].sum()
+        gaps.append(1 / (1 + np.exp(-log_odds)))
+    return np.array(gaps)
+
+
+@pytest.mark.slow
+def test_surprise_of_played_episodes_is_that_of_the_world(drawn_run, policies):
+    world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    bank = world.banks[0]
+    scenes = {world.scenes[index].name: world.scenes[index] for index in range(len(world.scenes))}
+    all_centres = [cell_centres(scenes[name], standable_cells(scenes[name].reach)) for name in bank.names]
+    centres = np.concatenate(all_centres)
+
+    surprised = policies.with_estimator("surprise")
+    episodes = draw_episodes(bank, 8)
+    traces = replay_episodes(surprised, world, episodes, table_row("stde", 0.5, "residual", "sample"))
+    num_views = 0
+    for trace, scene in zip(traces, episodes.scene, strict=True):
+        room = world.make_env_params(0).room[scene]
+        near_log_odds = policies.knowledge.cooccurrence.near_log_odds[room]
+        expected = count_in_the_world(trace.pose.tolist(), bank, centres, world.env.task, near_log_odds)
+        # A pair at exactly 1, 2 or 4 m may be rounded to either side.
+        np.testing.assert_allclose(trace.gap, expected, atol=2e-4)
+        num_views += len(trace.pose)
+    assert num_views > 20
+    assert np.std(np.concatenate([trace.gap for trace in traces])) > 0.02
+
+
+def test_evidence_of_sightings_is_exported(drawn_run, policies, tmp_path):
+    config = drawn_run.config
+    explored = Exploration(policies.prior_counts, policies.prior_counts, np.int32(1), np.int32(1))
+    export_policy(
+        tmp_path / "policy",
+        config,
+        jax.tree.map(lambda leaf: leaf[0], policies.arm_params("layout")),
+        policies.knowledge,
+        policies.estimator_config,
+        explored,
+    )
+    _, loaded = load_policy_as_run(tmp_path / "policy")
+    np.testing.assert_array_equal(
+        loaded.knowledge.cooccurrence.near_log_odds, policies.knowledge.cooccurrence.near_log_odds
+    )
+    expected = dataclasses.replace(policies.estimator_config, gap="surprise")
+    assert loaded.with_estimator("surprise").estimator_config == expected
+
+
+def test_surprise_is_refused_without_evidence_of_sightings(drawn_run):
+    with pytest.raises(InputError, match=r"--setting surprise: .*earlier version.*train the run again"):
+        drawn_run.policies().with_estimator("surprise")
