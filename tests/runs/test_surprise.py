@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
@@ -91,7 +92,7 @@ def test_surprise_of_played_episodes_is_that_of_the_world(drawn_run, policies):
 
 def test_evidence_of_sightings_is_exported(drawn_run, policies, tmp_path):
     config = drawn_run.config
-    explored = Exploration(policies.prior_counts, policies.prior_counts, np.int32(1), np.int32(1))
+    explored = Exploration(policies.prior_counts, policies.prior_counts, jnp.int32(1), jnp.int32(1))
     export_policy(
         tmp_path / "policy",
         config,
@@ -101,6 +102,7 @@ def test_evidence_of_sightings_is_exported(drawn_run, policies, tmp_path):
         explored,
     )
     _, loaded = load_policy_as_run(tmp_path / "policy")
+    assert loaded.knowledge.cooccurrence is not None
     np.testing.assert_array_equal(
         loaded.knowledge.cooccurrence.near_log_odds, policies.knowledge.cooccurrence.near_log_odds
     )
