@@ -106,7 +106,7 @@ def _compared_estimators(policies: Policies) -> dict[str, EstimatorConfig]:
     }
     if policies.knowledge.cooccurrence is not None:
         estimators["learned"] = by_gap["learned"]
-        if policies.knowledge.cooccurrence.near_log_odds is not None:
+        if policies.has_sighting_evidence:
             estimators["surprise"] = by_gap["surprise"]
         estimators["overdue"] = by_gap["overdue"]
     return estimators

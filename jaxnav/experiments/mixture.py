@@ -88,8 +88,8 @@ REMOVAL_RULES = (
     RemovalRule("overdue", False, StdeOptions(0.0, "paper")),
     RemovalRule("evidence", True, StdeOptions(0.5, "switch")),
     RemovalRule("overdue", True, StdeOptions(0.5, "switch")),
-    RemovalRule("learned", True, StdeOptions(0.75, "switch")),
     RemovalRule("surprise", False, StdeOptions(0.5, "switch")),
+    RemovalRule("learned", True, StdeOptions(0.75, "switch")),
 )
 #: Controls of each form. A mean gap is not a switch, so `course` does not apply there.
 CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
@@ -214,10 +214,8 @@ def _measure_removals(
 
     # Every rule is compared with its own controls and with the best clock.
     best_clock = max(outcome_by_clock, key=lambda name: report.mixture_gain(outcome_by_clock[name], budgets[-1]))
-    evidence = policies.knowledge.cooccurrence
-    has_near_evidence = evidence is not None and evidence.near_log_odds is not None
     for rule in rules:
-        if rule.gap == "surprise" and not has_near_evidence:
+        if rule.gap == "surprise" and not policies.has_sighting_evidence:
             continue
         bench.console.print(str(rule))
         rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)

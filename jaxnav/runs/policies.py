@@ -86,6 +86,12 @@ class Policies(NamedTuple):
         priors = np.asarray(self.knowledge.layout)
         return bool((priors != priors[0]).any())
 
+    @property
+    def has_sighting_evidence(self) -> bool:
+        """True if the evidence holds what the gap `surprise` needs; runs of earlier versions lack it."""
+        evidence = self.knowledge.cooccurrence
+        return evidence is not None and evidence.near_log_odds is not None
+
     def arm_params(self, arm: str) -> dict[str, Any]:
         """Parameters of one arm, leaves [S, ...]."""
         start = self.num_seeds * self.arms.index(arm)
@@ -110,10 +116,9 @@ class Policies(NamedTuple):
         if self.estimator_config is None:
             option = "--hold" if name is None else f"--setting {name}"
             raise InputError(f"{option}: needs policies with the layout estimator; train a run with the arm `layout`")
-        evidence = self.knowledge.cooccurrence
-        if name in ("learned", "surprise", "overdue") and evidence is None:
+        if name in ("learned", "surprise", "overdue") and self.knowledge.cooccurrence is None:
             raise InputError(f"--setting {name}: the run has no evidence from co-occurrence; train the run again")
-        if name == "surprise" and evidence is not None and evidence.near_log_odds is None:
+        if name == "surprise" and not self.has_sighting_evidence:
             raise InputError(
                 "--setting surprise: the run or policy was trained by an earlier version and holds no evidence of this "
                 "gap; train the run again"

@@ -95,9 +95,10 @@ def most_misleading_cycles(
     for category in present:
         mean_neighbours[category] = places.neighbours[places.category == category].mean(axis=0)
 
+    goals = np.intersect1d(present, np.flatnonzero(is_goal))
+
     def score(place_of: np.ndarray) -> float:
         """Score of a permutation, int [K]: objects of category k stand where those of `place_of[k]` stood."""
-        goals = np.intersect1d(present, np.flatnonzero(is_goal))
         new_neighbours = mean_neighbours[place_of[goals]][:, :, place_of]
         return float((weights[goals] * new_neighbours).sum())
 

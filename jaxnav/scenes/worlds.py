@@ -374,21 +374,19 @@ class SceneSource:
         """
         # Names of worlds come before files of the same name.
         task = task or self.task
-        scenes: Scenes
-        if self.file in WORLDS:
-            scenes = make_generated_scenes(self.file, self.split or "val", count, self.seed)
-        else:
-            scenes = load_scenes(self.file, self.split)
+        scenes = self._open_split(self.split, count)
         if not (self.shift and self.shift_by == "context"):
             return shift_scenes(scenes, task, self.shift, self.seed)
 
         # The exchange that misleads most is that of the training scenes.
-        training_scenes: Scenes
+        context_exchange = fit_scene_exchange(self._open_split("train"), task)
+        return shift_scenes(scenes, task, self.shift, self.seed, context_exchange)
+
+    def _open_split(self, split: str | None, count: int | None = None) -> Scenes:
+        """Open the unshifted scenes of a split; None for all scenes of a file, or `val` of a generated world."""
         if self.file in WORLDS:
-            training_scenes = make_generated_scenes(self.file, "train", seed=self.seed)
-        else:
-            training_scenes = load_scenes(self.file, "train")
-        return shift_scenes(scenes, task, self.shift, self.seed, fit_scene_exchange(training_scenes, task))
+            return make_generated_scenes(self.file, split or "val", count, self.seed)
+        return load_scenes(self.file, split)
 
     def select_scene(self, name: str | None = None, index: int | None = None) -> Scene:
         """Return the scene of a name or an index, or else the first scene.

@@ -343,9 +343,7 @@ def fit_shift_classifier(
       pooled: learn the same log odds for all room types.
     """
     walk_key = jax.random.fold_in(key, 0)
-    exchange_key = jax.random.fold_in(key, 1)
     length_key = jax.random.fold_in(key, 2)
-    scene_key = jax.random.fold_in(key, 3)
 
     # Pairs that each walk has seen together when it is cut at a random length, bool [W, K, K].
     poses, scene = _walk(env, env_params, walk_key, num_walks, _WALK_LENGTHS[-1])
@@ -354,25 +352,7 @@ def fit_shift_classifier(
     is_before_cut = jnp.arange(presence.shape[1])[None] <= lengths[:, None]
     co_seen = jax.vmap(seen_together)(presence & is_before_cut[..., None])
 
-    # The same pairs in another layout: a new exchange of categories for each walk.
-    room = env_params.room[scene]
-    is_present = _find_present_categories(env, env_params)[scene]  # [W, K]
-    frequency = jnp.diagonal(counts, axis1=1, axis2=2)[room]
-    exchange_keys = jax.random.split(exchange_key, num_walks)
-    exchanges = jax.vmap(draw_category_exchange)(exchange_keys, is_present, frequency)
-    shifted_co_seen = jax.vmap(lambda matrix, exchange: matrix[exchange][:, exchange])(co_seen, exchanges)
-
-    # Examples of both layouts, bool [2 W, pairs], and the scenes that only calibrate.
-    rows, columns = jnp.triu_indices(counts.shape[-1], 1)
-    pairs = jnp.concatenate([co_seen, shifted_co_seen])[:, rows, columns]
-    is_held_out = jax.random.bernoulli(scene_key, _CALIBRATION_SHARE, env_params.room.shape)[scene]
-
-    # Log odds of each room type, or of all as if they were the first one.
-    fit_rooms = jnp.zeros_like(room) if pooled else room
-    pair_log_odds = _fit_log_odds(pairs, jnp.tile(fit_rooms, 2), jnp.tile(is_held_out, 2), len(counts))
-    if pooled:
-        pair_log_odds = jnp.broadcast_to(pair_log_odds[0], pair_log_odds.shape)
-    log_odds = jnp.zeros_like(counts).at[:, rows, columns].set(pair_log_odds)
+    log_odds = _fit_against_exchanges(co_seen[:, None], scene, env, env_params, counts, key, pooled)[:, 0]
     return CooccurrenceEvidence(log_odds=log_odds, co_visibility=co_visibility_from_counts(counts))
 
 
@@ -400,9 +380,7 @@ def fit_sighting_classifier(
       float32 [rooms, F, K, K], log odds of each feature; 0 on and below the diagonal.
     """
     walk_key = jax.random.fold_in(key, 0)
-    exchange_key = jax.random.fold_in(key, 1)
     length_key = jax.random.fold_in(key, 2)
-    scene_key = jax.random.fold_in(key, 3)
 
     # Sightings of each walk when it is cut at a random length, uint8 [W, R, K, K].
     poses, scene = _walk(env, env_params, walk_key, num_walks, _SIGHTING_LENGTHS[-1])
@@ -410,29 +388,53 @@ def fit_sighting_classifier(
     count_sightings = partial(_count_sightings, env, env_params)
     sightings = jax.lax.map(lambda walk: count_sightings(*walk), (poses, lengths), batch_size=_SIGHTING_BATCH)
 
-    # The same sightings in another layout: a new exchange of categories for each walk.
+    return _fit_against_exchanges(near_features(sightings), scene, env, env_params, counts, key, pooled)
+
+
+def _fit_against_exchanges(
+    features: jax.Array,
+    scene: jax.Array,
+    env: ObjectNav,
+    env_params: EnvParams,
+    counts: jax.Array,
+    key: jax.Array,
+    pooled: bool,
+) -> jax.Array:
+    """Learn which features of pairs tell walks from the same walks with categories exchanged.
+
+    Args:
+      features: bool [W, F, K, K], features of the pairs of each walk.
+      scene: int32 [W].
+      env, env_params, counts, key, pooled: as in `fit_shift_classifier`.
+
+    Returns:
+      float32 [rooms, F, K, K], calibrated log odds; 0 on and below the diagonal.
+    """
+    exchange_key = jax.random.fold_in(key, 1)
+    scene_key = jax.random.fold_in(key, 3)
+
+    # The same features in another layout: a new exchange of categories for each walk.
     room = env_params.room[scene]
     is_present = _find_present_categories(env, env_params)[scene]  # [W, K]
     frequency = jnp.diagonal(counts, axis1=1, axis2=2)[room]
-    exchange_keys = jax.random.split(exchange_key, num_walks)
+    exchange_keys = jax.random.split(exchange_key, len(features))
     exchanges = jax.vmap(draw_category_exchange)(exchange_keys, is_present, frequency)
-    shifted_sightings = jax.vmap(lambda matrix, exchange: matrix[:, exchange][:, :, exchange])(sightings, exchanges)
+    shifted_features = jax.vmap(lambda matrix, exchange: matrix[:, exchange][:, :, exchange])(features, exchanges)
 
     # Examples of both layouts, bool [2 W, F pairs], and the scenes that only calibrate.
     num_categories = counts.shape[-1]
     rows, columns = jnp.triu_indices(num_categories, 1)
-    features = near_features(jnp.concatenate([sightings, shifted_sightings]))[..., rows, columns]  # [2 W, F, pairs]
-    num_features = features.shape[1]
+    pair_features = jnp.concatenate([features, shifted_features])[..., rows, columns]  # [2 W, F, pairs]
+    examples = pair_features.reshape(len(pair_features), -1)
     is_held_out = jax.random.bernoulli(scene_key, _CALIBRATION_SHARE, env_params.room.shape)[scene]
 
     # Log odds of each room type, or of all as if they were the first one.
     fit_rooms = jnp.zeros_like(room) if pooled else room
-    examples = features.reshape(2 * num_walks, -1)
-    log_odds = _fit_log_odds(examples, jnp.tile(fit_rooms, 2), jnp.tile(is_held_out, 2), len(counts))
+    example_log_odds = _fit_log_odds(examples, jnp.tile(fit_rooms, 2), jnp.tile(is_held_out, 2), len(counts))
     if pooled:
-        log_odds = jnp.broadcast_to(log_odds[0], log_odds.shape)
-    near_log_odds = jnp.zeros((len(counts), num_features, num_categories, num_categories))
-    return near_log_odds.at[:, :, rows, columns].set(log_odds.reshape(len(counts), num_features, -1))
+        example_log_odds = jnp.broadcast_to(example_log_odds[0], example_log_odds.shape)
+    log_odds = jnp.zeros((len(counts), features.shape[1], num_categories, num_categories))
+    return log_odds.at[:, :, rows, columns].set(example_log_odds.reshape(len(counts), features.shape[1], -1))
 
 
 def _count_sightings(env: ObjectNav, env_params: EnvParams, poses: jax.Array, length: jax.Array) -> jax.Array:
