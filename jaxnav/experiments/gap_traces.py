@@ -2,7 +2,8 @@
 
 `measure_gaps` evaluates a run of an experiment at every layout shift. `trace_gaps` walks episodes with the policies of
 a run while several estimators observe. `mean_by_step` and `auc_by_step` summarize the traces: the mean gap, and how
-well the gap separates shifted from unshifted episodes.
+well the gap separates shifted from unshifted episodes. `calibration_at_steps` compares the gap with the share of
+shifted episodes.
 """
 
 import functools
@@ -17,7 +18,7 @@ import numpy as np
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.episodes import EpisodeList, joint_clusters
 from jaxnav.evaluation.grid import start_states
-from jaxnav.evaluation.statistics import divide_or_nan, jackknife_interval, run_clusters, weight_below
+from jaxnav.evaluation.statistics import Interval, divide_or_nan, jackknife_interval, run_clusters, weight_below
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import Curve, ResultRow
@@ -36,6 +37,10 @@ Belief = Literal["updated", "frozen"]
 UPDATED = 0
 FROZEN = 1
 BELIEFS: dict[Belief, int] = {"updated": UPDATED, "frozen": FROZEN}
+#: Steps at which the gap is compared with the share of shifted episodes.
+CALIBRATION_STEPS = (10, 20, 40, 80)
+#: Number of bins of equal width from 0 to 1, in which gaps are compared with the share of shifted episodes.
+NUM_CALIBRATION_BINS = 10
 
 
 class GapTraces(NamedTuple):
@@ -56,7 +61,7 @@ class GapTraces(NamedTuple):
 
 
 def measure_gaps(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
-    """Measure the mean gap by step at every shift, and the AUC of each shift against the first.
+    """Measure the mean gap by step at every shift, and the AUC and the calibration of each shift against the first.
 
     The rows' variant is the name of the layout estimator, their control the belief: `updated` or `frozen`.
 
@@ -89,6 +94,14 @@ def measure_gaps(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             for index, name in enumerate(estimators):
                 curve = Curve(steps, *auc_bounds[:, index, UPDATED])
                 yield ResultRow(**fields, variant=name, control="updated", metric="gap auc", value=curve)
+
+            # Share of shifted episodes among those with an equal gap.
+            calibration_steps = [step for step in CALIBRATION_STEPS if step < len(steps)]
+            for step, calibrations in calibration_at_steps(traces, shift_traces[0], calibration_steps).items():
+                for name, calibration in zip(estimators, calibrations, strict=True):
+                    gap_fields = {**fields, "variant": name, "control": "updated"}
+                    yield ResultRow(**gap_fields, metric=f"shifted share@{step}", value=calibration.shifted_share)
+                    yield ResultRow(**gap_fields, metric=f"calibration error@{step}", value=calibration.error)
 
 
 def _compared_estimators(policies: Policies) -> dict[str, EstimatorConfig]:
@@ -366,6 +379,57 @@ def auc_by_step(shifted: GapTraces, unshifted: GapTraces) -> np.ndarray:
     return _statistic_by_step(weighted_auc, [shifted, unshifted])
 
 
+class Calibration(NamedTuple):
+    """How well a gap states the probability that its episode is shifted.
+
+    Attributes:
+      shifted_share: percentage of shifted episodes in each bin of the gap, over the mean gap in the bin; bins without
+        episodes are left out.
+      error: mean absolute difference between the mean gap and the share of shifted episodes over the bins, weighted by
+        their episodes; from 0 to 1.
+    """
+
+    shifted_share: Curve
+    error: Interval
+
+
+def calibration_at_steps(
+    shifted: GapTraces, unshifted: GapTraces, steps: Sequence[int]
+) -> dict[int, list[Calibration]]:
+    """Compare the gap with the share of shifted episodes among those that still run.
+
+    Args:
+      shifted: traces at the greater shift.
+      unshifted: traces of the same policies, estimators and episodes per shift at the smaller shift.
+      steps: steps of the traces.
+
+    Returns:
+      The calibration of every estimator with the updated belief, by step.
+    """
+    # The statistics of all steps but the wanted ones would be a waste.
+    sides = []
+    for traces in (shifted, unshifted):
+        sides.append(traces._replace(gap=traces.gap[..., list(steps)], running=traces.running[..., list(steps)]))
+
+    # Statistics by bin: mean and bounds, [bins, 3, estimators, 2, steps].
+    mean_gap, shifted_share = [], []
+    for bin_index in range(NUM_CALIBRATION_BINS):
+        mean_gap.append(_statistic_by_step(functools.partial(_bin_gap, bin_index=bin_index), sides))
+        shifted_share.append(_statistic_by_step(functools.partial(_bin_share, bin_index=bin_index), sides))
+    error = _statistic_by_step(_calibration_error, sides)
+
+    calibrations: dict[int, list[Calibration]] = {step: [] for step in steps}
+    num_estimators = shifted.gap.shape[0]
+    for (step_index, step), estimator in itertools.product(enumerate(steps), range(num_estimators)):
+        gaps = np.array(mean_gap)[:, 0, estimator, UPDATED, step_index]
+        shares = 100.0 * np.array(shifted_share)[:, :, estimator, UPDATED, step_index]
+        has_episodes = np.isfinite(gaps)
+        curve = Curve(gaps[has_episodes], *shares[has_episodes].T)
+        interval = Interval(*error[:, estimator, UPDATED, step_index].tolist())
+        calibrations[step].append(Calibration(curve, interval))
+    return calibrations
+
+
 def _statistic_by_step(statistic: Callable[..., np.ndarray], sides: list[GapTraces]) -> np.ndarray:
     """Compute a statistic of the gaps of all sides, with intervals over shared scenes and policies.
 
@@ -424,6 +488,59 @@ def weighted_auc(
     positive_total = positive_weights.sum(axis=0, dtype=np.float64)
     negative_total = negative_weights.sum(axis=0, dtype=np.float64)
     return divide_or_nan(wins, positive_total * negative_total)
+
+
+def _bin_totals(gaps: Sequence[np.ndarray], weights: Sequence[np.ndarray], bin_index: int) -> tuple[np.ndarray, ...]:
+    """Sum the weights of each side, and the weighted gaps of both sides, over the gaps in a bin; all float64 [R]."""
+    weight_by_side = []
+    gap_total = np.zeros(weights[0].shape[1])
+    for side_gaps, side_weights in zip(gaps, weights, strict=True):
+        bins = np.minimum((NUM_CALIBRATION_BINS * side_gaps).astype(int), NUM_CALIBRATION_BINS - 1)
+        in_bin = bins == bin_index
+        weight_by_side.append(side_weights[in_bin].sum(axis=0, dtype=np.float64))
+        gap_total += side_gaps[in_bin].astype(np.float64) @ side_weights[in_bin]
+    return (*weight_by_side, gap_total)
+
+
+def _bin_gap(
+    shifted: np.ndarray,
+    unshifted: np.ndarray,
+    shifted_weights: np.ndarray,
+    unshifted_weights: np.ndarray,
+    bin_index: int,
+) -> np.ndarray:
+    """Mean gap in a bin, float64 [R]; NaN without episodes."""
+    totals = _bin_totals((shifted, unshifted), (shifted_weights, unshifted_weights), bin_index)
+    shifted_total, unshifted_total, gap_total = totals
+    return divide_or_nan(gap_total, shifted_total + unshifted_total)
+
+
+def _bin_share(
+    shifted: np.ndarray,
+    unshifted: np.ndarray,
+    shifted_weights: np.ndarray,
+    unshifted_weights: np.ndarray,
+    bin_index: int,
+) -> np.ndarray:
+    """Share of shifted episodes in a bin, float64 [R]; NaN without episodes."""
+    totals = _bin_totals((shifted, unshifted), (shifted_weights, unshifted_weights), bin_index)
+    shifted_total, unshifted_total, _ = totals
+    return divide_or_nan(shifted_total, shifted_total + unshifted_total)
+
+
+def _calibration_error(
+    shifted: np.ndarray, unshifted: np.ndarray, shifted_weights: np.ndarray, unshifted_weights: np.ndarray
+) -> np.ndarray:
+    """Mean absolute difference between mean gap and share of shifted episodes over the bins, float64 [R]."""
+    differences = np.zeros(shifted_weights.shape[1])
+    total = np.zeros_like(differences)
+    for bin_index in range(NUM_CALIBRATION_BINS):
+        # The number of episodes of a bin times the difference of both means.
+        totals = _bin_totals((shifted, unshifted), (shifted_weights, unshifted_weights), bin_index)
+        shifted_total, unshifted_total, gap_total = totals
+        differences += np.abs(gap_total - shifted_total)
+        total += shifted_total + unshifted_total
+    return divide_or_nan(differences, total)
 
 
 def _weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

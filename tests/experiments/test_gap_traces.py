@@ -20,6 +20,7 @@ from jaxnav.experiments.gap_traces import (
     UPDATED,
     GapTraces,
     auc_by_step,
+    calibration_at_steps,
     mean_by_step,
     trace_gaps,
     truncate_to_shortest,
@@ -108,6 +109,42 @@ def test_intervals_by_step_are_those_of_a_plain_loop():
 
         assert aucs[:, 0, UPDATED, step] == pytest.approx(left_out(auc_without, num_scenes, num_runs))
         assert means[:, 0, FROZEN, step] == pytest.approx(left_out(mean_without, num_scenes, num_runs), rel=1e-5)
+
+
+def test_calibration_compares_the_mean_gap_of_each_bin_with_the_share_of_shifted_episodes():
+    # Of the gaps in [0.9, 1], 2 of 3 are of shifted episodes, and their mean is 0.95; in [0.1, 0.2), 1 of 3, with
+    # a mean of 0.13. So the error is (3 x |0.95 - 2 / 3| + 3 x |0.13 - 1 / 3|) / 6. Ended episodes do not count.
+    shifted = make_traces([[[0.9], [1.0], [0.11], [0.5]]], [0, 1, 2, 3], running=[[[True], [True], [True], [False]]])
+    unshifted = make_traces(
+        [[[0.95], [0.13], [0.15], [0.5]]], [0, 1, 2, 3], running=[[[True], [True], [True], [False]]]
+    )
+    ((calibration,),) = calibration_at_steps(shifted, unshifted, [0]).values()
+    assert calibration.shifted_share.positions == pytest.approx([0.13, 0.95])
+    assert calibration.shifted_share.mean == pytest.approx([100 / 3, 200 / 3])
+    assert calibration.error.mean == pytest.approx((0.95 - 2 / 3) / 2 + (1 / 3 - 0.13) / 2)
+
+
+def test_a_gap_drawn_from_its_own_probability_is_calibrated():
+    # An episode with gap D is shifted with probability D. The share in a bin of 4,000 episodes has a standard
+    # deviation of at most 0.8 points. The square of the gap has the same order and another level.
+    rng = np.random.default_rng(0)
+    gap = rng.random(40_000)
+    is_shifted = rng.random(40_000) < gap
+
+    def calibrate(values):
+        def side_traces(side: np.ndarray) -> GapTraces:
+            return make_traces(np.tile(side[:, None], (2, 1, 1)), np.arange(len(side)) % 20)
+
+        shifted, unshifted = side_traces(values[is_shifted]), side_traces(values[~is_shifted])
+        ((calibration,),) = calibration_at_steps(shifted, unshifted, [0]).values()
+        return calibration
+
+    calibrated = calibrate(gap)
+    assert len(calibrated.shifted_share.mean) == 10
+    np.testing.assert_allclose(calibrated.shifted_share.mean, 100 * calibrated.shifted_share.positions, atol=4)
+    assert calibrated.error.mean < 0.02
+    # The mean of |D^2 - D| over uniform D is 1 / 2 - 1 / 3.
+    assert calibrate(gap**2).error.mean == pytest.approx(1 / 6, abs=0.01)
 
 
 def test_scenes_of_a_floor_plan_are_left_out_of_both_shifts_at_once():
