@@ -1,10 +1,11 @@
 """Value of the layout to a planner: the same search with and without a prior.
 
 `python benchmarks/layout_value.py [WORLD or SCENE FILE ...] [--scenes 48] [--episodes 320] [--shift 0]
-[--shift-by size] [--goals CATEGORY ...]` searches in the scenes of generated worlds (all three without arguments) and
-of scene files. Every scene is searched with a prior fitted to other scenes, without a shift: the scenes are divided
-into folds by floor plan, within room types. An exchange by context is fitted to the other folds too. The detector makes
-no errors. Rows:
+[--shift-by size] [--random-exchanges 0] [--goals CATEGORY ...]` searches in the scenes of generated worlds (all three
+without arguments) and of scene files. Every scene is searched with a prior fitted to other scenes, without a shift: the
+scenes are divided into folds by floor plan, within room types. An exchange by context is fitted to the other folds too.
+With `--random-exchanges N`, the searches are repeated with N random exchanges of the same categories, in homes. The
+detector makes no errors. Rows:
 
   flat    all sites are equally likely
   places  knows where objects stand at all (on furniture, at walls), but tells no category from another
@@ -37,7 +38,7 @@ from jaxnav.choices import ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference, scene_clusters
-from jaxnav.scenes.context_exchange import fit_context_exchange
+from jaxnav.scenes.context_exchange import ContextExchange, draw_exchange, fit_context_exchange
 from jaxnav.scenes.lattice import pose_successors
 from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.scene import Scene, floor_plan_name
@@ -77,15 +78,27 @@ def main(
     num_episodes: int,
     shift: float,
     shift_by: ShiftKind,
+    num_random_exchanges: int,
     goals: Sequence[str],
 ) -> None:
     results = {}
     for source in sources:
         name = Path(source).name
         training_world = compile_search_world(source, num_scenes, num_episodes, goals)
+        priors = fit_priors(training_world)
         search_world = shift_search_world(training_world, shift, shift_by, num_episodes)
-        results[name] = compare_priors(training_world, search_world)
+        results[name] = compare_priors(priors, search_world)
         print(format_table(name, results[name]), file=sys.stderr, flush=True)
+
+        # Random exchanges show how adverse the fitted one is.
+        random_results = []
+        for seed in range(num_random_exchanges):
+            exchange = draw_exchange(training_world.scenes, training_world.bank.task, seed)
+            random_world = exchange_search_world(training_world, [exchange] * NUM_FOLDS, shift, num_episodes)
+            random_results.append(compare_priors(priors, random_world)["differences"])
+            print(format_differences(f"random exchange {seed}", random_results[-1]), file=sys.stderr, flush=True)
+        if random_results:
+            results[name]["random_exchanges"] = random_results
     print_report({"shift": shift, "shift_by": shift_by, "goals": list(goals), "worlds": results})
 
 
@@ -118,19 +131,26 @@ def shift_search_world(
     """Shift the layout of the scenes and draw episodes anew; without a shift, the world itself."""
     if shift == 0.0:
         return training_world
-    task = training_world.bank.task
-    scenes = training_world.scenes
-    shifted_scenes = []
-    for fold in range(NUM_FOLDS):
-        # The exchange of a fold is fitted to the scenes of all other folds.
-        exchange = None
-        if shift_by == "context":
+
+    # The exchange of a fold is fitted to the scenes of all other folds.
+    exchanges: list[ContextExchange | None] = [None] * NUM_FOLDS
+    if shift_by == "context":
+        for fold in range(NUM_FOLDS):
             other_indices = np.flatnonzero(training_world.fold != fold)
-            exchange = fit_context_exchange((scenes[index] for index in other_indices), task)
-        for index in np.flatnonzero(training_world.fold == fold):
-            shifted_scenes.append((index, exchange_places(scenes[index], task, shift, 0, exchange)))
-    scenes_in_order = [scene for _, scene in sorted(shifted_scenes, key=lambda entry: entry[0])]
-    return prepare_search(scenes_in_order, training_world.world, task, num_episodes)
+            other_scenes = (training_world.scenes[index] for index in other_indices)
+            exchanges[fold] = fit_context_exchange(other_scenes, training_world.bank.task)
+    return exchange_search_world(training_world, exchanges, shift, num_episodes)
+
+
+def exchange_search_world(
+    training_world: SearchWorld, exchanges: Sequence[ContextExchange | None], shift: float, num_episodes: int
+) -> SearchWorld:
+    """Shift every scene by the exchange of its fold, None for the exchange by size, and draw episodes anew."""
+    task = training_world.bank.task
+    shifted_scenes = []
+    for scene, fold in zip(training_world.scenes, training_world.fold.tolist(), strict=True):
+        shifted_scenes.append(exchange_places(scene, task, shift, 0, exchanges[fold]))
+    return prepare_search(shifted_scenes, training_world.world, task, num_episodes)
 
 
 def prepare_search(scenes: Sequence[Scene], world: World, task: Task, num_episodes: int) -> SearchWorld:
@@ -163,8 +183,20 @@ def assign_folds(scenes: Sequence[Scene]) -> np.ndarray:
 # Searches
 
 
-def compare_priors(training_world: SearchWorld, search_world: SearchWorld) -> dict[str, Any]:
-    """Search with each prior, fitted to the training world, and return means and differences with intervals."""
+class FittedPriors(NamedTuple):
+    """Priors fitted to the training world, by fold: those of a fold come from the scenes of all other folds.
+
+    Attributes:
+      rates: detection rates of each fold.
+      models: layout models by variant, one for each fold.
+    """
+
+    rates: list[np.ndarray]
+    models: dict[str, list[LayoutModel]]
+
+
+def fit_priors(training_world: SearchWorld) -> FittedPriors:
+    """Fit the priors of all variants."""
     # Detection rates of each fold come from the scenes of the other folds.
     counts = np.stack([detection_counts(planner_scene.sites) for planner_scene in training_world.planner_scenes])
     rates = []
@@ -172,7 +204,7 @@ def compare_priors(training_world: SearchWorld, search_world: SearchWorld) -> di
         rates.append(detection_rates(counts[training_world.fold != fold].sum(axis=0)))
 
     # Searches with a flat belief give the snapshots to which the models of the other folds are fitted.
-    uniform_models = [uniform_layout_model(len(search_world.bank.task.categories))] * NUM_FOLDS
+    uniform_models = [uniform_layout_model(len(training_world.bank.task.categories))] * NUM_FOLDS
     training_searches = run_searches(training_world, rates, uniform_models)
     training_fold = training_world.fold[training_world.episodes.scene]
     snapshots_by_fold = []
@@ -182,19 +214,26 @@ def compare_priors(training_world: SearchWorld, search_world: SearchWorld) -> di
             snapshots += training_searches[episode_index].snapshots
         snapshots_by_fold.append(snapshots)
 
+    models = {"flat": uniform_models}
+    for name, use_relations in (("places", False), ("layout", True)):
+        models[name] = []
+        for fold in range(NUM_FOLDS):
+            models[name].append(fit_layout_model(snapshots_by_fold[fold], rates[fold], use_relations=use_relations))
+    return FittedPriors(rates, models)
+
+
+def compare_priors(priors: FittedPriors, search_world: SearchWorld) -> dict[str, Any]:
+    """Search with each prior, and return means and differences with intervals."""
+    rates = priors.rates
+    searches = {name: run_searches(search_world, rates, models) for name, models in priors.models.items()}
+
+    # Information in the priors, at the snapshots of the flat searches.
     episodes = search_world.episodes
     episode_fold = search_world.fold[episodes.scene]
-    flat_searches = training_searches
-    if search_world is not training_world:
-        flat_searches = run_searches(search_world, rates, uniform_models)
-    searches = {"flat": flat_searches}
-    bits = {}
-    for name, use_relations in (("places", False), ("layout", True)):
-        models = []
-        for fold in range(NUM_FOLDS):
-            models.append(fit_layout_model(snapshots_by_fold[fold], rates[fold], use_relations=use_relations))
-        searches[name] = run_searches(search_world, rates, models)
-        bits[name] = []
+    flat_searches = searches["flat"]
+    bits: dict[str, list[float]] = {"places": [], "layout": []}
+    for name in bits:
+        models = priors.models[name]
         for fold, search in zip(episode_fold, flat_searches, strict=True):
             for snapshot in search.snapshots:
                 bits[name].append(information_gain(models[fold], rates[fold], snapshot))
@@ -305,6 +344,13 @@ def format_table(name: str, results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def format_differences(name: str, differences: dict[str, Any]) -> str:
+    """Return the difference of the layout to the places, in one line."""
+    row = differences["layout - places"]
+    cells = [f"{measure} {Interval.from_json(row[measure]):+.1f}" for measure in row]
+    return f"{name}: {', '.join(cells)}"
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("sources", nargs="*", default=list(WORLDS))
@@ -312,9 +358,18 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=320)
     parser.add_argument("--shift", type=float, default=0.0)
     parser.add_argument("--shift-by", choices=get_args(ShiftKind), default="size")
+    parser.add_argument("--random-exchanges", type=int, default=0)
     parser.add_argument("--goals", nargs="+", default=())
     options = parser.parse_args()
     try:
-        main(options.sources, options.scenes, options.episodes, options.shift, options.shift_by, options.goals)
+        main(
+            options.sources,
+            options.scenes,
+            options.episodes,
+            options.shift,
+            options.shift_by,
+            options.random_exchanges,
+            options.goals,
+        )
     except InputError as error:
         sys.exit(f"error: {error}")

@@ -102,13 +102,8 @@ def most_misleading_cycles(
         new_neighbours = mean_neighbours[place_of[goals]][:, :, place_of]
         return float((weights[goals] * new_neighbours).sum())
 
-    # Categories that may exchange.
-    is_small = places.mean_range <= SMALL_RANGE
-    groups = []
-    for group_class in range(4):
-        groups.append([k for k in present.tolist() if 2 * is_goal[k] + is_small[k] == group_class])
-
     # The best of several local minima; each pure cycle is then scored alone.
+    groups = exchange_groups(places.mean_range, is_goal)
     best_permutation = np.arange(num_categories)
     for _ in range(NUM_RESTARTS):
         permutation = search_permutation(score, groups, num_categories, rng)
@@ -119,6 +114,45 @@ def most_misleading_cycles(
     return tuple(cycles)
 
 
+def draw_exchange(scenes: Iterable[Scene], task: Task, seed: int) -> ContextExchange:
+    """Draw an exchange at random, from all that `fit_context_exchange` searches.
+
+    Args:
+      scenes: training scenes of one room type, without a shift.
+      task: the K categories, and which of them are goals.
+      seed: seed of the permutation.
+    """
+    read_scenes = list(scenes)
+    rng = np.random.default_rng(seed)
+    mean_range = find_places(read_scenes, task, rng).mean_range
+    permutation = draw_permutation(exchange_groups(mean_range, task.is_goal()), len(mean_range), rng)
+    cycles = tuple(cycle for cycle in permutation_cycles(permutation) if len(cycle) > 1)
+    return {read_scenes[0].room_type: cycles}
+
+
+def exchange_groups(mean_range: np.ndarray, is_goal: np.ndarray) -> list[list[int]]:
+    """Categories that may exchange with each other: goals or others, small or large.
+
+    Args:
+      mean_range: mean detection range of each category, metres, float64 [K]; NaN for absent ones.
+      is_goal: bool [K].
+    """
+    present = np.flatnonzero(np.isfinite(mean_range)).tolist()
+    is_small = mean_range <= SMALL_RANGE
+    groups = []
+    for group_class in range(4):
+        groups.append([k for k in present if 2 * is_goal[k] + is_small[k] == group_class])
+    return groups
+
+
+def draw_permutation(groups: Sequence[Sequence[int]], num_categories: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw a permutation within groups, int [K]."""
+    permutation = np.arange(num_categories)
+    for group in groups:
+        permutation[list(group)] = rng.permutation(group)
+    return permutation
+
+
 def search_permutation(
     score: Callable[[np.ndarray], float],
     groups: Sequence[Sequence[int]],
@@ -126,10 +160,7 @@ def search_permutation(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Descend from a random permutation within groups by the best exchange of two, until none lowers the score."""
-    permutation = np.arange(num_categories)
-    for group in groups:
-        permutation[list(group)] = rng.permutation(group)
-
+    permutation = draw_permutation(groups, num_categories, rng)
     pairs = [(first, second) for group in groups for i, first in enumerate(group) for second in group[i + 1 :]]
     best_score = score(permutation)
     while True:

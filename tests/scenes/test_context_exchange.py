@@ -13,6 +13,7 @@ from jaxnav.scenes.context_exchange import (
     NEIGHBOUR_DISTANCES,
     Places,
     apply_cycles,
+    draw_exchange,
     find_places,
     fit_context_exchange,
     fit_place_weights,
@@ -144,6 +145,19 @@ def test_search_finds_the_best_of_all_permutations():
 def test_cycles_are_those_of_the_permutation(seed):
     permutation = np.random.default_rng(seed).permutation(9)
     np.testing.assert_array_equal(apply_cycles(permutation_cycles(permutation), 9), permutation)
+
+
+def test_random_exchanges_reach_every_permutation_within_the_groups():
+    # Two small goals and three large categories: 2! x 3! = 12 permutations. After 250 draws, one is missing with a
+    # chance below 12 x (11 / 12)^250 < 1e-8.
+    goals = {TASK.categories.index(name) for name in ("Mug", "Book")}
+    drawn = set()
+    for seed in range(250):
+        (cycles,) = draw_exchange(ROOMS, TASK, seed).values()
+        drawn.add(cycles)
+        for cycle in cycles:
+            assert set(cycle) <= goals or goals.isdisjoint(cycle)
+    assert len(drawn) == 12
 
 
 def test_rooms_in_which_nothing_can_exchange_have_no_cycles():
