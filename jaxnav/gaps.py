@@ -15,8 +15,10 @@ import jax.numpy as jnp
 NEAR_DISTANCES = (1.0, 2.0, 4.0, float("inf"))
 #: Numbers of views that show a pair so near, of which each is a feature: a false alarm rarely comes twice.
 NEAR_VIEW_COUNTS = (1, 3, 8, 20)
+#: R, the number of relations of a pair whose views are counted: each of the distances, and together in one view.
+NUM_RELATIONS = len(NEAR_DISTANCES) + 1
 #: F, the number of features of a pair.
-NUM_NEAR_FEATURES = len(NEAR_DISTANCES) * len(NEAR_VIEW_COUNTS)
+NUM_NEAR_FEATURES = NUM_RELATIONS * len(NEAR_VIEW_COUNTS)
 #: Views of a pair are counted up to this number.
 _MAX_VIEW_COUNT = 200
 
@@ -73,7 +75,7 @@ class PairSightings(NamedTuple):
         compass.
       is_seen: bool [K], whether a category has been detected.
       counts: uint8 [R, K, K], number of views that showed one of two categories while both were known, within each of
-        `NEAR_DISTANCES` of each other; at most 200.
+        `NEAR_DISTANCES` of each other; last the number of views that showed both. At most 200.
     """
 
     offsets: jax.Array
@@ -83,7 +85,7 @@ class PairSightings(NamedTuple):
     @staticmethod
     def init(num_categories: int) -> "PairSightings":
         """Sightings before the first view."""
-        counts_shape = (len(NEAR_DISTANCES), num_categories, num_categories)
+        counts_shape = (NUM_RELATIONS, num_categories, num_categories)
         return PairSightings(
             offsets=jnp.zeros((num_categories, 2), jnp.float32),
             is_seen=jnp.zeros(num_categories, bool),
@@ -106,13 +108,14 @@ class PairSightings(NamedTuple):
         # A view counts for the pairs of which it shows at least one category.
         distance = jnp.linalg.norm(offsets[:, None] - offsets[None], axis=-1)  # [K, K]
         is_counted = (is_visible[:, None] | is_visible[None]) & is_seen[:, None] & is_seen[None]
-        within = distance[None] <= jnp.array(NEAR_DISTANCES)[:, None, None]  # [R, K, K]
-        is_near = is_counted[None] & within & (self.counts < _MAX_VIEW_COUNT)
-        return PairSightings(offsets, is_seen, self.counts + is_near.astype(jnp.uint8))
+        is_near = is_counted[None] & (distance[None] <= jnp.array(NEAR_DISTANCES)[:, None, None])
+        is_together = is_visible[:, None] & is_visible[None]
+        is_related = jnp.concatenate([is_near, is_together[None]]) & (self.counts < _MAX_VIEW_COUNT)  # [R, K, K]
+        return PairSightings(offsets, is_seen, self.counts + is_related.astype(jnp.uint8))
 
 
 def near_features(counts: jax.Array) -> jax.Array:
-    """Features of the counts of `PairSightings`: at least so many views within so many metres.
+    """Features of the counts of `PairSightings`: at least so many views with each relation.
 
     Args:
       counts: uint8 [..., R, K, K].
@@ -129,7 +132,7 @@ def surprise_gap(counts: jax.Array, near_log_odds: jax.Array) -> jax.Array:
     """Return the gap D as the probability that the layout is not that of training, from where things were seen.
 
     The features of all pairs add up to the log odds z (prior odds of 1), and D = sigmoid(z). In contrast to
-    `learned_gap`, two categories need not be in one view: odometry tells how far apart they were seen.
+    `learned_gap`, pairs that are never in one view count too: odometry tells how far apart they were seen.
 
     Args:
       counts: uint8 [R, K, K], of `PairSightings`.

@@ -14,6 +14,7 @@ from jaxnav.gaps import (
     NEAR_DISTANCES,
     NEAR_VIEW_COUNTS,
     NUM_NEAR_FEATURES,
+    NUM_RELATIONS,
     CooccurrenceEvidence,
     PairSightings,
     learned_gap,
@@ -67,21 +68,24 @@ def test_learned_gap_follows_worked_arithmetic():
 
 
 def test_sightings_follow_worked_arithmetic():
-    """Two categories, seen one after the other.
+    """Two categories, seen one after the other, and then together.
 
     The first view shows 0 at (3, 0) from the agent, which then moves by (1, 0): 0 is now at (2, 0). The second view
-    shows 1 at (2, 1.5), 1.5 m from it: within 2 and 4 m, not within 1 m. The third view shows 1 again, 0.5 m from 0.
+    shows 1 at (2, 1.5), 1.5 m from it: within 2 and 4 m, not within 1 m. The third view shows 1 again, 0.5 m from 0. The
+    fourth view shows both, 3 m from each other. The last count is that of views that show both.
     """
     far_away = [0.0, 0.0]
     sightings = PairSightings.init(2)
     assert (1.0, 2.0, 4.0, float("inf")) == NEAR_DISTANCES
     sightings = sightings.update(jnp.array([True, False]), jnp.array([[3.0, 0.0], far_away]), jnp.zeros(2))
-    assert sightings.counts[:, 0, 1].tolist() == [0, 0, 0, 0]  # 1 is not known yet
+    assert sightings.counts[:, 0, 1].tolist() == [0, 0, 0, 0, 0]  # 1 is not known yet
     sightings = sightings.update(jnp.array([False, True]), jnp.array([far_away, [2.0, 1.5]]), jnp.array([1.0, 0.0]))
     np.testing.assert_allclose(sightings.offsets, [[2.0, 0.0], [2.0, 1.5]])
-    assert sightings.counts[:, 0, 1].tolist() == [0, 1, 1, 1]
+    assert sightings.counts[:, 0, 1].tolist() == [0, 1, 1, 1, 0]
     sightings = sightings.update(jnp.array([False, True]), jnp.array([far_away, [2.5, 0.0]]), jnp.zeros(2))
-    assert sightings.counts[:, 0, 1].tolist() == [1, 2, 2, 2]
+    assert sightings.counts[:, 0, 1].tolist() == [1, 2, 2, 2, 0]
+    sightings = sightings.update(jnp.ones(2, bool), jnp.array([[2.0, 0.0], [2.0, 3.0]]), jnp.zeros(2))
+    assert sightings.counts[:, 0, 1].tolist() == [1, 2, 3, 3, 1]
     # A view without either category adds nothing, wherever the agent goes.
     unchanged = sightings.update(jnp.zeros(2, bool), jnp.zeros((2, 2)), jnp.array([5.0, 5.0]))
     np.testing.assert_array_equal(unchanged.counts, sightings.counts)
@@ -91,13 +95,13 @@ def test_sightings_follow_worked_arithmetic():
 def test_surprise_gap_follows_worked_arithmetic():
     """One view within 4 m reaches one feature of each of two distances: ln 3 + ln 2 - ln 1 = ln 6, p = 6 / 7."""
     assert NEAR_VIEW_COUNTS[:2] == (1, 3)
-    counts = jnp.zeros((4, 2, 2), jnp.uint8).at[2:, 0, 1].set(1)
+    counts = jnp.zeros((NUM_RELATIONS, 2, 2), jnp.uint8).at[2:4, 0, 1].set(1)
     num_thresholds = len(NEAR_VIEW_COUNTS)
     log_odds = jnp.zeros((NUM_NEAR_FEATURES, 2, 2))
     log_odds = log_odds.at[2 * num_thresholds, 0, 1].set(np.log(3)).at[3 * num_thresholds, 0, 1].set(np.log(2))
     log_odds = log_odds.at[2 * num_thresholds + 1, 0, 1].set(5.0)  # three views within 4 m: not reached
     np.testing.assert_allclose(surprise_gap(counts, log_odds), 6 / 7, rtol=1e-6)
-    assert float(surprise_gap(jnp.zeros((4, 2, 2), jnp.uint8), log_odds)) == 0.5
+    assert float(surprise_gap(jnp.zeros_like(counts), log_odds)) == 0.5
 
 
 def test_near_features_grow_with_the_number_of_views():

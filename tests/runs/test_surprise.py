@@ -12,7 +12,7 @@ from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.variants import table_row
-from jaxnav.gaps import NEAR_DISTANCES, NEAR_VIEW_COUNTS, NUM_NEAR_FEATURES
+from jaxnav.gaps import NEAR_DISTANCES, NEAR_VIEW_COUNTS, NUM_NEAR_FEATURES, NUM_RELATIONS
 from jaxnav.runs.evaluate import replay_episodes
 from jaxnav.runs.policies import export_policy, load_policy_as_run
 from jaxnav.runs.worlds import compile_evaluation_world
@@ -36,12 +36,12 @@ def policies(drawn_run):
 def count_in_the_world(poses, bank, centres, task, near_log_odds):
     """Return the gap after each pose, with the places of all detections in world coordinates.
 
-    Pairs are counted view by view: both known, one of the two in view, and at most so far apart.
+    Pairs are counted view by view: both known, one of the two in view, and at most so far apart; or both in view.
     """
     rules = task.rules
     num_categories = len(task.categories)
     last_place = {}
-    counts = np.zeros((len(NEAR_DISTANCES), num_categories, num_categories), int)
+    counts = np.zeros((NUM_RELATIONS, num_categories, num_categories), int)
     gaps = []
     for pose in poses:
         cell, heading, _ = rules.split_pose(pose)
@@ -53,13 +53,16 @@ def count_in_the_world(poses, bank, centres, task, near_log_odds):
             for second in last_place:
                 if second in visible and second < first:
                     continue  # counted with the roles exchanged
+                pair = min(first, second), max(first, second)
                 distance = np.linalg.norm(last_place[first] - last_place[second])
                 for index, limit in enumerate(NEAR_DISTANCES):
                     if distance <= limit:
-                        counts[index, min(first, second), max(first, second)] += 1
+                        counts[index, *pair] += 1
+                if second in visible:
+                    counts[-1, *pair] += 1
 
         log_odds = 0.0
-        for index in range(len(NEAR_DISTANCES)):
+        for index in range(NUM_RELATIONS):
             for threshold_index, threshold in enumerate(NEAR_VIEW_COUNTS):
                 feature = index * len(NEAR_VIEW_COUNTS) + threshold_index
                 log_odds += near_log_odds[feature][np.triu(counts[index] >= threshold, 1)].sum()
