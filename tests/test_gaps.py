@@ -71,8 +71,8 @@ def test_sightings_follow_worked_arithmetic():
     """Two categories, seen one after the other, and then together.
 
     The first view shows 0 at (3, 0) from the agent, which then moves by (1, 0): 0 is now at (2, 0). The second view
-    shows 1 at (2, 1.5), 1.5 m from it: within 2 and 4 m, not within 1 m. The third view shows 1 again, 0.5 m from 0. The
-    fourth view shows both, 3 m from each other. The last count is that of views that show both.
+    shows 1 at (2, 1.5), 1.5 m from it: within 2 and 4 m, not within 1 m. The third view shows 1 again, 0.5 m from 0.
+    The fourth view shows both, 3 m from each other. The last count is that of views that show both.
     """
     far_away = [0.0, 0.0]
     sightings = PairSightings.init(2)
