@@ -5,6 +5,7 @@ from support.commands import contents, refusal
 from support.tiny_run import draw_run, tiny_config
 
 from jaxnav import __main__ as commands
+from jaxnav.cli.study import parse_study
 from jaxnav.experiments.config import EXPERIMENTS
 from jaxnav.runs.run import Run
 
@@ -53,6 +54,16 @@ def test_study_help_lists_experiments_and_settings(capsys):
         study("--help")
     words = capsys.readouterr().out.replace(",", " ").split()
     assert {*EXPERIMENTS, "--run", "--reference", "--split", "--episodes"} <= set(words)
+
+
+def test_a_variant_is_an_experiment_of_its_own(capsys):
+    assert parse_study(["study", "--config", "quick", "--episodes", "7"]) == parse_study(
+        ["study_quick", "--episodes", "7"]
+    )
+    assert study("study", "--config", "quik") == 2
+    assert "--config quik: is unknown; choose from ithor, quick" in refusal(capsys)
+    assert study("table2", "--config", "quick") == 2
+    assert "table2 has no variants" in refusal(capsys)
 
 
 def test_study_lists_the_experiments_for_an_unknown_one(capsys):
