@@ -25,12 +25,14 @@ def main(arguments: list[str] | None = None, prog: str = "jaxnav study") -> int:
 
 
 def _run_study(config: ExperimentConfig, console: Console) -> None:
-    """Run the experiment, and print its pages if they are about a single run, which are short."""
+    """Run the experiment, and print the results of its pages; pages about a single run are short and printed whole."""
     from jaxnav.experiments.driver import run_experiment
+    from jaxnav.experiments.pages import result_sections
 
-    pages = run_experiment(config, console)
-    if config.run is not None:
-        print(escape_control_chars("\n".join(pages), keep="\n"))
+    for page in run_experiment(config, console):
+        text = page if config.run is not None else result_sections(page)
+        if text:
+            print(escape_control_chars(text, keep="\n"))
 
 
 def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> ExperimentConfig:

@@ -28,6 +28,8 @@ from jaxnav.viz import require_plotting_packages
 
 PAGES = Path(__file__).parent / "pages"
 READING_MARK = "<!-- reading -->"
+#: Before and after the tables of a page that `jaxnav study` prints.
+RESULT_MARK = "<!-- result -->"
 #: Names that a template is given; see docs/experiments.md.
 CONTEXT_NAMES = frozenset(("config", "table", "tables", "runs", "summary", "missing", "figure"))
 
@@ -102,6 +104,11 @@ def render_page(
         raise InputError(f"template {template}: give {{{{ summary }}}} once; text written by hand is kept there")
     write_atomic(document, (text.strip() + "\n").encode())
     return text
+
+
+def result_sections(text: str) -> str:
+    """Parts of a page between two result marks."""
+    return "\n\n".join(section.strip() for section in text.split(RESULT_MARK)[1::2])
 
 
 def _load_template(template: str) -> jinja2.Template:
