@@ -235,17 +235,7 @@ class ShareProbe:
             counts = jax.tree.map(lambda total, new: total + weight * new, counts, new_counts)
 
             # The factual decision acts. Ended episodes keep their agent.
-            next_agent, result, _ = infer_and_act(
-                config,
-                policy,
-                agent,
-                running,
-                episode_keys,
-                agent_loop=agent_loop,
-                env_params=env_params,
-                knowledge=knowledge,
-                can_remove=False,
-            )
+            next_agent, result, _ = infer_and_act(config, context, agent, running, episode_keys, can_remove=False)
             return tree_where(running, next_agent, agent), running & ~result.ended, time + 1, counts
 
         # Start all episodes, and stop when too few are left to be partners.

@@ -245,17 +245,11 @@ def _run_episodes(
     policy_key = jax.random.fold_in(key, config.policy_index)
     episode_keys = jax.vmap(lambda episode: jax.random.fold_in(policy_key, episode))(jnp.arange(num_episodes))
 
+    context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
+
     def step(batch: _Batch) -> _Batch:
         next_agent, result, trace = infer_and_act(
-            config,
-            policy,
-            batch.agent,
-            batch.running,
-            batch.episode_keys,
-            agent_loop=agent_loop,
-            env_params=env_params,
-            knowledge=knowledge,
-            **compiled_parts,
+            config, context, batch.agent, batch.running, batch.episode_keys, **compiled_parts
         )
         # The memory holds the executed action, which differs from the choice where the method has macro-actions.
         action = policy_memory(result.agent).action
@@ -311,14 +305,11 @@ def _write_rows(table: Tree, row_indices: jax.Array, values: Tree) -> Tree:
 
 def infer_and_act(
     config: InferenceConfig,
-    policy: Decider,
+    context: DecisionContext,
     agent: Agent,
     running: jax.Array,
     episode_keys: jax.Array,
     *,
-    agent_loop: AgentLoop,
-    env_params: EnvParams,
-    knowledge: Knowledge,
     can_remove: bool = True,
     has_controls: bool = True,
     replaced_parts: tuple[ReplacedPart, ...] = (),
@@ -327,13 +318,10 @@ def infer_and_act(
 
     Args:
       config: configuration of the grid entry.
-      policy: policy with the entry's parameters.
+      context: the entry's policy, agent loop, knowledge and environment.
       agent: agents in E episodes, with the states of their environments.
       running: bool [E], episodes that have not ended.
       episode_keys: PRNG keys [E]; the time is folded in for a sampled action.
-      agent_loop: runs policy and environment.
-      env_params: parameters of the environment.
-      knowledge: layout priors and statistics from before training.
       can_remove: whether experience may be removed.
       has_controls: whether `config` may name the controls `direct_noise` and `removed_source`.
       replaced_parts: parts that `config.replaced_part` may name.
@@ -343,7 +331,7 @@ def infer_and_act(
       [E, ...].
     """
     # Factual decision; entries without the layout replace its weights by ones.
-    context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
+    policy, agent_loop = context.policy, context.agent_loop
     factual = make_factual_decision(agent, context)
     pathways, memory = factual.pathways, factual.memory
 
@@ -381,7 +369,9 @@ def infer_and_act(
     # Choose the best action or sample one, then act.
     sampled_choice = jax.vmap(jax.random.categorical)(step_keys, logits)
     choice = jnp.where(config.greedy, jnp.argmax(logits, axis=-1), sampled_choice).astype(jnp.int32)
-    next_agent, result = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)
+    next_agent, result = agent_loop.step(
+        agent, choice, context.knowledge, context.env_params, policy=policy, decision=decision
+    )
     trace = InferenceTrace(
         layout_weights=factual.inputs.layout_weights,
         gap=gap,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxnav.env.objectnav import EnvParams, State
 from jaxnav.evaluation.grid import infer_and_act
 from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace
+from jaxnav.evaluation.replacements import DecisionContext
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
@@ -123,16 +124,8 @@ def _step(
     """
     # Act in all episodes, including those that have ended: shapes stay fixed.
     policy = agent_loop.bind_decider(policy_params)
-    next_agent, step_result, inferred = infer_and_act(
-        config,
-        policy,
-        agent,
-        running,
-        episode_keys,
-        agent_loop=agent_loop,
-        env_params=env_params,
-        knowledge=knowledge,
-    )
+    context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
+    next_agent, step_result, inferred = infer_and_act(config, context, agent, running, episode_keys)
 
     # Record the pose before the action, so that a trace pairs each action with the view it was chosen from.
     recorded_step = _Step(

@@ -15,7 +15,7 @@ from jaxnav.choices import Decoding, Form, Variant
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import infer_and_act, start_states
 from jaxnav.evaluation.removal import GapSource, RemovedLogits, control_logits, select_gap
-from jaxnav.evaluation.replacements import ReplacedPart, other_running_episode
+from jaxnav.evaluation.replacements import DecisionContext, ReplacedPart, other_running_episode
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.network import Policy
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState
@@ -111,15 +111,13 @@ def test_controls_take_a_part_of_the_counterfactual_decision_from_another_episod
 
     @jax.jit
     def infer(cell, agent):
+        context = DecisionContext(AGENT_LOOP.bind(WEIGHTS), cell.use_layout, AGENT_LOOP, KNOWLEDGE, PARAMS)
         return infer_and_act(
             cell,
-            AGENT_LOOP.bind(WEIGHTS),
+            context,
             agent,
             jnp.asarray(running),
             EPISODE_KEYS,
-            agent_loop=AGENT_LOOP,
-            env_params=PARAMS,
-            knowledge=KNOWLEDGE,
             replaced_parts=(ReplacedPart.EXPERIENCE, ReplacedPart.MEMORY),
         )[2]
 

@@ -3,6 +3,7 @@
 import jax
 
 from jaxnav.evaluation.grid import infer_and_act
+from jaxnav.evaluation.replacements import DecisionContext
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from support import tiny_world as tiny
@@ -22,13 +23,5 @@ def start_agent(weights, states, env_params):
 @jax.jit
 def take_step(cell, weights, agent, running, keys, env_params):
     """Take one step by a cell of the evaluation grid."""
-    return infer_and_act(
-        cell,
-        AGENT_LOOP.bind(weights),
-        agent,
-        running,
-        keys,
-        agent_loop=AGENT_LOOP,
-        env_params=env_params,
-        knowledge=KNOWLEDGE,
-    )
+    context = DecisionContext(AGENT_LOOP.bind(weights), cell.use_layout, AGENT_LOOP, KNOWLEDGE, env_params)
+    return infer_and_act(cell, context, agent, running, keys)
