@@ -25,13 +25,15 @@ class EpisodeConfig:
         is the list of the first shard.
       out: GIF to write, which shows every step, or PNG, which shows the end. The default is `episode.gif` (with
         `--map`, `map.png`) in the run directory or, for a policy, in the working directory.
-      variant: `stde` removes experience where the layout gap exceeds epsilon, `layout` never removes it, and `baseline`
-        has no layout weights.
-      epsilon: threshold of sTDE, at least 0.
+      variant: uses of the experience, with a row of panels for each. `stde` removes it where the layout gap exceeds
+        epsilon, `scde` does so towards the decision without experience (for runs with `--ppo.experience` below 1),
+        `layout` never removes it, and `baseline` has no layout weights.
+      epsilon: threshold of the removal, at least 0.
       setting: layout estimator to use instead of that of the run; `jaxnav list settings` describes them.
       scenes: scene file to use instead of the scenes of the run.
       shift: layout shifts of the scenes, each from 0 (as in training) to 1, with one panel for each. The default is the
-        shift of the run. With several shifts, all episodes of the list are played and the success rates are printed.
+        shift of the run. With several shifts or variants, all episodes of the list are played and the success rates are
+        printed.
       shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
         `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       map: draw the map that the agent made, the block that it searches and its way to it. This needs a method that
@@ -43,7 +45,7 @@ class EpisodeConfig:
     split: Literal["train", "val", "test"] = "val"
     index: int = 0
     out: Path | None = None
-    variant: Literal["stde", "layout", "baseline"] = "stde"
+    variant: tuple[Literal["stde", "scde", "layout", "baseline"], ...] = ("stde",)
     epsilon: float = 0.5
     setting: EstimatorName | None = None
     scenes: Path | None = None
@@ -73,14 +75,18 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
         raise InputError(f"--out {path}: give a name that ends in {' or '.join(suffixes)}")
     if config.step is not None and not config.map:
         raise InputError(f"--step {config.step}: applies to the map only; add --map")
+    if not config.variant or len(set(config.variant)) < len(config.variant):
+        raise InputError(f"--variant {' '.join(config.variant)}: give one or more different variants")
     if config.map and len(config.shift) > 1:
         raise InputError("--map: the map is drawn at one layout shift; give one --shift")
+    if config.map and len(config.variant) > 1:
+        raise InputError("--map: the map is drawn of one variant; give one --variant")
 
     episodes = play_episode(
         config.source,
         split=config.split,
         index=config.index,
-        variant=config.variant,
+        variants=config.variant,
         epsilon=config.epsilon,
         estimator=config.setting,
         scenes=config.scenes,

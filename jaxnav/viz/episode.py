@@ -1,11 +1,12 @@
 """Pictures of evaluation episodes, still or moving, at one or several layout shifts.
 
-`play_episode` plays an episode of a run or of an exported policy and returns one `PlayedEpisode` for each layout shift.
-`draw_episode` writes their picture, a GIF or a PNG with an `EpisodePanel` for each: the scene from above, the
-detections and the layout gap.
+`play_episode` plays an episode of a run or of an exported policy and returns one `PlayedEpisode` for each variant and
+layout shift. `draw_episode` writes their picture, a GIF or a PNG with an `EpisodePanel` for each: the scene from above,
+the detections and the layout gap.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -13,15 +14,15 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from PIL import Image
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName, ShiftKind
+from jaxnav.choices import EstimatorName, Form, ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
-from jaxnav.evaluation.variants import table_row
+from jaxnav.evaluation.variants import EvaluationRow, table_row
 from jaxnav.policies.methods import method_label
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import find_scene, replay_episodes
@@ -40,6 +41,12 @@ from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, T
 REMOVAL_COLOR = "#E69F00"
 ACTION_PHRASES = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")
 SHIFT_CAPTIONS = {0.0: "layout as trained", 1.0: "layout shifted"}
+VARIANT_CAPTIONS = {
+    "baseline": "no layout weights",
+    "layout": "experience kept",
+    "stde": "experience removed by the gap",
+    "scde": "experience removed by the gap",
+}
 
 # Size of a panel, inches.
 PANEL_WIDTH = 5.2
@@ -53,7 +60,7 @@ NUM_COLORS = 128
 
 _MAX_DETECTIONS = 8  # bars in a panel
 
-PlayedVariant = Literal["stde", "layout", "baseline"]
+PlayedVariant = Literal["stde", "scde", "layout", "baseline"]
 
 
 class PlayedEpisode(NamedTuple):
@@ -67,10 +74,11 @@ class PlayedEpisode(NamedTuple):
       task: categories and rules.
       goal: index of the category to search for.
       best_length: length L* of a shortest path.
-      epsilon: threshold of sTDE; infinite where experience is kept.
+      epsilon: threshold of the removal; infinite where experience is kept.
       title: name of the agent and the scene.
       policies: policies of the run, one of which acted.
       shift: layout shift of the scene, from 0 to 1.
+      variant: use of the experience.
     """
 
     trace: EpisodeTrace
@@ -84,6 +92,7 @@ class PlayedEpisode(NamedTuple):
     title: str
     policies: Policies
     shift: float = 0.0
+    variant: PlayedVariant = "stde"
 
 
 # Playing an episode
@@ -107,7 +116,7 @@ def play_episode(
     source: str | Path,
     split: str = "val",
     index: int = 0,
-    variant: PlayedVariant = "stde",
+    variants: Sequence[PlayedVariant] = ("stde",),
     epsilon: float = 0.5,
     estimator: EstimatorName | None = None,
     scenes: Path | None = None,
@@ -115,74 +124,87 @@ def play_episode(
     shift_by: ShiftKind = "size",
     console: Console | None = None,
 ) -> list[PlayedEpisode]:
-    """Play one episode of an evaluation at every layout shift.
+    """Play one episode of an evaluation with every variant at every layout shift.
 
-    Room, goal and start are equal at every shift. The first seed acts, with the best action at every step. With several
-    shifts all episodes of the list are played, and the console reports the number of successes at each shift.
+    Room, goal and start are equal everywhere. The first seed acts, with the best action at every step. With several
+    variants or shifts all episodes of the list are played, and the console reports the number of successes of each.
 
     Args:
       source: directory of a finished run, folder of an exported policy, or name of a policy of the package.
       split: scenes to play in.
       index: index of the episode in the default list of an evaluation (of the first shard, where scenes are streamed).
-      variant: `stde` removes experience where the gap exceeds epsilon, `layout` keeps it, `baseline` has no layout.
-      epsilon: threshold of sTDE, at least 0.
+      variants: uses of the experience. `stde` and `scde` remove it where the gap exceeds epsilon, by the counterfactual
+        logits and towards the decision without experience; `layout` keeps it, `baseline` has no layout weights.
+      epsilon: threshold of the removal, at least 0.
       estimator: layout estimator to use instead of the run's; see `Policies.with_estimator`.
       scenes: scene file to read instead of the run's world or file.
       shifts: layout shifts of the scenes, from 0 to 1; None for the run's.
       shift_by: categories that exchange their places, see `jaxnav.evaluate`.
       console: receives messages; None for silence.
 
+    Returns:
+      The episodes, variant by variant, with one for each shift.
+
     Raises:
-      InputError: no finished run and no policy, no such episode, a goal that cannot be reached at some shift, or an
-        impossible epsilon.
+      InputError: no finished run and no policy, no such episode, a goal that cannot be reached at some shift, an
+        impossible epsilon, or the variant `scde` of a policy that cannot act without experience.
     """
     console = console or Console(quiet=True)
 
     # The arm without layout weights acts in the variant `baseline`.
-    config, policies = _load_source(source, arm="baseline" if variant == "baseline" else "layout")
+    arms = tuple(dict.fromkeys("baseline" if variant == "baseline" else "layout" for variant in variants))
+    config, policies = _load_source(source, arms)
     policies = policies.with_estimator(estimator)
 
-    # Play the episode alone or, to compare shifts, all episodes whose goal can be reached at every shift.
+    # Play the episode alone or, to compare, all episodes whose goal can be reached at every shift.
     episodes_by_shift = _draw_shifted_episodes(config, split, scenes, shifts, shift_by, console)
     is_reachable = _check_index(index, episodes_by_shift)
-    played_indices = np.flatnonzero(is_reachable) if len(shifts) > 1 else np.array([index])
+    is_comparison = len(shifts) * len(variants) > 1
+    played_indices = np.flatnonzero(is_reachable) if is_comparison else np.array([index])
+    trace_index = int(np.searchsorted(played_indices, index))
 
     # Replay the episodes with best actions.
-    gap_form = None if policies.estimator_config is None else policies.estimator_config.form
-    evaluation_row = table_row(variant, epsilon if variant == "stde" else None, gap_form, "argmax")
-    traces_by_shift = []
-    for shifted in episodes_by_shift:
+    requested_episodes = []
+    success_by_name = {}
+    for variant, shifted in itertools.product(variants, episodes_by_shift):
+        row = _variant_row(policies, variant, epsilon)
         played_episodes = shifted.episodes.take(played_indices)
         plural = "" if len(played_indices) == 1 else "s"
         with console.status(f"playing {len(played_indices):,} episode{plural} at shift {shifted.shift:g}"):
-            traces_by_shift.append(replay_episodes(policies, shifted.world, played_episodes, evaluation_row))
-    if len(shifts) > 1:
-        _report_success(traces_by_shift, [shifted.shift for shifted in episodes_by_shift], console)
+            traces = replay_episodes(policies, shifted.world, played_episodes, row)
 
-    # Return the requested episode at every shift.
-    trace_index = int(np.searchsorted(played_indices, index))
-    agent_name = _describe_agent(policies, variant, epsilon)
-    requested_episodes = []
-    for traces, shifted in zip(traces_by_shift, episodes_by_shift, strict=True):
+        suffix = f", {VARIANT_CAPTIONS[variant]}" if len(variants) > 1 else ""
+        success_by_name[f"shift {shifted.shift:g}{suffix}"] = [trace.success for trace in traces]
         requested_episode = _make_played_episode(
             trace=traces[trace_index],
             shifted=shifted,
             index=index,
-            epsilon=np.inf if evaluation_row.epsilon is None else epsilon,
-            agent_name=agent_name,
+            epsilon=np.inf if row.epsilon is None else epsilon,
+            agent_name=_describe_agent(policies, variants, epsilon),
             policies=policies,
+            variant=variant,
         )
         requested_episodes.append(requested_episode)
+    if is_comparison:
+        _report_success(success_by_name, console)
     return requested_episodes
 
 
-def _load_source(source: str | Path, arm: str) -> tuple[RunConfig, Policies]:
+def _variant_row(policies: Policies, variant: PlayedVariant, epsilon: float) -> EvaluationRow:
+    """Row of an evaluation with best actions, in the default form of its removal."""
+    form: Form | None = None if policies.estimator_config is None else policies.estimator_config.form
+    if variant == "scde":
+        form = "paper"
+    return table_row(variant, epsilon if variant in ("stde", "scde") else None, form, "argmax")
+
+
+def _load_source(source: str | Path, arms: tuple[str, ...]) -> tuple[RunConfig, Policies]:
     """Load a run or an exported policy."""
     if not is_policy(source):
         config = load_run_config(Path(source))
-        return config, load_policies(config, config.arms if arm in config.arms else (arm,))
+        return config, load_policies(config, config.arms if set(arms) <= set(config.arms) else arms)
     config, policies = load_policy_as_run(source)
-    if arm not in config.arms:
+    if not set(arms) <= set(config.arms):
         raise InputError(f"{source}: is a policy of the arm {config.arms[0]!r}; choose another --variant")
     return config, policies
 
@@ -230,29 +252,27 @@ def _check_index(index: int, episodes_by_shift: Sequence[ShiftedEpisodes]) -> np
     return is_reachable
 
 
-def _report_success(
-    traces_by_shift: Sequence[Sequence[EpisodeTrace]], shifts: Sequence[float], console: Console
-) -> None:
-    """Print the number of successful episodes at each shift, and the number that succeeds at no other shift."""
-    # Success of each episode, bool [shifts, E].
-    success_by_shift = []
-    for traces in traces_by_shift:
-        success_by_shift.append([trace.success for trace in traces])
-    success = np.array(success_by_shift)
-
-    for i, shift in enumerate(shifts):
+def _report_success(success_by_name: Mapping[str, Sequence[bool]], console: Console) -> None:
+    """Print the number of successful episodes of each comparison partner, and the number that no other finds."""
+    success = np.array(list(success_by_name.values()))  # [partners, E]
+    for i, name in enumerate(success_by_name):
         success_elsewhere = np.delete(success, i, axis=0).any(axis=0)
         only_here = success[i] & ~success_elsewhere
         console.print(
-            f"shift {shift:g}: goal found in {success[i].sum()} of {success.shape[1]} episodes, "
-            f"in {only_here.sum()} only at this shift"
+            f"{name}: goal found in {success[i].sum()} of {success.shape[1]} episodes, in {only_here.sum()} only here"
         )
 
 
-def _describe_agent(policies: Policies, variant: PlayedVariant, epsilon: float) -> str:
-    """Return method and variant of the agent, for a title."""
-    name_suffixes = {"stde": f" with layout and sTDE, epsilon {epsilon:g}", "layout": " with layout", "baseline": ""}
-    return f"{method_label(policies.spec.method.name)}{name_suffixes[variant]}"
+def _describe_agent(policies: Policies, variants: Sequence[PlayedVariant], epsilon: float) -> str:
+    """Return method and variants of the agent, for a title."""
+    variant_names = {
+        "stde": f"layout and sTDE, epsilon {epsilon:g}",
+        "scde": f"layout and sCDE, epsilon {epsilon:g}",
+        "layout": "layout",
+    }
+    names = [variant_names[variant] for variant in variants if variant in variant_names]
+    suffix = f" with {' or '.join(names)}" if names else ""
+    return f"{method_label(policies.spec.method.name)}{suffix}"
 
 
 def _make_played_episode(
@@ -263,6 +283,7 @@ def _make_played_episode(
     epsilon: float,
     agent_name: str,
     policies: Policies,
+    variant: PlayedVariant,
 ) -> PlayedEpisode:
     """Combine a trace with the scene and the tables of its episode."""
     # The cell of each pose, counted from the first cell of the scene, [T].
@@ -283,6 +304,7 @@ def _make_played_episode(
         title=f"{agent_name}  ·  {scene.name}",
         policies=policies,
         shift=shifted.shift,
+        variant=variant,
     )
 
 
@@ -290,33 +312,36 @@ def _make_played_episode(
 
 
 def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
-    """Write the picture of an episode, with a panel for each layout shift.
+    """Write the picture of an episode: a row of panels for each variant, a column for each layout shift.
 
     All panels show one step at a time; a panel whose episode has ended keeps its last step. Hollow stars mark the goals
-    of the first panel in the other panels. A path that ends in .gif gets a frame per step, or evenly spaced frames of
+    of the first panel in all others. A path that ends in .gif gets a frame per step, or evenly spaced frames of
     an episode with more than 60 steps; another path gets the last frame.
 
     Args:
-      episodes: one or more episodes with equal room, goal and start at several layout shifts.
+      episodes: one or more episodes with equal room, goal and start, as `play_episode` returns them.
       path: file to write.
     """
-    # Texts above and below the panels.
     first_episode = episodes[0]
-    figure = Figure(figsize=(PANEL_WIDTH * len(episodes), PANEL_HEIGHT), dpi=100)
+    num_rows = len({episode.variant for episode in episodes})
+    num_columns = len(episodes) // num_rows
+    figure = Figure(figsize=(PANEL_WIDTH * num_columns, PANEL_HEIGHT * num_rows), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    goal_name = first_episode.task.categories[first_episode.goal]
-    text_margin = 0.02 / len(episodes)
-    figure.text(text_margin, 0.955, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
-    figure.text(1 - text_margin, 0.012, first_episode.title, color=MUTED_COLOR, fontsize=8, ha="right")
 
-    # One panel for each episode, side by side.
+    # A panel for each episode.
     max_steps = max(len(episode.trace.pose) for episode in episodes)
-    width = 1 / len(episodes)
     panels = []
-    for number, episode in enumerate(episodes):
-        panels.append(EpisodePanel(figure, width * number, width, episode, gap_steps=max(2, max_steps)))
+    for episode, part in zip(episodes, figure.subfigures(num_rows, num_columns, squeeze=False).flat, strict=True):
+        panels.append(EpisodePanel(part, episode, gap_steps=max(2, max_steps), show_variant=num_rows > 1))
     for panel in panels[1:]:
         panel.mark_goal(first_episode)
+
+    # Texts above and below the panels.
+    goal_name = first_episode.task.categories[first_episode.goal]
+    margin = 0.02 / num_columns
+    top, bottom = 1 - 0.045 / num_rows, 0.012 / num_rows
+    figure.text(margin, top, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
+    figure.text(1 - margin, bottom, first_episode.title, color=MUTED_COLOR, fontsize=8, ha="right")
 
     # One frame for each step, or the last one alone.
     last_step = max_steps - 1
@@ -360,34 +385,30 @@ class EpisodePanel:
     """Panel of a figure that shows one episode, step by step."""
 
     def __init__(
-        self, figure: Figure, panel_left: float, panel_width: float, episode: PlayedEpisode, gap_steps: int
+        self, figure: FigureBase, episode: PlayedEpisode, gap_steps: int, *, show_variant: bool = False
     ) -> None:
         """Draw the parts that do not change: the plan of the scene and the caption.
 
         Args:
-          figure: figure to draw in.
-          panel_left: left side of the panel, as a share of the figure.
-          panel_width: width of the panel, as a share of the figure.
+          figure: figure, or part of one, that the panel fills.
           episode: episode to draw.
           gap_steps: number of steps on the axis of the layout gap.
+          show_variant: whether the caption states the use of the experience.
         """
-
-        def add_axes(x: float, y: float, width: float, height: float) -> Axes:
-            return figure.add_axes((panel_left + x * panel_width, y, width * panel_width, height))
-
         # The plan fills the width; below it stand the detections and the gap.
         self._episode = episode
         self._gap_steps = gap_steps
         self._moving_artists: list[Artist] = []
-        self._plan_axes = add_axes(0.02, 0.31, 0.96, 0.565)
-        self._detections_axes = add_axes(0.2, 0.075, 0.28, 0.185)
-        self._gap_axes = add_axes(0.6, 0.1, 0.35, 0.16)
+        self._plan_axes = figure.add_axes((0.02, 0.31, 0.96, 0.565))
+        self._detections_axes = figure.add_axes((0.2, 0.075, 0.28, 0.185))
+        self._gap_axes = figure.add_axes((0.6, 0.1, 0.35, 0.16))
 
         # Captions: the shift on the left, the state of the episode on the right.
         caption_text = SHIFT_CAPTIONS.get(episode.shift, f"layout shifted by {episode.shift:g}")
-        caption_left = panel_left + 0.02 * panel_width
-        figure.text(caption_left, 0.9, caption_text, color=TEXT_COLOR, fontsize=12, weight="bold")
-        self._status = figure.text(panel_left + 0.98 * panel_width, 0.9, "", fontsize=10.5, ha="right")
+        if show_variant:
+            caption_text = f"{caption_text}, {VARIANT_CAPTIONS[episode.variant]}"
+        figure.text(0.02, 0.9, caption_text, color=TEXT_COLOR, fontsize=9.5 if show_variant else 12, weight="bold")
+        self._status = figure.text(0.98, 0.9, "", fontsize=9 if show_variant else 10.5, ha="right")
         draw_plan(self._plan_axes, episode.scene, episode.task.categories, episode.goal)
 
     def mark_goal(self, other_episode: PlayedEpisode) -> None:

@@ -16,11 +16,11 @@ from jaxnav.evaluation.removal import InferenceTrace
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
-from jaxnav.viz.episode import EpisodePanel, PlayedEpisode, draw_episode
+from jaxnav.viz.episode import EpisodePanel, PlayedEpisode, PlayedVariant, draw_episode
 from jaxnav.viz.scene import view_cone
 
 
-def make_episode(action, success=False, shift=0.0):
+def make_episode(action, success=False, shift=0.0, variant: PlayedVariant = "stde"):
     """An episode of the tiny world with the given actions."""
     episodes = draw_episodes(tiny.BANK, 12)
     pose = [int(episodes.pose[0])]
@@ -42,6 +42,7 @@ def make_episode(action, success=False, shift=0.0):
         epsilon=0.1,
         title="test",
         shift=shift,
+        variant=variant,
         policies=tiny.make_untrained_policies(),
     )
 
@@ -80,6 +81,17 @@ def test_shorter_panel_stands_still_after_its_end(tmp_path):
     assert durations[-1] >= 1000 > max(durations[:-1])
 
 
+def test_each_variant_has_a_row_of_panels(tmp_path):
+    episodes = []
+    variants: tuple[PlayedVariant, ...] = ("layout", "scde")
+    for variant in variants:
+        for shift in (0.0, 0.5, 1.0):
+            episodes.append(make_episode([1, DONE], shift=shift, variant=variant))
+    draw_episode(episodes, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as png:
+        assert png.size == (3 * 520, 2 * 680)
+
+
 @pytest.mark.parametrize(
     ("actions", "success", "words"),
     [
@@ -90,7 +102,7 @@ def test_shorter_panel_stands_still_after_its_end(tmp_path):
 )
 def test_panel_shows_shift_action_and_outcome(actions, success, words):
     figure = Figure()
-    panel = EpisodePanel(figure, 0.0, 1.0, make_episode(actions, success, shift=0.5), 2)
+    panel = EpisodePanel(figure, make_episode(actions, success, shift=0.5), 2)
     panel.draw_step(0)
     texts = [text.get_text() for text in figure.texts]
     assert any("0.5" in text for text in texts)

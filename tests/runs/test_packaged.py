@@ -80,6 +80,6 @@ def test_shifted_episode_differs_in_the_layout_alone(drawn_run):
 
 def test_play_episode_refuses_unknown_variants_and_indexes(drawn_run):
     with pytest.raises(InputError, match="is a policy of the arm 'layout'; choose another --variant"):
-        play_episode("rooms-org", variant="baseline")
+        play_episode("rooms-org", variants=("baseline",))
     with pytest.raises(InputError, match="--index 1000: give a number from 0 to 999"):
         play_episode(drawn_run.config.run_dir, index=1000)
