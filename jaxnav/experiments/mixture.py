@@ -97,6 +97,8 @@ CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
     "paper": ("shuffled", "course"),
     "switch": ("shuffled",),
 }
+#: Control in which prior and evidence take each category for another one.
+PERMUTED_CONTROL = "permuted layout"
 
 
 def measure_mixture(
@@ -212,7 +214,8 @@ def _measure_removals(
         factual_outcomes = runner.run_trials(factual_run, estimator, [hard_trial])
         yield from report.removal_rows("TDE, factual memory", factual_outcomes[hard_trial])
 
-    # Every rule is compared with its own controls and with the best clock.
+    # Every rule is compared with its own controls, with a layout of permuted categories, and with the best clock.
+    permuted_run = evaluated_run._replace(policies=policies.with_permuted_layout(bench.config.seed))
     best_clock = max(outcome_by_clock, key=lambda name: report.mixture_gain(outcome_by_clock[name], budgets[-1]))
     for rule in rules:
         if rule.gap == "surprise" and not policies.has_sighting_evidence:
@@ -225,6 +228,7 @@ def _measure_removals(
             control_trials[control] = dataclasses.replace(trial, control=control)
         rule_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *control_trials.values()])
         compared_outcomes = {control: rule_outcomes[control_trial] for control, control_trial in control_trials.items()}
+        compared_outcomes[PERMUTED_CONTROL] = runner.run_trials(permuted_run, rule_estimator, [trial])[trial]
         compared_outcomes[best_clock] = outcome_by_clock[best_clock]
         yield from report.removal_rows(str(rule), rule_outcomes[trial], compared_outcomes)
 

@@ -155,6 +155,32 @@ class Policies(NamedTuple):
         limit_inner_steps(method.adaptation, inner_steps)  # raises for an impossible number
         return self._replace(inner_steps=inner_steps)
 
+    def with_permuted_layout(self, seed: int) -> "Policies":
+        """Policies that mistake each category for another in the layout prior and the evidence, as a control.
+
+        Args:
+          seed: seed of the permutation of the categories.
+        """
+        permutation = np.random.default_rng(seed).permutation(self.spec.num_categories)
+
+        def permute(matrices: jax.Array) -> jax.Array:
+            return matrices[..., permutation, :][..., permutation]
+
+        def permute_pairs(pairs: jax.Array) -> jax.Array:
+            # Each pair has its value above the diagonal.
+            return jnp.triu(permute(pairs + jnp.swapaxes(pairs, -1, -2)), 1)
+
+        evidence = self.knowledge.cooccurrence
+        if evidence is not None:
+            near_log_odds = evidence.near_log_odds
+            evidence = CooccurrenceEvidence(
+                log_odds=permute_pairs(evidence.log_odds),
+                co_visibility=permute(evidence.co_visibility),
+                near_log_odds=None if near_log_odds is None else permute_pairs(near_log_odds),
+            )
+        knowledge = self.knowledge._replace(layout=permute(self.knowledge.layout), cooccurrence=evidence)
+        return self._replace(knowledge=knowledge, prior_counts=permute(self.prior_counts))
+
     def with_handover_to(self, fallback_policies: "Policies") -> "Policies":
         """Policies that hand over to fallback policies once experience is removed.
 

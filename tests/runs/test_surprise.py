@@ -12,7 +12,7 @@ from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.variants import table_row
-from jaxnav.gaps import NEAR_DISTANCES, NEAR_VIEW_COUNTS, NUM_NEAR_FEATURES, NUM_RELATIONS
+from jaxnav.gaps import NEAR_DISTANCES, NEAR_VIEW_COUNTS, NUM_NEAR_FEATURES, NUM_RELATIONS, learned_gap, surprise_gap
 from jaxnav.runs.evaluate import replay_episodes
 from jaxnav.runs.policies import export_policy, load_policy_as_run
 from jaxnav.runs.worlds import compile_evaluation_world
@@ -31,6 +31,32 @@ def policies(drawn_run):
     near_log_odds = np.triu(np.random.default_rng(0).normal(0.0, 0.3, shape), 1).astype(np.float32)
     evidence = policies.knowledge.cooccurrence._replace(near_log_odds=near_log_odds)
     return policies._replace(knowledge=policies.knowledge._replace(cooccurrence=evidence))
+
+
+def test_permuted_layout_reads_renamed_categories_as_before(policies):
+    """Views of a layout whose categories are renamed by the permutation have the former gaps and prior."""
+    permuted = policies.with_permuted_layout(3)
+    permutation = np.random.default_rng(3).permutation(policies.spec.num_categories)
+    assert (permutation != np.arange(len(permutation))).any()
+    # Views of few pairs, so that no gap is 0 or 1.
+    rng = np.random.default_rng(4)
+    shape = (NUM_RELATIONS, len(permutation), len(permutation))
+    counts = rng.integers(1, 25, shape) * (rng.random(shape) < 0.01)
+    counts = (counts + counts.swapaxes(1, 2)).astype(np.uint8)
+    renamed_counts = counts[:, permutation][:, :, permutation]
+
+    for room in range(NUM_PRIORS):
+        evidence, permuted_evidence = (p.knowledge.cooccurrence for p in (policies, permuted))
+        gap = surprise_gap(counts, evidence.near_log_odds[room])
+        permuted_gap = surprise_gap(renamed_counts, permuted_evidence.near_log_odds[room])
+        np.testing.assert_allclose(permuted_gap, gap, rtol=1e-4)
+        assert abs(surprise_gap(counts, permuted_evidence.near_log_odds[room]) - gap) > 1e-3
+
+        learned = learned_gap(counts[0] > 0, evidence.log_odds[room])
+        renamed = learned_gap(renamed_counts[0] > 0, permuted_evidence.log_odds[room])
+        np.testing.assert_allclose(renamed, learned, rtol=1e-4)
+    expected_prior = np.asarray(policies.knowledge.layout)[:, permutation][:, :, permutation]
+    np.testing.assert_array_equal(permuted.knowledge.layout, expected_prior)
 
 
 def count_in_the_world(poses, bank, centres, task, near_log_odds):
