@@ -42,7 +42,7 @@ def test_permuted_layout_reads_renamed_categories_as_before(policies):
     rng = np.random.default_rng(4)
     shape = (NUM_RELATIONS, len(permutation), len(permutation))
     counts = rng.integers(1, 25, shape) * (rng.random(shape) < 0.01)
-    counts = (counts + counts.swapaxes(1, 2)).astype(np.uint8)
+    counts = jnp.asarray(counts + counts.swapaxes(1, 2), jnp.uint8)
     renamed_counts = counts[:, permutation][:, :, permutation]
 
     for room in range(NUM_PRIORS):
