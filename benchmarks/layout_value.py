@@ -48,7 +48,7 @@ from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS, World, load_scenes, make_generated_scenes, world_name_of_origin
 
 NUM_FOLDS = 4
-#: Variants to compare.
+#: (base, variant) pairs whose difference is reported.
 PAIRS = (("flat", "layout"), ("places", "layout"))
 
 
@@ -56,11 +56,11 @@ class SearchWorld(NamedTuple):
     """Compiled scenes of a world with a list of episodes.
 
     Attributes:
-      world: rules and step limits.
+      world: definition of the world, with its step limits and budgets.
       bank: tables of the scenes.
       scenes: the S scenes.
       planner_scenes: the S scenes as the planner needs them.
-      fold: of every scene, int [S].
+      fold: int [S], fold of each scene.
       episodes: the E episodes.
     """
 
@@ -90,7 +90,7 @@ def main(
         results[name] = compare_priors(priors, search_world)
         print(format_table(name, results[name]), file=sys.stderr, flush=True)
 
-        # Random exchanges show how adverse the fitted one is.
+        # Random exchanges are measured beside the one of `--shift-by`.
         random_results = []
         for seed in range(num_random_exchanges):
             exchange = draw_exchange(training_world.scenes, training_world.bank.task, seed)
@@ -122,7 +122,8 @@ def compile_search_world(source: str, max_scenes: int, num_episodes: int, goals:
         world = WORLDS[world_name_of_origin(all_scenes[0].world)]
     task = dataclasses.replace(world.task, detector=PERFECT_DETECTOR, goals=tuple(goals) or world.task.goals)
     indices = np.unique(np.linspace(0, len(all_scenes) - 1, max_scenes).astype(int))
-    return prepare_search([all_scenes[int(index)] for index in indices], world, task, num_episodes)
+    scenes = [all_scenes[int(index)] for index in indices]
+    return prepare_search(scenes, world, task, assign_folds(scenes), num_episodes)
 
 
 def shift_search_world(
@@ -150,25 +151,29 @@ def exchange_search_world(
     shifted_scenes = []
     for scene, fold in zip(training_world.scenes, training_world.fold.tolist(), strict=True):
         shifted_scenes.append(exchange_places(scene, task, shift, 0, exchanges[fold]))
-    return prepare_search(shifted_scenes, training_world.world, task, num_episodes)
+    return prepare_search(shifted_scenes, training_world.world, task, training_world.fold, num_episodes)
 
 
-def prepare_search(scenes: Sequence[Scene], world: World, task: Task, num_episodes: int) -> SearchWorld:
-    """Compile scenes and draw episodes."""
+def prepare_search(
+    scenes: Sequence[Scene], world: World, task: Task, fold: np.ndarray, num_episodes: int
+) -> SearchWorld:
+    """Compile scenes and draw episodes; `fold` is that of each scene."""
     tables = [compile_scene(scene, task) for scene in scenes]
     bank = join_scenes(tables, task)
 
     # As in the bank, scenes without any reachable goal are left out.
     searchable_scenes = []
     planner_scenes = []
-    for scene, table in zip(scenes, tables, strict=True):
+    searchable_fold = []
+    for scene, table, scene_fold in zip(scenes, tables, fold.tolist(), strict=True):
         if (table.best_length > 0).any():
             sites = find_sites(scene, task, table.rows)
             successors = pose_successors(table.ahead, task.rules)
             searchable_scenes.append(scene)
+            searchable_fold.append(scene_fold)
             planner_scenes.append(PlannerScene(sites, successors, table.best_length))
-    fold = assign_folds(searchable_scenes)
-    return SearchWorld(world, bank, searchable_scenes, planner_scenes, fold, draw_episodes(bank, num_episodes))
+    episodes = draw_episodes(bank, num_episodes)
+    return SearchWorld(world, bank, searchable_scenes, planner_scenes, np.array(searchable_fold), episodes)
 
 
 def assign_folds(scenes: Sequence[Scene]) -> np.ndarray:
@@ -361,6 +366,8 @@ if __name__ == "__main__":
     parser.add_argument("--random-exchanges", type=int, default=0)
     parser.add_argument("--goals", nargs="+", default=())
     options = parser.parse_args()
+    if options.random_exchanges and not options.shift:
+        sys.exit(f"error: --random-exchanges {options.random_exchanges}: needs a --shift above 0")
     try:
         main(
             options.sources,

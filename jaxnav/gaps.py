@@ -3,7 +3,7 @@
 `learned_gap` adds up learned log odds of the pairs seen together, `surprise_gap` those of pairs seen near each other in
 one view or several. `overdue_gap` grows as the goal fails to appear where the training layout would show it, and
 `evidence_gap` is a z-test of the counts against layouts drawn from the prior.
-All handle one episode.
+All functions take the arrays of a single episode.
 """
 
 from typing import NamedTuple
@@ -13,13 +13,13 @@ import jax.numpy as jnp
 
 #: Distances within which two categories count as near each other, metres.
 NEAR_DISTANCES = (1.0, 2.0, 4.0, float("inf"))
-#: Numbers of views that show a pair so near, of which each is a feature: a false alarm rarely comes twice.
+#: Thresholds on the number of views with a relation; each is one feature. High ones guard against false alarms.
 NEAR_VIEW_COUNTS = (1, 3, 8, 20)
-#: R, the number of relations of a pair whose views are counted: each of the distances, and together in one view.
-NUM_RELATIONS = len(NEAR_DISTANCES) + 1
+#: R, the number of relations that are counted for a pair: near within each distance, and visible in one view.
+NUM_SIGHTING_RELATIONS = len(NEAR_DISTANCES) + 1
 #: F, the number of features of a pair.
-NUM_NEAR_FEATURES = NUM_RELATIONS * len(NEAR_VIEW_COUNTS)
-#: Views of a pair are counted up to this number.
+NUM_NEAR_FEATURES = NUM_SIGHTING_RELATIONS * len(NEAR_VIEW_COUNTS)
+#: Counts stop here: above the highest threshold, and within uint8.
 _MAX_VIEW_COUNT = 200
 
 
@@ -31,8 +31,8 @@ class CooccurrenceEvidence(NamedTuple):
         been seen together; 0 on and below the diagonal, so that each pair counts once.
       co_visibility: float32 [..., K, K], in [0, 1], 0 on the diagonal; P(j visible | i visible) over the
         training poses.
-      near_log_odds: float32 [..., F, K, K], the same as `log_odds` for the F features of `near_features`; None in runs
-        of earlier versions.
+      near_log_odds: float32 [..., F, K, K], log odds of the F features of `near_features`, used by `surprise_gap`; None
+        in runs of earlier versions.
     """
 
     log_odds: jax.Array
@@ -64,7 +64,12 @@ def learned_gap(co_seen: jax.Array, log_odds: jax.Array) -> jax.Array:
     Returns:
       float32 [], in [0, 1]; 1/2 where no pair was seen.
     """
-    return jax.nn.sigmoid(jnp.where(co_seen, log_odds, 0.0).sum())
+    return _shift_probability(co_seen, log_odds)
+
+
+def _shift_probability(is_reached: jax.Array, log_odds: jax.Array) -> jax.Array:
+    """Probability that the layout is not that of training, from features bool [...] with log odds float32 [...]."""
+    return jax.nn.sigmoid(jnp.where(is_reached, log_odds, 0.0).sum())
 
 
 class PairSightings(NamedTuple):
@@ -74,8 +79,8 @@ class PairSightings(NamedTuple):
       offsets: float32 [K, 2], metres from the agent to the last detection of each category, along the axes of the
         compass.
       is_seen: bool [K], whether a category has been detected.
-      counts: uint8 [R, K, K], number of views that showed one of two categories while both were known, within each of
-        `NEAR_DISTANCES` of each other; last the number of views that showed both. At most 200.
+      counts: uint8 [R, K, K], at most 200. For each of `NEAR_DISTANCES`, the number of views that showed at least one
+        of two categories while their last known places were within the distance; last, of views that showed both.
     """
 
     offsets: jax.Array
@@ -85,7 +90,7 @@ class PairSightings(NamedTuple):
     @staticmethod
     def init(num_categories: int) -> "PairSightings":
         """Sightings before the first view."""
-        counts_shape = (NUM_RELATIONS, num_categories, num_categories)
+        counts_shape = (NUM_SIGHTING_RELATIONS, num_categories, num_categories)
         return PairSightings(
             offsets=jnp.zeros((num_categories, 2), jnp.float32),
             is_seen=jnp.zeros(num_categories, bool),
@@ -132,7 +137,7 @@ def surprise_gap(counts: jax.Array, near_log_odds: jax.Array) -> jax.Array:
     """Return the gap D as the probability that the layout is not that of training, from where things were seen.
 
     The features of all pairs add up to the log odds z (prior odds of 1), and D = sigmoid(z). In contrast to
-    `learned_gap`, pairs that are never in one view count too: odometry tells how far apart they were seen.
+    `learned_gap`, pairs that are never in one view count too: odometry gives the distance of their detections.
 
     Args:
       counts: uint8 [R, K, K], of `PairSightings`.
@@ -141,7 +146,7 @@ def surprise_gap(counts: jax.Array, near_log_odds: jax.Array) -> jax.Array:
     Returns:
       float32 [], in [0, 1]; 1/2 where no pair was seen.
     """
-    return learned_gap(near_features(counts), near_log_odds)
+    return _shift_probability(near_features(counts), near_log_odds)
 
 
 def overdue_gap(co_seen: jax.Array, co_visibility: jax.Array, goal: jax.Array | int) -> jax.Array:

@@ -14,7 +14,7 @@ from jaxnav.gaps import (
     NEAR_DISTANCES,
     NEAR_VIEW_COUNTS,
     NUM_NEAR_FEATURES,
-    NUM_RELATIONS,
+    NUM_SIGHTING_RELATIONS,
     CooccurrenceEvidence,
     PairSightings,
     learned_gap,
@@ -95,7 +95,7 @@ def test_sightings_follow_worked_arithmetic():
 def test_surprise_gap_follows_worked_arithmetic():
     """One view within 4 m reaches one feature of each of two distances: ln 3 + ln 2 - ln 1 = ln 6, p = 6 / 7."""
     assert NEAR_VIEW_COUNTS[:2] == (1, 3)
-    counts = jnp.zeros((NUM_RELATIONS, 2, 2), jnp.uint8).at[2:4, 0, 1].set(1)
+    counts = jnp.zeros((NUM_SIGHTING_RELATIONS, 2, 2), jnp.uint8).at[2:4, 0, 1].set(1)
     num_thresholds = len(NEAR_VIEW_COUNTS)
     log_odds = jnp.zeros((NUM_NEAR_FEATURES, 2, 2))
     log_odds = log_odds.at[2 * num_thresholds, 0, 1].set(np.log(3)).at[3 * num_thresholds, 0, 1].set(np.log(2))

@@ -23,7 +23,7 @@ class EpisodeConfig:
       split: scenes to play in.
       index: number of the episode, from 0, in the list of 1,000 episodes of `jaxnav eval`. If scenes are streamed, this
         is the list of the first shard.
-      out: GIF to write, which shows every step, or PNG, which shows the end. The default is `episode.gif` (with
+      out: GIF to write, with at most 60 frames, or PNG, which shows the end. The default is `episode.gif` (with
         `--map`, `map.png`) in the run directory or, for a policy, in the working directory.
       variant: uses of the experience, with a row of panels for each. `stde` removes it where the layout gap exceeds
         epsilon, `scde` does so towards the decision without experience (for runs with `--ppo.experience` below 1),
@@ -32,8 +32,8 @@ class EpisodeConfig:
       setting: layout estimator to use instead of that of the run; `jaxnav list settings` describes them.
       scenes: scene file to use instead of the scenes of the run.
       shift: layout shifts of the scenes, each from 0 (as in training) to 1, with one panel for each. The default is the
-        shift of the run. With several shifts or variants, all episodes of the list are played and the success rates are
-        printed.
+        shift of the run. With several shifts or variants, all episodes of the list are played and the numbers of
+        successes are printed.
       shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
         `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       map: draw the map that the agent made, the block that it searches and its way to it. This needs a method that
@@ -77,6 +77,8 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
         raise InputError(f"--step {config.step}: applies to the map only; add --map")
     if not config.variant or len(set(config.variant)) < len(config.variant):
         raise InputError(f"--variant {' '.join(config.variant)}: give one or more different variants")
+    if len(set(config.shift)) < len(config.shift):
+        raise InputError(f"--shift {' '.join(map(str, config.shift))}: give different shifts")
     if config.map and len(config.shift) > 1:
         raise InputError("--map: the map is drawn at one layout shift; give one --shift")
     if config.map and len(config.variant) > 1:

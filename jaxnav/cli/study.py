@@ -11,10 +11,10 @@ from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig
 
 DESCRIPTION = (
     "Run an experiment: train and measure everything that has no results yet, and write its pages. `jaxnav study NAME` "
-    "needs no option; `jaxnav list experiments` describes the names, and how much each one trains. `jaxnav study NAME "
-    "--config quick` is the experiment NAME_quick, which is smaller. The exceptions are "
-    "account, cde, handover, instrument and mixture, which measure a finished run: give --run RUN, and --reference RUN "
-    "with a run of layout-blind agents (--method anonymous). The options change an experiment; their defaults are "
+    "needs no option, except for account, cde, handover, instrument and mixture, which measure a finished run: give "
+    "--run RUN, and --reference RUN with a run of layout-blind agents (--method anonymous). `jaxnav list experiments` "
+    "describes the names, and how much each one trains. `jaxnav study NAME --config quick` runs the smaller experiment "
+    "NAME_quick, where there is one. The options change an experiment; their defaults are "
     "shown for the experiment that you give: jaxnav study table2 --help."
 )
 
@@ -49,12 +49,12 @@ def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> Expe
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words:
         raise InputError(f"give an experiment: {', '.join(EXPERIMENTS)}, or a YAML file")
-    words = _apply_variant(words)
+    words = _select_version(words)
     return parse_config(ExperimentConfig(), words, prog, DESCRIPTION, _check, EXPERIMENTS, is_positional=True)
 
 
-def _apply_variant(words: list[str]) -> list[str]:
-    """Replace `NAME --config VARIANT` by the experiment `NAME_VARIANT`.
+def _select_version(words: list[str]) -> list[str]:
+    """Replace `NAME --config VERSION` by the experiment `NAME_VERSION`.
 
     Raises:
       InputError: there is no such experiment.
@@ -65,13 +65,13 @@ def _apply_variant(words: list[str]) -> list[str]:
     if namespace.config is None or not other_words or other_words[0].startswith("-"):
         return words
 
-    # An experiment without variants has none to choose from.
+    # Any packaged experiment NAME_... counts as another version of NAME.
     experiment, *options = other_words
     name = f"{experiment}_{namespace.config}"
     if name not in EXPERIMENTS:
-        variants = [other.removeprefix(f"{experiment}_") for other in EXPERIMENTS if other.startswith(f"{experiment}_")]
-        choices = f"choose from {', '.join(variants)}" if variants else f"{experiment} has no variants"
-        raise InputError(f"--config {namespace.config}: is unknown; {choices}")
+        versions = [other.removeprefix(f"{experiment}_") for other in EXPERIMENTS if other.startswith(f"{experiment}_")]
+        mend = f"choose from {', '.join(versions)}" if versions else f"{experiment} has no other version; omit --config"
+        raise InputError(f"--config {namespace.config}: is unknown; {mend}")
     return [name, *options]
 
 

@@ -38,7 +38,7 @@ class ExperimentConfig:
         `results` of the run directory.
       runs: folder of the training runs of the experiment.
       pages: pages to write, as YAML that maps each Markdown document to its template: a file, or one of the packaged
-        templates account, factors, instrument, methods, mixture, paper and study.
+        templates account, claims, factors, instrument, methods, mixture, paper and study.
       worlds: worlds by name, as YAML. Each maps settings of `jaxnav train` to the values of all runs in that world.
       agents: agents by name, as YAML. Each maps settings of `jaxnav train` to the values of its runs. The key `against`
         lists agents to compare with: AGENT compares equal variants, AGENT/VARIANT always compares with that variant,

@@ -220,7 +220,7 @@ def load_results(config: ExperimentConfig, missing: Collection[str] = ()) -> dic
     """
     tables = {}
     for split in ("train", "val", "test"):
-        settings = evaluation_settings(config) | {"split": split}
+        settings = evaluation_settings(config) | {"split": split, "shift_by": config.shift_by}
         for name in ("shifts", "decodings", "steps"):
             del settings[name]  # of single parts
         rows: list[ResultRow] = []

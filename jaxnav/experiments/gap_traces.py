@@ -107,7 +107,7 @@ def measure_gaps(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
 def _compared_estimators(policies: Policies) -> dict[str, EstimatorConfig]:
     """Configurations of the compared estimators, by name.
 
-    Gaps that need co-occurrence evidence are left out if the run learned none.
+    Gaps that need evidence are left out if the run learned none.
     """
     # The two published estimators come first, then those of this package.
     by_gap = estimators_by_gap(require_estimator_config(policies))
@@ -115,13 +115,10 @@ def _compared_estimators(policies: Policies) -> dict[str, EstimatorConfig]:
         "paper": adapt_counts(ESTIMATORS["paper"], policies.task),
         "released": ESTIMATORS["released"],
         "calibrated": by_gap["novelty"],
-        "evidence": by_gap["evidence"],
     }
-    if policies.knowledge.cooccurrence is not None:
-        estimators["learned"] = by_gap["learned"]
-        if policies.has_sighting_evidence:
-            estimators["surprise"] = by_gap["surprise"]
-        estimators["overdue"] = by_gap["overdue"]
+    for gap in ("evidence", "learned", "surprise", "overdue"):
+        if policies.supports_gap(gap):
+            estimators[gap] = by_gap[gap]
     return estimators
 
 
@@ -379,14 +376,14 @@ def auc_by_step(shifted: GapTraces, unshifted: GapTraces) -> np.ndarray:
     return _statistic_by_step(weighted_auc, [shifted, unshifted])
 
 
-class Calibration(NamedTuple):
+class GapCalibration(NamedTuple):
     """How well a gap states the probability that its episode is shifted.
 
     Attributes:
-      shifted_share: percentage of shifted episodes in each bin of the gap, over the mean gap in the bin; bins without
-        episodes are left out.
+      shifted_share: share of shifted episodes in each bin of the gap, over the mean gap in the bin, both from 0 to 1;
+        bins without episodes are left out.
       error: mean absolute difference between the mean gap and the share of shifted episodes over the bins, weighted by
-        their episodes; from 0 to 1.
+        their episodes, from 0 to 1.
     """
 
     shifted_share: Curve
@@ -395,38 +392,42 @@ class Calibration(NamedTuple):
 
 def calibration_at_steps(
     shifted: GapTraces, unshifted: GapTraces, steps: Sequence[int]
-) -> dict[int, list[Calibration]]:
+) -> dict[int, list[GapCalibration]]:
     """Compare the gap with the share of shifted episodes among those that still run.
 
     Args:
       shifted: traces at the greater shift.
-      unshifted: traces of the same policies, estimators and episodes per shift at the smaller shift.
+      unshifted: traces of equal policies and estimators, with equally many episodes, at the smaller shift.
       steps: steps of the traces.
 
     Returns:
       The calibration of every estimator with the updated belief, by step.
     """
-    # The statistics of all steps but the wanted ones would be a waste.
+    # Keep only the requested steps and the updated belief, because every statistic has many jackknife replicates.
     sides = []
     for traces in (shifted, unshifted):
-        sides.append(traces._replace(gap=traces.gap[..., list(steps)], running=traces.running[..., list(steps)]))
+        updated_gap = traces.gap[:, UPDATED : UPDATED + 1, ..., list(steps)]
+        sides.append(traces._replace(gap=updated_gap, running=traces.running[..., list(steps)]))
 
-    # Statistics by bin: mean and bounds, [bins, 3, estimators, 2, steps].
-    mean_gap, shifted_share = [], []
+    # Statistics by bin: mean and bounds, [bins, 3, estimators, 1, steps].
+    mean_gaps = []
+    shifted_shares = []
     for bin_index in range(NUM_CALIBRATION_BINS):
-        mean_gap.append(_statistic_by_step(functools.partial(_bin_gap, bin_index=bin_index), sides))
-        shifted_share.append(_statistic_by_step(functools.partial(_bin_share, bin_index=bin_index), sides))
-    error = _statistic_by_step(_calibration_error, sides)
+        mean_gaps.append(_statistic_by_step(functools.partial(_bin_gap, bin_index=bin_index), sides))
+        shifted_shares.append(_statistic_by_step(functools.partial(_bin_share, bin_index=bin_index), sides))
+    bin_gaps = np.stack(mean_gaps)[:, 0, :, 0]  # [bins, estimators, steps]
+    bin_shares = np.stack(shifted_shares)[:, :, :, 0]  # [bins, 3, estimators, steps]
+    errors = _statistic_by_step(_calibration_error, sides)[:, :, 0]  # [3, estimators, steps]
 
-    calibrations: dict[int, list[Calibration]] = {step: [] for step in steps}
+    # One curve over the bins with episodes, and one error, for each step and estimator.
+    calibrations: dict[int, list[GapCalibration]] = {step: [] for step in steps}
     num_estimators = shifted.gap.shape[0]
     for (step_index, step), estimator in itertools.product(enumerate(steps), range(num_estimators)):
-        gaps = np.array(mean_gap)[:, 0, estimator, UPDATED, step_index]
-        shares = 100.0 * np.array(shifted_share)[:, :, estimator, UPDATED, step_index]
+        gaps = bin_gaps[:, estimator, step_index]
         has_episodes = np.isfinite(gaps)
-        curve = Curve(gaps[has_episodes], *shares[has_episodes].T)
-        interval = Interval(*error[:, estimator, UPDATED, step_index].tolist())
-        calibrations[step].append(Calibration(curve, interval))
+        curve = Curve(gaps[has_episodes], *bin_shares[has_episodes, :, estimator, step_index].T)
+        interval = Interval(*errors[:, estimator, step_index].tolist())
+        calibrations[step].append(GapCalibration(curve, interval))
     return calibrations
 
 

@@ -20,6 +20,8 @@ from jaxnav.evaluation.report import package_versions
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.store.files import write_atomic
 
+#: Settings that files of results of earlier versions lack.
+_DEFAULT_SETTINGS: Mapping[str, Any] = {"shift_by": "size"}
 #: Version of the files of results.
 RESULTS_FORMAT = 4
 
@@ -312,7 +314,7 @@ def read_part(path: Path, settings: Mapping[str, Any] | None = None) -> list[Res
     """
     part_settings, rows = _read_file(path)
     for name, value in (settings or {}).items():
-        if part_settings.get(name) != value:
+        if part_settings.get(name, _DEFAULT_SETTINGS.get(name)) != value:
             return []
     return rows
 

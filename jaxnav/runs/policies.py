@@ -86,11 +86,15 @@ class Policies(NamedTuple):
         priors = np.asarray(self.knowledge.layout)
         return bool((priors != priors[0]).any())
 
-    @property
-    def has_sighting_evidence(self) -> bool:
-        """True if the evidence holds what the gap `surprise` needs; runs of earlier versions lack it."""
+    def supports_gap(self, gap: str) -> bool:
+        """True if the policies hold the evidence that a gap needs; runs of earlier versions lack that of `surprise`."""
         evidence = self.knowledge.cooccurrence
-        return evidence is not None and evidence.near_log_odds is not None
+        match gap:
+            case "learned" | "overdue":
+                return evidence is not None
+            case "surprise":
+                return evidence is not None and evidence.near_log_odds is not None
+        return True
 
     def arm_params(self, arm: str) -> dict[str, Any]:
         """Parameters of one arm, leaves [S, ...]."""
@@ -116,13 +120,8 @@ class Policies(NamedTuple):
         if self.estimator_config is None:
             option = "--hold" if name is None else f"--setting {name}"
             raise InputError(f"{option}: needs policies with the layout estimator; train a run with the arm `layout`")
-        if name in ("learned", "surprise", "overdue") and self.knowledge.cooccurrence is None:
-            raise InputError(f"--setting {name}: the run has no evidence from co-occurrence; train the run again")
-        if name == "surprise" and not self.has_sighting_evidence:
-            raise InputError(
-                "--setting surprise: the run or policy was trained by an earlier version and holds no evidence of this "
-                "gap; train the run again"
-            )
+        if name is not None and not self.supports_gap(name):
+            raise InputError(f"--setting {name}: the run or policy holds no evidence for this gap; train the run again")
 
         # `paper` and `released` also build the priors in their own way.
         estimator_config = self.estimator_config
@@ -155,12 +154,20 @@ class Policies(NamedTuple):
         limit_inner_steps(method.adaptation, inner_steps)  # raises for an impossible number
         return self._replace(inner_steps=inner_steps)
 
-    def with_permuted_layout(self, seed: int) -> "Policies":
-        """Policies that mistake each category for another in the layout prior and the evidence, as a control.
+    def with_permuted_evidence(self, seed: int) -> "Policies":
+        """Policies whose co-occurrence evidence has randomly permuted categories, as a control.
+
+        The decisions of the policies stay; the gaps `learned`, `surprise` and `overdue`, which read it, change.
 
         Args:
           seed: seed of the permutation of the categories.
+
+        Raises:
+          ValueError: the policies have no evidence.
         """
+        evidence = self.knowledge.cooccurrence
+        if evidence is None:
+            raise ValueError("needs policies with co-occurrence evidence")
         permutation = np.random.default_rng(seed).permutation(self.spec.num_categories)
 
         def permute(matrices: jax.Array) -> jax.Array:
@@ -170,16 +177,13 @@ class Policies(NamedTuple):
             # Each pair has its value above the diagonal.
             return jnp.triu(permute(pairs + jnp.swapaxes(pairs, -1, -2)), 1)
 
-        evidence = self.knowledge.cooccurrence
-        if evidence is not None:
-            near_log_odds = evidence.near_log_odds
-            evidence = CooccurrenceEvidence(
-                log_odds=permute_pairs(evidence.log_odds),
-                co_visibility=permute(evidence.co_visibility),
-                near_log_odds=None if near_log_odds is None else permute_pairs(near_log_odds),
-            )
-        knowledge = self.knowledge._replace(layout=permute(self.knowledge.layout), cooccurrence=evidence)
-        return self._replace(knowledge=knowledge, prior_counts=permute(self.prior_counts))
+        near_log_odds = evidence.near_log_odds
+        permuted_evidence = CooccurrenceEvidence(
+            log_odds=permute_pairs(evidence.log_odds),
+            co_visibility=permute(evidence.co_visibility),
+            near_log_odds=None if near_log_odds is None else permute_pairs(near_log_odds),
+        )
+        return self._replace(knowledge=self.knowledge._replace(cooccurrence=permuted_evidence))
 
     def with_handover_to(self, fallback_policies: "Policies") -> "Policies":
         """Policies that hand over to fallback policies once experience is removed.

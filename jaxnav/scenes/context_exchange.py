@@ -27,10 +27,10 @@ from jaxnav.scenes.task import Task
 NEIGHBOUR_DISTANCES = (1.0, 2.0, 4.0)
 #: Number of random standable cells of each scene that stand for places without an object.
 NUM_EMPTY_PLACES = 60
-#: Categories that are detected from at most this distance on average are small, metres.
+#: Mean detection range up to which a category counts as small, metres.
 SMALL_RANGE = 3.0
 #: Factor of the squared weights, added to the mean negative log likelihood.
-WEIGHT_PENALTY = 1e-3
+PLACE_WEIGHT_PENALTY = 1e-3
 #: Number of random permutations from which the search for the worst one starts.
 NUM_RESTARTS = 16
 
@@ -68,24 +68,20 @@ def fit_context_exchange(scenes: Iterable[Scene], task: Task, seed: int = 0) -> 
       seed: seed of the random permutations and of the random cells.
 
     Returns:
-      The cycles by room type, in the order of the score that each loses alone, the most misleading first. Rooms without
-      cycles have no permutation that lowers the score.
+      The cycles by room type, ordered by the score of each cycle alone, the most misleading first. In rooms without
+      cycles, no permutation was found that lowers the score.
     """
-    scenes_by_room: dict[str, list[Scene]] = {}
-    for scene in scenes:
-        scenes_by_room.setdefault(scene.room_type, []).append(scene)
-
     exchange = {}
-    for room_type, room_scenes in sorted(scenes_by_room.items()):
+    for room_type, room_scenes in group_by_room(scenes).items():
         places = find_places(room_scenes, task, np.random.default_rng([seed, 0]))
-        exchange[room_type] = most_misleading_cycles(places, task.is_goal(), np.random.default_rng([seed, 1]))
+        exchange[room_type] = find_misleading_cycles(places, task.is_goal(), np.random.default_rng([seed, 1]))
     return exchange
 
 
-def most_misleading_cycles(
+def find_misleading_cycles(
     places: Places, is_goal: np.ndarray, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], ...]:
-    """Cycles of the permutation with the lowest score; see `fit_context_exchange`. `is_goal` is bool [K]."""
+    """Find the cycles of the permutation with the lowest score; see `fit_context_exchange`. `is_goal` is bool [K]."""
     num_categories = len(is_goal)
     weights = fit_place_weights(places)
 
@@ -99,39 +95,49 @@ def most_misleading_cycles(
 
     def score(place_of: np.ndarray) -> float:
         """Score of a permutation, int [K]: objects of category k stand where those of `place_of[k]` stood."""
+        # The intercepts are left out: goals keep theirs under every permutation.
         new_neighbours = mean_neighbours[place_of[goals]][:, :, place_of]
         return float((weights[goals] * new_neighbours).sum())
 
-    # The best of several local minima; each pure cycle is then scored alone.
-    groups = exchange_groups(places.mean_range, is_goal)
+    # Keep the best of several local minima, and order its cycles by the score of each cycle alone.
+    groups = group_exchangeable(places.mean_range, is_goal)
     best_permutation = np.arange(num_categories)
     for _ in range(NUM_RESTARTS):
         permutation = search_permutation(score, groups, num_categories, rng)
         if score(permutation) < score(best_permutation):
             best_permutation = permutation
-    cycles = [cycle for cycle in permutation_cycles(best_permutation) if len(cycle) > 1]
+    cycles = list_cycles(best_permutation)
     cycles.sort(key=lambda cycle: score(apply_cycles([cycle], num_categories)))
     return tuple(cycles)
 
 
 def draw_exchange(scenes: Iterable[Scene], task: Task, seed: int) -> ContextExchange:
-    """Draw an exchange at random, from all that `fit_context_exchange` searches.
+    """Draw an exchange of each room type at random, from all that `fit_context_exchange` searches.
 
     Args:
-      scenes: training scenes of one room type, without a shift.
+      scenes: training scenes, without a shift.
       task: the K categories, and which of them are goals.
-      seed: seed of the permutation.
+      seed: seed of the permutations.
     """
-    read_scenes = list(scenes)
-    rng = np.random.default_rng(seed)
-    mean_range = find_places(read_scenes, task, rng).mean_range
-    permutation = draw_permutation(exchange_groups(mean_range, task.is_goal()), len(mean_range), rng)
-    cycles = tuple(cycle for cycle in permutation_cycles(permutation) if len(cycle) > 1)
-    return {read_scenes[0].room_type: cycles}
+    exchange = {}
+    for room_type, room_scenes in group_by_room(scenes).items():
+        rng = np.random.default_rng(seed)
+        mean_range = find_places(room_scenes, task, rng).mean_range
+        permutation = draw_permutation(group_exchangeable(mean_range, task.is_goal()), len(mean_range), rng)
+        exchange[room_type] = tuple(list_cycles(permutation))
+    return exchange
 
 
-def exchange_groups(mean_range: np.ndarray, is_goal: np.ndarray) -> list[list[int]]:
-    """Categories that may exchange with each other: goals or others, small or large.
+def group_by_room(scenes: Iterable[Scene]) -> dict[str, list[Scene]]:
+    """Group scenes by room type, in alphabetical order."""
+    scenes_by_room: dict[str, list[Scene]] = {}
+    for scene in scenes:
+        scenes_by_room.setdefault(scene.room_type, []).append(scene)
+    return dict(sorted(scenes_by_room.items()))
+
+
+def group_exchangeable(mean_range: np.ndarray, is_goal: np.ndarray) -> list[list[int]]:
+    """Group the categories that may exchange with each other: goals or others, small or large.
 
     Args:
       mean_range: mean detection range of each category, metres, float64 [K]; NaN for absent ones.
@@ -164,6 +170,7 @@ def search_permutation(
     pairs = [(first, second) for group in groups for i, first in enumerate(group) for second in group[i + 1 :]]
     best_score = score(permutation)
     while True:
+        # Try every exchange of two categories of a group, and take the best.
         candidates = []
         for first, second in pairs:
             candidate = permutation.copy()
@@ -184,8 +191,9 @@ def apply_cycles(cycles: Iterable[Sequence[int]], num_categories: int) -> np.nda
     return place_of
 
 
-def permutation_cycles(place_of: np.ndarray) -> list[tuple[int, ...]]:
-    """Cycles of a permutation, the inverse of `apply_cycles`."""
+def list_cycles(place_of: np.ndarray) -> list[tuple[int, ...]]:
+    """List the cycles of a permutation, without categories that stay; the inverse of `apply_cycles`."""
+    # Follow each category to the one that takes its places, until the cycle closes.
     next_of = np.argsort(place_of)
     remaining = set(range(len(place_of)))
     cycles = []
@@ -194,7 +202,8 @@ def permutation_cycles(place_of: np.ndarray) -> list[tuple[int, ...]]:
         while next_of[cycle[-1]] != cycle[0]:
             cycle.append(int(next_of[cycle[-1]]))
         remaining -= set(cycle)
-        cycles.append(tuple(cycle))
+        if len(cycle) > 1:
+            cycles.append(tuple(cycle))
     return cycles
 
 
@@ -209,13 +218,16 @@ def fit_place_weights(places: Places) -> np.ndarray:
     is_penalized = np.append(np.ones(features.shape[1] - 1), 0.0)  # all but the intercept
 
     def loss_and_gradient(flat_weights: np.ndarray) -> tuple[float, np.ndarray]:
+        # Mean cross-entropy with the penalty, and its gradient.
         weights = flat_weights.reshape(num_categories + 1, -1)
         scores = features @ weights.T
         scores -= scores.max(axis=1, keepdims=True)
         log_probabilities = scores - np.log(np.exp(scores).sum(axis=1, keepdims=True))
-        loss = -(labels * log_probabilities).sum() / num_places + WEIGHT_PENALTY * (is_penalized * weights**2).sum()
+        loss = (
+            -(labels * log_probabilities).sum() / num_places + PLACE_WEIGHT_PENALTY * (is_penalized * weights**2).sum()
+        )
         gradient = (np.exp(log_probabilities) - labels).T @ features / num_places
-        return loss, (gradient + 2 * WEIGHT_PENALTY * is_penalized * weights).ravel()
+        return loss, (gradient + 2 * PLACE_WEIGHT_PENALTY * is_penalized * weights).ravel()
 
     start = np.zeros((num_categories + 1) * features.shape[1])
     result = minimize(loss_and_gradient, start, jac=True, method="L-BFGS-B", options={"maxiter": 300})
@@ -230,6 +242,7 @@ def find_places(scenes: Iterable[Scene], task: Task, rng: np.random.Generator) -
     neighbours = []
     range_sums = np.zeros(num_categories)
     for scene in scenes:
+        # Objects first, then empty cells: `_find_neighbours` relies on this order.
         object_category = np.array(category_ids(scene.types, task.categories), int)
         boxes = scene.boxes[object_category >= 0]
         object_category = object_category[object_category >= 0]

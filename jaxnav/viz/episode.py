@@ -44,8 +44,8 @@ SHIFT_CAPTIONS = {0.0: "layout as trained", 1.0: "layout shifted"}
 VARIANT_CAPTIONS = {
     "baseline": "no layout weights",
     "layout": "experience kept",
-    "stde": "experience removed by the gap",
-    "scde": "experience removed by the gap",
+    "stde": "experience removed (sTDE)",
+    "scde": "experience removed (sCDE)",
 }
 
 # Size of a panel, inches.
@@ -164,23 +164,24 @@ def play_episode(
     trace_index = int(np.searchsorted(played_indices, index))
 
     # Replay the episodes with best actions.
+    agent_name = _describe_agent(policies, variants, epsilon)
     requested_episodes = []
     success_by_name = {}
-    for variant, shifted in itertools.product(variants, episodes_by_shift):
+    for variant, shift_episodes in itertools.product(variants, episodes_by_shift):
         row = _variant_row(policies, variant, epsilon)
-        played_episodes = shifted.episodes.take(played_indices)
+        compared_episodes = shift_episodes.episodes.take(played_indices)
         plural = "" if len(played_indices) == 1 else "s"
-        with console.status(f"playing {len(played_indices):,} episode{plural} at shift {shifted.shift:g}"):
-            traces = replay_episodes(policies, shifted.world, played_episodes, row)
+        with console.status(f"playing {len(played_indices):,} episode{plural} at shift {shift_episodes.shift:g}"):
+            traces = replay_episodes(policies, shift_episodes.world, compared_episodes, row)
 
         suffix = f", {VARIANT_CAPTIONS[variant]}" if len(variants) > 1 else ""
-        success_by_name[f"shift {shifted.shift:g}{suffix}"] = [trace.success for trace in traces]
+        success_by_name[f"shift {shift_episodes.shift:g}{suffix}"] = [trace.success for trace in traces]
         requested_episode = _make_played_episode(
             trace=traces[trace_index],
-            shifted=shifted,
+            shifted=shift_episodes,
             index=index,
             epsilon=np.inf if row.epsilon is None else epsilon,
-            agent_name=_describe_agent(policies, variants, epsilon),
+            agent_name=agent_name,
             policies=policies,
             variant=variant,
         )
@@ -194,7 +195,7 @@ def _variant_row(policies: Policies, variant: PlayedVariant, epsilon: float) -> 
     """Row of an evaluation with best actions, in the default form of its removal."""
     form: Form | None = None if policies.estimator_config is None else policies.estimator_config.form
     if variant == "scde":
-        form = "paper"
+        form = "paper"  # interpolates towards the decision without experience
     return table_row(variant, epsilon if variant in ("stde", "scde") else None, form, "argmax")
 
 
@@ -202,7 +203,10 @@ def _load_source(source: str | Path, arms: tuple[str, ...]) -> tuple[RunConfig, 
     """Load a run or an exported policy."""
     if not is_policy(source):
         config = load_run_config(Path(source))
-        return config, load_policies(config, config.arms if set(arms) <= set(config.arms) else arms)
+        missing_arms = sorted(set(arms) - set(config.arms))
+        if missing_arms:
+            raise InputError(f"{source}: was trained without the arm {missing_arms[0]!r}; choose another --variant")
+        return config, load_policies(config, config.arms)
     config, policies = load_policy_as_run(source)
     if not set(arms) <= set(config.arms):
         raise InputError(f"{source}: is a policy of the arm {config.arms[0]!r}; choose another --variant")
@@ -259,7 +263,8 @@ def _report_success(success_by_name: Mapping[str, Sequence[bool]], console: Cons
         success_elsewhere = np.delete(success, i, axis=0).any(axis=0)
         only_here = success[i] & ~success_elsewhere
         console.print(
-            f"{name}: goal found in {success[i].sum()} of {success.shape[1]} episodes, in {only_here.sum()} only here"
+            f"{name}: goal found in {success[i].sum()} of {success.shape[1]} episodes, "
+            f"{only_here.sum()} of them found by no other"
         )
 
 
@@ -269,10 +274,10 @@ def _describe_agent(policies: Policies, variants: Sequence[PlayedVariant], epsil
         "stde": f"layout and sTDE, epsilon {epsilon:g}",
         "scde": f"layout and sCDE, epsilon {epsilon:g}",
         "layout": "layout",
+        "baseline": "no layout weights",
     }
-    names = [variant_names[variant] for variant in variants if variant in variant_names]
-    suffix = f" with {' or '.join(names)}" if names else ""
-    return f"{method_label(policies.spec.method.name)}{suffix}"
+    names = [variant_names[variant] for variant in variants]
+    return f"{method_label(policies.spec.method.name)} with {' or '.join(names)}"
 
 
 def _make_played_episode(
@@ -499,7 +504,8 @@ def _category_color(category: int, episode: PlayedEpisode) -> str:
 def _draw_gap(axes: Axes, episode: PlayedEpisode, step: int, gap_steps: int) -> None:
     """Draw the layout gap so far, on an axis of `gap_steps` steps.
 
-    The filled part above the threshold is the weight with which experience is removed.
+    In the forms `paper` and `residual`, the filled part above the threshold is the weight with which experience is
+    removed; in the form `switch`, all experience is removed where there is a filled part.
     """
     # The gap, and its excess over the threshold.
     axes.clear()

@@ -56,14 +56,14 @@ def test_study_help_lists_experiments_and_settings(capsys):
     assert {*EXPERIMENTS, "--run", "--reference", "--split", "--episodes"} <= set(words)
 
 
-def test_a_variant_is_an_experiment_of_its_own(capsys):
+def test_a_smaller_version_is_an_experiment_of_its_own(capsys):
     assert parse_study(["study", "--config", "quick", "--episodes", "7"]) == parse_study(
         ["study_quick", "--episodes", "7"]
     )
     assert study("study", "--config", "quik") == 2
     assert "--config quik: is unknown; choose from ithor, quick" in refusal(capsys)
     assert study("table2", "--config", "quick") == 2
-    assert "table2 has no variants" in refusal(capsys)
+    assert "table2 has no other version; omit --config" in refusal(capsys)
 
 
 def test_study_lists_the_experiments_for_an_unknown_one(capsys):

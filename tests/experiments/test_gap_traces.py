@@ -120,7 +120,7 @@ def test_calibration_compares_the_mean_gap_of_each_bin_with_the_share_of_shifted
     )
     ((calibration,),) = calibration_at_steps(shifted, unshifted, [0]).values()
     assert calibration.shifted_share.positions == pytest.approx([0.13, 0.95])
-    assert calibration.shifted_share.mean == pytest.approx([100 / 3, 200 / 3])
+    assert calibration.shifted_share.mean == pytest.approx([1 / 3, 2 / 3])
     assert calibration.error.mean == pytest.approx((0.95 - 2 / 3) / 2 + (1 / 3 - 0.13) / 2)
 
 
@@ -141,7 +141,7 @@ def test_a_gap_drawn_from_its_own_probability_is_calibrated():
 
     calibrated = calibrate(gap)
     assert len(calibrated.shifted_share.mean) == 10
-    np.testing.assert_allclose(calibrated.shifted_share.mean, 100 * calibrated.shifted_share.positions, atol=4)
+    np.testing.assert_allclose(calibrated.shifted_share.mean, calibrated.shifted_share.positions, atol=0.04)
     assert calibrated.error.mean < 0.02
     # The mean of |D^2 - D| over uniform D is 1 / 2 - 1 / 3.
     assert calibrate(gap**2).error.mean == pytest.approx(1 / 6, abs=0.01)

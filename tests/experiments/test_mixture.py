@@ -12,6 +12,7 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.mixture import (
+    EVIDENCE_GAPS,
     HARD_CONTROLS,
     LAYOUT_BLIND,
     ORACLE_NAME,
@@ -19,8 +20,8 @@ from jaxnav.experiments.mixture import (
     REMOVAL_RULES,
     WITHOUT_REMOVAL,
     PopulationMetrics,
-    clock_trials,
     join_end_to_end,
+    list_fixed_trials,
     measure_cde,
     measure_handover,
     measure_mixture,
@@ -121,7 +122,7 @@ def test_oracle_keeps_the_value_and_recovers_the_cost():
 
 
 def test_clocks_remove_at_shares_of_the_budget():
-    trials = clock_trials("sample", 150)
+    trials = list_fixed_trials("sample", 150)
     # 0.1, 0.25 and 0.5 of 150 actions, rounded.
     assert list(trials) == [
         *("constant 0.25", "constant 0.5", "constant 0.75"),
@@ -209,7 +210,7 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
     # Every rule is compared with the gap of another episode, the mean gap unless it is a switch, and one clock.
     for rule, own_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
         controls = table.distinct("control", row_fields, variant=str(rule), reference="control")
-        assert controls[:-1] == [*own_controls, PERMUTED_CONTROL]
+        assert controls[:-1] == own_controls + [PERMUTED_CONTROL] * (rule.gap in EVIDENCE_GAPS)
         assert controls[-1] in removals[2:-5]
 
 

@@ -68,7 +68,7 @@ def test_with_estimator_refuses_gaps_without_learned_cooccurrence(drawn_run):
         assert policies.with_estimator(name).estimator_config == dataclasses.replace(
             policies.estimator_config, gap=name
         )
-        with pytest.raises(InputError, match=f"--setting {name}: the run has no evidence from co-occurrence"):
+        with pytest.raises(InputError, match=f"--setting {name}: the run or policy holds no evidence for this gap"):
             without.with_estimator(name)
 
 

@@ -14,11 +14,11 @@ from jaxnav.scenes.context_exchange import (
     Places,
     apply_cycles,
     draw_exchange,
+    find_misleading_cycles,
     find_places,
     fit_context_exchange,
     fit_place_weights,
-    most_misleading_cycles,
-    permutation_cycles,
+    list_cycles,
 )
 from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.task import Task
@@ -134,7 +134,7 @@ def test_search_finds_the_best_of_all_permutations():
     all_scores = []
     for goals, others in itertools.product(itertools.permutations(range(3)), itertools.permutations(range(3, 7))):
         all_scores.append(score([*goals, *others]))
-    cycles = most_misleading_cycles(places, is_goal, np.random.default_rng(0))
+    cycles = find_misleading_cycles(places, is_goal, np.random.default_rng(0))
     assert score(apply_cycles(cycles, 7)) == pytest.approx(min(all_scores), abs=1e-9)
     # Cycles come with the most misleading first.
     alone = [score(apply_cycles([cycle], 7)) for cycle in cycles]
@@ -144,7 +144,7 @@ def test_search_finds_the_best_of_all_permutations():
 @pytest.mark.parametrize("seed", range(20))
 def test_cycles_are_those_of_the_permutation(seed):
     permutation = np.random.default_rng(seed).permutation(9)
-    np.testing.assert_array_equal(apply_cycles(permutation_cycles(permutation), 9), permutation)
+    np.testing.assert_array_equal(apply_cycles(list_cycles(permutation), 9), permutation)
 
 
 def test_random_exchanges_reach_every_permutation_within_the_groups():
