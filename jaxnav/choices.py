@@ -15,6 +15,8 @@ Counts = Literal["presence", "instances"]
 EstimatorName = Literal["paper", "released", "evidence", "learned", "surprise", "overdue", "clock"]
 #: Ways to use policies in an evaluation, and the two references without training.
 Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde", "cde", "scde"]
+#: Ways to use policies in the picture of an episode.
+PlayedVariant = Literal["stde", "scde", "layout", "baseline"]
 #: Parts of a decision whose cost an evaluation measures: other categories in Z, all parts, or none.
 Costs = Literal["categories", "all", "none"]
 #: Causal quantity that a complete removal of experience leaves: the total direct effect (eq. 1), or the decision under

@@ -6,7 +6,7 @@ from typing import Literal
 
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName, ShiftKind
+from jaxnav.choices import EstimatorName, PlayedVariant, ShiftKind
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
 
@@ -45,7 +45,7 @@ class EpisodeConfig:
     split: Literal["train", "val", "test"] = "val"
     index: int = 0
     out: Path | None = None
-    variant: tuple[Literal["stde", "scde", "layout", "baseline"], ...] = ("stde",)
+    variant: tuple[PlayedVariant, ...] = ("stde",)
     epsilon: float = 0.5
     setting: EstimatorName | None = None
     scenes: Path | None = None

@@ -409,23 +409,25 @@ def calibration_at_steps(
         updated_gap = traces.gap[:, UPDATED : UPDATED + 1, ..., list(steps)]
         sides.append(traces._replace(gap=updated_gap, running=traces.running[..., list(steps)]))
 
-    # Statistics by bin: mean and bounds, [bins, 3, estimators, 1, steps].
-    mean_gaps = []
+    # Shares by bin, mean and bounds.
     shifted_shares = []
     for bin_index in range(NUM_CALIBRATION_BINS):
-        mean_gaps.append(_statistic_by_step(functools.partial(_bin_gap, bin_index=bin_index), sides))
-        shifted_shares.append(_statistic_by_step(functools.partial(_bin_share, bin_index=bin_index), sides))
-    bin_gaps = np.stack(mean_gaps)[:, 0, :, 0]  # [bins, estimators, steps]
-    bin_shares = np.stack(shifted_shares)[:, :, :, 0]  # [bins, 3, estimators, steps]
+        share_in_bin = functools.partial(_shifted_share, bin_index=bin_index)
+        shifted_shares.append(_statistic_by_step(share_in_bin, sides)[:, :, 0])
+    bin_shares = np.stack(shifted_shares)  # [bins, 3, estimators, steps]
     errors = _statistic_by_step(_calibration_error, sides)[:, :, 0]  # [3, estimators, steps]
 
     # One curve over the bins with episodes, and one error, for each step and estimator.
     calibrations: dict[int, list[GapCalibration]] = {step: [] for step in steps}
     num_estimators = shifted.gap.shape[0]
     for (step_index, step), estimator in itertools.product(enumerate(steps), range(num_estimators)):
-        gaps = bin_gaps[:, estimator, step_index]
-        has_episodes = np.isfinite(gaps)
-        curve = Curve(gaps[has_episodes], *bin_shares[has_episodes, :, estimator, step_index].T)
+        side_gaps = [side.gap[estimator, 0, ..., step_index][side.running[..., step_index]] for side in sides]
+        gaps = np.concatenate(side_gaps).astype(np.float64)
+        bin_sizes = np.bincount(_bin_indices(gaps), minlength=NUM_CALIBRATION_BINS)
+        bin_sums = np.bincount(_bin_indices(gaps), gaps, NUM_CALIBRATION_BINS)
+        has_episodes = bin_sizes > 0
+        mean_gaps = bin_sums[has_episodes] / bin_sizes[has_episodes]
+        curve = Curve(mean_gaps, *bin_shares[has_episodes, :, estimator, step_index].T)
         interval = Interval(*errors[:, estimator, step_index].tolist())
         calibrations[step].append(GapCalibration(curve, interval))
     return calibrations
@@ -491,32 +493,13 @@ def weighted_auc(
     return divide_or_nan(wins, positive_total * negative_total)
 
 
-def _bin_totals(gaps: Sequence[np.ndarray], weights: Sequence[np.ndarray], bin_index: int) -> tuple[np.ndarray, ...]:
-    """Sum the weights of each side, and the weighted gaps of both sides, over the gaps in a bin; all float64 [R]."""
-    weight_by_side = []
-    gap_total = np.zeros(weights[0].shape[1])
-    for side_gaps, side_weights in zip(gaps, weights, strict=True):
-        bins = np.minimum((NUM_CALIBRATION_BINS * side_gaps).astype(int), NUM_CALIBRATION_BINS - 1)
-        in_bin = bins == bin_index
-        weight_by_side.append(side_weights[in_bin].sum(axis=0, dtype=np.float64))
-        gap_total += side_gaps[in_bin].astype(np.float64) @ side_weights[in_bin]
-    return (*weight_by_side, gap_total)
+def _bin_indices(gaps: np.ndarray) -> np.ndarray:
+    """Bin of each gap, int, from 0 to `NUM_CALIBRATION_BINS` - 1; a gap of 1 is in the last one."""
+    # In the precision of the gaps, so that 0.9 is in the bin from 0.9.
+    return np.minimum((NUM_CALIBRATION_BINS * gaps.astype(np.float32)).astype(int), NUM_CALIBRATION_BINS - 1)
 
 
-def _bin_gap(
-    shifted: np.ndarray,
-    unshifted: np.ndarray,
-    shifted_weights: np.ndarray,
-    unshifted_weights: np.ndarray,
-    bin_index: int,
-) -> np.ndarray:
-    """Mean gap in a bin, float64 [R]; NaN without episodes."""
-    totals = _bin_totals((shifted, unshifted), (shifted_weights, unshifted_weights), bin_index)
-    shifted_total, unshifted_total, gap_total = totals
-    return divide_or_nan(gap_total, shifted_total + unshifted_total)
-
-
-def _bin_share(
+def _shifted_share(
     shifted: np.ndarray,
     unshifted: np.ndarray,
     shifted_weights: np.ndarray,
@@ -524,8 +507,8 @@ def _bin_share(
     bin_index: int,
 ) -> np.ndarray:
     """Share of shifted episodes in a bin, float64 [R]; NaN without episodes."""
-    totals = _bin_totals((shifted, unshifted), (shifted_weights, unshifted_weights), bin_index)
-    shifted_total, unshifted_total, _ = totals
+    shifted_total = shifted_weights[_bin_indices(shifted) == bin_index].sum(axis=0, dtype=np.float64)
+    unshifted_total = unshifted_weights[_bin_indices(unshifted) == bin_index].sum(axis=0, dtype=np.float64)
     return divide_or_nan(shifted_total, shifted_total + unshifted_total)
 
 
@@ -533,15 +516,16 @@ def _calibration_error(
     shifted: np.ndarray, unshifted: np.ndarray, shifted_weights: np.ndarray, unshifted_weights: np.ndarray
 ) -> np.ndarray:
     """Mean absolute difference between mean gap and share of shifted episodes over the bins, float64 [R]."""
-    differences = np.zeros(shifted_weights.shape[1])
-    total = np.zeros_like(differences)
+    # A shifted episode adds its gap less 1 to the difference of its bin, an unshifted one its gap.
+    gaps = np.concatenate([shifted, unshifted]).astype(np.float64)
+    is_shifted = np.arange(len(gaps)) < len(shifted)
+    weights = np.concatenate([shifted_weights, unshifted_weights])
+    bins = _bin_indices(gaps)
+    differences = np.zeros(weights.shape[1])
     for bin_index in range(NUM_CALIBRATION_BINS):
-        # The number of episodes of a bin times the difference of both means.
-        totals = _bin_totals((shifted, unshifted), (shifted_weights, unshifted_weights), bin_index)
-        shifted_total, unshifted_total, gap_total = totals
-        differences += np.abs(gap_total - shifted_total)
-        total += shifted_total + unshifted_total
-    return divide_or_nan(differences, total)
+        in_bin = bins == bin_index
+        differences += np.abs((gaps - is_shifted)[in_bin] @ weights[in_bin])
+    return divide_or_nan(differences, weights.sum(axis=0, dtype=np.float64))
 
 
 def _weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

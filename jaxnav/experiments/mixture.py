@@ -36,7 +36,7 @@ from jaxnav.experiments.trials import (
     mean_removal_weight,
     require_estimator_config,
 )
-from jaxnav.runs.policies import GapName, estimators_by_gap, load_policies
+from jaxnav.runs.policies import EVIDENCE_GAPS, GapName, estimators_by_gap, load_policies
 from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
 
@@ -100,7 +100,6 @@ CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
 }
 #: Control whose evidence has permuted categories, for the gaps that read evidence.
 PERMUTED_CONTROL = "permuted evidence"
-EVIDENCE_GAPS: tuple[GapName, ...] = ("learned", "surprise", "overdue")
 
 
 def measure_mixture(
@@ -223,6 +222,8 @@ def _measure_removals(
         factual_outcomes = runner.run_trials(factual_run, estimator, [hard_trial])
         yield from report.removal_rows("TDE, factual memory", factual_outcomes[hard_trial])
 
+    permuted_run = evaluated_run._replace(policies=policies.with_permuted_evidence(bench.config.seed))
+
     # Every rule is compared with its own controls and with the best removal that follows no gap. The latter is chosen
     # on these very episodes, so the comparison favours the control.
     best_fixed_name = max(outcome_by_fixed, key=lambda name: report.mixture_gain(outcome_by_fixed[name], budgets[-1]))
@@ -239,7 +240,6 @@ def _measure_removals(
         rule_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *control_trials.values()])
         compared_outcomes = {control: rule_outcomes[control_trial] for control, control_trial in control_trials.items()}
         if rule.gap in EVIDENCE_GAPS:
-            permuted_run = evaluated_run._replace(policies=policies.with_permuted_evidence(bench.config.seed))
             compared_outcomes[PERMUTED_CONTROL] = runner.run_trials(permuted_run, rule_estimator, [trial])[trial]
         compared_outcomes[best_fixed_name] = outcome_by_fixed[best_fixed_name]
         yield from report.removal_rows(str(rule), rule_outcomes[trial], compared_outcomes)

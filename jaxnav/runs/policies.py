@@ -46,6 +46,10 @@ PACKAGED_POLICIES = Path(__file__).parents[1] / "weights"
 GapName = Literal["novelty", "evidence", "learned", "surprise", "overdue", "clock"]
 
 
+#: Gaps that read the co-occurrence evidence.
+EVIDENCE_GAPS: tuple[str, ...] = ("learned", "surprise", "overdue")
+
+
 class Policies(NamedTuple):
     """Policies of a run: A arms with S seeds each.
 
@@ -89,12 +93,9 @@ class Policies(NamedTuple):
     def supports_gap(self, gap: str) -> bool:
         """True if the policies hold the evidence that a gap needs; runs of earlier versions lack that of `surprise`."""
         evidence = self.knowledge.cooccurrence
-        match gap:
-            case "learned" | "overdue":
-                return evidence is not None
-            case "surprise":
-                return evidence is not None and evidence.near_log_odds is not None
-        return True
+        if gap not in EVIDENCE_GAPS:
+            return True
+        return evidence is not None and (gap != "surprise" or evidence.near_log_odds is not None)
 
     def arm_params(self, arm: str) -> dict[str, Any]:
         """Parameters of one arm, leaves [S, ...]."""
@@ -157,17 +158,14 @@ class Policies(NamedTuple):
     def with_permuted_evidence(self, seed: int) -> "Policies":
         """Policies whose co-occurrence evidence has randomly permuted categories, as a control.
 
-        The decisions of the policies stay; the gaps `learned`, `surprise` and `overdue`, which read it, change.
+        The decisions of the policies stay, and `EVIDENCE_GAPS` change. Policies without evidence stay as they are.
 
         Args:
           seed: seed of the permutation of the categories.
-
-        Raises:
-          ValueError: the policies have no evidence.
         """
         evidence = self.knowledge.cooccurrence
         if evidence is None:
-            raise ValueError("needs policies with co-occurrence evidence")
+            return self
         permutation = np.random.default_rng(seed).permutation(self.spec.num_categories)
 
         def permute(matrices: jax.Array) -> jax.Array:

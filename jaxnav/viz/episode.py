@@ -8,7 +8,7 @@ the detections and the layout gap.
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure, FigureBase
 from PIL import Image
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName, Form, ShiftKind
+from jaxnav.choices import EstimatorName, Form, PlayedVariant, ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
@@ -59,8 +59,6 @@ LAST_MILLISECONDS = 2500
 NUM_COLORS = 128
 
 _MAX_DETECTIONS = 8  # bars in a panel
-
-PlayedVariant = Literal["stde", "scde", "layout", "baseline"]
 
 
 class PlayedEpisode(NamedTuple):

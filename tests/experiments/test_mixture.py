@@ -12,7 +12,6 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.mixture import (
-    EVIDENCE_GAPS,
     HARD_CONTROLS,
     LAYOUT_BLIND,
     ORACLE_NAME,
@@ -29,6 +28,7 @@ from jaxnav.experiments.mixture import (
 from jaxnav.experiments.table import ResultTable
 from jaxnav.experiments.trials import NEVER
 from jaxnav.runs.evaluate import evaluate
+from jaxnav.runs.policies import EVIDENCE_GAPS
 
 NUM_SCENES, EPISODES_PER_SCENE, NUM_RUNS = 6, 4, 3
 SHIFT = np.repeat([0, 1], NUM_SCENES * EPISODES_PER_SCENE)

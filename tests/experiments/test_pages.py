@@ -14,6 +14,7 @@ from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.config import ExperimentConfig
 from jaxnav.experiments.pages import (
     READING_MARK,
+    RESULT_MARK,
     check_page,
     difference_of_worlds,
     effect_cells,
@@ -21,6 +22,7 @@ from jaxnav.experiments.pages import (
     format_weights,
     format_with_std,
     render_page,
+    result_sections,
     table_header,
     table_line,
     verdict,
@@ -513,3 +515,9 @@ def test_the_papers_numbers_add_up_to_the_gains_that_it_prints(tmp_path, title, 
     for host, gain in gains.items():
         paper_gain = float(cells[f"`{host}` + w + sTDE"][0]) - float(cells[f"`{host}`"][0])
         assert paper_gain == pytest.approx(gain, abs=1e-6)
+
+
+def test_result_sections_are_the_parts_between_the_marks():
+    text = f"head\n{RESULT_MARK}\nfirst\n{RESULT_MARK}\nbetween\n{RESULT_MARK}\nsecond\n{RESULT_MARK}\ntail"
+    assert result_sections(text) == "first\n\nsecond"
+    assert result_sections("no marks") == ""

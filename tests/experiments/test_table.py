@@ -176,6 +176,9 @@ def test_a_file_holds_the_results_of_its_settings_alone(tmp_path):
     assert len(read_part(path, {"split": "val"})) == 1
     assert read_part(path, {"split": "test"}) == []
     assert read_part(path, {"episodes": 1}) == []
+    # Files without the kind of the shift are of earlier versions, which shifted by size.
+    assert len(read_part(path, {"shift_by": "size"})) == 1
+    assert read_part(path, {"shift_by": "context"}) == []
 
 
 GOOD_HEAD = '{"settings": {}, "versions": {}, "format": 4, "shared": {"world": "rooms", "run": "org"}}\n'
