@@ -57,7 +57,7 @@ from jaxnav.runs.share_report import (
     limit_room_episodes,
     list_cost_replacements,
     measure_costs,
-    rows_without_removal,
+    rows_with_shares,
 )
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, prefetch_env_params
 from jaxnav.scenes.scene import Scene
@@ -179,7 +179,7 @@ def evaluate(
     with console.status(_describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
         # Decision shares are counted in a thread: compilations use one core each.
         episode_lists = draw_episode_lists(compiled, episodes, seed)
-        share_rows = rows_without_removal(rows)
+        share_rows = rows_with_shares(rows)
         counting = thread.submit(count_shares, share_rows, policies, compiled, episode_lists, seed)
 
         # Replacements are further rows of the same grid.

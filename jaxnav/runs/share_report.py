@@ -37,15 +37,15 @@ def replaced_parts(row: EvaluationRow) -> list[ReplacedPart]:
     return parts
 
 
-def rows_without_removal(rows: Sequence[EvaluationRow]) -> list[EvaluationRow]:
-    """Rows of policies from which nothing is removed; only these have decision shares."""
-    return [row for row in rows if row.variant in ("baseline", "layout")]
+def rows_with_shares(rows: Sequence[EvaluationRow]) -> list[EvaluationRow]:
+    """Rows that have decision shares: those of policies from which nothing is removed, with best actions."""
+    return [row for row in rows if row.variant in ("baseline", "layout") and row.decoding == "argmax"]
 
 
 def list_cost_replacements(rows: Sequence[EvaluationRow], costs: Costs) -> list[Replacement]:
     """List the replacements whose cost is measured."""
     replacements = []
-    for row in rows_without_removal(rows):
+    for row in rows_with_shares(rows):
         for part in replaced_parts(row):
             if costs == "all" or (costs == "categories" and part == ReplacedPart.OTHER_CATEGORIES):
                 replacements.append(Replacement(row, part))
@@ -70,7 +70,7 @@ def count_shares(
     """Count changed decisions of R rows and S seeds on a few episodes of the evaluation.
 
     Args:
-      rows: rows with decision shares, see `rows_without_removal`.
+      rows: rows with decision shares, see `rows_with_shares`.
       policies: policies with S seeds of each arm.
       world: compiled scenes.
       episode_lists: the evaluation's episodes, for each bank.

@@ -92,8 +92,9 @@ def test_evaluation_reports_a_deviation_over_seeds_of_trained_rows_alone(evaluat
 def test_every_policy_row_has_decision_shares(evaluated):
     entries = evaluated.report["decision_shares"]
     parts = {"baseline": 4, "layout": 6}
-    assert len(entries) == 2 * sum(parts.values())
+    assert len(entries) == sum(parts.values())
     for entry in entries:
+        assert entry["decoding"] == "argmax"
         assert min(entry["weighted_decisions"]) > 0
         assert 0.0 <= entry["share"]["mean"] <= 100.0
         assert len(entry["share"]["seeds"]) == 2
@@ -101,7 +102,7 @@ def test_every_policy_row_has_decision_shares(evaluated):
         assert (entry["partner_difference"] is None) == entry["part"].endswith("_weights")
         assert (entry["cost"] is None) == (entry["part"] != "other_categories")
     for variant, num_parts in parts.items():
-        assert sum(entry["variant"] == variant for entry in entries) == 2 * num_parts
+        assert sum(entry["variant"] == variant for entry in entries) == num_parts
 
 
 def test_evaluation_notes_describe_the_rows_and_the_run(evaluated):
