@@ -21,7 +21,7 @@ SPLITS = ("train", "val", "test")
 
 #: Names of scenes that share their walls with others: apartments, and rooms with their objects moved.
 _FURNISHING_NAME = re.compile(
-    r"(FloorPlan_[A-Za-z]+[0-9]+)_[0-9]+|((?:train|val|test)-apartment-[0-9]+)-[0-9]+|(.+)-replaced-[0-9]+"
+    r"(FloorPlan_.*[^0-9_][0-9]+)_[0-9]+|((?:train|val|test)-apartment-[0-9]+)-[0-9]+|(.+)-replaced-[0-9]+"
 )
 
 
@@ -74,8 +74,8 @@ def floor_plan_name(name: str) -> str:
     """Return the name of the floor plan, derived from a scene's name.
 
     Scenes of one floor plan are alike, and count as one in statistics: `FloorPlan_Train3_1` and `FloorPlan_Train3_5`,
-    `val-apartment-02-0` and `val-apartment-02-4`, `FloorPlan7` and `FloorPlan7-replaced-2`. Any other scene has a floor
-    plan of its own with the scene's name.
+    `FloorPlan_test-dev1_1` and `FloorPlan_test-dev1_2`, `val-apartment-02-0` and `val-apartment-02-4`, `FloorPlan7` and
+    `FloorPlan7-replaced-2`. Any other scene has a floor plan of its own with the scene's name.
     """
     # Suffixes can be nested, for example an apartment with its objects moved.
     name_match = _FURNISHING_NAME.fullmatch(name)
