@@ -8,6 +8,7 @@ reads one value from the command line.
 import dataclasses
 import difflib
 import math
+import re
 import reprlib
 import types
 import typing
@@ -31,13 +32,17 @@ RENAMED_SETTINGS = {
     "without": "reference",
 }
 
+#: Numbers that YAML 1.1 does not read as decimal ones: 010 is 8 there, and 1:30 is 90.
+_AMBIGUOUS_NUMBER = re.compile(r"[-+]?(0[0-9_]+|[0-9_]+(:[0-9_]+)+(\.[0-9_]*)?)")
+
 
 def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] = CONFIGS) -> Config:
     """Apply a YAML configuration to a dataclass.
 
     Only fields that the file names change, and each value is checked against the annotation of its field. Supported
     annotations are `bool`, `int`, `float`, `str`, `Path`, `Any`, `Literal`, `X | None`, `tuple`, `dict` and nested
-    dataclasses. A float field also accepts whole numbers, and text such as `3e-4` (which is text in YAML 1.1).
+    dataclasses. A float field also accepts whole numbers, and text such as `3e-4` (which is text in YAML 1.1). Numbers
+    that YAML 1.1 reads as octal or in base 60 are refused, and so are those beyond the range of floats.
 
     Args:
       default: instance of a frozen dataclass.
@@ -65,7 +70,11 @@ def parse_setting(text: str, annotation: Any) -> Any:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Safe YAML loader that refuses repeated keys, of which `SafeLoader` would silently use the last."""
+    """Safe YAML loader that refuses repeated keys, of which `SafeLoader` would silently use the last.
+
+    Numbers that are not decimal to every reader (`_AMBIGUOUS_NUMBER`), or beyond the range of floats, stay text, so
+    that errors can quote them.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         mapping_keys = set()
@@ -77,6 +86,18 @@ class _UniqueKeyLoader(yaml.SafeLoader):
                 raise yaml.MarkedYAMLError(problem=problem, problem_mark=key_node.start_mark)
             mapping_keys.add(key_node.value)
         return super().construct_mapping(node, deep)
+
+    def construct_decimal_int(self, node: yaml.ScalarNode) -> int | str:
+        text = self.construct_scalar(node)
+        return text if _is_ambiguous(text) else self.construct_yaml_int(node)
+
+    def construct_finite_float(self, node: yaml.ScalarNode) -> float | str:
+        text = self.construct_scalar(node)
+        return text if _is_ambiguous(text) or _is_too_large(text) else self.construct_yaml_float(node)
+
+
+_UniqueKeyLoader.add_constructor("tag:yaml.org,2002:int", _UniqueKeyLoader.construct_decimal_int)
+_UniqueKeyLoader.add_constructor("tag:yaml.org,2002:float", _UniqueKeyLoader.construct_finite_float)
 
 
 def _load_yaml(path: Path, configs: Mapping[str, Path]) -> Any:
@@ -201,16 +222,31 @@ def _convert_dict(value: Any, arguments: tuple[Any, ...]) -> dict[Any, Any]:
 
 
 def _convert_float(value: Any) -> float:
-    if type(value) not in (int, float, str):
+    # YAML reads some notations, such as 1e-3, as text.
+    if type(value) not in (int, float, str) or _is_ambiguous(value) or _is_too_large(value):
         raise _MismatchError
     try:
-        # YAML reads some notations, such as 1e-3, as text.
         float_value = float(value)
-    except (ValueError, OverflowError):
+    except ValueError:
         raise _MismatchError from None
     if math.isnan(float_value):
         raise _MismatchError
     return float_value
+
+
+def _is_ambiguous(value: Any) -> bool:
+    """Return True for the text of a number that YAML 1.1 does not read as decimal."""
+    return isinstance(value, str) and _AMBIGUOUS_NUMBER.fullmatch(value) is not None
+
+
+def _is_too_large(value: Any) -> bool:
+    """Return True for a number beyond the range of floats; infinity itself has a name."""
+    try:
+        return math.isinf(float(value)) and isinstance(value, str) and "inf" not in value.lower()
+    except OverflowError:
+        return True
+    except (TypeError, ValueError):
+        return False
 
 
 def _describe_type(annotation: Any) -> str:
@@ -233,4 +269,10 @@ def _describe_type(annotation: Any) -> str:
 
 
 def _describe_value(value: Any) -> str:
-    return "null" if value is None else f"{reprlib.repr(value)} ({type(value).__name__})"
+    if value is None:
+        return "null"
+    if _is_ambiguous(value):
+        return f"{value}, which YAML 1.1 reads as {yaml.safe_load(value)}"
+    if type(value) in (int, str) and _is_too_large(value):
+        return f"{reprlib.repr(value)}, which is too large"
+    return f"{reprlib.repr(value)} ({type(value).__name__})"

@@ -264,6 +264,10 @@ def fit_scene_exchange(scenes: Scenes | Sequence[Scene], task: Task) -> ContextE
     return context_exchange
 
 
+#: Largest number of scenes of a split; their numbers fit into 32 bits.
+_MAX_GENERATED_SCENES = 2**32
+
+
 def make_generated_scenes(world: str, split: str, count: int | None = None, seed: int = 0) -> GeneratedScenes:
     """Return the scenes of one split of a generated world, which are generated on access.
 
@@ -281,8 +285,9 @@ def make_generated_scenes(world: str, split: str, count: int | None = None, seed
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}")
     _check_split(split)
     count = WORLDS[world].counts[split] if count is None else count
-    if count < 1:
-        raise InputError(f"world {world!r}: {count} scenes of split {split!r}; request at least one")
+    if not 1 <= count <= _MAX_GENERATED_SCENES:
+        expected = f"request 1 to {_MAX_GENERATED_SCENES:,}"
+        raise InputError(f"world {world!r}: {count} scenes of split {split!r}; {expected}")
     if seed < 0:
         raise InputError(f"world {world!r}: seed {seed}; give a number of at least 0")
     return GeneratedScenes(world, split, count, seed)

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from support.refusals import assert_message_names
 
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig
@@ -103,6 +104,52 @@ def test_apply_yaml_refuses_values_of_wrong_types(overlay, text, key, expected, 
         overlay(text)
     for part in ("config.yaml: ", f" {key} ", expected, wrong_type):
         assert part in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "problem"),
+    [
+        # YAML 1.1 reads these as octal or in base 60; the command line and YAML 1.2 read 010 as 10.
+        ("limit: 010", "limit", "010, which YAML 1.1 reads as 8"),
+        ("ppo: {epochs: -010}", "ppo.epochs", "-010, which YAML 1.1 reads as -8"),
+        ("limit: 1:30", "limit", "1:30, which YAML 1.1 reads as 90"),
+        ("epsilons: [0.1, 010]", "epsilons", "[0.1, '010']"),
+        ("ppo: {learning_rate: 010}", "ppo.learning_rate", "010, which YAML 1.1 reads as 8"),
+        ("ppo: {learning_rate: 1:30.5}", "ppo.learning_rate", "1:30.5, which YAML 1.1 reads as 90.5"),
+        # Numbers that would overflow, or silently become infinite.
+        (f"ppo: {{learning_rate: 1{'0' * 400}}}", "ppo.learning_rate", "which is too large"),
+        ("ppo: {learning_rate: 1e400}", "ppo.learning_rate", "'1e400', which is too large"),
+        ("ppo: {learning_rate: 1.0e+400}", "ppo.learning_rate", "'1.0e+400', which is too large"),
+    ],
+)
+def test_apply_yaml_refuses_ambiguous_and_too_large_numbers(overlay, text, key, problem):
+    with pytest.raises(InputError) as error:
+        overlay(text)
+    assert_message_names(error.value, "config.yaml: ", f"{key} must be", problem, "; change the value")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("limit: 0", Config(limit=0)),
+        ("limit: 0x10", Config(limit=16)),
+        ("limit: 1_000", Config(limit=1000)),
+        ("limit: -7", Config(limit=-7)),
+        ("ppo: {learning_rate: 0.5}", Config(ppo=Ppo(learning_rate=0.5, epochs=2))),
+        ("ppo: {learning_rate: -.inf}", Config(ppo=Ppo(learning_rate=float("-inf"), epochs=2))),
+        ("ppo: {learning_rate: Infinity}", Config(ppo=Ppo(learning_rate=float("inf"), epochs=2))),
+    ],
+)
+def test_apply_yaml_reads_numbers_with_one_meaning(overlay, text, expected):
+    assert overlay(text) == expected
+
+
+@pytest.mark.parametrize("seed", ["010", "1:30"])
+def test_settings_of_a_run_refuse_ambiguous_seeds(tmp_path, seed):
+    path = tmp_path / "config.yaml"
+    path.write_text(f"seed: {seed}")
+    with pytest.raises(InputError, match=f"seed must be int, but is {seed}, which YAML 1.1 reads as"):
+        apply_yaml(RunConfig(), path)
 
 
 @pytest.mark.parametrize(

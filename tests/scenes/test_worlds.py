@@ -33,3 +33,9 @@ def test_scene_source_of_a_file_without_scenes_defaults_to_rooms(tmp_path):
     assert SceneSource(str(scene_file)).world_name == "rooms"
     with pytest.raises(InputError, match="cannot be read"):
         _ = SceneSource(str(tmp_path / "absent.jsonl.gz")).world_name
+
+
+@pytest.mark.parametrize("number", [2**32, 2**63, 10**23])
+def test_scene_source_refuses_indices_that_are_too_large(number):
+    with pytest.raises(InputError, match=f"{number + 1} scenes of split 'val'; request 1 to 4,294,967,296"):
+        SceneSource("rooms").select_scene(index=number)
