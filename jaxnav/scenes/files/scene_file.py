@@ -2,10 +2,11 @@
 
 `read_scenes` and `write_scenes` convert between files `*.jsonl.gz` (docs/scene_format.md) and `Scene`s;
 `iterate_scenes` reads line by line and reports bad scenes instead of raising. `derive_walls` gives scenes walls where
-their file has none. The importers of other formats use `read_bytes`, `parse_json` and `JsonRecord` too: every error
-names the place of the bad value and how to fix it.
+their file has none. The importers of other formats read files by the functions of this module too: they skip blank
+lines, byte order marks and hidden files, and every error names the place of the bad value and how to fix it.
 """
 
+import codecs
 import dataclasses
 import gzip
 import io
@@ -78,7 +79,7 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
       InputError: the file is missing or damaged.
     """
     line_by_name: dict[str, int] = {}
-    for line_number, line_bytes in enumerate(read_bytes(path).splitlines(), start=1):
+    for line_number, line_bytes in numbered_lines(read_bytes(path)):
         try:
             record = _parse_line(path, line_number, line_bytes)
             scene = _decode_scene(record)
@@ -222,6 +223,45 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
+def numbered_lines(content: bytes) -> list[tuple[int, bytes]]:
+    """Return number and text of each line that is not blank; numbers begin at 1."""
+    text_lines: list[tuple[int, bytes]] = []
+    for line_number, line_bytes in enumerate(content.splitlines(), start=1):
+        if line_bytes.removeprefix(codecs.BOM_UTF8).strip():
+            text_lines.append((line_number, line_bytes))
+    return text_lines
+
+
+def read_json_texts(path: Path) -> list[tuple[str, bytes]]:
+    """Read the JSON texts of a file, whether it is one text or has one on every line.
+
+    Returns:
+      Location and text of each; none for a file of lines that are all blank.
+
+    Raises:
+      InputError: the file is missing or damaged.
+    """
+    content = read_bytes(path)
+    text_lines = numbered_lines(content)
+
+    # The first line is JSON by itself only in a file of lines; the name decides for damaged files.
+    has_json_lines = path.name.removesuffix(".gz").endswith(".jsonl")
+    if text_lines and not has_json_lines:
+        try:
+            parse_json(str(path), text_lines[0][1])
+            has_json_lines = True
+        except InputError:
+            has_json_lines = False
+    if not has_json_lines:
+        return [(str(path), content)]
+    return [(f"{path}, line {line_number}", line_bytes) for line_number, line_bytes in text_lines]
+
+
+def list_visible_files(folder: Path) -> list[Path]:
+    """Return the sorted members of a folder, without hidden ones such as the `._*` that archives of macOS add."""
+    return sorted(member for member in folder.iterdir() if not member.name.startswith("."))
+
+
 def max_decompressed_size(compressed_size: int) -> int:
     """Return the number of bytes that a gzip file of `compressed_size` bytes may hold.
 
@@ -231,13 +271,13 @@ def max_decompressed_size(compressed_size: int) -> int:
 
 
 def parse_json(location: str, text: bytes) -> Any:
-    """Parse JSON.
+    """Parse JSON, with or without a byte order mark.
 
     Raises:
       InputError: the bytes are not JSON.
     """
     try:
-        return json.loads(text.decode())
+        return json.loads(text.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{location}: not JSON ({error}); give valid JSON") from error
 

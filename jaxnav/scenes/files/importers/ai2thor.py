@@ -13,7 +13,6 @@
 
 import dataclasses
 import importlib
-import json
 import re
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,8 +22,22 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
-from jaxnav.scenes.files.importers.assemble import SceneObject, build_scene_from_cells, lattice_cells, scene_or_error
-from jaxnav.scenes.files.scene_file import JsonRecord, parse_json, read_bytes, read_scenes
+from jaxnav.scenes.files.importers.assemble import (
+    SceneObject,
+    build_scene_from_cells,
+    lattice_cells,
+    read_bounding_box,
+    scene_or_error,
+)
+from jaxnav.scenes.files.scene_file import (
+    JsonRecord,
+    list_visible_files,
+    numbered_lines,
+    parse_json,
+    read_bytes,
+    read_json_texts,
+    read_scenes,
+)
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.scene import CELL_SIZE, Scene
 
@@ -94,14 +107,14 @@ def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
     """
     metadata_files = [path]
     if path.is_dir():
-        metadata_files = sorted(
-            metadata_file for metadata_file in path.iterdir() if metadata_file.name.endswith(_METADATA_ENDINGS)
-        )
+        metadata_files = [file for file in list_visible_files(path) if file.name.endswith(_METADATA_ENDINGS)]
         if not metadata_files:
             raise InputError(f"{path}: holds no file {', '.join(_METADATA_ENDINGS)}; give the folder of the metadata")
     for metadata_file in metadata_files:
         try:
-            record_texts = _read_record_texts(metadata_file)
+            record_texts = read_json_texts(metadata_file)
+            if not record_texts:
+                raise InputError(f"{metadata_file}: holds no record; write one JSON object per line")
         except InputError as error:
             if metadata_file == path:
                 raise
@@ -109,21 +122,6 @@ def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
             continue
         for location, record_text in record_texts:
             yield scene_or_error(_build_scene_from_text, location, record_text, split)
-
-
-def _read_record_texts(path: Path) -> list[tuple[str, bytes]]:
-    """Return location and text of each record of a file."""
-    content = read_bytes(path)
-    if ".jsonl" not in path.suffixes:
-        return [(str(path), content)]
-    record_lines = content.splitlines()
-    if not record_lines:
-        raise InputError(f"{path}: holds no record; write one JSON object per line")
-
-    record_texts: list[tuple[str, bytes]] = []
-    for line_number, line_bytes in enumerate(record_lines, start=1):
-        record_texts.append((f"{path}, line {line_number}", line_bytes))
-    return record_texts
 
 
 def _build_scene_from_text(location: str, record_text: bytes, split: str) -> Scene:
@@ -222,9 +220,7 @@ def _parse_box(object_row: JsonRecord, floor_height: float) -> list[float]:
     box_size = [0.0, 0.0, 0.0]
     box_field = "axisAlignedBoundingBox"
     if object_row.fields.get(box_field) is not None:
-        bounding_box = object_row.get_record(box_field)
-        box_centre = bounding_box.get_record("center").get_numbers()
-        box_size = bounding_box.get_record("size").get_numbers()
+        box_centre, box_size = read_bounding_box(object_row.get_record(box_field))
     elif object_row.fields.get("bounds3D") is not None:
         # Older releases give the low and the high corner.
         box_field = "bounds3D"
@@ -357,7 +353,7 @@ def read_scene_data(path: Path, split: str) -> Iterator[Scene | InputError]:
         raise InputError(f"{path}: is not a folder; give Scene_Data or the folder of one scene")
     scene_folders = [path]
     if not _is_scene_folder(path):
-        scene_folders = sorted(scene_folder for scene_folder in path.iterdir() if _is_scene_folder(scene_folder))
+        scene_folders = [folder for folder in list_visible_files(path) if _is_scene_folder(folder)]
     if not scene_folders:
         raise InputError(
             f"{path}: holds no scene; give a folder with subfolders that have {_GRID_FILE} and {_MAP_FILES[0]}"
@@ -471,10 +467,10 @@ def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
       InputError: one of the files cannot be read, or `path` is empty.
     """
     base_rooms = _read_base_rooms(base)
-    room_lines = read_bytes(path).splitlines()
+    room_lines = numbered_lines(read_bytes(path))
     if not room_lines:
         raise InputError(f"{path}: holds no room; write one JSON object per line")
-    for line_number, line_bytes in enumerate(room_lines, start=1):
+    for line_number, line_bytes in room_lines:
         # Check the room once, for all of its sets.
         try:
             line_record = JsonRecord(f"{path}, line {line_number}", {})
@@ -497,8 +493,8 @@ def _read_base_rooms(base: Path) -> dict[str, tuple[Scene, np.ndarray]]:
     """Return scene and pivot offsets (`_pivot_offsets`) of each room by name."""
     base_scenes = read_scenes(base)  # also checks the fields that are read below
     base_rooms: dict[str, tuple[Scene, np.ndarray]] = {}
-    for scene, line_bytes in zip(base_scenes, read_bytes(base).splitlines(), strict=True):
-        base_rooms[scene.name] = (scene, _pivot_offsets(scene, json.loads(line_bytes)))
+    for scene, (_, line_bytes) in zip(base_scenes, numbered_lines(read_bytes(base)), strict=True):
+        base_rooms[scene.name] = (scene, _pivot_offsets(scene, parse_json(str(base), line_bytes)))
     return base_rooms
 
 

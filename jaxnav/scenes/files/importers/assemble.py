@@ -16,6 +16,9 @@ from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene
 
 Arguments = ParamSpec("Arguments")
 
+#: Fields of a bounding box; see `read_bounding_box`.
+BOX_FIELDS = frozenset({"center", "size", "min", "max"})
+
 _MARGIN = 3  # cells around the standable ones; a cell beyond them is indistinguishable from a wall
 
 
@@ -55,6 +58,19 @@ def scene_or_error(
         return build(*args, **kwargs)
     except InputError as error:
         return error
+
+
+def read_bounding_box(box: JsonRecord) -> tuple[list[float], list[float]]:
+    """Read centre and full size of a box, metres, from its `center` and `size` or from its corners `min` and `max`.
+
+    Raises:
+      InputError: a field is missing or is no number.
+    """
+    if not {"min", "max"} & set(box.fields):
+        return box.get_record("center").get_numbers(), box.get_record("size").get_numbers()
+    low_corner = np.array(box.get_record("min").get_numbers())
+    high_corner = np.array(box.get_record("max").get_numbers())
+    return ((low_corner + high_corner) / 2).tolist(), (high_corner - low_corner).tolist()
 
 
 def lattice_cells(record: JsonRecord, field: str, points: Sequence[Sequence[float]]) -> np.ndarray:

@@ -21,7 +21,7 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES
 from jaxnav.scenes.files.importers.assemble import SceneObject, build_scene_from_cells, lattice_cells, scene_or_error
 from jaxnav.scenes.files.importers.pickled_arrays import PickledArray, read_pickle
-from jaxnav.scenes.files.scene_file import JsonRecord, parse_json, read_bytes
+from jaxnav.scenes.files.scene_file import JsonRecord, list_visible_files, parse_json, read_bytes
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import connected_parts, standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene
@@ -145,7 +145,7 @@ def list_episode_files(path: Path) -> list[Path]:
         folder = folder / "content"
     elif folder != path:
         return [path]
-    folder_files = sorted(folder.glob("*.json.gz"))
+    folder_files = [file for file in list_visible_files(folder) if file.name.endswith(".json.gz")]
 
     # SemExp keeps `X_episodes.json.gz` next to Habitat's `X.json.gz` or `X.glb.json.gz`, which it does not use.
     file_stems = {file.name.split(".")[0] for file in folder_files}

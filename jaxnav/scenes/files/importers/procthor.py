@@ -8,7 +8,6 @@ to the categories of the worlds (`normalize_object_type`).
 
 import dataclasses
 import functools
-import io
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, ITHOR_CATEGORIES, ROBOTHOR_CATEGORIES, category_ids
 from jaxnav.scenes.files.importers.assemble import (
+    BOX_FIELDS,
     ImportNote,
     SceneObject,
     build_scene,
@@ -27,9 +27,10 @@ from jaxnav.scenes.files.importers.assemble import (
     lattice_cells,
     object_boxes,
     points_in_polygon,
+    read_bounding_box,
     subtract_openings,
 )
-from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, parse_json, read_bytes
+from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, parse_json, read_bytes, read_json_texts
 from jaxnav.scenes.generate.rooms import AGENT_RADIUS, OBSTACLE_HEIGHTS
 from jaxnav.scenes.generate.sizes import typical_box, typical_boxes
 from jaxnav.scenes.lattice import cells_near_boxes, cells_touching_boxes
@@ -171,35 +172,18 @@ def read_procthor(
 
 def _iterate_houses(path: Path) -> Iterator[tuple[str, Any]]:
     """Yield the location of each house and its JSON; for a line that is not JSON its error."""
-    content = read_bytes(path)
-    if not _has_json_lines(path, content):
-        yield from _iterate_values(str(path), parse_json(str(path), content))
-        return
-    for line_number, line_bytes in enumerate(io.BytesIO(content), start=1):
-        if line_bytes.strip():
-            location = f"{path}, line {line_number}"
-            try:
-                house_value = parse_json(location, line_bytes)
-            except InputError as error:
-                house_value = error
-            yield from _iterate_values(location, house_value)
+    for location, house_text in read_json_texts(path):
+        try:
+            house_value = parse_json(location, house_text)
+        except InputError as error:
+            # A damaged line leaves the other lines of a file.
+            if location == str(path):
+                raise
+            house_value = error
 
-
-def _iterate_values(location: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield a house, or each house of a list, with its location."""
-    for house in value if isinstance(value, list) else [value]:
-        yield location, house
-
-
-def _has_json_lines(path: Path, content: bytes) -> bool:
-    """Return True where each line is JSON by itself; for damaged files the name decides."""
-    # The first line that is not blank is JSON by itself only in a file of lines.
-    first_line = next((line for line in io.BytesIO(content) if line.strip()), b"")
-    try:
-        parse_json(str(path), first_line)
-    except InputError:
-        return ".jsonl" in path.name
-    return True
+        # A text holds one house, or a list of houses.
+        for house in house_value if isinstance(house_value, list) else [house_value]:
+            yield location, house
 
 
 def _build_house(house: JsonRecord, name: str, split: str, objects: Sequence[SceneObject]) -> Scene:
@@ -391,11 +375,19 @@ def read_assets(path: Path) -> dict[str, AssetInfo]:
                 type_name = asset.check_text("objectType", type_name)
             asset_size = asset.fields.get("boundingBox")
             if asset_size is not None:
-                asset_size = asset.check_record("boundingBox", asset_size).get_numbers()
+                asset_size = _read_asset_size(asset.check_record("boundingBox", asset_size))
             if asset_size and min(asset_size) < 0:
                 raise asset.error("boundingBox", f"is {asset_size}; give sizes of at least 0")
             asset_by_id[asset.check_text("assetId", asset_id)] = AssetInfo(type_name, asset_size)
     return asset_by_id
+
+
+def _read_asset_size(box: JsonRecord) -> list[float]:
+    """Read the size of an asset, which is {x, y, z} itself or follows from another form of its box."""
+    if "x" in box.fields or not BOX_FIELDS & set(box.fields):
+        return box.get_numbers()
+    _, asset_size = read_bounding_box(box)
+    return asset_size
 
 
 def read_objects(house: JsonRecord, assets: dict[str, AssetInfo]) -> HouseObjects:
