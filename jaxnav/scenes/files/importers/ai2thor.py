@@ -196,18 +196,17 @@ def _parse_objects(record: JsonRecord, floor_height: float) -> list[SceneObject]
     if not object_rows:
         raise record.error("objects", "holds no object except walls and floors; give at least one")
 
-    # Receptacles are named by id, and the smallest of them counts.
-    index_by_id: dict[str, int] = {}
+    # Receptacles are named by id, which several objects may share.
+    indices_by_id: dict[str, list[int]] = {}
     for object_index, object_row in enumerate(object_rows):
-        index_by_id[object_row.get_text("objectId")] = object_index
+        indices_by_id.setdefault(object_row.get_text("objectId"), []).append(object_index)
     object_boxes = [_parse_box(object_row, floor_height) for object_row in object_rows]
-    box_volumes = [float(np.prod(box[3:])) for box in object_boxes]
 
     # Parents are indices into the same rows.
     scene_objects: list[SceneObject] = []
     for object_index, object_row in enumerate(object_rows):
         (yaw,) = object_row.get_record("rotation").get_numbers("y")
-        parent_index = _smallest_receptacle(object_row, object_index, index_by_id, box_volumes)
+        parent_index = _smallest_receptacle(object_row, object_index, indices_by_id, object_boxes)
         scene_objects.append(
             SceneObject(object_row.get_text("objectType"), object_boxes[object_index], yaw, parent_index)
         )
@@ -238,28 +237,37 @@ def _parse_box(object_row: JsonRecord, floor_height: float) -> list[float]:
 
 
 def _smallest_receptacle(
-    object_row: JsonRecord, object_index: int, index_by_id: Mapping[str, int], box_volumes: Sequence[float]
+    object_row: JsonRecord,
+    object_index: int,
+    indices_by_id: Mapping[str, Sequence[int]],
+    object_boxes: Sequence[Sequence[float]],
 ) -> int:
     """Return the index of the smallest receptacle of an object, or -1; a drawer is more specific than its desk.
 
     Args:
       object_row: the object.
       object_index: index of the object.
-      index_by_id: index of each object.
-      box_volumes: volumes of the objects' boxes.
+      indices_by_id: indices of the objects with each id.
+      object_boxes: boxes of the objects, centre and full size.
     """
     receptacle_ids = object_row.fields.get("parentReceptacles")
     if receptacle_ids is None:
         return -1
+
+    def centre_distance(receptacle_index: int) -> float:
+        return float(np.linalg.norm(np.subtract(object_boxes[receptacle_index], object_boxes[object_index])[:3]))
+
+    def box_volume(receptacle_index: int) -> float:
+        return float(np.prod(object_boxes[receptacle_index][3:]))
+
     receptacle_indices: list[int] = []
     for receptacle_id in object_row.check_list("parentReceptacles", receptacle_ids):
-        # Ids of the shell of the room and of objects outside the record are unknown.
-        receptacle_index = (
-            index_by_id.get(receptacle_id, object_index) if isinstance(receptacle_id, str) else object_index
-        )
-        if receptacle_index != object_index:
-            receptacle_indices.append(receptacle_index)
-    return min(receptacle_indices, key=box_volumes.__getitem__, default=-1)
+        # Ids of the shell of the room and of objects outside the record are unknown; of equal ids the nearest counts.
+        same_id_indices = indices_by_id.get(receptacle_id, ()) if isinstance(receptacle_id, str) else ()
+        other_indices = [index for index in same_id_indices if index != object_index]
+        if other_indices:
+            receptacle_indices.append(min(other_indices, key=centre_distance))
+    return min(receptacle_indices, key=box_volume, default=-1)
 
 
 def box_at_pivot(object_type: str, x: float, y: float, z: float) -> list[float]:

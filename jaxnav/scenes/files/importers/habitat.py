@@ -10,6 +10,7 @@ from `origin[0] + 5 j` to `+ 5` cm.
 
 import dataclasses
 import itertools
+import re
 import reprlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,6 +26,9 @@ from jaxnav.scenes.files.scene_file import JsonRecord, list_visible_files, parse
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import connected_parts, standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene
+
+# Endings of the files of scenes; any other dot belongs to the name of a scene.
+_MESH_ENDING = re.compile(r"(\.basis|\.semantic)?\.(glb|gltf|obj|ply)\Z|\.scene_instance(\.json)?\Z")
 
 # Floors by the starts of episodes.
 _FLOOR_TOLERANCE = 0.5  # metres above or below a floor's height that still belong to it
@@ -148,12 +152,17 @@ def list_episode_files(path: Path) -> list[Path]:
     folder_files = [file for file in list_visible_files(folder) if file.name.endswith(".json.gz")]
 
     # SemExp keeps `X_episodes.json.gz` next to Habitat's `X.json.gz` or `X.glb.json.gz`, which it does not use.
-    file_stems = {file.name.split(".")[0] for file in folder_files}
+    scene_names = [_strip_mesh_ending(file.name.removesuffix(".json.gz")) for file in folder_files]
     episode_files: list[Path] = []
-    for file in folder_files:
-        if f"{file.name.split('.')[0]}_episodes" not in file_stems:
+    for file, scene_name in zip(folder_files, scene_names, strict=True):
+        if f"{scene_name}_episodes" not in scene_names:
             episode_files.append(file)
     return episode_files
+
+
+def _strip_mesh_ending(mesh: str) -> str:
+    """Return the name of the scene in a file such as `house.1.glb`: `house.1`."""
+    return _MESH_ENDING.sub("", mesh) or mesh
 
 
 def read_episodes(file: Path) -> list[SceneEpisodes]:
@@ -169,7 +178,7 @@ def read_episodes(file: Path) -> list[SceneEpisodes]:
     scene_by_name: dict[str, SceneEpisodes] = {}
     for index, episode in enumerate(file_record.iterate_records("episodes", file_record.get("episodes"))):
         mesh = episode.get_text("scene_id").rsplit("/", 1)[-1]
-        name = mesh.split(".")[0]
+        name = _strip_mesh_ending(mesh)
         location = f"{file}, scene {reprlib.repr(name)}"
         scene = scene_by_name.setdefault(name, SceneEpisodes(JsonRecord(location, file_content), name, mesh, []))
         scene.episodes.append(JsonRecord(f"{location}: episodes[{index}]", episode.fields))
@@ -185,7 +194,8 @@ def read_position(record: JsonRecord, field: str = "position") -> list[float]:
 def collect_goals(scene: SceneEpisodes) -> list[JsonRecord]:
     """Return the goal objects, each once.
 
-    They are those of the scene's categories, or else those of its episodes.
+    They are those of the scene's categories, or else those of its episodes. An object is listed again where id,
+    category and place are equal; ids alone need not be unique.
     """
     # Lists of goals: the record that holds the list, its field and the goals.
     goal_lists: list[tuple[JsonRecord, str, Any]] = []
@@ -199,14 +209,14 @@ def collect_goals(scene: SceneEpisodes) -> list[JsonRecord]:
             if list_field.startswith(f"{scene.mesh}_"):
                 goal_lists.append((category_record, list_field, goals))
 
-    # Goals without an id are distinguished by their positions.
-    goal_by_id: dict[Any, JsonRecord] = {}
+    goal_by_identity: dict[Any, JsonRecord] = {}
     for record, list_field, goals in goal_lists:
         for goal in record.iterate_records(list_field, goals):
             object_id = goal.fields.get("object_id")
-            goal_id = object_id if isinstance(object_id, int | str) else tuple(read_position(goal))
-            goal_by_id.setdefault(goal_id, goal)
-    return list(goal_by_id.values())
+            known_id = object_id if isinstance(object_id, int | str) else None
+            goal_identity = (known_id, goal.get_text("object_category"), *read_position(goal))
+            goal_by_identity.setdefault(goal_identity, goal)
+    return list(goal_by_identity.values())
 
 
 def collect_standable_points(scene: SceneEpisodes, goals: list[JsonRecord]) -> np.ndarray:

@@ -65,6 +65,12 @@ _TYPE_ALIASES = {
 }  # fmt: skip
 _OBJAVERSE_PREFIX = "Obja"
 
+# Parts of names: letters and digits in a row. A word ends with its number, if it has one, and a hash is no word.
+_NAME_PART = re.compile(r"[^\W_]+")
+_NUMBERED_WORD = re.compile("([a-z]+)[0-9]*")
+_HASH = re.compile("(?=.*[0-9])[0-9a-f]{8,}")
+_UUID = re.compile("[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+
 
 class AssetInfo(NamedTuple):
     """An entry of the asset database.
@@ -492,16 +498,27 @@ def type_from_asset_name(name: str) -> str | None:
     """Return the type in the name of an asset, if any.
 
     The longest run of the name's words that is a known type counts, and of equally long runs the last: `bin_8` is a
-    GarbageCan, `RoboTHOR_sofa_kramfors` a Sofa, `Towel_Statue_2` a Statue.
+    GarbageCan, `RoboTHOR_sofa_kramfors` a Sofa, `Towel_Statue_2` a Statue. Hashes and other ids have no words.
     """
     # Runs of words, the longest first and of equal ones the last first.
-    name_words = re.findall("[a-z]+", name.lower())
+    name_words = _split_words(name)
     for num_words in range(len(name_words), 0, -1):
         for first_word in range(len(name_words) - num_words, -1, -1):
             type_name = _types_by_name().get("".join(name_words[first_word : first_word + num_words]))
             if type_name:
                 return type_name
     return None
+
+
+def _split_words(name: str) -> list[str]:
+    """Return the words of a name in small letters; a part that is no word stays whole, so that it matches no type."""
+    name_words: list[str] = []
+    for name_part in _NAME_PART.findall(_UUID.sub("0x", name.lower())):
+        if name_part.isdecimal():
+            continue
+        word_match = None if _HASH.fullmatch(name_part) else _NUMBERED_WORD.fullmatch(name_part)
+        name_words.append(word_match[1] if word_match else name_part)
+    return name_words
 
 
 def normalize_object_type(name: str) -> str:
@@ -537,12 +554,18 @@ def _named_type(item: JsonRecord, asset: AssetInfo) -> str | None:
         return normalize_object_type(item.get_text("objectType"))
     if asset.type:
         return asset.type
-    # Ids such as `Bowl|surface|3|1` begin with the type, `small|3|1` and `3|0` do not.
+    # Ids such as `Bowl|surface|3|1` begin with the type; `small|3|1`, `3|0` and hashes do not.
     id_prefix, id_separator, _ = item.get_text("id").partition("|")
-    return id_prefix if id_separator and id_prefix and id_prefix != "small" and not id_prefix.isdigit() else None
+    names_type = id_separator and id_prefix != "small" and _split_words(id_prefix) == [id_prefix.lower()]
+    return id_prefix if names_type and id_prefix.isalpha() else None
 
 
 def _guess_type(item: JsonRecord) -> str:
-    """Return the type in the name of the asset, or else this name without its numbers."""
+    """Return the type in the name of the asset or the object, or else the asset's name without its numbers."""
     asset_name = item.get_text("assetId")
-    return type_from_asset_name(asset_name) or re.sub(r"(_\d+)+$", "", asset_name).replace("_", "") or asset_name
+    object_name = item.fields.get("object_name")  # of Holodeck's houses, whose assets are named by hashes
+    for name in (asset_name, object_name):
+        type_name = type_from_asset_name(name) if isinstance(name, str) else None
+        if type_name:
+            return type_name
+    return re.sub(r"(_\d+)+$", "", asset_name).replace("_", "") or asset_name

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.importer_inputs.ai2thor import METADATA, PLACES, TABLE
+from support.importer_inputs.ai2thor import METADATA, PLACES, TABLE, thing
 from support.mutations import changed, without
 from support.scene_records import assert_scenes_equal
 
@@ -65,6 +65,14 @@ def test_read_ai2thor_reads_older_boxes_as_corners(read_metadata):
     table_row = TABLE | {"axisAlignedBoundingBox": None, "bounds3D": [1.0, 0.25, -0.5, 2.0, 1.05, 0.7]}
     scene = read_metadata(changed(METADATA, "objects", [table_row]))
     np.testing.assert_allclose(scene.boxes, [[1.5, 0.4, 0.1, 1.0, 0.8, 1.2]])
+
+
+def test_read_ai2thor_tells_receptacles_of_one_id_apart_by_place(read_metadata):
+    # Two tables of one id, and a book on each.
+    tables = [changed(TABLE, "axisAlignedBoundingBox", "center", "z", z) for z in (0.0, 5.0)]
+    books = [thing("Book", 1.5, 1.05, z, (0.2, 0.1, 0.2), parents=[TABLE["objectId"]]) for z in (0.1, 5.1)]
+    scene = read_metadata(changed(METADATA, "objects", [*tables, *books]))
+    assert scene.parents.tolist() == [-1, -1, 0, 1]
 
 
 @pytest.mark.parametrize(

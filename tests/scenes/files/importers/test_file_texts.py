@@ -71,7 +71,7 @@ def test_replacements_and_their_rooms_may_have_blank_lines(tmp_path):
 
 @pytest.mark.parametrize("indent", [None, 1])
 def test_importers_skip_the_byte_order_mark_of_one_document(tmp_path, indent):
-    contents = {"procthor": HOUSE, "ai2thor": METADATA, "habitat": EPISODES}
+    contents: dict[SceneFormat, object] = {"procthor": HOUSE, "ai2thor": METADATA, "habitat": EPISODES}
     for scene_format, content in contents.items():
         source = tmp_path / f"{scene_format}.json"
         source.write_bytes(codecs.BOM_UTF8 + json.dumps(content, indent=indent).encode())

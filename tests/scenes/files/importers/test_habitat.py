@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.importer_inputs.habitat import EPISODES, STARTS, episode, goal, write_json
 from support.importer_inputs.semantic_maps import bedroom, l_shaped_floor, write_maps
+from support.real_scenes import INPUTS, require
 from support.refusals import assert_message_names
 from support.scene_geometry import points_of
 from support.scene_records import assert_scenes_equal, scenes_and_errors
@@ -117,6 +118,80 @@ def test_read_habitat_imports_floors_from_episodes_alone(tmp_path):
     assert (ground_floor.types, upper_floor.types) == (("chair",), ("bed",))
     np.testing.assert_allclose(upper_floor.boxes, [[1.0, 0.4, -1.0, 1.84, 0.91, 1.84]], atol=1e-12)
     assert len(standable_cells(upper_floor.reach)) == upper_floor.reach.sum() == 9
+
+
+def read_goals(path: Path, goals_by_category: dict[str, list[dict]]) -> list[list[tuple[str, float]]]:
+    """Return type and x of the objects of each scene of `EPISODES` with other goals on its ground floor."""
+    content = EPISODES | {"goals_by_category": EPISODES["goals_by_category"] | goals_by_category}
+    scenes, errors = scenes_and_errors(read_habitat(write_json(path / "Home.json.gz", content), "train"))
+    assert not errors
+    return [list(zip(scene.types, scene.boxes[:, 0].tolist(), strict=True)) for scene in scenes]
+
+
+def test_read_habitat_tells_goals_of_one_id_apart_by_category(tmp_path):
+    sofa = goal("sofa", 7, [1.0, 0.5, -1.5], [])
+    ground_floor, upper_floor = read_goals(tmp_path, {"Home.glb_sofa": [sofa]})
+    assert ground_floor == [("chair", 2.5), ("sofa", 1.0)]
+    assert upper_floor == [("bed", 1.0)]
+
+
+def test_read_habitat_tells_goals_of_one_id_apart_by_place(tmp_path):
+    chairs = [goal("chair", -1, [x, 0.6, -1.5], []) for x in (2.5, 0.0, 1.0, 0.0)]
+    ground_floor, _ = read_goals(tmp_path, {"Home.glb_chair": chairs})
+    assert ground_floor == [("chair", 2.5), ("chair", 0.0), ("chair", 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("mesh", "scene_name"),
+    [
+        ("x/house.1.glb", "house.1"),
+        ("house.glb", "house"),
+        ("00800-TEEsavR23oF/TEEsavR23oF.basis.glb", "TEEsavR23oF"),
+        ("fphab/102344049.scene_instance.json", "102344049"),
+        ("v1.2/no-ending", "no-ending"),
+        (".glb", ".glb"),
+    ],
+)
+def test_read_habitat_keeps_dots_in_names_of_scenes(tmp_path, mesh, scene_name):
+    home = goal("chair", 7, [0.5, 0.4, -0.5], [])
+    starts = [episode(0.25 * i, 0.0, 0.0, goals=[home]) | {"scene_id": mesh} for i in range(9)]
+    (scene,) = read_habitat(write_json(tmp_path / "val.json.gz", {"episodes": starts}), "val")
+    assert isinstance(scene, Scene)
+    assert scene.name == f"{scene_name}_floor0"
+
+
+def test_read_habitat_replaces_files_by_their_whole_name(tmp_path):
+    content = tmp_path / "val" / "content"
+    names = ("house.1.json.gz", "house.1_episodes.json.gz", "house.2.json.gz", "house.3.glb.json.gz")
+    for name in names:
+        scene_name = "house." + name[6]
+        episodes = [start | {"scene_id": f"{scene_name}.glb"} for start in EPISODES["episodes"]]
+        goals = {f"{scene_name}.glb_chair": [goal("chair", 1, [2.0 + len(name) / 100, 0.6, -1.5], [])]}
+        write_json(content / name, {"episodes": episodes[:9], "goals_by_category": goals})
+    scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val"))
+    assert not errors
+    assert [scene.name for scene in scenes] == ["house.1_floor0", "house.2_floor0", "house.3_floor0"]
+    assert scenes[0].boxes[0, 0] == 2.0 + len(names[1]) / 100
+
+
+@pytest.mark.parametrize(
+    ("folder_name", "types_by_scene"),
+    [
+        ("h01_same_id_two_categories", {"Home_floor0": ("chair", "sofa"), "Home_floor1": ("bed",)}),
+        ("h02_all_ids_minus_one", {"Home_floor0": ("chair", "chair", "chair")}),
+    ],
+)
+def test_read_habitat_imports_the_files_of_earlier_reports(folder_name, types_by_scene):
+    scenes, _ = scenes_and_errors(read_habitat(require(INPUTS / folder_name / "Home.json.gz"), "train"))
+    assert {scene.name: scene.types for scene in scenes} == types_by_scene
+
+
+def test_read_habitat_tells_the_dotted_names_of_an_earlier_report_apart(tmp_path):
+    # Each house has every second start of a row, so the places are too few to be connected.
+    assert not scenes
+    for scene_name, problem in {"house.1": "7 cells, of which only 3", "house.2": "5 cells, of which only 2"}.items():
+        (message,) = [error for error in errors if scene_name in error and "connected" in error]
+        assert_message_names(message, f"scene '{scene_name}': floor ", problem)
 
 
 def test_read_habitat_uses_goals_and_shortest_paths_of_episodes(tmp_path):
