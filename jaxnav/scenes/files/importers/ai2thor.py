@@ -25,6 +25,7 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.assemble import (
     SceneObject,
     build_scene_from_cells,
+    check_lattice_spacing,
     lattice_cells,
     read_bounding_box,
     scene_or_error,
@@ -175,6 +176,7 @@ def parse_agent_positions(record: JsonRecord, field: str, positions: Sequence[An
     position_records = record.iterate_records(field, positions)
     body_positions = np.array([position.get_numbers() for position in position_records]).reshape(-1, 3)
     cells = lattice_cells(record, field, body_positions[:, [0, 2]].tolist())
+    check_lattice_spacing(record, field, cells)
     return cells, float(np.median(body_positions[:, 1])) - AGENT_HEIGHT
 
 
@@ -423,7 +425,9 @@ def _parse_graph(record: JsonRecord, value: Any) -> np.ndarray:
             problem = f"is {reprlib.repr(state_id)}; give x|z|rotation|horizon, such as 0.25|-1.50|90|0"
             raise graph_node.error("id", problem)
         node_points.append(graph_node.check_numbers("id", map(float, id_match.groups())))
-    return lattice_cells(graph, "nodes", node_points)
+    node_cells = lattice_cells(graph, "nodes", node_points)
+    check_lattice_spacing(graph, "nodes", node_cells)
+    return node_cells
 
 
 def _read_visible_objects(folder: Path, name: str, floor_height: float) -> list[SceneObject]:

@@ -105,6 +105,31 @@ def lattice_cells(record: JsonRecord, field: str, points: Sequence[Sequence[floa
     return lattice_indices[:, ::-1]
 
 
+def check_lattice_spacing(record: JsonRecord, field: str, cells: np.ndarray) -> None:
+    """Refuse positions of another lattice, such as one of 0.5 m, whose cells have no neighbours.
+
+    Args:
+      record: the scene's record, for errors.
+      field: name of the field that holds the positions.
+      cells: int [N, 2], lattice indices.
+
+    Raises:
+      InputError: most positions have no other one beside them; names the spacing that they seem to have.
+    """
+    from scipy import spatial  # slow to import, and not needed to show the help of a command
+
+    distinct_cells = np.unique(cells, axis=0)
+    if len(distinct_cells) < 2:
+        return
+
+    # Steps to the nearest other cell, in cells along the longer side: 1 for neighbours, diagonal ones too.
+    nearest_distances, _ = spatial.KDTree(distinct_cells).query(distinct_cells, k=2, p=np.inf)
+    spacing = float(np.median(nearest_distances[:, 1])) * CELL_SIZE
+    if spacing > CELL_SIZE:
+        problem = f"has positions that seem to be {spacing:g} m apart, but the agent moves by {CELL_SIZE} m"
+        raise record.error(field, f"{problem}; give the positions of a grid of {CELL_SIZE} m (gridSize)")
+
+
 def build_scene_from_cells(
     name: str, world: str, room_type: str, split: str, cells: np.ndarray, objects: Sequence[SceneObject]
 ) -> Scene:

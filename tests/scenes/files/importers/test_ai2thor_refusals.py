@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given
-from support.importer_inputs.ai2thor import METADATA
+from support.importer_inputs.ai2thor import METADATA, PLACES, vector
 from support.mutations import changed, mutated, mutated_text, without
+from support.real_scenes import INPUTS, require
 from support.refusals import assert_message_names
 from support.scene_records import as_scene, check_outcomes
 
@@ -104,6 +105,34 @@ def test_read_ai2thor_imports_all_good_records_of_a_file(tmp_path):
     assert (as_scene(first_scene).name, as_scene(second_scene).name) == ("FloorPlan201", "FloorPlan2")
     assert_message_names(bad_record, f"{metadata_file}, line 2, scene 'FloorPlan201_physics': objects ", "add it")
     assert_message_names(torn_line, f"{metadata_file}, line 4: not JSON")
+
+
+def grid_positions(steps: range, spacing: float) -> list[dict[str, float]]:
+    """Return the positions of a square grid."""
+    return [vector(spacing * i, 1.15, spacing * j) for i in steps for j in steps]
+
+
+@pytest.mark.parametrize(("spacing", "num_steps"), [(0.5, 5), (0.5, 2), (0.75, 4), (1.0, 3)])
+def test_read_ai2thor_refuses_grids_of_another_spacing(read_metadata, spacing, num_steps):
+    positions = grid_positions(range(num_steps), spacing)
+    for extra_positions in ([], grid_positions(range(2), 0.25)):
+        if num_steps**2 > 4 * len(extra_positions):
+            error = read_metadata(changed(METADATA, "actionReturn", [*positions, *extra_positions]))
+            assert_message_names(error, "actionReturn has positions", f"{spacing:g} m apart", "0.25 m", "gridSize")
+
+
+def test_read_ai2thor_imports_grids_with_gaps(read_metadata):
+    # A single position, a diagonal, and two rooms with places of their own.
+    diagonal = [vector(0.25 * i, 1.15, 0.25 * i) for i in range(4)]
+    far_room = [vector(position["x"] + 5.0, 1.15, position["z"]) for position in PLACES]
+    for positions in (PLACES[:1], diagonal, PLACES + far_room, [*PLACES, vector(3.0, 1.15, 3.0)]):
+        scene = as_scene(read_metadata(changed(METADATA, "actionReturn", positions)))
+        assert scene.reach.sum() == len(positions)
+
+
+def test_read_ai2thor_refuses_the_grid_of_an_earlier_report():
+    (error,) = read_ai2thor(require(INPUTS / "a02_grid_half.json"), "train")
+    assert_message_names(error, "scene 'FloorPlan201_physics': actionReturn ", "0.5 m apart", "grid of 0.25 m")
 
 
 def test_read_ai2thor_imports_all_good_files_of_a_folder(tmp_path):

@@ -92,6 +92,14 @@ def test_read_scene_data_imports_all_good_scenes_of_a_folder(tmp_path):
     assert_message_names(error, f"{tmp_path / 'FloorPlan2' / 'grid.json'}, scene 'FloorPlan2': not JSON")
 
 
+def test_read_scene_data_refuses_grids_of_another_spacing(read_folder):
+    positions = [{"x": 0.5 * i, "y": 0.9, "z": 0.5 * j} for i in range(3) for j in range(3)]
+    assert_message_names(read_folder(grid=positions, graph=None), "grid has positions", "0.5 m apart")
+    nodes = [{"id": f"{position['x']:.2f}|{position['z']:.2f}|0|0"} for position in positions]
+    error = read_folder(grid=None, graph={"nodes": nodes, "links": []})
+    assert_message_names(error, "nodes has positions", "0.5 m apart")
+
+
 @pytest.mark.parametrize(
     ("changed_files", "field_name", "remedy"),
     [
