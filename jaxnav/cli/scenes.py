@@ -145,7 +145,9 @@ def _import(config: ImportConfig, console: Console) -> None:
         scenes, config.source, config.out, config.split, config.val, config.test, categories or None, report_refusal
     )
 
-    # Print guesses and omissions line by line; the last line counts the scenes.
+    # Print what was read, guesses and omissions line by line; the last line counts the scenes.
+    for import_count in summary.account.values():
+        console.print(str(import_count))
     for warning in _import_warnings(summary):
         console.print(warning, style="yellow")
     if summary.unknown_type_counts:

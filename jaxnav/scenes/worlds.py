@@ -18,7 +18,7 @@ import numpy as np
 from jaxnav.choices import ShiftKind
 from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.scenes.context_exchange import ContextExchange, fit_context_exchange
-from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes
+from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes, remove_headers
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
 from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.layout_shift import exchange_places
@@ -313,8 +313,8 @@ def load_scenes(path: str | Path, split: str | None) -> FileScenes:
         splits_in_file = sorted({scene.split for scene in scenes})
         raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(splits_in_file)}")
 
-    # The identity follows the content of the file, not its name.
-    file_checksum = hashlib.sha256(read_bytes(Path(path))).hexdigest()
+    # The identity follows the scenes of the file, not its name or the account of its import.
+    file_checksum = hashlib.sha256(remove_headers(read_bytes(Path(path)))).hexdigest()
     return FileScenes(scenes_of_split, f"{split or 'all'} of {file_checksum}")
 
 

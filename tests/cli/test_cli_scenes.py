@@ -103,6 +103,10 @@ def test_import_counts_refused_scenes_and_keeps_the_rest(tmp_path, capsys):
     assert "1 scenes imported, 1 refused" in output
     assert len(read_scenes(target)) == 1
 
+    # The account of the two houses, of two objects each.
+    assert "scenes: 2 read, 1 kept, 1 skipped (1 refused)" in output
+    assert "objects: 4 read, 2 kept, 2 skipped (2 in refused scenes)" in output
+
 
 def test_import_counts_unconnected_cells(tmp_path, capsys):
     house_without_doors = HOUSE | {"doors": []}
@@ -147,7 +151,7 @@ def test_import_skips_bad_lines_of_a_scene_file(tmp_path, capsys):
     good_file = tmp_path / "good.jsonl.gz"
     mixed_file = tmp_path / "mixed.jsonl.gz"
     assert import_scenes("ai2thor", room_file, good_file) == 0
-    good_line = gzip.decompress(good_file.read_bytes())
+    _, good_line = gzip.decompress(good_file.read_bytes()).splitlines(keepends=True)  # after the header
     unknown_split = good_line.replace(b'"train"', b'"trial"')
     mixed_file.write_bytes(good_line + unknown_split + b"{]\n" + good_line)
     assert import_scenes("scenes", mixed_file, tmp_path / "o.jsonl.gz") == 0

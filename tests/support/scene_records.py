@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.files.account import ImportCount
 from jaxnav.scenes.files.importers.assemble import ImportNote
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.scenes.scene import Scene
@@ -41,7 +42,14 @@ def as_scene(result: Scene | InputError) -> Scene:
     return result
 
 
-def scenes_and_errors(results: Iterable[Scene | InputError | ImportNote]) -> tuple[list[Scene], list[str]]:
+def without_counts(results: Iterable[Any]) -> list[Any]:
+    """Return the results of an importer without the counts of what it read."""
+    return [result for result in results if not isinstance(result, ImportCount)]
+
+
+def scenes_and_errors(
+    results: Iterable[Scene | InputError | ImportNote | ImportCount],
+) -> tuple[list[Scene], list[str]]:
     """Return the scenes among results, and the errors' messages."""
     scenes = []
     messages = []
@@ -73,7 +81,7 @@ def assert_scenes_equal(result: Scene | InputError, expected: Scene | InputError
 
 
 def check_outcomes(
-    results: Iterable[Scene | InputError | ImportNote], outcomes: collections.Counter[type], path: Path
+    results: Iterable[Scene | InputError | ImportNote | ImportCount], outcomes: collections.Counter[type], path: Path
 ) -> None:
     """Check that a scene file can hold each scene and that each error names its file; count the results by type."""
     scene_file = path.parent / "fuzzed.jsonl.gz"
@@ -81,6 +89,8 @@ def check_outcomes(
         outcomes[type(result)] += 1
         if isinstance(result, ImportNote):
             assert result.number > 0
+        elif isinstance(result, ImportCount):
+            assert min(result.num_read, result.num_added, result.num_kept, *result.skipped.values(), 0) == 0
         elif isinstance(result, InputError):
             assert str(result).startswith(str(path))
         else:

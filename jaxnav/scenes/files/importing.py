@@ -2,7 +2,7 @@
 
 `read_source` yields the scenes of a source in any of the formats, `filter_scenes` leaves out unwanted ones, and
 `import_scenes` checks the rest and writes them to a scene file. Scenes flow between them one by one, together with the
-errors of scenes that cannot be used and notes of guesses.
+errors of scenes that cannot be used, notes of guesses and counts of what was read.
 """
 
 import dataclasses
@@ -15,18 +15,19 @@ from typing import Literal, NamedTuple
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids, count_unknown_types
+from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount
 from jaxnav.scenes.files.importers.ai2thor import read_ai2thor, read_controller, read_replacements, read_scene_data
 from jaxnav.scenes.files.importers.assemble import ImportNote
 from jaxnav.scenes.files.importers.habitat import read_habitat
 from jaxnav.scenes.files.importers.procthor import read_procthor
-from jaxnav.scenes.files.scene_file import iterate_scenes, write_scenes
+from jaxnav.scenes.files.scene_file import iterate_counted_scenes, write_scenes
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS, world_name_of_origin
 
 SceneFormat = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
 SceneSplit = Literal["train", "val", "test"]
-ImportStream = Iterator[Scene | InputError | ImportNote]
+ImportStream = Iterator[Scene | InputError | ImportNote | ImportCount]
 
 #: Format that each option of `read_source` is for.
 FORMAT_OPTIONS = {
@@ -47,6 +48,7 @@ class ImportSummary(NamedTuple):
       unknown_type_counts: number of objects of each type that is in no vocabulary.
       unconnected_cell_counts: standable cells outside the largest connected part, of each scene that has such cells.
       notes: number of guesses and other changes to the scenes, by their text.
+      account: what was read, kept and skipped, by its unit; see `ImportCount`.
     """
 
     scenes: dict[str, Scene]
@@ -54,6 +56,7 @@ class ImportSummary(NamedTuple):
     unknown_type_counts: Counter[str]
     unconnected_cell_counts: Counter[str]
     notes: Counter[str]
+    account: dict[str, ImportCount]
 
 
 def read_source(
@@ -79,7 +82,7 @@ def read_source(
       agent_part: use only the cells of a ProcTHOR house that are connected with the agent's place in the file.
 
     Yields:
-      A scene, or why it cannot be used; also notes of guesses and other changes.
+      A scene, or why it cannot be used; also notes of guesses and other changes, and counts of what was read.
 
     Raises:
       InputError: the source cannot be read, or an option is missing or is for another format.
@@ -116,7 +119,7 @@ def read_source(
                 raise InputError("--base: is missing; replacements need the scene file of their rooms")
             yield from read_replacements(source_path, base)
         case "scenes":
-            yield from iterate_scenes(source_path)
+            yield from iterate_counted_scenes(source_path)
 
 
 def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_side: int | None = None) -> ImportStream:
@@ -128,7 +131,7 @@ def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_si
       max_side: cells along the longer side of the largest scene to keep; None for any.
 
     Yields:
-      Scenes to keep, a note for each skipped scene, and all errors and notes.
+      Scenes to keep, a note and counts for each skipped scene, and all errors, notes and counts.
 
     Raises:
       InputError: no scene remains.
@@ -143,9 +146,11 @@ def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_si
         elif room_types and scene.room_type not in room_types:
             other_room_types.add(scene.room_type)
             yield ImportNote(f"scenes are skipped, because their room type is not {' or '.join(room_types)}", 1)
+            yield from _skip_scene(scene, "of other room types")
         elif max_side is not None and max(scene.reach.shape) > max_side:
             excessive_sides.add(max(scene.reach.shape))
             yield ImportNote(f"scenes are skipped, because they are longer than {max_side} cells", 1)
+            yield from _skip_scene(scene, f"longer than {max_side} cells")
         else:
             num_scenes += 1
             yield scene
@@ -159,8 +164,14 @@ def filter_scenes(scenes: ImportStream, room_types: tuple[str, ...] = (), max_si
         raise InputError(f"--room-types {' '.join(room_types)}: no scene has these types; there are {present_types}")
 
 
+def _skip_scene(scene: Scene, reason: str) -> Iterator[ImportCount]:
+    """Count a skipped scene, whose objects the importer has counted as read."""
+    yield ImportCount("scenes", num_read=1, skipped=Counter({reason: 1}))
+    yield ImportCount("objects", skipped=Counter({f"in scenes {reason}": len(scene.types)}))
+
+
 def import_scenes(
-    scenes: Iterable[Scene | InputError | ImportNote],
+    scenes: Iterable[Scene | InputError | ImportNote | ImportCount],
     source: str,
     out: Path,
     split: SceneSplit = "train",
@@ -209,27 +220,32 @@ def import_scenes(
             scene_split = split
         divided_scenes.append(dataclasses.replace(scene, split=scene_split))
     try:
-        write_scenes(out, divided_scenes)
+        write_scenes(out, divided_scenes, summary.account)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another name") from error
     return summary
 
 
 def _collect_usable_scenes(
-    scenes: Iterable[Scene | InputError | ImportNote],
+    scenes: Iterable[Scene | InputError | ImportNote | ImportCount],
     source: str,
     categories: tuple[str, ...] | None,
     report: Callable[[InputError], None],
 ) -> ImportSummary:
     """Collect the scenes that can be used, and count all else."""
-    summary = ImportSummary({}, 0, Counter(), Counter(), Counter())
+    account = {unit: ImportCount(unit) for unit in ("scenes", "objects")}
+    summary = ImportSummary({}, 0, Counter(), Counter(), Counter(), account)
     num_refused = 0
     for scene in scenes:
+        if isinstance(scene, ImportCount):
+            account.setdefault(scene.unit, ImportCount(scene.unit)).add(scene)
+            continue
         if isinstance(scene, ImportNote):
             summary.notes[scene.text] += scene.number
             continue
 
         # Refuse scenes that an importer or the following checks find unusable.
+        account["scenes"].num_read += 1
         try:
             if isinstance(scene, InputError):
                 raise scene
@@ -237,11 +253,16 @@ def _collect_usable_scenes(
             _check_scene(scene, summary.scenes, vocabulary, source)
         except InputError as error:
             num_refused += 1
+            account["scenes"].skipped["refused"] += 1
+            if isinstance(scene, Scene):
+                account["objects"].skipped[IN_REFUSED_SCENE] += len(scene.types)
             report(error)
             continue
 
         # Count the oddities of a usable scene, for the report after the import.
         summary.scenes[scene.name] = scene
+        account["scenes"].num_kept += 1
+        account["objects"].num_kept += len(scene.types)
         summary.unknown_type_counts.update(count_unknown_types([scene], vocabulary))
         num_unconnected = int(scene.reach.sum()) - len(standable_cells(scene.reach))
         if num_unconnected:

@@ -14,13 +14,14 @@ import json
 import re
 import reprlib
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount, account_to_json
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import cells_near_boxes
 from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, SPLITS, Room, Scene, box_footprints
@@ -32,6 +33,10 @@ SNAP_TOLERANCE = 0.02
 _NUMBER_LIMIT = 1e6  # metres or degrees; a number beyond it is a mistake
 
 _HALF_CHARACTER = re.compile("[\ud800-\udfff]")  # a surrogate without its partner
+
+# Header of a scene file, one line before the scenes; joined files have several.
+_HEADER_FIELD = "account"
+_HEADER_LINE = re.compile(rb'^\{"account":.*\n?', re.MULTILINE)
 
 _CENTRE_COLUMNS = ("x", "y", "z")
 _SIZE_COLUMNS = ("sx", "sy", "sz")
@@ -78,35 +83,54 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
     Raises:
       InputError: the file is missing or damaged.
     """
+    for result in iterate_counted_scenes(path):
+        if not isinstance(result, ImportCount):
+            yield result
+
+
+def iterate_counted_scenes(path: Path) -> Iterator[Scene | InputError | ImportCount]:
+    """Read a scene file line by line, as `iterate_scenes`, and count the objects of each line after its scene."""
     line_by_name: dict[str, int] = {}
-    for line_number, line_bytes in numbered_lines(read_bytes(path)):
+    for line_number, line_bytes in scene_lines(read_bytes(path)):
+        object_count = ImportCount("objects")
         try:
             record = _parse_line(path, line_number, line_bytes)
+            object_count.num_read = count_items(record.fields.get("objects"))
             scene = _decode_scene(record)
 
             # Names must be unique, because results and shifts refer to scenes by name.
             if scene.name in line_by_name:
                 raise record.error("name", f"is also that of line {line_by_name[scene.name]}; make it unique")
         except InputError as error:
+            object_count.skip_all(IN_REFUSED_SCENE)
             yield error
         else:
             line_by_name[scene.name] = line_number
+            object_count.skipped["without a place"] = object_count.num_read - len(scene.types)
             yield scene
+        yield object_count
 
 
-def write_scenes(path: str | Path, scenes: Iterable[Scene]) -> None:
+def write_scenes(path: str | Path, scenes: Iterable[Scene], account: Mapping[str, ImportCount] | None = None) -> None:
     """Write a scene file, whole or not at all.
 
-    Equal scenes give equal bytes.
+    Equal scenes and accounts give equal bytes.
+
+    Args:
+      path: the file.
+      scenes: the scenes.
+      account: counts of an import by their unit, for a header line; None for no header.
 
     Raises:
       ValueError: a number is NaN or infinite.
     """
     # One compact line per scene; without a time in the gzip header equal scenes give equal bytes.
-    scene_lines: list[str] = []
-    for scene in scenes:
-        scene_lines.append(json.dumps(_encode_scene(scene), allow_nan=False, separators=(",", ":")) + "\n")
-    write_atomic(Path(path), gzip.compress("".join(scene_lines).encode(), mtime=0))
+    file_records: list[dict[str, Any]] = []
+    if account is not None:
+        file_records.append({_HEADER_FIELD: account_to_json(account)})
+    file_records.extend(map(_encode_scene, scenes))
+    file_lines = [json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n" for record in file_records]
+    write_atomic(Path(path), gzip.compress("".join(file_lines).encode(), mtime=0))
 
 
 # Checked access to JSON
@@ -230,6 +254,21 @@ def numbered_lines(content: bytes) -> list[tuple[int, bytes]]:
         if line_bytes.removeprefix(codecs.BOM_UTF8).strip():
             text_lines.append((line_number, line_bytes))
     return text_lines
+
+
+def scene_lines(content: bytes) -> list[tuple[int, bytes]]:
+    """Return number and text of each line of a scene file that is neither blank nor a header."""
+    return [numbered_line for numbered_line in numbered_lines(content) if not _HEADER_LINE.match(numbered_line[1])]
+
+
+def remove_headers(content: bytes) -> bytes:
+    """Return the content of a scene file without its header lines, as it was before scene files had headers."""
+    return _HEADER_LINE.sub(b"", content)
+
+
+def count_items(value: Any) -> int:
+    """Return the number of items of a JSON list or object; 0 for any other value."""
+    return len(value) if isinstance(value, list | dict) else 0
 
 
 def read_json_texts(path: Path) -> list[tuple[str, bytes]]:

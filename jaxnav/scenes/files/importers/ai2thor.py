@@ -22,22 +22,25 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount
 from jaxnav.scenes.files.importers.assemble import (
     SceneObject,
     build_scene_from_cells,
     check_lattice_spacing,
     lattice_cells,
     read_bounding_box,
-    scene_or_error,
+    scene_and_count,
 )
 from jaxnav.scenes.files.scene_file import (
     JsonRecord,
+    count_items,
     list_visible_files,
     numbered_lines,
     parse_json,
     read_bytes,
     read_json_texts,
     read_scenes,
+    scene_lines,
 )
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.scene import CELL_SIZE, Scene
@@ -46,6 +49,7 @@ from jaxnav.scenes.scene import CELL_SIZE, Scene
 AGENT_HEIGHT = 0.9
 #: Types that are the shell of a room. Doorways and windows are objects.
 STRUCTURE_TYPES = frozenset({"Floor", "Wall", "Ceiling", "Room"})
+_IS_STRUCTURE = "floors, walls and ceilings"
 
 _ITHOR_ROOMS = {0: "kitchen", 2: "living_room", 3: "bedroom", 4: "bathroom"}  # by the hundreds of the scene number
 
@@ -90,7 +94,7 @@ def world_and_room_type(name: str) -> tuple[str, str]:
 # Saved metadata
 
 
-def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
+def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError | ImportCount]:
     """Read saved metadata of the controller.
 
     Object types keep the names of the file. Boxes come from `axisAlignedBoundingBox` or the older `bounds3D`; an object
@@ -122,20 +126,21 @@ def read_ai2thor(path: Path, split: str) -> Iterator[Scene | InputError]:
             yield error
             continue
         for location, record_text in record_texts:
-            yield scene_or_error(_build_scene_from_text, location, record_text, split)
+            yield from scene_and_count(_build_scene_from_text, location, record_text, split)
 
 
-def _build_scene_from_text(location: str, record_text: bytes, split: str) -> Scene:
-    return build_scene_from_metadata(location, parse_json(location, record_text), split)
+def _build_scene_from_text(location: str, record_text: bytes, split: str, object_count: ImportCount) -> Scene:
+    return build_scene_from_metadata(location, parse_json(location, record_text), split, object_count)
 
 
-def build_scene_from_metadata(location: str, value: Any, split: str) -> Scene:
+def build_scene_from_metadata(location: str, value: Any, split: str, object_count: ImportCount) -> Scene:
     """Build the scene of one record.
 
     Args:
       location: name of the record in errors.
       value: the record, see the module.
       split: split of the scene.
+      object_count: counts the objects that are read and skipped.
 
     Raises:
       InputError: the record cannot be used; names the scene, the field and how to fix it.
@@ -146,6 +151,7 @@ def build_scene_from_metadata(location: str, value: Any, split: str) -> Scene:
         outer_record.check_record("metadata", outer_record.fields.get("metadata", outer_record.fields)).fields
         | outer_record.fields
     )
+    object_count.num_read = count_items(metadata.get("objects"))
     record = JsonRecord(f"{location}, scene {reprlib.repr(metadata.get('sceneName', '(no name)'))}", metadata)
     name = strip_physics_suffix(record.get_text("sceneName"))
 
@@ -156,7 +162,7 @@ def build_scene_from_metadata(location: str, value: Any, split: str) -> Scene:
     positions = record.get_list(positions_field)
     standable_cells, floor_height = parse_agent_positions(record, positions_field, positions)
 
-    scene_objects = _parse_objects(record, floor_height)
+    scene_objects = _parse_objects(record, floor_height, object_count)
     return build_scene_from_cells(name, *world_and_room_type(name), split, standable_cells, scene_objects)
 
 
@@ -180,7 +186,7 @@ def parse_agent_positions(record: JsonRecord, field: str, positions: Sequence[An
     return cells, float(np.median(body_positions[:, 1])) - AGENT_HEIGHT
 
 
-def _parse_objects(record: JsonRecord, floor_height: float) -> list[SceneObject]:
+def _parse_objects(record: JsonRecord, floor_height: float, object_count: ImportCount) -> list[SceneObject]:
     """Read the objects without the shell of the room.
 
     The field `objects` is a list, or an object keyed by id.
@@ -191,10 +197,13 @@ def _parse_objects(record: JsonRecord, floor_height: float) -> list[SceneObject]
         keyed_values = list(object_values.items())
     else:
         keyed_values = list(enumerate(record.check_list("objects", object_values)))
-    all_rows: list[JsonRecord] = []
+    object_rows: list[JsonRecord] = []
     for object_key, object_value in keyed_values:
-        all_rows.append(record.check_record(f"objects[{reprlib.repr(object_key)}]", object_value))
-    object_rows = [object_row for object_row in all_rows if object_row.get_text("objectType") not in STRUCTURE_TYPES]
+        object_row = record.check_record(f"objects[{reprlib.repr(object_key)}]", object_value)
+        if object_row.get_text("objectType") in STRUCTURE_TYPES:
+            object_count.skipped[_IS_STRUCTURE] += 1
+        else:
+            object_rows.append(object_row)
     if not object_rows:
         raise record.error("objects", "holds no object except walls and floors; give at least one")
 
@@ -293,7 +302,7 @@ def box_at_pivot(object_type: str, x: float, y: float, z: float) -> list[float]:
 
 def read_controller(
     names: Sequence[str], split: str, controller_factory: Callable[..., Any] | None = None
-) -> Iterator[Scene | InputError]:
+) -> Iterator[Scene | InputError | ImportCount]:
     """Read the metadata of scenes from a simulator.
 
     Args:
@@ -311,7 +320,7 @@ def read_controller(
     controller = controller_class(gridSize=CELL_SIZE, renderDepthImage=False)
     try:
         for name in names:
-            yield scene_or_error(_build_scene_in_simulator, controller, name, split)
+            yield from scene_and_count(_build_scene_in_simulator, controller, name, split)
     finally:
         controller.stop()
 
@@ -323,7 +332,7 @@ def _import_controller_class() -> Callable[..., Any]:
         raise InputError(f"--from-controller: {error}; install the simulator with `pip install ai2thor`") from error
 
 
-def _build_scene_in_simulator(controller: Any, name: str, split: str) -> Scene:
+def _build_scene_in_simulator(controller: Any, name: str, split: str, object_count: ImportCount) -> Scene:
     location = f"controller, {name!r}"
     # The apartments are made for another robot than the rooms; the controller warns of a wrong one.
     robot = "locobot" if world_and_room_type(name)[0] == "robothor" else "default"
@@ -336,13 +345,13 @@ def _build_scene_in_simulator(controller: Any, name: str, split: str) -> Scene:
     if not metadata["lastActionSuccess"]:
         problem = f"GetReachablePositions failed ({metadata['errorMessage']})"
         raise InputError(f"{location}: {problem}; leave the scene out")
-    return build_scene_from_metadata(location, metadata, split)
+    return build_scene_from_metadata(location, metadata, split, object_count)
 
 
 # Offline folders
 
 
-def read_scene_data(path: Path, split: str) -> Iterator[Scene | InputError]:
+def read_scene_data(path: Path, split: str) -> Iterator[Scene | InputError | ImportCount]:
     """Read an offline folder.
 
     Cells come from `grid.json`, or else from the nodes of `graph.json`; objects from the ids in the visibility map,
@@ -369,17 +378,17 @@ def read_scene_data(path: Path, split: str) -> Iterator[Scene | InputError]:
             f"{path}: holds no scene; give a folder with subfolders that have {_GRID_FILE} and {_MAP_FILES[0]}"
         )
     for scene_folder in scene_folders:
-        yield scene_or_error(_build_scene_of_folder, scene_folder, split)
+        yield from scene_and_count(_build_scene_of_folder, scene_folder, split)
 
 
 def _is_scene_folder(folder: Path) -> bool:
     return any((folder / file_name).is_file() for file_name in (_GRID_FILE, _GRAPH_FILE, *_MAP_FILES))
 
 
-def _build_scene_of_folder(folder: Path, split: str) -> Scene:
+def _build_scene_of_folder(folder: Path, split: str, object_count: ImportCount) -> Scene:
     name = strip_physics_suffix(folder.resolve().name)
     standable_cells, floor_height = _read_standable_cells(folder, name)
-    visible_objects = _read_visible_objects(folder, name, floor_height)
+    visible_objects = _read_visible_objects(folder, name, floor_height, object_count)
     return build_scene_from_cells(name, *world_and_room_type(name), split, standable_cells, visible_objects)
 
 
@@ -430,7 +439,7 @@ def _parse_graph(record: JsonRecord, value: Any) -> np.ndarray:
     return node_cells
 
 
-def _read_visible_objects(folder: Path, name: str, floor_height: float) -> list[SceneObject]:
+def _read_visible_objects(folder: Path, name: str, floor_height: float, object_count: ImportCount) -> list[SceneObject]:
     """Read the objects that are visible from somewhere, from their ids."""
     map_file = folder / _MAP_FILES[0]
     older_file = folder / _MAP_FILES[1]
@@ -439,17 +448,22 @@ def _read_visible_objects(folder: Path, name: str, floor_height: float) -> list[
     record, value = _load_file(map_file, name)
 
     # The map lists the states from which each object is visible, by the object's id.
+    states_by_id = record.check_record("map", value).fields
+    object_count.num_read = len(states_by_id)
     visible_objects: list[SceneObject] = []
-    for object_id, visible_states in record.check_record("map", value).fields.items():
+    for object_id, visible_states in states_by_id.items():
         id_label = reprlib.repr(object_id)
         if not record.check_list(id_label, visible_states):
+            object_count.skipped["visible from nowhere"] += 1
             continue
         id_match = _OBJECT_ID.fullmatch(object_id)
         if id_match is None:
             raise record.error(id_label, "is not an id; give Type|x|y|z or remove the object")
         # Parts such as the basin of a sink have a type of their own.
         object_type = id_match[5] or id_match[1]
-        if object_type not in STRUCTURE_TYPES:
+        if object_type in STRUCTURE_TYPES:
+            object_count.skipped[_IS_STRUCTURE] += 1
+        else:
             x, y, z = record.check_numbers(id_label, map(float, id_match.group(2, 3, 4)))
             visible_objects.append(SceneObject(object_type, box_at_pivot(object_type, x, y - floor_height, z)))
     if not visible_objects:
@@ -460,7 +474,7 @@ def _read_visible_objects(folder: Path, name: str, floor_height: float) -> list[
 # Re-placements
 
 
-def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
+def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError | ImportCount]:
     """Read one scene for every set of every room.
 
     Scenes are in the order of the file and named `<room>-replaced-<number of the set>`. The rows of a type go to the
@@ -498,14 +512,20 @@ def read_replacements(path: Path, base: Path) -> Iterator[Scene | InputError]:
             yield error
             continue
         for set_index in range(num_sets):
-            yield scene_or_error(_replace_objects, record, set_index, *base_rooms[name])
+            # A row moves an object of the room; all objects of the room are kept.
+            object_count = ImportCount("objects", num_read=len(base_rooms[name][0].types))
+            for result in scene_and_count(_replace_objects, record, set_index, *base_rooms[name], unit="rows"):
+                if isinstance(result, InputError):
+                    object_count.skip_all(IN_REFUSED_SCENE)
+                yield result
+            yield object_count
 
 
 def _read_base_rooms(base: Path) -> dict[str, tuple[Scene, np.ndarray]]:
     """Return scene and pivot offsets (`_pivot_offsets`) of each room by name."""
     base_scenes = read_scenes(base)  # also checks the fields that are read below
     base_rooms: dict[str, tuple[Scene, np.ndarray]] = {}
-    for scene, (_, line_bytes) in zip(base_scenes, numbered_lines(read_bytes(base)), strict=True):
+    for scene, (_, line_bytes) in zip(base_scenes, scene_lines(read_bytes(base)), strict=True):
         base_rooms[scene.name] = (scene, _pivot_offsets(scene, parse_json(str(base), line_bytes)))
     return base_rooms
 
@@ -533,7 +553,9 @@ def _pivot_offsets(scene: Scene, fields: dict[str, Any]) -> np.ndarray:
     return np.where(np.abs(pivot_offsets) < half_heights - _PIVOT_ROUNDING, pivot_offsets, half_heights)
 
 
-def _replace_objects(record: JsonRecord, set_index: int, scene: Scene, pivot_offsets: np.ndarray) -> Scene:
+def _replace_objects(
+    record: JsonRecord, set_index: int, scene: Scene, pivot_offsets: np.ndarray, row_count: ImportCount
+) -> Scene:
     """Return a scene with its objects where a set puts them."""
     # The objects of each type that no row has moved so far.
     waiting_objects: dict[str, list[int]] = {}
@@ -543,7 +565,9 @@ def _replace_objects(record: JsonRecord, set_index: int, scene: Scene, pivot_off
     # The n-th row of a type moves the n-th object of this type.
     moved_boxes = scene.boxes.copy()
     has_moved = np.zeros(len(scene.types), bool)
-    for row_index, set_row in enumerate(record.check_list(f"sets[{set_index}]", record.get("sets")[set_index])):
+    set_rows = record.check_list(f"sets[{set_index}]", record.get("sets")[set_index])
+    row_count.num_read = len(set_rows)
+    for row_index, set_row in enumerate(set_rows):
         field = f"sets[{set_index}][{row_index}]"
         object_type, *pivot_values = record.check_list(field, set_row, len(_REPLACEMENT_COLUMNS))
         candidates = waiting_objects.get(record.check_text(field, object_type))
@@ -553,6 +577,7 @@ def _replace_objects(record: JsonRecord, set_index: int, scene: Scene, pivot_off
         x, y, z = record.check_numbers(field, pivot_values)
         moved_boxes[object_index, :3] = (x, y + pivot_offsets[object_index], z)
         has_moved[object_index] = True
+    row_count.num_kept = int(has_moved.sum())
 
     # Moved objects rest on nothing, nor do objects whose parent has moved.
     still_rests = (scene.parents >= 0) & ~has_moved

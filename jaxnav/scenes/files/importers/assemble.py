@@ -5,12 +5,13 @@ An importer describes objects as `SceneObject`s. Those that know standable point
 call `build_scene`. The functions on polygons and walls find the cells of rooms and the pieces between doors.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, ParamSpec
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, ParamSpec
 
 import numpy as np
 
 from jaxnav.errors import InputError
+from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount
 from jaxnav.scenes.files.scene_file import SNAP_TOLERANCE, JsonRecord, derive_walls
 from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, Room, Scene
 
@@ -58,6 +59,24 @@ def scene_or_error(
         return build(*args, **kwargs)
     except InputError as error:
         return error
+
+
+def scene_and_count(
+    build: Callable[..., Scene], *args: Any, unit: str = "objects"
+) -> Iterator[Scene | InputError | ImportCount]:
+    """Yield the scene that a function builds, or its error, and then the account of its objects.
+
+    Args:
+      build: function of `args` and an `ImportCount`, in which it counts what it reads and skips.
+      args: the other arguments.
+      unit: unit of the count.
+    """
+    import_count = ImportCount(unit)
+    result = scene_or_error(build, *args, import_count)
+    if isinstance(result, InputError):
+        import_count.skip_all(IN_REFUSED_SCENE)
+    yield result
+    yield import_count
 
 
 def read_bounding_box(box: JsonRecord) -> tuple[list[float], list[float]]:

@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 import re
 import reprlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,9 +21,10 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES
+from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount
 from jaxnav.scenes.files.importers.assemble import SceneObject, build_scene_from_cells, lattice_cells, scene_or_error
 from jaxnav.scenes.files.importers.pickled_arrays import PickledArray, read_pickle
-from jaxnav.scenes.files.scene_file import JsonRecord, list_visible_files, parse_json, read_bytes
+from jaxnav.scenes.files.scene_file import JsonRecord, count_items, list_visible_files, parse_json, read_bytes
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import connected_parts, standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene
@@ -35,6 +37,7 @@ _FLOOR_TOLERANCE = 0.5  # metres above or below a floor's height that still belo
 _MIN_FLOOR_SHARE = 0.05  # of all starts on a floor; with fewer they are on stairs
 _UNDER_FLOOR = 0.25  # metres that the centre of an object may lie below its floor
 _STOREY_HEIGHT = 3.0  # metres that the centre of an object may lie above its floor
+_ON_NO_FLOOR = "on no floor"
 _MIN_SHARE_ON_MAP = 0.8  # of the starts; with fewer the map is of another scene
 _MIN_CONNECTED_SHARE = 0.5  # of the standable cells; with fewer too little of the floor is in the episodes
 
@@ -86,7 +89,7 @@ class FloorMap(NamedTuple):
     layers: np.ndarray
 
 
-def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[Scene | InputError]:
+def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[Scene | InputError | ImportCount]:
     """Read a split of Habitat's ObjectNav.
 
     With `maps`, floor and objects come from the map (`build_scene_from_map`), and the episodes of a floor must start on
@@ -99,7 +102,8 @@ def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[S
       maps: a semantic floor map `*_info.pbz2`; all of its scenes are read if there is no episode.
 
     Yields:
-      For every floor of every scene the `Scene`, or why it cannot be used.
+      For every floor of every scene the `Scene`, or why it cannot be used; also the accounts of episodes, goals and
+      objects.
 
     Raises:
       InputError: `path` or `maps` cannot be read.
@@ -122,10 +126,17 @@ def read_habitat(path: Path, split: str, maps: Path | None = None) -> Iterator[S
             has_episodes = True
             if floor_maps is None:
                 yield from _floors_without_map(scene, split)
-            elif scene.name in floor_maps:
+                continue
+
+            # The maps have the objects, so the goals are not used.
+            yield _count_unused_goals(scene)
+            if scene.name in floor_maps:
                 yield from _floors_with_map(scene.name, split, floor_maps[scene.name], scene.episodes)
             else:
                 yield InputError(f"{scene.record.location}: has no map in {maps}; give the maps of this split")
+                num_episodes = len(scene.episodes)
+                yield ImportCount("episodes", num_episodes, skipped=Counter({IN_REFUSED_SCENE: num_episodes}))
+        yield _count_other_goals(scene_episodes)
 
     # Without any episode, all scenes of the map are built.
     if has_episodes:
@@ -191,12 +202,8 @@ def read_position(record: JsonRecord, field: str = "position") -> list[float]:
     return [x, y, 0.0 - z]
 
 
-def collect_goals(scene: SceneEpisodes) -> list[JsonRecord]:
-    """Return the goal objects, each once.
-
-    They are those of the scene's categories, or else those of its episodes. An object is listed again where id,
-    category and place are equal; ids alone need not be unique.
-    """
+def list_goals(scene: SceneEpisodes) -> list[JsonRecord]:
+    """Return the goals of the scene's categories, or else those of its episodes, as often as they are listed."""
     # Lists of goals: the record that holds the list, its field and the goals.
     goal_lists: list[tuple[JsonRecord, str, Any]] = []
     goals_by_category = scene.record.fields.get("goals_by_category")
@@ -209,14 +216,49 @@ def collect_goals(scene: SceneEpisodes) -> list[JsonRecord]:
             if list_field.startswith(f"{scene.mesh}_"):
                 goal_lists.append((category_record, list_field, goals))
 
-    goal_by_identity: dict[Any, JsonRecord] = {}
+    listed_goals: list[JsonRecord] = []
     for record, list_field, goals in goal_lists:
-        for goal in record.iterate_records(list_field, goals):
-            object_id = goal.fields.get("object_id")
-            known_id = object_id if isinstance(object_id, int | str) else None
-            goal_identity = (known_id, goal.get_text("object_category"), *read_position(goal))
-            goal_by_identity.setdefault(goal_identity, goal)
+        listed_goals.extend(record.iterate_records(list_field, goals))
+    return listed_goals
+
+
+def distinct_goals(listed_goals: Sequence[JsonRecord], goal_count: ImportCount) -> list[JsonRecord]:
+    """Return the goal objects, each once.
+
+    An object is listed again where id, category and place are equal; ids alone need not be unique.
+    """
+    goal_by_identity: dict[Any, JsonRecord] = {}
+    for goal in listed_goals:
+        object_id = goal.fields.get("object_id")
+        known_id = object_id if isinstance(object_id, int | str) else None
+        goal_identity = (known_id, goal.get_text("object_category"), *read_position(goal))
+        if goal_identity in goal_by_identity:
+            goal_count.skipped["listed again"] += 1
+        else:
+            goal_by_identity[goal_identity] = goal
+    goal_count.num_kept = len(goal_by_identity)
     return list(goal_by_identity.values())
+
+
+def _count_unused_goals(scene: SceneEpisodes) -> ImportCount:
+    """Count the goals of a scene whose objects come from a map."""
+    try:
+        num_goals = len(list_goals(scene))
+    except InputError:
+        num_goals = 0
+    return ImportCount("goals", num_goals, skipped=Counter({"replaced by the objects of the maps": num_goals}))
+
+
+def _count_other_goals(scenes: Sequence[SceneEpisodes]) -> ImportCount:
+    """Count the goals of a file that belong to none of its scenes with episodes."""
+    num_goals = 0
+    goals_by_category = scenes[0].record.fields.get("goals_by_category") if scenes else None
+    if isinstance(goals_by_category, dict):
+        scene_prefixes = tuple(f"{scene.mesh}_" for scene in scenes)
+        for list_field, goals in goals_by_category.items():
+            if not list_field.startswith(scene_prefixes):
+                num_goals += count_items(goals)
+    return ImportCount("goals", num_goals, skipped=Counter({"of scenes without an episode": num_goals}))
 
 
 def collect_standable_points(scene: SceneEpisodes, goals: list[JsonRecord]) -> np.ndarray:
@@ -245,20 +287,33 @@ def _iterate_path_points(episode: JsonRecord) -> Iterator[list[float]]:
 # Floors by episodes alone
 
 
-def _floors_without_map(scene: SceneEpisodes, split: str) -> Iterator[Scene | InputError]:
+def _floors_without_map(scene: SceneEpisodes, split: str) -> Iterator[Scene | InputError | ImportCount]:
     """Build the floors of a scene from its episodes."""
+    episode_count = ImportCount("episodes", len(scene.episodes))
+    goal_count = ImportCount("goals")
     try:
-        goals = collect_goals(scene)
+        listed_goals = list_goals(scene)
+        goal_count.num_read = len(listed_goals)
+        goals = distinct_goals(listed_goals, goal_count)
         standable_points = collect_standable_points(scene, goals)
         goal_centres = np.array([read_position(goal) for goal in goals]).reshape(-1, 3)
         goal_types = [goal.get_text("object_category") for goal in goals]
     except InputError as error:
         yield error
+        for import_count in (episode_count, goal_count):
+            import_count.skip_all(IN_REFUSED_SCENE)
+            yield import_count
         return
 
     # An object belongs to the highest floor below it.
     floor_heights = _find_floor_heights(standable_points[: len(scene.episodes), 1])
     floor_numbers = np.searchsorted(floor_heights, goal_centres[:, 1] + _UNDER_FLOOR, side="right") - 1
+
+    # Which objects and starts are on an imported floor, and which on a refused one.
+    object_count = ImportCount("objects", len(goals))
+    num_placed = 0
+    has_used_start = np.zeros(len(scene.episodes), bool)
+    has_refused_start = np.zeros(len(scene.episodes), bool)
 
     for floor_index, floor_height in enumerate(floor_heights):
         floor_record = JsonRecord(f"{scene.record.location}: floor {floor_index}", {})
@@ -267,7 +322,7 @@ def _floors_without_map(scene: SceneEpisodes, split: str) -> Iterator[Scene | In
             if floor_number == floor_index and y - floor_height <= _STOREY_HEIGHT:
                 floor_objects.append(SceneObject(object_type, (x, y - floor_height, z, *typical_box(object_type)[:3])))
         on_floor = np.abs(standable_points[:, 1] - floor_height) <= _FLOOR_TOLERANCE
-        yield scene_or_error(
+        result = scene_or_error(
             _build_scene_from_points,
             floor_record,
             f"{scene.name}_floor{floor_index}",
@@ -275,6 +330,21 @@ def _floors_without_map(scene: SceneEpisodes, split: str) -> Iterator[Scene | In
             standable_points[on_floor][:, ::2],
             floor_objects,
         )
+        yield result
+
+        starts_on_floor = on_floor[: len(scene.episodes)]
+        num_placed += len(floor_objects)
+        if isinstance(result, InputError):
+            object_count.skipped[IN_REFUSED_SCENE] += len(floor_objects)
+            has_refused_start |= starts_on_floor
+        else:
+            has_used_start |= starts_on_floor
+
+    object_count.skipped[_ON_NO_FLOOR] = len(goals) - num_placed
+    episode_count.num_kept = int(has_used_start.sum())
+    episode_count.skipped[IN_REFUSED_SCENE] = int((has_refused_start & ~has_used_start).sum())
+    episode_count.skipped[_ON_NO_FLOOR] = int((~has_refused_start & ~has_used_start).sum())
+    yield from (episode_count, goal_count, object_count)
 
 
 def _find_floor_heights(start_heights: np.ndarray) -> list[float]:
@@ -382,7 +452,9 @@ def parse_floor_map(record: JsonRecord) -> FloorMap:
     return FloorMap(float(height), (x_cm, z_cm), layers.values == 1)
 
 
-def build_scene_from_map(record: JsonRecord, name: str, split: str, floor: FloorMap) -> Scene:
+def build_scene_from_map(
+    record: JsonRecord, name: str, split: str, floor: FloorMap, object_count: ImportCount | None = None
+) -> Scene:
     """Build the scene of one floor.
 
     Its x is Habitat's, its z is minus Habitat's. A cell is standable if at least 8 of its 25 pixels are navigable: the
@@ -397,7 +469,7 @@ def build_scene_from_map(record: JsonRecord, name: str, split: str, floor: Floor
     narrow_walls = _keep_long_parts(_find_strips(floor, _NARROW_STRIP_WIDTHS, _MIN_NARROW_ROWS))
     reach_mask = free_cells & ~narrow_walls
     lattice_indices = _to_lattice_cells(floor, reach_mask)
-    map_objects = list(_iterate_map_objects(floor))
+    map_objects = list(_iterate_map_objects(floor, object_count or ImportCount("objects")))
     if not len(lattice_indices):
         raise record.error("sem_map", f"has no cell with {_MIN_FREE_PIXELS} pixels of layer 0; leave the floor out")
     if not map_objects:
@@ -416,7 +488,7 @@ def build_scene_from_map(record: JsonRecord, name: str, split: str, floor: Floor
 
 def _floors_with_map(
     name: str, split: str, records: dict[int, JsonRecord], episodes: Sequence[JsonRecord]
-) -> Iterator[Scene | InputError]:
+) -> Iterator[Scene | InputError | ImportCount]:
     """Build the floors of a scene from their maps, and check them against the episodes."""
     # All maps first: the heights of the floors decide on which of them an episode starts.
     floor_maps: dict[int, FloorMap] = {}
@@ -426,14 +498,29 @@ def _floors_with_map(
         except InputError as error:
             yield error
 
+    episode_count = ImportCount("episodes", len(episodes))
     for floor_number, floor_map in floor_maps.items():
+        floor_name = f"{name}_floor{floor_number}"
+        object_count = ImportCount("objects")
+        num_starts = 0
         try:
-            scene = build_scene_from_map(records[floor_number], f"{name}_floor{floor_number}", split, floor_map)
-            _check_starts(records[floor_number], scene, _starts_on_floor(floor_number, floor_maps, episodes))
+            floor_starts = _starts_on_floor(floor_number, floor_maps, episodes)
+            num_starts = len(floor_starts)
+            scene = build_scene_from_map(records[floor_number], floor_name, split, floor_map, object_count)
+            _check_starts(records[floor_number], scene, floor_starts)
         except InputError as error:
+            object_count.skip_all(IN_REFUSED_SCENE)
+            episode_count.skipped[IN_REFUSED_SCENE] += num_starts
             yield error
         else:
+            episode_count.num_kept += num_starts
             yield scene
+        yield object_count
+
+    # Each other episode is on a floor without a map, or has no readable start.
+    num_counted = episode_count.num_kept + episode_count.skipped.total()
+    episode_count.skipped[_ON_NO_FLOOR] = episode_count.num_read - num_counted
+    yield episode_count
 
 
 def _starts_on_floor(number: int, floors: dict[int, FloorMap], episodes: Sequence[JsonRecord]) -> np.ndarray:
@@ -506,12 +593,15 @@ def _to_lattice_cells(floor: FloorMap, mask: np.ndarray) -> np.ndarray:
     return np.stack([-z, x], axis=1)
 
 
-def _iterate_map_objects(floor: FloorMap) -> Iterator[SceneObject]:
+def _iterate_map_objects(floor: FloorMap, object_count: ImportCount) -> Iterator[SceneObject]:
     # Pixels are 5 cm wide, and the box of an object ends with its last pixel.
     for category, layer in zip(GIBSON_CATEGORIES, floor.layers[1:], strict=True):
         _, height, _, y = typical_box(category)
         for part_pixels in connected_parts(layer):
-            if len(part_pixels) >= _MIN_OBJECT_PIXELS:
+            object_count.num_read += 1
+            if len(part_pixels) < _MIN_OBJECT_PIXELS:
+                object_count.skipped[f"smaller than {_MIN_OBJECT_PIXELS} pixels"] += 1
+            else:
                 low_pixel = part_pixels.min(axis=0)
                 high_pixel = part_pixels.max(axis=0) + 1
                 x, z = ((floor.origin + _PIXEL_CM * (low_pixel + high_pixel) / 2) / 100).tolist()

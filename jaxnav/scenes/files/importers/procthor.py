@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import GIBSON_CATEGORIES, ITHOR_CATEGORIES, ROBOTHOR_CATEGORIES, category_ids
+from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount
 from jaxnav.scenes.files.importers.assemble import (
     BOX_FIELDS,
     ImportNote,
@@ -91,11 +92,13 @@ class HouseObjects(NamedTuple):
       objects: each before the objects that rest on or in it.
       num_guessed_types: number of objects whose type is guessed from the name of their asset.
       num_guessed_sizes: number of objects whose size is the typical one of their type.
+      num_added_boxes: number of boxes of corner counters beyond the first of each.
     """
 
     objects: list[SceneObject]
     num_guessed_types: int
     num_guessed_sizes: int
+    num_added_boxes: int
 
 
 class FloorPolygon(NamedTuple):
@@ -114,7 +117,7 @@ class FloorPolygon(NamedTuple):
 
 def read_procthor(
     path: Path, split: str, assets: Path | None = None, agent_part: bool = False
-) -> Iterator[Scene | InputError | ImportNote]:
+) -> Iterator[Scene | InputError | ImportNote | ImportCount]:
     """Read ProcTHOR houses.
 
     The agent can stand on the lattice points of the rooms that are at least 0.2 m from walls and from objects whose
@@ -130,8 +133,8 @@ def read_procthor(
         to the nearest free cell, at most 0.5 m away.
 
     Yields:
-      A scene `<file>-<index>` for each house and notes of what was guessed or moved, or the error that says why there
-      is no scene.
+      A scene `<file>-<index>` for each house, or the error that says why there is no scene, with the account of its
+      objects and notes of what was guessed or moved.
 
     Raises:
       InputError: a file is missing or damaged, or holds no house.
@@ -144,6 +147,7 @@ def read_procthor(
     for location, house_value in _iterate_houses(path):
         name = f"{file_stem}-{num_houses}"
         num_houses += 1
+        object_count = ImportCount("objects", num_read=_count_tree(house_value))
         try:
             if isinstance(house_value, InputError):
                 raise house_value
@@ -155,10 +159,14 @@ def read_procthor(
             if agent_part:
                 reach_mask, agent_moved = _cells_of_agent(house, scene)
         except InputError as error:
+            object_count.skip_all(IN_REFUSED_SCENE)
             yield error
+            yield object_count
             continue
 
         yield dataclasses.replace(scene, reach=reach_mask)
+        object_count.num_added = house_objects.num_added_boxes
+        yield object_count
         count_by_note = {
             f"types of objects are guessed from the names of their assets{hint}": house_objects.num_guessed_types,
             f"sizes of objects are the typical ones of their types{hint}": house_objects.num_guessed_sizes,
@@ -190,6 +198,19 @@ def _iterate_houses(path: Path) -> Iterator[tuple[str, Any]]:
         # A text holds one house, or a list of houses.
         for house in house_value if isinstance(house_value, list) else [house_value]:
             yield location, house
+
+
+def _count_tree(house_value: Any) -> int:
+    """Return the number of objects of a house with their children, also in a house that cannot be used."""
+    num_objects = 0
+    item_lists = [house_value.get("objects")] if isinstance(house_value, dict) else []
+    while item_lists:
+        items = item_lists.pop()
+        for item in items if isinstance(items, list) else []:
+            num_objects += 1
+            if isinstance(item, dict):
+                item_lists.append(item.get("children"))
+    return num_objects
 
 
 def _build_house(house: JsonRecord, name: str, split: str, objects: Sequence[SceneObject]) -> Scene:
@@ -411,6 +432,7 @@ def read_objects(house: JsonRecord, assets: dict[str, AssetInfo]) -> HouseObject
     house_objects: list[SceneObject] = []
     num_guessed_types = 0
     num_guessed_sizes = 0
+    num_added_boxes = 0
 
     # Walk the tree in the order of the file. The stack holds label, JSON and parent index of the objects to come.
     item_stack = _reversed_items("objects", root_values, -1)
@@ -424,12 +446,13 @@ def read_objects(house: JsonRecord, assets: dict[str, AssetInfo]) -> HouseObject
         asset = assets.get(asset_id, AssetInfo())
         named_type = _named_type(item, asset)
         asset_size = asset.size or _counter_size(asset_id)
-        house_objects += _object_parts(
-            item, named_type or _guess_type(item), asset_size, parent_index, len(house_objects)
-        )
+        object_type = named_type or _guess_type(item)
+        object_parts = _object_parts(item, object_type, asset_size, parent_index, len(house_objects))
+        house_objects += object_parts
+        num_added_boxes += len(object_parts) - 1
         num_guessed_types += named_type is None
         num_guessed_sizes += asset_size is None
-    return HouseObjects(house_objects, num_guessed_types, num_guessed_sizes)
+    return HouseObjects(house_objects, num_guessed_types, num_guessed_sizes, num_added_boxes)
 
 
 def _reversed_items(field: str, values: Sequence[Any], parent: int) -> list[tuple[str, Any, int]]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from support.importer_inputs.procthor import ASSETS
-from support.scene_records import as_scene
+from support.scene_records import as_scene, without_counts
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.ai2thor import read_ai2thor
@@ -22,7 +22,7 @@ def read_metadata(tmp_path: Path) -> Callable[[object], Scene | InputError]:
     def read(record: object) -> Scene | InputError:
         metadata_file = tmp_path / "room.json"
         metadata_file.write_text(json.dumps(record))
-        (result,) = read_ai2thor(metadata_file, "val")
+        (result,) = without_counts(read_ai2thor(metadata_file, "val"))
         return result
 
     return read
@@ -37,7 +37,7 @@ def read_house(tmp_path: Path) -> Callable[..., Scene | InputError]:
         house_file.write_text(json.dumps(house))
         asset_file = tmp_path / "assets.json"
         asset_file.write_text(json.dumps(assets))
-        result, *notes = read_procthor(house_file, "val", asset_file if assets else None, agent_part)
+        result, *notes = without_counts(read_procthor(house_file, "val", asset_file if assets else None, agent_part))
         assert all(isinstance(note, ImportNote) for note in notes)
         assert not isinstance(result, ImportNote)
         return result

@@ -12,7 +12,7 @@ from support.importer_inputs.ai2thor import METADATA, PLACES, vector
 from support.mutations import changed, mutated, mutated_text, without
 from support.real_scenes import INPUTS, require
 from support.refusals import assert_message_names
-from support.scene_records import as_scene, check_outcomes
+from support.scene_records import as_scene, check_outcomes, without_counts
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.ai2thor import read_ai2thor
@@ -101,7 +101,7 @@ def test_read_ai2thor_imports_all_good_records_of_a_file(tmp_path):
     records = [METADATA, without(METADATA, "objects"), changed(METADATA, "sceneName", "FloorPlan2")]
     lines = [json.dumps(record) for record in records]
     metadata_file.write_bytes(gzip.compress("\n".join([*lines, '{"sceneName": "Flo']).encode()))
-    first_scene, bad_record, second_scene, torn_line = read_ai2thor(metadata_file, "train")
+    first_scene, bad_record, second_scene, torn_line = without_counts(read_ai2thor(metadata_file, "train"))
     assert (as_scene(first_scene).name, as_scene(second_scene).name) == ("FloorPlan201", "FloorPlan2")
     assert_message_names(bad_record, f"{metadata_file}, line 2, scene 'FloorPlan201_physics': objects ", "add it")
     assert_message_names(torn_line, f"{metadata_file}, line 4: not JSON")
@@ -131,7 +131,7 @@ def test_read_ai2thor_imports_grids_with_gaps(read_metadata):
 
 
 def test_read_ai2thor_refuses_the_grid_of_an_earlier_report():
-    (error,) = read_ai2thor(require(INPUTS / "a02_grid_half.json"), "train")
+    (error,) = without_counts(read_ai2thor(require(INPUTS / "a02_grid_half.json"), "train"))
     assert_message_names(error, "scene 'FloorPlan201_physics': actionReturn ", "0.5 m apart", "grid of 0.25 m")
 
 
@@ -139,7 +139,7 @@ def test_read_ai2thor_imports_all_good_files_of_a_folder(tmp_path):
     (tmp_path / "b.json").write_text(json.dumps(METADATA))
     (tmp_path / "a.json.gz").write_bytes(gzip.compress(json.dumps(METADATA).encode())[:-20])
     (tmp_path / "c.pkl").write_bytes(b"not opened")
-    cut_file, scene = read_ai2thor(tmp_path, "train")
+    cut_file, scene = without_counts(read_ai2thor(tmp_path, "train"))
     assert_message_names(cut_file, "a.json.gz: ", "cut short")
     assert as_scene(scene).name == "FloorPlan201"
 
@@ -158,7 +158,7 @@ def test_read_ai2thor_refuses_paths_without_a_record(tmp_path, file_name, expect
 def refusal_message(metadata_file: Path) -> str:
     """Return the message of the only refusal of a file, which is raised or among the results."""
     try:
-        (result,) = read_ai2thor(metadata_file, "train")
+        (result,) = without_counts(read_ai2thor(metadata_file, "train"))
     except InputError as error:
         return str(error)
     assert isinstance(result, InputError)
@@ -180,7 +180,7 @@ def test_read_ai2thor_imports_or_refuses_mutated_records(tmp_path):
     @given(mutated(METADATA))
     def check_import(record):
         metadata_file.write_text(json.dumps(record) + "\n" + json.dumps(METADATA))
-        results = list(read_ai2thor(metadata_file, "train"))
+        results = without_counts(read_ai2thor(metadata_file, "train"))
         check_outcomes(results[:1], outcomes, metadata_file)
         assert isinstance(results[1], Scene)
 
@@ -195,7 +195,7 @@ def test_read_ai2thor_imports_or_refuses_mutated_text(tmp_path):
     @given(mutated_text(json.dumps(METADATA)))
     def check_import(file_text):
         metadata_file.write_text(file_text)
-        check_outcomes(list(read_ai2thor(metadata_file, "train")), outcomes, metadata_file)
+        check_outcomes(without_counts(read_ai2thor(metadata_file, "train")), outcomes, metadata_file)
 
     check_import()
     assert outcomes[InputError] >= 10
@@ -207,5 +207,5 @@ def test_read_ai2thor_imports_or_refuses_mutated_text(tmp_path):
 def test_read_ai2thor_refuses_strange_texts(tmp_path, file_text):
     metadata_file = tmp_path / "room.json"
     metadata_file.write_text(file_text)
-    (result,) = read_ai2thor(metadata_file, "train")
+    (result,) = without_counts(read_ai2thor(metadata_file, "train"))
     assert isinstance(result, InputError)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.mutations import mutated
 from support.real_scenes import ITHOR, ITHOR_SHUFFLES, require
 from support.refusals import assert_message_names
-from support.scene_records import as_scene, check_outcomes, write_records
+from support.scene_records import as_scene, check_outcomes, without_counts, write_records
 
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
@@ -65,7 +65,7 @@ def base_file(tmp_path):
 
 def test_read_replacements_moves_the_objects_of_every_set(tmp_path, base_file):
     sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS)
-    first_scene, second_scene = map(as_scene, read_replacements(sets_file, base_file))
+    first_scene, second_scene = map(as_scene, without_counts(read_replacements(sets_file, base_file)))
     (base_room,) = read_scenes(base_file)
     assert [first_scene.name, second_scene.name] == ["den-replaced-0", "den-replaced-1"]
     assert first_scene.types == base_room.types == ("Desk", "Book", "Book", "BasketBall", "Mug", "Pen", "Cup")
@@ -114,7 +114,7 @@ def test_read_replacements_refuses_bad_rooms_and_imports_the_rest(
     tmp_path, base_file, changed_fields, field_name, remedy
 ):
     sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS | changed_fields, SETS)
-    error, *scenes = read_replacements(sets_file, base_file)
+    error, *scenes = without_counts(read_replacements(sets_file, base_file))
     assert isinstance(error, InputError)
     assert str(error).startswith(f"{sets_file}, line 1: record")
     assert_message_names(error, f"{field_name} ", remedy)
@@ -123,7 +123,7 @@ def test_read_replacements_refuses_bad_rooms_and_imports_the_rest(
 
 def test_read_replacements_refuses_a_bad_set_and_imports_the_rest(tmp_path, base_file):
     sets_file = write_records(tmp_path / "sets.jsonl.gz", SETS | {"sets": [[["Sofa", 0, 0, 0]], ROWS]})
-    error, scene = read_replacements(sets_file, base_file)
+    error, scene = without_counts(read_replacements(sets_file, base_file))
     assert isinstance(error, InputError)
     assert as_scene(scene).name == "den-replaced-1"
 
@@ -142,7 +142,7 @@ def test_read_replacements_imports_or_refuses_mutated_records(tmp_path, base_fil
     @given(mutated(SETS))
     def check_import(mutated_sets):
         sets_file = write_records(tmp_path / "sets.jsonl.gz", mutated_sets, SETS)
-        results = list(read_replacements(sets_file, base_file))
+        results = without_counts(read_replacements(sets_file, base_file))
         check_outcomes(results[:-2], outcomes, sets_file)
         assert [type(result) for result in results[-2:]] == [Scene, Scene]
 
@@ -160,7 +160,7 @@ def test_read_replacements_puts_the_underside_at_the_pivot_for_strange_ids(tmp_p
         folder / "room.jsonl.gz", ROOM | {"objects": [[*ROOM["objects"][CUP][:8], -1, object_id]]}
     )
     sets_file = write_records(folder / "sets.jsonl.gz", SETS | {"sets": SETS["sets"][1:]})
-    (scene,) = read_replacements(sets_file, room_file)
+    (scene,) = without_counts(read_replacements(sets_file, room_file))
     assert as_scene(scene).boxes[0, 1] == pytest.approx(0.85)
 
 
@@ -175,7 +175,7 @@ def test_scenes_import_replacements_writes_a_scene_file(tmp_path, base_file, cap
 
 
 def test_read_replacements_reads_ten_sets_of_eighty_real_rooms():
-    scenes = list(map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))))
+    scenes = list(map(as_scene, without_counts(read_replacements(require(ITHOR_SHUFFLES), require(ITHOR)))))
     rooms = {scene.name: scene for scene in read_scenes(ITHOR)}
     train_rooms = [name for name, base_room in rooms.items() if base_room.split == "train"]
     assert len(scenes) == 800
@@ -209,7 +209,7 @@ def test_read_replacements_restores_real_heights_from_pivots(tmp_path):
             if type_name in movable_types:
                 rows.append([type_name, *map(float, object_id.split("|")[1:4])])
         all_sets.append({"name": record["name"], "columns": ["type", "x", "y", "z"], "sets": [rows]})
-    scenes = read_replacements(write_records(tmp_path / "sets.jsonl.gz", *all_sets), ITHOR)
+    scenes = without_counts(read_replacements(write_records(tmp_path / "sets.jsonl.gz", *all_sets), ITHOR))
 
     # At least 95 % of the heights are within 2 cm.
     height_errors = []
@@ -225,7 +225,7 @@ def test_read_replacements_restores_real_heights_from_pivots(tmp_path):
 def test_replaced_real_rooms_keep_nearly_all_categories_reachable():
     num_present = 0
     num_reachable = 0
-    for scene in map(as_scene, read_replacements(require(ITHOR_SHUFFLES), require(ITHOR))):
+    for scene in map(as_scene, without_counts(read_replacements(require(ITHOR_SHUFFLES), require(ITHOR)))):
         num_present += len(set(category_ids(scene.types, ITHOR_CATEGORIES)) - {-1})
         num_reachable += (compile_scene(scene, ROOMS).best_length > 0).any(axis=0).sum()
     assert num_present == 6700

@@ -9,7 +9,7 @@ from support.importer_inputs.semantic_maps import bedroom, l_shaped_floor, write
 from support.real_scenes import INPUTS, require
 from support.refusals import assert_message_names
 from support.scene_geometry import points_of
-from support.scene_records import assert_scenes_equal, scenes_and_errors
+from support.scene_records import assert_scenes_equal, scenes_and_errors, without_counts
 
 from jaxnav.errors import InputError
 from jaxnav.scenes.files.importers.habitat import read_habitat
@@ -62,7 +62,7 @@ def test_read_habitat_without_episodes_imports_every_mapped_floor(tmp_path, map_
 
     # Without a map either there is nothing to import.
     with pytest.raises(InputError, match="give the folder of a split, or a semantic floor map"):
-        list(read_habitat(tmp_path / episode_path, "train"))
+        without_counts(read_habitat(tmp_path / episode_path, "train"))
 
 
 def move_starts_upstairs(offset: float, num_moved: int) -> list[dict]:
@@ -155,7 +155,7 @@ def test_read_habitat_tells_goals_of_one_id_apart_by_place(tmp_path):
 def test_read_habitat_keeps_dots_in_names_of_scenes(tmp_path, mesh, scene_name):
     home = goal("chair", 7, [0.5, 0.4, -0.5], [])
     starts = [episode(0.25 * i, 0.0, 0.0, goals=[home]) | {"scene_id": mesh} for i in range(9)]
-    (scene,) = read_habitat(write_json(tmp_path / "val.json.gz", {"episodes": starts}), "val")
+    (scene,) = without_counts(read_habitat(write_json(tmp_path / "val.json.gz", {"episodes": starts}), "val"))
     assert isinstance(scene, Scene)
     assert scene.name == f"{scene_name}_floor0"
 
@@ -202,7 +202,7 @@ def test_read_habitat_uses_goals_and_shortest_paths_of_episodes(tmp_path):
         episode(0, 0, 0, goals=[chair_goal], shortest_paths=[shortest_path]),
         episode(0, 0, 0, goals=[chair_goal]),
     ]
-    (scene,) = read_habitat(write_json(tmp_path / "e.json.gz", {"episodes": episodes}), "val")
+    (scene,) = without_counts(read_habitat(write_json(tmp_path / "e.json.gz", {"episodes": episodes}), "val"))
     assert isinstance(scene, Scene)
     assert scene.types == ("chair",)
     assert len(standable_cells(scene.reach)) == 3  # (0, 0), (0.25, 0.25), (0.5, 0.5): a diagonal
