@@ -33,6 +33,20 @@ from support.mutations import edited
 CRASHED = -1
 NASTY = [None, True, -1, 0, 7, 1e308, -0.13, 10**400, float("nan"), float("inf"), "", "Floor", "\ud800", [], {}, [[]]]
 
+_NAME_WORDS = (
+    "Bed",
+    "sofa",
+    "FloorPlan_test-dev1",
+    "house.1.glb",
+    "Home.glb",
+    "._x",
+    "small",
+    "room",
+    "\u00e9t\u00e9",
+    "\ufeff",
+)
+_NAME_SEPARATORS = ("|", "_", "-", ".", "/", " ", "")
+
 
 class Format(NamedTuple):
     """Describe an input: format, content, and a writer.
@@ -78,13 +92,26 @@ FORMATS = (
 )
 
 
+def random_name(draw: random.Random) -> str:
+    """Return an id or name: hashes, numbers and words with the separators of the formats between them."""
+    name_parts: list[str] = []
+    for _ in range(draw.randint(1, 4)):
+        hash_text = f"{draw.getrandbits(128):032x}"[: draw.choice((4, 8, 32))]
+        name_parts.append(draw.choice((hash_text, hash_text.upper(), str(draw.randrange(-1, 999)), *_NAME_WORDS)))
+    return draw.choice(_NAME_SEPARATORS).join(name_parts)
+
+
 def mutated(content: object, draw: random.Random) -> object:
-    """Return a copy with up to three values replaced.
+    """Return a copy with up to three values replaced, by nasty values or random names.
 
     They may be deleted, too.
     """
+
+    def replacement() -> object:
+        return random_name(draw) if draw.random() < 0.3 else copy.deepcopy(draw.choice(NASTY))
+
     for _ in range(draw.randint(1, 3)):
-        content = edited(content, draw.choice, lambda: copy.deepcopy(draw.choice(NASTY)))
+        content = edited(content, draw.choice, replacement)
     return content
 
 
