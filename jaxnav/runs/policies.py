@@ -303,10 +303,15 @@ def export_policy(
     }
 
     # Arrays, by group.
-    arrays = {
-        "policy": jax.device_get(params),
-        "layout": {"prior": np.asarray(knowledge.layout), "counts": np.asarray(explored.prior_counts)},
-    }
+    arrays = knowledge_to_arrays(knowledge) | {"policy": jax.device_get(params)}
+    arrays["layout"]["counts"] = np.asarray(explored.prior_counts)
+
+    export_params(folder, arrays, fields)
+
+
+def knowledge_to_arrays(knowledge: Knowledge) -> dict[str, Any]:
+    """Return knowledge from before training as nested dicts of NumPy arrays, by groups of an export."""
+    arrays = {"layout": {"prior": np.asarray(knowledge.layout)}}
     if knowledge.method:
         arrays["knowledge"] = jax.device_get(knowledge.method)
     if knowledge.cooccurrence is not None:
@@ -314,8 +319,26 @@ def export_policy(
         arrays["signs"] = {"odds": evidence.log_odds, "chance": evidence.co_visibility}
         if evidence.near_log_odds is not None:
             arrays["signs"]["near_odds"] = evidence.near_log_odds
+    return arrays
 
-    export_params(folder, arrays, fields)
+
+def knowledge_from_arrays(arrays: Mapping[str, Any]) -> Knowledge:
+    """Return the knowledge in the arrays of an export, on the device; the inverse of `knowledge_to_arrays`."""
+    # Exports of baselines have no co-occurrence evidence.
+    cooccurrence = None
+    if "signs" in arrays:
+        evidence_arrays = arrays["signs"]
+        near_log_odds = evidence_arrays.get("near_odds")  # missing in exports of earlier versions
+        cooccurrence = CooccurrenceEvidence(
+            jnp.asarray(evidence_arrays["odds"]),
+            jnp.asarray(evidence_arrays["chance"]),
+            None if near_log_odds is None else jnp.asarray(near_log_odds),
+        )
+    return Knowledge(
+        layout=jnp.asarray(arrays["layout"]["prior"]),
+        method=jax.tree.map(jnp.asarray, arrays.get("knowledge", {})),
+        cooccurrence=cooccurrence,
+    )
 
 
 def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Policies:
@@ -399,21 +422,8 @@ def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) 
         # Network parameters, on the device.
         params = jax.tree.map(jnp.asarray, arrays["policy"])
 
-        # Knowledge from before training; exports of baselines have no co-occurrence evidence.
-        cooccurrence = None
-        if "signs" in arrays:
-            evidence_arrays = arrays["signs"]
-            near_log_odds = evidence_arrays.get("near_odds")  # missing in exports of earlier versions
-            cooccurrence = CooccurrenceEvidence(
-                jnp.asarray(evidence_arrays["odds"]),
-                jnp.asarray(evidence_arrays["chance"]),
-                None if near_log_odds is None else jnp.asarray(near_log_odds),
-            )
-        knowledge = Knowledge(
-            layout=jnp.asarray(arrays["layout"]["prior"]),
-            method=jax.tree.map(jnp.asarray, arrays.get("knowledge", {})),
-            cooccurrence=cooccurrence,
-        )
+        # Knowledge from before training.
+        knowledge = knowledge_from_arrays(arrays)
         if knowledge.method:
             check_knowledge(params, policy_spec, knowledge)
 

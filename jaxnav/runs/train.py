@@ -1,7 +1,8 @@
 """Training of a run, from the layout prior to the exported policies.
 
 `train` is the entry point. Before training, `explore_world`, `calibrate_estimator` and `learn_knowledge` collect the
-layout prior and everything else that is known from the training scenes. `make_trainer` builds the trainer of all seeds
+layout prior and everything else that is known from the training scenes; `prepare_training` stores the results in the
+run directory. `make_trainer` builds the trainer of all seeds
 of both arms (`baseline`: policies without the layout estimator, `layout`: with it), and `run_updates` trains chunk by
 chunk. A chunk is one compiled call of several updates in one bank of scenes (a shard, where scenes are streamed).
 Between chunks the run validates, logs and saves its policies. A run resumes from its last checkpoint, and a signal
@@ -38,6 +39,13 @@ from jaxnav.policies.network import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.policies import POLICIES_DIR, export_policy
+from jaxnav.runs.preparation import (
+    PREPARATION_DIR,
+    Preparation,
+    has_preparation,
+    load_preparation,
+    save_preparation,
+)
 from jaxnav.runs.run import REACH_FILE, TIMES_FILE, Run, RunLogs, lock_run_dir, run_settings
 from jaxnav.runs.validation import SCORE_METRIC, Validator
 from jaxnav.runs.worlds import (
@@ -136,18 +144,9 @@ def _train_in_run_dir(
     console: Console,
 ) -> None:
     """Train in a run directory whose lock is held; see `train`."""
-    # Prepare the knowledge from before training: layout prior, estimator, and the method's own statistics.
     warn_if_rollout_too_short(config, console)
     warn_if_more_steps(config, console)
-    with console.status("random walks for the layout prior"):
-        exploration = explore_world(config, world)
-        num_steps = int(exploration.steps)
-        num_poses = int(exploration.poses)
-    console.print(f"layout prior from {num_steps:,} random steps, {num_poses:,} distinct poses")
-    with console.status("calibrating the layout estimator"):
-        estimator_config = calibrate_estimator(config, world, exploration, console)
-    with console.status("learning statistics of the training scenes"):
-        knowledge = learn_knowledge(config, world, exploration, estimator_config)
+    exploration, estimator_config, knowledge = prepare_training(config, world, manifest, console)
 
     # Draw the bank of scenes in which each chunk trains.
     trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
@@ -226,6 +225,45 @@ def warn_if_more_steps(config: RunConfig, console: Console) -> None:
         console.print(
             f"training for {num_steps:,} steps instead of {asked_steps:,}: whole chunks of {chunk_steps:,} steps each"
         )
+
+
+def prepare_training(
+    config: RunConfig, world: CompiledWorld, manifest: dict[str, Any], console: Console
+) -> Preparation:
+    """Layout prior, layout estimator and the method's own statistics, learned once in each run.
+
+    Args:
+      config: configuration of the run, whose directory is locked.
+      world: compiled training scenes.
+      manifest: manifest of the run.
+      console: console for progress.
+
+    Raises:
+      InputError: the run directory holds knowledge of other settings or scenes.
+    """
+    # A repeated command reads the knowledge: other hardware would learn it with other last digits.
+    if has_preparation(config.run_dir):
+        preparation = load_preparation(config.run_dir, manifest)
+        if preparation is not None:
+            run_on_first_process(lambda: None)  # processes that learn wait for the one that stores
+            console.print(f"layout prior of this run, from {int(preparation.exploration.steps):,} random steps")
+            return preparation
+        console.print(f"{config.run_dir / PREPARATION_DIR}: is damaged, so it is learned again")
+
+    # Learn the layout prior, the estimator, and then everything that builds on both.
+    with console.status("random walks for the layout prior"):
+        exploration = explore_world(config, world)
+        num_steps = int(exploration.steps)
+        num_poses = int(exploration.poses)
+    console.print(f"layout prior from {num_steps:,} random steps, {num_poses:,} distinct poses")
+    with console.status("calibrating the layout estimator"):
+        estimator_config = calibrate_estimator(config, world, exploration, console)
+    with console.status("learning statistics of the training scenes"):
+        knowledge = learn_knowledge(config, world, exploration, estimator_config)
+
+    preparation = Preparation(exploration, estimator_config, knowledge)
+    run_on_first_process(lambda: save_preparation(config.run_dir, preparation, manifest))
+    return preparation
 
 
 def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:

@@ -19,6 +19,10 @@ from jaxnav.store.files import WRITTEN_BY_0_1, verify_digest, write_atomic, writ
 POLICY_FORMAT_VERSION = 3
 _FORMAT_VERSION_OF_0_1 = 2
 
+#: Largest difference of two equal exports, absolute and relative. Other hardware sums in another order, which changes
+#: the last digits of float32.
+TOLERANCE = 1e-5
+
 #: File with all arrays of the policy: network parameters, layout priors and method knowledge.
 PARAMS_FILE = "params.safetensors"
 #: File that describes the policy; it is written last.
@@ -34,7 +38,8 @@ def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, 
 
     `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, the fields as `spec`, the
     SHA-256 of the arrays and a digest of its own. Because `policy.json` is written last, `load_params` refuses an
-    export that was cut short. An identical export stays, a damaged one is replaced, and a different one is refused.
+    export that was cut short. An equal export stays, a damaged one is replaced, and a different one is refused.
+    Exports are equal if all fields, names, shapes and dtypes are, and if all numbers differ by at most `TOLERANCE`.
 
     Args:
       folder: created if missing.
@@ -45,13 +50,8 @@ def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, 
       InputError: the folder holds another export, or one of another format version.
       TypeError: a name in `arrays` is no string or contains `/`.
     """
-    # The description has the digest of the arrays, so that both files are known to belong together.
-    array_bytes = safetensors.numpy.save(_flatten(arrays))
-    policy = {
-        "format_version": POLICY_FORMAT_VERSION,
-        "params_sha256": hashlib.sha256(array_bytes).hexdigest(),
-        "spec": fields,
-    }
+    flat_arrays = _flatten(arrays)
+    array_bytes = safetensors.numpy.save(flat_arrays)
 
     # An intact export is never overwritten.
     try:
@@ -59,13 +59,36 @@ def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, 
     except _OtherVersionError:
         raise
     except InputError:  # no export there, or a damaged one
+        # The description has the digest of the arrays, so that both files are known to belong together.
+        policy = {
+            "format_version": POLICY_FORMAT_VERSION,
+            "params_sha256": hashlib.sha256(array_bytes).hexdigest(),
+            "spec": fields,
+        }
         write_atomic(folder / PARAMS_FILE, array_bytes)
         write_json_with_digest(folder / POLICY_FILE, policy)
         return
 
-    # Compare as JSON, in which tuples are lists.
-    if existing_policy != json.loads(json.dumps(policy)):
+    # Compare fields as JSON, in which tuples are lists.
+    has_equal_fields = existing_policy["spec"] == json.loads(json.dumps(fields))
+    existing_arrays = safetensors.numpy.load_file(folder / PARAMS_FILE)
+    if not (has_equal_fields and _are_close(existing_arrays, flat_arrays)):
         raise InputError(f"{folder}: holds another policy, which is not overwritten; move or remove the folder")
+
+
+def _are_close(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> bool:
+    """True if two exports have equal names, shapes and dtypes, and equal numbers within `TOLERANCE`."""
+    if first.keys() != second.keys():
+        return False
+    for name, array in first.items():
+        other_array = second[name]
+        if array.shape != other_array.shape or array.dtype != other_array.dtype:
+            return False
+        # Integers and flags are exact.
+        tolerance = TOLERANCE if np.issubdtype(array.dtype, np.inexact) else 0.0
+        if not np.allclose(array, other_array, rtol=tolerance, atol=tolerance, equal_nan=True):
+            return False
+    return True
 
 
 def load_params(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:

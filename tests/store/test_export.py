@@ -49,6 +49,39 @@ def test_export_refuses_to_replace_another_policy(tmp_path, other_params, other_
     assert contents(tmp_path) == exported_files
 
 
+@pytest.mark.parametrize(
+    ("other_kernel", "is_equal"),
+    [
+        (lambda kernel: kernel * np.float32(1 + 5e-6), True),  # other hardware sums in another order
+        (lambda kernel: kernel + np.float32(5e-6), True),
+        (lambda kernel: kernel * np.float32(1 + 1e-4), False),
+        (lambda kernel: kernel + np.float32(1e-4), False),
+        (lambda kernel: kernel * np.nan, False),
+        (lambda kernel: kernel.astype(np.float64), False),
+        (lambda kernel: kernel[None], False),
+        (lambda kernel: kernel[:, None], False),
+    ],
+)
+def test_exports_are_compared_by_numbers(tmp_path, other_kernel, is_equal):
+    kernel = np.linspace(-3, 3, 7, dtype=np.float32)
+    export_params(tmp_path, {"kernel": kernel}, SPEC)
+    exported_files = contents(tmp_path)
+    if is_equal:
+        export_params(tmp_path, {"kernel": other_kernel(kernel)}, SPEC)
+    else:
+        with pytest.raises(InputError, match="another policy"):
+            export_params(tmp_path, {"kernel": other_kernel(kernel)}, SPEC)
+    assert contents(tmp_path) == exported_files
+
+
+def test_whole_numbers_of_equal_exports_are_exact(tmp_path):
+    steps = np.array([10**6, 0], np.int32)
+    export_params(tmp_path, {"steps": steps}, SPEC)
+    export_params(tmp_path, {"steps": steps}, SPEC)
+    with pytest.raises(InputError, match="another policy"):
+        export_params(tmp_path, {"steps": steps + np.int32(1)}, SPEC)
+
+
 @pytest.mark.parametrize("file_name", ["params.safetensors", "policy.json"])
 def test_export_repairs_a_damaged_file(tmp_path, file_name):
     export_params(tmp_path, PARAMS, SPEC)
