@@ -12,6 +12,7 @@ ends it after the current chunk (`Interrupts`).
 import dataclasses
 import functools
 import json
+import math
 import signal
 import threading
 import time
@@ -74,7 +75,7 @@ from jaxnav.training.devices import (
     is_first_process,
     run_on_first_process,
 )
-from jaxnav.training.ppo import Learner, LearnerState
+from jaxnav.training.ppo import EPISODE_MEANS, Learner, LearnerState
 from jaxnav.training.trainer import SeedMetrics, ShardedTrainer, Trainer, TrainerStates
 
 # Constants folded into the run's key; the arms use 0, 1, ... (`ARM_KEY_PURPOSES`).
@@ -496,6 +497,7 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
 
             # Train, and validate if due.
             states, metrics = trainer.train(states, env_params, stage_index)
+            metrics = mark_undefined_means(metrics)
             update += config.chunk
             progress.stop_timing()
             if session.validator is not None and update in validation_updates:
@@ -525,6 +527,17 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
             stop_message = f"{config.run_dir}: stopped after update {update} of {config.total_updates} and saved"
             raise Interrupted(signal_number, stop_message)
     return states
+
+
+def mark_undefined_means(metrics: SeedMetrics) -> SeedMetrics:
+    """Metrics with NaN, which the log holds as null, for means over no episode."""
+    marked_metrics: SeedMetrics = {}
+    for arm, metrics_by_seed in metrics.items():
+        marked_metrics[arm] = []
+        for seed_metrics in metrics_by_seed:
+            undefined_means = {} if seed_metrics["episodes"] else dict.fromkeys(EPISODE_MEANS, math.nan)
+            marked_metrics[arm].append(seed_metrics | undefined_means)
+    return marked_metrics
 
 
 def _validate(
@@ -701,8 +714,11 @@ class ProgressDisplay:
         success_rates = []
         num_skipped = 0
         for arm, seeds in metrics.items():
-            arm_success = np.mean([seed_metrics["success"] for seed_metrics in seeds])
-            success_rates.append(f"{arm} {100 * arm_success:.0f} %")
+            # Success is undefined in seeds in which no episode ended.
+            seed_success = [seed_metrics["success"] for seed_metrics in seeds]
+            has_success = not np.isnan(seed_success).all()
+            success_text = f"{100 * np.nanmean(seed_success):.0f} %" if has_success else "undefined (no episode ended)"
+            success_rates.append(f"{arm} {success_text}")
             num_skipped += sum(seed_metrics["skipped_steps"] for seed_metrics in seeds)
         skip_note = f", {num_skipped:.0f} gradient steps skipped as not finite" if num_skipped else ""
 

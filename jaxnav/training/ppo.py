@@ -62,6 +62,8 @@ from jaxnav.training.config import CounterfactualTraining, PPOConfig
 from jaxnav.training.shares import ENV_AXIS, masked_mean, mean_and_std, mean_over_devices
 
 Metrics = dict[str, jax.Array]
+#: Metrics that are means over the episodes that ended.
+EPISODE_MEANS = ("success", "return", "length", "truncated")
 #: Parameters and optimizer state.
 TrainCarry = tuple[Params, Any]
 
@@ -782,8 +784,8 @@ class Learner:
 
         Returns:
           The state after the updates and float32 [] metrics: the losses' means over the updates, `success`, `return`
-          (undiscounted, without shaping), `length` and `truncated` averaged over the `episodes` that ended, and the
-          number of `skipped_steps` of the optimizer whose gradient was not finite.
+          (undiscounted, without shaping), `length` and `truncated` averaged over the `episodes` that ended (0 without
+          any), and the number of `skipped_steps` of the optimizer whose gradient was not finite.
         """
 
         def update_once(state: LearnerState, _: None) -> tuple[LearnerState, Metrics]:
@@ -799,7 +801,7 @@ class Learner:
         num_episodes = totals.pop("episodes")
         num_skipped = totals.pop("skipped_steps")
         summary = {}
-        for name in ("success", "return", "length", "truncated"):
+        for name in EPISODE_MEANS:
             summary[name] = totals.pop(name) / jnp.maximum(num_episodes, 1.0)
         for name, value in totals.items():
             summary[name] = value / num_updates

@@ -67,19 +67,21 @@ def learning_figure(
 
 
 def _mean_curve(rows: Sequence[Mapping[str, Any]], arm: str, metric_name: str) -> tuple[list[float], list[float]]:
-    """Return millions of steps, and the mean over seeds in percent."""
-    # The log has a row for each seed and step; a metric may be missing in some.
+    """Return millions of steps, and the mean over seeds in percent; NaN, a gap, where it is undefined in all seeds."""
+    # The log has a row for each seed and step; a metric may be missing in some, and undefined (null) in some.
     values_by_step: dict[int, list[float]] = {}
     for row in rows:
-        if row["arm"] == arm and row.get(metric_name) is not None:
-            values_by_step.setdefault(row["env_steps"], []).append(row[metric_name])
+        if row["arm"] == arm and metric_name in row:
+            seed_values = values_by_step.setdefault(row["env_steps"], [])
+            if row[metric_name] is not None:
+                seed_values.append(row[metric_name])
 
     # One point for each step, in the order of the log.
     million_steps = []
     mean_values = []
     for num_steps, seed_values in values_by_step.items():
         million_steps.append(num_steps / 1e6)
-        mean_values.append(float(np.mean(seed_values)))
+        mean_values.append(float(np.mean(seed_values)) if seed_values else float("nan"))
     return million_steps, _percent(mean_values)
 
 

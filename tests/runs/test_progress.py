@@ -2,13 +2,15 @@
 
 import dataclasses
 import io
+import math
 
 import pytest
 from rich.console import Console
 from rich.text import Text
 
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.train import ProgressDisplay, warn_if_more_steps
+from jaxnav.runs.train import ProgressDisplay, mark_undefined_means, warn_if_more_steps
+from jaxnav.store.files import append_log_rows, read_log_rows
 
 
 @pytest.mark.parametrize("num_skipped", [0, 12])
@@ -27,6 +29,31 @@ def test_bar_and_both_times_fit_80_columns(num_skipped):
     assert num_skipped or "layout 88 %" in words
     assert len(bar) >= 10
     assert [len(cell) for cell in (elapsed, remaining)] == [7, 7]
+
+
+def test_success_without_an_episode_that_ended_is_undefined():
+    config = RunConfig()
+    output = io.StringIO()
+    metrics = {
+        "baseline": [{"success": math.nan, "skipped_steps": 0}, {"success": 0.5, "skipped_steps": 0}],
+        "layout": [{"success": math.nan, "skipped_steps": 0}] * 2,
+    }
+    with ProgressDisplay(config, 0, Console(file=output, width=200)) as progress:
+        progress.stop_timing()
+        progress.show_chunk(metrics, config.total_updates)
+    assert "training SR: baseline 50 %, layout undefined (no episode ended)" in output.getvalue()
+
+
+def test_means_over_no_episode_are_undefined_in_the_log(tmp_path):
+    """With episodes they stay as they are, and a loss is defined always."""
+    means = {"success": 0.0, "return": 0.0, "length": 0.0, "truncated": 0.0}
+    metrics = {"layout": [means | {"episodes": 0.0, "loss": 1.0}, means | {"episodes": 3.0, "loss": 2.0}]}
+    rows = [{"step": seed} | row for seed, row in enumerate(mark_undefined_means(metrics)["layout"])]
+    append_log_rows(tmp_path / "metrics.jsonl", rows)
+    assert read_log_rows(tmp_path / "metrics.jsonl") == [
+        {"step": 0} | dict.fromkeys(means) | {"episodes": 0.0, "loss": 1.0},
+        {"step": 1} | means | {"episodes": 3.0, "loss": 2.0},
+    ]
 
 
 def test_steps_beyond_those_asked_for_are_printed():

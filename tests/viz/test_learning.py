@@ -50,3 +50,11 @@ def test_learning_figure_draws_percentages_as_means_over_seeds(tmp_path):
 @pytest.mark.parametrize("rows", [ROWS, []])
 def test_learning_figure_without_val_scenes_has_one_panel(rows):
     assert len(learning_figure(rows, None, "ORG").axes) == 1
+
+
+def test_undefined_success_is_a_gap():
+    """No episode of any seed ended in the second chunk, and none of seed 1 in the third."""
+    rows = [*ROWS[:2], log_row(0, 2_000_000, None), log_row(1, 2_000_000, None)]
+    rows += [log_row(0, 3_000_000, 0.5), log_row(1, 3_000_000, None)]
+    (curve_axes,) = learning_figure(rows, None, "ORG").axes
+    np.testing.assert_allclose(drawn_lines(curve_axes)[0], ([1, 2, 3], [30, np.nan, 50]))
