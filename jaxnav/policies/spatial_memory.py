@@ -1,7 +1,8 @@
 """Spatial memory: a map of where the agent has been and which cells it saw free or blocked.
 
-The map is drawn from the agent's views by compass and odometry and holds nothing about objects. `SpatialMemory` draws
-and reads it; the policy reads the cells around the agent on the direct pathway of the scene.
+The map is drawn from the agent's views by compass and odometry and holds nothing about objects. It is a window that
+moves with the agent: cells farther away than half its size are forgotten. `SpatialMemory` draws and reads it; the
+policy reads the cells around the agent on the direct pathway of the scene.
 """
 
 import dataclasses
@@ -22,7 +23,8 @@ class ExplorationMap(NamedTuple):
     """Map of one episode.
 
     Attributes:
-      cells: uint8 [N, N], state of each cell; the map is toroidal, so it wraps around at its edges.
+      cells: uint8 [N, N], state of each cell of the window around the agent, from N / 2 cells behind to N / 2 - 1 ahead
+        along both axes. The map is toroidal: (z, x) is stored at (z mod N, x mod N).
       position: int32 [2], (z, x) of the agent's cell.
       heading: int32 [], 0 to H - 1, its compass heading.
     """
@@ -69,8 +71,9 @@ class SpatialMemory:
           row_format: format of the row.
         """
         # Odometry: a successful step leads one cell ahead.
-        step = jnp.asarray(self._rules.move_steps(), jnp.int32)[heading]
-        position = (explored.position + jnp.where(moved, step, 0)) % self.size
+        step = jnp.where(moved, jnp.asarray(self._rules.move_steps(), jnp.int32)[heading], 0)
+        position = (explored.position + step) % self.size
+        known_cells = self._forget_left_cells(explored.cells, position, step)
 
         # Draw the V x V cells of the view, then the agent's own cell.
         view = row_format.view_cells(row)
@@ -79,7 +82,7 @@ class SpatialMemory:
         offsets = self._rules.view_offsets(row_format.view).reshape(self.headings, -1, 2)
         rows, columns = self._cells_at(offsets, position, heading)
         # A state only ever grows (unknown, blocked, free, visited), so the maximum joins map and view.
-        cells = explored.cells.at[rows, columns].max(view_states)
+        cells = known_cells.at[rows, columns].max(view_states)
         cells = cells.at[position[0], position[1]].set(jnp.uint8(VISITED))
         return ExplorationMap(cells, position, heading)
 
@@ -113,6 +116,21 @@ class SpatialMemory:
     def num_inputs(self) -> int:
         """Number of inputs to a network, 3 M."""
         return 3 * (2 * self.reach + 1) ** 2
+
+    def _forget_left_cells(self, cells: jax.Array, position: jax.Array, step: jax.Array) -> jax.Array:
+        """Clear the line of cells that leaves the window on each axis of a step, and enters it on the other side.
+
+        Args:
+          cells: uint8 [N, N], the map before the step.
+          position: int32 [2], the agent's cell after the step.
+          step: int32 [2], -1, 0 or 1 along each axis.
+        """
+        # The new line has the greatest offset after a step of 1, N / 2 - 1, and the least after a step of -1, -N / 2.
+        new_lines = (position + self.size // 2 - jnp.maximum(step, 0)) % self.size
+        lines = jnp.arange(self.size)
+        is_new_row = (lines == new_lines[0]) & (step[0] != 0)
+        is_new_column = (lines == new_lines[1]) & (step[1] != 0)
+        return jnp.where(is_new_row[:, None] | is_new_column[None], jnp.uint8(UNKNOWN), cells)
 
     @property
     def _rules(self) -> Rules:

@@ -18,7 +18,8 @@ from jaxnav.policies.network import bind
 from jaxnav.policies.spatial_memory import BLOCKED, FREE, UNKNOWN, VISITED, SpatialMemory
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.task import DONE, MOVE_AHEAD, NUM_ACTIONS
+from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat
+from jaxnav.scenes.task import DONE, MOVE_AHEAD, NUM_ACTIONS, Rules
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 STEPS, WALKS = 60, 8
@@ -90,6 +91,90 @@ def test_what_is_read_is_the_map_turned_with_the_agent(walked):
             z, x = x, len(turned) - 1 - z
         along = memory.stride * np.arange(-memory.reach, memory.reach + 1)
         np.testing.assert_array_equal(read[walk], turned[np.ix_((z + along) % 64, (x + along) % 64)])
+
+
+# The window that moves with the agent
+
+
+WINDOW_ROWS = RowFormat(1)
+
+
+def draw_walk(seed, num_steps, headings, turn_prob):
+    """Headings, moves and views of a walk, drawn at random; views differ from step to step."""
+    generator = np.random.default_rng(seed)
+    turns = generator.choice([-1, 0, 1], num_steps, p=[turn_prob / 2, 1 - turn_prob, turn_prob / 2])
+    is_move = generator.random(num_steps) < 0.8
+    view_rows = generator.integers(0, 256, (num_steps, WINDOW_ROWS.num_bytes)).astype(np.uint8)
+    return np.cumsum(turns) % headings, is_move & (turns == 0), view_rows
+
+
+def record_readings(memory, walk):
+    """Maps and readings after every step of a walk."""
+    headings, is_move, view_rows = walk
+
+    def step(explored, inputs):
+        row, heading, moved = inputs
+        explored = memory.update(explored, row, heading, moved, WINDOW_ROWS)
+        return explored, (explored, memory.read(explored))
+
+    inputs = jnp.asarray(view_rows), jnp.asarray(headings, jnp.int32), jnp.asarray(is_move)
+    return jax.tree.map(np.asarray, jax.jit(lambda: jax.lax.scan(step, memory.init(), inputs)[1])())
+
+
+def endless_readings(memory, walk):
+    """Readings of a map without edges, whose cells are forgotten where they leave the window; by cell (z, x)."""
+    headings, is_move, view_rows = walk
+    rules = Rules(headings=memory.headings)
+    view_offsets = rules.view_offsets(WINDOW_ROWS.view).reshape(memory.headings, -1, 2)
+    distances = memory.stride * np.arange(-memory.reach, memory.reach + 1)
+    read_offsets = rules.offsets_by_heading(distances, distances).reshape(memory.headings, -1, 2)
+    half = memory.size // 2
+    cell_states = {}
+    position = np.zeros(2, int)
+    readings = []
+    for heading, moved, row in zip(headings, is_move, view_rows, strict=True):
+        position = position + (rules.move_steps()[heading] if moved else 0)
+        cell_states = {
+            cell: state
+            for cell, state in cell_states.items()
+            if all(-half <= distance < half for distance in np.subtract(cell, position))
+        }
+        for view_cell, offset in zip(np.asarray(WINDOW_ROWS.view_cells(row)), view_offsets[heading], strict=True):
+            cell = tuple(position + offset)
+            view_state = {VIEW_FREE: FREE, VIEW_BLOCKED: BLOCKED}.get(int(view_cell), UNKNOWN)
+            cell_states[cell] = max(cell_states.get(cell, UNKNOWN), view_state)
+        cell_states[tuple(position)] = VISITED
+        readings.append([cell_states.get(tuple(position + offset), UNKNOWN) for offset in read_offsets[heading]])
+    return np.array(readings)
+
+
+@pytest.mark.parametrize("headings", [4, 8, 12])
+@pytest.mark.parametrize("turn_prob", [0.0, 0.1])
+def test_a_walk_longer_than_the_map_is_read_as_on_a_map_without_edges(headings, turn_prob):
+    memory = SpatialMemory(headings, size=32)
+    walk = draw_walk(headings, 150, headings, turn_prob)
+    _, readings = record_readings(memory, walk)
+    np.testing.assert_array_equal(readings, endless_readings(memory, walk))
+
+
+def test_cells_never_entered_are_never_read_as_visited():
+    """100 cells straight on, on the map of 64 x 64 cells: visited cells lie behind."""
+    memory = SpatialMemory(12)
+    walk = np.zeros(100, int), np.ones(100, bool), np.zeros((100, WINDOW_ROWS.num_bytes), np.uint8)
+    _, readings = record_readings(memory, walk)
+    side = 2 * memory.reach + 1
+    assert (readings.reshape(-1, side, side)[:, memory.reach + 1 :] != VISITED).all()
+    assert (readings.reshape(-1, side, side)[-1, : memory.reach + 1, memory.reach] == VISITED).all()
+
+
+def test_within_the_window_nothing_is_forgotten(monkeypatch):
+    """Policies decide by the map, which stays bit-identical to that without forgetting."""
+    memory = SpatialMemory(8)
+    walk = draw_walk(0, 180, 8, 0.6)
+    explored, readings = record_readings(memory, walk)
+    assert np.ptp(explored.position, axis=0).max() in range(10, memory.size // 2 - WINDOW_ROWS.view)
+    monkeypatch.setattr(SpatialMemory, "_forget_left_cells", lambda self, cells, *_: cells)
+    chex.assert_trees_all_equal((explored, readings), record_readings(memory, walk))
 
 
 def test_one_hot_inputs():
