@@ -49,6 +49,7 @@ from tyro.constructors import (
 
 from jaxnav.errors import InputError, Interrupted
 from jaxnav.runs.config_files import CONFIGS, RENAMED_SETTINGS, apply_yaml, parse_setting
+from jaxnav.store.files import expand_home
 
 Config = TypeVar("Config")
 
@@ -622,6 +623,20 @@ def _parse_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | Pr
         metavar=number_type.__name__.upper(),
         instance_from_str=parse,
         is_instance=lambda value: isinstance(value, int | number_type) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+@REGISTRY.primitive_rule
+def _parse_path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
+    """Expand the home folder in paths; a shell does not in `--run-dir=~/run`."""
+    if info.type is not Path:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: expand_home(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda value: [str(value)],
     )
 

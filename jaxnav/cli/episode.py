@@ -9,6 +9,7 @@ from rich.console import Console
 from jaxnav.choices import EstimatorName, PlayedVariant, ShiftKind
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
+from jaxnav.store.files import expand_home
 
 DESCRIPTION = "Draw one evaluation episode as a GIF or a PNG."
 
@@ -112,5 +113,5 @@ def _default_path(config: EpisodeConfig) -> Path:
     """Return the picture's path in the run directory or, for a policy, in the working directory."""
     from jaxnav.runs.policies import is_policy
 
-    folder = Path() if is_policy(config.source) else Path(config.source)
+    folder = Path() if is_policy(config.source) else expand_home(config.source)
     return folder / ("map.png" if config.map else "episode.gif")

@@ -30,7 +30,7 @@ def _write_report(config: ReportConfig, console: Console) -> None:
 
     run = Run.open(config.run)
     reference_run = None if config.reference is None else Run.open(config.reference)
-    page = make_report(run, reference_run, config, console).encode()
+    page = make_report(run, reference_run, config, console).encode(errors="backslashreplace")
     with refuse_unwritable(target, "--out"):
         write_atomic(target, page)
     console.print(f"{len(page) / 1e6:.1f} MB, written to {target}")

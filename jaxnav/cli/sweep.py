@@ -19,6 +19,7 @@ from jaxnav.cli.console import (
     run_command,
 )
 from jaxnav.errors import InputError
+from jaxnav.store.files import expand_home
 
 if TYPE_CHECKING:
     from jaxnav.evaluation.sweep_tables import ThresholdRow
@@ -128,7 +129,7 @@ def _find_figure_path(config: SweepConfig) -> Path:
 
     # A policy is not in a run directory, so its name belongs to the file.
     is_single_policy = is_policy(config.source)
-    folder = Path() if is_single_policy else Path(config.source)
+    folder = Path() if is_single_policy else expand_home(config.source)
     command = f"sweep-{Path(config.source).resolve().name}" if is_single_policy else "sweep"
     has_default_shifts = config.shift == SweepConfig.shift
     details = (

@@ -19,6 +19,7 @@ from jaxnav.choices import Decoding, Form, ShiftKind, Variant
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
+from jaxnav.store.files import expand_home
 
 #: Experiments that come with jaxnav, by name.
 EXPERIMENTS = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
@@ -295,7 +296,7 @@ def _agent_run(config: ExperimentConfig, world: str, world_changes: dict[str, An
 
         if changes:
             raise InputError(f"agents.{agent}: is a finished run; remove its settings {', '.join(changes)}")
-        run_config = load_run_config(Path(agent_settings["run"]))
+        run_config = load_run_config(expand_home(agent_settings["run"]))
         run_config = apply_values(run_config, world_changes, Path(f"worlds.{world}"))
         return AgentRun(world, agent, run_config, against, is_external=True)
 

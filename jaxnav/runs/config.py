@@ -16,6 +16,7 @@ from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, Weight
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS, Task
 from jaxnav.scenes.worlds import WORLDS
+from jaxnav.store.files import expand_home
 from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_index_at
 
 if TYPE_CHECKING:
@@ -409,11 +410,12 @@ def check_config(config: RunConfig) -> RunConfig:
     Raises:
       InputError: names the first impossible setting.
     """
-    # Paths from files and Python callers may be text.
-    for name in ("run_dir", "scenes", "cache"):
+    # Paths from files and Python callers may be text. Only a world on disk needs the cache, and thus a home folder.
+    config = dataclasses.replace(config, cache=Path(config.cache))
+    for name in ("run_dir", "scenes"):
         path_setting = getattr(config, name)
         if path_setting is not None:
-            config = dataclasses.replace(config, **{name: Path(path_setting)})
+            config = dataclasses.replace(config, **{name: expand_home(path_setting)})
 
     # Settings that follow from the method and the decision.
     method = config.policy_method

@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar, Union
 import yaml
 
 from jaxnav.errors import InputError
+from jaxnav.store.files import expand_home
 
 Config = TypeVar("Config", bound=Any)
 
@@ -56,7 +57,7 @@ def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] 
       InputError: the file is missing or is no YAML mapping, has a key twice, an unknown key or a value of another type.
         The message names the file, the line or dotted key, and a remedy.
     """
-    path = configs.get(str(source), Path(source))
+    path = configs.get(str(source)) or expand_home(source)
     values = _load_yaml(path, configs)
     return default if values is None else apply_values(default, values, path)
 
@@ -149,6 +150,8 @@ def apply_values(default: Config, values: Any, path: Path, prefix: str = "") -> 
             raise InputError(
                 f"{path}: {key} must be {expected_type}, but is {_describe_value(value)}; change the value"
             ) from error
+        except InputError as error:
+            raise InputError(f"{path}: {key}: {error}") from error
     return dataclasses.replace(default, **changed_fields)
 
 
@@ -194,7 +197,7 @@ def _convert(value: Any, annotation: Any) -> Any:
     elif annotation is Any:
         return value
     elif annotation is Path:
-        return Path(_convert(value, str))
+        return expand_home(_convert(value, str))
     elif annotation in (bool, int, str, types.NoneType):
         if type(value) is annotation:
             return value

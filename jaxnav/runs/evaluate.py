@@ -62,7 +62,7 @@ from jaxnav.runs.share_report import (
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, prefetch_env_params
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.store.files import write_atomic
+from jaxnav.store.files import expand_home, write_atomic
 
 #: Usual thresholds of a sweep.
 SWEPT_THRESHOLDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -691,7 +691,7 @@ def _open_run(source: Run | str | Path) -> Run:
     """Open a run; text that names neither a run nor a policy is refused with the names of packaged policies."""
     if isinstance(source, Run):
         return source
-    if not (Path(source) / CONFIG_FILE).exists():
+    if not (expand_home(source) / CONFIG_FILE).exists():
         packaged_names = ", ".join(list_packaged_policies())
         raise InputError(
             f"{source}: neither a run directory ({CONFIG_FILE} is missing) nor an exported policy; train a run, or "

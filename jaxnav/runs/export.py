@@ -77,7 +77,7 @@ def export_policy_of_run(
         (out / file_name).unlink(missing_ok=True)
     for file_name, file_bytes in export.files.items():
         write_atomic(out / file_name, file_bytes)
-    write_atomic(out / CARD_FILE, card.encode())
+    write_atomic(out / CARD_FILE, card.encode(errors="backslashreplace"))
     return out
 
 

@@ -35,7 +35,7 @@ from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.checkpoint import describe_arrays
 from jaxnav.store.export import POLICY_FILE, export_params, load_params
-from jaxnav.store.files import list_differences
+from jaxnav.store.files import expand_home, list_differences
 from jaxnav.training.calibration import Exploration, layout_priors
 
 #: Folder of the exported policies in a run directory.
@@ -575,7 +575,8 @@ def is_policy(path: str | Path) -> bool:
 
 
 def _resolve_folder(path: str | Path) -> Path:
-    return Path(path) if Path(path).exists() else PACKAGED_POLICIES / path
+    folder = expand_home(path)
+    return folder if folder.exists() else PACKAGED_POLICIES / path
 
 
 def load_policy_as_run(path: str | Path) -> tuple[RunConfig, Policies]:

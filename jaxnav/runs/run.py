@@ -21,6 +21,7 @@ from jaxnav.store.files import (
     FolderLock,
     LogRow,
     append_log_rows,
+    expand_home,
     list_differences,
     read_json_with_digest,
     read_log_rows,
@@ -62,7 +63,7 @@ class Run:
         Raises:
           InputError: the directory holds no run, or its configuration file is damaged or of another version.
         """
-        return cls(load_run_config(Path(run_dir)))
+        return cls(load_run_config(expand_home(run_dir)))
 
     def policies(self, arms: Sequence[str] | None = None) -> Policies:
         """Load the exported policies; see `load_policies`."""

@@ -33,6 +33,7 @@ from jaxnav.scenes.worlds import (
     make_generated_scenes,
     shift_scenes,
 )
+from jaxnav.store.files import expand_home
 
 #: Scenes in which a method of another package is checked.
 _NUM_SAMPLE_SCENES = 4
@@ -247,7 +248,7 @@ def _compile_to_cache(config: RunConfig, scenes: Scenes, console: Console) -> Sh
             progress.update(progress_bar, completed=completed, total=total)
 
         try:
-            cache = config.cache.expanduser()
+            cache = expand_home(config.cache)
             shards = compile_shards(scenes, config.task, config.worlds.shard_scenes, cache, report_progress)
         except OSError as error:
             remedy = "give another folder or free disk space"

@@ -24,6 +24,7 @@ from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.task import APARTMENTS, HOUSES, ROOMS, Task
+from jaxnav.store.files import expand_home
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,7 +315,7 @@ def load_scenes(path: str | Path, split: str | None) -> FileScenes:
         raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(splits_in_file)}")
 
     # The identity follows the scenes of the file, not its name or the account of its import.
-    file_checksum = hashlib.sha256(remove_headers(read_bytes(Path(path)))).hexdigest()
+    file_checksum = hashlib.sha256(remove_headers(read_bytes(expand_home(path)))).hexdigest()
     return FileScenes(scenes_of_split, f"{split or 'all'} of {file_checksum}")
 
 
@@ -357,7 +358,7 @@ class SceneSource:
             return self.file
 
         # The first scene that can be used decides; later lines are not parsed.
-        for scene in iterate_scenes(Path(self.file)):
+        for scene in iterate_scenes(expand_home(self.file)):
             if isinstance(scene, Scene):
                 return world_name_of_origin(scene.world)
         return world_name_of_origin("")

@@ -10,7 +10,9 @@ import contextlib
 import gc
 import hashlib
 import logging
+import re
 import shutil
+import tempfile
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -37,6 +39,8 @@ FILE_LIST = "files.json"
 
 _NUM_KEPT_CHECKPOINTS = 2
 _REMEDY = "the one before it is used"
+#: Paths without any character that Orbax or TensorStore could take for more than a part of a name.
+_PLAIN_PATH = re.compile(r"[\w/. ~+,=@-]+")
 
 State = TypeVar("State")
 
@@ -81,6 +85,7 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
     )
 
     # Steps only increase: a smaller step belongs to another run in this folder.
+    folder = _checkpoints_folder(run_dir) / str(step)
     with _silence_libraries(), _open_checkpointer(run_dir, cleanup_tmp_directories=True) as checkpointer:
         latest_checkpoint = checkpointer.latest
         if latest_checkpoint is not None and latest_checkpoint.step >= step:
@@ -90,9 +95,13 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
             )
         checkpointer.save(step, state, force=True, custom_metadata=metadata)
 
+        # Read the first checkpoint of a run back, so that a fault of the storage ends the run before it has trained
+        # for long.
+        if latest_checkpoint is None:
+            _load_step(checkpointer, folder, step, state, metadata["manifest"])
+
     # One process lists the files, after the commit.
     if jax.process_index() == 0:
-        folder = _checkpoints_folder(run_dir) / str(step)
         write_json_with_digest(folder / FILE_LIST, {"files": _file_digests(folder)})
 
 
@@ -273,13 +282,37 @@ def _checkpoints_folder(run_dir: Path) -> Path:
     return (run_dir / "checkpoints").absolute()  # Orbax refuses relative paths
 
 
-def _open_checkpointer(run_dir: Path, cleanup_tmp_directories: bool = False) -> ocp.training.Checkpointer:
+@contextlib.contextmanager
+def _open_checkpointer(run_dir: Path, cleanup_tmp_directories: bool = False) -> Iterator[ocp.training.Checkpointer]:
     keep_latest = ocp.training.preservation_policies.LatestN(_NUM_KEPT_CHECKPOINTS)
-    return ocp.training.Checkpointer(
-        str(_checkpoints_folder(run_dir)),
-        preservation_policy=keep_latest,  # pyright: ignore[reportArgumentType]  (Orbax's own policy, typed too narrowly)
-        cleanup_tmp_directories=cleanup_tmp_directories,
-    )
+    with (
+        _plain_path(_checkpoints_folder(run_dir)) as folder,
+        ocp.training.Checkpointer(
+            str(folder),
+            preservation_policy=keep_latest,  # pyright: ignore[reportArgumentType]  (Orbax's own policy, typed too narrowly)
+            cleanup_tmp_directories=cleanup_tmp_directories,
+        ) as checkpointer,
+    ):
+        yield checkpointer
+
+
+@contextlib.contextmanager
+def _plain_path(folder: Path) -> Iterator[Path]:
+    """Yield a path to a folder that Orbax and TensorStore read literally.
+
+    They read brackets and stars as patterns, backslashes as separators, `gs:` as a bucket, and text as UTF-8, in any
+    part of a path. Such a folder is reached through a symbolic link with a plain name.
+    """
+    if _PLAIN_PATH.fullmatch(str(folder)):
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="jaxnav-") as link_folder:
+        if not _PLAIN_PATH.fullmatch(link_folder):
+            raise InputError(f"TMPDIR: is {link_folder}; give a folder whose path has only letters, digits and / . _ -")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        link = Path(link_folder) / "run"
+        link.symlink_to(folder.parent, target_is_directory=True)
+        yield link / folder.name
 
 
 @contextlib.contextmanager

@@ -31,6 +31,21 @@ except ImportError:  # not a POSIX system: nothing is locked there
 WRITTEN_BY_0_1 = "written by jaxnav 0.1; train again, or read it with jaxnav 0.1"
 
 
+def expand_home(path: str | Path) -> Path:
+    """Return a path in which a leading `~` or `~user` is replaced by the home folder.
+
+    Raises:
+      InputError: unknown user or home folder, or a path with a zero byte.
+    """
+    if "\0" in str(path):
+        raise InputError(f"{path}: contains a zero byte, which no path can; remove it")
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        first_part = Path(path).parts[0]
+        raise InputError(f"{path}: {first_part} has no home folder; write the whole path") from error
+
+
 def write_atomic(path: Path, data: bytes) -> None:
     """Replace a file in one step.
 
@@ -42,7 +57,8 @@ def write_atomic(path: Path, data: bytes) -> None:
     """
     # The temporary file is in the same folder, because a rename is atomic only within one file system.
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary_path = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # A part of the name keeps it within the limit of the file system.
+    temporary_path = path.with_name(f".{path.name[:40]}.{os.getpid()}.tmp")
     try:
         with temporary_path.open("wb") as temporary_file:
             temporary_file.write(data)

@@ -35,6 +35,7 @@ from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.observation_row import RowFormat, detected_positions
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, Task
+from jaxnav.store.files import expand_home
 from jaxnav.viz.scene import draw_agent, draw_plan
 from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR, style_axes
 
@@ -200,7 +201,7 @@ def _variant_row(policies: Policies, variant: PlayedVariant, epsilon: float) -> 
 def _load_source(source: str | Path, arms: tuple[str, ...]) -> tuple[RunConfig, Policies]:
     """Load a run or an exported policy."""
     if not is_policy(source):
-        config = load_run_config(Path(source))
+        config = load_run_config(expand_home(source))
         missing_arms = sorted(set(arms) - set(config.arms))
         if missing_arms:
             raise InputError(f"{source}: was trained without the arm {missing_arms[0]!r}; choose another --variant")

@@ -56,6 +56,8 @@ MISTAKES = (
             "evaluation/test_episodes.py"),
     Mistake("evaluation/episodes.py", "default_rng([seed, len", "default_rng([len", "evaluation/test_episodes.py"),
     Mistake("training/ppo.py", "max_consecutive_errors=2**30", "max_consecutive_errors=0", LEARNER),
+    Mistake("store/checkpoint.py", "if _PLAIN_PATH.fullmatch(str(folder)):", "if str(folder):",
+            "promises/test_paths_are_names.py"),
     Mistake("store/export.py", '"""Exported', 'import jax  # noqa\n"""Exported', "store/test_export.py"),
     Mistake("store/export.py", "FORMAT_VERSION = 3", "FORMAT_VERSION = 2", "promises/test_old_versions.py"),
     Mistake("store/checkpoint.py", "if file_digests.get(file_name) != digest", "if False", STORED),

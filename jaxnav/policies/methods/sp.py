@@ -27,6 +27,7 @@ from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.files.scene_file import read_bytes
 from jaxnav.scenes.tables.compile import Bank
+from jaxnav.store.files import expand_home
 
 
 def learn_graph(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, np.ndarray]:
@@ -79,7 +80,7 @@ def graph_from_file(path: str | Path, banks: Iterable[Bank], counts: np.ndarray)
     # Every line but comments and empty ones is an edge, entered in both directions.
     categories = next(iter(banks)).task.categories
     edges = np.zeros((len(categories), len(categories)))
-    lines = read_bytes(Path(path)).decode(errors="replace").splitlines()
+    lines = read_bytes(expand_home(path)).decode(errors="replace").splitlines()
     for line_number, line in enumerate(lines, 1):
         edge_text = line.partition("#")[0].strip()
         if not edge_text:

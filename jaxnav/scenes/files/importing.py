@@ -24,6 +24,7 @@ from jaxnav.scenes.files.scene_file import iterate_counted_scenes, write_scenes
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS, world_name_of_origin
+from jaxnav.store.files import expand_home
 
 SceneFormat = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
 SceneSplit = Literal["train", "val", "test"]
@@ -102,7 +103,7 @@ def read_source(
             raise InputError(f"--{option_name.replace('_', '-')}: {problem}")
 
     # The importers read one scene after the other, as their caller asks for them.
-    source_path = Path(source)
+    source_path = expand_home(source)
     match scene_format:
         case "procthor":
             yield from read_procthor(source_path, split, assets, agent_part)

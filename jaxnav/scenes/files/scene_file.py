@@ -25,7 +25,7 @@ from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount, account_t
 from jaxnav.scenes.generate.sizes import typical_box
 from jaxnav.scenes.lattice import cells_near_boxes
 from jaxnav.scenes.scene import CELL_SIZE, MAX_SIDE_CELLS, SPLITS, Room, Scene, box_footprints
-from jaxnav.store.files import write_atomic
+from jaxnav.store.files import expand_home, write_atomic
 
 #: Distance in metres that a position in a file may lie off the lattice.
 SNAP_TOLERANCE = 0.02
@@ -63,7 +63,7 @@ def read_scenes(path: str | Path) -> list[Scene]:
       InputError: the file is missing, damaged or empty, or a field is missing or wrong; names file, line, scene,
         field and remedy.
     """
-    path = Path(path)
+    path = expand_home(path)
     scenes: list[Scene] = []
     for scene in iterate_scenes(path):
         if isinstance(scene, InputError):
@@ -130,7 +130,7 @@ def write_scenes(path: str | Path, scenes: Iterable[Scene], account: Mapping[str
         file_records.append({_HEADER_FIELD: account_to_json(account)})
     file_records.extend(map(_encode_scene, scenes))
     file_lines = [json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n" for record in file_records]
-    write_atomic(Path(path), gzip.compress("".join(file_lines).encode(), mtime=0))
+    write_atomic(expand_home(path), gzip.compress("".join(file_lines).encode(), mtime=0))
 
 
 # Checked access to JSON

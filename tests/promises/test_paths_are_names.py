@@ -1,0 +1,155 @@
+"""A run directory may have any name: checkpoints are stored under it alone, or it is refused before anything is done.
+
+Seen to fail: with the folder itself given to Orbax instead of a link, 14 of the names below cannot be read or saved; a
+`~` that is not expanded is a folder of this name.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from support.commands import evaluate, refusal, train
+from support.refusals import assert_message_names
+from support.tiny_run import write_config
+
+import jaxnav
+from jaxnav.cli.console import parse_arguments
+from jaxnav.cli.eval import EvalConfig
+from jaxnav.errors import InputError
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import apply_yaml
+from jaxnav.store import checkpoint
+from jaxnav.store.files import expand_home, make_manifest, write_atomic
+
+MANIFEST = make_manifest({})
+STATE = {"weights": jnp.arange(3.0)}
+
+#: Names that a shell, a pattern, an address, an escape, a parser or a decoder may take for something else.
+NAMES = (
+    *("plain", "exp[1]", "[x]", "[!a]", "[]", "[", "]", "a]b[", "{a,b}", "{x}", "{"),
+    *("*", "a*", "**", "?", "a?b", "\\", "a\\b", "q\\", "\\\\n", "^", "|", "a|b"),
+    *("%", "%20", "%2F", "%s", "#", "a#b", "&", "a&b=c", "!", ";", "@", "+", "=", "<a>"),
+    *(":", "a:b", "C:", "gs:", "s3:", "file:", "'", '"', "`", "$HOME", "${x}", "$(x)"),
+    *("-x", "--x", "-", " ", " a ", "a b", "\t", "a\nb", "\x01", "\x7f", "~", "~x", "..."),
+    *("é", "日本", "\u202e", "😀", os.fsdecode(b"\xff"), os.fsdecode(b"a\xe9b"), "n" * 255, "é" * 127),
+)
+
+
+@pytest.mark.parametrize("name", NAMES, ids=ascii)
+def test_checkpoints_are_stored_in_a_run_directory_of_any_name(name, tmp_path, monkeypatch):
+    # The working directory has the name, too.
+    working_dir = tmp_path / name
+    run_dir = Path(name)
+    working_dir.mkdir()
+    monkeypatch.chdir(working_dir)
+    checkpoint.save_checkpoint(run_dir, 1, STATE, MANIFEST)
+    restored = checkpoint.restore_checkpoint(run_dir, jax.eval_shape(lambda: STATE), MANIFEST)
+    assert restored is not None
+    assert (restored.step, restored.damaged) == (1, ())
+    assert restored.state["weights"].tolist() == [0.0, 1.0, 2.0]
+
+    # Nothing was written elsewhere.
+    assert os.listdir(tmp_path) == [name]
+    assert os.listdir(working_dir) == [name]
+    assert os.listdir(run_dir) == ["checkpoints"]
+    assert os.listdir(run_dir / "checkpoints") == ["1"]
+
+
+def test_two_names_that_match_as_patterns_stay_apart(tmp_path):
+    for value, name in enumerate(("a*", "ab", "a[b]", "a?")):
+        checkpoint.save_checkpoint(tmp_path / name, 1 + value, STATE, MANIFEST)
+    for value, name in enumerate(("a*", "ab", "a[b]", "a?")):
+        restored = checkpoint.restore_checkpoint(tmp_path / name, jax.eval_shape(lambda: STATE), MANIFEST)
+        assert restored is not None
+        assert restored.step == 1 + value
+
+
+def test_save_checkpoint_refuses_a_temporary_folder_with_a_hostile_name(tmp_path, monkeypatch):
+    (tmp_path / "t[1]").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "t[1]"))
+    checkpoint.save_checkpoint(tmp_path / "plain", 1, STATE, MANIFEST)
+    with pytest.raises(InputError, match=r"TMPDIR: is .*t\[1\].*; give a folder"):
+        checkpoint.save_checkpoint(tmp_path / "exp[1]", 1, STATE, MANIFEST)
+
+
+def test_first_checkpoint_is_read_back(tmp_path, monkeypatch):
+    digests = checkpoint.array_digests(STATE)
+    wrong_digests = digests | dict.fromkeys(digests, "0")
+    monkeypatch.setattr(checkpoint, "array_digests", lambda state: answers.pop())
+
+    # The digests of the loaded arrays differ from those of the saved ones.
+    answers = [wrong_digests, digests]
+    with pytest.raises(InputError, match="wrong digests of \\['weights'\\]"):
+        checkpoint.save_checkpoint(tmp_path / "run", 1, STATE, MANIFEST)
+
+    # Later checkpoints are not read back.
+    answers = [digests]
+    checkpoint.save_checkpoint(tmp_path / "run", 2, STATE, MANIFEST)
+    assert answers == []
+
+
+@pytest.mark.parametrize("name", ["n" * 256, "n" * 700, "é" * 350])
+def test_train_refuses_a_name_that_is_too_long_in_one_line(name, tmp_path, capsys):
+    assert train(write_config(tmp_path), tmp_path / name) == 2
+    assert_message_names(refusal(capsys), name, "File name too long")
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def test_write_atomic_accepts_the_longest_name(tmp_path):
+    write_atomic(tmp_path / ("é" * 127), b"x")
+    assert [path.name for path in tmp_path.iterdir()] == ["é" * 127]
+
+
+# Home folders
+
+
+def test_home_folders_are_expanded_alike_in_every_setting(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    expected = tmp_path / "x"
+    assert expand_home("~/x") == expected
+    assert check_config(RunConfig(run_dir="~/x", scenes="~/x")).run_dir == expected  # pyright: ignore[reportArgumentType]
+    assert parse_arguments(EvalConfig, ["~/x", "--json=~/x"], "eval", "").json == expected
+
+    # YAML, and a configuration in the home folder.
+    (tmp_path / "a.yaml").write_text("{run_dir: ~/x, scenes: ~/x, cache: ~/x}")
+    config = apply_yaml(RunConfig(), "~/a.yaml")
+    assert (config.run_dir, config.scenes, config.cache) == (expected, expected, expected)
+
+    # A folder called `~` has a whole path.
+    assert expand_home(tmp_path / "~") == tmp_path / "~"
+
+
+@pytest.mark.parametrize("path", ["~no_such_user/x", "a\0b"])
+def test_paths_without_a_meaning_are_refused_in_every_setting(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.yaml").write_text(json.dumps({"run_dir": path}))
+    readers = (
+        lambda: check_config(RunConfig(run_dir=path)),  # pyright: ignore[reportArgumentType]
+        lambda: apply_yaml(RunConfig(), "a.yaml"),
+        lambda: jaxnav.Run.open(path),
+        lambda: jaxnav.evaluate(path),
+        lambda: jaxnav.load_policy(path),
+        lambda: jaxnav.make("rooms", scenes=path),
+    )
+    for reader in readers:
+        with pytest.raises(InputError, match=r"(has no home folder; write|zero byte, which no path can; remove)"):
+            reader()
+    with pytest.raises(SystemExit):
+        evaluate(path)
+    capsys.readouterr()
+    assert [file.name for file in tmp_path.iterdir()] == ["a.yaml"]
+
+
+@pytest.mark.slow
+def test_a_run_directory_with_brackets_is_trained_resumed_and_evaluated(tmp_path, monkeypatch, capsys):
+    name = os.fsdecode(b"exp[1]\\ \xff")
+    monkeypatch.chdir(tmp_path)
+    config_file = write_config(tmp_path)
+    assert train(config_file, Path(name), "--seeds", 1) == 0
+    assert train(config_file, Path(name), "--seeds", 1) == 0
+    assert "resumed after update 4 of 4" in capsys.readouterr().err
+    assert evaluate(name, "--episodes", 10) == 0
+    assert sorted(os.listdir(tmp_path)) == sorted([name, "tiny.yaml"])
