@@ -10,6 +10,7 @@ import contextlib
 import gc
 import hashlib
 import logging
+import os
 import re
 import shutil
 import tempfile
@@ -38,6 +39,8 @@ from jaxnav.store.files import (
 FILE_LIST = "files.json"
 
 _NUM_KEPT_CHECKPOINTS = 2
+#: Upper bound of the files and folders of a checkpoint, while it is written.
+_NUM_INODES = 40
 _REMEDY = "the one before it is used"
 #: Paths without any character that Orbax or TensorStore could take for more than a part of a name.
 _PLAIN_PATH = re.compile(r"[\w/. ~+,=@-]+")
@@ -75,7 +78,8 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
       manifest: manifest of the run, see `make_manifest`.
 
     Raises:
-      InputError: the run already has this step or a later step.
+      InputError: the run already has this step or a later step, the disk is full, or the first checkpoint of the run
+        cannot be read again.
       TypeError: a leaf is no array, or an empty array.
     """
     # Orbax commits the metadata together with the arrays.
@@ -84,25 +88,28 @@ def save_checkpoint(run_dir: Path, step: int, state: Any, manifest: Mapping[str,
         {"manifest": dict(manifest), "leaves": describe_arrays(state), "digests": array_digests(state)}
     )
 
+    _check_free_inodes(run_dir)
+
     # Steps only increase: a smaller step belongs to another run in this folder.
     folder = _checkpoints_folder(run_dir) / str(step)
-    with _silence_libraries(), _open_checkpointer(run_dir, cleanup_tmp_directories=True) as checkpointer:
-        latest_checkpoint = checkpointer.latest
-        if latest_checkpoint is not None and latest_checkpoint.step >= step:
-            raise InputError(
-                f"{run_dir}: holds step {latest_checkpoint.step} already, so step {step} cannot be saved; "
-                "resume that run or choose another run directory"
-            )
-        checkpointer.save(step, state, force=True, custom_metadata=metadata)
+    with _report_unsaved(folder):
+        with _silence_libraries(), _open_checkpointer(run_dir, cleanup_tmp_directories=True) as checkpointer:
+            latest_checkpoint = checkpointer.latest
+            if latest_checkpoint is not None and latest_checkpoint.step >= step:
+                raise InputError(
+                    f"{run_dir}: holds step {latest_checkpoint.step} already, so step {step} cannot be saved; "
+                    "resume that run or choose another run directory"
+                )
+            checkpointer.save(step, state, force=True, custom_metadata=metadata)
 
-        # Read the first checkpoint of a run back, so that a fault of the storage ends the run before it has trained
-        # for long.
-        if latest_checkpoint is None:
-            _load_step(checkpointer, folder, step, state, metadata["manifest"])
+            # Read the first checkpoint of a run back, so that a fault of the storage ends the run before it has trained
+            # for long.
+            if latest_checkpoint is None:
+                _load_step(checkpointer, folder, step, state, metadata["manifest"])
 
-    # One process lists the files, after the commit.
-    if jax.process_index() == 0:
-        write_json_with_digest(folder / FILE_LIST, {"files": _file_digests(folder)})
+        # One process lists the files, after the commit.
+        if jax.process_index() == 0:
+            write_json_with_digest(folder / FILE_LIST, {"files": _file_digests(folder)})
 
 
 def restore_checkpoint(
@@ -330,6 +337,34 @@ def _silence_libraries() -> Iterator[None]:
             logger.setLevel(saved_level)
 
 
+def _check_free_inodes(run_dir: Path) -> None:
+    """Refuse a disk with too few inodes, on which threads of Orbax wait for minutes for folders that do not exist."""
+    if not hasattr(os, "statvfs"):  # not a POSIX system
+        return
+    existing_folder = next(folder for folder in (run_dir, *run_dir.absolute().parents) if folder.exists())
+    disk = os.statvfs(existing_folder)
+    # Some file systems have no limit, and count no inodes.
+    if disk.f_files and disk.f_favail < _NUM_INODES:
+        raise InputError(
+            f"{run_dir}: cannot be saved (the disk has {disk.f_favail} free inodes, a checkpoint needs {_NUM_INODES}); "
+            "remove files, then run the same command again"
+        )
+
+
+@contextlib.contextmanager
+def _report_unsaved(folder: Path) -> Iterator[None]:
+    """Turn the errors of Orbax and TensorStore about a full disk, which are of many kinds, into an `InputError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        advice = "free space and inodes on the disk, then run the same command again"
+        raise InputError(f"{folder}: cannot be saved ({_summarize_root(error)}); {advice}") from error
+    finally:
+        gc.collect()  # asyncio logs the error of a task when it is collected
+
+
 @contextlib.contextmanager
 def _report_damage(folder: Path) -> Iterator[None]:
     """Turn the errors of Orbax and TensorStore about missing or broken files into a `_DamageError`."""
@@ -337,10 +372,19 @@ def _report_damage(folder: Path) -> Iterator[None]:
         yield
     except (ValueError, KeyError, OSError) as error:
         # Orbax wraps every error of loading in a KeyError, so the root error decides if a file is damaged.
-        root_error: BaseException = error
-        while root_error.__cause__ is not None:
-            root_error = root_error.__cause__
-        if not isinstance(root_error, ValueError | KeyError | OSError):
+        if not isinstance(_root_error(error), ValueError | KeyError | OSError):
             raise
-        error_summary = textwrap.shorten(f"{type(root_error).__name__}: {root_error}", 300)
-        raise _DamageError(f"{folder}: is damaged ({error_summary})") from error
+        raise _DamageError(f"{folder}: is damaged ({_summarize_root(error)})") from error
+
+
+def _root_error(error: BaseException) -> BaseException:
+    """Return the first error of a chain of causes."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def _summarize_root(error: BaseException) -> str:
+    """Describe the first error of a chain of causes in one line."""
+    root_error = _root_error(error)
+    return textwrap.shorten(f"{type(root_error).__name__}: {root_error}", 300)

@@ -233,11 +233,14 @@ def read_log_rows(path: Path) -> list[dict[str, Any]]:
     Raises:
       InputError: a line other than the last is no JSON object with an int `step`, or a row is damaged.
     """
-    if not path.exists():
+    try:
+        log_lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
         return []
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); move it away, or restore the file") from error
 
     # A crash can cut short only the last line, so only the last line may be broken.
-    log_lines = path.read_bytes().splitlines()
     rows: list[dict[str, Any]] = []
     for line_number, line in enumerate(log_lines, start=1):
         source = f"{path}, line {line_number}"

@@ -1,9 +1,13 @@
 """Checkpoints: exact round trips, refusals, and kills at any moment."""
 
+import errno
+import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.refusals import assert_message_names
 
 from jaxnav.errors import InputError
 from jaxnav.store import checkpoint
@@ -216,3 +221,72 @@ def test_kill_during_save_leaves_a_whole_checkpoint(tmp_path, kill_delay):
     # The run continues with the next step.
     checkpoint.save_checkpoint(tmp_path, restored_step + 1, restored_state, make_manifest({}))
     assert restore_latest(tmp_path, abstract_state, make_manifest({}))[1] == restored_step + 1
+
+
+# A full disk
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), ValueError("RESOURCE_EXHAUSTED: Failed writing")]
+)
+def test_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, error):
+    checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
+
+    def fail(*_, **__):
+        raise error
+
+    with monkeypatch.context() as patches:
+        patches.setattr(checkpoint.ocp.training.Checkpointer, "save", fail)
+        with pytest.raises(InputError, match=r"checkpoints/2: cannot be saved \(.*; free space and inodes") as refusal:
+            checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
+    assert "\n" not in str(refusal.value)
+
+    # The run goes on where there is room again.
+    assert restore_latest(tmp_path)[1] == 1
+    checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
+    assert restore_latest(tmp_path)[1] == 2
+
+
+@pytest.mark.parametrize(("num_inodes", "num_free", "is_refused"), [(50, 39, True), (50, 40, False), (0, 0, False)])
+def test_save_needs_inodes(tmp_path, monkeypatch, num_inodes, num_free, is_refused):
+    disk = types.SimpleNamespace(f_files=num_inodes, f_favail=num_free)
+    monkeypatch.setattr(os, "statvfs", lambda _: disk)
+    if is_refused:
+        with pytest.raises(InputError, match=r"cannot be saved \(the disk has 39 free inodes.*; remove files"):
+            checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
+        assert list(tmp_path.iterdir()) == []
+    else:
+        checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
+
+
+def fill_disk(folder: Path) -> list[Path]:
+    """Save a run after another until the disk is full, and return the directories of those that were saved."""
+    saved_runs = []
+    for index in range(20):
+        try:
+            checkpoint.save_checkpoint(folder / f"run{index}", 1, make_state(1), MANIFEST)
+        except InputError as error:
+            assert_message_names(error, "cannot be saved", "run the same command again")
+            break
+        saved_runs.append(folder / f"run{index}")
+    return saved_runs
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="only root mounts a file system")
+@pytest.mark.parametrize("limit", ["size=40k", "size=80k", "size=160k", "nr_inodes=5", "nr_inodes=12", "nr_inodes=60"])
+def test_small_file_system_is_one_line_and_loses_nothing(tmp_path, limit):
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", limit, "tmpfs", tmp_path], check=False).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        saved_runs = fill_disk(tmp_path)
+        assert len(saved_runs) < 20
+
+        # Every run that was saved is restored, and the next one is saved where there is room again.
+        subprocess.run(["mount", "-o", "remount,size=90m,nr_inodes=9000", tmp_path], check=True)
+        for run_dir in saved_runs:
+            assert restore_latest(run_dir)[1] == 1
+        checkpoint.save_checkpoint(tmp_path / "next", 1, make_state(1), MANIFEST)
+        assert restore_latest(tmp_path / "next")[1] == 1
+    finally:
+        subprocess.run(["umount", tmp_path], check=True)

@@ -78,3 +78,10 @@ def test_log_rows_of_any_content_round_trip_and_survive_truncation(tmp_path_fact
     assert read_log_rows(log_file) == [row | {"step": 1}]
     truncate_log_after(log_file, 1)
     assert log_file.read_bytes() == content_before
+
+
+def test_a_folder_in_place_of_a_log_is_refused(tmp_path):
+    (tmp_path / "metrics.jsonl").mkdir()
+    for read in (read_log_rows, lambda path: truncate_log_after(path, 1)):
+        with pytest.raises(InputError, match=r"metrics.jsonl: cannot be read \(Is a directory\); move it away"):
+            read(tmp_path / "metrics.jsonl")
