@@ -91,6 +91,7 @@ def run_command(command: Callable[..., object], parse: Callable[[], Any] | None 
     try:
         arguments = (console,) if parse is None else (parse(), console)
         if compiles:
+            _prepare_jax(console)
             _enable_program_cache(console)
             _trim_memory_after_compiling()
         command(*arguments)
@@ -151,9 +152,22 @@ def _user_message(error: Exception) -> str | None:
             return f"there is not enough memory ({error}); give fewer or smaller scenes, seeds or environments"
         case OSError(strerror=str()):
             return f"{error.filename or 'a file'}: {error.strerror}; check the path, its permissions and the disk"
+    if isinstance(error, RuntimeError | AssertionError) and not _has_jax_backend():
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        return f"JAX_PLATFORMS={platforms}: JAX finds no such device; unset it, give cpu, or install the package for it"
     if type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error):
         return "there is not enough memory on the device; give fewer seeds or a smaller ppo.num_envs"
     return None
+
+
+def _has_jax_backend() -> bool:
+    """True where JAX finds a device, or is not in use."""
+    if "jax" not in sys.modules:
+        return True
+    try:
+        return bool(sys.modules["jax"].devices())
+    except (RuntimeError, AssertionError):  # JAX raises either, some without a message
+        return False
 
 
 # Printing
@@ -688,6 +702,15 @@ def _format_int_pairs(values: dict[str, int]) -> list[str]:
 
 
 # Compiled programs and their memory
+
+
+def _prepare_jax(console: Console) -> None:
+    """Set the modes of JAX that a command needs, and warn about one that makes it very slow."""
+    import jax
+
+    jax.config.update("jax_enable_x64", False)  # policies compute in float32
+    if jax.config.values["jax_disable_jit"]:
+        console.print("warning: JAX_DISABLE_JIT is set, so commands take many times longer; unset it", style="yellow")
 
 
 def _enable_program_cache(console: Console) -> None:

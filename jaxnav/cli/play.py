@@ -1,5 +1,6 @@
 """The play command: an episode in the terminal, with the reader at the keys."""
 
+import os
 import sys
 
 from rich.console import Console
@@ -26,6 +27,9 @@ def _play(config: PlayConfig, console: Console) -> None:
     with read_keys(sys.stdin) as keys:
         if not screen.is_terminal:
             raise InputError("play: the output is not a terminal; start the command in a terminal")
+        if screen.is_dumb_terminal or not screen.encoding.startswith("utf"):
+            terminal = f"TERM={os.environ.get('TERM', '')}, encoding {screen.encoding}"
+            raise InputError(f"play: the terminal cannot show the map ({terminal}); give another TERM, or LANG=C.UTF-8")
         game = prepare_game(config, console)
         with Live(console=screen, screen=True, auto_refresh=False) as live:
             result = play_game(game, keys, lambda view: live.update(game_screen(game, view), refresh=True))

@@ -7,6 +7,7 @@ The worlds `apartments` and `houses` are registered likewise; keyword arguments 
 Importing this module registers the ids.
 """
 
+import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -21,12 +22,16 @@ from gymnasium.vector.utils import batch_space
 
 from jaxnav.env.make import make
 from jaxnav.env.objectnav import DETECTION_ORIGIN, DETECTION_SCALE, EnvParams, ObjectNav, State, unpack_detections
+from jaxnav.errors import InputError
 from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import WORLDS
 
 #: Observations or infos by name.
 NamedValues = dict[str, Any]
+
+#: Processes that have imported this module: one that was forked later is another one.
+_IMPORT_PROCESS_ID = os.getpid()
 
 
 class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
@@ -40,8 +45,13 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         """Make the scenes; the options are those of `jaxnav.make`.
 
         Raises:
-          InputError: see `jaxnav.make`.
+          InputError: see `jaxnav.make`, and a process that was forked, in which JAX would wait forever.
         """
+        if os.getpid() != _IMPORT_PROCESS_ID:
+            raise InputError(
+                "vectorization_mode='async': JAX hangs in forked processes; omit the mode, to step all environments in "
+                "one compiled call, or give vector_kwargs={'context': 'spawn'}"
+            )
         env, params = make(world, **options)
         self._batched_env = _BatchedEnv(env, params)
         self._episodes: EpisodeState | None = None  # leaves [1]

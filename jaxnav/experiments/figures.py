@@ -20,7 +20,7 @@ from jaxnav.experiments.gap_traces import Belief
 from jaxnav.experiments.similarity import GainBySimilarity, SuccessBySimilarity, gain_of_table, success_of_table
 from jaxnav.experiments.table import Curve, ResultTable
 from jaxnav.experiments.trials import PAPER_THRESHOLD, SWEPT_FORMS, ZERO_THRESHOLD, Trial
-from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, freeze_axes_positions, make_panels, set_panel_title
+from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, default_style, freeze_axes_positions, make_panels, set_panel_title
 
 _LINE = {"lw": 1.5, "ms": 4.5}
 #: Styles of lines; neighbours differ in lightness.
@@ -119,6 +119,7 @@ FIGURES = {
 # One figure each
 
 
+@default_style
 def similarity_figure(by_shift: Mapping[float, SuccessBySimilarity]) -> Figure:
     """Draw SR against layout similarity (paper's Fig. 4).
 
@@ -155,6 +156,7 @@ def similarity_figure(by_shift: Mapping[float, SuccessBySimilarity]) -> Figure:
     return freeze_axes_positions(figure)
 
 
+@default_style
 def gain_figure(by_shift: Mapping[float, GainBySimilarity], variant: str) -> Figure:
     """Draw baseline SR and the gain of a variant per category (paper's Fig. 5).
 
@@ -192,6 +194,7 @@ def gain_figure(by_shift: Mapping[float, GainBySimilarity], variant: str) -> Fig
     return freeze_axes_positions(figure)
 
 
+@default_style
 def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, Mapping[str, Interval]]]) -> Figure:
     """Draw the metrics over epsilon (paper's Fig. 6a).
 
@@ -222,6 +225,7 @@ def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, Mapping[st
     return freeze_axes_positions(figure)
 
 
+@default_style
 def gap_figure(panels_by_setting: Mapping[str, GapLines]) -> Figure:
     """Draw the mean layout gap by step (paper's Fig. 6b).
 
@@ -255,6 +259,7 @@ def gap_figure(panels_by_setting: Mapping[str, GapLines]) -> Figure:
     return freeze_axes_positions(figure)
 
 
+@default_style
 def auc_figure(curve_by_setting: Mapping[str, Curve]) -> Figure:
     """Draw the AUC of the gap by step, one line per setting."""
     figure, panels = make_panels(1, 1, height=3.6)
@@ -270,6 +275,7 @@ def auc_figure(curve_by_setting: Mapping[str, Curve]) -> Figure:
     return freeze_axes_positions(figure)
 
 
+@default_style
 def effects_figure(groups: Mapping[str, Mapping[str, Interval]]) -> Figure:
     """Draw differences in SR with their intervals.
 

@@ -13,6 +13,7 @@ from jaxnav.evaluation.report import ExperienceLead, difference_label
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.figures import effects_figure, epsilon_figure
 from jaxnav.report.page import Chart
+from jaxnav.viz.style import default_style
 
 #: Variables of the page's style sheet, by the colors of the figures.
 _PAGE_COLORS = {
@@ -77,6 +78,7 @@ def differences_chart(reports: Mapping[float, Mapping[str, Any]]) -> Chart:
     return Chart(to_svg(effects_figure(differences_by_shift)), "Paired differences in success, best actions.")
 
 
+@default_style
 def to_svg(figure: Figure) -> str:
     """Return a figure as an SVG element.
 

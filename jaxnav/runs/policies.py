@@ -37,6 +37,7 @@ from jaxnav.store.checkpoint import describe_arrays
 from jaxnav.store.export import POLICY_FILE, export_params, load_params
 from jaxnav.store.files import expand_home, list_differences
 from jaxnav.training.calibration import Exploration, layout_priors
+from jaxnav.training.devices import require_float32
 
 #: Folder of the exported policies in a run directory.
 POLICIES_DIR = "policies"
@@ -410,6 +411,7 @@ def read_exported_policy(folder: Path) -> Policies:
 
 def _parse_export(folder: Path, arrays: dict[str, Any], fields: dict[str, Any]) -> Policies:
     """Build policies from the contents of one export; see `read_exported_policy`."""
+    require_float32()
     try:
         # The specification decides which arrays there must be.
         method = find_method(fields["method"])

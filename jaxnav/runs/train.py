@@ -73,6 +73,7 @@ from jaxnav.training.devices import (
     check_agreement,
     exit_if_process_lost,
     is_first_process,
+    require_float32,
     run_on_first_process,
 )
 from jaxnav.training.ppo import EPISODE_MEANS, Learner, LearnerState
@@ -117,6 +118,7 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
       InputError: a setting is impossible, the run directory holds something else or is in use, or files are damaged.
       Interrupted: Ctrl-C or SIGTERM came during training. The run is saved, and the same call resumes it.
     """
+    require_float32()
     stopwatch = Stopwatch.start()
     config = _check_config_and_method(config)
     mesh = connect_devices(config)

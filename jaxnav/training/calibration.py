@@ -281,7 +281,7 @@ def _measure_gaps(
     key: jax.Array,
     num_walks: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Early and late gap of each walk, float32 [W]; the early gap is NaN where no view was accepted.
+    """Early and late gap of each walk, float32 [W]; the early gap is infinite where no view was accepted.
 
     Args:
       estimator_config: estimator with a reduction; its strength has no effect.
@@ -312,7 +312,8 @@ def _measure_gaps(
     # Mean over the first accepted views, and the gap after the last step.
     is_early = is_accepted & (jnp.cumsum(is_accepted, axis=0) <= NUM_EARLY_VIEWS)
     num_early = is_early.astype(jnp.float32).sum(axis=0)
-    early_gap = jnp.where(is_early, gaps, 0.0).sum(axis=0) / num_early
+    early_sum = jnp.where(is_early, gaps, 0.0).sum(axis=0)
+    early_gap = jnp.where(num_early > 0, early_sum / jnp.maximum(num_early, 1.0), jnp.inf)
     return early_gap, gaps[-1]
 
 

@@ -129,6 +129,19 @@ class Devices:
 # Placing arrays on a mesh
 
 
+def require_float32() -> None:
+    """Refuse the 64-bit mode of JAX, in which arrays that are not given a dtype are float64 and int64.
+
+    Raises:
+      InputError: the mode is on.
+    """
+    if jax.config.values["jax_enable_x64"]:
+        raise InputError(
+            "JAX_ENABLE_X64: is on, but policies compute in float32; unset it, or call "
+            "jax.config.update('jax_enable_x64', False) first"
+        )
+
+
 def replicated_sharding(mesh: Mesh) -> NamedSharding:
     """Sharding that copies whole arrays to all devices."""
     return NamedSharding(mesh, PartitionSpec())

@@ -37,7 +37,7 @@ from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, Task
 from jaxnav.store.files import expand_home
 from jaxnav.viz.scene import draw_agent, draw_plan
-from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR, style_axes
+from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR, default_style, style_axes
 
 REMOVAL_COLOR = "#E69F00"
 ACTION_PHRASES = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")
@@ -315,6 +315,7 @@ def _make_played_episode(
 # The picture
 
 
+@default_style
 def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
     """Write the picture of an episode: a row of panels for each variant, a column for each layout shift.
 
@@ -364,7 +365,7 @@ def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
     if is_gif:
         _write_gif(frames, path)
     else:
-        frames[-1].save(path, optimize=True)
+        frames[-1].save(path, format="PNG", optimize=True)
 
 
 def _write_gif(frames: list[Image.Image], path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxnav.viz.style import TEXT_COLOR, freeze_axes_positions, make_panels, set_panel_title
+from jaxnav.viz.style import TEXT_COLOR, default_style, freeze_axes_positions, make_panels, set_panel_title
 
 #: Color of the curves of each arm.
 _ARM_COLORS = {"baseline": "#D55E00", "layout": "#0072B2"}
@@ -19,6 +19,7 @@ _SAMPLED_STYLE: dict[str, Any] = _LINE | {"ls": "--", "marker": "s"}
 _TRAINING_STYLE: dict[str, Any] = _LINE | {"ls": ":"}
 
 
+@default_style
 def learning_figure(
     rows: Sequence[Mapping[str, Any]], success_by_budget: Mapping[str, Any] | None, title: str
 ) -> Figure:

@@ -6,7 +6,6 @@ they cover little else.
 """
 
 import dataclasses
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -35,8 +34,15 @@ from jaxnav.scenes.tables.compile import compile_scene
 from jaxnav.scenes.tables.observation_row import MAX_RANGE, PERFECT_DETECTOR, RowFormat, detected_positions
 from jaxnav.scenes.tables.visibility import cell_centres, is_opaque, wall_boxes
 from jaxnav.scenes.task import Rules, Task
-from jaxnav.store.files import write_atomic
-from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR
+from jaxnav.viz.style import (
+    AGENT_COLOR,
+    GOAL_COLOR,
+    MUTED_COLOR,
+    SEEN_COLOR,
+    TEXT_COLOR,
+    default_style,
+    save_figure,
+)
 
 SCENE_DPI = 120
 
@@ -101,11 +107,10 @@ def draw_scene(
       OSError: the file cannot be written.
     """
     task = dataclasses.replace(task, detector=PERFECT_DETECTOR)
-    png_buffer = io.BytesIO()
-    scene_figure(scene, task, view_from_pose(scene, task, pose), shift).savefig(png_buffer, dpi=SCENE_DPI)
-    write_atomic(path, png_buffer.getvalue())
+    save_figure(scene_figure(scene, task, view_from_pose(scene, task, pose), shift), path, dpi=SCENE_DPI)
 
 
+@default_style
 def scene_figure(scene: Scene, task: Task, view: PoseView, shift: float = 0.0) -> Figure:
     """Compose the plan of a scene, a view and a panel with numbers.
 

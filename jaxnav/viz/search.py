@@ -33,7 +33,7 @@ from jaxnav.scenes.scene import CELL_SIZE, scene_extent
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 from jaxnav.viz.episode import PlayedEpisode, describe_step
 from jaxnav.viz.scene import BACKGROUND_COLOR, LabelPlacer, draw_agent, draw_plan_background, is_any_near
-from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR
+from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, default_style, save_figure
 
 MAX_PREDICTED_ACTIONS = 80
 
@@ -183,6 +183,7 @@ class MapProjection:
         return (offsets + self.size // 2) % self.size - self.size // 2
 
 
+@default_style
 def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, path: Path) -> None:
     """Write the picture of the search at a step as a PNG."""
     figure = Figure(figsize=(9.6, 5.4), dpi=100)
@@ -206,8 +207,7 @@ def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, pat
     # The legend stands to the right of the plan.
     legend_handles = _legend_handles(goal_name, snapshot.is_searching)
     figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _draw_map(axes: Axes, snapshot: SearchSnapshot, projection: MapProjection) -> None:

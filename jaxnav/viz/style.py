@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,6 +21,10 @@ SEEN_COLOR = "#009E73"
 
 TEXT_COLOR = "#333333"
 MUTED_COLOR = "#8a8a8a"
+
+
+#: Decorator of functions that draw: figures look alike, and are drawn at all, whatever the user's matplotlibrc sets.
+default_style = matplotlib.style.context("default")
 
 
 def make_panels(rows: int, columns: int, *, height: float, **sharing: Any) -> tuple[Figure, np.ndarray]:
@@ -62,12 +67,18 @@ def freeze_axes_positions(figure: Figure) -> Figure:
     return figure
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+@default_style
+def save_figure(figure: Figure, path: Path, dpi: int | None = None) -> None:
     """Write a figure as a PNG, atomically.
+
+    Args:
+      figure: figure to write.
+      path: file to write.
+      dpi: pixels per inch; None for those of the figure.
 
     Raises:
       OSError: the file cannot be written; `path` is unchanged.
     """
     png = io.BytesIO()
-    figure.savefig(png, format="png", metadata={"Software": None})
+    figure.savefig(png, format="png", dpi=dpi or figure.dpi, metadata={"Software": None})
     write_atomic(path, png.getvalue())

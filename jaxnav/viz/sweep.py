@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.runs.evaluate import Sweep
-from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, freeze_axes_positions, make_panels, set_panel_title
+from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, default_style, freeze_axes_positions, make_panels, set_panel_title
 
 # Styles of the layout shifts; neighbours differ in lightness, marker and dash.
 _SHIFT_STYLES: tuple[dict[str, Any], ...] = (
@@ -25,6 +25,7 @@ _SHIFT_STYLES: tuple[dict[str, Any], ...] = (
 _METRIC_TITLES = {"sr": "SR", "spl": "SPL"}
 
 
+@default_style
 def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str | None = None) -> Figure:
     """Draw SR and SPL over the threshold, with a curve for each layout shift.
 

@@ -1,0 +1,226 @@
+"""Environment variables, streams and settings of other programs are inputs: they do not matter, or get one line."""
+
+import itertools
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import jax
+import matplotlib as mpl
+import pytest
+from support.refusals import assert_message_names
+from support.tiny_run import finished_run, tiny_config, write_config
+
+import jaxnav
+from jaxnav.__main__ import main
+from jaxnav.cli.console import run_command
+from jaxnav.env import gym
+from jaxnav.env.testing import check_environment
+from jaxnav.errors import InputError
+from jaxnav.training.devices import require_float32
+from jaxnav.viz.learning import learning_figure
+from jaxnav.viz.style import save_figure
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def run_jaxnav(*words, redirection="", timeout=300, **environment):
+    """Run a command in a shell, with variables of the environment, and return exit code and output."""
+    command = [sys.executable, "-m", "jaxnav", *map(str, words)]
+    shell_line = f'exec "$@" {redirection}'
+    variables = {name: value for name, value in (os.environ | environment).items() if value is not None}
+    process = subprocess.run(
+        ["sh", "-c", shell_line, "sh", *command],
+        env=variables | {"PYTHONPATH": str(REPOSITORY)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout,
+    )
+    return process.returncode, process.stdout + process.stderr
+
+
+@pytest.fixture
+def x64():
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+# JAX
+
+
+@pytest.mark.usefixtures("x64")
+def test_python_refuses_the_64_bit_mode_in_one_line(tmp_path):
+    calls = (
+        require_float32,
+        lambda: jaxnav.load_policy("rooms-org"),
+        lambda: jaxnav.train(tiny_config(tmp_path)),
+    )
+    for call in calls:
+        with pytest.raises(InputError, match=r"JAX_ENABLE_X64: is on, but .* float32; unset it"):
+            call()
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.usefixtures("x64")
+def test_commands_leave_the_64_bit_mode():
+    assert run_command(lambda _: require_float32()) == 0
+
+
+def test_commands_warn_that_nothing_is_compiled(capsys):
+    with jax.disable_jit():
+        assert run_command(lambda _: None) == 0
+    assert "JAX_DISABLE_JIT is set" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_environment_is_checked_without_compilation():
+    env, params = jaxnav.make("rooms")
+    with jax.disable_jit():
+        check_environment(env, params, num_envs=1, num_steps=1)
+
+
+@pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unable to initialize backend 'x': y")])
+def test_a_missing_backend_is_one_line(error, monkeypatch, capsys):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setenv("JAX_PLATFORMS", "x")
+    monkeypatch.setattr(jax, "devices", fail)
+    assert run_command(fail) == 2
+    assert_message_names(capsys.readouterr().err, "error: JAX_PLATFORMS=x: ", "no such device", "unset it")
+
+
+def test_a_bug_is_not_taken_for_a_missing_backend():
+    def fail(_):
+        raise AssertionError("a bug")
+
+    with pytest.raises(AssertionError, match="a bug"):
+        run_command(fail)
+
+
+# Figures
+
+
+@pytest.mark.parametrize("setting", ["text.usetex: True", "savefig.format: pdf", "savefig.dpi: 7", "font.size: 99"])
+def test_figures_do_not_depend_on_matplotlibrc(setting, tmp_path):
+    rows = [{"arm": "layout", "env_steps": steps, "success": 0.5} for steps in (1, 2)]
+    name, value = setting.split(": ")
+    pictures = []
+    for settings in ({}, {name: value}):
+        with mpl.rc_context(settings):
+            save_figure(learning_figure(rows, None, "a title"), tmp_path / "a.png")
+        pictures.append((tmp_path / "a.png").read_bytes())
+    assert pictures[0] == pictures[1]
+    assert pictures[0].startswith(b"\x89PNG")
+
+
+# Forked processes
+
+
+def test_an_environment_is_refused_in_a_forked_process(monkeypatch):
+    monkeypatch.setattr(gym.os, "getpid", lambda: -1)
+    with pytest.raises(InputError, match="'async': JAX hangs in forked processes; omit the mode"):
+        gymnasium.make("jaxnav.env.gym:jaxnav/rooms-v0")
+
+
+# Streams and terminals
+
+
+@pytest.mark.parametrize("columns", [1, 2, 5, 40])
+def test_help_ends_at_any_width(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    assert "--run-dir" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
+def test_commands_run_with_closed_streams(redirection):
+    code, output = run_jaxnav("list", "worlds", redirection=redirection)
+    assert code == 0
+    assert "Traceback" not in output
+
+
+def test_play_refuses_a_closed_input():
+    code, output = run_jaxnav("play", redirection="<&-")
+    assert (code, output.count("\n")) == (2, 1)
+    assert "play: the input is not a terminal" in output
+
+
+def test_characters_that_a_stream_lacks_are_escaped():
+    code, output = run_jaxnav("list", "küche", PYTHONIOENCODING="ascii")
+    assert code == 2
+    assert "k\\xfcche" in output
+
+
+# The matrix: commands by environments
+
+ENVIRONMENTS = {
+    "usual": {},
+    "64 bits": {"JAX_ENABLE_X64": "1"},
+    "NaN": {"JAX_DEBUG_NANS": "1"},
+    "no jit": {"JAX_DISABLE_JIT": "1"},
+    "no backend": {"JAX_PLATFORMS": "no_such_backend"},
+    "no home": {"HOME": None},
+    "home that cannot be written": {"HOME": "/proc/nothing"},
+    "matplotlib": {"MATPLOTLIBRC": "matplotlibrc"},
+    "matplotlib backend": {"MPLBACKEND": "module://no_such"},
+    "ASCII": {"PYTHONIOENCODING": "ascii"},
+    "C locale": {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+    "dumb": {"TERM": "dumb"},
+    "no terminal": {"TERM": None},
+    "one column": {"COLUMNS": "1"},
+    "many columns": {"COLUMNS": "100000"},
+    "bad columns": {"COLUMNS": "x"},
+    "no color": {"NO_COLOR": "1"},
+    "color": {"FORCE_COLOR": "1"},
+    "optimized": {"PYTHONOPTIMIZE": "2"},
+    "no input": {"redirection": "<&-"},
+    "no output": {"redirection": ">&- 2>&-"},
+}
+COMMANDS = {
+    "list": ("list", "worlds"),
+    "show": ("scenes", "show", "rooms", "--out", "scene.png"),
+    "play": ("play",),
+    "eval": ("eval", "finished", "--episodes", "2"),
+    "train": ("train", "--config", "tiny.yaml", "--run-dir", "run", "--seeds", "1", "--arms", "baseline"),
+    "report": ("report", "finished", "--episodes", "20"),
+}
+#: Each environment once; only commands that take a second.
+SAMPLE = list(zip(ENVIRONMENTS, itertools.cycle(["list", "list", "play"]), strict=False))
+#: Environments that matter to what is computed, drawn or written, which takes longer.
+COMPUTING = ("64 bits", "NaN", "no home", "matplotlib", "ASCII", "no output")
+MATRIX = [(name, "show") for name in ENVIRONMENTS]
+MATRIX += list(itertools.product(COMPUTING, ("train", "eval", "report")))
+
+
+def check_surroundings(environment_name, command_name, folder, monkeypatch):
+    """Check that a command in an environment ends well or with one line, and writes pictures as PNG."""
+    monkeypatch.chdir(folder)
+    write_config(folder)
+    (folder / "matplotlibrc").write_text("text.usetex: True\nsavefig.format: pdf\n")
+    code, output = run_jaxnav(*COMMANDS[command_name], timeout=240, **ENVIRONMENTS[environment_name])
+    assert code in (0, 2), output
+    assert "Traceback" not in output
+    assert code == 0 or "error: " in output or environment_name == "no output"
+    for picture in folder.rglob("*.png"):
+        assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("environment_name", "command_name"), SAMPLE)
+def test_surroundings_by_a_sample(environment_name, command_name, tmp_path, monkeypatch):
+    check_surroundings(environment_name, command_name, tmp_path, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("environment_name", "command_name"), MATRIX)
+def test_surroundings_of_every_command(environment_name, command_name, tmp_path, tmp_path_factory, monkeypatch):
+    if command_name in ("eval", "report"):
+        shutil.copytree(finished_run(tmp_path_factory)[1], tmp_path / "finished")
+    check_surroundings(environment_name, command_name, tmp_path, monkeypatch)
