@@ -173,7 +173,7 @@ def test_commands_of_the_page_train_and_evaluate_the_method(method_folder, tmp_p
         assert completed.returncode == 0, completed.stderr
         outputs.append(completed.stdout)
     assert int(outputs[-1]) in range(NUM_ACTIONS)
-    rows = json.loads((run_dir / "eval-val.json").read_text())["rows"]
+    rows = json.loads((run_dir / "eval-val-episodes4.json").read_text())["rows"]
     assert {row["variant"] for row in rows} == {"baseline", "layout", "tde", "stde", "random", "oracle"}
 
     completed = run(*evaluate_command, cwd=ROOT)  # where the module is not

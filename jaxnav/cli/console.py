@@ -15,6 +15,7 @@ import ctypes
 import dataclasses
 import difflib
 import functools
+import hashlib
 import inspect
 import io
 import operator
@@ -70,6 +71,9 @@ _MAX_HELP_WIDTH = 100
 _PIPE_WIDTH = 10_000
 #: Seconds from which a compilation is cached, and its freed memory returned.
 _LONG_COMPILATION_S = 0.5
+#: Longest name of a results file without its endings, and longest part of it, in characters.
+_MAX_NAME_LENGTH = 160
+_MAX_PART_LENGTH = 40
 
 
 # Running a command
@@ -124,6 +128,8 @@ def refuse_unwritable(path: object, remedy: str) -> Iterator[None]:
 def name_evaluation(command: str, split: str, world: str | None, scenes: Path | None, *details: str | None) -> str:
     """Return the name, without an ending, of the file that a command writes by default.
 
+    Results of other settings get another name, so that they never overwrite each other.
+
     Args:
       command: name of the command.
       split: scenes that are evaluated.
@@ -133,8 +139,34 @@ def name_evaluation(command: str, split: str, world: str | None, scenes: Path | 
     """
     source = world
     if source is None and scenes is not None:
-        source = f"scenes-{scenes.name.split('.')[0]}"  # never the name of a world
-    return "-".join(part for part in (command, source, split, *details) if part is not None)
+        source = f"scenes-{name_path(scenes)}"  # never the name of a world
+    name = "-".join(part for part in (command, source, split, *details) if part is not None)
+    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:_MAX_NAME_LENGTH]}-{_short_digest(name)}"
+
+
+def name_path(path: Path) -> str:
+    """Return the part of a file name that stands for a path: the start of its last name, and a digest of the whole."""
+    readable_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name.removesuffix(".gz").removesuffix(".jsonl"))
+    return f"{readable_name[:_MAX_PART_LENGTH]}-{_short_digest(os.fspath(path.resolve()))}"
+
+
+def name_numbers(option: str, numbers: Sequence[float]) -> str:
+    """Return the part of a file name that stands for an option with numbers, such as `epsilon0.25-0.5`."""
+    numbers_text = "-".join(repr(float(number)).removesuffix(".0") for number in numbers)
+    if len(numbers_text) > _MAX_PART_LENGTH:
+        numbers_text = f"s-{len(numbers)}-{_short_digest(numbers_text)}"
+    return option + numbers_text
+
+
+def _short_digest(text: str) -> str:
+    return hashlib.sha256(os.fsencode(text)).hexdigest()[:8]
+
+
+def write_latest(command: str, path: Path) -> None:
+    """Name a file of results as the newest one of a command, in `latest-COMMAND.txt` next to it."""
+    from jaxnav.store.files import write_atomic
+
+    write_atomic(path.with_name(f"latest-{command}.txt"), f"{path.name}\n".encode())
 
 
 def refuse_folder(path: Path, option: str) -> None:

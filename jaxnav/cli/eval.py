@@ -15,11 +15,13 @@ from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
     name_evaluation,
+    name_numbers,
     parse_arguments,
     print_table,
     refuse_folder,
     refuse_unwritable,
     run_command,
+    write_latest,
 )
 from jaxnav.errors import InputError
 
@@ -63,7 +65,8 @@ class EvalConfig:
         `categories`: the categories other than the goal within experience, on a quarter of the episodes. `all`: every
         part, on all episodes. The shares of decisions that change are always measured.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
-      json: JSON file to write. The default is a name such as `eval-val.json` in the run directory.
+      json: JSON file to write. The default is a name after the options, such as `eval-val-shift1-seed3.json`, in the
+        run directory, where `latest-eval.txt` names the newest evaluation.
       format: format in which the evaluation is printed.
     """
 
@@ -124,6 +127,8 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
 
     with refuse_unwritable(target, "--json"):
         results.write(target)
+        if config.json is None:
+            write_latest("eval", target)
     num_compilations = results.report["compilations"]
     plural = "" if num_compilations == 1 else "s"
     num_episodes = len(results.episodes.goal)
@@ -172,12 +177,18 @@ def _print_report(report: dict[str, Any], report_format: str) -> None:
 def _find_target(config: EvalConfig) -> Path:
     """Return the JSON file to write, or raise an `InputError` before anything is evaluated."""
     details = (
-        None if config.shift is None else f"shift{config.shift:g}",
-        None if config.shift_by == "size" else f"by-{config.shift_by}",
-        config.setting,
+        None if config.shift is None else name_numbers("shift", [config.shift]),
+        None if config.shift_by == EvalConfig.shift_by else f"by-{config.shift_by}",
+        None if config.episodes == EvalConfig.episodes else f"episodes{config.episodes}",
+        None if config.epsilon == EvalConfig.epsilon else name_numbers("epsilon", config.epsilon),
+        None if config.form is None else "-".join(config.form),
+        None if config.setting is None else f"setting-{config.setting}",
+        "hold" if config.hold else None,
         None if config.inner_steps is None else f"inner{config.inner_steps}",
-        None if config.removal == ("tde",) else "-".join(config.removal),
+        None if config.removal == EvalConfig.removal else "-".join(config.removal),
         None if config.counterfactual_memory is None else f"{config.counterfactual_memory}-memory",
+        None if config.costs == EvalConfig.costs else f"costs-{config.costs}",
+        None if config.seed == EvalConfig.seed else f"seed{config.seed}",
     )
     name = name_evaluation("eval", config.split, config.world, config.scenes, *details)
     target = config.json or config.run / f"{name}.json"

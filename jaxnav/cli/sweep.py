@@ -12,11 +12,14 @@ from jaxnav.cli.console import (
     escape_control_chars,
     make_result_console,
     name_evaluation,
+    name_numbers,
+    name_path,
     parse_arguments,
     print_table,
     refuse_folder,
     refuse_unwritable,
     run_command,
+    write_latest,
 )
 from jaxnav.errors import InputError
 from jaxnav.store.files import expand_home
@@ -56,8 +59,9 @@ class SweepConfig:
       hold: keep the gap from falling within an episode. With `--form switch`, experience then stays removed for the
         rest of the episode once the gap exceeds the threshold.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
-      out: PNG to write the figure to; the numbers are written next to it as JSON. The default is a name such as
-        `sweep-val.png` in the run directory or, for a policy, in the working directory.
+      out: PNG to write the figure to; the numbers are written next to it as JSON. The default is a name
+        after the options, such as `sweep-val-seed3.png`, in the run directory or, for a policy, in the working
+        directory, where `latest-sweep.txt` names the newest sweep.
       format: format of the printed table.
     """
 
@@ -118,6 +122,8 @@ def _run_sweep(config: SweepConfig, console: Console) -> None:
     console.print(f"{compilations} compilation{plural} for all thresholds, seeds and shifts")
     with refuse_unwritable(numbers_path, "--out"):
         _write_numbers(results, rows, numbers_path)
+        if config.out is None:
+            write_latest("sweep", numbers_path)
     console.print(f"numbers: {numbers_path}")
     with refuse_unwritable(figure_path, "--out"):
         _draw_figure(results, figure_path, console)
@@ -130,15 +136,21 @@ def _find_figure_path(config: SweepConfig) -> Path:
     # A policy is not in a run directory, so its name belongs to the file.
     is_single_policy = is_policy(config.source)
     folder = Path() if is_single_policy else expand_home(config.source)
-    command = f"sweep-{Path(config.source).resolve().name}" if is_single_policy else "sweep"
-    has_default_shifts = config.shift == SweepConfig.shift
+    command = "sweep"
+    if is_single_policy:
+        source_path = expand_home(config.source)
+        command = f"sweep-{name_path(source_path) if source_path.exists() else config.source}"
+
     details = (
-        None if has_default_shifts else f"shift{'-'.join(f'{shift:g}' for shift in config.shift)}",
-        None if config.shift_by == "size" else f"by-{config.shift_by}",
+        None if config.shift == SweepConfig.shift else name_numbers("shift", config.shift),
+        None if config.shift_by == SweepConfig.shift_by else f"by-{config.shift_by}",
+        None if config.episodes == SweepConfig.episodes else f"episodes{config.episodes}",
+        None if config.epsilon == SweepConfig.epsilon else name_numbers("epsilon", config.epsilon),
         config.form,
-        config.setting,
+        None if config.setting is None else f"setting-{config.setting}",
         "hold" if config.hold else None,
         "sampled" if config.decoding == "sample" else None,
+        None if config.seed == SweepConfig.seed else f"seed{config.seed}",
     )
     name = name_evaluation(command, config.split, config.world, config.scenes, *details)
 

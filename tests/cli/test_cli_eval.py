@@ -2,8 +2,10 @@
 
 import contextlib
 import csv
+import dataclasses
 import io
 import json
+import re
 import shutil
 import tarfile
 from pathlib import Path
@@ -143,7 +145,53 @@ def test_eval_report_names_differ_for_a_world_and_a_file():
     scene_file = Path("elsewhere/rooms.jsonl.gz")
     configs = [EvalConfig(run_path), EvalConfig(run_path, world="rooms"), EvalConfig(run_path, scenes=scene_file)]
     report_names = [str(_find_target(config)) for config in configs]
-    assert report_names == ["run/eval-val.json", "run/eval-rooms-val.json", "run/eval-scenes-rooms-val.json"]
+    assert report_names[:2] == ["run/eval-val.json", "run/eval-rooms-val.json"]
+    assert re.fullmatch("run/eval-scenes-rooms-[0-9a-f]{8}-val.json", report_names[2])
+
+
+#: For every option that changes an evaluation, other values than the default.
+OTHER_OPTIONS = {
+    "split": ("train", "test"),
+    "world": ("rooms", "houses"),
+    "scenes": tuple(
+        Path(name)
+        for name in ("homes.v1.jsonl.gz", "homes.v2.jsonl.gz", "a/homes.jsonl", "b/homes.jsonl", "a\nb.gz", "x" * 250)
+    ),
+    "shift": (0.0, 1.0, 0.1234567, 0.12345678),
+    "shift_by": ("context",),
+    "episodes": (8, 100),
+    "epsilon": ((0.0,), (0.5, 0.0), (0.25, 0.5), tuple(range(50)), tuple(range(51)), ()),
+    "form": (("paper",), ("switch",), ("paper", "switch"), ("switch",) * 99),
+    "setting": ("paper", "learned"),
+    "hold": (True,),
+    "inner_steps": (0, 3),
+    "removal": (("cde",), ("tde", "cde")),
+    "counterfactual_memory": ("factual", "own"),
+    "costs": ("all", "none"),
+    "seed": (1, 2**32 - 1),
+}
+
+
+def test_evaluations_of_other_settings_have_other_files():
+    fields = {field.name for field in dataclasses.fields(EvalConfig)}
+    assert OTHER_OPTIONS.keys() == fields - {"run", "json", "format"}
+
+    run_path = Path("run")
+    configs = [EvalConfig(run_path), EvalConfig(run_path, seed=1, hold=True)]
+    for name, values in OTHER_OPTIONS.items():
+        configs += [dataclasses.replace(EvalConfig(run_path), **{name: value}) for value in values]
+    targets = [_find_target(config) for config in configs]
+    assert len({str(target).lower() for target in targets}) == len(configs)
+    for config, target in zip(configs, targets, strict=True):
+        assert _find_target(config) == target
+        assert target.parent == run_path
+        assert re.fullmatch(r"eval-[A-Za-z0-9._-]{1,200}\.json", target.name)
+
+    # How a report is printed changes no name, and a scene file has one name by any path.
+    assert _find_target(EvalConfig(run_path, format="json")) == targets[0]
+    scene_path = Path("homes.jsonl.gz")
+    absolute_config = EvalConfig(run_path, scenes=Path.cwd() / scene_path)
+    assert _find_target(EvalConfig(run_path, scenes=scene_path)) == _find_target(absolute_config)
 
 
 # Layout shifts, scene files and other worlds
@@ -153,15 +201,16 @@ def test_eval_report_names_differ_for_a_world_and_a_file():
 def test_eval_of_a_shift_is_named_in_file_and_report(run_dir, tmp_path, capsys):
     copied_run = shutil.copytree(run_dir, tmp_path / "run")
     assert evaluate(copied_run, "--episodes", 4, "--shift", 1) == 0
-    report = read_report(copied_run / "eval-val-shift1.json")
+    report = read_report(copied_run / "eval-val-shift1-episodes4.json")
     assert report["run"]["evaluation_shift"] == 1.0
     assert report["run"]["worlds"]["shift"] == 0.0
     assert report["run"]["evaluation_shift_by"] == "size"
-    assert not (copied_run / "eval-val.json").exists()
+    assert not (copied_run / "eval-val-episodes4.json").exists()
 
     # The exchange that misleads most is another one, and the file is named after it.
     assert evaluate(copied_run, "--episodes", 4, "--shift", 1, "--shift-by", "context") == 0
-    context_report = read_report(copied_run / "eval-val-shift1-by-context.json")
+    assert (copied_run / "latest-eval.txt").read_text() == "eval-val-shift1-by-context-episodes4.json\n"
+    context_report = read_report(copied_run / "eval-val-shift1-by-context-episodes4.json")
     assert context_report["run"]["evaluation_shift_by"] == "context"
 
     capsys.readouterr()
@@ -209,8 +258,8 @@ def test_eval_of_a_run_on_a_file_accepts_a_generated_world(run_dir, tmp_path, ca
 
     # The generated world gives the rows of the run's own rooms, the file gives other ones.
     assert evaluate(copied_run, "--episodes", 8, "--world", "rooms") == 0
-    rooms_report = read_report(copied_run / "eval-rooms-val.json")
-    own_report = read_report(copied_run / "eval-val.json")
+    rooms_report = read_report(copied_run / "eval-rooms-val-episodes8.json")
+    own_report = read_report(copied_run / "eval-val-episodes8.json")
     assert rooms_report["rows"] == own_report["rows"]
     assert rooms_report["run"]["evaluation_source"] == "rooms"
     assert rooms_report["run"]["evaluation_shift"] == 0.0
@@ -219,7 +268,7 @@ def test_eval_of_a_run_on_a_file_accepts_a_generated_world(run_dir, tmp_path, ca
 
     # In another world the categories are still the run's, whose step limit replaces that of the world.
     assert evaluate(copied_run, "--episodes", 8, "--world", "houses") == 0
-    houses_file = copied_run / "eval-houses-val.json"
+    houses_file = copied_run / "eval-houses-val-episodes8.json"
     assert {row["world"] for row in read_report(houses_file)["rows"]} == {"houses"}
     assert {row["goal"] for row in read_episodes(houses_file)} <= set(ITHOR_CATEGORIES)
 

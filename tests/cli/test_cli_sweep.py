@@ -1,7 +1,9 @@
 """The sweep command end to end, and its refusals."""
 
+import dataclasses
 import json
 import sys
+from pathlib import Path
 
 import pytest
 from support.commands import refusal
@@ -28,10 +30,12 @@ def test_sweep_prints_a_table_and_writes_figure_and_numbers(run_dir, capsys, mon
         assert f"shift {shift} " in printed.out
     assert "95 % intervals over 2 training seeds and 4 floor plans." in printed.out
     assert "1 compilation for all thresholds, seeds and shifts\n" in printed.err
-    assert (run_dir / "sweep-val.png").read_bytes().startswith(b"\x89PNG")
+    assert (run_dir / "sweep-val-episodes24-epsilon0-0.5.png").read_bytes().startswith(b"\x89PNG")
+
+    assert (run_dir / "latest-sweep.txt").read_text() == "sweep-val-episodes24-epsilon0-0.5.json\n"
 
     # The numbers are those of the call in Python.
-    numbers = json.loads((run_dir / "sweep-val.json").read_text())
+    numbers = json.loads((run_dir / "sweep-val-episodes24-epsilon0-0.5.json").read_text())
     assert numbers["compilations"] == 1
     assert numbers["settings"]["seeds"] == 2
     sweep = jaxnav.sweep(run_dir, (0.0, 0.5), shift=1.0, episodes=24)
@@ -81,6 +85,36 @@ def test_file_names_differ_by_what_is_evaluated():
         "sweep-rooms-org-val-sampled.png",
         "run/sweep-val-shift0-0.5.png",
     ]
+
+
+def test_sweeps_of_other_settings_have_other_files(tmp_path):
+    other_options = {
+        "split": ("train", "test"),
+        "world": ("rooms",),
+        "scenes": (Path("homes.v1.jsonl.gz"), Path("homes.v2.jsonl.gz")),
+        "epsilon": ((0.5,), tuple(range(99))),
+        "shift": ((0.0,), (1.0, 0.0)),
+        "shift_by": ("context",),
+        "episodes": (8,),
+        "decoding": ("sample",),
+        "form": ("paper", "switch"),
+        "setting": ("paper", "learned"),
+        "hold": (True,),
+        "seed": (1,),
+    }
+    fields = {field.name for field in dataclasses.fields(SweepConfig)}
+    assert other_options.keys() == fields - {"source", "out", "format"}
+
+    configs = [SweepConfig("run")]
+    for name, values in other_options.items():
+        configs += [dataclasses.replace(SweepConfig("run"), **{name: value}) for value in values]
+    # Two policies of one name in two folders write into the working directory.
+    for folder in ("a", "b"):
+        policy_dir = tmp_path / folder / "layout-0"
+        policy_dir.mkdir(parents=True)
+        (policy_dir / "policy.json").touch()
+        configs.append(SweepConfig(str(policy_dir)))
+    assert len({_find_figure_path(config) for config in configs}) == len(configs)
 
 
 @pytest.mark.parametrize(

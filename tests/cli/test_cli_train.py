@@ -265,7 +265,7 @@ def test_custom_categories_are_trained_resumed_and_evaluated(tmp_path, config_fi
     assert spec["task"]["categories"] == list(categories)
     assert spec["task"]["goals"] == list(goals)
     assert evaluate(run_dir, "--episodes", 8) == 0
-    with (run_dir / "eval-val.episodes.csv").open() as file:
+    with (run_dir / "eval-val-episodes8.episodes.csv").open() as file:
         assert {row["goal"] for row in csv.DictReader(file)} == set(goals)
 
 
