@@ -48,9 +48,16 @@ from jaxnav.evaluation.variants import (
 )
 from jaxnav.policies.methods import find_method, method_label
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.policies import Policies, config_for_task, is_policy, list_packaged_policies, load_policy_as_run
+from jaxnav.runs.policies import (
+    CONFIG_FILE,
+    Policies,
+    config_for_task,
+    is_policy,
+    list_packaged_policies,
+    load_policy_as_run,
+)
 from jaxnav.runs.policy import LoadedPolicy
-from jaxnav.runs.run import CONFIG_FILE, Run, run_settings
+from jaxnav.runs.run import Run, run_settings
 from jaxnav.runs.share_report import (
     build_decision_shares,
     count_shares,

@@ -8,6 +8,7 @@ found by name (`find_policy_folder`), and `load_policy_as_run` treats a single p
 import dataclasses
 import functools
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -39,8 +40,9 @@ from jaxnav.store.files import expand_home, list_differences
 from jaxnav.training.calibration import Exploration, layout_priors
 from jaxnav.training.devices import require_float32
 
-#: Folder of the exported policies in a run directory.
+#: Folder of the exported policies in a run directory, and the settings of the run.
 POLICIES_DIR = "policies"
+CONFIG_FILE = "config.json"
 #: Folder of the policies that come with the package, each in a folder of its own.
 PACKAGED_POLICIES = Path(__file__).parents[1] / "weights"
 #: Measures of the layout gap.
@@ -554,7 +556,7 @@ def find_policy_folder(path: str | Path) -> Path:
       path: the folder, or the name of a policy that comes with the package.
 
     Raises:
-      InputError: neither exists; names the policies of the package.
+      InputError: neither exists, or a run is there; names the policies of the package, or those of the run.
     """
     folder = _resolve_folder(path)
     if not folder.exists():
@@ -562,6 +564,16 @@ def find_policy_folder(path: str | Path) -> Path:
         raise InputError(
             f"{path}: not an exported policy (No such file or directory: {path}); export it, "
             f"or load one of the package: {packaged_names}"
+        )
+    if (folder / CONFIG_FILE).exists() and not (folder / POLICY_FILE).exists():
+        policy_folders = sorted(
+            str(policy_file.parent) for policy_file in folder.glob(f"{POLICIES_DIR}/*/{POLICY_FILE}")
+        )
+        remedy = f"give one of its policies: {', '.join(policy_folders)}"
+        if not policy_folders:
+            remedy = "its training has not finished; resume it by jaxnav train"
+        raise InputError(
+            f"{path}: not an exported policy (No such file or directory: {folder / POLICY_FILE}) but a run; {remedy}"
         )
     return folder
 
@@ -576,7 +588,21 @@ def is_policy(path: str | Path) -> bool:
     return (_resolve_folder(path) / POLICY_FILE).exists()
 
 
+def check_path(path: object) -> None:
+    """Refuse an argument that is no path.
+
+    Raises:
+      InputError: names the type of the argument.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(
+            f"{type(path).__name__} is no path; give the directory of a run, the folder of an exported policy or the "
+            "name of a packaged one, as text"
+        )
+
+
 def _resolve_folder(path: str | Path) -> Path:
+    check_path(path)
     folder = expand_home(path)
     return folder if folder.exists() else PACKAGED_POLICIES / path
 

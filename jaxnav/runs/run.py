@@ -16,7 +16,7 @@ from typing import Any
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
-from jaxnav.runs.policies import POLICIES_DIR, Policies, load_policies
+from jaxnav.runs.policies import CONFIG_FILE, POLICIES_DIR, Policies, check_path, is_policy, load_policies
 from jaxnav.store.files import (
     FolderLock,
     LogRow,
@@ -30,7 +30,6 @@ from jaxnav.store.files import (
 )
 from jaxnav.training.devices import run_on_first_process
 
-CONFIG_FILE = "config.json"
 #: Training metrics, a row for each chunk, arm and seed.
 LOG_FILE = "metrics.jsonl"
 #: Seconds of training, a row for each chunk.
@@ -63,6 +62,7 @@ class Run:
         Raises:
           InputError: the directory holds no run, or its configuration file is damaged or of another version.
         """
+        check_path(run_dir)
         return cls(load_run_config(expand_home(run_dir)))
 
     def policies(self, arms: Sequence[str] | None = None) -> Policies:
@@ -147,6 +147,11 @@ def load_run_config(run_dir: Path) -> RunConfig:
       InputError: the directory holds no run, or its configuration file is damaged or of another version.
     """
     path = run_dir / CONFIG_FILE
+    if not path.exists() and is_policy(run_dir):
+        raise InputError(
+            f"{run_dir}: is an exported policy and holds no run; give the directory of a run (jaxnav.sweep and "
+            "jaxnav.load_policy accept policies)"
+        )
     if not path.exists():
         raise InputError(f"{run_dir}: holds no run ({CONFIG_FILE} is missing); train one there first")
     # The digest reveals edits and damage.

@@ -185,8 +185,13 @@ def _check_config_and_method(config: RunConfig) -> RunConfig:
     """Complete and check a configuration, and check a method of another package.
 
     Raises:
-      InputError: a setting is impossible, or the method breaks the contract of methods.
+      InputError: this is no configuration, a setting is impossible, or the method breaks the contract of methods.
     """
+    if not isinstance(config, RunConfig):
+        raise InputError(
+            f"{type(config).__name__} is no configuration; give a jaxnav.RunConfig (the command jaxnav train --config "
+            "reads named configurations and files)"
+        )
     config = check_config(config)
     if config.method not in METHODS:
         bank = compile_sample_bank(config)

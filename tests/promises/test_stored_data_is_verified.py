@@ -23,9 +23,9 @@ from support.refusals import assert_message_names
 from support.tiny_run import POLICY_NAMES, finished_run, tiny_config
 
 from jaxnav.errors import InputError
-from jaxnav.runs.policies import PACKAGED_POLICIES
+from jaxnav.runs.policies import CONFIG_FILE, PACKAGED_POLICIES
 from jaxnav.runs.policy import load_policy
-from jaxnav.runs.run import CONFIG_FILE, LOG_FILE, REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, run_settings
+from jaxnav.runs.run import LOG_FILE, REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, run_settings
 from jaxnav.store import checkpoint
 from jaxnav.store.export import export_params, load_params
 from jaxnav.store.files import make_manifest, write_json_with_digest

@@ -42,6 +42,36 @@ def test_load_policy_refuses_folders_without_an_export(tmp_path, drawn_run):
         assert "not an exported policy (No such file or directory: " in refusal_of(folder)
 
 
+def test_a_run_is_no_policy_and_its_policies_are_named(drawn_run, tmp_path):
+    run_dir = drawn_run.config.run_dir
+    refusal = refusal_of(run_dir)
+    policy_names = ("baseline-0", "baseline-1", "layout-0", "layout-1")
+    policy_folders = ", ".join(str(run_dir / POLICIES_DIR / name) for name in policy_names)
+    assert refusal.endswith(f" but a run; give one of its policies: {policy_folders}")
+
+    shutil.copy(run_dir / "config.json", tmp_path)
+    assert refusal_of(tmp_path).endswith(" but a run; its training has not finished; resume it by jaxnav train")
+
+
+def test_a_policy_is_no_run(drawn_run, export):
+    for policy in (export, "rooms-org"):
+        for open_run in (jaxnav.evaluate, jaxnav.Run.open):
+            with pytest.raises(InputError, match=f"^{policy}: is an exported policy and holds no run; give the dir"):
+                open_run(policy)
+
+
+@pytest.mark.parametrize("function", [jaxnav.evaluate, jaxnav.sweep, jaxnav.load_policy, jaxnav.Run.open])
+@pytest.mark.parametrize("argument", [None, 3, b"runs/rooms", ["runs/rooms"]])
+def test_arguments_that_are_no_path_are_named(function, argument):
+    with pytest.raises(InputError, match=f"^{type(argument).__name__} is no path; give the directory of a run"):
+        function(argument)
+
+
+def test_training_takes_a_configuration():
+    with pytest.raises(InputError, match=r"^str is no configuration; give a jaxnav\.RunConfig"):
+        jaxnav.train("smoke")
+
+
 def test_load_policy_refuses_damaged_exports(export):
     data = bytearray((export / "params.safetensors").read_bytes())
     data[-1] ^= 1
