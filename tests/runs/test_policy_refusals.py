@@ -69,7 +69,7 @@ def test_arguments_that_are_no_path_are_named(function, argument):
 
 def test_training_takes_a_configuration():
     with pytest.raises(InputError, match=r"^str is no configuration; give a jaxnav\.RunConfig"):
-        jaxnav.train("smoke")
+        jaxnav.train("smoke")  # pyright: ignore[reportArgumentType]
 
 
 def test_load_policy_refuses_damaged_exports(export):
