@@ -144,12 +144,13 @@ def test_paths_without_a_meaning_are_refused_in_every_setting(path, tmp_path, mo
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_run_directory_with_brackets_is_trained_resumed_and_evaluated(tmp_path, monkeypatch, capsys):
     name = os.fsdecode(b"exp[1]\\ \xff")
     monkeypatch.chdir(tmp_path)
     config_file = write_config(tmp_path)
-    assert train(config_file, Path(name), "--seeds", 1) == 0
-    assert train(config_file, Path(name), "--seeds", 1) == 0
+    assert train(config_file, Path(name), "--seeds", 1, "--arms", "baseline") == 0
+    assert train(config_file, Path(name), "--seeds", 1, "--arms", "baseline") == 0
     assert "resumed after update 4 of 4" in capsys.readouterr().err
     assert evaluate(name, "--episodes", 10) == 0
     assert sorted(os.listdir(tmp_path)) == sorted([name, "tiny.yaml"])
