@@ -41,6 +41,7 @@ ARRAY_FIELDS = tuple(field for field in Bank._fields if field not in ("task", *T
 _CODE = (
     *("categories.py", "context_exchange.py", "lattice.py", "layout_shift.py", "scene.py", "task.py", "worlds.py"),
     *("generate/*.py", "generate/*.yaml", "tables/*.py"),
+    "files/account.py",
     "files/scene_file.py",
 )
 _SOURCE = Path(__file__).parents[1]
