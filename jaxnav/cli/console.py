@@ -50,7 +50,7 @@ from tyro.constructors import (
 
 from jaxnav.errors import InputError, Interrupted
 from jaxnav.runs.config_files import CONFIGS, RENAMED_SETTINGS, apply_yaml, parse_setting
-from jaxnav.store.files import expand_home
+from jaxnav.store.files import expand_home, write_atomic
 
 Config = TypeVar("Config")
 
@@ -164,8 +164,6 @@ def _short_digest(text: str) -> str:
 
 def write_latest(command: str, path: Path) -> None:
     """Name a file of results as the newest one of a command, in `latest-COMMAND.txt` next to it."""
-    from jaxnav.store.files import write_atomic
-
     write_atomic(path.with_name(f"latest-{command}.txt"), f"{path.name}\n".encode())
 
 
