@@ -71,6 +71,8 @@ class ExperimentConfig:
       decodings: rules that choose actions from logits, `argmax` (best actions) and `sample` (sampled actions). The
         measurements `mixture`, `handover` and `cde`, in which half of the episodes are in shifted homes, are repeated
         with each rule.
+      removals: patterns of the removals that these measurements compare, such as `surprise, paper*`; all by default.
+        Each rule of soft removal is named by its layout gap, form and threshold (`REMOVAL_RULES`).
       steps: number of steps, at least 1, over which the curves of the layout gap are recorded.
       seed: random seed of the episode lists and the sampled actions, from 0 to 2**32 - 1.
       base: settings of `jaxnav train` that all runs of the experiment share.
@@ -95,6 +97,7 @@ class ExperimentConfig:
     epsilon: tuple[float, ...] = (0.5,)
     form: Form = "residual"
     decodings: tuple[Decoding, ...] = ("sample",)
+    removals: tuple[str, ...] = ("*",)
     steps: int = 80
     seed: int = 0
     base: RunConfig = RunConfig()
@@ -181,7 +184,7 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
 
     # Listing the runs checks the settings of each.
     runs = agent_runs(config)
-    if not any(_matches(f"{run.world}-{run.agent}", config.only) for run in runs):
+    if not any(matches_any(f"{run.world}-{run.agent}", config.only) for run in runs):
         raise InputError("worlds, agents, only and left_out: select no run; give others")
     for measurement in config.measure:
         if not measured_runs(dataclasses.replace(config, only=("*",)), measurement):
@@ -274,12 +277,13 @@ def agent_runs(config: ExperimentConfig) -> list[AgentRun]:
     runs = []
     for world, world_changes in config.worlds.items():
         for agent in config.agents:
-            if not _matches(f"{world}-{agent}", config.left_out):
+            if not matches_any(f"{world}-{agent}", config.left_out):
                 runs.append(_agent_run(config, world, world_changes, agent))
     return runs
 
 
-def _matches(name: str, patterns: tuple[str, ...]) -> bool:
+def matches_any(name: str, patterns: tuple[str, ...]) -> bool:
+    """True if a name matches one of several patterns, in which `*` stands for any letters."""
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
@@ -319,8 +323,8 @@ def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:
     runs = []
     for run in agent_runs(config):
         full_name = f"{run.world}-{run.agent}"
-        is_measured = _matches(run.agent, patterns) or _matches(full_name, patterns)
-        if is_measured and _matches(full_name, config.only):
+        is_measured = matches_any(run.agent, patterns) or matches_any(full_name, patterns)
+        if is_measured and matches_any(full_name, config.only):
             runs.append(run)
     return runs
 

@@ -18,12 +18,13 @@ from jaxnav.experiments.config import (
     ExperimentConfig,
     check_experiment,
     evaluation_settings,
+    matches_any,
     measured_runs,
     part_settings,
 )
 from jaxnav.experiments.gap_traces import measure_gaps
 from jaxnav.experiments.instrument import measure_instrument
-from jaxnav.experiments.mixture import measure_cde, measure_handover, measure_mixture
+from jaxnav.experiments.mixture import list_removal_names, measure_cde, measure_handover, measure_mixture
 from jaxnav.experiments.pages import check_page, render_page
 from jaxnav.experiments.scores import measure_account, measure_evaluation, measure_frontier, measure_groups
 from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, read_settings, write_part
@@ -84,6 +85,8 @@ MEASUREMENTS = {
     "handover": Measurement(measure_handover, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
     "cde": Measurement(measure_cde, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
 }
+#: Measurements that compare removals, of which `removals` selects some.
+REMOVAL_MEASURES = (measure_mixture, measure_handover, measure_cde)
 
 
 class Part(NamedTuple):
@@ -112,6 +115,10 @@ def check_measurements(config: ExperimentConfig) -> ExperimentConfig:
     for name in config.measure:
         if MEASUREMENTS[name].compares_shifts and len(config.shifts) < 2:
             raise InputError(f"shifts: {config.shifts}: give two or more, which the measurement {name} compares")
+    removal_names = list_removal_names()
+    for pattern in config.removals:
+        if not any(matches_any(name, (pattern,)) for name in removal_names):
+            raise InputError(f"removals: {pattern!r} matches none; choose from {'; '.join(removal_names)}")
     return check_experiment(config)
 
 
@@ -183,6 +190,8 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
                 settings["against"] = list(run.against)
             if measurement.measure is measure_groups:
                 settings["groups"] = config.groups
+            if measurement.measure in REMOVAL_MEASURES and config.removals != ("*",):
+                settings["removals"] = list(config.removals)
             measure = partial(measurement.measure, bench, run)
             if measurement.parts is None:
                 parts.append(Part(f"{run.name}-{name}", settings, measure))

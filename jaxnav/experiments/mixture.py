@@ -12,7 +12,7 @@ outcomes, at each shift and over the mixture.
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
 from jaxnav.evaluation.report import remaining_share
 from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
 from jaxnav.experiments.bench import Bench
-from jaxnav.experiments.config import AgentRun
+from jaxnav.experiments.config import AgentRun, matches_any
 from jaxnav.experiments.scores import require_layout_blind_run
 from jaxnav.experiments.table import ResultRow
 from jaxnav.experiments.trials import (
@@ -39,6 +39,8 @@ from jaxnav.experiments.trials import (
 from jaxnav.runs.policies import EVIDENCE_GAPS, GapName, estimators_by_gap, load_policies
 from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
+
+Removal = TypeVar("Removal")
 
 #: Variants of the agents that removals are compared with.
 LAYOUT_BLIND = "layout-blind agents"
@@ -182,7 +184,7 @@ def _measure_removals(
     baseline_trial = Trial("baseline", decoding)
     layout_blind_outcome = runner.run_trials(layout_blind, None, [baseline_trial])[baseline_trial]
     bench.console.print(f"{hard_name} and removals that follow no gap")
-    fixed_trials = list_fixed_trials(decoding, budgets[-1])
+    fixed_trials = select_removals(list_fixed_trials(decoding, budgets[-1]), bench.config.removals)
     plain_trial = Trial("layout", decoding)
     hard_trial = Trial("tde", decoding)
     outcomes = runner.run_trials(evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
@@ -211,7 +213,8 @@ def _measure_removals(
 
     # Complete removal with counterfactual logits that know nothing of a part of this episode.
     if direct_policy == "own":
-        control_trials = {name: Trial("tde", decoding, control=control) for name, control in HARD_CONTROLS.items()}
+        hard_controls = select_removals(HARD_CONTROLS, bench.config.removals)
+        control_trials = {name: Trial("tde", decoding, control=control) for name, control in hard_controls.items()}
         control_outcomes = runner.run_trials(evaluated_run, estimator, control_trials.values())
         for name, trial in control_trials.items():
             yield from report.removal_rows(name, control_outcomes[trial])
@@ -226,8 +229,11 @@ def _measure_removals(
 
     # Every rule is compared with its own controls and with the best removal that follows no gap. The latter is chosen
     # on these very episodes, so the comparison favours the control.
-    best_fixed_name = max(outcome_by_fixed, key=lambda name: report.mixture_gain(outcome_by_fixed[name], budgets[-1]))
-    for rule in rules:
+    best_fixed = {}
+    if outcome_by_fixed:
+        best_name = max(outcome_by_fixed, key=lambda name: report.mixture_gain(outcome_by_fixed[name], budgets[-1]))
+        best_fixed = {best_name: outcome_by_fixed[best_name]}
+    for rule in select_removals({str(rule): rule for rule in rules}, bench.config.removals).values():
         if not policies.supports_gap(rule.gap):
             bench.console.print(f"{rule}: left out, for the run has no evidence for this gap; train it again")
             continue
@@ -241,8 +247,20 @@ def _measure_removals(
         compared_outcomes = {control: rule_outcomes[control_trial] for control, control_trial in control_trials.items()}
         if rule.gap in EVIDENCE_GAPS:
             compared_outcomes[PERMUTED_CONTROL] = runner.run_trials(permuted_run, rule_estimator, [trial])[trial]
-        compared_outcomes[best_fixed_name] = outcome_by_fixed[best_fixed_name]
-        yield from report.removal_rows(str(rule), rule_outcomes[trial], compared_outcomes)
+        yield from report.removal_rows(str(rule), rule_outcomes[trial], compared_outcomes | best_fixed)
+
+
+def list_removal_names() -> list[str]:
+    """List the names of the removals that `removals` can select; those of clocks depend on the world's budget."""
+    fixed_names = []
+    for world in WORLDS.values():
+        fixed_names += list_fixed_trials("sample", world.budgets[-1])
+    return [*map(str, REMOVAL_RULES), *dict.fromkeys(fixed_names), *HARD_CONTROLS]
+
+
+def select_removals(removals: Mapping[str, Removal], patterns: tuple[str, ...]) -> dict[str, Removal]:
+    """Select the removals whose names match one of several patterns."""
+    return {name: removal for name, removal in removals.items() if matches_any(name, patterns)}
 
 
 def list_fixed_trials(decoding: Decoding, budget: int) -> dict[str, Trial]:

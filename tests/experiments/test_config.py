@@ -228,6 +228,7 @@ def test_finished_runs_refuse_settings(drawn_run):
         # One shift has nothing to be compared with.
         ({"measure": {"growth": ["*"]}, "shifts": (0.5,)}, "shifts"),
         ({"measure": {"mixture": ["*"]}, "shifts": (0.5,)}, "shifts"),
+        ({"removals": ("surprise, papper*",)}, "removals: 'surprise, papper"),
     ],
 )
 def test_impossible_measurements_are_refused_by_name(changes, named):

@@ -21,9 +21,11 @@ from jaxnav.experiments.mixture import (
     PopulationMetrics,
     join_end_to_end,
     list_fixed_trials,
+    list_removal_names,
     measure_cde,
     measure_handover,
     measure_mixture,
+    select_removals,
 )
 from jaxnav.experiments.table import ResultTable
 from jaxnav.experiments.trials import NEVER
@@ -140,6 +142,15 @@ def test_clocks_remove_at_shares_of_the_budget():
         cell = trials[name].grid_cells(("layout",), 1)
         assert (cell.gap_begin.item(), cell.gap_end.item(), cell.given_gap.item()) == expected
         assert cell.epsilon.item() == 0.0
+
+
+def test_removals_are_selected_by_pattern():
+    trials = list_fixed_trials("sample", 150)
+    selected = select_removals(trials, ("constant*", "until step 15"))
+    assert list(selected) == ["constant 0.25", "constant 0.5", "constant 0.75", "until step 15"]
+    assert select_removals(trials, ("*",)) == trials
+    assert select_removals(trials, ()) == {}
+    assert {"surprise, paper, eps 0", "constant 0.5", *HARD_CONTROLS} <= set(list_removal_names())
 
 
 def test_joined_lists_number_the_poses_and_scenes_of_all_banks():
