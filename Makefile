@@ -10,12 +10,13 @@ VERSION = $(shell sed -n 's/^version = "\(.*\)"$$/\1/p' pyproject.toml)
 # Version of the topmost section of the changelog.
 CHANGES = $(shell sed -n 's/^\#\# \[\([^]]*\)\].*/\1/p' CHANGELOG.md | head -n 1)
 
-.PHONY: help setup run test lint docs test-slow coverage mutants gate versions bench package release lock clean
+.PHONY: help setup run test lint docs test-slow test-exhaustive coverage mutants gate versions bench package release lock clean
 
 help:
 	@echo 'make run        train on generated rooms, then evaluate the run (runs/rooms)'
 	@echo 'make test       linter, import layers, types, documentation and the fast tests'
 	@echo 'make test-slow  the slow tests'
+	@echo 'make test-exhaustive  every method, world and environment of the slow tests; takes more than an hour'
 	@echo 'make coverage   the fast tests, with the branch coverage of the package'
 	@echo 'make mutants    change the code in many ways, and list the changes that no test detects'
 	@echo 'make gate       fail if the environment is much slower than the stored result'
@@ -57,6 +58,9 @@ test: lint docs
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -n 2 -m slow --timeout 900 --durations 20
+
+test-exhaustive: $(READY)
+	$(BIN)/python -m pytest -n 2 -m exhaustive --timeout 1800 --durations 20
 
 coverage: $(READY)
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term:skip-covered

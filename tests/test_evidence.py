@@ -79,7 +79,7 @@ def test_evidence_gap_follows_worked_arithmetic():
 
 
 @given(SEEDS, VIEWS)
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_evidence_gap_agrees_with_scipy(seed, views):
     prior = random_prior(seed)
     estimator = LayoutEstimator(prior, "evidence")

@@ -114,7 +114,7 @@ def test_own_detections_example_raises_the_gap_for_new_pairs(tmp_path):
     assert gaps[3] > max(gaps[:2])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stable_baselines3_example_learns(tmp_path):
     pytest.importorskip("stable_baselines3")
     learned, random = (

@@ -243,7 +243,7 @@ def test_eval_shifts_the_scenes_of_a_file(run_dir, tmp_path, capsys):
     assert "shift 1.5; give" in refusal(capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_eval_of_a_run_on_a_file_accepts_a_generated_world(run_dir, tmp_path, capsys):
     copied_run = shutil.copytree(run_dir, tmp_path / "run")
     scene_file = tmp_path / "a.jsonl.gz"

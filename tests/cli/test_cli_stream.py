@@ -130,7 +130,7 @@ def test_streamed_run_resumes_bit_for_bit(finished, config_file, cache, tmp_path
         assert (stopped / name).read_bytes() == (finished / name).read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_streamed_evaluation_compiles_once_and_visits_all_scenes(finished, tmp_path):
     target = tmp_path / "train.json"
     assert evaluate(finished, "--split", "train", "--episodes", 24, "--json", target) == 0

@@ -125,7 +125,7 @@ class RejaxAdapter(wrappers.LegacyStepAPIWrapper):
         return self
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rejax_ppo_improves_on_the_untrained_policy(flat_env):
     """Mean returns of 128 episodes: about 1.5 against 0.5 untrained; shortest paths give about 5."""
     rejax = pytest.importorskip("rejax")

@@ -346,7 +346,7 @@ base:
     assert contents(tmp_path) == before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(900)
 def test_a_killed_experiment_goes_on_to_the_same_files(drawn_run, tmp_path):
     template = tmp_path / "template.md"

@@ -225,7 +225,7 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
         assert controls[-1] in removals[2:-5]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_handover_leaves_the_layout_blind_agents(bench):
     table = ResultTable(measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ()))
     (name,) = table.distinct("run")

@@ -131,7 +131,7 @@ def window_loss(spec, window, method_weights, fast_layers):
 # The rule
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("spec_name", SPECS)
 def test_adaptation_by_factors_equals_gradient_steps_on_whole_kernels(spec_name):
     """The sum of factors, of rank 24, is the change that autodiff makes to kernels of the episode's own."""
@@ -302,7 +302,7 @@ def test_learned_loss_adaptation_refuses_zero_steps():
         LearnedLossAdaptation(inner_steps=0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_adaptation_with_two_steps_takes_the_first_two_of_four():
     weights = tiny.random_params(0, SAVN)
     observation, action = random_episode(6)

@@ -164,7 +164,7 @@ def test_half_of_the_reference_removal_lies_midway():
     np.testing.assert_allclose(result, (factual + without_experience) / 2, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_under_cde_episodes_are_those_of_the_network_without_experience():
     """Whole episodes: a policy whose experience columns are zero takes the same actions."""
     kernel = AGENT["fuse"]["kernel"]

@@ -103,7 +103,7 @@ def test_what_is_learned_depends_on_the_banks_alone():
 # The shipped worlds
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("world", "scenes"), [("rooms", 80), ("apartments", 8), ("houses", 4)])
 def test_indirect_paths_exist_where_edges_are_relative_and_not_where_they_are_absolute(world, scenes):
     task, train_scenes = WORLDS[world].task, make_generated_scenes(world, "train", scenes)

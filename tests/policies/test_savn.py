@@ -111,7 +111,7 @@ def fall(weights, steps):
     return jax.lax.scan(step, agent, jax.random.split(jax.random.key(1), steps))[1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_training_teaches_the_loss_and_its_steps_make_it_fall():
     learner = Learner(ACTING, PPOConfig(num_envs=ENVS, rollout=10, epochs=2, minibatches=2), "none")
     begin = jax.jit(learner.init)(jax.random.key(0), LONG, KNOWLEDGE)
@@ -126,7 +126,7 @@ def test_training_teaches_the_loss_and_its_steps_make_it_fall():
     np.testing.assert_array_equal(now[~full], before[~full])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["savn:UNADAPTED", "savn:FIRST_ORDER", "eotp:ADAPTED"])
 def test_variants_keep_the_contract(name):
     check_method(f"jaxnav.policies.methods.{name}", steps=7)

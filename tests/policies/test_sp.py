@@ -268,7 +268,7 @@ def test_fresh_graph_convolution_has_outputs_of_both_signs():
 # The shipped worlds
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("world_name", "num_scenes"), [("rooms", 80), ("apartments", 16), ("houses", 10)])
 def test_graph_of_training_scenes_correlates_with_validation_scenes(world_name, num_scenes):
     """Over all pairs of categories; a permuted graph does not correlate."""

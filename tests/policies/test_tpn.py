@@ -296,7 +296,7 @@ def test_each_stage_of_tpn_trains_its_own_parameters(params):
     assert 0.05 < metrics["repeated"] < 0.95
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_tentative_policy_learns_the_actions_of_shortest_paths(params):
     learner = make_learner(IMITATION_STAGE)
     scalars = learner.config.scalars(400)
@@ -320,7 +320,7 @@ def test_tentative_policy_learns_the_actions_of_shortest_paths(params):
     assert random_loss > 1.5 * last_metrics["imitation_loss"] / last_metrics["repeated"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_replay_of_tpn_recomputes_log_probs_and_actor_changes():
     weights = tiny.random_params(3, SPEC)
 

@@ -165,7 +165,7 @@ def test_random_input_ends_commands_by_exit_code(kind, tmp_path):
     assert slowest_s < 10
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_hundred_random_inputs_stay_within_time_and_memory(kind):
     """The inputs have a process, and so a peak memory, of their own; docs/promises.md has the command for more."""

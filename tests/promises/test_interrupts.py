@@ -64,7 +64,7 @@ def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
         assert (ended / name).read_bytes() == (whole / name).read_bytes(), name
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_signal_to_one_process_ends_both_at_the_same_chunk(tmp_path):
     """Both save the same chunk, end with the code of the signal, and go on together."""
     config_file = write_config(tmp_path)

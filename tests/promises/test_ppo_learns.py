@@ -154,7 +154,7 @@ SEEDS = 8
 BOUNDS = {(0, 20): (0.0, 0.5), (80, 100): (0.75, 1.0), (180, 200): (0.9, 1.0), (380, 400): (0.95, 1.0)}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_median_training_success_stays_within_stored_bounds():
     """A random policy soon says Done and is right by chance; a trained one finds the goals within 20 steps.
 

@@ -195,7 +195,7 @@ def test_random_damage_is_never_used_silently(name, tmp_path):
     assert outcomes["reported"] >= 2  # harmless damage changes what is not read, such as spaces
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", STORED_KINDS)
 def test_many_random_damages_are_never_used_silently(name, tmp_path):
     outcomes = damage_repeatedly(name, tmp_path, NUM_DAMAGES, seed=1)

@@ -173,7 +173,7 @@ def test_replays_weigh_the_removal_by_the_gap_above_the_threshold(measurements):
     assert largest_weight > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_report_of_sixty_replays_is_below_eight_megabytes(run, measurements):
     """Twenty replays take less than a third of that."""
     page_text = make_report(run, run, dataclasses.replace(OPTIONS, replays=20), QUIET)

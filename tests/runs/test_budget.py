@@ -77,7 +77,7 @@ def test_stage_shares_of_a_method_add_up(shares):
         Method(NoExperience, stages=tuple(Stage(share) for share in shares))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("method", ["vtnet", "tpn"])
 def test_staged_run_resumes_between_its_stages(method, config, tmp_path, monkeypatch):
     """Two chunks, one of each stage; a run that stops after the first ends as one that does not."""

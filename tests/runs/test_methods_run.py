@@ -29,8 +29,17 @@ def config_of(method, folder):
     return config
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"])
+#: Methods whose runs are tested each time: one with a stage of imitation, and one with a map.
+TESTED_METHODS = ("tpn", "semexp")
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in TESTED_METHODS else pytest.mark.exhaustive)
+        for name in ("rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp")
+    ],
+)
 def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     """The exported policy is that of the run, with the same knowledge."""
     run = train(config_of(method, tmp_path / "one"))
@@ -45,8 +54,13 @@ def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["savn", "hoz", "semexp"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param("semexp", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("savn", "hoz")),
+    ],
+)
 def test_method_with_tracker_state_resumes_bit_for_bit(method, tmp_path, monkeypatch):
     """Fast weights, zones and maps are in the checkpoint; those of several stages are resumed in `test_budget`."""
     config = config_of(method, tmp_path / "one")

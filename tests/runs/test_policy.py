@@ -287,7 +287,7 @@ def draw_reluctant_params(spec):
     return params
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["semexp", "savn", "tpn"])
 def test_loaded_adaptive_or_controlled_policy_acts_as_in_the_evaluation(name):
     """Both agree on the logits of a whole episode, longer than a window of six actions, so adaptation changes them."""

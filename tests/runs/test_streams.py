@@ -60,7 +60,7 @@ def test_load_policy_refuses_export_without_decision(drawn_run, tmp_path):
         jaxnav.load_policy(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stream_run_is_trained_and_evaluated(config, tmp_path):
     ppo = dataclasses.replace(config.ppo, experience=0.5)
     run = jaxnav.train(dataclasses.replace(config, decision="streams", ppo=ppo, run_dir=tmp_path / "run"))

@@ -124,7 +124,7 @@ def one_chunk_config(config, run_dir, **changes):
     return dataclasses.replace(config, seeds=1, total_steps=256, run_dir=run_dir, **changes)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_method_without_layout_support_is_trained_as_baseline_alone(config, tmp_path):
     run_dir = tmp_path / "run"
     anonymous = one_chunk_config(config, run_dir, method="anonymous", method_sizes={})

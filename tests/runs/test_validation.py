@@ -120,7 +120,7 @@ def test_validator_uses_layout_weights_in_any_order_of_the_arms(validated):
     assert unweighted["layout"] != expected["layout"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_train_without_val_scenes_exports_the_last_policy(config, tmp_path):
     scenes = tmp_path / "train_only.jsonl"
     write_scenes(scenes, [make_generated_scenes("rooms", "train", 2)[i] for i in range(2)])

@@ -165,7 +165,7 @@ def test_layout_shift_keeps_number_and_distance_of_goals(world):
 
 
 @pytest.mark.parametrize("world", EVERY_WORLD)
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_layout_shift_leaves_the_training_distribution(world: str):
     categories = WORLDS[world].task.categories
     rng = np.random.default_rng(0)

@@ -107,7 +107,7 @@ def test_devices_exchange_a_few_single_arrays():
     assert trained(1, 4)["exchanged"] == {"1": {}, "4": {"all-gather": 1, "all-reduce": 3}}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_devices_that_cannot_be_shared_out_are_refused():
     assert trained(1, 4)["refused"] == (
         "config: ppo.num_envs is 18; with 4 devices and 2 seeds, 2 devices share the episodes of a seed: "

@@ -50,7 +50,7 @@ def test_choices_that_do_not_count_teach_no_policy():
     assert abs(float(counted[0] - expected[0])) > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("optimised")
 def test_where_to_search_is_learned():
     """The book is always north: who chooses at random goes south as often, and finds it too late.

@@ -63,7 +63,7 @@ def test_random_actions_seldom_succeed():
     assert 0.05 < random_success() < 0.6
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.control == ActionControl()])
 def test_a_method_learns(name):

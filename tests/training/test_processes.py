@@ -48,7 +48,7 @@ def test_two_processes_train_the_run_of_one(tmp_path, capsys):
     assert evaluate(two, "--episodes", 10) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_processes_go_on_before_a_damaged_checkpoint(tmp_path):
     """In a part that one of them alone reads, where the other would wait for it."""
     config_file, run_dir = write_config(tmp_path), tmp_path / "run"
@@ -72,7 +72,7 @@ def test_processes_that_disagree_are_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("victim", "written"), [(0, "4"), (1, "4.*")])  # the last while it is written
 def test_a_killed_process_ends_the_other_one(victim, written, tmp_path, capsys):
     config_file, run_dir, address = write_config(tmp_path), tmp_path / "run", free_address()
@@ -88,7 +88,7 @@ def test_a_killed_process_ends_the_other_one(victim, written, tmp_path, capsys):
     assert re.search(r"resumed after update \d+ of 60", capsys.readouterr().err)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_process_that_stays_alone_ends(tmp_path):
     config_file = write_config(tmp_path)
     alone = [start(free_address(), index, config_file, tmp_path / "run") for index in range(2)]  # each waits elsewhere

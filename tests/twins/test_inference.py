@@ -180,8 +180,11 @@ def compare(
     ("method", "decision", "count"),
     [
         ("org", "fused", 12),
+        # A method with a map and a local policy, and one with attention and two streams.
+        pytest.param("semexp", "fused", 12, marks=pytest.mark.slow),
+        pytest.param("vtnet", "streams", 12, marks=pytest.mark.slow),
         *(
-            pytest.param(name, decision, FEWER_EPISODES.get(name, NUM_EPISODES), marks=pytest.mark.slow)
+            pytest.param(name, decision, FEWER_EPISODES.get(name, NUM_EPISODES), marks=pytest.mark.exhaustive)
             for name, decision in itertools.product(METHODS, DECISIONS)
         ),
     ],
@@ -204,7 +207,7 @@ def test_every_decision_is_the_twins(method, decision, count):
     ("method", "weight_kind"),
     [
         ("org", "relative"),
-        *(pytest.param(name, "relative", marks=pytest.mark.slow) for name in ("eotp", "semexp", "vtnet")),
+        *(pytest.param(name, "relative", marks=pytest.mark.exhaustive) for name in ("eotp", "semexp", "vtnet")),
     ],
 )
 def test_decisions_with_scaled_weights_are_the_twins(method, weight_kind):

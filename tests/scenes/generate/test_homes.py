@@ -48,7 +48,7 @@ def test_generated_homes_have_names_of_split_and_index():
     assert (apartment.split, house.split) == ("train", "val")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_generated_apartments_share_walls_in_groups_of_five(apartments: list[Scene]):
     plan_walls = [scene.walls.tobytes() for scene in apartments]
     for i, wall_bytes in enumerate(plan_walls):
