@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.leakage import find_leaks, step_into
+from support.tiers import params_by_tier
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav
@@ -15,7 +16,9 @@ from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 #: Scenes of each world, enough that a perfect predictor differs from the detector beyond chance for most goals.
 NUM_SCENES = {"rooms": 12, "apartments": 8, "houses": 4}
-all_worlds = pytest.mark.parametrize("world", ["rooms", "houses", pytest.param("apartments", marks=pytest.mark.slow)])
+all_worlds = pytest.mark.parametrize(
+    "world", params_by_tier(["rooms", "houses", "apartments"], fast=["rooms"], slow=["houses"])
+)
 
 
 @functools.cache

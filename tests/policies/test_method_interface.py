@@ -14,6 +14,7 @@ import pytest
 from support import methods
 from support import tiny_world as tiny
 from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts, choice_log_probs
+from support.tiers import params_by_tier
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
@@ -75,11 +76,6 @@ def collect_method_rollout(name) -> MethodRollout:
 # The contract
 
 
-def params_slow_except(names, fast_name=None):
-    """Names as parameters of a test, all but one marked slow."""
-    return [pytest.param(name, marks=() if name == fast_name else pytest.mark.slow) for name in names]
-
-
 #: Test methods whose parts no method of the package has.
 TEST_METHODS = [f"support.methods:{name}" for name in ("COUNTING", "ADAPTIVE", "CONTROLLED", "PATIENT", "LEARNED")]
 ABLATIONS = [
@@ -96,7 +92,9 @@ ABLATIONS = [
 ]
 
 
-@pytest.mark.parametrize("name", params_slow_except([*METHODS, *ABLATIONS, *TEST_METHODS], "anonymous"))
+@pytest.mark.parametrize(
+    "name", params_by_tier([*METHODS, *ABLATIONS, *TEST_METHODS], fast=["anonymous"], slow=["savn", "semexp"])
+)
 def test_check_method_accepts_every_method_of_the_package(name):
     check_method(name, steps=4)
 
@@ -108,7 +106,9 @@ def test_method_label_is_the_name_without_its_module(name, label):
     assert method_label(name) == label
 
 
-@pytest.mark.parametrize("name", params_slow_except(["BATCH", "WIDTH", "FINITE", "NOTE", "ACTION"], "ACTION"))
+@pytest.mark.parametrize(
+    "name", params_by_tier(["BATCH", "WIDTH", "FINITE", "NOTE", "ACTION"], fast=["ACTION"], slow=["BATCH", "FINITE"])
+)
 def test_check_method_rejects_a_method_that_breaks_one_promise(name):
     with pytest.raises((AssertionError, TypeError, ValueError)):
         check_method(f"support.methods:{name}", steps=3)
@@ -146,7 +146,10 @@ def test_find_method_finds_methods_of_other_packages_by_entry_point(monkeypatch)
 
 
 @pytest.mark.parametrize(
-    "name", params_slow_except(["ATTENTIVE", "COUNTING", "ADAPTIVE", "CONTROLLED", "PATIENT", "STEPWISE"])
+    "name",
+    params_by_tier(
+        ["ATTENTIVE", "COUNTING", "ADAPTIVE", "CONTROLLED", "PATIENT", "STEPWISE"], slow=["ATTENTIVE", "CONTROLLED"]
+    ),
 )
 def test_replay_rollout_recomputes_log_probs_and_values(name):
     weights, _, _, rollout = collect_method_rollout(name)

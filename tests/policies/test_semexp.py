@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.scenes import BOOK, CATEGORIES, FRIDGE, corridor_scene
+from support.tiers import params_by_tier
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import State
@@ -325,10 +326,7 @@ def test_learn_search_setup_refuses_more_categories_than_map_bits():
         learn_search_setup([crowded_bank], np.zeros(0))
 
 
-@pytest.mark.parametrize(
-    "world_name",
-    [pytest.param("apartments", marks=pytest.mark.slow), pytest.param("houses", marks=pytest.mark.exhaustive)],
-)
+@pytest.mark.parametrize("world_name", params_by_tier(["apartments", "houses"], slow=["apartments"]))
 def test_nearest_frontier_finds_most_goals_of_homes_without_learning(world_name):
     """Without looking down, or with Done said too far away, it finds few of them."""
     preset = WORLDS[world_name]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.scenes import CATEGORIES
+from support.tiers import params_by_tier
 
 from jaxnav.causal import do, stde, tde
 from jaxnav.env.objectnav import Observation
@@ -26,11 +27,6 @@ BATCH_SIZE = 48
 HIDDEN_SIZE = tiny.SIZES.hidden
 #: The package's methods, one that attends with its memory, and one that adapts.
 HOSTS = [*METHODS, "support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
-
-
-def params_slow_except(*fast_names):
-    """All hosts as parameters of a test; all but some marked slow, as they take seconds each to compile."""
-    return [pytest.param(name, marks=() if name in fast_names else pytest.mark.slow) for name in HOSTS]
 
 
 def make_spec(method_name, **options):
@@ -117,7 +113,9 @@ def assert_bit_identical(actual, desired):
 # Equations 1 and 2
 
 
-@pytest.mark.parametrize("method_name", params_slow_except("org", "rgb", "anonymous", "eotp"))
+@pytest.mark.parametrize(
+    "method_name", params_by_tier(HOSTS, fast=["org", "anonymous"], slow=["support.methods:ADAPTIVE", "vtnet"])
+)
 def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
     for seed in range(4):
         decisions = random_decisions(make_spec(method_name), seed)
@@ -130,7 +128,7 @@ def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
         assert np.std(decisions.counterfactual.logits) > 0.1
 
 
-@pytest.mark.parametrize("method_name", params_slow_except("rgb", "org", "hoz"))
+@pytest.mark.parametrize("method_name", params_by_tier(HOSTS, fast=["rgb", "org"], slow=["hoz", "semexp"]))
 def test_stde_of_streams_keeps_a_share_of_the_experience_stream(method_name):
     decisions = random_decisions(make_spec(method_name), seed=5)
     direct_logits = decisions.direct.logits - decisions.neither.logits

@@ -12,6 +12,7 @@ import jax
 import matplotlib as mpl
 import pytest
 from support.refusals import assert_message_names
+from support.tiers import params_by_tier
 from support.tiny_run import finished_run, tiny_config, write_config
 
 import jaxnav
@@ -218,10 +219,7 @@ def test_surroundings_by_a_sample(environment_name, command_name, tmp_path, monk
 
 @pytest.mark.parametrize(
     ("environment_name", "command_name"),
-    [
-        pytest.param(*pair, marks=pytest.mark.slow if pair in COMPUTING else pytest.mark.exhaustive)
-        for pair in itertools.product(ENVIRONMENTS, COMMANDS)
-    ],
+    params_by_tier(itertools.product(ENVIRONMENTS, COMMANDS), slow=COMPUTING),
 )
 def test_surroundings_of_every_command(environment_name, command_name, tmp_path, tmp_path_factory, monkeypatch):
     if command_name in ("eval", "report"):

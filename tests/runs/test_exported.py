@@ -16,6 +16,7 @@ import pytest
 from support import tiny_world as tiny
 from support.commands import contents, refusal
 from support.refusals import assert_message_names
+from support.tiers import params_by_tier
 
 import jaxnav
 from jaxnav.__main__ import main
@@ -156,9 +157,9 @@ def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
     ("method_name", "decision"),
     [
         ("org", "streams"),
-        *(
-            pytest.param(name, "streams" if name in ("savn", "sp", "vtnet") else "fused", marks=pytest.mark.slow)
-            for name in METHODS
+        *params_by_tier(
+            [(name, "streams" if name in ("savn", "sp", "vtnet") else "fused") for name in METHODS],
+            slow=[("semexp", "fused"), ("savn", "streams")],
         ),
     ],
 )

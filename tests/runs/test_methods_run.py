@@ -6,6 +6,7 @@ import chex
 import pytest
 from rich.console import Console
 from support.stopping import train_in_two
+from support.tiers import params_by_tier
 from support.tiny_run import tiny_config
 
 import jaxnav
@@ -34,11 +35,7 @@ TESTED_METHODS = ("tpn", "semexp")
 
 
 @pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name in TESTED_METHODS else pytest.mark.exhaustive)
-        for name in ("rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp")
-    ],
+    "method", params_by_tier(["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"], slow=TESTED_METHODS)
 )
 def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     """The exported policy is that of the run, with the same knowledge."""
@@ -54,13 +51,7 @@ def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param("semexp", marks=pytest.mark.slow),
-        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("savn", "hoz")),
-    ],
-)
+@pytest.mark.parametrize("method", params_by_tier(["savn", "hoz", "semexp"], slow=["semexp"]))
 def test_method_with_tracker_state_resumes_bit_for_bit(method, tmp_path, monkeypatch):
     """Fast weights, zones and maps are in the checkpoint; those of several stages are resumed in `test_budget`."""
     config = config_of(method, tmp_path / "one")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.scene_records import assert_scenes_equal
 from support.scenes import draw
+from support.tiers import params_by_tier
 
 from jaxnav.scenes.categories import ITHOR_CATEGORIES, category_ids
 from jaxnav.scenes.files.scene_file import write_scenes
@@ -20,7 +21,7 @@ from jaxnav.scenes.worlds import WORLDS, load_scenes, make_generated_scenes, shi
 
 NUM_SCENES = {"apartments": 48, "houses": 48, "rooms": 96}  # a room has fewer pairs
 
-EVERY_WORLD = ["rooms", *(pytest.param(world, marks=pytest.mark.slow) for world in ("apartments", "houses"))]
+EVERY_WORLD = params_by_tier(["rooms", "apartments", "houses"], fast=["rooms"], slow=["houses"])
 
 
 @functools.cache

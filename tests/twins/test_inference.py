@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
+from support.tiers import params_by_tier
 from twins import agent
 from twins.agent import TwinEpisode
 from twins.methods import TWINS, TwinRelations, TwinTentativeRelations
@@ -183,8 +184,8 @@ def compare(
         # A method with a map and a local policy, and one with attention and two streams.
         pytest.param("semexp", "fused", 12, marks=pytest.mark.slow),
         pytest.param("vtnet", "streams", 12, marks=pytest.mark.slow),
-        *(
-            pytest.param(name, decision, FEWER_EPISODES.get(name, NUM_EPISODES), marks=pytest.mark.exhaustive)
+        *params_by_tier(
+            (name, decision, FEWER_EPISODES.get(name, NUM_EPISODES))
             for name, decision in itertools.product(METHODS, DECISIONS)
         ),
     ],
@@ -205,10 +206,7 @@ def test_every_decision_is_the_twins(method, decision, count):
 
 @pytest.mark.parametrize(
     ("method", "weight_kind"),
-    [
-        ("org", "relative"),
-        *(pytest.param(name, "relative", marks=pytest.mark.exhaustive) for name in ("eotp", "semexp", "vtnet")),
-    ],
+    params_by_tier([(name, "relative") for name in ("org", "eotp", "semexp", "vtnet")], fast=[("org", "relative")]),
 )
 def test_decisions_with_scaled_weights_are_the_twins(method, weight_kind):
     row = table_row("stde", 0.0, "paper", "argmax")
