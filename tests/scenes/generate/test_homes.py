@@ -20,15 +20,17 @@ from jaxnav.scenes.generate.homes import DOOR_WIDTHS, generate_apartment, genera
 from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.scene import CELL_SIZE, Room, Scene
 
+NUM_HOMES = 30
+
 
 @pytest.fixture(scope="module")
 def apartments() -> list[Scene]:
-    return [generate_apartment("train", i, seed=0) for i in range(60)]
+    return [generate_apartment("train", i, seed=0) for i in range(NUM_HOMES)]
 
 
 @pytest.fixture(scope="module")
 def houses() -> list[Scene]:
-    return [generate_house("train", i, seed=0) for i in range(60)]
+    return [generate_house("train", i, seed=0) for i in range(NUM_HOMES)]
 
 
 @pytest.mark.parametrize("generate_scene", [generate_room, generate_apartment, generate_house])
@@ -53,7 +55,7 @@ def test_generated_apartments_share_walls_in_groups_of_five(apartments: list[Sce
     plan_walls = [scene.walls.tobytes() for scene in apartments]
     for i, wall_bytes in enumerate(plan_walls):
         assert wall_bytes == plan_walls[i - i % 5]
-    assert len(set(plan_walls)) == 12
+    assert len(set(plan_walls)) == NUM_HOMES // 5
     val_walls = {generate_apartment("val", 5 * plan_index, 0).walls.tobytes() for plan_index in range(3)}
     assert len(val_walls) == 3
     assert not val_walls & set(plan_walls)
@@ -140,7 +142,7 @@ def test_generated_house_sizes_and_contents_follow_the_measured_ones(houses: lis
     low_quartile, high_quartile = np.quantile([len(scene.types) for scene in houses], [0.25, 0.75])
     assert 25 <= low_quartile < high_quartile <= 48
 
-    # Instances per house, chosen near those of the 30 Gibson houses; the standard error over 60 houses is about 0.2.
+    # Instances per house, chosen near those of the 30 Gibson houses; the standard error over 30 houses is about 0.3.
     mean_instances = {
         "Chair": 3.6,
         "Sofa": 1.6,
