@@ -130,7 +130,7 @@ def test_eval_episode_file_averages_to_the_report(report_file):
         assert 0 <= float(episode["mean_weight"]) <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_eval_is_reproducible_byte_for_byte(run_dir, report_file, tmp_path):
     for seed, is_equal in ((0, True), (1, False)):
         path = tmp_path / f"{seed}.json"
@@ -218,7 +218,7 @@ def test_eval_of_a_shift_is_named_in_file_and_report(run_dir, tmp_path, capsys):
     assert "a shift from 0 to 1" in refusal(capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_eval_shifts_the_scenes_of_a_file(run_dir, tmp_path, capsys):
     copied_run = shutil.copytree(run_dir, tmp_path / "run")
     scene_file = tmp_path / "a.jsonl.gz"

@@ -239,7 +239,7 @@ def test_handover_leaves_the_layout_blind_agents(bench):
             assert agent.mean + change.mean == pytest.approx(layout_blind.mean)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_cde_leaves_the_network_without_experience(make_bench, drawn_run, tmp_path_factory):
     config = drawn_run.config
     dropping_config = dataclasses.replace(

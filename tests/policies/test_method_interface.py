@@ -93,7 +93,7 @@ ABLATIONS = [
 
 
 @pytest.mark.parametrize(
-    "name", params_by_tier([*METHODS, *ABLATIONS, *TEST_METHODS], fast=["anonymous"], slow=["savn", "semexp"])
+    "name", params_by_tier([*METHODS, *ABLATIONS, *TEST_METHODS], fast=["anonymous"], slow=["semexp"])
 )
 def test_check_method_accepts_every_method_of_the_package(name):
     check_method(name, steps=4)

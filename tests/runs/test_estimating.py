@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from support.tiers import params_by_tier
 
 import jaxnav
 from jaxnav.errors import InputError
@@ -23,7 +22,8 @@ from jaxnav.training.calibration import co_visibility_from_counts, layout_priors
 EPSILON, EPISODES = np.linspace(0, 1, 11), 24  # those of `evaluated`
 
 
-@pytest.mark.parametrize("setting", params_by_tier(["evidence", "clock"], slow=["evidence"]))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("setting", ["evidence", "clock"])
 def test_gap_estimator_changes_stde_rows_alone(drawn_run, evaluated, setting):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting=setting)
     assert other.rows == evaluated.rows

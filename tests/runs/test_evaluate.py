@@ -55,7 +55,7 @@ def test_evaluation_report_equals_the_results(evaluated):
     assert evaluated.report["compilations"] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_evaluation_names_its_phases_on_a_terminal_alone(drawn_run):
     printed_texts = []
     for is_terminal in (True, False):

@@ -159,7 +159,7 @@ def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
         ("org", "streams"),
         *params_by_tier(
             [(name, "streams" if name in ("savn", "sp", "vtnet") else "fused") for name in METHODS],
-            slow=[("semexp", "fused"), ("savn", "streams")],
+            slow=[("semexp", "fused")],
         ),
     ],
 )

@@ -30,12 +30,8 @@ def config_of(method, folder):
     return config
 
 
-#: Methods whose runs are tested each time: one with a stage of imitation, and one with a map.
-TESTED_METHODS = ("tpn", "semexp")
-
-
 @pytest.mark.parametrize(
-    "method", params_by_tier(["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"], slow=TESTED_METHODS)
+    "method", params_by_tier(["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"], slow=["semexp"])
 )
 def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     """The exported policy is that of the run, with the same knowledge."""
@@ -51,7 +47,8 @@ def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
 
 
-@pytest.mark.parametrize("method", params_by_tier(["savn", "hoz", "semexp"], slow=["semexp"]))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("method", ["savn", "hoz", "semexp"])
 def test_method_with_tracker_state_resumes_bit_for_bit(method, tmp_path, monkeypatch):
     """Fast weights, zones and maps are in the checkpoint; those of several stages are resumed in `test_budget`."""
     config = config_of(method, tmp_path / "one")
@@ -71,7 +68,7 @@ PRIORS = dataclasses.replace(METHODS["sp"], learn=functools.partial(graph_from_f
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_custom_edges_must_match_the_categories_of_the_world(tmp_path, monkeypatch, capsys):
     (tmp_path / "my_priors.py").write_text(PRIORS)
     (tmp_path / "edges.csv").write_text("Mug,DiningTable")  # which rooms do not know

@@ -50,7 +50,7 @@ def test_local_folder_precedes_a_packaged_policy_of_the_same_name(tmp_path, monk
     assert not is_policy("rooms-org")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_shifted_episode_differs_in_the_layout_alone(drawn_run):
     """Room, goal and start of the second panel are those of the first; L* is that of its own scenes."""
     console = Console(record=True, width=120, file=io.StringIO())

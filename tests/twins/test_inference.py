@@ -183,7 +183,7 @@ def compare(
         ("org", "fused", 12),
         # A method with a map and a local policy, and one with attention and two streams.
         pytest.param("semexp", "fused", 12, marks=pytest.mark.slow),
-        pytest.param("vtnet", "streams", 12, marks=pytest.mark.slow),
+        pytest.param("vtnet", "streams", 12, marks=pytest.mark.exhaustive),
         *params_by_tier(
             (name, decision, FEWER_EPISODES.get(name, NUM_EPISODES))
             for name, decision in itertools.product(METHODS, DECISIONS)
@@ -370,7 +370,7 @@ for _method in ("eotp", "hoz", "semexp", "sp", "tpn", "vtnet"):
 
 
 @pytest.mark.parametrize(
-    "mistake", [*MISTAKES, *(pytest.param(mistake, marks=pytest.mark.slow) for mistake in SLOW_MISTAKES)]
+    "mistake", [*MISTAKES, *(pytest.param(mistake, marks=pytest.mark.exhaustive) for mistake in SLOW_MISTAKES)]
 )
 def test_a_twin_that_is_wrong_is_noticed(mistake):
     method, decision, twin = (MISTAKES | SLOW_MISTAKES)[mistake]
