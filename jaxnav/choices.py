@@ -13,8 +13,8 @@ Reduction = Literal["mean_visible", "mean", "sum"]
 Counts = Literal["presence", "instances"]
 #: Layout estimators that an evaluation may use in place of the one from training.
 EstimatorName = Literal["paper", "released", "evidence", "learned", "surprise", "overdue", "clock"]
-#: Ways to use policies in an evaluation, and the two references without training.
-Variant = Literal["oracle", "random", "baseline", "layout", "tde", "stde", "cde", "scde"]
+#: Ways to use policies in an evaluation, agents of other kinds, and the references without training.
+Variant = Literal["oracle", "frontier", "random", "agent", "baseline", "layout", "tde", "stde", "cde", "scde"]
 #: Ways to use policies in the picture of an episode.
 PlayedVariant = Literal["stde", "scde", "layout", "baseline"]
 #: Parts of a decision whose cost an evaluation measures: other categories in Z, all parts, or none.
@@ -29,3 +29,5 @@ CounterfactualMemory = Literal["factual", "own"]
 ShiftKind = Literal["size", "context"]
 #: Rule that turns logits into actions: the best action, or a sampled one.
 Decoding = Literal["argmax", "sample"]
+#: Decoding of a row: that of its policies, or the agent's own way to choose actions.
+RowDecoding = Literal["argmax", "sample", "own"]

@@ -21,7 +21,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from jaxnav.env.make import make
-from jaxnav.env.objectnav import DETECTION_ORIGIN, DETECTION_SCALE, EnvParams, ObjectNav, State, unpack_detections
+from jaxnav.env.named_observation import name_observation, to_numpy
+from jaxnav.env.objectnav import DETECTION_ORIGIN, DETECTION_SCALE, EnvParams, ObjectNav, State
 from jaxnav.errors import InputError
 from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.task import NUM_ACTIONS
@@ -63,7 +64,7 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         """Start an episode."""
         super().reset(seed=seed)
         self._episodes, observations = self._batched_env.reset(_draw_keys(self.np_random, 1))
-        return _select_env(_to_numpy(observations), 0), {}
+        return _select_env(to_numpy(observations), 0), {}
 
     def step(self, action: Any) -> tuple[NamedValues, float, bool, bool, NamedValues]:
         """Take an action; `info["success"]` is True for a successful Done."""
@@ -71,7 +72,7 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         self._episodes, observations, signals = self._batched_env.advance(self._episodes, actions[None])
 
         # Gymnasium expects Python scalars; the single environment is a batch of one.
-        observation = _select_env(_to_numpy(observations), 0)
+        observation = _select_env(to_numpy(observations), 0)
         step_info = {"success": signals.success.item()}
         return observation, signals.reward.item(), signals.terminated.item(), signals.truncated.item(), step_info
 
@@ -131,7 +132,7 @@ class ObjectNavVectorEnv(VectorEnv[NamedValues, np.ndarray, np.ndarray]):
             reset_keys = jnp.concatenate(env_keys)
             self.np_random = env_generators[0]
         self._episodes, observations = self._batched_env.reset(reset_keys)
-        return _to_numpy(observations), {}
+        return to_numpy(observations), {}
 
     def step(self, actions: np.ndarray) -> tuple[NamedValues, np.ndarray, np.ndarray, np.ndarray, NamedValues]:
         """Take an action in every episode.
@@ -150,7 +151,7 @@ class ObjectNavVectorEnv(VectorEnv[NamedValues, np.ndarray, np.ndarray]):
         # Gymnasium's infos: one entry per environment, with a mask of the valid ones under the name with "_".
         env_infos = {}
         if has_ended.any():
-            final_observations = _to_numpy(final_observations)
+            final_observations = to_numpy(final_observations)
             final_obs = np.full(self.num_envs, None, object)
             for env_index in np.flatnonzero(has_ended).tolist():
                 final_obs[env_index] = _select_env(final_observations, env_index)
@@ -160,7 +161,7 @@ class ObjectNavVectorEnv(VectorEnv[NamedValues, np.ndarray, np.ndarray]):
                 "_final_obs": has_ended,
                 "_final_info": has_ended,
             }
-        return _to_numpy(observations), signals.reward, signals.terminated, signals.truncated, env_infos
+        return to_numpy(observations), signals.reward, signals.terminated, signals.truncated, env_infos
 
 
 def observation_space(env: ObjectNav) -> spaces.Dict:
@@ -263,20 +264,7 @@ class _BatchedEnv:
         return episode, observation, final_observation, signals
 
     def _observe(self, episode: EpisodeState) -> NamedValues:
-        env = self._env
-        observation_row = env.observe(episode.state, self._params).row
-        _, heading, horizon = env.task.rules.split_pose(episode.state.pose)
-
-        # The view is square, [V V] -> [V, V].
-        view_side = env.row_format.view
-        return {
-            "view": env.row_format.view_cells(observation_row).reshape(view_side, view_side),
-            "detections": unpack_detections(env.row_format.detections(observation_row)),
-            "goal": episode.state.goal,
-            "heading": heading,
-            "horizon": horizon,
-            "moved": episode.moved.astype(jnp.int32),
-        }
+        return name_observation(self._env, self._params, episode.state, episode.moved)
 
 
 def _validate_actions(space: spaces.Space, episodes: EpisodeState | None, action: Any) -> np.ndarray:
@@ -303,15 +291,6 @@ def _draw_keys(generator: np.random.Generator, count: int) -> jax.Array:
     """Draw PRNG keys [count] from a NumPy generator."""
     seed = int(generator.integers(2**32))
     return jax.random.split(jax.random.key(seed), count)
-
-
-def _to_numpy(observations: NamedValues) -> NamedValues:
-    """Copy observations to NumPy arrays in the dtypes of their space."""
-    arrays = {}
-    for name, batch_values in observations.items():
-        space_dtype = np.int64 if batch_values.dtype == np.int32 else batch_values.dtype  # Discrete spaces are int64
-        arrays[name] = np.array(batch_values, space_dtype)
-    return arrays
 
 
 def _select_env(observations: NamedValues, index: int) -> NamedValues:

@@ -9,14 +9,14 @@ success weighted by action efficiency (SAE) and distance to success (DTS).
 """
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.env.objectnav import EnvParams, State
+from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.evaluation.episodes import EpisodeList, select_first_episodes
 from jaxnav.evaluation.removal import (
     InferenceConfig,
@@ -114,8 +114,15 @@ class EpisodeOutcome(NamedTuple):
         )
 
 
-class _Batch(NamedTuple):
-    """Episodes that are run side by side, leaves [B, ...]."""
+class EpisodeBatch(NamedTuple):
+    """Episodes that are run side by side, leaves [B, ...].
+
+    Attributes:
+      agent: the agents, with the states of their environments.
+      running: bool [B], episodes that have not ended.
+      outcome: outcomes so far.
+      episode_keys: PRNG keys [B].
+    """
 
     agent: Agent
     running: jax.Array
@@ -247,51 +254,89 @@ def _run_episodes(
 
     context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
 
-    def step(batch: _Batch) -> _Batch:
+    def step(batch: EpisodeBatch) -> EpisodeBatch:
         next_agent, result, trace = infer_and_act(
             config, context, batch.agent, batch.running, batch.episode_keys, **compiled_parts
         )
         # The memory holds the executed action, which differs from the choice where the method has macro-actions.
         action = policy_memory(result.agent).action
         is_decision_step = agent_loop.is_decision_step(batch.agent)  # of the state before the step
-        outcome = batch.outcome.add_step(batch.running, action, result, trace.removal_weight, is_decision_step)
-        # Ended episodes keep their state; their memories and beliefs are no longer used.
-        state = tree_where(batch.running, next_agent.state, batch.agent.state)
-        return _Batch(
-            agent=next_agent._replace(state=state),
-            running=batch.running & ~result.ended,
-            outcome=outcome,
-            episode_keys=batch.episode_keys,
-        )
-
-    def run_until(batch: _Batch, max_running: int) -> _Batch:
-        return jax.lax.while_loop(lambda batch: batch.running.sum() > max_running, step, batch)
+        return advance_batch(batch, next_agent, action, result, trace.removal_weight, is_decision_step)
 
     # Start all episodes in one batch.
     memory = policy.initial_memory((num_episodes,))
-    batch = _Batch(
+    batch = EpisodeBatch(
         agent=agent_loop.start_from(initial_states, memory, knowledge, env_params),
         running=select_first_episodes(room_rank, config.max_room_episodes),
         outcome=EpisodeOutcome.zeros((num_episodes,)),
         episode_keys=episode_keys,
     )
+    outcome, final_state = run_to_end(batch, step, lambda batch: batch.agent.state)
+    return finish_outcome(outcome, final_state, agent_loop.env, env_params)
+
+
+def advance_batch(
+    batch: EpisodeBatch,
+    next_agent: Agent,
+    action: jax.Array,
+    result: StepResult,
+    weight: jax.Array,
+    is_decision_step: jax.Array | None = None,
+) -> EpisodeBatch:
+    """Return a batch after one step of every running episode.
+
+    Args:
+      batch: the batch before the step.
+      next_agent: agents after the step [B].
+      action, result, weight, is_decision_step: see `EpisodeOutcome.add_step`.
+    """
+    outcome = batch.outcome.add_step(batch.running, action, result, weight, is_decision_step)
+    # Ended episodes keep their state; their memories and beliefs are no longer used.
+    state = tree_where(batch.running, next_agent.state, batch.agent.state)
+    return batch._replace(
+        agent=next_agent._replace(state=state), running=batch.running & ~result.ended, outcome=outcome
+    )
+
+
+def run_to_end(
+    batch: EpisodeBatch, step: Callable[[EpisodeBatch], EpisodeBatch], select: Callable[[EpisodeBatch], Tree]
+) -> tuple[EpisodeOutcome, Tree]:
+    """Step a batch of E episodes until all of them have ended.
+
+    Args:
+      batch: the episodes at their start.
+      step: advances every running episode of a batch of any size.
+      select: returns further leaves [B, ...] of a batch to keep of every episode.
+
+    Returns:
+      The outcomes, leaves [E], before `finish_outcome`; and the selected leaves at the end of every episode, [E, ...].
+    """
+    num_episodes = len(batch.running)
+
+    def run_until(batch: EpisodeBatch, max_running: int) -> EpisodeBatch:
+        return jax.lax.while_loop(lambda batch: batch.running.sum() > max_running, step, batch)
+
     batch_ids = jnp.arange(num_episodes)
-    episode_table = batch.outcome, initial_states  # outcomes and states of all episodes; overwritten with final ones
+    episode_table = batch.outcome, select(batch)  # of all episodes; overwritten with the final ones
 
     # Carry on with ever smaller batches: whenever enough episodes have ended, keep only those that still run. The loop
     # is unrolled, one `while_loop` for each static batch size.
     smaller_sizes = [num_episodes // divisor for divisor in _BATCH_DIVISORS if num_episodes >= divisor]
     for next_size in (*smaller_sizes, 0):
         batch = run_until(batch, max_running=next_size)
-        episode_table = _write_rows(episode_table, batch_ids, (batch.outcome, batch.agent.state))
+        episode_table = _write_rows(episode_table, batch_ids, (batch.outcome, select(batch)))
         kept_rows = jnp.argsort(~batch.running)[:next_size]  # running episodes first; ended ones may fill the rest
         batch_ids = batch_ids[kept_rows]
         batch = take_rows(batch, kept_rows)
+    return episode_table
 
-    # DTS needs the distance from the final cell; the sum of the weights becomes their mean.
-    outcome, final_state = episode_table
+
+def finish_outcome(
+    outcome: EpisodeOutcome, final_state: State, env: ObjectNav, env_params: EnvParams
+) -> EpisodeOutcome:
+    """Add the distance from the final cell, which DTS needs, and turn the sum of the weights into their mean."""
     num_choices = jnp.maximum(outcome.choices, 1).astype(jnp.float32)
-    final_cell = agent_loop.env.cell_of_pose(final_state.pose)
+    final_cell = env.cell_of_pose(final_state.pose)
     return outcome._replace(
         distance=env_params.tables.goal_distance[final_cell, final_state.goal],
         mean_weight=outcome.mean_weight / num_choices,

@@ -24,6 +24,7 @@ def evaluation_notes(
     *,
     has_room_prior: bool,
     has_experience: bool = True,
+    is_run: bool = True,
     random_name: str = "Random",
 ) -> list[str]:
     """Describe the limits of a table, one sentence per note.
@@ -34,10 +35,17 @@ def evaluation_notes(
       episodes: the E episodes.
       has_room_prior: True if room types have different layout priors.
       has_experience: False if the method's experience Z is empty, so that w has nothing to multiply.
+      is_run: False for a single policy, whose intervals are over scenes alone.
       random_name: name of the agent that acts at random.
     """
     # Intervals first, then what a row knows in advance, then comparisons with chance.
-    notes = _missing_interval_notes(success.shape[1], episodes)
+    notes = missing_interval_notes(episodes)
+    if is_run and success.shape[1] == 1:
+        # A single seed gives no spread between training runs.
+        notes.append(
+            "No intervals for trained policies: a single training seed does not show how training runs differ; train "
+            "with `--seeds 2` or more."
+        )
     if has_room_prior and any(row.arm == "layout" for row in rows):
         notes.append(
             "Rows with w receive the room type of the scene, because each room type has its own layout prior; "
@@ -139,25 +147,14 @@ def last_quarter_success(log: Sequence[Mapping[str, Any]]) -> tuple[float, float
     return start_success, end_success
 
 
-def _missing_interval_notes(num_seeds: int, episodes: EpisodeList) -> list[str]:
-    """Explain why a table has no intervals, if so."""
-    interval_notes = []
-
+def missing_interval_notes(episodes: EpisodeList) -> list[str]:
+    """Explain why a table has no intervals over scenes, if so."""
     # Floor plans are the units of the interval over scenes.
-    if episodes.clusters().degrees_of_freedom < MIN_SCENE_DEGREES:
-        num_plans = len(set(episodes.floor_plans))
-        plural_ending = "s" if num_plans > 1 else ""
-        interval_notes.append(
-            f"No intervals: the episodes use {num_plans} floor plan{plural_ending}; an interval needs at least 3."
-        )
-
-    # A single seed gives no spread between training runs.
-    if num_seeds == 1:
-        interval_notes.append(
-            "No intervals for trained policies: a single training seed does not show how training runs differ; train "
-            "with `--seeds 2` or more."
-        )
-    return interval_notes
+    if episodes.clusters().degrees_of_freedom >= MIN_SCENE_DEGREES:
+        return []
+    num_plans = len(set(episodes.floor_plans))
+    plural_ending = "s" if num_plans > 1 else ""
+    return [f"No intervals: the episodes use {num_plans} floor plan{plural_ending}; an interval needs at least 3."]
 
 
 def _chance_notes(

@@ -19,7 +19,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from jaxnav.choices import Decoding, Form, Variant
+from jaxnav.choices import Form, RowDecoding, Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import (
@@ -37,7 +37,7 @@ from jaxnav.store.files import WRITTEN_BY_0_1, installed_versions, write_atomic
 REPORT_FORMAT = 1
 
 #: Variants without training, whose seeds are repetitions.
-UNTRAINED_VARIANTS: tuple[Variant, ...] = ("oracle", "random")
+UNTRAINED_VARIANTS: tuple[Variant, ...] = ("oracle", "frontier", "random")
 #: Smallest L* of the episodes in each bucket.
 _LENGTH_BUCKETS = {"L>=1": 1, "L>=5": 5}
 
@@ -49,10 +49,11 @@ def build_row(
     world: str,
     split: str,
     epsilon: float | None,
-    decoding: Decoding,
+    decoding: RowDecoding,
     form: Form | None,
     metrics: dict[str, np.ndarray],
     episodes: EpisodeList,
+    trained: bool = True,
 ) -> dict[str, Any]:
     """Build one row: the metrics of a variant, over all episodes and by bucket (L* >= 1, L* >= 5).
 
@@ -69,6 +70,7 @@ def build_row(
       form: how counterfactual logits are combined; None for variants without counterfactual.
       metrics: metrics of `episode_metrics` by name, each [S, E].
       episodes: the E episodes.
+      trained: True to generalize to other training runs; False for the interval of these agents in other scenes.
 
     Raises:
       InputError: results not finite or out of range.
@@ -85,7 +87,7 @@ def build_row(
         if in_bucket.any():
             clusters = scene_clusters(episodes.floor_plans[in_bucket], episodes.room[in_bucket])
             for metric_name, metric_values in scaled_metrics.items():
-                is_trained = variant not in UNTRAINED_VARIANTS
+                is_trained = trained and variant not in UNTRAINED_VARIANTS
                 interval = mean_interval(metric_values[:, in_bucket], clusters, trained=is_trained)
                 buckets[bucket_name][metric_name] = interval.to_json()
 
@@ -111,9 +113,10 @@ def build_difference(
     *,
     epsilon: float | None,
     form: Form | None,
-    decoding: Decoding,
+    decoding: RowDecoding,
     episodes: EpisodeList,
     same_runs: bool = False,
+    trained: bool = True,
 ) -> dict[str, Any]:
     """Build one paired difference, `compared - reference` over all episodes, in the report's units.
 
@@ -126,6 +129,7 @@ def build_difference(
       decoding: rule that turns logits into actions, equal for both variants.
       episodes: the E episodes.
       same_runs: True if equal seed indices are the same network (see `paired_difference`).
+      trained: see `build_row`.
 
     Raises:
       InputError: results not finite or out of range.
@@ -139,6 +143,7 @@ def build_difference(
         _to_report_units(metric, compared_results),
         episodes.clusters(),
         same_runs=same_runs,
+        trained=trained,
     )
     return {
         "metric": metric,
@@ -392,7 +397,9 @@ def _lines_by_heading(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]
             cells.append(f"{row[metric]['mean']:.1f}")
 
         # Rows are compared within one world, split and decoding only.
-        heading = f"{row['world']} {row['split']}, {row['decoding']} decoding"
+        heading = f"{row['world']} {row['split']}"
+        if row["decoding"] != "own":
+            heading += f", {row['decoding']} decoding"
         table_lines.setdefault(heading, []).append(tuple(cells))
     return table_lines
 
@@ -404,6 +411,10 @@ def row_label(row: dict[str, Any]) -> str:
             return "Shortest path (oracle)"
         case "random":
             return "Random"
+        case "frontier":
+            return "Frontier search"
+        case "agent":
+            return row["method"]
         case "baseline":
             return f"{row['method']} (baseline)"
         case "layout":
@@ -422,8 +433,10 @@ def row_label(row: dict[str, Any]) -> str:
 
 def difference_label(difference: dict[str, Any]) -> str:
     """Name of a report's paired difference, as printed in tables."""
-    compared = row_label({**difference, "variant": difference["to"], "method": ""})
-    reference = "+ w" if difference["from"] == "layout" else difference["from"]
+    compared = row_label({"method": "", **difference, "variant": difference["to"]})
+    reference = {"layout": "+ w", "random": "Random", "frontier": "Frontier search"}.get(
+        difference["from"], difference["from"]
+    )
     return f"{compared} vs. {reference}"
 
 
@@ -442,7 +455,7 @@ class ExperienceLead(NamedTuple):
 
     row_index: int
     variant: str
-    decoding: Decoding
+    decoding: RowDecoding
     metric: str
     lead: Interval
     remaining: Interval | None

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.causal import FORMS
-from jaxnav.choices import Decoding, Form, Removal, Variant
+from jaxnav.choices import Form, Removal, RowDecoding, Variant
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import MAX_EPISODES
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
@@ -29,18 +29,18 @@ class EvaluationRow(NamedTuple):
       variant: the evaluated variant.
       epsilon: threshold of soft removal; None for other variants.
       form: how counterfactual logits are combined; None for variants without counterfactual.
-      decoding: `argmax` or `sample`.
+      decoding: `argmax`, `sample`, or `own` for an agent that is no policy of jaxnav.
     """
 
     variant: Variant
     epsilon: float | None
     form: Form | None
-    decoding: Decoding
+    decoding: RowDecoding
 
     @property
     def arm(self) -> Literal["baseline", "layout"] | None:
         """Training arm whose policies the row uses; None if it uses no policy."""
-        if self.variant in ("random", "oracle"):
+        if self.variant in ("random", "frontier", "oracle", "agent"):
             return None
         return "baseline" if self.variant == "baseline" else "layout"
 
@@ -96,7 +96,7 @@ def table_rows(
     return [*trained_rows, table_row("random", None, None, "sample")]
 
 
-def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: Decoding) -> EvaluationRow:
+def table_row(variant: Variant, epsilon: float | None, form: Form | None, decoding: RowDecoding) -> EvaluationRow:
     """Make one row, dropping the settings that its variant does not use.
 
     Raises:

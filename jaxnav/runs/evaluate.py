@@ -1,4 +1,4 @@
-"""Evaluation of a run on fixed episodes.
+"""Evaluation of runs, policies and agents on fixed episodes.
 
 `evaluate` measures every variant of the run's policies (baseline, layout weights, complete removal of experience, and
 soft removal at every epsilon) and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many
@@ -6,8 +6,6 @@ epsilons and all seeds in one compiled call, and `sweep_shifts` does so at sever
 compares results with those of layout-blind agents, and `replay_episodes` plays episodes step by step.
 """
 
-import csv
-import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -22,7 +20,7 @@ from rich.table import Table
 from jaxnav.baselines.shortest_path import run_oracle
 from jaxnav.choices import Costs, CounterfactualMemory, Decoding, EstimatorName, Form, Removal, ShiftKind
 from jaxnav.errors import InputError
-from jaxnav.evaluation.episodes import EpisodeList, draw_episodes, join_episode_lists
+from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
 from jaxnav.evaluation.notes import budget_note, convergence_note, decision_share_notes, evaluation_notes
 from jaxnav.evaluation.playback import EpisodeTrace, play_episodes
@@ -31,10 +29,8 @@ from jaxnav.evaluation.report import (
     ExperienceLead,
     build_difference,
     build_report,
-    build_row,
     remaining_share,
     row_label,
-    write_report,
 )
 from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
@@ -48,15 +44,16 @@ from jaxnav.evaluation.variants import (
 )
 from jaxnav.policies.methods import find_method, method_label
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.evaluate_agents import evaluate_agents
 from jaxnav.runs.policies import (
     CONFIG_FILE,
     Policies,
-    config_for_task,
     is_policy,
     list_packaged_policies,
     load_policy_as_run,
 )
 from jaxnav.runs.policy import LoadedPolicy
+from jaxnav.runs.results import Results, build_result_rows
 from jaxnav.runs.run import Run, run_settings
 from jaxnav.runs.share_report import (
     build_decision_shares,
@@ -66,55 +63,24 @@ from jaxnav.runs.share_report import (
     measure_costs,
     rows_with_shares,
 )
-from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, prefetch_env_params
+from jaxnav.runs.subjects import AgentSubject, find_subject, policy_in_memory_as_run
+from jaxnav.runs.worlds import (
+    CompiledWorld,
+    compile_evaluation_world,
+    draw_episode_lists,
+    evaluation_shift,
+    prefetch_env_params,
+)
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.store.files import expand_home, write_atomic
+from jaxnav.store.files import expand_home
 
 #: Usual thresholds of a sweep.
 SWEPT_THRESHOLDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
-class Results(NamedTuple):
-    """Results of an evaluation with R rows, S seeds and E episodes.
-
-    Attributes:
-      rows: rows of the table.
-      outcome: outcomes of the episodes, leaves [R, S, E].
-      episodes: the episodes.
-      categories: names of the K categories.
-      budgets: numbers of actions within which success is counted too.
-      report: table, paired differences, settings and versions, as JSON.
-    """
-
-    rows: list[EvaluationRow]
-    outcome: EpisodeOutcome
-    episodes: EpisodeList
-    categories: tuple[str, ...]
-    budgets: tuple[int, ...]
-    report: dict[str, Any]
-
-    def metrics(self) -> dict[str, np.ndarray]:
-        """Metrics of every episode, float64 [R, S, E].
-
-        All metrics are in [0, 1], except for `dts`, which is in metres; see `episode_metrics`.
-        """
-        return episode_metrics(self.outcome, self.episodes.best_length, self.budgets)
-
-    def write(self, path: Path) -> None:
-        """Write the report, and next to it a CSV file with a line per row, seed and episode.
-
-        Raises:
-          OSError: a file cannot be written.
-        """
-        # `eval-val.json` is accompanied by `eval-val.episodes.csv`.
-        write_report(path, self.report)
-        csv_path = path.with_name(f"{path.name.removesuffix('.json')}.episodes.csv")
-        write_atomic(csv_path, _format_csv(self).encode())
-
-
 def evaluate(
-    run: Run | str | Path,
+    subject: Any,
     *,
     split: str = "val",
     scenes: Path | None = None,
@@ -134,13 +100,22 @@ def evaluate(
     compiled: CompiledWorld | None = None,
     console: Console | None = None,
 ) -> Results:
-    """Evaluate a run on fixed episodes, in one compiled call.
+    """Evaluate a run, a policy or an agent of your own on fixed episodes.
+
+    All subjects meet the same episodes. The results of a run have a row for each of its variants; those of an agent
+    stand beside Random, frontier search and the shortest path.
 
     Args:
-      run: a finished run, or its directory.
+      subject: one of
+        a finished run, or its directory;
+        an exported policy: a `LoadedPolicy`, its folder, or the name of a packaged one, such as `rooms-org`;
+        an agent: an object with `init` and `act`, an object with `predict`, or a function of a batch of observations;
+        a list of agents, one for each training seed;
+        `package.module:AGENT`, which names any of them.
+        `docs/evaluate_your_agent.md` describes agents and their observations.
       split: split of the scenes.
-      scenes: scene file to read in place of the run's scenes.
-      world: generated world to use in place of the run's scenes, with the categories and rules of the run.
+      scenes: scene file to read in place of the generated scenes, or of those of the run.
+      world: generated world; None for `rooms` or the world of the run or policy, whose categories and rules remain.
       shift: layout shift, from 0 to 1; None for the run's, and 0 with `scenes` or `world`.
       shift_by: categories that exchange their places: neighbours in size (`size`), or the ones whose exchange misleads
         most (`context`); see `exchange_places`.
@@ -162,13 +137,41 @@ def evaluate(
       console: console for progress; None for silence.
 
     Raises:
-      InputError: the run is not finished, or an argument is impossible.
+      InputError: the run is not finished, the subject is no agent or returns wrong actions, or an argument is
+        impossible.
     """
     check_seed(seed)
     console = console or Console(quiet=True)
-    run = run if isinstance(run, Run) else Run.open(run)
-    config = run.config
-    policies = run.policies().with_estimator(setting, hold).with_inner_steps(inner_steps)
+    found_subject = find_subject(subject)
+    if isinstance(found_subject, AgentSubject):
+        policy_options = {
+            "epsilon": tuple(epsilon) != (0.5,),
+            "form": form is not None,
+            "setting": setting is not None,
+            "hold": hold,
+            "removal": tuple(removal) != ("tde",),
+            "counterfactual_memory": counterfactual_memory is not None,
+            "inner_steps": inner_steps is not None,
+            "costs": costs != "categories",
+        }
+        _refuse_policy_options(found_subject.name, policy_options)
+        return evaluate_agents(
+            found_subject,
+            split=split,
+            scenes=scenes,
+            world=world,
+            shift=shift,
+            shift_by=shift_by,
+            num_episodes=episodes,
+            seed=seed,
+            console=console,
+        )
+
+    # A single policy has no other training seeds, so its intervals are over scenes alone.
+    config = found_subject.config
+    run = found_subject.run
+    is_run = run is not None
+    policies = found_subject.policies.with_estimator(setting, hold).with_inner_steps(inner_steps)
     policies = policies.with_counterfactual_memory(counterfactual_memory)
     if "cde" in removal:
         policies.with_own_fallback()  # refuses policies that cannot act without experience
@@ -223,17 +226,22 @@ def evaluate(
         results.episodes,
         has_room_prior=policies.has_room_priors,
         has_experience=not policies.spec.method.experience.is_empty,
+        is_run=is_run,
     )
     report_notes = [
         *limit_notes,
         *(decision_share_notes(decision_shares) if not policies.spec.method.experience.is_empty else []),
-        budget_note(steps_by_purpose),
-        *convergence_note(run.log()),
+        *([budget_note(steps_by_purpose), *convergence_note(run.log())] if run is not None else []),
     ]
-    report_settings = run_settings(config) | {
-        "steps_per_policy": config.total_updates * config.steps_per_update,
-        "prior_steps": policies.prior_steps,
-        "budget": steps_by_purpose,
+    if is_run:
+        subject_settings = run_settings(config) | {
+            "steps_per_policy": config.total_updates * config.steps_per_update,
+            "prior_steps": policies.prior_steps,
+            "budget": steps_by_purpose,
+        }
+    else:
+        subject_settings = {"subject": found_subject.name, "method": config.method, "world": config.world, "seeds": 1}
+    report_settings = subject_settings | {
         "evaluation_source": str(scenes or world or config.scene_source),
         "evaluation_shift": applied_shift,
         "evaluation_shift_by": shift_by,
@@ -244,14 +252,29 @@ def evaluate(
         "evaluation_counterfactual_memory": policies.spec.counterfactual_memory,
     }
     report = build_report(
-        _build_rows(results, names),
-        _build_differences(results),
+        build_result_rows(results, names, trained=is_run),
+        _build_differences(results, trained=is_run),
         report_notes,
         compilations,
         report_settings,
         decision_shares,
     )
     return results._replace(report=report)
+
+
+def _refuse_policy_options(name: str, is_given: dict[str, bool]) -> None:
+    """Refuse options that apply to the experience of policies, of which other agents have none.
+
+    Args:
+      name: name of the agent.
+      is_given: which options are given, by name.
+    """
+    for option, is_option_given in is_given.items():
+        if is_option_given:
+            raise InputError(
+                f"--{option.replace('_', '-')}: {name} is an agent whose experience jaxnav cannot remove; omit the "
+                "option, or give a run or a policy"
+            )
 
 
 def evaluate_rows(
@@ -367,12 +390,6 @@ def _add_fallback_rows(
     return table_order, outcome, compilations
 
 
-def draw_episode_lists(world: CompiledWorld, num_episodes: int, seed: int) -> list[EpisodeList]:
-    """Draw fixed episodes, equally many in every bank of scenes."""
-    episodes_per_bank = -(-num_episodes // len(world.banks))  # rounded up
-    return [draw_episodes(bank, episodes_per_bank, seed, index) for index, bank in enumerate(world.banks)]
-
-
 def check_seed(seed: int) -> None:
     """Check that a seed fits NumPy's generators.
 
@@ -398,25 +415,7 @@ def _append_row(outcome: EpisodeOutcome, row_outcome: EpisodeOutcome) -> Episode
     return jax.tree.map(append_leaf, outcome, row_outcome)
 
 
-def _build_rows(results: Results, names: dict[str, str]) -> list[dict[str, Any]]:
-    """Rows of the report's table."""
-    metrics = results.metrics()
-    report_rows = []
-    for index, row in enumerate(results.rows):
-        report_row = build_row(
-            variant=row.variant,
-            **names,
-            epsilon=row.epsilon,
-            decoding=row.decoding,
-            form=row.form,
-            metrics={name: metric_values[index] for name, metric_values in metrics.items()},
-            episodes=results.episodes,
-        )
-        report_rows.append(report_row)
-    return report_rows
-
-
-def _build_differences(results: Results) -> list[dict[str, Any]]:
+def _build_differences(results: Results, *, trained: bool) -> list[dict[str, Any]]:
     """Paired differences of the report: layout weights to the baseline, and removals to the layout weights."""
     metrics = results.metrics()
     rows = results.rows
@@ -442,40 +441,10 @@ def _build_differences(results: Results) -> list[dict[str, Any]]:
                 decoding=row.decoding,
                 episodes=results.episodes,
                 same_runs=reference_variant == "layout",
+                trained=trained,
             )
             difference_rows.append(difference_row)
     return difference_rows
-
-
-def _format_csv(results: Results) -> str:
-    """CSV with a line per row, seed and episode."""
-    metrics = results.metrics()
-    outcome = results.outcome
-    episodes = results.episodes
-    csv_buffer = io.StringIO()
-    csv_writer = csv.writer(csv_buffer, lineterminator="\n")
-    episode_columns = ["scene", "room", "goal", "start_pose", "best_length"]
-    # Header.
-    csv_writer.writerow([*EvaluationRow._fields, "seed", *episode_columns, "length", *metrics, "mean_weight"])
-
-    # Cells that all rows and seeds share.
-    episode_cells = []
-    for scene, room, goal, pose, best_length in zip(
-        episodes.scene, episodes.room, episodes.goal, episodes.pose, episodes.best_length, strict=True
-    ):
-        names = (episodes.scenes[scene], episodes.rooms[room], results.categories[goal])
-        episode_cells.append((*names, pose, best_length))
-
-    # Measured values, with M columns.
-    num_seeds = outcome.length.shape[1]
-    metric_columns = (outcome.length, *metrics.values(), outcome.mean_weight)
-    measured_values = np.stack(metric_columns, axis=-1)  # [R, S, E, M]
-    for row_index, row in enumerate(results.rows):
-        for seed in range(num_seeds):
-            metric_values = measured_values[row_index, seed].tolist()
-            for cells_of_episode, episode_values in zip(episode_cells, metric_values, strict=True):
-                csv_writer.writerow((*row, seed, *cells_of_episode, *map("{:.6g}".format, episode_values)))
-    return csv_buffer.getvalue()
 
 
 class Sweep(NamedTuple):
@@ -674,7 +643,7 @@ def _load_layout_policies(
     if isinstance(source, LoadedPolicy):
         if setting is not None or hold:
             raise InputError("setting, hold: give them to jaxnav.load_policy, which loaded this policy")
-        config, policies = _policy_in_memory_as_run(source)
+        config, policies = policy_in_memory_as_run(source)
     elif not isinstance(source, Run) and is_policy(source):
         config, policies = load_policy_as_run(source)
     else:
@@ -705,27 +674,6 @@ def _open_run(source: Run | str | Path) -> Run:
             f"give a packaged policy: {packaged_names}"
         )
     return Run.open(source)
-
-
-def _policy_in_memory_as_run(policy: LoadedPolicy) -> tuple[RunConfig, Policies]:
-    """Treat a loaded policy as if a run had trained it with one seed."""
-    arm = "baseline" if policy.estimator_config is None else "layout"
-    config = config_for_task(policy.task, policy.spec.method.name, arm)
-    if config is None:
-        raise InputError(
-            "the policy was trained for a task that no generated world has; give the run that it comes from"
-        )
-    policies = Policies(
-        params=jax.tree.map(lambda leaf: leaf[None], policy.params),
-        arms=config.arms,
-        knowledge=policy.knowledge,
-        prior_counts=jnp.zeros_like(policy.knowledge.layout),  # only needed to replace the estimator
-        spec=policy.spec,
-        estimator_config=policy.estimator_config,
-        prior_steps=0,
-        task=policy.task,
-    )
-    return config, policies
 
 
 def _source_name(source: Run | LoadedPolicy | str | Path) -> str:

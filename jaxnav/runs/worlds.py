@@ -18,6 +18,7 @@ from jaxnav.choices import ShiftKind
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.policies.method import Knowledge, Method
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import count_unknown_types, format_most_common
@@ -293,6 +294,12 @@ def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
         num_scenes=len(bank.names),
         fingerprint="-".join(world.fingerprint for world in worlds),
     )
+
+
+def draw_episode_lists(world: CompiledWorld, num_episodes: int, seed: int) -> list[EpisodeList]:
+    """Draw fixed episodes, equally many in every bank of scenes."""
+    episodes_per_bank = -(-num_episodes // len(world.banks))  # rounded up
+    return [draw_episodes(bank, episodes_per_bank, seed, index) for index, bank in enumerate(world.banks)]
 
 
 def draw_bank_order(world: CompiledWorld, seed: int, num_turns: int) -> list[int]:
