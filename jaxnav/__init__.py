@@ -1,6 +1,6 @@
 """Layout-based causal inference for object navigation, in JAX.
 
-Make an environment with `make`, train a method with `train`, evaluate a run with `evaluate` or `sweep`, and act with an
+Make an environment with `make`, train a method with `train`, score a run or any agent with `evaluate`, and act with an
 exported policy from `load_policy`. `METHODS` and `Method` are the starting points for a method of your own, `Scene` and
 `compile_bank` for scenes of your own, `layout` and `causal` hold the paper's equations. `__all__` lists the public
 interface; import anything else from its own module.
@@ -29,9 +29,10 @@ if TYPE_CHECKING:
     from jaxnav.policies.testing import check_method
     from jaxnav.registry import registered
     from jaxnav.runs.config import RunConfig
-    from jaxnav.runs.evaluate import Results, Sweep, evaluate, sweep
+    from jaxnav.runs.evaluate import Sweep, evaluate, sweep
     from jaxnav.runs.policies import Policies
     from jaxnav.runs.policy import LoadedPolicy, PolicyOutput, load_policy
+    from jaxnav.runs.results import Results
     from jaxnav.runs.run import Run
     from jaxnav.runs.train import train
     from jaxnav.scenes.lattice import standable_cells
@@ -143,9 +144,10 @@ _NAMES_BY_MODULE = {
     "policies.testing": ("check_method",),
     "registry": ("registered",),
     "runs.config": ("RunConfig",),
-    "runs.evaluate": ("Results", "Sweep", "evaluate", "sweep"),
+    "runs.evaluate": ("Sweep", "evaluate", "sweep"),
     "runs.policies": ("Policies",),
     "runs.policy": ("LoadedPolicy", "PolicyOutput", "load_policy"),
+    "runs.results": ("Results",),
     "runs.run": ("Run",),
     "runs.train": ("train",),
     "scenes.lattice": ("standable_cells",),

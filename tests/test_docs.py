@@ -124,6 +124,14 @@ def test_python_blocks_of_own_detections_run():
     run_python_blocks(DOCS / "own_detections.md")
 
 
+def test_python_blocks_of_evaluate_your_agent_run(capsys):
+    """The searcher beats Random in the few episodes of the page."""
+    names = run_python_blocks(DOCS / "evaluate_your_agent.md")
+    searcher, random = names["results"].metrics()["sr"].mean(axis=(1, 2))[:2]
+    assert searcher > random
+    assert names["compiled"].rows[0].variant == "agent"
+
+
 @pytest.mark.slow
 def test_recipe_of_rejax_trains():
     """The returns before and after training that the page states."""

@@ -144,6 +144,13 @@ def name_evaluation(command: str, split: str, world: str | None, scenes: Path | 
     return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:_MAX_NAME_LENGTH]}-{_short_digest(name)}"
 
 
+def name_subject(subject: str) -> str:
+    """Return the part of a file name that stands for a policy or an agent: its name, or that of its folder."""
+    if os.sep in subject:
+        return name_path(Path(subject))
+    return re.sub(r"[^A-Za-z0-9._-]", "_", subject)[: _MAX_NAME_LENGTH // 2]
+
+
 def name_path(path: Path) -> str:
     """Return the part of a file name that stands for a path: the start of its last name, and a digest of the whole."""
     readable_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name.removesuffix(".gz").removesuffix(".jsonl"))

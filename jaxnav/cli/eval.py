@@ -1,4 +1,4 @@
-"""The eval command: evaluate a run, or print a finished evaluation again.
+"""The eval command: evaluate a run, a policy or an agent, or print a finished evaluation again.
 
 An evaluation is printed as a table, and written as JSON and as a CSV file with a row per episode.
 """
@@ -16,6 +16,7 @@ from jaxnav.cli.console import (
     make_result_console,
     name_evaluation,
     name_numbers,
+    name_subject,
     parse_arguments,
     print_table,
     refuse_folder,
@@ -24,8 +25,9 @@ from jaxnav.cli.console import (
     write_latest,
 )
 from jaxnav.errors import InputError
+from jaxnav.store.files import expand_home
 
-DESCRIPTION = "Evaluate the policies of a run, or print a finished evaluation again."
+DESCRIPTION = "Evaluate a run, a policy or an agent of your own, or print a finished evaluation again."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +35,15 @@ class EvalConfig:
     """Options of the eval command.
 
     Attributes:
-      run: run directory to evaluate, or the JSON file of a finished evaluation to print.
+      subject: what to evaluate: a run directory, the folder of an exported policy, the name of a packaged policy, such
+        as `rooms-org`, or an agent of your own as `package.module:AGENT`, which stands beside Random, frontier search
+        and the shortest path; or the JSON file of a finished evaluation to print.
       split: scenes to evaluate on.
-      scenes: scene file to use instead of the scenes of the run.
-      world: generated world to use instead of the scenes of the run. The categories and rules remain those of the run.
-      shift: layout shift of the scenes, from 0 (as in training) to 1. The default is the shift of the run, and 0 with
-        `--scenes` or `--world`.
+      scenes: scene file to use instead of the scenes of the run or of the generated world.
+      world: generated world to use. The default is `rooms` for an agent, and the world of a run or a policy, whose
+        categories and rules remain.
+      shift: layout shift of the scenes, from 0 (as in training) to 1. The default is the shift of the run, and 0 for
+        agents and policies and with `--scenes` or `--world`.
       shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
         `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       episodes: number of fixed episodes, at least 1, balanced over room types and scenes.
@@ -66,11 +71,12 @@ class EvalConfig:
         part, on all episodes. The shares of decisions that change are always measured.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
       json: JSON file to write. The default is a name after the options, such as `eval-val-shift1-seed3.json`, in the
-        run directory, where `latest-eval.txt` names the newest evaluation.
+        run directory, where `latest-eval.txt` names the newest evaluation; for policies and agents, in the working
+        directory, with the name of the subject.
       format: format in which the evaluation is printed.
     """
 
-    run: Path
+    subject: str
     split: Literal["train", "val", "test"] = "val"
     scenes: Path | None = None
     world: Literal["rooms", "apartments", "houses"] | None = None
@@ -96,8 +102,9 @@ def main(arguments: list[str] | None = None, prog: str = "jaxnav eval") -> int:
 
 
 def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
-    """Evaluate a run, or read the file of an evaluation, and print the report."""
-    if config.run.is_file() or config.run.suffix == ".json":
+    """Evaluate a subject, or read the file of an evaluation, and print the report."""
+    path = expand_home(config.subject)
+    if path.is_file() or path.suffix == ".json":
         _print_report(_read_finished_report(config), config.format)
         return
     from jaxnav.runs.evaluate import evaluate
@@ -105,7 +112,7 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
     # Find the file first: an evaluation takes minutes.
     target = _find_target(config)
     results = evaluate(
-        config.run,
+        config.subject,
         split=config.split,
         scenes=config.scenes,
         world=config.world,
@@ -131,19 +138,20 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
             write_latest("eval", target)
     num_compilations = results.report["compilations"]
     plural = "" if num_compilations == 1 else "s"
+    compilation_text = f", {num_compilations} compilation{plural}" if num_compilations else ""
     num_episodes = len(results.episodes.goal)
-    console.print(f"{num_episodes} episodes, {num_compilations} compilation{plural}; written to {target}")
+    console.print(f"{num_episodes} episodes{compilation_text}; written to {target}")
 
 
 def _read_finished_report(config: EvalConfig) -> dict[str, Any]:
     """Read the report of a finished evaluation, for which only `--format` is an option."""
     from jaxnav.evaluation.report import read_report
 
-    report = read_report(config.run)
+    report = read_report(expand_home(config.subject))
     for field in dataclasses.fields(config):
-        if field.name not in ("run", "format") and getattr(config, field.name) != field.default:
+        if field.name not in ("subject", "format") and getattr(config, field.name) != field.default:
             option = f"--{field.name.replace('_', '-')}"
-            raise InputError(f"{option}: {config.run} is a finished evaluation; omit the option or give a run")
+            raise InputError(f"{option}: {config.subject} is a finished evaluation; omit the option or give a run")
     return report
 
 
@@ -176,6 +184,8 @@ def _print_report(report: dict[str, Any], report_format: str) -> None:
 
 def _find_target(config: EvalConfig) -> Path:
     """Return the JSON file to write, or raise an `InputError` before anything is evaluated."""
+    from jaxnav.runs.policies import is_policy
+
     details = (
         None if config.shift is None else name_numbers("shift", [config.shift]),
         None if config.shift_by == EvalConfig.shift_by else f"by-{config.shift_by}",
@@ -190,7 +200,14 @@ def _find_target(config: EvalConfig) -> Path:
         None if config.costs == EvalConfig.costs else f"costs-{config.costs}",
         None if config.seed == EvalConfig.seed else f"seed{config.seed}",
     )
-    name = name_evaluation("eval", config.split, config.world, config.scenes, *details)
-    target = config.json or config.run / f"{name}.json"
+    # Results of a run lie in its directory; others in the working directory, with the name of the subject.
+    folder = expand_home(config.subject)
+    command = "eval"
+    is_agent = ":" in config.subject and not folder.exists()
+    if is_agent or is_policy(config.subject):
+        command = f"eval-{name_subject(config.subject)}"
+        folder = Path()
+    name = name_evaluation(command, config.split, config.world, config.scenes, *details)
+    target = config.json or folder / f"{name}.json"
     refuse_folder(target, "--json")
     return target

@@ -219,7 +219,7 @@ def _run_step_agent(
     def select(batch: EpisodeBatch) -> tuple[State, jax.Array, jax.Array]:
         return batch.agent.state, batch.agent.memory.is_invalid, batch.agent.memory.invalid_action
 
-    outcome, (final_state, is_invalid, invalid_action) = run_to_end(batch, step, select)
+    outcome, (final_state, is_invalid, invalid_action) = run_to_end(batch, step, select, divisors=())
     return finish_outcome(outcome, final_state, loop.env, env_params), (is_invalid, invalid_action)
 
 

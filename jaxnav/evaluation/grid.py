@@ -299,7 +299,10 @@ def advance_batch(
 
 
 def run_to_end(
-    batch: EpisodeBatch, step: Callable[[EpisodeBatch], EpisodeBatch], select: Callable[[EpisodeBatch], Tree]
+    batch: EpisodeBatch,
+    step: Callable[[EpisodeBatch], EpisodeBatch],
+    select: Callable[[EpisodeBatch], Tree],
+    divisors: Sequence[int] = _BATCH_DIVISORS,
 ) -> tuple[EpisodeOutcome, Tree]:
     """Step a batch of E episodes until all of them have ended.
 
@@ -307,6 +310,8 @@ def run_to_end(
       batch: the episodes at their start.
       step: advances every running episode of a batch of any size.
       select: returns further leaves [B, ...] of a batch to keep of every episode.
+      divisors: once at most E / divisor episodes still run, the batch shrinks to that size. Each size compiles the step
+        anew; () keeps the whole batch, for steps that compile for longer than they run.
 
     Returns:
       The outcomes, leaves [E], before `finish_outcome`; and the selected leaves at the end of every episode, [E, ...].
@@ -321,7 +326,7 @@ def run_to_end(
 
     # Carry on with ever smaller batches: whenever enough episodes have ended, keep only those that still run. The loop
     # is unrolled, one `while_loop` for each static batch size.
-    smaller_sizes = [num_episodes // divisor for divisor in _BATCH_DIVISORS if num_episodes >= divisor]
+    smaller_sizes = [num_episodes // divisor for divisor in divisors if num_episodes >= divisor]
     for next_size in (*smaller_sizes, 0):
         batch = run_until(batch, max_running=next_size)
         episode_table = _write_rows(episode_table, batch_ids, (batch.outcome, select(batch)))

@@ -143,7 +143,11 @@ def test_eval_is_reproducible_byte_for_byte(run_dir, report_file, tmp_path):
 def test_eval_report_names_differ_for_a_world_and_a_file():
     run_path = Path("run")
     scene_file = Path("elsewhere/rooms.jsonl.gz")
-    configs = [EvalConfig(run_path), EvalConfig(run_path, world="rooms"), EvalConfig(run_path, scenes=scene_file)]
+    configs = [
+        EvalConfig(str(run_path)),
+        EvalConfig(str(run_path), world="rooms"),
+        EvalConfig(str(run_path), scenes=scene_file),
+    ]
     report_names = [str(_find_target(config)) for config in configs]
     assert report_names[:2] == ["run/eval-val.json", "run/eval-rooms-val.json"]
     assert re.fullmatch("run/eval-scenes-rooms-[0-9a-f]{8}-val.json", report_names[2])
@@ -174,12 +178,12 @@ OTHER_OPTIONS = {
 
 def test_evaluations_of_other_settings_have_other_files():
     fields = {field.name for field in dataclasses.fields(EvalConfig)}
-    assert OTHER_OPTIONS.keys() == fields - {"run", "json", "format"}
+    assert OTHER_OPTIONS.keys() == fields - {"subject", "json", "format"}
 
     run_path = Path("run")
-    configs = [EvalConfig(run_path), EvalConfig(run_path, seed=1, hold=True)]
+    configs = [EvalConfig(str(run_path)), EvalConfig(str(run_path), seed=1, hold=True)]
     for name, values in OTHER_OPTIONS.items():
-        configs += [dataclasses.replace(EvalConfig(run_path), **{name: value}) for value in values]
+        configs += [dataclasses.replace(EvalConfig(str(run_path)), **{name: value}) for value in values]
     targets = [_find_target(config) for config in configs]
     assert len({str(target).lower() for target in targets}) == len(configs)
     for config, target in zip(configs, targets, strict=True):
@@ -188,10 +192,10 @@ def test_evaluations_of_other_settings_have_other_files():
         assert re.fullmatch(r"eval-[A-Za-z0-9._-]{1,200}\.json", target.name)
 
     # How a report is printed changes no name, and a scene file has one name by any path.
-    assert _find_target(EvalConfig(run_path, format="json")) == targets[0]
+    assert _find_target(EvalConfig(str(run_path), format="json")) == targets[0]
     scene_path = Path("homes.jsonl.gz")
-    absolute_config = EvalConfig(run_path, scenes=Path.cwd() / scene_path)
-    assert _find_target(EvalConfig(run_path, scenes=scene_path)) == _find_target(absolute_config)
+    absolute_config = EvalConfig(str(run_path), scenes=Path.cwd() / scene_path)
+    assert _find_target(EvalConfig(str(run_path), scenes=scene_path)) == _find_target(absolute_config)
 
 
 # Layout shifts, scene files and other worlds
