@@ -16,10 +16,12 @@ import jaxnav
 from jaxnav.causal import removal_weight
 from jaxnav.choices import EstimatorName
 from jaxnav.env.objectnav import EnvParams
-from jaxnav.layout import EstimatorConfig, LayoutEstimator, prior_from_counts
-from jaxnav.viz.style import (
+from jaxnav.env.render import (
     AGENT_COLOR,
     GOAL_COLOR,
+)
+from jaxnav.layout import EstimatorConfig, LayoutEstimator, prior_from_counts
+from jaxnav.viz.style import (
     MUTED_COLOR,
     TEXT_COLOR,
     freeze_axes_positions,

@@ -42,18 +42,32 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
       categories: names of the detected categories, by index.
     """
 
-    def __init__(self, world: str = "rooms", **options: Any) -> None:
+    metadata: NamedValues = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}  # noqa: RUF012
+
+    def __init__(self, world: str = "rooms", *, render_mode: str | None = None, **options: Any) -> None:
         """Make the scenes; the options are those of `jaxnav.make`.
 
+        Args:
+          world: name of the world.
+          render_mode: `rgb_array` or `ansi`, see `ObjectNav.render`; None without pictures.
+          options: further options of `jaxnav.make`.
+
         Raises:
-          InputError: see `jaxnav.make`, and a process that was forked, in which JAX would wait forever.
+          InputError: see `jaxnav.make`; an unknown render mode; and a process that was forked, in which JAX would wait
+            forever.
         """
         if os.getpid() != _IMPORT_PROCESS_ID:
             raise InputError(
                 "vectorization_mode='async': JAX hangs in forked processes; omit the mode, to step all environments in "
                 "one compiled call, or give vector_kwargs={'context': 'spawn'}"
             )
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode {render_mode!r}: choose rgb_array, ansi or None")
         env, params = make(world, **options)
+        self.render_mode = render_mode
+        self._env = env
+        self._params = params
+        self._path: list[int] = []  # poses of the episode so far
         self._batched_env = _BatchedEnv(env, params)
         self._episodes: EpisodeState | None = None  # leaves [1]
         self.observation_space = observation_space(env)
@@ -64,17 +78,32 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         """Start an episode."""
         super().reset(seed=seed)
         self._episodes, observations = self._batched_env.reset(_draw_keys(self.np_random, 1))
+        self._path = [int(self._episodes.state.pose[0])]
         return _select_env(to_numpy(observations), 0), {}
 
     def step(self, action: Any) -> tuple[NamedValues, float, bool, bool, NamedValues]:
         """Take an action; `info["success"]` is True for a successful Done."""
         actions = _validate_actions(self.action_space, self._episodes, action)
         self._episodes, observations, signals = self._batched_env.advance(self._episodes, actions[None])
+        self._path.append(int(self._episodes.state.pose[0]))
 
         # Gymnasium expects Python scalars; the single environment is a batch of one.
         observation = _select_env(to_numpy(observations), 0)
         step_info = {"success": signals.success.item()}
         return observation, signals.reward.item(), signals.terminated.item(), signals.truncated.item(), step_info
+
+    def render(self) -> Any:
+        """Draw the episode in the render mode: uint8 [height, width, 3], or text; None without a render mode.
+
+        Raises:
+          ResetNeeded: `reset` was not called before.
+        """
+        if self.render_mode is None:
+            return None
+        if self._episodes is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        state = jax.tree.map(lambda leaf: np.asarray(leaf[0]), self._episodes.state)
+        return self._env.render(state, self._params, mode=self.render_mode, path=self._path[:-1])
 
 
 class ObjectNavVectorEnv(VectorEnv[NamedValues, np.ndarray, np.ndarray]):

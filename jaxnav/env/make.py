@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, ObjectNav, SceneTables, prior_index
+from jaxnav.env.render import SceneRenderers
 from jaxnav.errors import InputError
 from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.task import Task
@@ -62,7 +63,8 @@ def make(
         env = dataclasses.replace(env, near_starts=world_config.near_starts)
     else:
         env, params = build_environment(bank, {"living_room": world_config.large_step_limit}, world_config.step_limit)
-    return dataclasses.replace(env, bundled_params=params), params
+    renderers = SceneRenderers(shifted_scenes, bank.names, task)
+    return dataclasses.replace(env, bundled_params=params, renderers=renderers), params
 
 
 def build_environment(

@@ -17,14 +17,17 @@ Symbols in shapes: S scenes, C cells, H headings, P = C * H * horizons poses, K 
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxnav.env.render import SceneRenderers
 from jaxnav.env.spaces import Box, Dict, Discrete
+from jaxnav.errors import InputError
 from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, RowFormat
@@ -134,12 +137,14 @@ class ObjectNav:
       near_starts: probability that an episode starts near its goal, in the nearest of `NUM_START_CANDIDATES` random
         cells.
       bundled_params: parameters made together with the environment by `jaxnav.make`.
+      renderers: renderers of the scenes of `jaxnav.make`; see `render`.
     """
 
     task: Task
     shaping: float = 0.0
     near_starts: float = 0.0
     bundled_params: EnvParams | None = dataclasses.field(default=None, compare=False, repr=False)
+    renderers: SceneRenderers | None = dataclasses.field(default=None, compare=False, repr=False)
 
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
         """Start an episode.
@@ -274,7 +279,7 @@ class ObjectNav:
         horizon = jnp.clip(horizon + is_action(LOOK_DOWN) - is_action(LOOK_UP), 0, num_horizons - 1)
         return self.task.rules.join_pose(cell, heading, horizon)
 
-    def cell_of_pose(self, pose: jax.Array) -> jax.Array:
+    def cell_of_pose(self, pose: Any) -> Any:
         """Cell of a pose, int32 [], numbered over all scenes."""
         return self.task.rules.split_pose(pose)[0]
 
@@ -287,6 +292,52 @@ class ObjectNav:
         goal_byte = state.goal // 8
         goal_bit = (state.goal % 8).astype(jnp.uint8)
         return (params.tables.success[state.pose, goal_byte] >> goal_bit) & jnp.uint8(1) > 0
+
+    def render(
+        self,
+        state: State,
+        params: EnvParams,
+        *,
+        mode: Literal["rgb_array", "ansi"] = "rgb_array",
+        size: int = 480,
+        path: Sequence[int] = (),
+    ) -> Any:
+        """Draw the scene from above, with the goals, the agent and the floor in its view; on the host, with NumPy.
+
+        Args:
+          state: state of one episode, leaves [].
+          params: parameters that `jaxnav.make` returned with this environment.
+          mode: `rgb_array` for pixels, `ansi` for text.
+          size: pixels along the longer side, at least 16.
+          path: earlier poses of the episode, which are drawn as dots.
+
+        Returns:
+          uint8 [height, width, 3], +z is up; or the text.
+
+        Raises:
+          InputError: the environment was not made by `jaxnav.make`, the state is a batch, or an argument is impossible.
+        """
+        if self.renderers is None:
+            raise InputError("render: this ObjectNav has no scenes to draw; use the environment of jaxnav.make")
+        if np.ndim(state.pose):
+            raise InputError(
+                f"render: the state is a batch of shape {np.shape(state.pose)}; give the state of one episode, such as "
+                "jax.tree.map(lambda leaf: leaf[0], state)"
+            )
+        if mode not in ("rgb_array", "ansi"):
+            raise InputError(f"render: mode {mode!r}; choose rgb_array or ansi")
+        if size < 16:
+            raise InputError(f"render: size {size}; give at least 16 pixels")
+
+        # Cells of the path, counted from the first cell of the scene.
+        scene = int(state.scene)
+        _, heading, _ = self.task.rules.split_pose(int(state.pose))
+        poses = np.array([*path, int(state.pose)])
+        cells = self.cell_of_pose(poses) - int(params.tables.first_cell[scene])
+        renderer = self.renderers[scene]
+        if mode == "ansi":
+            return renderer.draw_text(cells, heading, int(state.goal))
+        return renderer.draw_pixels(cells, heading, int(state.goal), size)
 
     @property
     def name(self) -> str:

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxnav.baselines.shortest_path import oracle_actions
+from jaxnav.env.render import GOAL_CHARACTER, goal_cells, plan_characters
 from jaxnav.errors import InputError
 from jaxnav.game.session import Game, GameResult, GameView
 from jaxnav.runs.evaluate import find_scene
@@ -212,17 +213,15 @@ def _map_text(game: Game, poses: list[int], shortest_poses: list[int], columns: 
 
     # Walls, standable cells and furniture, [nz, nx]. Characters are about twice as high as wide: spaces keep the
     # proportions where they fit.
-    map_characters = np.where(scene.walls, "█", np.where(scene.reach, "·", "░"))
+    map_characters = plan_characters(scene)
     separator = " " if 2 * map_characters.shape[1] <= columns else ""
     mark_rows = []
     for character_row in map_characters.tolist():
         mark_rows.append([(cell_character + separator, MUTED_STYLE) for cell_character in character_row])
 
     # Mark the objects of the goal's category.
-    for name, (x, z) in zip(scene.types, scene.boxes[:, [0, 2]], strict=True):
-        iz, ix = np.rint((np.array([z, x]) - np.array(scene.origin)[::-1]) / CELL_SIZE).astype(int)
-        if name == game.goal and 0 <= iz < len(mark_rows) and 0 <= ix < len(mark_rows[0]):
-            mark_rows[iz][ix] = ("★" + separator, GOAL_STYLE)
+    for iz, ix in goal_cells(scene, game.goal).tolist():
+        mark_rows[iz][ix] = (GOAL_CHARACTER + separator, GOAL_STYLE)
 
     # Mark the shortest path, the path of the player over it, and the start.
     cells = standable_cells(scene.reach)

@@ -17,6 +17,10 @@ import numpy as np
 from scipy.special import softmax
 
 from jaxnav.choices import Variant
+from jaxnav.env.render import (
+    FULL_SHADE_HEIGHT,
+    view_cone,
+)
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import EvaluationRow
@@ -30,7 +34,6 @@ from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, detected_positions
 from jaxnav.scenes.tables.visibility import cell_centres, wall_boxes
 from jaxnav.scenes.task import NUM_ACTIONS
-from jaxnav.viz.scene import FULL_SHADE_HEIGHT, view_cone
 
 #: Pairs of roles to show side by side, by the difference between them.
 ROLE_PAIRS = {

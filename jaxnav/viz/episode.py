@@ -19,6 +19,11 @@ from PIL import Image
 from rich.console import Console
 
 from jaxnav.choices import EstimatorName, Form, PlayedVariant, ShiftKind
+from jaxnav.env.render import (
+    AGENT_COLOR,
+    GOAL_COLOR,
+    SEEN_COLOR,
+)
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
@@ -36,8 +41,16 @@ from jaxnav.scenes.tables.observation_row import RowFormat, detected_positions
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, Task
 from jaxnav.store.files import expand_home
-from jaxnav.viz.scene import draw_agent, draw_plan
-from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, TEXT_COLOR, default_style, style_axes
+from jaxnav.viz.scene import (
+    draw_agent,
+    draw_plan,
+)
+from jaxnav.viz.style import (
+    MUTED_COLOR,
+    TEXT_COLOR,
+    default_style,
+    style_axes,
+)
 
 REMOVAL_COLOR = "#E69F00"
 ACTION_PHRASES = ("moves ahead", "turns left", "turns right", "looks up", "looks down", "says Done")

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
@@ -26,19 +26,28 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.transforms import Affine2D
 
+from jaxnav.env.render import (
+    AGENT_COLOR,
+    BACKGROUND_COLOR,
+    CONE_OPACITY,
+    FULL_SHADE_HEIGHT,
+    GOAL_COLOR,
+    HEIGHT_COLORS,
+    SEEN_COLOR,
+    WALL_COLOR,
+    floor_colors,
+    view_cone,
+)
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent, scene_size
 from jaxnav.scenes.tables.compile import compile_scene
-from jaxnav.scenes.tables.observation_row import MAX_RANGE, PERFECT_DETECTOR, RowFormat, detected_positions
-from jaxnav.scenes.tables.visibility import cell_centres, is_opaque, wall_boxes
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, RowFormat, detected_positions
+from jaxnav.scenes.tables.visibility import cell_centres, wall_boxes
 from jaxnav.scenes.task import Rules, Task
 from jaxnav.viz.style import (
-    AGENT_COLOR,
-    GOAL_COLOR,
     MUTED_COLOR,
-    SEEN_COLOR,
     TEXT_COLOR,
     default_style,
     save_figure,
@@ -46,15 +55,7 @@ from jaxnav.viz.style import (
 
 SCENE_DPI = 120
 
-# Colors of a plan.
-BACKGROUND_COLOR = "#f7f5f1"
-FLOOR_COLOR = "#ebe5d8"
-WALL_COLOR = "#55524d"
-ROOM_TINTS = ("#f3d9b8", "#c9e0ee", "#cbe6dc", "#eed3e2", "#f1ecb9", "#d6d4ee")  # pale colors of the palette
-
-#: Boxes are shaded by the height of their tops, from 0 m to this height in metres; higher boxes are no darker.
-FULL_SHADE_HEIGHT = 2.0
-HEIGHT_COLORMAP = LinearSegmentedColormap.from_list("height", ["#ddd5c5", "#7f7566"])
+HEIGHT_COLORMAP = LinearSegmentedColormap.from_list("height", list(HEIGHT_COLORS))
 
 _ARROW = Outline([(0, 1), (-0.75, -0.9), (0, -0.45), (0.75, -0.9), (0, 1)], closed=True)
 _PLAN_MARGIN = 0.05  # metres around the plan
@@ -344,7 +345,7 @@ def draw_plan_background(axes: Axes, scene: Scene, alpha: float = 0.3) -> None:
     nz, nx = scene.reach.shape
     corner = np.asarray(scene.origin) - CELL_SIZE / 2
     sides = (corner[0], corner[0] + CELL_SIZE * nx, corner[1], corner[1] + CELL_SIZE * nz)
-    axes.imshow(_floor_colors(scene), origin="lower", extent=sides, interpolation="nearest", alpha=alpha)
+    axes.imshow(floor_colors(scene), origin="lower", extent=sides, interpolation="nearest", alpha=alpha)
     _draw_boxes(axes, scene, alpha)
 
     # Limits of the plan, without ticks and spines.
@@ -373,54 +374,10 @@ def draw_agent(axes: Axes, scene: Scene, rules: Rules, place: np.ndarray, yaw: f
       yaw: heading, degrees.
     """
     outline = view_cone(scene, rules, place, yaw)
-    (cone,) = axes.fill(*outline.T, color=AGENT_COLOR, alpha=0.16, lw=0, zorder=3)
+    (cone,) = axes.fill(*outline.T, color=AGENT_COLOR, alpha=CONE_OPACITY, lw=0, zorder=3)
     marker = MarkerStyle(_ARROW, transform=Affine2D().rotate_deg(-yaw))
     (arrow,) = axes.plot(*place, marker=marker, color=AGENT_COLOR, markersize=15, markeredgecolor="white", zorder=8)
     return cone, arrow
-
-
-def view_cone(scene: Scene, rules: Rules, place: np.ndarray, yaw: float) -> np.ndarray:
-    """Return the outline of the visible floor of a level view.
-
-    The cone is 5 m deep and ends at walls and at opaque boxes as high as the camera.
-
-    Returns:
-      float64 [N, 2], world (x, z), `place` first.
-    """
-    # Points along each ray: [401 distances, 81 rays, 2].
-    ray_angles = np.deg2rad(yaw + rules.field_of_view[0] * np.linspace(-0.5, 0.5, 81))
-    ray_distances = np.linspace(0.0, MAX_RANGE, 401)
-    ray_directions = np.stack([np.sin(ray_angles), np.cos(ray_angles)], axis=-1)
-    points = place + ray_distances[:, None] * ray_directions[:, None]
-
-    # Mark the points in walls; points outside the grid are free.
-    cells = np.rint((points - scene.origin) / CELL_SIZE).astype(int)[..., ::-1]
-    last_cell = np.array(scene.walls.shape) - 1
-    iz, ix = np.moveaxis(np.clip(cells, 0, last_cell), -1, 0)
-    is_inside_grid = (cells == np.stack([iz, ix], axis=-1)).all(axis=-1)
-    is_blocked = scene.walls[iz, ix] & is_inside_grid
-
-    # Mark the points in boxes that are as high as the camera.
-    box_top = scene.boxes[:, 1] + scene.boxes[:, 4] / 2
-    for box in scene.boxes[is_opaque(scene.boxes) & (box_top >= rules.camera)]:
-        is_blocked |= (np.abs(points - box[[0, 2]]) < box[[3, 5]] / 2).all(axis=-1)
-
-    # Each ray ends at its first blocked point, or at the end of the range.
-    depth = np.where(is_blocked.any(axis=1), is_blocked.argmax(axis=1), len(ray_distances) - 1)
-    return np.concatenate([place[None], points[np.arange(len(ray_angles)), depth]])
-
-
-def _floor_colors(scene: Scene) -> np.ndarray:
-    """Return the colors of the cells, float [nz, nx, 3]; standable floor is darker than the rest."""
-    colors = np.array([to_rgb(FLOOR_COLOR), to_rgb(BACKGROUND_COLOR)])[np.where(scene.reach, 0, 1)]
-    # Types of rooms have tints in alphabetical order; furniture stands on a paler floor.
-    room_types = sorted({room.type for room in scene.rooms})
-    for room in scene.rooms:
-        room_tint = np.array(to_rgb(ROOM_TINTS[room_types.index(room.type) % len(ROOM_TINTS)]))
-        colors[room.cells & scene.reach] = room_tint
-        colors[room.cells & ~scene.reach] = (room_tint + to_rgb(BACKGROUND_COLOR)) / 2
-    colors[scene.walls] = to_rgb(WALL_COLOR)
-    return colors
 
 
 def _draw_boxes(axes: Axes, scene: Scene, alpha: float) -> None:

@@ -17,6 +17,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from jaxnav.env.render import (
+    AGENT_COLOR,
+    BACKGROUND_COLOR,
+    GOAL_COLOR,
+    SEEN_COLOR,
+)
 from jaxnav.errors import InputError
 from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.methods.local_policy import LocalPolicy
@@ -32,8 +38,17 @@ from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.scene import CELL_SIZE, scene_extent
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 from jaxnav.viz.episode import PlayedEpisode, describe_step
-from jaxnav.viz.scene import BACKGROUND_COLOR, LabelPlacer, draw_agent, draw_plan_background, is_any_near
-from jaxnav.viz.style import AGENT_COLOR, GOAL_COLOR, MUTED_COLOR, SEEN_COLOR, default_style, save_figure
+from jaxnav.viz.scene import (
+    LabelPlacer,
+    draw_agent,
+    draw_plan_background,
+    is_any_near,
+)
+from jaxnav.viz.style import (
+    MUTED_COLOR,
+    default_style,
+    save_figure,
+)
 
 MAX_PREDICTED_ACTIONS = 80
 

@@ -14,11 +14,6 @@ from jaxnav.store.files import write_atomic
 FIGURE_WIDTH = 7.0  # inches
 FIGURE_DPI = 150  # documents show a figure 700 pixels wide: a point of type is 1.4 pixels
 
-# From Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies.
-GOAL_COLOR = "#D55E00"
-AGENT_COLOR = "#0072B2"
-SEEN_COLOR = "#009E73"
-
 TEXT_COLOR = "#333333"
 MUTED_COLOR = "#8a8a8a"
 

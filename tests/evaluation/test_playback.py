@@ -11,6 +11,9 @@ from PIL.GifImagePlugin import GifImageFile
 from support import tiny_world as tiny
 
 from jaxnav.choices import PlayedVariant
+from jaxnav.env.render import (
+    view_cone,
+)
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.removal import InferenceTrace
@@ -18,7 +21,6 @@ from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
 from jaxnav.viz.episode import EpisodePanel, PlayedEpisode, draw_episode
-from jaxnav.viz.scene import view_cone
 
 
 def make_episode(action, success=False, shift=0.0, variant: PlayedVariant = "stde"):

@@ -8,10 +8,12 @@ import pytest
 from support import tiny_world as tiny
 from support.report_page import POSES
 
+from jaxnav.env.render import (
+    view_cone,
+)
 from jaxnav.report.replays import make_plan, pack_shares
 from jaxnav.scenes.scene import Room
 from jaxnav.scenes.tables.observation_row import RowFormat
-from jaxnav.viz.scene import view_cone
 
 
 @pytest.fixture(scope="module")

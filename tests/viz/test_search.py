@@ -13,6 +13,9 @@ from support.scenes import BOOK, CATEGORIES, corridor_scene
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import State
+from jaxnav.env.render import (
+    GOAL_COLOR,
+)
 from jaxnav.errors import InputError
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.removal import InferenceTrace
@@ -27,7 +30,6 @@ from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import Task
 from jaxnav.viz.episode import PlayedEpisode
 from jaxnav.viz.search import BLOCK_COLOR, NEAR_COLOR, OBSTACLE_COLOR, MapProjection, draw_search, take_snapshot
-from jaxnav.viz.style import GOAL_COLOR
 
 CORRIDOR = corridor_scene(24)
 BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))

@@ -1,0 +1,133 @@
+"""Pictures of episodes as pixels and text."""
+
+import dataclasses
+import importlib.util
+
+import jax
+import numpy as np
+import pytest
+from support import tiny_world as tiny
+
+from jaxnav.env.objectnav import State
+from jaxnav.env.render import AGENT_COLOR, GOAL_COLOR, SceneRenderers, parse_color
+from jaxnav.errors import InputError
+from jaxnav.scenes.scene import scene_extent
+from jaxnav.scenes.worlds import FileScenes
+
+BARE_ENV, PARAMS = tiny.world()
+SCENES = FileScenes((tiny.BEDROOM, tiny.KITCHEN, tiny.BEDROOM), "with one that the bank lacks")
+RENDERERS = SceneRenderers(SCENES, tiny.BANK.names, tiny.BANK.task)
+ENV = dataclasses.replace(BARE_ENV, renderers=RENDERERS)
+BOOK = ENV.categories.index("Book")
+
+
+def state_at(cell, heading=0, scene=0):
+    """State in the kitchen that looks for a book."""
+    pose = ENV.task.rules.join_pose(cell, heading, 0)
+    return State(pose=np.int32(pose), scene=np.int32(scene), goal=np.int32(BOOK), time=np.int32(0))
+
+
+def pixel_of(place, image):
+    """Row and column of a place (x, z)."""
+    low, high = scene_extent(tiny.KITCHEN)
+    scale = max(image.shape[:2]) / (high - low).max()
+    return int((high[1] - place[1]) * scale), int((place[0] - low[0]) * scale)
+
+
+def color_at(image, place):
+    return image[pixel_of(place, image)].tolist()
+
+
+def as_bytes(color):
+    return np.rint(255 * parse_color(color)).astype(int).tolist()
+
+
+def test_pixels_show_agent_and_goals_where_they_are():
+    image = ENV.render(state_at(0), PARAMS, size=240)
+    assert (image.dtype, max(image.shape[:2]), image.shape[2]) == (np.uint8, 240, 3)
+    # Cell 0 is the first standable one, at the origin of the grid; books stand where the tiny world has them.
+    origin = np.array(tiny.KITCHEN.origin)
+    assert color_at(image, origin) == as_bytes(AGENT_COLOR)
+    for name, box in zip(tiny.KITCHEN.types, tiny.KITCHEN.boxes, strict=True):
+        if name == "Book":
+            assert color_at(image, box[[0, 2]]) == as_bytes(GOAL_COLOR)
+
+
+def test_pixels_change_with_the_pose_and_not_the_cached_plan():
+    first = ENV.render(state_at(0), PARAMS)
+    other = ENV.render(state_at(3, heading=2), PARAMS, path=[int(state_at(0).pose)])
+    assert (first != other).any()
+    np.testing.assert_array_equal(first, ENV.render(state_at(0), PARAMS))
+
+
+def test_text_shows_agent_path_and_goals():
+    heading_right = ENV.task.rules.headings // 4
+    text = ENV.render(state_at(3, heading_right), PARAMS, mode="ansi", path=[int(state_at(0).pose)])
+    lines = text.splitlines()
+    # The kitchen has five rows of cells, +z up.
+    assert lines[0] == "looking for Book (★)"
+    assert len(lines) == 1 + tiny.KITCHEN.walls.shape[0]
+    assert sum(line.count("→") for line in lines) == 1
+    assert sum(line.count("•") for line in lines) == 1
+    assert lines[-1].startswith("•")  # cell 0 is the first of the lowest row
+
+
+def test_scenes_are_found_by_name_where_the_bank_lacks_some():
+    assert [RENDERERS[index].scene.name for index in range(2)] == [tiny.KITCHEN.name, tiny.BEDROOM.name]
+
+
+@pytest.mark.parametrize(
+    ("env", "state", "options", "message"),
+    [
+        (BARE_ENV, state_at(0), {}, "has no scenes to draw; use the environment of jaxnav.make"),
+        (
+            ENV,
+            jax.tree.map(lambda leaf: leaf[None], state_at(0)),
+            {},
+            r"is a batch of shape \(1,\); give the state of one",
+        ),
+        (ENV, state_at(0), {"mode": "human"}, "mode 'human'; choose rgb_array or ansi"),
+        (ENV, state_at(0), {"size": 3}, "size 3; give at least 16"),
+    ],
+)
+def test_render_refuses_bad_input(env, state, options, message):
+    with pytest.raises(InputError, match=f"^render: .*{message}"):
+        env.render(state, PARAMS, **options)
+
+
+@pytest.fixture(scope="module")
+def gym_env():
+    gymnasium = pytest.importorskip("gymnasium")
+    return gymnasium.make("jaxnav.env.gym:jaxnav/rooms-v0", split="val", render_mode="rgb_array")
+
+
+def test_gymnasium_renders_the_episode(gym_env):
+    gym_env.reset(seed=0)
+    first_frame = gym_env.render()
+    gym_env.step(1)
+    assert (first_frame != gym_env.render()).any()
+    assert gym_env.metadata["render_modes"] == ["rgb_array", "ansi"]
+    text = gym_env.unwrapped._env.render(
+        jax.tree.map(lambda leaf: leaf[0], gym_env.unwrapped._episodes.state), gym_env.unwrapped._params, mode="ansi"
+    )
+    assert text.startswith("looking for ")
+
+
+def test_gymnasium_refuses_other_render_modes():
+    pytest.importorskip("gymnasium")
+    from jaxnav.env.gym import ObjectNavEnv
+
+    with pytest.raises(InputError, match=r"^render_mode 'human': choose rgb_array, ansi or None"):
+        ObjectNavEnv(render_mode="human")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="RecordVideo needs moviepy")
+def test_record_video_writes_an_episode(gym_env, tmp_path):
+    from gymnasium.wrappers import RecordVideo
+
+    recorder = RecordVideo(gym_env, str(tmp_path), episode_trigger=lambda episode: True)
+    recorder.reset(seed=0)
+    for action in (1, 1, 5):
+        recorder.step(action)
+    recorder.stop_recording()
+    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
