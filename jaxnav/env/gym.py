@@ -9,7 +9,7 @@ Importing this module registers the ids.
 
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import jax
@@ -30,6 +30,8 @@ from jaxnav.scenes.worlds import WORLDS
 
 #: Observations or infos by name.
 NamedValues = dict[str, Any]
+#: Kinds of pictures, see `ObjectNav.render`.
+RenderMode = Literal["rgb_array", "ansi"]
 
 #: Processes that have imported this module: one that was forked later is another one.
 _IMPORT_PROCESS_ID = os.getpid()
@@ -44,7 +46,9 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
 
     metadata: NamedValues = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}  # noqa: RUF012
 
-    def __init__(self, world: str = "rooms", *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(
+        self, world: str = "rooms", *, render_mode: Literal["rgb_array", "ansi"] | None = None, **options: Any
+    ) -> None:
         """Make the scenes; the options are those of `jaxnav.make`.
 
         Args:
@@ -64,7 +68,7 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode {render_mode!r}: choose rgb_array, ansi or None")
         env, params = make(world, **options)
-        self.render_mode = render_mode
+        self.render_mode: RenderMode | None = render_mode
         self._env = env
         self._params = params
         self._path: list[int] = []  # poses of the episode so far
@@ -77,15 +81,17 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
     def reset(self, *, seed: int | None = None, options: NamedValues | None = None) -> tuple[NamedValues, NamedValues]:
         """Start an episode."""
         super().reset(seed=seed)
-        self._episodes, observations = self._batched_env.reset(_draw_keys(self.np_random, 1))
-        self._path = [int(self._episodes.state.pose[0])]
+        episodes, observations = self._batched_env.reset(_draw_keys(self.np_random, 1))
+        self._episodes = episodes
+        self._path = [int(episodes.state.pose[0])]
         return _select_env(to_numpy(observations), 0), {}
 
     def step(self, action: Any) -> tuple[NamedValues, float, bool, bool, NamedValues]:
         """Take an action; `info["success"]` is True for a successful Done."""
         actions = _validate_actions(self.action_space, self._episodes, action)
-        self._episodes, observations, signals = self._batched_env.advance(self._episodes, actions[None])
-        self._path.append(int(self._episodes.state.pose[0]))
+        episodes, observations, signals = self._batched_env.advance(self._episodes, actions[None])
+        self._episodes = episodes
+        self._path.append(int(episodes.state.pose[0]))
 
         # Gymnasium expects Python scalars; the single environment is a batch of one.
         observation = _select_env(to_numpy(observations), 0)

@@ -174,11 +174,10 @@ def _run_step_agent(
     """
     num_episodes = len(states.pose)
     episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes))
-    no_weight = 0.0  # no logits are removed
 
     def step(batch: EpisodeBatch) -> EpisodeBatch:
         # Observation and odometry of every episode, and the agent's action.
-        agent_state = batch.agent.memory
+        agent_state = _agent_state(batch)
         state = batch.agent.state
         observation = jax.vmap(loop.env.observe, (0, None))(state, env_params)
         _, heading, horizon = loop.env.task.rules.split_pose(state.pose)
@@ -202,7 +201,7 @@ def _run_step_agent(
 
         next_agent, result = loop.step(batch.agent, action, None, env_params)
         next_agent = next_agent._replace(memory=next_state._replace(moved=result.moved))
-        return advance_batch(batch, next_agent, action, result, jnp.full(action.shape, no_weight))
+        return advance_batch(batch, next_agent, action, result, jnp.zeros(action.shape))
 
     # Every agent starts with its own memory and a key of its own.
     memory = jax.vmap(functools.partial(_init, agent))(episode_keys)
@@ -217,10 +216,16 @@ def _run_step_agent(
     )
 
     def select(batch: EpisodeBatch) -> tuple[State, jax.Array, jax.Array]:
-        return batch.agent.state, batch.agent.memory.is_invalid, batch.agent.memory.invalid_action
+        agent_state = _agent_state(batch)
+        return batch.agent.state, agent_state.is_invalid, agent_state.invalid_action
 
     outcome, (final_state, is_invalid, invalid_action) = run_to_end(batch, step, select, divisors=())
     return finish_outcome(outcome, final_state, loop.env, env_params), (is_invalid, invalid_action)
+
+
+def _agent_state(batch: EpisodeBatch) -> Any:
+    """State of the agents, which takes the place of a policy's memory in the batch."""
+    return batch.agent.memory
 
 
 def _init(agent: Any, key: jax.Array) -> Any:
@@ -262,8 +267,9 @@ def _check_step_agent(agent: Any, name: str, env: ObjectNav, env_params: EnvPara
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     num_bytes = env_params.tables.rows.shape[-1]
-    observation = Observation(jax.ShapeDtypeStruct((num_bytes,), jnp.uint8), jax.ShapeDtypeStruct((), jnp.int32))
-    index = jax.ShapeDtypeStruct((), jnp.int32)
+    row: Any = jax.ShapeDtypeStruct((num_bytes,), jnp.uint8)
+    index: Any = jax.ShapeDtypeStruct((), jnp.int32)
+    observation = Observation(row, index)
     odometry = {"heading": index, "horizon": index, "moved": jax.ShapeDtypeStruct((), jnp.bool_)}
 
     # Any exception may come from the code of the agent.
@@ -347,7 +353,7 @@ def _run_batch_agent(
 def _observe_batch(batch: EpisodeBatch, env_params: EnvParams, loop: AgentLoop) -> dict[str, jax.Array]:
     """Named observations [B, ...]; the memory of the batch is whether the last action changed the cell."""
     name_state = functools.partial(name_observation, loop.env, env_params)
-    return jax.vmap(name_state)(batch.agent.state, batch.agent.memory)
+    return jax.vmap(name_state)(batch.agent.state, _agent_state(batch))
 
 
 @functools.partial(jax.jit, static_argnames="loop")

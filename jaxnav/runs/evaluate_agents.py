@@ -1,6 +1,7 @@
 """Evaluation of agents that act on observations, next to Random, frontier search and the shortest path."""
 
 import time
+import typing
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def evaluate_agents(
 ) -> Results:
     """Evaluate agents on the fixed episodes of a world; see `jaxnav.evaluate`."""
     # A world gives the task; a scene file replaces its scenes.
-    config = RunConfig(world=world or DEFAULT_WORLD, scenes=scenes)
+    config = RunConfig(world=typing.cast(Any, world or DEFAULT_WORLD), scenes=scenes)  # checked when it is compiled
     compiled = compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
     episode_lists = draw_episode_lists(compiled, num_episodes, seed)
     key = jax.random.key(seed)

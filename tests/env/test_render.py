@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
@@ -24,7 +25,7 @@ BOOK = ENV.categories.index("Book")
 def state_at(cell, heading=0, scene=0):
     """State in the kitchen that looks for a book."""
     pose = ENV.task.rules.join_pose(cell, heading, 0)
-    return State(pose=np.int32(pose), scene=np.int32(scene), goal=np.int32(BOOK), time=np.int32(0))
+    return State(pose=jnp.int32(pose), scene=jnp.int32(scene), goal=jnp.int32(BOOK), time=jnp.int32(0))
 
 
 def pixel_of(place, image):

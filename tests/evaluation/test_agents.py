@@ -39,11 +39,16 @@ class Walker(NamedTuple):
         return action, memory + 1
 
 
-def walk(observations):
-    """The same agent as a function, which counts its calls: before the first action nothing has moved either."""
-    walk.time = 0 if getattr(walk, "time", None) is None else walk.time + 1
-    is_blocked = (observations["moved"] == 0) & (walk.time > 0)
-    return np.where(is_blocked, ROTATE_RIGHT, MOVE_AHEAD)
+class CountingWalker:
+    """The same agent as a function that counts its calls: before the first action nothing has moved either."""
+
+    def __init__(self):
+        self.num_calls = 0
+
+    def __call__(self, observations):
+        is_blocked = (observations["moved"] == 0) & (self.num_calls > 0)
+        self.num_calls += 1
+        return np.where(is_blocked, ROTATE_RIGHT, MOVE_AHEAD)
 
 
 class Predictor:
@@ -65,8 +70,7 @@ def test_all_kinds_of_agents_give_equal_outcomes():
     assert not outcome.done.any()
     assert (outcome.moves > 0).all()
 
-    for other_agent in (walk, Predictor()):
-        walk.time = None
+    for other_agent in (CountingWalker(), Predictor()):
         jax.tree.map(np.testing.assert_array_equal, outcome, run(other_agent))
 
 
@@ -181,7 +185,7 @@ def test_an_observation_space_selects_parts_or_the_flat_form():
     run(Policy(spaces.Dict({"goal": space["goal"]})))
     named, flat, goal_alone = inputs
     first_episode = {name: values[0] for name, values in named.items()}
-    np.testing.assert_allclose(flat[0], spaces.flatten(space, first_episode))
+    np.testing.assert_allclose(flat[0], np.asarray(spaces.flatten(space, first_episode)))
     assert set(goal_alone) == {"goal"}
     with pytest.raises(InputError, match=r"observation_space is .*; expected that of the world, a dictionary with "):
         run(Policy(spaces.Box(0, 1, (3,))))

@@ -141,11 +141,12 @@ def test_options_about_experience_are_refused_for_agents(capsys):
 def test_policies_are_found_by_name_path_and_object():
     """One policy is evaluated as a run of one seed in the world of its training."""
     policy = jaxnav.load_policy("rooms-org")
-    subjects = [find_subject("rooms-org"), find_subject(policy)]
-    for subject in subjects:
+    layouts = []
+    for subject in map(find_subject, ("rooms-org", policy)):
         assert isinstance(subject, PolicySubject)
+        layouts.append(subject.policies.knowledge.layout)
         assert (subject.config.world, subject.policies.arms, subject.policies.num_seeds) == ("rooms", ("layout",), 1)
-    assert jnp.array_equal(subjects[0].policies.knowledge.layout, subjects[1].policies.knowledge.layout)
+    assert jnp.array_equal(*layouts)
 
 
 @pytest.mark.slow
