@@ -13,6 +13,9 @@ the factual memory (hidden state, previous action), D the layout gap, and epsilo
     counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
     tde(logits, counterfactual)                    # eq. 1: a - a_bar
     stde(logits, counterfactual, gap, epsilon)     # eq. 2: subtracts a_bar, weighted by how far D exceeds epsilon
+
+Some hosts score their choices by a sum, a = direct + experience. There a_bar is the experience itself, eq. 1 leaves the
+direct scores, and eq. 2 in the paper's form scales the experience: see `remove_from_sum`.
 """
 
 import typing
@@ -115,3 +118,31 @@ def stde(
     effect = factual - s * counterfactual
     # Subtracting 0 * a_bar could still turn -0.0 into 0.0, so the factual logits are copied.
     return jnp.where(s == 0, logits, effect)
+
+
+def remove_from_sum(
+    direct: jax.Array, experience: jax.Array, gap: jax.Array, epsilon: jax.Array | float, form: Form = "paper"
+) -> jax.Array:
+    """Equation 2 for scores that are a sum: direct + (1 - s) experience.
+
+    With the logits a = direct + experience and the counterfactual logits a_bar = experience, this is a - s a_bar, the
+    value of `stde` in the same form up to rounding. A weight s = 1 leaves eq. 1.
+
+    Args:
+      direct: float [..., A], scores without experience.
+      experience: float [..., A], what experience adds to the scores; finite.
+      gap: float32 [...], layout gap D in [0, 1].
+      epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
+      form: `paper`, s = ReLU(D - epsilon), or `switch`, s = 1 where D > epsilon.
+
+    Returns:
+      float [..., A], bit-identical to `direct` where s is 1, and to `direct + experience` where s is 0.
+
+    Raises:
+      ValueError: another form; `residual` rescales the direct scores, so it is no removal from a sum.
+    """
+    if form == "residual":
+        raise ValueError("form='residual': a sum keeps its direct scores as they are; choose paper or switch")
+    s = removal_weight(gap, epsilon, form)[..., None].astype(direct.dtype)
+    # Adding 0 * experience could still turn -0.0 into 0.0, so the direct scores are copied.
+    return jnp.where(s == 1, direct, direct + (1 - s) * experience)

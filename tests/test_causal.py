@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxnav.causal import do, removal_weight, stde, tde
+from jaxnav.causal import do, removal_weight, remove_from_sum, stde, tde
 
 FORMS = ("paper", "residual", "switch")
 SOFT = FORMS[:2]
@@ -157,3 +157,39 @@ def test_stde_traces_epsilon():
 def test_stde_keeps_the_dtype_of_logits():
     factual = jnp.ones((3, 6), jnp.bfloat16)
     assert stde(factual, factual, jnp.ones(3), 0.5).dtype == jnp.bfloat16
+
+
+# Scores that are a sum
+
+
+def test_removal_from_a_sum_follows_worked_arithmetic():
+    direct, experience = jnp.array([2.0, -1.0]), jnp.array([4.0, 0.5])
+    # s = 0.75 - 0.5 = 0.25: [2 + 0.75 x 4, -1 + 0.75 x 0.5]. The switch removes all experience.
+    gap = jnp.float32(0.75)
+    np.testing.assert_array_equal(remove_from_sum(direct, experience, gap, 0.5), [5.0, -0.625])
+    np.testing.assert_array_equal(remove_from_sum(direct, experience, gap, 0.5, "switch"), direct)
+
+
+@given(direct=LOGITS, experience=LOGITS, gap=UNIT, epsilon=UNIT)
+def test_removal_from_a_sum_is_equation_2_of_the_paper(direct, experience, gap, epsilon):
+    gap = jnp.full(4, gap, jnp.float32)
+    for form in ("paper", "switch"):
+        expected = stde(direct + experience, jnp.asarray(experience), gap, epsilon, form)
+        # Both sides round at the size of the scores, at most 60.
+        np.testing.assert_allclose(
+            remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), gap, epsilon, form), expected, atol=1e-5
+        )
+
+
+@given(direct=LOGITS, experience=LOGITS, gap=UNIT)
+def test_complete_removal_from_a_sum_leaves_the_direct_scores_and_epsilon_one_leaves_all(direct, experience, gap):
+    gap = jnp.full(4, gap, jnp.float32)
+    without_experience = remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), jnp.ones(4), 0.0)
+    np.testing.assert_array_equal(as_bits(without_experience), as_bits(direct))
+    complete = remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), gap, 1.0)
+    np.testing.assert_array_equal(as_bits(complete), as_bits(direct + experience))
+
+
+def test_removal_from_a_sum_refuses_the_residual_form():
+    with pytest.raises(ValueError, match=r"residual.*paper or switch"):
+        remove_from_sum(jnp.zeros(1), jnp.zeros(1), jnp.float32(0), 0.5, "residual")
