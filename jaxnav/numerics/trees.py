@@ -1,11 +1,13 @@
 """Selection between pytrees of arrays, and of their rows."""
 
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 
 Tree = TypeVar("Tree")
+Rows = TypeVar("Rows")
 
 
 def tree_where(condition: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
@@ -28,3 +30,42 @@ def tree_where(condition: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
 def take_rows(tree: Tree, row_indices: jax.Array) -> Tree:
     """Take the rows `row_indices`, int [B], of leaves [E, ...]."""
     return jax.tree.map(lambda leaf: leaf[row_indices], tree)
+
+
+def map_selected_rows(
+    function: Callable[[Rows], Tree], rows: Rows, is_selected: jax.Array, chunk_size: int = 16
+) -> Tree:
+    """Apply a function to the selected rows of a batch; all other rows of the result are zeros.
+
+    The selected rows are taken together chunk by chunk, so the time is that of the selected rows alone, up to the last
+    chunk. Under `jax.vmap` all chunks of the longest batch are computed.
+
+    Args:
+      function: function of one row.
+      rows: leaves [B, ...].
+      is_selected: bool [B].
+      chunk_size: number of rows that are computed at once.
+
+    Returns:
+      The results, leaves [B, ...].
+    """
+    num_rows = len(is_selected)
+    chunk_size = min(chunk_size, num_rows)
+    one_row = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
+    row_shapes = jax.eval_shape(function, one_row)
+    results = jax.tree.map(lambda leaf: jnp.zeros((num_rows, *leaf.shape), leaf.dtype), row_shapes)
+
+    # Selected rows first. The last chunk may hold rows of an earlier chunk, or rows that are not selected.
+    order = jnp.argsort(~is_selected)
+    num_selected = is_selected.sum()
+
+    def compute_chunk(carry: tuple[jax.Array, Tree]) -> tuple[jax.Array, Tree]:
+        start, results = carry
+        indices = jax.lax.dynamic_slice(order, (start,), (chunk_size,))
+        chunk_results = jax.vmap(function)(take_rows(rows, indices))
+        zeros = jax.tree.map(jnp.zeros_like, chunk_results)
+        chunk_results = tree_where(is_selected[indices], chunk_results, zeros)
+        results = jax.tree.map(lambda leaf, values: leaf.at[indices].set(values), results, chunk_results)
+        return start + chunk_size, results
+
+    return jax.lax.while_loop(lambda carry: carry[0] < num_selected, compute_chunk, (jnp.int32(0), results))[1]

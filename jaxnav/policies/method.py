@@ -21,7 +21,9 @@ from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.task import NUM_ACTIONS
 
 if TYPE_CHECKING:
-    from jaxnav.policies.network import Policy
+    from jaxnav.env.objectnav import EnvParams
+    from jaxnav.policies.agent_loop import AgentLoop
+    from jaxnav.policies.network import Params, Policy
     from jaxnav.policies.pathways import Decision, Pathways, PolicyState
     from jaxnav.policies.spec import PolicySpec
 
@@ -261,6 +263,34 @@ class Stage:
     adapts_online: bool = True
 
 
+class Fit(Protocol):
+    """Fit of the parameters of a policy to searches in training scenes, in place of training by PPO."""
+
+    def __call__(
+        self,
+        agent_loop: "AgentLoop",
+        bank: Bank,
+        env_params: "EnvParams",
+        knowledge: Knowledge,
+        key: jax.Array,
+        num_searches: int,
+        num_steps: int,
+        /,
+    ) -> "Params":
+        """Return the parameters of one seed.
+
+        Args:
+          agent_loop: runs the policy and the environment.
+          bank: compiled training scenes.
+          env_params: parameters of the environment with these scenes.
+          knowledge: statistics from before training.
+          key: typed PRNG key [] of the seed; consumed.
+          num_searches: number of parallel searches.
+          num_steps: number of environment steps of each; ended episodes are followed by new ones.
+        """
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Method:
     """A method of object navigation; the defaults of all fields but the first do nothing.
@@ -278,6 +308,10 @@ class Method:
       control: map from choices to actions.
       check: function of knowledge and a bank that raises an `InputError` if the method cannot act in these scenes.
       hosts_layout: whether the layout's weights can enter; if not, only the agent without the layout is trained.
+      policy_class: class of the policy, built with `(spec, rngs)`, in place of the networks of
+        `jaxnav.policies.network`. A policy whose scores are a sum holds its own agent without experience, so only the
+        agent with the layout is trained.
+      fit: function that fits the parameters of one seed in place of training by PPO; None trains by PPO.
       name: name by which `find_method` finds the method again.
     """
 
@@ -291,6 +325,8 @@ class Method:
     control: Control = ActionControl()
     check: Callable[[Knowledge, Bank], None] | None = None
     hosts_layout: bool = True
+    policy_class: "type[Policy] | None" = None
+    fit: "Fit | None" = None
     name: str = ""
 
     def __post_init__(self) -> None:

@@ -54,7 +54,7 @@ NO_CHANGES: LayerChanges = MappingProxyType({})
 
 def init_params(spec: PolicySpec, key: jax.Array) -> Params:
     """Draw fresh parameters, a nested dict of float32 arrays."""
-    policy = _POLICIES[spec.decision](spec, nnx.Rngs(params=key))
+    policy = _policy_class(spec)(spec, nnx.Rngs(params=key))
     return nnx.to_pure_dict(nnx.state(policy, nnx.Param))
 
 
@@ -67,8 +67,13 @@ def bind(spec: PolicySpec, params: Params) -> "Policy":
 def _graph(spec: PolicySpec) -> "nnx.GraphDef[Policy]":
     """Return the structure of a policy without its parameters."""
     # Abstract evaluation gives the structure without drawing parameters.
-    abstract_policy = nnx.eval_shape(lambda: _POLICIES[spec.decision](spec, nnx.Rngs(0)))
+    abstract_policy = nnx.eval_shape(lambda: _policy_class(spec)(spec, nnx.Rngs(0)))
     return nnx.split(abstract_policy)[0]
+
+
+def _policy_class(spec: PolicySpec) -> "type[Policy]":
+    """Return the class of a policy: that of its method, if it brings one, else the network of its decision."""
+    return spec.method.policy_class or _POLICIES[spec.decision]
 
 
 # One recurrent core
@@ -205,6 +210,8 @@ class Policy(Stream):
     """Three pathways, fused before one recurrent core; works on single observations and batches."""
 
     num_views: ClassVar[int] = 1  # the scene layer embeds the view once per stream
+    #: True if logits are direct scores plus experience, so that the counterfactual logits are the experience itself.
+    has_additive_scores: ClassVar[bool] = False
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         method = spec.method

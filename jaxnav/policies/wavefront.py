@@ -2,7 +2,8 @@
 
 A board uint32 [N, N / 32] holds one bit per cell: cell (z, x) is bit x % 32 of word x // 32 in line z. Lines and
 columns wrap around at the edges. `find_path` spreads a wave from the targets to the eight neighbours of all cells,
-which takes a few shifts per step, and `follow_path` returns the agent's next action.
+which takes a few shifts per step, and `follow_path` returns the agent's next action. `walking_steps` measures the way
+from one cell to all.
 """
 
 from typing import NamedTuple
@@ -16,8 +17,14 @@ from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 WORD_BITS = 32
 _LAST_BIT = np.uint32(WORD_BITS - 1)
 
+#: Binary digits in which `walking_steps` counts, and the largest number of steps that they hold.
+_NUM_STEP_DIGITS = 8
+MAX_STEPS = 2**_NUM_STEP_DIGITS - 1
+
 #: State of the wave: number of steps, cells reached one step before, and cells reached so far.
 _Wave = tuple[jax.Array, jax.Array, jax.Array]
+#: The same with the digits of the distances so far.
+_CountingWave = tuple[jax.Array, jax.Array, jax.Array, tuple[jax.Array, ...]]
 
 
 class PathField(NamedTuple):
@@ -63,6 +70,46 @@ def find_path(targets: jax.Array, passable: jax.Array, start: jax.Array) -> Path
     return PathField(jnp.where(is_on_board(reached, start), length, -1), reached_before)
 
 
+def walking_steps(passable: jax.Array, start: jax.Array) -> jax.Array:
+    """Number of steps from a cell to every cell, int32 [N, N]; -1 where there is no path of at most `MAX_STEPS` steps.
+
+    A step leads to one of the eight neighbours. The start need not be passable.
+
+    Args:
+      passable: uint32 [N, N / 32].
+      start: int32 [2], (z, x).
+    """
+    start_row, start_column = start
+    start_bit = jnp.uint32(1) << (start_column % WORD_BITS).astype(jnp.uint32)
+    reached = jnp.zeros_like(passable).at[start_row, start_column // WORD_BITS].set(start_bit)
+    enterable = passable | reached
+
+    # A cell is at a distance of as many steps as the wave has made without reaching it. The numbers of all cells are
+    # counted together: digit i of a cell's number is its bit on board i.
+    digits = (jnp.zeros_like(passable),) * _NUM_STEP_DIGITS
+
+    def is_spreading(wave: _CountingWave) -> jax.Array:
+        step, reached_before, reached, _ = wave
+        return (step < MAX_STEPS) & ((step == 0) | (reached != reached_before).any())
+
+    def spread(wave: _CountingWave) -> _CountingWave:
+        step, _, reached, digits = wave
+        carry = ~reached
+        next_digits = []
+        for digit in digits:
+            next_digits.append(digit ^ carry)
+            carry = digit & carry
+        return step + 1, reached, reached | (dilate_board(reached) & enterable), tuple(next_digits)
+
+    _, _, reached, digits = jax.lax.while_loop(is_spreading, spread, (jnp.int32(0), reached, reached, digits))
+
+    # Read the numbers of all cells from the boards.
+    steps = jnp.zeros((passable.shape[0], passable.shape[0]), jnp.int32)
+    for index, digit in enumerate(digits):
+        steps += unpack_board(digit).astype(jnp.int32) << index
+    return jnp.where(unpack_board(reached), steps, -1)
+
+
 def follow_path(path_field: PathField, start: jax.Array, heading: jax.Array, strides: jax.Array) -> jax.Array:
     """Return the next action int32 [] along a path of at least one step.
 
@@ -98,6 +145,13 @@ def pack_board(cells: jax.Array) -> jax.Array:
     cells_by_word = cells.reshape(*cells.shape[:-1], -1, WORD_BITS).astype(jnp.uint32)
     shifts = np.arange(WORD_BITS, dtype=np.uint32).reshape((1,) * cells.ndim + (WORD_BITS,))
     return (cells_by_word << shifts).sum(axis=-1, dtype=jnp.uint32)
+
+
+def unpack_board(board: jax.Array) -> jax.Array:
+    """Unpack a board uint32 [..., N / 32] into cells bool [..., N]."""
+    shifts = np.arange(WORD_BITS, dtype=np.uint32).reshape((1,) * board.ndim + (WORD_BITS,))
+    cells_by_word = (board[..., None] >> shifts) & np.uint32(1) > 0
+    return cells_by_word.reshape(*board.shape[:-1], -1)
 
 
 def is_on_board(board: jax.Array, positions: jax.Array) -> jax.Array:

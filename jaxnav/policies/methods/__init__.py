@@ -8,6 +8,7 @@ from importlib import metadata
 
 from jaxnav.errors import InputError
 from jaxnav.policies.method import Method
+from jaxnav.policies.methods.belief import BELIEF
 from jaxnav.policies.methods.eotp import EOTP
 from jaxnav.policies.methods.hoz import HOZ
 from jaxnav.policies.methods.org import ORG
@@ -19,7 +20,7 @@ from jaxnav.policies.methods.tpn import TPN
 from jaxnav.policies.methods.vtnet import VTNET
 
 #: The methods of this package.
-METHODS = {method.name: method for method in (ANONYMOUS, EOTP, HOZ, ORG, RGB, SAVN, SEMEXP, SP, TPN, VTNET)}
+METHODS = {method.name: method for method in (ANONYMOUS, BELIEF, EOTP, HOZ, ORG, RGB, SAVN, SEMEXP, SP, TPN, VTNET)}
 #: Group of the entry points by which other packages announce their methods.
 ENTRY_POINT_GROUP = "jaxnav.methods"
 

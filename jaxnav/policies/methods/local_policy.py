@@ -92,7 +92,7 @@ class LocalPolicy:
         unexplored = pack_board(state.cells & EXPLORED_BIT == 0)
         search_targets = unexplored
         if not self.use_nearest_frontier:
-            search_targets = unexplored & _block_board(state.block_start, size)
+            search_targets = unexplored & _block_board(state.block_start, self._block_size(size), size)
         targets = jnp.where(goal_location.is_known, pack_board(goal_location.viewpoints), search_targets)
 
         # Plan a path; the search has failed if no cell can be reached.
@@ -125,21 +125,27 @@ class LocalPolicy:
 
     def _apply_choice(self, choice: jax.Array, state: SearchState) -> SearchState:
         """Store the chosen block, at a decision step."""
-        # Blocks are numbered row by row from the corner of the map centred on the agent.
-        size = len(state.cells)
-        block = jnp.stack([choice // BLOCKS_PER_SIDE, choice % BLOCKS_PER_SIDE]).astype(jnp.int32)
-        block_start = (state.position - size // 2 + size // BLOCKS_PER_SIDE * block) % size
-
+        block_start = self._find_block(choice, state)
         is_decision_step = self.is_decision_step(state)
         return state._replace(
             block_start=jnp.where(is_decision_step, block_start, state.block_start),
             actions_left=jnp.where(is_decision_step, self.interval, state.actions_left),
         )
 
+    def _block_size(self, size: int) -> int:
+        """Return the number of cells along each side of a block, on a map of N cells."""
+        return size // BLOCKS_PER_SIDE
 
-def _block_board(block_start: jax.Array, size: int) -> jax.Array:
+    def _find_block(self, choice: jax.Array, state: SearchState) -> jax.Array:
+        """Return the first cell int32 [2] of a block."""
+        # Blocks are numbered row by row from the corner of the map centred on the agent.
+        size = len(state.cells)
+        block = jnp.stack([choice // BLOCKS_PER_SIDE, choice % BLOCKS_PER_SIDE]).astype(jnp.int32)
+        return (state.position - size // 2 + self._block_size(size) * block) % size
+
+
+def _block_board(block_start: jax.Array, block_size: int, size: int) -> jax.Array:
     """Return the board uint32 [N, N / 32] of the block that starts at a cell int32 [2]."""
-    block_size = size // BLOCKS_PER_SIDE
     in_rows, in_columns = (jnp.arange(size)[None] - block_start[:, None]) % size < block_size
     return jnp.where(in_rows[:, None], pack_board(in_columns)[None], NO_BITS)
 

@@ -44,6 +44,11 @@ NO_BITS = np.uint32(0)
 
 #: Number of blocks along each side of the map; the policy chooses one of them.
 BLOCKS_PER_SIDE = 8
+#: Cells along each side of a square, the unit in which looks are counted: 0.5 m.
+SQUARE_CELLS = 2
+#: Width of the distance bins of looks, metres, and their number; the last bin holds all larger distances.
+LOOK_SPACING = 0.5
+NUM_LOOK_DISTANCES = 6
 #: Value of `SearchState.goal_sight`: the goal is not in view, or too far for Done.
 GOAL_FAR = 0
 #: Value of `SearchState.goal_sight`: the goal is near enough for Done.
@@ -125,6 +130,31 @@ def detection_cells(
     return (position[None] + jnp.rint(offsets).astype(jnp.int32)) % size
 
 
+def nearest_looks(
+    row: jax.Array, position: jax.Array, heading: jax.Array, row_format: RowFormat, headings: int, size: int
+) -> jax.Array:
+    """Return the distance bin from which a view shows each square, int32 [N / 2, N / 2].
+
+    Squares that the view does not show have the bin `NUM_LOOK_DISTANCES`. Of a square's cells the nearest one counts.
+
+    Args:
+      row, position, heading, row_format, headings: as in `draw_view`.
+      size: N, cells along each side of the map.
+    """
+    # Squares and distance bins of the cells of the view, [V V].
+    offset_table, _ = _view_tables(headings, row_format.view)
+    distance_table = CELL_SIZE * np.hypot(*np.moveaxis(offset_table, -1, 0))
+    bin_table = np.minimum(distance_table / LOOK_SPACING, NUM_LOOK_DISTANCES - 1).astype(np.int32)
+    rows, columns = ((position[None] + jnp.asarray(offset_table)[heading]) % size // SQUARE_CELLS).T
+    view = row_format.view_cells(row)
+    is_seen = (view == VIEW_FREE) | (view == VIEW_BLOCKED)
+    distance_bins = jnp.where(is_seen, jnp.asarray(bin_table)[heading], NUM_LOOK_DISTANCES)
+
+    num_squares = size // SQUARE_CELLS
+    unseen = jnp.full((num_squares, num_squares), NUM_LOOK_DISTANCES, jnp.int32)
+    return unseen.at[rows, columns].min(distance_bins)
+
+
 def neighbourhood(position: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
     """Return rows and columns, int32 [9] each, of a cell int32 [2] and its eight neighbours on a map of N cells."""
     offsets = np.moveaxis(np.indices((3, 3)), 0, -1).reshape(-1, 2).astype(np.int32) - 1
@@ -198,6 +228,8 @@ class SearchState(NamedTuple):
         map.
       search_horizon: int32 [], index of the horizon to search with, at first the lowest; -1 before the first view.
       failed_views: int32 [], number of viewpoints that did not show the goal since it was last near.
+      looks: uint8 [D, N / 2, N / 2], number of views that showed each square, by the distance bin of `nearest_looks`;
+        None for methods that do not count looks.
     """
 
     cells: jax.Array
@@ -211,6 +243,7 @@ class SearchState(NamedTuple):
     actions_left: jax.Array
     search_horizon: jax.Array
     failed_views: jax.Array
+    looks: jax.Array | None = None
 
 
 class MapReading(NamedTuple):
