@@ -53,7 +53,9 @@ def _train(config: RunConfig, console: Console) -> None:
 
 
 def _draw_learning_curves(run: "Run", console: Console) -> None:
-    """Draw the learning curves if the plotting packages are installed."""
+    """Draw the learning curves if the plotting packages are installed; a policy that was fitted has none."""
+    if not run.log():
+        return
     from jaxnav.viz import require_plotting_packages
 
     try:

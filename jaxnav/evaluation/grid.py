@@ -38,7 +38,7 @@ from jaxnav.numerics.trees import take_rows, tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, policy_memory
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.method import Knowledge
-from jaxnav.policies.network import Params
+from jaxnav.policies.network import Params, Policy
 from jaxnav.scenes.task import MOVE_AHEAD
 
 Tree = TypeVar("Tree")
@@ -407,7 +407,8 @@ def infer_and_act(
         else:
             removed_logits = counterfactual_logits(policy, replaced_pathways, replaced_memory)
         gap = select_gap(config, gap, running, episode_keys, agent.state.time)
-        logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap)
+        has_additive_scores = isinstance(policy, Policy) and policy.has_additive_scores
+        logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap, has_additive_scores)
     else:
         removed_logits = decision.logits
         logits = decision.logits

@@ -90,8 +90,13 @@ def budget_note(budget: Mapping[str, int]) -> str:
     """Describe the environment steps behind a policy.
 
     Args:
-      budget: steps of `exploration`, `imitation` and `learning`.
+      budget: steps of `exploration`, and of `imitation` and `learning` or, where a policy was fitted, of `searches`.
     """
+    if "searches" in budget:
+        return (
+            f"Environment steps of each policy: {budget['exploration']:,} of random exploration for the layout priors, "
+            f"{budget['searches']:,} of searches to which it was fitted."
+        )
     return (
         f"Environment steps of each policy: {budget['exploration']:,} of random exploration for the layout priors, "
         f"{budget['imitation']:,} of imitation learning, {budget['learning']:,} of reinforcement learning."

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.causal import FORMS, do, removal_weight, stde, tde
+from jaxnav.causal import FORMS, do, removal_weight, remove_from_sum, stde, tde
 from jaxnav.evaluation.replacements import other_running_episode
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.pathways import Pathways, PolicyState
@@ -213,7 +213,11 @@ def select_gap(
 
 
 def apply_removal(
-    config: InferenceConfig, logits: jax.Array, removed_logits: jax.Array, gap: jax.Array
+    config: InferenceConfig,
+    logits: jax.Array,
+    removed_logits: jax.Array,
+    gap: jax.Array,
+    has_additive_scores: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
     """Remove experience from logits by equation 1 or 2.
 
@@ -222,12 +226,20 @@ def apply_removal(
       logits: float32 [E, A], factual logits.
       removed_logits: float32 [E, A], logits to remove.
       gap: float32 [E], layout gaps.
+      has_additive_scores: whether the logits are the removed ones plus direct scores, without rounding.
 
     Returns:
       Logits float32 [E, A], and the weight float32 [E] of the removed ones.
     """
     # The form is a traced index: compute every form, then pick one.
-    soft_logits = jnp.stack([stde(logits, removed_logits, gap, config.epsilon, form) for form in FORMS])[config.form]
+    logits_by_form = []
+    for form in FORMS:
+        if has_additive_scores and form != "residual":
+            direct = tde(logits, removed_logits)
+            logits_by_form.append(remove_from_sum(direct, removed_logits, gap, config.epsilon, form))
+        else:
+            logits_by_form.append(stde(logits, removed_logits, gap, config.epsilon, form))
+    soft_logits = jnp.stack(logits_by_form)[config.form]
     soft_weight = jnp.stack([removal_weight(gap, config.epsilon, form) for form in FORMS])[config.form]
 
     corrected_logits = jnp.where(config.remove_completely, tde(logits, removed_logits), soft_logits)

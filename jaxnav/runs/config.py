@@ -22,6 +22,9 @@ from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_inde
 if TYPE_CHECKING:
     from jaxnav.policies.method import Method, Stage
 
+#: Environment steps of the searches to which a policy is fitted, for methods that are fitted (`Method.fit`).
+FITTED_STEPS = 76_800
+
 Arm = Literal["baseline", "layout"]
 #: Kinds of policies: without and with the layout estimator. They differ only in the layout weights.
 ARMS: tuple[Arm, ...] = ("baseline", "layout")
@@ -291,7 +294,12 @@ class RunConfig:
 
     @property
     def steps_by_purpose(self) -> dict[str, int]:
-        """Environment steps behind each policy: exploration for the prior, imitation, and learning."""
+        """Environment steps behind each policy: exploration for the prior, then imitation and learning, or searches."""
+        if self.policy_method.fit is not None:
+            return {
+                "exploration": self.layout.walks * self.layout.steps,
+                "searches": self.total_updates * self.steps_per_update,
+            }
         steps_per_chunk = self.chunk * self.steps_per_update
         stage_by_chunk = self.stage_by_chunk
         imitation_chunks = sum(self.stages[index].uses_expert for index in stage_by_chunk)
@@ -435,6 +443,9 @@ def check_config(config: RunConfig) -> RunConfig:
         usual_experience = 0.8 if config.decision == "streams" else 1.0
         config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, experience=usual_experience))
 
+    if method.fit is not None:
+        config = _complete_fitted(config)
+
     # The method and the numbers come first: later checks compute with them.
     _check_method(config, method)
     _check_numbers(config)
@@ -443,6 +454,16 @@ def check_config(config: RunConfig) -> RunConfig:
     _check_learning(config)
     _check_world(config)
     return config
+
+
+def _complete_fitted(config: RunConfig) -> RunConfig:
+    """Settings of a method that is fitted to searches: no map for a network, no training of a counterfactual branch."""
+    # The agent without experience is part of the policy.
+    arms = ("layout",) if config.arms == ARMS else config.arms
+    total_steps = FITTED_STEPS if config.total_steps is None else config.total_steps
+    return dataclasses.replace(
+        config, arms=arms, total_steps=total_steps, spatial_memory=False, counterfactual="none", direct="goal"
+    )
 
 
 def usual_direct(method: "Method") -> Direct:
@@ -464,6 +485,13 @@ def _check_method(config: RunConfig, method: "Method") -> None:
     _require(len(set(arms)) == len(arms) > 0, "arms", arms, f"give {' and '.join(ARMS)}, or one of them")
     has_host = method.hosts_layout or "layout" not in arms
     _require(has_host, "arms", arms, f"method {config.method!r} cannot use layout weights; give only baseline")
+
+    # A policy of the method's own holds its agent without experience, and needs no second stream for it.
+    if method.policy_class is not None:
+        advice = f"method {config.method!r} holds its agent without experience, the row with TDE; give only layout"
+        _require(arms == ("layout",), "arms", arms, advice)
+        advice = f"the scores of method {config.method!r} are a sum already; give fused"
+        _require(config.decision == "fused", "decision", config.decision, advice)
 
     # The gate multiplies the logit of Done, which exists only where the method chooses actions.
     can_gate = not config.done_gate or method.control.num_choices == NUM_ACTIONS

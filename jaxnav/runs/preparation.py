@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxnav.errors import InputError
 from jaxnav.layout import EstimatorConfig
 from jaxnav.policies.method import Knowledge
+from jaxnav.policies.network import Params
 from jaxnav.runs.policies import knowledge_from_arrays, knowledge_to_arrays
 from jaxnav.store.export import POLICY_FILE, export_params, load_params
 from jaxnav.store.files import check_manifest
@@ -31,11 +32,13 @@ class Preparation(NamedTuple):
       exploration: counts from random walks.
       estimator_config: calibrated layout estimator.
       knowledge: layout priors, method knowledge and co-occurrence evidence.
+      fitted_params: parameters of each seed, for methods that are fitted (`Method.fit`); empty for all others.
     """
 
     exploration: Exploration
     estimator_config: EstimatorConfig
     knowledge: Knowledge
+    fitted_params: tuple[Params, ...] = ()
 
 
 def save_preparation(run_dir: Path, preparation: Preparation, manifest: Mapping[str, Any]) -> None:
@@ -48,6 +51,11 @@ def save_preparation(run_dir: Path, preparation: Preparation, manifest: Mapping[
     """
     arrays = knowledge_to_arrays(preparation.knowledge)
     arrays["exploration"] = jax.device_get(preparation.exploration)._asdict()
+    if preparation.fitted_params:
+        seed_params = {}
+        for seed, params in enumerate(preparation.fitted_params):
+            seed_params[str(seed)] = jax.device_get(params)
+        arrays["fitted"] = seed_params
     fields = {"manifest": manifest, "estimator": dataclasses.asdict(preparation.estimator_config)}
     export_params(run_dir / PREPARATION_DIR, arrays, fields)
 
@@ -74,7 +82,9 @@ def load_preparation(run_dir: Path, manifest: Mapping[str, Any]) -> Preparation 
         exploration = Exploration(**jax.tree.map(jnp.asarray, arrays["exploration"]))
         estimator_config = EstimatorConfig(**fields["estimator"])
         knowledge = knowledge_from_arrays(arrays)
+        seed_params = arrays.get("fitted", {})
+        fitted_params = tuple(jax.tree.map(jnp.asarray, seed_params[str(seed)]) for seed in range(len(seed_params)))
     except (InputError, KeyError, TypeError):
         return None
     check_manifest(folder, stored_manifest, manifest)
-    return Preparation(exploration, estimator_config, knowledge)
+    return Preparation(exploration, estimator_config, knowledge, fitted_params)

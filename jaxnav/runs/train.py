@@ -77,7 +77,7 @@ from jaxnav.training.devices import (
     run_on_first_process,
 )
 from jaxnav.training.ppo import EPISODE_MEANS, Learner, LearnerState
-from jaxnav.training.trainer import SeedMetrics, ShardedTrainer, Trainer, TrainerStates
+from jaxnav.training.trainer import ARM_KEY_PURPOSES, SeedMetrics, ShardedTrainer, Trainer, TrainerStates
 
 # Constants folded into the run's key; the arms use 0, 1, ... (`ARM_KEY_PURPOSES`).
 _EXPLORE = 2**31 - 1
@@ -149,7 +149,11 @@ def _train_in_run_dir(
     """Train in a run directory whose lock is held; see `train`."""
     warn_if_rollout_too_short(config, console)
     warn_if_more_steps(config, console)
-    exploration, estimator_config, knowledge = prepare_training(config, world, manifest, console)
+    preparation = prepare_training(config, world, manifest, console)
+    exploration, estimator_config, knowledge, fitted_params = preparation
+    if fitted_params:
+        _finish_fitted_run(config, world, preparation, lock, stopwatch, console)
+        return
 
     # Draw the bank of scenes in which each chunk trains.
     trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
@@ -269,7 +273,12 @@ def prepare_training(
     with console.status("learning statistics of the training scenes"):
         knowledge = learn_knowledge(config, world, exploration, estimator_config)
 
-    preparation = Preparation(exploration, estimator_config, knowledge)
+    # Methods without training by PPO fit their policies here.
+    fitted_params: tuple[Params, ...] = ()
+    if config.policy_method.fit is not None:
+        fitted_params = fit_policies(config, world, estimator_config, knowledge, console)
+
+    preparation = Preparation(exploration, estimator_config, knowledge, fitted_params)
     run_on_first_process(lambda: save_preparation(config.run_dir, preparation, manifest))
     return preparation
 
@@ -320,6 +329,9 @@ def calibrate_estimator(
     Values that the run's configuration leaves open are calibrated in the training scenes of the first bank.
     """
     estimator_config = named_estimator(config)
+    policy_class = config.policy_method.policy_class
+    if policy_class is not None and policy_class.has_additive_scores:
+        estimator_config = dataclasses.replace(estimator_config, form="paper")  # removes from a sum
     if estimator_config.strength is None:
         return estimator_config  # `paper` and `released` keep the sums of the counts, so nothing is calibrated
 
@@ -376,6 +388,70 @@ def learn_knowledge(
     learn_near_evidence = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
     near_log_odds = learn_near_evidence(world.env, env_params, exploration.counts, near_key, num_walks, is_pooled)
     return Knowledge(layout, method_knowledge, cooccurrence._replace(near_log_odds=near_log_odds))
+
+
+def fit_policies(
+    config: RunConfig, world: CompiledWorld, estimator_config: EstimatorConfig, knowledge: Knowledge, console: Console
+) -> tuple[Params, ...]:
+    """Fit the policy of each seed to searches in the training scenes of the first bank; see `Method.fit`.
+
+    Args:
+      config: configuration of the run, whose method is fitted.
+      world: compiled training scenes.
+      estimator_config: layout estimator.
+      knowledge: knowledge from before training.
+      console: console for progress.
+    """
+    fit = config.policy_method.fit
+    assert fit is not None
+    world.check_method(config.policy_method, knowledge)
+    agent_loop = _make_fitted_loop(config, world.env, estimator_config)
+    env_params = world.make_env_params(0)
+    arm_key = jax.random.fold_in(jax.random.key(config.seed), ARM_KEY_PURPOSES["layout"])
+    num_steps = config.total_updates * config.ppo.rollout
+
+    fitted_params = []
+    for seed in range(config.seeds):
+        with console.status(f"fitting policy {seed + 1} of {config.seeds} to searches"):
+            seed_key = jax.random.fold_in(arm_key, seed)
+            params = fit(agent_loop, world.banks[0], env_params, knowledge, seed_key, config.ppo.num_envs, num_steps)
+            fitted_params.append(jax.block_until_ready(params))
+        console.print(f"policy {seed + 1} of {config.seeds}: fitted to {config.ppo.num_envs * num_steps:,} steps")
+    return tuple(fitted_params)
+
+
+def _make_fitted_loop(config: RunConfig, env: ObjectNav, estimator_config: EstimatorConfig) -> AgentLoop:
+    """Agent loop of policies that are fitted; it has no use for the gap."""
+    policy_spec = config.policy_spec(len(env.categories))
+    return AgentLoop(env, policy_spec, dataclasses.replace(estimator_config, gap="none"))
+
+
+def _finish_fitted_run(
+    config: RunConfig,
+    world: CompiledWorld,
+    preparation: Preparation,
+    lock: FolderLock,
+    stopwatch: "Stopwatch",
+    console: Console,
+) -> None:
+    """Export the policies that were fitted, and measure them."""
+    exploration, estimator_config, knowledge, fitted_params = preparation
+    policies = {"layout": [jax.device_get(params) for params in fitted_params]}
+    run_on_first_process(lock.check)
+    run_on_first_process(lambda: _export_policies(config, policies, estimator_config, knowledge, exploration))
+
+    # Success within budgets of actions; a finished run has it already.
+    if config.validations and not (config.run_dir / REACH_FILE).exists():
+        agent_loop = _make_fitted_loop(config, world.env, estimator_config)
+        try:
+            validator = Validator(config, agent_loop, knowledge, world, console)
+        except MissingSplitError as error:
+            console.print(f"no val scenes, so the policies are not measured ({error})")
+        else:
+            with console.status("measuring the policies"):
+                success_by_budget = validator.success_by_budget(policies)
+            run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
+    console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
 
 def make_trainer(

@@ -77,6 +77,8 @@ MAP_SQUARES = MAP_CELLS // SQUARE_CELLS
 _FLOOR_HIDDEN = 8
 #: Bounds of the relative weights whose logs `Dirichlet` spreads.
 _MIN_RELATIVE_WEIGHT = 0.05
+#: Initial log odds that an object is hidden from all looks: one in twenty.
+_INITIAL_HIDDEN_LOGIT = -3.0
 #: Largest number of looks at a square that is counted.
 _MAX_LOOKS = 255
 
@@ -289,7 +291,7 @@ class TargetPolicy(Policy):
       method: the predictor.
       places: the score by places.
       detection_rates: float32 [K, D], probability that a look at a square detects an object of each category there.
-      miss_scale: float32 [], factor on the log probability of looks in vain: looks at one square are not independent.
+      hidden_logit: float32 [], log odds that no look at its square shows an object, because something hides it.
     """
 
     has_additive_scores = True
@@ -301,7 +303,7 @@ class TargetPolicy(Policy):
         self.method = predictor_class(spec, rngs)
         self.places = Places(rngs)
         self.detection_rates = nnx.Param(jnp.zeros((spec.num_categories, NUM_LOOK_DISTANCES)))
-        self.miss_scale = nnx.Param(jnp.ones(()))
+        self.hidden_logit = nnx.Param(jnp.float32(_INITIAL_HIDDEN_LOGIT))
 
     def log_beliefs(self, squares: MapSquares, goal: jax.Array, weights: jax.Array) -> LogBeliefs:
         """Belief over the squares of one episode's map.
@@ -312,7 +314,7 @@ class TargetPolicy(Policy):
           weights: float32 [K], the goal's column of w (eq. 7).
         """
         assert isinstance(self.method, Predictor)
-        missed = self.miss_scale[...] * missed_looks(squares.looks, self.detection_rates[...][goal])
+        missed = missed_looks(squares.looks, self.detection_rates[...][goal], self.hidden_logit[...])
         places = self.places(squares) + missed
         return LogBeliefs(places, places + self.method.score_squares(squares, goal, weights))
 
@@ -349,9 +351,7 @@ class TargetPolicy(Policy):
         """Return the memory at the start of an episode, which holds only the previous action."""
         return PolicyState(hidden=jnp.zeros((*batch, 0)), action=jnp.full(batch, NO_ACTION, jnp.int32))
 
-    def _score_row(
-        self, reading: BeliefReading, goal: jax.Array, weights: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def _score_row(self, reading: BeliefReading, goal: jax.Array, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Direct scores and experience of one episode, float32 [n n] each."""
         squares = read_squares(reading.cells, reading.looks)
         beliefs = self.log_beliefs(squares, goal, weights)
@@ -393,8 +393,8 @@ def check_belief_map(knowledge: Knowledge, bank: Bank) -> None:
     for scene_name, required_size in required_map_sizes(bank).items():
         if required_size > MAP_CELLS:
             raise InputError(
-                f"method belief: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the map "
-                f"has {MAP_CELLS} x {MAP_CELLS}; leave the scene out"
+                f"method belief: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the "
+                f"map has {MAP_CELLS} x {MAP_CELLS}; leave the scene out"
             )
 
 

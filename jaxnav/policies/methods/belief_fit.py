@@ -1,11 +1,11 @@
 """Fit of a belief to searches in training homes.
 
 1. `locate_objects` finds where the detector reports objects from several poses of a training home.
-2. `explore_homes` searches for goals with a belief that is flat, and keeps snapshots of the agent's map together with the
-   squares of the objects; on the way it counts how often a look at an object detects it.
+2. `explore_homes` searches for goals with a belief that is flat, and keeps snapshots of the agent's map together with
+   the squares of the objects; on the way it counts how often a look at an object detects it.
 3. `fit_weights` fits places and predictor by conditional likelihood: among the squares of a map that does not show the
-   goal, those with the goal should be likeliest, given the looks in vain. The places are fitted by their own likelihood,
-   and the predictor to what they leave unexplained.
+   goal, those with the goal should be likeliest, given the looks in vain. The places are fitted by their own
+   likelihood, and the predictor to what they leave unexplained.
 """
 
 import functools
@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from jaxnav.env.objectnav import EnvParams
     from jaxnav.policies.methods.belief import TargetPolicy
 
-#: Actions between two snapshots of a map.
-SNAPSHOT_INTERVAL = 10
+#: Smallest number of actions between two snapshots of a map, and largest number of snapshots, which bounds the memory.
+MIN_SNAPSHOT_INTERVAL = 10
+MAX_SNAPSHOTS = 10_000
 #: Poses that must report an object at one cell; false alarms are scattered.
 MIN_REPORTS = 5
 #: Steps, maps in each, and learning rate of Adam.
@@ -236,8 +237,11 @@ def explore_homes(
         )
         return carry, snapshots
 
-    num_snapshots = num_steps // SNAPSHOT_INTERVAL
-    times = jnp.arange(num_snapshots * SNAPSHOT_INTERVAL).reshape(num_snapshots, SNAPSHOT_INTERVAL)
+    # At least one snapshot of each search.
+    interval = max(MIN_SNAPSHOT_INTERVAL, -(-num_searches * num_steps // MAX_SNAPSHOTS))
+    interval = min(interval, num_steps)
+    num_snapshots = num_steps // interval
+    times = jnp.arange(num_snapshots * interval).reshape(num_snapshots, interval)
     (_, look_counts), snapshots = jax.lax.scan(take_snapshot, (agent, no_looks), times)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), snapshots), look_counts
 

@@ -1,10 +1,10 @@
 """The belief about where the goal is, on the squares of the agent's own map.
 
-A square is 2 x 2 cells of the semantic map (`map_tracker.draw_view`), 0.5 m wide. `read_squares` joins the cells of each
-square. `floor_features` describes floor, walls and unexplored space around a square without any category, and
-`nearby_categories` the categories seen within 0.5, 1, 2 and 4 m of it: predictors score squares by them. `missed_looks`
-lowers the score of squares that were looked at in vain, and `score_targets` turns a belief into scores of places to go:
-the log of the probability of detecting the goal there, per action.
+A square is 2 x 2 cells of the semantic map (`map_tracker.draw_view`), 0.5 m wide. `read_squares` joins the cells of
+each square. `floor_features` describes floor, walls and unexplored space around a square without any category, and
+`nearby_categories` the categories seen within 0.5, 1, 2 and 4 m of it: predictors score squares by them.
+`missed_looks` lowers the score of squares that were looked at in vain, and `score_targets` turns a belief into scores
+of places to go: the log of the probability of detecting the goal there, per action.
 
 Functions handle one episode; callers `vmap`. Symbols in shapes: N cells along each side of the map, n = N / 2 squares,
 K categories, D distances of a look, R radii, F floor features.
@@ -142,17 +142,24 @@ def relation_scores(nearby: jax.Array, weights: jax.Array) -> jax.Array:
     return scores
 
 
-def missed_looks(looks: jax.Array, detection_rates: jax.Array) -> jax.Array:
+def missed_looks(looks: jax.Array, detection_rates: jax.Array, hidden_logit: jax.Array) -> jax.Array:
     """Log probability that the looks so far have missed a goal in each square.
+
+    Looks miss independently unless the goal is hidden from all of them.
 
     Args:
       looks: float32 [D, n, n].
-      detection_rates: float32 [D], in [0, 1), probability that a look from each distance detects the goal.
+      detection_rates: float32 [D], in [0, 1), probability that a look from each distance detects a goal that is not
+        hidden.
+      hidden_logit: float32 [], log odds that the goal is hidden.
 
     Returns:
       float32 [n, n], 0 or less.
     """
-    return jnp.tensordot(jnp.log1p(-detection_rates), looks, 1)
+    log_all_missed = jnp.tensordot(jnp.log1p(-detection_rates), looks, 1)
+    log_hidden = jax.nn.log_sigmoid(hidden_logit)
+    log_in_sight = jax.nn.log_sigmoid(-hidden_logit)
+    return jnp.logaddexp(log_hidden, log_in_sight + log_all_missed)
 
 
 def score_targets(log_belief: jax.Array, log_cost: jax.Array) -> jax.Array:
