@@ -120,7 +120,9 @@ def _uniform_knowledge(method: Method, env: ObjectNav, bank: Bank) -> Knowledge:
 
 
 def _with_random_actor(params: dict[str, Any], key: jax.Array) -> dict[str, Any]:
-    """Replace the actor's kernel, which is nearly zero at first, by a random one."""
+    """Replace the actor's kernel, which is nearly zero at first, by a random one; other policies change all over."""
+    if "actor" not in params:
+        return jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
     kernel = jax.random.normal(key, params["actor"]["kernel"].shape)
     return params | {"actor": params["actor"] | {"kernel": kernel}}
 

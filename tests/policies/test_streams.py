@@ -25,8 +25,9 @@ from jaxnav.scenes.task import NUM_ACTIONS
 NUM_CATEGORIES = len(CATEGORIES)
 BATCH_SIZE = 48
 HIDDEN_SIZE = tiny.SIZES.hidden
-#: The package's methods, one that attends with its memory, and one that adapts.
-HOSTS = [*METHODS, "support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
+#: The package's methods with its networks, one method that attends with its memory, and one that adapts.
+HOSTS = [name for name, method in METHODS.items() if method.policy_class is None]
+HOSTS += ["support.methods:ATTENTIVE", "support.methods:ADAPTIVE"]
 
 
 def make_spec(method_name, **options):

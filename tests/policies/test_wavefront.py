@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.policies.wavefront import dilate_board, find_path, follow_path, is_on_board, pack_board, turn_towards
+from jaxnav.policies.wavefront import (
+    dilate_board,
+    find_path,
+    follow_path,
+    is_on_board,
+    pack_board,
+    turn_towards,
+    unpack_board,
+    walking_steps,
+)
 from jaxnav.scenes.task import MOVE_AHEAD, NEIGHBOURS, ROTATE_LEFT, ROTATE_RIGHT, Rules
 
 SIZE = 32
@@ -49,6 +58,26 @@ def test_ways_are_as_long_as_those_of_a_queue(maps):
     np.testing.assert_array_equal(lengths, expected)
     assert (lengths < 0).sum() > maps / 25
     assert (lengths > 10).sum() > maps / 25
+
+
+def test_steps_to_all_cells_are_those_of_a_queue():
+    _, passable, start = random_maps(12)
+    steps = jax.jit(jax.vmap(lambda passable, start: walking_steps(pack_board(passable), start)))(passable, start)
+    for maze, maze_start, maze_steps in zip(passable, start, np.asarray(steps), strict=True):
+        # The queue of all cells that can be entered from the start.
+        expected = np.full(maze.shape, -1)
+        expected[tuple(maze_start)] = 0
+        queue = deque([tuple(maze_start)])
+        while queue:
+            cell = queue.popleft()
+            for step in NEIGHBOURS:
+                after = tuple((np.array(cell) + step) % SIZE)
+                if maze[after] and expected[after] < 0:
+                    expected[after] = expected[cell] + 1
+                    queue.append(after)
+        np.testing.assert_array_equal(maze_steps, expected)
+    assert (np.asarray(steps) > 16).any()  # more than half of an open board: walls lengthen ways
+    np.testing.assert_array_equal(unpack_board(pack_board(jnp.asarray(passable))), passable)
 
 
 def test_following_a_way_gets_there_by_passable_cells():

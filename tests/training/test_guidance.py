@@ -103,7 +103,7 @@ def test_a_guided_policy_agrees_with_shortest_paths_more_often():
 @pytest.mark.parametrize("method", METHODS)
 def test_the_default_weight_is_that_of_the_world_where_methods_choose_actions(world, method):
     config = check_config(RunConfig(world=world, method=method, total_steps=10**7))
-    assert config.ppo.guidance == (0.0 if method == "semexp" else WORLDS[world].guidance)
+    assert config.ppo.guidance == (0.0 if method in ("semexp", "belief") else WORLDS[world].guidance)
     assert fill_world_defaults(RunConfig(world=world)).ppo.guidance == WORLDS[world].guidance
 
 

@@ -25,7 +25,7 @@ subclass of `Predictor`, and `make_belief_method` makes a method of it.
 
 import dataclasses
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -323,13 +323,13 @@ class TargetPolicy(Policy):
     ) -> Pathways:
         """Score the targets; arguments as in `Policy.pathways`."""
         goal = inputs.observation.goal
-        reading = inputs.reading
+        reading: Any = inputs.reading
         if partner_inputs is not None:
             features = self._unpack_goal(inputs)
             _, reading = self.method.replace_other_categories(features, reading, features, partner_inputs.reading)
 
         # Only episodes in which a target is due are computed.
-        rows = (reading, goal, inputs.layout_weights)
+        rows: Any = (reading, goal, inputs.layout_weights)
         if goal.ndim == 0:
             rows = jax.tree.map(lambda leaf: leaf[None], rows)
         direct, experience = map_selected_rows(lambda row: self._score_row(*row), rows, rows[0].is_due)

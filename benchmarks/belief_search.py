@@ -1,0 +1,195 @@
+"""Value of experience to the search by belief, and what removal makes of it under a shift.
+
+`python benchmarks/belief_search.py RUN [RUN ...] [--split val] [--episodes 240] [--shift 0 1] [--shift-by context]
+[--gap surprise] [--ablations]` evaluates runs of the method `belief`, or of a method with another predictor, with best
+actions on equal episodes. Rows of each run:
+
+  nearest  the local policy alone, which walks to the nearest unexplored cell
+  flat     all squares are equally likely, except for looks in vain
+  places   complete removal of experience (eq. 1): the search by places alone
+  layout   the complete belief
+  sTDE     removal by eq. 2 in the paper's form with epsilon 0, weighed by the gap of `--gap`
+
+With `--ablations` also `no looks`, the complete belief without looks in vain. Intervals are over floor plans and fits.
+The result goes to stdout as JSON, the tables to stderr.
+"""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import print_report
+from rich.console import Console
+
+from jaxnav.choices import EstimatorName, ShiftKind
+from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import join_episode_lists
+from jaxnav.evaluation.grid import Evaluator, episode_metrics
+from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
+from jaxnav.evaluation.variants import EvaluationRow, table_row
+from jaxnav.policies.methods.belief import TargetControl
+from jaxnav.runs.evaluate import evaluate_rows
+from jaxnav.runs.policies import Policies
+from jaxnav.runs.run import Run
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+
+#: (base, variant) pairs whose difference is reported.
+PAIRS = (
+    ("nearest", "layout"),
+    ("flat", "layout"),
+    ("flat", "places"),
+    ("places", "layout"),
+    ("layout", "sTDE"),
+    ("places", "sTDE"),
+    ("layout", "no looks"),
+)
+BUDGETS = (50, 150)
+#: Metrics [S, E] by name.
+Metrics = Mapping[str, np.ndarray]
+
+
+def main(
+    run_dirs: Sequence[str],
+    split: str,
+    num_episodes: int,
+    shifts: Sequence[float],
+    shift_by: ShiftKind,
+    gap: EstimatorName,
+    has_ablations: bool,
+) -> None:
+    results = []
+    for run_dir in run_dirs:
+        run = Run.open(run_dir)
+        policies = run.policies(("layout",)).with_estimator(gap)
+        for shift in shifts:
+            console = Console(stderr=True)
+            world = compile_evaluation_world(run.config, split, None, shift, console, shift_by=shift_by)
+            result = measure_run(policies, world, num_episodes, has_ablations)
+            result |= {"run": Path(run_dir).name, "method": run.config.method, "shift": shift}
+            print(format_table(result), file=sys.stderr, flush=True)
+            results.append(result)
+    settings = {"split": split, "episodes": num_episodes, "shift_by": shift_by, "gap": gap}
+    print_report(settings | {"results": results})
+
+
+def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has_ablations: bool) -> dict[str, Any]:
+    """Measure all rows of a run in one world.
+
+    Args:
+      policies: policies of the arm `layout`, one for each fit.
+      world: compiled scenes.
+      num_episodes: number of episodes.
+      has_ablations: whether the search without looks in vain is measured too.
+    """
+    layout_row = table_row("layout", None, None, "argmax")
+    belief_rows = {
+        "places": table_row("tde", None, None, "argmax"),
+        "layout": layout_row,
+        "sTDE": table_row("stde", 0.0, "paper", "argmax"),
+    }
+    evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False)
+
+    # Rows of other parameters share the compilation; the nearest frontier is another control.
+    nearest_policies = with_nearest_frontier(policies)
+    metrics, clusters = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
+    flat_policies = with_zeros(policies, "places", "method")
+    metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
+    metrics |= measure_rows(belief_rows, policies, world, num_episodes, evaluator)[0]
+    if has_ablations:
+        no_looks = with_zeros(policies, "detection_rates")
+        metrics |= measure_rows({"no looks": layout_row}, no_looks, world, num_episodes, evaluator)[0]
+    return summarize(metrics, clusters)
+
+
+def measure_rows(
+    rows: Mapping[str, EvaluationRow],
+    policies: Policies,
+    world: CompiledWorld,
+    num_episodes: int,
+    evaluator: Evaluator | None = None,
+) -> tuple[dict[str, Metrics], Clusters]:
+    """Run rows by name; returns their metrics in percent, and the clusters of the episodes."""
+    episode_lists, outcome, _ = evaluate_rows(list(rows.values()), policies, world, num_episodes, 0, evaluator)
+    episodes = join_episode_lists(episode_lists)
+    metrics = episode_metrics(outcome, episodes.best_length, BUDGETS)
+    metrics_by_row = {}
+    for index, name in enumerate(rows):
+        row_metrics = {}
+        for metric in ("spl", "sr", *(f"sr@{budget}" for budget in BUDGETS)):
+            row_metrics[metric] = 100.0 * metrics[metric][index]
+        metrics_by_row[name] = row_metrics
+    return metrics_by_row, episodes.clusters()
+
+
+def with_zeros(policies: Policies, *groups: str) -> Policies:
+    """Policies whose parameters in some groups are zero."""
+    zeros = {group: jax.tree.map(jnp.zeros_like, policies.params[group]) for group in groups}
+    return policies._replace(params=policies.params | zeros)
+
+
+def with_nearest_frontier(policies: Policies) -> Policies:
+    """Policies whose choices are ignored for the nearest unexplored cell."""
+    method = dataclasses.replace(policies.spec.method, control=TargetControl(use_nearest_frontier=True))
+    return policies._replace(spec=dataclasses.replace(policies.spec, method=method))
+
+
+def summarize(metrics: Mapping[str, Metrics], clusters: Clusters) -> dict[str, Any]:
+    """Means of all rows, and differences of pairs, with intervals."""
+    rows: dict[str, Any] = {}
+    for name, row_metrics in metrics.items():
+        rows[name] = {}
+        for metric, values in row_metrics.items():
+            rows[name][metric] = mean_interval(values, clusters).to_json()
+    differences: dict[str, Any] = {}
+    for base, variant in PAIRS:
+        if base in metrics and variant in metrics:
+            label = f"{variant} - {base}"
+            differences[label] = {}
+            for metric in metrics[base]:
+                difference = paired_difference(
+                    metrics[base][metric], metrics[variant][metric], clusters, same_runs=True
+                )
+                differences[label][metric] = difference.to_json()
+    return {"rows": rows, "differences": differences}
+
+
+def format_table(result: dict[str, Any]) -> str:
+    """Return the results of a run in one world in Markdown."""
+    names = list(result["rows"]["layout"])
+    title = f"{result['run']}, shift {result['shift']:g}"
+    lines = [f"| {title} | {' | '.join(name.upper() for name in names)} |", "| --- |" + " ---: |" * len(names)]
+    for label, row in (result["rows"] | result["differences"]).items():
+        number_format = "+.1f" if " - " in label else ".1f"
+        cells = [f"{Interval.from_json(row[name]):{number_format}}" for name in names]
+        lines.append(f"| {label} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("runs", nargs="+")
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--episodes", type=int, default=240)
+    parser.add_argument("--shift", type=float, nargs="+", default=[0.0, 1.0])
+    parser.add_argument("--shift-by", choices=get_args(ShiftKind), default="context")
+    parser.add_argument("--gap", choices=get_args(EstimatorName), default="surprise")
+    parser.add_argument("--ablations", action="store_true")
+    options = parser.parse_args()
+    try:
+        main(
+            options.runs,
+            options.split,
+            options.episodes,
+            options.shift,
+            options.shift_by,
+            options.gap,
+            options.ablations,
+        )
+    except InputError as error:
+        sys.exit(f"error: {error}")
