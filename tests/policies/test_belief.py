@@ -2,6 +2,9 @@
 
 import dataclasses
 import functools
+import re
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -390,6 +393,31 @@ def test_fit_finds_what_stands_near_what(monkeypatch):
     assert relations[BOOK, :, CHAIR].sum() > 1.0
     assert not relations[FRIDGE].any()  # no goal of the fit
     np.testing.assert_array_equal(fitted["detection_rates"], params["detection_rates"])
+
+
+# A predictor of one's own
+
+
+def test_predictor_of_the_page_scores_by_its_weights():
+    """A book is attracted by a chair with weight 1 within the smallest radius, halved from radius to radius."""
+    page = Path(__file__).parents[2] / "docs" / "belief.md"
+    (block,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    names: dict[str, Any] = {"__name__": "page"}
+    exec(compile(block, str(page), "exec"), names)
+
+    spec = PolicySpec(names["ATTRACTION"], NUM_CATEGORIES)
+    params = init_params(spec, jax.random.key(0))
+    assert not params["method"]["attraction"].any()
+    params["method"]["attraction"] = params["method"]["attraction"].at[BOOK, CHAIR].set(1.0)
+    cells = jnp.zeros((MAP_CELLS, MAP_CELLS), jnp.uint32).at[20, 20].set(1 << CHAIR)
+    squares = read_squares(cells, jnp.zeros((NUM_LOOK_DISTANCES, MAP_SQUARES, MAP_SQUARES), jnp.uint8))
+
+    @jax.jit
+    def score_squares(params):
+        return bind(spec, params).method.score_squares(squares, jnp.int32(BOOK), jnp.ones(3))  # type: ignore
+
+    scores = np.asarray(score_squares(params))
+    np.testing.assert_array_equal(scores[10, [10, 14, 18, 19]], [1.875, 0.375, 0.125, 0.0])
 
 
 # Refusals
