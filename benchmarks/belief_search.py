@@ -10,8 +10,8 @@ actions on equal episodes. Rows of each run:
   layout   the complete belief
   sTDE     removal by eq. 2 in the paper's form with epsilon 0, weighed by the gap of `--gap`
 
-With `--ablations` also `no looks`, the complete belief without looks in vain. Intervals are over floor plans and fits.
-The result goes to stdout as JSON, the tables to stderr.
+With `--ablations` also `no looks`, the complete belief without looks in vain. Intervals are over floor plans and fits;
+those of differences are also given for these fits alone, `(these fits)`. The result goes to stdout as JSON, the tables to stderr.
 """
 
 import argparse
@@ -51,7 +51,7 @@ PAIRS = (
 )
 BUDGETS = (50, 150)
 #: Metrics [S, E] by name.
-Metrics = Mapping[str, np.ndarray]
+Metrics = dict[str, np.ndarray]
 
 
 def main(
@@ -95,9 +95,13 @@ def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has
     }
     evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False)
 
-    # Rows of other parameters share the compilation; the nearest frontier is another control.
+    # Rows of other parameters share the compilation.
+    # The nearest frontier does not depend on the fit.
     nearest_policies = with_nearest_frontier(policies)
+    nearest_policies = nearest_policies._replace(params=jax.tree.map(lambda leaf: leaf[:1], policies.params))
     metrics, clusters = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
+    for metric, values in metrics["nearest"].items():
+        metrics["nearest"][metric] = np.repeat(values, policies.num_seeds, axis=0)
     flat_policies = with_zeros(policies, "places", "method")
     metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
     metrics |= measure_rows(belief_rows, policies, world, num_episodes, evaluator)[0]
@@ -147,6 +151,7 @@ def summarize(metrics: Mapping[str, Metrics], clusters: Clusters) -> dict[str, A
         for metric, values in row_metrics.items():
             rows[name][metric] = mean_interval(values, clusters).to_json()
     differences: dict[str, Any] = {}
+    fixed_differences: dict[str, Any] = {}
     for base, variant in PAIRS:
         if base in metrics and variant in metrics:
             label = f"{variant} - {base}"

@@ -13,6 +13,7 @@ import jaxnav
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
 from jaxnav.policies.methods import find_method
+from jaxnav.runs.config import ARMS, FITTED_STEPS, RunConfig, check_config
 from jaxnav.runs.train import train, warn_if_rollout_too_short
 
 SMALL_VTNET = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
@@ -94,3 +95,46 @@ def test_train_warns_of_rollouts_shorter_than_a_macro_step(rollout, is_warned, t
     assert ("give --ppo.rollout 50 or more" in capsys.readouterr().out) == is_warned
     warn_if_rollout_too_short(dataclasses.replace(config, method="org"), Console())
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.slow
+def test_belief_is_fitted_exported_swept_and_evaluated(tmp_path):
+    """The fit takes the place of training, and is read by a repeated command."""
+    config = tiny_config(tmp_path)
+    worlds = dataclasses.replace(config.worlds, num_train=16)
+    config = dataclasses.replace(config, method="belief", method_sizes={}, arms=ARMS, worlds=worlds, validations=1)
+    run = train(config)
+    folder = run.config.run_dir
+    assert run.config.arms == ("layout",)
+    assert run.policies().estimator_config.form == "paper"
+    assert run.config.steps_by_purpose == {"exploration": 64 * 20, "searches": 512}
+    assert run.success_by_budget() is not None
+    policies = [jaxnav.load_policy(folder / "policies" / f"layout-{seed}") for seed in range(2)]
+    chex.assert_trees_all_equal(policies[0].knowledge, policies[1].knowledge)
+    assert (policies[0].params["method"]["relations"] != policies[1].params["method"]["relations"]).any()
+
+    # A repeated command reads the fit, and exports it again.
+    before = (folder / "policies" / "layout-1" / "params.safetensors").read_bytes()
+    train(config)
+    assert (folder / "policies" / "layout-1" / "params.safetensors").read_bytes() == before
+
+    # Without removal a sweep gives the complete belief; the program of a step is exported.
+    sweep = jaxnav.sweep(run, epsilon=[0.0, 1.0], episodes=8)
+    assert sweep.sr.shape[:2] == (2, 2)
+    results = jaxnav.evaluate(run, episodes=8)
+    assert {leaf.shape[-1] for leaf in results.outcome} == {8}
+    assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"arms": ("baseline",)}, r"arms is \('baseline',\); method 'belief' holds its agent without experience"),
+        ({"decision": "streams"}, "decision is streams; the scores of method 'belief' are a sum already"),
+    ],
+)
+def test_belief_has_one_arm_and_one_decision(settings, problem):
+    with pytest.raises(InputError, match=problem):
+        check_config(RunConfig(method="belief", **settings))
+    config = check_config(RunConfig(method="belief"))
+    assert (config.arms, config.total_steps, config.spatial_memory) == (("layout",), FITTED_STEPS, False)
