@@ -11,7 +11,8 @@ actions on equal episodes. Rows of each run:
   sTDE     removal by eq. 2 in the paper's form with epsilon 0, weighed by the gap of `--gap`
 
 With `--ablations` also `no looks`, the complete belief without looks in vain. Intervals are over floor plans and fits;
-those of differences are also given for these fits alone, `(these fits)`. The result goes to stdout as JSON, the tables to stderr.
+those of differences are also given for these fits alone, `(these fits)`. The result goes to stdout as JSON, the tables
+to stderr.
 """
 
 import argparse
@@ -95,13 +96,14 @@ def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has
     }
     evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False)
 
-    # Rows of other parameters share the compilation.
     # The nearest frontier does not depend on the fit.
     nearest_policies = with_nearest_frontier(policies)
     nearest_policies = nearest_policies._replace(params=jax.tree.map(lambda leaf: leaf[:1], policies.params))
     metrics, clusters = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
     for metric, values in metrics["nearest"].items():
         metrics["nearest"][metric] = np.repeat(values, policies.num_seeds, axis=0)
+
+    # Rows of other parameters share the compilation.
     flat_policies = with_zeros(policies, "places", "method")
     metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
     metrics |= measure_rows(belief_rows, policies, world, num_episodes, evaluator)[0]
@@ -153,15 +155,18 @@ def summarize(metrics: Mapping[str, Metrics], clusters: Clusters) -> dict[str, A
     differences: dict[str, Any] = {}
     fixed_differences: dict[str, Any] = {}
     for base, variant in PAIRS:
-        if base in metrics and variant in metrics:
-            label = f"{variant} - {base}"
-            differences[label] = {}
-            for metric in metrics[base]:
-                difference = paired_difference(
-                    metrics[base][metric], metrics[variant][metric], clusters, same_runs=True
-                )
-                differences[label][metric] = difference.to_json()
-    return {"rows": rows, "differences": differences}
+        if base not in metrics or variant not in metrics:
+            continue
+        label = f"{variant} - {base}"
+        differences[label] = {}
+        fixed_differences[f"{label} (these fits)"] = {}
+        for metric in metrics[base]:
+            pair = metrics[base][metric], metrics[variant][metric]
+            over_fits = paired_difference(*pair, clusters, same_runs=True)
+            these_fits = paired_difference(*pair, clusters, trained=False)
+            differences[label][metric] = over_fits.to_json()
+            fixed_differences[f"{label} (these fits)"][metric] = these_fits.to_json()
+    return {"rows": rows, "differences": differences | fixed_differences}
 
 
 def format_table(result: dict[str, Any]) -> str:
