@@ -75,7 +75,7 @@ MAP_SQUARES = MAP_CELLS // SQUARE_CELLS
 
 #: Hidden units of the perceptron for the floor around a square.
 _FLOOR_HIDDEN = 8
-#: Bounds of the relative weights whose logs `Dirichlet` spreads.
+#: Smallest relative weight whose log `Dirichlet` spreads.
 _MIN_RELATIVE_WEIGHT = 0.05
 #: Initial log odds that an object is hidden from all looks: one in twenty.
 _INITIAL_HIDDEN_LOGIT = -3.0
