@@ -102,14 +102,14 @@ def random_policy_params(method=BELIEF, seed=0):
 def test_squares_are_those_of_a_twin():
     rng = np.random.default_rng(0)
     cells = random_cells(rng)
-    looks = rng.integers(0, 9, (NUM_LOOK_DISTANCES, NUM_SQUARES, NUM_SQUARES)).astype(np.uint8)
-    squares = read_squares(jnp.asarray(cells), jnp.asarray(looks))
+    look_counts = rng.integers(0, 9, (NUM_LOOK_DISTANCES, NUM_SQUARES, NUM_SQUARES)).astype(np.uint8)
+    squares = read_squares(jnp.asarray(cells), jnp.asarray(look_counts))
     for row, column in np.ndindex(NUM_SQUARES, NUM_SQUARES):
         square_cells = cells[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
         assert squares.categories[row, column] == np.bitwise_or.reduce(square_cells, axis=None)
         shares = [(square_cells & flag > 0).mean() for flag in (EXPLORED_BIT, FREE_BIT, WALL_BIT)]
         np.testing.assert_allclose(squares.floor[:, row, column], shares, rtol=1e-6)
-    np.testing.assert_array_equal(squares.looks, looks)
+    np.testing.assert_array_equal(squares.looks, look_counts)
 
 
 def neighbours(row, column, radius):
@@ -140,11 +140,11 @@ def test_features_of_a_square_are_those_of_a_twin():
 
 def test_looks_in_vain_follow_worked_arithmetic():
     # Two looks with rate 1/2 and one with rate 1/4 miss with (1/2)^2 x 3/4 = 3/16, unless hidden (odds 1: half).
-    looks = jnp.zeros((NUM_LOOK_DISTANCES, 1, 2)).at[0, 0, 0].set(2.0).at[1, 0, 0].set(1.0)
+    look_counts = jnp.zeros((NUM_LOOK_DISTANCES, 1, 2)).at[0, 0, 0].set(2.0).at[1, 0, 0].set(1.0)
     rates = jnp.zeros(NUM_LOOK_DISTANCES).at[0].set(0.5).at[1].set(0.25)
-    missed = missed_looks(looks, rates, jnp.float32(0.0))
+    missed = missed_looks(look_counts, rates, jnp.float32(0.0))
     np.testing.assert_allclose(np.exp(missed), [[0.5 + 0.5 * 3 / 16, 1.0]], rtol=1e-6)
-    never_hidden = missed_looks(looks, rates, jnp.float32(-30.0))
+    never_hidden = missed_looks(look_counts, rates, jnp.float32(-30.0))
     np.testing.assert_allclose(np.exp(never_hidden), [[3 / 16, 1.0]], rtol=1e-6)
 
 
@@ -316,11 +316,11 @@ def test_objects_of_a_home_are_where_its_detector_reports_them():
 
 
 def test_rates_are_hits_per_look_and_rare_categories_have_the_mean_rate():
-    looks = np.zeros((2, NUM_LOOK_DISTANCES), np.float32)
-    hits = np.zeros_like(looks)
-    looks[0, 0] = 98.0
+    look_counts = np.zeros((2, NUM_LOOK_DISTANCES), np.float32)
+    hits = np.zeros_like(look_counts)
+    look_counts[0, 0] = 98.0
     hits[0, 0] = 73.5
-    rates = np.asarray(detection_rates(LookCounts(jnp.asarray(looks), jnp.asarray(hits))))
+    rates = np.asarray(detection_rates(LookCounts(jnp.asarray(look_counts), jnp.asarray(hits))))
     # Mean 74 / 99; with two looks at it, (73.5 + 2 x 74 / 99) / 100, and the mean itself for the category never seen.
     np.testing.assert_allclose(rates[:, 0], [(73.5 + 148 / 99) / 100, 74 / 99], rtol=1e-5)
     np.testing.assert_allclose(rates[:, 1], [0.5, 0.5], rtol=1e-5)

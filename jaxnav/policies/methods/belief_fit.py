@@ -289,8 +289,8 @@ def count_looks(
     is_close = jnp.zeros(num_categories + 1, bool).at[categories].max(separation <= 1)[:num_categories]
     is_hit = row_format.presence(row) & is_close
 
-    looks = jax.nn.one_hot(nearest_bin, NUM_LOOK_DISTANCES)  # zeros for categories out of view
-    return LookCounts(looks, looks * is_hit[:, None].astype(jnp.float32))
+    view_looks = jax.nn.one_hot(nearest_bin, NUM_LOOK_DISTANCES)  # zeros for categories out of view
+    return LookCounts(view_looks, view_looks * is_hit[:, None].astype(jnp.float32))
 
 
 def detection_rates(look_counts: LookCounts) -> jax.Array:

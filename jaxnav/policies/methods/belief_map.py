@@ -50,12 +50,12 @@ class MapSquares(NamedTuple):
     looks: jax.Array
 
 
-def read_squares(cells: jax.Array, looks: jax.Array) -> MapSquares:
+def read_squares(cells: jax.Array, look_counts: jax.Array) -> MapSquares:
     """Join the cells of each square.
 
     Args:
       cells: uint32 [N, N], the map.
-      looks: uint8 [D, n, n], see `SearchState`.
+      look_counts: uint8 [D, n, n], see `SearchState.looks`.
     """
     # The four cells of each square, one array for each corner.
     corners = split_corners(cells)
@@ -64,7 +64,7 @@ def read_squares(cells: jax.Array, looks: jax.Array) -> MapSquares:
     for flag in (EXPLORED_BIT, FREE_BIT, WALL_BIT):
         num_flagged = sum((corner & flag > 0).astype(jnp.float32) for corner in corners)
         shares.append(num_flagged / len(corners))
-    return MapSquares(joined_bits, jnp.stack(shares), looks.astype(jnp.float32))
+    return MapSquares(joined_bits, jnp.stack(shares), look_counts.astype(jnp.float32))
 
 
 def split_corners(cells: jax.Array) -> list[jax.Array]:
@@ -142,13 +142,13 @@ def relation_scores(nearby: jax.Array, weights: jax.Array) -> jax.Array:
     return scores
 
 
-def missed_looks(looks: jax.Array, detection_rates: jax.Array, hidden_logit: jax.Array) -> jax.Array:
+def missed_looks(look_counts: jax.Array, detection_rates: jax.Array, hidden_logit: jax.Array) -> jax.Array:
     """Log probability that the looks so far have missed a goal in each square.
 
     Looks miss independently unless the goal is hidden from all of them.
 
     Args:
-      looks: float32 [D, n, n].
+      look_counts: float32 [D, n, n].
       detection_rates: float32 [D], in [0, 1), probability that a look from each distance detects a goal that is not
         hidden.
       hidden_logit: float32 [], log odds that the goal is hidden.
@@ -156,7 +156,7 @@ def missed_looks(looks: jax.Array, detection_rates: jax.Array, hidden_logit: jax
     Returns:
       float32 [n, n], 0 or less.
     """
-    log_all_missed = jnp.tensordot(jnp.log1p(-detection_rates), looks, 1)
+    log_all_missed = jnp.tensordot(jnp.log1p(-detection_rates), look_counts, 1)
     log_hidden = jax.nn.log_sigmoid(hidden_logit)
     log_in_sight = jax.nn.log_sigmoid(-hidden_logit)
     return jnp.logaddexp(log_hidden, log_in_sight + log_all_missed)
