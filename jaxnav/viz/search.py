@@ -1,9 +1,11 @@
 """Picture of a search with a map: the agent's map at one step, its target block and its planned path.
 
 `take_snapshot` recomputes the map and the plan of a step from a played episode, and `draw_search` draws both over the
-plan of the home. `MapProjection` converts cells of the toroidal map to places in the world.
+plan of the home. `MapProjection` converts cells of the toroidal map to places in the world. For a search by belief, the
+picture has two panels with the belief as a heat map: with all experience, and after its removal.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba
+from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from jaxnav.causal import remove_from_sum
 from jaxnav.env.render import (
     AGENT_COLOR,
     BACKGROUND_COLOR,
@@ -25,15 +28,17 @@ from jaxnav.env.render import (
 )
 from jaxnav.errors import InputError
 from jaxnav.policies.method import Knowledge, Percept
+from jaxnav.policies.methods.belief import TargetPolicy
+from jaxnav.policies.methods.belief_map import read_squares
 from jaxnav.policies.methods.local_policy import LocalPolicy
 from jaxnav.policies.methods.map_tracker import (
-    BLOCKS_PER_SIDE,
     EXPLORED_BIT,
     FREE_BIT,
     WALL_BIT,
     SearchState,
     goal_on_map,
 )
+from jaxnav.policies.network import Params, bind
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.scene import CELL_SIZE, scene_extent
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
@@ -56,6 +61,9 @@ NEAR_COLOR = "#bcd9ea"
 FAR_COLOR = "#e6f0f6"
 OBSTACLE_COLOR = "#55524d"
 BLOCK_COLOR = "#CC79A7"
+BELIEF_COLOR = "#D55E00"
+#: Opacity of the likeliest square.
+_MAX_OPACITY = 0.85
 
 
 class SearchSnapshot(NamedTuple):
@@ -64,10 +72,15 @@ class SearchSnapshot(NamedTuple):
     Attributes:
       search_state: state of the search after the choice of the step, with the map; leaves are NumPy arrays.
       predicted_cells: int32 [L, 2], cells (z, x) after each of the next actions, if nothing new is seen.
+      block_size: cells along each side of the target block.
+      beliefs: by the title of a panel, the probability float32 [n, n] that the goal is in each square of the map; empty
+        for other methods than a search by belief.
     """
 
     search_state: SearchState
     predicted_cells: np.ndarray
+    block_size: int
+    beliefs: Mapping[str, np.ndarray] = {}
 
     @property
     def is_searching(self) -> bool:
@@ -91,7 +104,7 @@ def take_snapshot(episode: PlayedEpisode, step: int) -> SearchSnapshot:
     tracker = method.tracker
     num_steps = len(episode.trace.pose)
     if not isinstance(control, LocalPolicy) or tracker is None:
-        raise InputError(f"--map: method {method.name!r} has no map; give a run of method semexp")
+        raise InputError(f"--map: method {method.name!r} has no map; give a run of method semexp or belief")
     if not 0 <= step < num_steps:
         raise InputError(f"--step {step + 1}: give a number from 1 to {num_steps}")
 
@@ -108,7 +121,50 @@ def take_snapshot(episode: PlayedEpisode, step: int) -> SearchSnapshot:
     # Predict the next actions with the choice of this step.
     predict = jax.jit(lambda state: predict_path(control, state, choices[step], knowledge))
     predicted_cells = predict(search_state)
-    return SearchSnapshot(jax.tree.map(np.asarray, search_state), np.asarray(predicted_cells))
+    return SearchSnapshot(
+        search_state=jax.tree.map(np.asarray, search_state),
+        predicted_cells=np.asarray(predicted_cells),
+        block_size=control.block_size(len(search_state.cells)),
+        beliefs=compute_beliefs(episode, search_state, step),
+    )
+
+
+def compute_beliefs(episode: PlayedEpisode, search_state: SearchState, step: int) -> dict[str, np.ndarray]:
+    """Return the belief of a search by belief with all experience, and after its removal by equations 1 or 2.
+
+    Args:
+      episode: played episode; its first policy has acted.
+      search_state: state of the search at the step.
+      step: step of the episode, from 0.
+
+    Returns:
+      By the title of a panel, float32 [n, n], as in `SearchSnapshot.beliefs`.
+    """
+    policies = episode.policies
+    if policies.spec.method.policy_class is not TargetPolicy:
+        return {}
+    inferred = episode.trace.inferred
+    removal_weight = float(inferred.removal_weight[step])
+    layout_weights = jnp.asarray(inferred.layout_weights[step])
+
+    @jax.jit
+    def predict_goal(params: Params, search_state: SearchState) -> tuple[jax.Array, jax.Array]:
+        policy = bind(policies.spec, params)
+        assert isinstance(policy, TargetPolicy)
+        assert search_state.looks is not None
+        squares = read_squares(search_state.cells, search_state.looks)
+        beliefs = policy.log_beliefs(squares, jnp.int32(episode.goal), layout_weights)
+        experience = beliefs.layout - beliefs.places
+        # A removal weight is a gap without a threshold.
+        remaining = remove_from_sum(beliefs.places, experience, jnp.full(len(experience), removal_weight), 0.0)
+        return jax.nn.softmax(beliefs.layout, axis=(0, 1)), jax.nn.softmax(remaining, axis=(0, 1))
+
+    params = jax.tree.map(lambda leaf: leaf[0], policies.params)
+    before_removal, after_removal = predict_goal(params, search_state)
+    return {
+        "belief with all experience": np.asarray(before_removal),
+        f"after removal, s = {removal_weight:.2f}": np.asarray(after_removal),
+    }
 
 
 def predict_path(control: LocalPolicy, search_state: SearchState, choice: jax.Array, knowledge: Knowledge) -> jax.Array:
@@ -203,7 +259,6 @@ def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, pat
     """Write the picture of the search at a step as a PNG."""
     figure = Figure(figsize=(9.6, 5.4), dpi=100)
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.015, 0.03, 0.7, 0.85))
     projection = MapProjection(episode, snapshot)
 
     # Texts above the plan.
@@ -213,14 +268,24 @@ def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, pat
     figure.text(0.02, 0.9, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
     figure.text(0.98, 0.935, status_text, color=status_color, fontsize=10.5, ha="right")
 
-    # The plan of the home, faint, under the agent's map.
-    draw_plan_background(axes, episode.scene)
-    _draw_map(axes, snapshot, projection)
-    _draw_paths(axes, episode, snapshot, step, projection)
-    _draw_marks(axes, episode, snapshot, projection)
+    # A panel for each belief; one panel without a belief.
+    panel_titles = list(snapshot.beliefs) or [""]
+    panel_width = 0.7 / len(panel_titles)
+    for index, panel_title in enumerate(panel_titles):
+        axes = figure.add_axes((0.015 + index * panel_width, 0.03, panel_width, 0.82 if panel_title else 0.85))
+        axes.set_title(panel_title, fontsize=9.5, color=MUTED_COLOR)
+        # The plan of the home, faint, under the agent's map.
+        draw_plan_background(axes, episode.scene)
+        _draw_map(axes, snapshot, projection)
+        if panel_title:
+            _draw_belief(axes, snapshot.beliefs[panel_title], projection)
+        _draw_paths(axes, episode, snapshot, step, projection)
+        _draw_marks(axes, episode, snapshot, projection)
 
     # The legend stands to the right of the plan.
     legend_handles = _legend_handles(goal_name, snapshot.is_searching)
+    if snapshot.beliefs:
+        legend_handles.append(Patch(color=BELIEF_COLOR, alpha=_MAX_OPACITY, label=f"{goal_name} is likely here"))
     figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
     save_figure(figure, path)
 
@@ -233,6 +298,16 @@ def _draw_map(axes: Axes, snapshot: SearchSnapshot, projection: MapProjection) -
     for bits, color in ((FREE_BIT, FAR_COLOR), (FREE_BIT | EXPLORED_BIT, NEAR_COLOR), (WALL_BIT, OBSTACLE_COLOR)):
         map_image[cells & bits == bits] = to_rgba(color)
     axes.imshow(map_image, origin="lower", extent=projection.borders, interpolation="nearest", zorder=2.5)
+
+
+def _draw_belief(axes: Axes, belief: np.ndarray, projection: MapProjection) -> None:
+    """Draw the probability of each square of the map, as opacity over the likeliest square."""
+    square_cells = projection.size // len(belief)
+    by_cell = np.repeat(np.repeat(belief, square_cells, axis=0), square_cells, axis=1)
+    heat_image = np.zeros((*by_cell.shape, 4))
+    heat_image[..., :3] = to_rgb(BELIEF_COLOR)
+    heat_image[..., 3] = _MAX_OPACITY * projection.unroll(by_cell) / belief.max()
+    axes.imshow(heat_image, origin="lower", extent=projection.borders, interpolation="nearest", zorder=3)
 
 
 def _draw_paths(
@@ -250,13 +325,12 @@ def _draw_paths(
     axes.plot(*planned_path.T, ":", color=AGENT_COLOR, lw=2, zorder=4)
     draw_agent(axes, episode.scene, rules, episode.places[step], 360.0 / rules.headings * float(search_state.heading))
     if snapshot.is_searching:
-        _draw_block(axes, search_state, projection)
+        _draw_block(axes, search_state, snapshot.block_size, projection)
     axes.apply_aspect()
 
 
-def _draw_block(axes: Axes, search_state: SearchState, projection: MapProjection) -> None:
+def _draw_block(axes: Axes, search_state: SearchState, block_size: int, projection: MapProjection) -> None:
     """Draw the target block, which may lie beyond the home."""
-    block_size = projection.size // BLOCKS_PER_SIDE  # cells
     block_side = CELL_SIZE * block_size  # metres
     middle_cell = search_state.block_start + block_size // 2
     _, block_middle = projection.path_to_world(np.stack([search_state.position, middle_cell]))

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 from support import tiny_world as tiny
-from support.scenes import BOOK, CATEGORIES, corridor_scene
+from support.scenes import BOOK, CATEGORIES, CHAIR, corridor_scene
 
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import State
@@ -21,15 +21,27 @@ from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.removal import InferenceTrace
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.methods import find_method
+from jaxnav.policies.methods.belief import BELIEF, BeliefTracker, learn_belief_setup
 from jaxnav.policies.methods.map_tracker import BLOCKS_PER_SIDE, VISITED_BIT
 from jaxnav.policies.methods.semexp import SEMEXP, learn_search_setup
+from jaxnav.policies.network import init_params
+from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import Task
 from jaxnav.viz.episode import PlayedEpisode
-from jaxnav.viz.search import BLOCK_COLOR, NEAR_COLOR, OBSTACLE_COLOR, MapProjection, draw_search, take_snapshot
+from jaxnav.viz.search import (
+    BLOCK_COLOR,
+    NEAR_COLOR,
+    OBSTACLE_COLOR,
+    MapProjection,
+    SearchSnapshot,
+    compute_beliefs,
+    draw_search,
+    take_snapshot,
+)
 
 CORRIDOR = corridor_scene(24)
 BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))
@@ -176,3 +188,42 @@ def test_snapshot_refuses_a_method_without_a_map(corridor_walk):
     episode, _ = corridor_walk
     with pytest.raises(InputError, match=r"--map: method 'org' .*; give a run of method semexp"):
         take_snapshot(episode._replace(policies=tiny.make_untrained_policies()), 0)
+
+
+# Belief
+
+
+def test_heat_maps_show_the_belief_before_and_after_removal(corridor_walk, tmp_path):
+    """With a removal weight of 1 the belief is that by places, softmax(0) without a fit; a chair attracts the book."""
+    episode, _ = corridor_walk
+    spec = PolicySpec(BELIEF, len(CATEGORIES))
+    params = init_params(spec, jax.random.key(0))
+    params["method"]["relations"] = params["method"]["relations"].at[BOOK, 0, CHAIR].set(2.0)
+    ones = np.ones(NUM_STEPS, np.float32)
+    inferred = episode.trace.inferred._replace(
+        removal_weight=ones, layout_weights=np.ones((NUM_STEPS, len(CATEGORIES)), np.float32)
+    )
+    episode = episode._replace(
+        trace=episode.trace._replace(inferred=inferred),
+        policies=episode.policies._replace(params=jax.tree.map(lambda leaf: leaf[None], params), spec=spec),
+    )
+
+    # A map with nothing but a chair in square (24, 26), next to the start.
+    knowledge = KNOWLEDGE._replace(method=jax.tree.map(jnp.asarray, learn_belief_setup([BANK], np.zeros(0))))
+    search_state = BeliefTracker().init(knowledge)
+    search_state = search_state._replace(cells=search_state.cells.at[48, 52].set(1 << CHAIR))
+    beliefs = compute_beliefs(episode, search_state, 3)
+    assert list(beliefs) == ["belief with all experience", "after removal, s = 1.00"]
+    before_removal, after_removal = beliefs.values()
+    np.testing.assert_allclose(after_removal, 1 / 48**2, rtol=1e-5)
+    # Nine squares within 0.5 m of the chair are e^2 times as likely as all the others.
+    near_chair = np.exp(2) / (9 * np.exp(2) + 48**2 - 9)
+    np.testing.assert_allclose(before_removal[23:26, 25:28], near_chair, rtol=1e-5)
+    assert (before_removal > 0.99 * near_chair).sum() == 9
+
+    # Both are drawn.
+    positions = np.repeat(np.asarray(search_state.position)[None], 3, axis=0)
+    snapshot = SearchSnapshot(jax.tree.map(np.asarray, search_state), positions, 2, beliefs)
+    draw_search(episode, snapshot, 3, tmp_path / "belief.png")
+    with Image.open(tmp_path / "belief.png") as image:
+        assert image.size == (960, 540)

@@ -144,7 +144,8 @@ class TargetControl(LocalPolicy):
         """Number of squares."""
         return MAP_SQUARES**2
 
-    def _block_size(self, size: int) -> int:
+    def block_size(self, size: int) -> int:
+        """Return the number of cells along each side of a square."""
         return SQUARE_CELLS
 
     def _find_block(self, choice: jax.Array, state: SearchState) -> jax.Array:

@@ -92,7 +92,7 @@ class LocalPolicy:
         unexplored = pack_board(state.cells & EXPLORED_BIT == 0)
         search_targets = unexplored
         if not self.use_nearest_frontier:
-            search_targets = unexplored & _block_board(state.block_start, self._block_size(size), size)
+            search_targets = unexplored & _block_board(state.block_start, self.block_size(size), size)
         targets = jnp.where(goal_location.is_known, pack_board(goal_location.viewpoints), search_targets)
 
         # Plan a path; the search has failed if no cell can be reached.
@@ -132,7 +132,7 @@ class LocalPolicy:
             actions_left=jnp.where(is_decision_step, self.interval, state.actions_left),
         )
 
-    def _block_size(self, size: int) -> int:
+    def block_size(self, size: int) -> int:
         """Return the number of cells along each side of a block, on a map of N cells."""
         return size // BLOCKS_PER_SIDE
 
@@ -141,7 +141,7 @@ class LocalPolicy:
         # Blocks are numbered row by row from the corner of the map centred on the agent.
         size = len(state.cells)
         block = jnp.stack([choice // BLOCKS_PER_SIDE, choice % BLOCKS_PER_SIDE]).astype(jnp.int32)
-        return (state.position - size // 2 + self._block_size(size) * block) % size
+        return (state.position - size // 2 + self.block_size(size) * block) % size
 
 
 def _block_board(block_start: jax.Array, block_size: int, size: int) -> jax.Array:
