@@ -1,8 +1,8 @@
 """Belief: a search that predicts where the goal is, and goes where detection is likeliest.
 
-Idea: S. K. Ramakrishnan et al., *PONI*, CVPR 2022, and A. J. Zhai and S. Wang, *PEANUT: Predicting and Navigating to
-Unseen Targets*, ICCV 2023 (arXiv 2212.02497), which predict where the goal is from a semantic map; and Bayesian search,
-in which a look that does not detect the goal lowers the probability of the places in view.
+Idea: A. J. Zhai and S. Wang, *PEANUT: Predicting and Navigating to Unseen Targets*, ICCV 2023 (arXiv 2212.02497), which
+predicts where the goal is from a semantic map; and Bayesian search, in which a look that does not detect the goal
+lowers the probability of the places in view.
 
 The map, the detections and the local policy are those of SemExp (`map_tracker`, `local_policy`). Every five actions, or
 when the target is reached or refuted, the policy scores all squares of the map. With the belief P over squares and the
