@@ -120,7 +120,7 @@ def neighbours(row, column, radius):
 
 def test_features_of_a_square_are_those_of_a_twin():
     rng = np.random.default_rng(1)
-    categories = rng.choice(np.uint32([0, 0, 0, 0, 0, 0, 0, 0, 1, 2, 4]), (NUM_SQUARES, NUM_SQUARES))
+    categories = rng.choice(np.array([0, 0, 0, 0, 0, 0, 0, 0, 1, 2, 4], np.uint32), (NUM_SQUARES, NUM_SQUARES))
     floor = rng.random((3, NUM_SQUARES, NUM_SQUARES)).astype(np.float32)
     weights = rng.normal(size=(len(RADII), NUM_CATEGORIES)).astype(np.float32)
     features = np.asarray(floor_features(jnp.asarray(floor)))

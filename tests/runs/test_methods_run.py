@@ -106,7 +106,9 @@ def test_belief_is_fitted_exported_swept_and_evaluated(tmp_path):
     run = train(config)
     folder = run.config.run_dir
     assert run.config.arms == ("layout",)
-    assert run.policies().estimator_config.form == "paper"
+    estimator_config = run.policies().estimator_config
+    assert estimator_config is not None
+    assert estimator_config.form == "paper"
     assert run.config.steps_by_purpose == {"exploration": 64 * 20, "searches": 512}
     assert run.success_by_budget() is not None
     policies = [jaxnav.load_policy(folder / "policies" / f"layout-{seed}") for seed in range(2)]
