@@ -88,7 +88,7 @@ def test_example_config_is_valid():
     assert config not in (RunConfig(), apply_yaml(RunConfig(), "smoke"))
 
 
-@pytest.mark.parametrize(("command", "first_name"), [("train", "long"), ("study", "ablations")])
+@pytest.mark.parametrize(("command", "first_name"), [("train", "belief"), ("study", "ablations")])
 def test_command_help_lists_the_packaged_configurations(capsys, command, first_name):
     with pytest.raises(SystemExit):
         main([command, "--help"])
