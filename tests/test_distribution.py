@@ -24,6 +24,10 @@ def build_distribution(sources, kind, folder):
     return folder / completed.stdout.splitlines()[-1]
 
 
+#: Trained policies of a study, too large for the archive; the study trains them anew where they are missing.
+LEFT_OUT = ROOT / "results" / "claims" / "runs"
+
+
 @pytest.fixture(scope="module")
 def built_distributions(tmp_path_factory):
     """The unpacked archive of the sources, and the wheel that is built there."""
@@ -50,7 +54,8 @@ def list_files(folder):
 def test_source_archive_contains_every_file_of_the_repository(built_distributions):
     unpacked, _ = built_distributions
     for folder in FOLDERS:
-        assert list_files(ROOT / folder) == list_files(unpacked / folder)
+        expected = {name for name in list_files(ROOT / folder) if not (ROOT / folder / name).is_relative_to(LEFT_OUT)}
+        assert list_files(unpacked / folder) == expected
     assert {path.name for path in FILES} <= list_files(unpacked)
 
 
