@@ -43,7 +43,7 @@ def test_concepts_contain_the_worked_divergences():
         assert f"{value:.4f}" in text
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_python_blocks_of_use_run(tmp_path, monkeypatch, capsys):
     """In a folder of its own, in the order of the page, with a run of a few updates."""
     monkeypatch.chdir(tmp_path)

@@ -75,7 +75,7 @@ def printed_text(notebook):
     return cell_outputs
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_notebook_prints_its_stored_outputs():
     """The words are equal, and the numbers up to what another CPU may change."""
     nbclient = pytest.importorskip("nbclient")

@@ -148,7 +148,7 @@ print(policy.act(observation, policy.init(), heading=0, moved=False)[0])
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_commands_of_the_page_train_and_evaluate_the_method(method_folder, tmp_path):
     run_dir = tmp_path / "run"
 

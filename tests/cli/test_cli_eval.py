@@ -201,7 +201,7 @@ def test_evaluations_of_other_settings_have_other_files():
 # Layout shifts, scene files and other worlds
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_eval_of_a_shift_is_named_in_file_and_report(run_dir, tmp_path, capsys):
     copied_run = shutil.copytree(run_dir, tmp_path / "run")
     assert evaluate(copied_run, "--episodes", 4, "--shift", 1) == 0

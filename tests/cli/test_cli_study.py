@@ -149,7 +149,7 @@ def test_study_of_a_run_prints_and_stores_the_results(experiment, drawn_run, cap
     assert [path.stem for path in (run_dir / "results" / "val").iterdir()] == ["rooms-main-frontier"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_study_account_of_a_run_over_itself_is_zero_for_the_baseline(drawn_run, capsys):
     # The run itself stands in for layout-blind agents, so that its baseline has no lead.
     run_dir = drawn_run.config.run_dir

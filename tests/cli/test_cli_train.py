@@ -249,7 +249,7 @@ def test_train_names_a_damaged_config_file(tmp_path, run_dir, config_file, capsy
 # Categories and priors
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_custom_categories_are_trained_resumed_and_evaluated(tmp_path, config_file, capsys):
     """Three categories, two of them goals, in a run that the second command finds finished."""
     run_dir = tmp_path / "own"

@@ -273,7 +273,7 @@ def test_growth_is_the_change_of_the_gain_between_the_shifts(make_bench, monkeyp
     assert growth.scenes == 4
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_trials_vary_gap_threshold_and_controls(make_bench):
     bench = make_bench(epsilon=(0.0, 1.0))
     table = ResultTable(measure_trials(bench, bench.find_run("rooms", "main"), 0.0))

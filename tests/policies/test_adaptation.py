@@ -155,7 +155,7 @@ def test_adaptation_by_factors_equals_gradient_steps_on_whole_kernels(spec_name)
         assert is_factor_used.sum() == 4 * WINDOW
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("order", [1, 2])
 def test_training_gradient_of_adaptation_has_the_configured_order(order):
     observation, action = random_episode(1)

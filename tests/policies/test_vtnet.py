@@ -240,7 +240,7 @@ def test_imitation_loss_is_the_cross_entropy_to_the_expert():
     assert parts["imitation_agreement"] == pytest.approx(1 / 3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("optimised")
 def test_imitation_stage_learns_the_expert_and_changes_only_the_method():
     spec = dataclasses.replace(tiny.SPEC, method=find_method("vtnet"), method_sizes=tuple(SIZES.items()))

@@ -301,7 +301,7 @@ def test_log_with_a_missing_or_repeated_row_is_refused(tmp_path, row_index):
 # Whole runs
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_run_with_a_damaged_checkpoint_resumes_bit_for_bit(tmp_path, tmp_path_factory, capsys):
     config_file, original_dir = finished_run(tmp_path_factory)
     damaged_dir = shutil.copytree(original_dir, tmp_path / "run")

@@ -15,7 +15,7 @@ def halved(evaluated):
     return evaluated._replace(outcome=evaluated.outcome._replace(success=success))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_account_has_a_lead_per_row_and_metric(evaluated, halved):
     entries = measure_leads(evaluated, halved)
     assert {entry.metric for entry in entries} == {"sr", "spl", "sr@20", "sr@50"}
@@ -32,7 +32,7 @@ def test_account_has_a_lead_per_row_and_metric(evaluated, halved):
     np.testing.assert_allclose(mean_leads, expected_leads, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_account_has_a_share_for_rows_with_removal_alone(evaluated, halved):
     shares = {entry.variant: entry.remaining for entry in measure_leads(evaluated, halved) if entry.metric == "sr"}
     assert shares["ORG (baseline)"] is None

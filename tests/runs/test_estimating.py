@@ -36,7 +36,7 @@ def test_gap_estimator_changes_stde_rows_alone(drawn_run, evaluated, setting):
             assert not same, row
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_paper_estimator_changes_layout_rows_alone(drawn_run, evaluated):
     other = jaxnav.evaluate(drawn_run, epsilon=EPSILON, episodes=EPISODES, setting="paper")
     by_arm = {"baseline": [], "layout": []}

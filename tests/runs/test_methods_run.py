@@ -97,7 +97,7 @@ def test_train_warns_of_rollouts_shorter_than_a_macro_step(rollout, is_warned, t
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_belief_is_fitted_exported_swept_and_evaluated(tmp_path):
     """The fit takes the place of training, and is read by a repeated command."""
     config = tiny_config(tmp_path)

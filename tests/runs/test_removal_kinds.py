@@ -91,7 +91,7 @@ def test_cde_leaves_the_policy_without_experience_in_a_replay(run, results):
     np.testing.assert_array_equal([len(trace.action) for trace in traces], expected_length)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_counterfactual_memory_changes_only_rows_with_counterfactual_logits(run, results):
     factual = jaxnav.evaluate(run, epsilon=THRESHOLDS, episodes=NUM_EPISODES, counterfactual_memory="factual")
     own = jaxnav.evaluate(run, epsilon=THRESHOLDS, episodes=NUM_EPISODES, counterfactual_memory="own")

@@ -167,7 +167,7 @@ def test_shifts_share_a_compilation_and_equal_evaluations(drawn_run):
 # Directories and policies
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_run_directory_stands_for_its_run(drawn_run, swept, evaluated):
     path = str(drawn_run.config.run_dir)
     chex.assert_trees_all_equal(jaxnav.sweep(path, EPSILON, episodes=EPISODES).outcome, swept["argmax"].outcome)
@@ -175,7 +175,7 @@ def test_run_directory_stands_for_its_run(drawn_run, swept, evaluated):
     chex.assert_trees_all_equal(evaluation.outcome, evaluated.outcome)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_policy_equals_the_run_that_exported_it(drawn_run):
     # A policy is evaluated in the usual scenes of its world.
     run = Run(dataclasses.replace(drawn_run.config, worlds=RunConfig().worlds))

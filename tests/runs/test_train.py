@@ -41,7 +41,7 @@ def finished_config(tmp_path_factory):
 # A finished run
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_train_leaves_a_finished_run_unchanged(finished_config, capsys):
     files_before = contents(finished_config.run_dir)
     assert jaxnav.train(finished_config) == jaxnav.Run(check_config(finished_config))
@@ -165,7 +165,7 @@ def test_method_without_layout_support_is_trained_as_baseline_alone(config, tmp_
         run.policies(("layout",))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_layout_arm_is_trained_and_evaluated_alone(config, tmp_path):
     run = jaxnav.train(one_chunk_config(config, tmp_path / "run", arms=("layout",)))
     assert [folder.name for folder in (tmp_path / "run" / "policies").iterdir()] == ["layout-0"]
@@ -193,7 +193,7 @@ def assert_run_can_be_evaluated(run_dir):
     assert {leaf.shape[-1] for leaf in results.outcome} == {NUM_EPISODES}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_hoz_zones_are_learned_from_training_scenes_and_exported(config, tmp_path):
     hoz_config = one_chunk_config(config, tmp_path / "run", method="hoz", method_sizes={})
     exported_zones = jaxnav.train(hoz_config).policies().knowledge.method
@@ -211,7 +211,7 @@ def test_hoz_zones_are_learned_from_training_scenes_and_exported(config, tmp_pat
     assert_run_can_be_evaluated(tmp_path / "run")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sp_graph_is_learned_from_training_scenes_and_exported(config, tmp_path):
     sp_config = one_chunk_config(config, tmp_path / "run", method="sp", method_sizes={})
     console = Console(quiet=True)

@@ -78,7 +78,7 @@ def test_validation_updates_are_evenly_spaced_and_end_with_the_last_chunk(valida
     assert sorted(config.validation_updates) == after
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_train_exports_the_policy_with_the_highest_validation_success(config, tmp_path):
     config = dataclasses.replace(config, run_dir=tmp_path / "run", total_steps=8 * config.total_steps, val_episodes=40)
     run = train(dataclasses.replace(config, validations=4))

@@ -139,7 +139,7 @@ def test_experience_coin_changes_within_an_episode_only_if_drawn_every_step(draw
 # Stages
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_trainer_trains_the_direct_stream_alone_and_then_both():
     """Two updates of each; each stage has an optimizer of its own."""
     learner = make_learner("org", experience=EXPERIENCE_PROB)

@@ -144,7 +144,8 @@ def step_differences(
     [
         ("rooms", "rooms", FEW_STEPS),
         ("ithor", "rooms", FEW_STEPS),
-        *(pytest.param("rooms", world, MANY_STEPS, marks=SLOW) for world in TASKS),
+        pytest.param("rooms", "houses", MANY_STEPS, marks=SLOW),
+        *(pytest.param("rooms", world, MANY_STEPS, marks=pytest.mark.exhaustive) for world in TASKS),
     ],
 )
 def test_environment_equals_the_twin_at_random_steps(source, world, num_steps):
