@@ -35,9 +35,9 @@ class EvalConfig:
     """Options of the eval command.
 
     Attributes:
-      subject: what to evaluate: a run directory, the folder of an exported policy, the name of a packaged policy, such
-        as `rooms-org`, or an agent of your own as `package.module:AGENT`, which stands beside Random, frontier search
-        and the shortest path; or the JSON file of a finished evaluation to print.
+      subject: a run directory, the folder of an exported policy, the name of a packaged policy, such as `rooms-org`, or
+        an agent of your own as `package.module:AGENT`, which is shown beside Random, frontier search and the shortest
+        path; or the JSON file of a finished evaluation to print.
       split: scenes to evaluate on.
       scenes: scene file to use instead of the scenes of the run or of the generated world.
       world: generated world to use. The default is `rooms` for an agent, and the world of a run or a policy, whose

@@ -44,7 +44,7 @@ def test_typos_suggest_the_nearest_name(words, suggestion, capsys):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["eval", "--json", "a.json"], ["RUN", "missing"]),
+        (["eval", "--json", "a.json"], ["SUBJECT", "missing"]),
         (["scenes", "import"], ["FORMAT, SOURCE, OUT", "missing"]),
         (["train", "--seeds", "x"], ["--seeds", "'x'", "whole number"]),
         (["train", "--ppo.gamma", "x"], ["--ppo.gamma", "'x'", "a number"]),
