@@ -162,7 +162,7 @@ NAMES = {
     "training.loss.advantages": "training.ppo.compute_advantages",
     "training.loss.replay": "training.ppo.replay_rollout",
     "viz.figure.save_figure": "viz.style.save_figure",
-    "viz.plan.AGENT": "viz.style.AGENT_COLOR",
+    "viz.plan.AGENT": "env.render.AGENT_COLOR",
     "viz.plan.draw_room": "viz.scene.draw_plan",
 }
 

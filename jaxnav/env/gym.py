@@ -9,7 +9,7 @@ Importing this module registers the ids.
 
 import os
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import gymnasium
 import jax
@@ -46,9 +46,7 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
 
     metadata: NamedValues = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}  # noqa: RUF012
 
-    def __init__(
-        self, world: str = "rooms", *, render_mode: Literal["rgb_array", "ansi"] | None = None, **options: Any
-    ) -> None:
+    def __init__(self, world: str = "rooms", *, render_mode: str | None = None, **options: Any) -> None:
         """Make the scenes; the options are those of `jaxnav.make`.
 
         Args:
@@ -68,7 +66,7 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode {render_mode!r}: choose rgb_array, ansi or None")
         env, params = make(world, **options)
-        self.render_mode: RenderMode | None = render_mode
+        self.render_mode = render_mode
         self._env = env
         self._params = params
         self._path: list[int] = []  # poses of the episode so far
@@ -109,7 +107,7 @@ class ObjectNavEnv(gymnasium.Env[NamedValues, np.int64]):
         if self._episodes is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         state = jax.tree.map(lambda leaf: np.asarray(leaf[0]), self._episodes.state)
-        return self._env.render(state, self._params, mode=self.render_mode, path=self._path[:-1])
+        return self._env.render(state, self._params, mode=cast(RenderMode, self.render_mode), path=self._path[:-1])
 
 
 class ObjectNavVectorEnv(VectorEnv[NamedValues, np.ndarray, np.ndarray]):
