@@ -55,16 +55,21 @@ def test_a_run_is_no_policy_and_its_policies_are_named(drawn_run, tmp_path):
 
 def test_a_policy_is_no_run(drawn_run, export):
     for policy in (export, "rooms-org"):
-        for open_run in (jaxnav.evaluate, jaxnav.Run.open):
-            with pytest.raises(InputError, match=f"^{policy}: is an exported policy and holds no run; give the dir"):
-                open_run(policy)
+        with pytest.raises(InputError, match=f"^{policy}: is an exported policy and holds no run; give the dir"):
+            jaxnav.Run.open(policy)
 
 
-@pytest.mark.parametrize("function", [jaxnav.evaluate, jaxnav.sweep, jaxnav.load_policy, jaxnav.Run.open])
+@pytest.mark.parametrize("function", [jaxnav.sweep, jaxnav.load_policy, jaxnav.Run.open])
 @pytest.mark.parametrize("argument", [None, 3, b"runs/rooms", ["runs/rooms"]])
 def test_arguments_that_are_no_path_are_named(function, argument):
     with pytest.raises(InputError, match=f"^{type(argument).__name__} is no path; give the directory of a run"):
         function(argument)
+
+
+@pytest.mark.parametrize("subject", [None, 3, b"runs/rooms", ["runs/rooms"]])
+def test_subjects_that_are_no_agent_are_named(subject):
+    with pytest.raises(InputError, match="is no agent; give an object with init and act or with predict, a function"):
+        jaxnav.evaluate(subject)
 
 
 def test_training_takes_a_configuration():
@@ -91,7 +96,7 @@ def test_load_policy_refuses_damaged_exports(export):
             "cannot be imported (ModuleNotFoundError: No module named ",
         ),
         ({"method": "jaxnav.layout:MINE"}, "cannot be imported (AttributeError: module 'jaxnav.layout' "),
-        ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, eotp, hoz, org, rgb, savn, "),
+        ({"method": "strange"}, "method 'strange': is unknown; choose one of anonymous, belief, eotp, hoz, org, "),
         ({"method": "sp"}, "the statistics of method 'sp' are missing; train the run again"),
         ({"sizes": {"depth": 3}}, "its spec does not fit this code (TypeError: "),
         ({"layout": {"rows": "some"}}, "its spec does not fit this code (ValueError: rows is 'some'"),
