@@ -29,7 +29,7 @@ def run_script(script, tmp_path):
     return result.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_packaged_policy_example_finds_most_goals(tmp_path):
     """Random actions find 7 %; in the 1,000 episodes of `jaxnav episode` the policy finds 91 %, and 88 % at shift 1."""
     matches = re.findall(

@@ -86,7 +86,7 @@ def test_prefetch_env_params_reads_one_bank_ahead(world, monkeypatch):
     assert list(given) == list(prefetch_env_params(world, [])) == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_trainer_restart_draws_new_episodes_and_keeps_the_learner(world):
     """Restarting draws episodes by the update's own key; parameters and optimizer stay."""
     ppo = PPOConfig(num_envs=32, rollout=4, minibatches=2)

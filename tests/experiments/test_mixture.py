@@ -173,7 +173,7 @@ def bench(make_bench, drawn_run):
     return make_bench(agents={"main": run, "anonymous": run}, shifts=(0.0, 1.0), episodes=8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_mixture_measures_every_removal_at_both_shifts(bench):
     rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each estimator compiles again
     # The run has no evidence of sightings, so rules of the gap `surprise` are left out.

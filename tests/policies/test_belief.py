@@ -297,7 +297,7 @@ def test_control_walks_to_the_chosen_square():
     assert next_state.actions_left == control.interval == 5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["belief", "jaxnav.policies.methods.belief:DIRICHLET"])
 def test_contract_of_methods_holds(name):
     check_method(name, steps=3)

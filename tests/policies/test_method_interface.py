@@ -92,9 +92,7 @@ ABLATIONS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "name", params_by_tier([*METHODS, *ABLATIONS, *TEST_METHODS], fast=["anonymous"], slow=["semexp"])
-)
+@pytest.mark.parametrize("name", params_by_tier([*METHODS, *ABLATIONS, *TEST_METHODS], fast=["anonymous"]))
 def test_check_method_accepts_every_method_of_the_package(name):
     check_method(name, steps=4)
 

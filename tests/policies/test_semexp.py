@@ -326,7 +326,7 @@ def test_learn_search_setup_refuses_more_categories_than_map_bits():
         learn_search_setup([crowded_bank], np.zeros(0))
 
 
-@pytest.mark.parametrize("world_name", params_by_tier(["apartments", "houses"], slow=["apartments"]))
+@pytest.mark.parametrize("world_name", params_by_tier(["apartments", "houses"]))
 def test_nearest_frontier_finds_most_goals_of_homes_without_learning(world_name):
     """Without looking down, or with Done said too far away, it finds few of them."""
     preset = WORLDS[world_name]

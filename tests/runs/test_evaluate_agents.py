@@ -149,7 +149,7 @@ def test_policies_are_found_by_name_path_and_object():
     assert jnp.array_equal(*layouts)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_packaged_policy_is_evaluated_with_its_removals(scene_file):
     results = jaxnav.evaluate("rooms-org", scenes=scene_file, episodes=NUM_EPISODES, costs="none")
     variants = [row.variant for row in results.rows]

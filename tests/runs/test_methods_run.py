@@ -31,9 +31,7 @@ def config_of(method, folder):
     return config
 
 
-@pytest.mark.parametrize(
-    "method", params_by_tier(["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"], slow=["semexp"])
-)
+@pytest.mark.parametrize("method", params_by_tier(["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"]))
 def test_method_is_trained_exported_and_evaluated(method, tmp_path):
     """The exported policy is that of the run, with the same knowledge."""
     run = train(config_of(method, tmp_path / "one"))

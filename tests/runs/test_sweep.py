@@ -152,7 +152,7 @@ def test_table_of_a_sweep_has_a_line_for_every_threshold(swept):
 # Several shifts
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_shifts_share_a_compilation_and_equal_evaluations(drawn_run):
     results = sweep_shifts(drawn_run, (0.0, 0.5), (0.0, 1.0), episodes=EPISODES)
     assert [result.compilations for result in results] == [1, 0]

@@ -227,7 +227,7 @@ def test_sp_graph_is_learned_from_training_scenes_and_exported(config, tmp_path)
     assert_run_can_be_evaluated(tmp_path / "run")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_prior_knowledge_depends_on_training_scenes_alone(config, tmp_path):
     """Other training scenes change priors, evidence and zones; other val and test scenes change nothing."""
     worlds = config.worlds

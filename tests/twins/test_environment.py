@@ -144,7 +144,6 @@ def step_differences(
     [
         ("rooms", "rooms", FEW_STEPS),
         ("ithor", "rooms", FEW_STEPS),
-        pytest.param("rooms", "houses", MANY_STEPS, marks=SLOW),
         *(pytest.param("rooms", world, MANY_STEPS, marks=pytest.mark.exhaustive) for world in TASKS),
     ],
 )
